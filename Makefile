@@ -1,0 +1,47 @@
+# make run    sets everything up and runs the whole loop on the built-in robot over real Zenoh
+# make test   sets everything up and runs the tests
+# make check  format, lint, types, import walls, docs
+# make bench  the figures that the docs state, as ratios in one run
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: run test check bench format clean wheels setup
+
+run: $(STAMP)
+	$(BIN)/s2r demo
+
+test: $(STAMP)
+	$(BIN)/pytest
+
+check: $(STAMP)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/pytest tests/test_docs.py
+
+bench: $(STAMP)
+	$(BIN)/python tools/bench.py
+
+format: $(STAMP)
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+wheels: $(STAMP)
+	rm -rf dist
+	for package in . plugins/zenoh plugins/standins; do $(BIN)/python -m build --wheel --outdir dist $$package || exit 1; done
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt plugins/zenoh/pyproject.toml plugins/standins/pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed; this is $$($(PYTHON) --version). Set PYTHON=..." >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || { echo "the venv module is missing: sudo apt-get install python3-venv" >&2; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt \
+	    --editable '.[report,dev]' --editable plugins/zenoh --editable plugins/standins
+	@touch $(STAMP)
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info plugins/*/*.egg-info

@@ -1,0 +1,45 @@
+"""The built-in models, effects and tasks, offered through the same hooks as anybody's."""
+
+from __future__ import annotations
+
+from s2r_runtime.hookspecs import Offer, hookimpl
+
+_MODELS = {
+    "unicycle": "planar pose driven by speed and yaw rate (Euler, heading at the start of the step)",
+    "differential_drive": "planar pose driven by two wheel speeds",
+    "bicycle": "kinematic bicycle about the rear axle",
+    "double_integrator": "planar position driven by acceleration",
+    "joint": "one joint driven by a force or torque",
+}
+
+
+@hookimpl
+def s2r_models() -> list[Offer]:
+    """The nominal models of the design."""
+    return [Offer(name, f"s2r_runtime.models.{name}:MODEL", summary) for name, summary in _MODELS.items()]
+
+
+_EFFECTS = {
+    "input_gain": "an input acts by a constant factor",
+    "input_bias": "a constant is added to an input",
+    "input_delay": "an input acts later",
+    "input_lag": "an input is followed with a first-order lag",
+    "input_saturation": "an input is clipped",
+    "wheel_saturation": "both wheels of a unicycle are clipped, which couples v and w",
+    "integration_scheme": "the pose moves along arcs, not along the step's first tangent",
+}
+
+
+@hookimpl
+def s2r_effects() -> list[Offer]:
+    """Effects that a model can lack, one file each."""
+    return [Offer(name, f"s2r_runtime.effects.{name}:EFFECT", summary) for name, summary in _EFFECTS.items()]
+
+
+@hookimpl
+def s2r_tasks() -> list[Offer]:
+    """Scenario laws with safety metrics."""
+    return [
+        Offer("grid_world", "s2r_runtime.tasks.grid_world:GridWorld", "the paper's grid with static and moving obstacles"),
+        Offer("keep_out", "s2r_runtime.tasks.keep_out:KeepOut", "reach a goal, stay out of a disc"),
+    ]

@@ -1,0 +1,1 @@
+"""Effects that a model can lack, one file each, registered through the public hook."""

@@ -1,0 +1,227 @@
+"""Every extension point, on one page.
+
+A plug-in is an installed package with an entry point in the group `s2r_runtime`, naming a module that has functions of
+these names marked with `@hookimpl`. Each returns a list of *offers*: a name and a way to get the thing, so that nothing
+heavy is imported until it is used. Built-in models, effects and tasks come through the same hooks
+(`s2r_runtime.builtin`). Names are unique: a plug-in that reuses one is refused, naming both distributions.
+
+    from s2r_runtime.hookspecs import Offer, hookimpl
+
+    @hookimpl
+    def s2r_transports() -> list[Offer]:
+        return [Offer("my_bus", "my_package.transport:MyTransport", "what it is, in one line")]
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
+
+import pluggy
+
+from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+GROUP = "s2r_runtime"
+API_VERSION = 1
+
+hookspec = pluggy.HookspecMarker(GROUP)
+hookimpl = pluggy.HookimplMarker(GROUP)
+
+
+class Offer(NamedTuple):
+    """`target`: `module:attribute`, imported when first used. The attribute is the class or object the hook asks for."""
+
+    name: str
+    target: str
+    summary: str = ""
+
+
+# ---------------------------------------------------------------- transports
+
+
+class Transport(Protocol):
+    """Turns a robot's protocol into observations and commands. Constructed as `T(options, states, inputs)`; options is the
+    profile's `[transport]` table without `name`. Raises ConfigError for a bad option. Construction opens nothing: an audit
+    constructs one just to `decode`.
+    """
+
+    OPTIONS: ClassVar[dict[str, str]]
+    """Every option and what it means."""
+
+    def open(self) -> None:
+        """Connects; returns at once, whether or not the robot is there. Raises ConfigError if it can never be."""
+
+    def fileno(self) -> int:
+        """A descriptor that is readable when `receive` has something."""
+
+    def receive(self) -> list[Frame]:
+        """What came since the last call, oldest first; never blocks. Queues behind it are bounded; drops are counted in `counters`."""
+
+    def decode(self, frame: Frame) -> list[Observation | Command | LinkChanged | OverrideChanged]:
+        """What an inbound frame means. Depends on this and earlier frames only, not on the link. Never raises for bad bytes:
+        gives an Observation with a `fault`, or nothing for a frame that is not for us. A Command is somebody else's
+        (source `external`): it is logged and refused. A non-finite number is a fault."""
+
+    def poll(self, now_ns: int) -> list[LinkChanged]:
+        """Called at least every 20 ms with the host's monotonic clock: link lost or back, by the transport's own time-outs."""
+
+    def encode(self, command: Command) -> Frame:
+        """The frame that makes the robot apply the command. Raises ValueError if it is not finite or not of shape (nu,)."""
+
+    def send(self, frame: Frame) -> None:
+        """Hands the frame to the robot; never blocks longer than a few ms; a drop is counted."""
+
+    def counters(self) -> dict[str, int]:
+        """received, sent, dropped_in, dropped_out, malformed, lost (gaps in the robot's sequence), and others."""
+
+    def close(self) -> None:
+        """Frees everything; may be called twice."""
+
+
+# ---------------------------------------------------------------- models and effects
+
+
+class NominalModel(Protocol):
+    """One step of `dt`, batched. x: (n, nx), u: (n, nu); all states and inputs in SI units, angles in rad."""
+
+    name: str
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    angles: tuple[str, ...]
+    parameters: dict[str, float]
+    """Defaults."""
+
+    def step(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
+        """x one step later, (n, nx); angles need not be wrapped."""
+
+
+class Parameter(NamedTuple):
+    """A parameter of an effect. `neutral`: the value at which the effect is none (None if there is no such value)."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    neutral: float | None = None
+    kink: bool = False
+    """Enters with a kink (delay, deadband, limits): its interval comes from the profile likelihood."""
+
+
+class Effect(Protocol):
+    """A phenomenon that can be composed into a model's step. Effects apply in the order in which a model lists them.
+
+    Stage `input`: changes the commanded input (n, nu) before the nominal step, with hidden state where it has one.
+    Stage `step`: changes the result of the nominal step. An effect of stage `input` is defined by `input_step` and, for
+    long recordings, the same thing over time at once, `input_sequence`; the kit checks that the two agree.
+    """
+
+    name: str
+    stage: str
+    parameters: tuple[Parameter, ...]
+
+    def channels(self, model: NominalModel) -> tuple[str, ...]:
+        """The channels on which it makes sense on this model (names of inputs or states, or `*`); empty: not at all."""
+
+    def unit(self, model: NominalModel, channel: str, parameter: str) -> str:
+        """The parameter's SI unit on this channel (`input` in a Parameter's unit stands for that channel's unit)."""
+
+    def hidden(self, n: int, model: NominalModel, channel: str, dt: float, p: dict[str, Any]) -> Array:
+        """Hidden state after a long time at zero input, (n, nh); nh may be 0."""
+
+    def input_step(self, u: Array, z: Array, model: NominalModel, channel: str, dt: float, p: dict[str, Any]) -> tuple[Array, Array]:
+        """u as commanded over this step -> u as it acts, averaged over the step; and the next hidden state."""
+
+    def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float, p: dict[str, Any]) -> Array:
+        """u (T, nu), one row a step of dt from rest -> what acts, (T, nu). Same as `input_step` T times."""
+
+    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: dict[str, Any]) -> Array:
+        """Stage `step`: the nominal result x_next (n, nx) -> the result with the effect. u is what acted."""
+
+
+# ---------------------------------------------------------------- tasks
+
+Scenario = dict[str, Any]
+"""Named arrays whose first axis is the rollout, (n, ...)."""
+
+
+class Task(Protocol):
+    """A law of scenarios, a horizon and a safety metric (>= 0 iff safe). Constructed as `T(parameters, model, dt)` where
+    parameters is the profile's `[task.parameters]`; raises ConfigError for a bad one. All randomness from the `rng`
+    passed in (numpy Generator); batched over the rollouts.
+    """
+
+    name: str
+    horizon: int
+    PARAMETERS: ClassVar[dict[str, tuple[float, str]]]
+    """Every parameter: default and meaning."""
+
+    def draw(self, rng: np.random.Generator, n: int) -> Scenario:
+        """n scenarios from the law, independent; each holds `start`, (n, nx)."""
+
+    def draw_at(self, rng: np.random.Generator, x: Array) -> Scenario:
+        """One scenario from the law given that the robot is at x (nx,): for driving scenario after scenario."""
+
+    def advance(self, scenario: Scenario, rng: np.random.Generator) -> Scenario:
+        """The scenario one step later (what moves, moves)."""
+
+    def view(self, scenario: Scenario) -> Scenario:
+        """What a controller may see of it now (`theta` of its entry)."""
+
+    def clearance(self, x: Array, scenario: Scenario) -> Array | None:
+        """Distance to the nearest unsafe set, (n,), negative inside; None if the task has no such function."""
+
+    def begin(self, scenario: Scenario) -> Any:
+        """A tally that `observe` updates."""
+
+    def observe(self, tally: Any, x: Array, scenario: Scenario) -> Any:
+        """Takes note of the states at this step, (n, nx)."""
+
+    def safety(self, tally: Any) -> Array:
+        """Safety value so far, (n,)."""
+
+    def progress(self, tally: Any) -> Array:
+        """Progress so far, (n,), in the task's unit; `progress_ok` judges it."""
+
+    def done(self, tally: Any) -> NDArray[np.bool_]:
+        """Rollouts whose outcome can't change any more, (n,)."""
+
+    def progress_ok(self, progress: Array) -> bool:
+        """Whether the rollouts together did what the task is for: standing still is no pass."""
+
+
+# ---------------------------------------------------------------- the hooks
+
+
+@hookspec
+def s2r_transports() -> list[Offer]:
+    """Classes with the interface of `Transport`."""
+    return []
+
+
+@hookspec
+def s2r_models() -> list[Offer]:
+    """Objects with the interface of `NominalModel`."""
+    return []
+
+
+@hookspec
+def s2r_effects() -> list[Offer]:
+    """Objects with the interface of `Effect`."""
+    return []
+
+
+@hookspec
+def s2r_tasks() -> list[Offer]:
+    """Classes with the interface of `Task`."""
+    return []
+
+
+@hookspec
+def s2r_robots() -> list[Offer]:
+    """Built-in robots for `s2r demo`: objects with `command(seed, effects) -> list[str]`, the argv that starts one, and `profile`."""
+    return []

@@ -1,0 +1,519 @@
+"""What flows through the runtime: frozen structs with stamps and units. SI and radians throughout.
+
+Three families. *Frames* are what a transport received or sent, byte for byte. *Events* go into the core in the order in
+which they are logged. *Outputs* come out of it: records (what was decided, and why) and actions (what the daemon is to
+do). `t_ns` is an integer on the daemon's monotonic clock: the host's in real time, the robot's own in lockstep.
+
+No field holds NaN or inf. What arrives non-finite is turned, at the edge, into a value with `fault` set and no numbers.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+Source = Literal["controller", "sampler", "recovery", "external"]
+
+
+class Struct(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of all that is logged; `tag` is the channel's last word."""
+
+
+# ---------------------------------------------------------------- frames, observations, commands
+
+
+class Frame(Struct, frozen=True, tag="frame"):
+    """Bytes as a transport received (`inbound`) or sent them. `arrival_ns`: host monotonic clock."""
+
+    arrival_ns: int
+    channel: str
+    data: bytes
+    inbound: bool = True
+
+
+class Observation(Struct, frozen=True, tag="observation"):
+    """Measured model state. x: (nx,) in the model's order; `stamp_ns`: the robot's own monotonic clock.
+
+    `fault` is not empty iff the observation cannot be used (then x may be empty): what was wrong with it, in a few words.
+    """
+
+    seq: int
+    stamp_ns: int
+    x: tuple[float, ...]
+    fault: str = ""
+
+
+class Command(Struct, frozen=True, tag="command"):
+    """An input that somebody asks the robot to apply. u: (nu,); answers the observation `obs_seq`; void after `ttl_ns`."""
+
+    seq: int
+    t_ns: int
+    source: Source
+    u: tuple[float, ...]
+    obs_seq: int
+    ttl_ns: int
+    fault: str = ""
+
+
+# ---------------------------------------------------------------- results that events carry
+
+
+class Gap(Struct, frozen=True, tag="gap"):
+    """Gap of a model on one campaign (DESIGN G1). `radius` in the weighted norm's unit; weights: (nx,).
+
+    `hold_radius`: the same bound for the discrepancy after `hold_periods` held periods. `radius_noise`: what measurement
+    noise alone would make of `radius`.
+    """
+
+    radius: float
+    radius_literal: float
+    hold_radius: float
+    hold_periods: int
+    set: Literal["ball", "box"]
+    weights: tuple[float, ...]
+    n: int
+    discarded: int
+    epsilon: float
+    beta: float
+    epoch: int
+    model_digest: str
+    transitions_digest: str
+    rejected: dict[str, int] = {}
+    radius_noise: float | None = None
+    white: bool = True
+
+
+class LawResult(Struct, frozen=True):
+    """One disturbance law's rollouts. `failure_upper`: Clopper-Pearson bound on P(s < threshold) at `beta`."""
+
+    law: str
+    n: int
+    s_star: float
+    failures: int
+    failure_upper: float
+    progress: float
+    progress_ok: bool
+    required: bool
+    passed: bool
+
+
+class Verification(Struct, frozen=True, tag="verification"):
+    """Rollouts of the uncertain model and what they show (DESIGN G2, G8)."""
+
+    passed: bool
+    radius: float
+    hold_radius: float
+    threshold: float
+    epsilon: float
+    beta: float
+    attempt: int
+    seed: int
+    laws: tuple[LawResult, ...]
+    controller_digest: str
+    model_digest: str
+    task_digest: str
+    reason: str = ""
+
+
+class CertificateFacts(Struct, frozen=True):
+    """What the gate compares. Taken from a certificate whose signature was verified when it was loaded."""
+
+    id: str
+    controller_digest: str
+    model_digest: str
+    task_digest: str
+    profile_digest: str
+    epoch: int
+    radius: float
+    verified_radius: float
+    issued_unix_s: int
+    expires_unix_s: int
+
+
+# ---------------------------------------------------------------- the core's settings and memory
+
+
+class Settings(Struct, frozen=True):
+    """What the profile fixes for the core. Bounds: (lower, upper) a state or input; angles are wrapped and unbounded."""
+
+    robot: str
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    angles: tuple[str, ...]
+    dt_ns: int
+    lockstep: bool
+    region: tuple[tuple[float, float], ...]
+    geofence: tuple[tuple[float, float], ...]
+    input_bounds: tuple[tuple[float, float], ...]
+    observation_timeout_ns: int
+    command_ttl_ns: int
+    hysteresis_ns: int
+    settle_periods: int
+    latching: tuple[str, ...]
+    recovery: Literal["stop", "hold", "return"]
+    recovery_input: tuple[float, ...]
+    home: tuple[float, ...]
+    model_name: str
+    model_digest: str
+    task_digest: str
+    profile_digest: str
+    epsilon: float
+    beta: float
+    discard: int
+    campaign_n: int
+    headroom: float
+    alpha: float
+    max_measurement_faults: int
+    certificate_lifetime_s: int
+    seed: int
+    campaign_timeout_s: float = 0.0
+    trace_after_campaign: bool = False
+
+
+class Memory(Struct, frozen=True):
+    """What outlives a restart: counters, the gap in force, the grown radius, certificates and revocations."""
+
+    robot: str
+    schema: int
+    epochs: int = 0
+    attempts: int = 0
+    model_digest: str = ""
+    gap: Gap | None = None
+    radius: float = 0.0
+    certificates: tuple[CertificateFacts, ...] = ()
+    revoked: dict[str, str] = {}
+    latched: tuple[str, ...] = ()
+    campaign_epoch: int = 0
+    """Epoch of a campaign that was begun and not finished (0: none); resuming it costs no new epoch."""
+
+
+# ---------------------------------------------------------------- events: into the core
+
+
+class Started(Struct, frozen=True, tag="started"):
+    """First event of every run; a restored memory is that of the same robot and schema, or there is none."""
+
+    t_ns: int
+    unix_s: int
+    settings: Settings
+    memory: Memory
+
+
+class Observed(Struct, frozen=True, tag="observed"):
+    t_ns: int
+    observation: Observation
+
+
+class Proposed(Struct, frozen=True, tag="proposed"):
+    """A source answers an `Ask` (or an outsider commands unasked: source `external`, which is never allowed)."""
+
+    t_ns: int
+    command: Command
+
+
+class Ticked(Struct, frozen=True, tag="ticked"):
+    """Time passed. At least every 20 ms in real time, also when nothing else happens."""
+
+    t_ns: int
+
+
+class WallClockRead(Struct, frozen=True, tag="wall_clock_read"):
+    t_ns: int
+    unix_s: int
+
+
+class LinkChanged(Struct, frozen=True, tag="link_changed"):
+    t_ns: int
+    up: bool
+    detail: str = ""
+
+
+class RecorderChanged(Struct, frozen=True, tag="recorder_changed"):
+    """The recorder failed (disk full, thread dead) or works again."""
+
+    t_ns: int
+    ok: bool
+    detail: str = ""
+
+
+class OverrideChanged(Struct, frozen=True, tag="override_changed"):
+    """A transport's emergency stop or manual override signal (latches until cleared)."""
+
+    t_ns: int
+    kind: Literal["emergency_stop", "manual_override"]
+    detail: str = ""
+
+
+class Measured(Struct, frozen=True, tag="measured"):
+    """One discrepancy of the stream, from analytics: of the transition that ended with observation `obs_seq`.
+
+    `fault`: the measurement-fault rule that rejected it (then it does not count), or empty. `e_value`: the watch's, after it.
+    """
+
+    t_ns: int
+    obs_seq: int
+    discrepancy: float
+    fault: str
+    e_value: float
+    n: int
+    exceedances: int
+
+
+class SourceStarted(Struct, frozen=True, tag="source_started"):
+    """A source runs and can be asked. `digest`: of what really runs (controller), or of the campaign's settings."""
+
+    t_ns: int
+    source: Source
+    digest: str
+
+
+class SourceStopped(Struct, frozen=True, tag="source_stopped"):
+    """A source is gone. `reason`: finished, raised, died, deadline, malformed, stopped, start_failed."""
+
+    t_ns: int
+    source: Source
+    reason: Literal["finished", "raised", "died", "deadline", "malformed", "stopped", "start_failed"]
+    detail: str = ""
+
+
+class CampaignFinished(Struct, frozen=True, tag="campaign_finished"):
+    """`complete` iff all samples that were fixed beforehand are there. Stopping early costs the epoch but founds no gap."""
+
+    t_ns: int
+    epoch: int
+    n: int
+    complete: bool
+    rejected: dict[str, int]
+    detail: str = ""
+
+
+class JobFinished(Struct, frozen=True, tag="job_finished"):
+    """A worker's result: exactly one of gap, verification, trace is there unless `error` is not empty."""
+
+    t_ns: int
+    job_id: int
+    kind: Literal["gap", "verify", "trace"]
+    gap: Gap | None = None
+    verification: Verification | None = None
+    trace: dict[str, object] | None = None
+    error: str = ""
+
+
+class CertificateStored(Struct, frozen=True, tag="certificate_stored"):
+    """A certificate was signed or loaded, its signature verified against a trusted key, and it is durable in the log.
+
+    `gap`: the gap it rests on, present when it was loaded from a file rather than issued by this daemon.
+    """
+
+    t_ns: int
+    facts: CertificateFacts
+    gap: Gap | None = None
+    request_id: int = 0
+
+
+class Requested(Struct, frozen=True, tag="requested"):
+    """An operator's decision, from the control socket. `by`: user id of the peer. Unused fields are at their defaults.
+
+    deploy: `digest` of the controller that was loaded for it. adopt: `digest` of the model. revoke: `text` a certificate
+    id, or empty for all. clear: `text` the reason. permit: `duration_s`. sample: `count` (0: the profile's).
+    """
+
+    t_ns: int
+    request_id: int
+    verb: Literal["deploy", "undeploy", "revoke", "adopt", "clear", "stop", "permit", "sample", "cancel", "trace", "verify"]
+    by: int
+    digest: str = ""
+    text: str = ""
+    duration_s: float = 0.0
+    count: int = 0
+
+
+Event = (
+    Started | Observed | Proposed | Ticked | WallClockRead | LinkChanged | RecorderChanged | OverrideChanged | Measured
+    | SourceStarted | SourceStopped | CampaignFinished | JobFinished | CertificateStored | Requested
+)  # fmt: skip
+
+
+# ---------------------------------------------------------------- outputs: actions
+
+
+class Ask(Struct, frozen=True, tag="ask"):
+    """The daemon is to ask this source what to do about this observation."""
+
+    t_ns: int
+    source: Source
+    obs_seq: int
+
+
+class Send(Struct, frozen=True, tag="send"):
+    """The one command that goes to the robot. Everything that moves it is one of these."""
+
+    t_ns: int
+    seq: int
+    source: Source
+    u: tuple[float, ...]
+    obs_seq: int
+    ttl_ns: int
+
+
+class StartCampaign(Struct, frozen=True, tag="start_campaign"):
+    t_ns: int
+    epoch: int
+    n: int
+    beta: float
+    seed: int
+    resume: bool
+
+
+class StopCampaign(Struct, frozen=True, tag="stop_campaign"):
+    t_ns: int
+    reason: str
+
+
+class StartController(Struct, frozen=True, tag="start_controller"):
+    t_ns: int
+    digest: str
+    certificate_id: str
+
+
+class StopController(Struct, frozen=True, tag="stop_controller"):
+    t_ns: int
+    reason: str
+
+
+class StartJob(Struct, frozen=True, tag="start_job"):
+    """What the worker is to do.
+
+    gap: of campaign `epoch` at `beta`. verify: controller `digest` at `radius`, `hold_radius`, attempt, seed, `beta`.
+    trace: of `epoch`.
+    """
+
+    t_ns: int
+    job_id: int
+    kind: Literal["gap", "verify", "trace"]
+    epoch: int = 0
+    digest: str = ""
+    radius: float = 0.0
+    hold_radius: float = 0.0
+    attempt: int = 0
+    seed: int = 0
+    beta: float = 0.0
+
+
+class IssueCertificate(Struct, frozen=True, tag="issue_certificate"):
+    """Sign what was shown: the gap in force and this verification."""
+
+    t_ns: int
+    gap: Gap
+    verification: Verification
+    request_id: int
+    lifetime_s: int
+
+
+class Persist(Struct, frozen=True, tag="persist"):
+    """Write the memory durably before the outputs after this one take effect."""
+
+    t_ns: int
+    memory: Memory
+
+
+class Answer(Struct, frozen=True, tag="answer"):
+    """Reply to an operator's request; `final` false for progress on the way. exit_code as on the command line."""
+
+    t_ns: int
+    request_id: int
+    exit_code: int
+    text: str
+    final: bool = True
+
+
+# ---------------------------------------------------------------- outputs: records
+
+
+class Decided(Struct, frozen=True, tag="decided"):
+    """The gate's verdict on one proposed command. `margin`: how far inside (>= 0) or outside (< 0) the failing bound, in its unit."""
+
+    t_ns: int
+    source: Source
+    seq: int
+    obs_seq: int
+    allow: bool
+    reason: str
+    margin: float
+
+
+class GateChanged(Struct, frozen=True, tag="gate_changed"):
+    t_ns: int
+    open: bool
+    reason: str
+    detail: str = ""
+
+
+class EpochChanged(Struct, frozen=True, tag="epoch_changed"):
+    """A campaign was begun (gap None: beta is spent now) or its gap is in force."""
+
+    t_ns: int
+    epoch: int
+    beta: float
+    gap: Gap | None = None
+
+
+class AttemptSpent(Struct, frozen=True, tag="attempt_spent"):
+    """Verification attempt `attempt` was begun; its beta is gone, passed or not."""
+
+    t_ns: int
+    attempt: int
+    beta: float
+    digest: str
+    radius: float
+
+
+class AttemptEnded(Struct, frozen=True, tag="attempt_ended"):
+    t_ns: int
+    attempt: int
+    passed: bool
+    reason: str
+
+
+class RadiusGrew(Struct, frozen=True, tag="radius_grew"):
+    t_ns: int
+    radius: float
+    verified_radius: float
+    obs_seq: int
+
+
+class AlarmRaised(Struct, frozen=True, tag="alarm_raised"):
+    """The watch's e-value reached 1/alpha: every certificate of this epoch's gap is revoked."""
+
+    t_ns: int
+    e_value: float
+    alpha: float
+    epoch: int
+
+
+class CertificateInstalled(Struct, frozen=True, tag="certificate_installed"):
+    t_ns: int
+    facts: CertificateFacts
+
+
+class Revoked(Struct, frozen=True, tag="revoked"):
+    t_ns: int
+    certificate_id: str
+    reason: str
+
+
+class ModelAdopted(Struct, frozen=True, tag="model_adopted"):
+    t_ns: int
+    digest: str
+    by: int
+
+
+Action = (
+    Ask | Send | StartCampaign | StopCampaign | StartController | StopController | StartJob | IssueCertificate | Persist | Answer
+)  # fmt: skip
+Record = (
+    Decided | GateChanged | EpochChanged | AttemptSpent | AttemptEnded | RadiusGrew | AlarmRaised | CertificateInstalled | Revoked
+    | ModelAdopted
+)  # fmt: skip
+Output = Action | Record

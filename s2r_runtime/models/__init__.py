@@ -1,0 +1,1 @@
+"""Nominal models. Nothing is imported here: the gate's process must stay light."""

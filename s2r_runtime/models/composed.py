@@ -1,0 +1,209 @@
+"""A model as it is used: nominal step, parameter values, effects in order, hidden state where an effect has one.
+
+    x, z -> x', z':   u_act, z' = effects of stage `input` (u, z);   x' = effects of stage `step` (nominal(x, u_act))
+
+x: (n, nx), u: (n, nu), angles wrapped to (-pi, pi]. The hidden state is a tuple of one array an effect, (n, nh); at rest it is
+what a long time at zero input leaves (a campaign's full stop).
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.canonical import digest
+from s2r_runtime.errors import ConfigError
+from s2r_runtime.hookspecs import Effect, NominalModel
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.plugins import registry
+
+Array = NDArray[np.float64]
+Hidden = tuple[Array, ...]
+
+
+def wrap(angle: Array) -> Array:
+    """Angles in rad, to (-pi, pi]; any shape."""
+    return -((-angle + math.pi) % (2.0 * math.pi) - math.pi)
+
+
+@dataclass(frozen=True)
+class AppliedEffect:
+    """An effect with its channel and parameter values."""
+
+    effect: Effect
+    channel: str
+    p: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ComposedModel:
+    """A nominal model with effects. Batched: x (n, nx), u (n, nu)."""
+
+    spec: ModelSpec
+    nominal: NominalModel
+    parameters: dict[str, float]
+    effects: tuple[AppliedEffect, ...]
+
+    @property
+    def dt(self) -> float:
+        """Step, s."""
+        return self.spec.dt
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states, in order."""
+        return self.nominal.states
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs, in order."""
+        return self.nominal.inputs
+
+    @property
+    def angle_columns(self) -> list[int]:
+        """Columns of x that wrap."""
+        return [self.states.index(name) for name in self.nominal.angles]
+
+    def at_rest(self, n: int) -> Hidden:
+        """Hidden state after a long time at zero input."""
+        return tuple(a.effect.hidden(n, self.nominal, a.channel, self.dt, a.p) for a in self.effects)
+
+    def step(self, x: Array, u: Array, hidden: Hidden) -> tuple[Array, Hidden]:
+        """One step: (x', hidden')."""
+        after: list[Array] = []
+        acting = u
+        for a, z in zip(self.effects, hidden, strict=True):
+            if a.effect.stage == "input":
+                acting, z = a.effect.input_step(acting, z, self.nominal, a.channel, self.dt, a.p)
+            after.append(z)
+        x_next = self.nominal.step(x, acting, self.dt, self.parameters)
+        for a in self.effects:
+            if a.effect.stage == "step":
+                x_next = a.effect.after_step(x, acting, x_next, self.nominal, a.channel, self.dt, a.p)
+        for column in self.angle_columns:
+            x_next[:, column] = wrap(x_next[:, column])
+        return x_next, tuple(after)
+
+    def hold(self, x: Array, u: Array, periods: int) -> Array:
+        """State after u was held for that many steps from rest, (n, nx)."""
+        hidden = self.at_rest(len(x))
+        for _ in range(periods):
+            x, hidden = self.step(x, u, hidden)
+        return x
+
+    def difference(self, measured: Array, predicted: Array) -> Array:
+        """measured ⊖ predicted, (n, nx): angles wrapped to (-pi, pi]."""
+        e = measured - predicted
+        for column in self.angle_columns:
+            e[:, column] = wrap(e[:, column])
+        return e
+
+
+def compose(spec: ModelSpec, where: str = "model") -> ComposedModel:
+    """The model that a spec describes. Raises ConfigError (unknown names with the nearest known one, bad parameters)."""
+    nominal = _file_model(spec, where) if spec.name.endswith(".py") else _registered(spec, where)
+    for name in spec.parameters:
+        if name not in nominal.parameters:
+            known = ", ".join(nominal.parameters) or "none"
+            raise ConfigError(f"{where}.parameters.{name}: model {spec.name!r} has no such parameter; it has: {known}")
+    applied = []
+    for index, entry in enumerate(spec.effects):
+        effect = registry().get("effects", entry.name)
+        place = f"{where}.effects[{index}] ({entry.name})"
+        channels = effect.channels(nominal)
+        if entry.channel not in channels:
+            raise ConfigError(f"{place}: channel is {entry.channel!r}, must be one of: {', '.join(channels) or 'none on this model'}")
+        applied.append(AppliedEffect(effect, entry.channel, _effect_parameters(effect, entry.parameters, place)))
+    return ComposedModel(spec, nominal, {**nominal.parameters, **spec.parameters}, tuple(applied))
+
+
+def _registered(spec: ModelSpec, where: str) -> NominalModel:
+    try:
+        model: NominalModel = registry().get("models", spec.name)
+    except ConfigError as error:
+        raise ConfigError(f"{where}.name: {error}") from None
+    return model
+
+
+def _effect_parameters(effect: Effect, given: dict[str, Any], where: str) -> dict[str, Any]:
+    known = {p.name: p for p in effect.parameters}
+    for name, value in given.items():
+        if name not in known:
+            raise ConfigError(f"{where}: has no parameter {name!r}; it has: {', '.join(known)}")
+        bounds = known[name]
+        if isinstance(value, int | float) and not bounds.low <= value <= bounds.high:
+            raise ConfigError(f"{where}: {name} is {value}, must be in [{bounds.low}, {bounds.high}] {bounds.unit}")
+    optional = getattr(effect, "optional", ())
+    if missing := [name for name in known if name not in given and name not in optional]:
+        raise ConfigError(f"{where}: lacks the parameter {', '.join(missing)}")
+    return dict(given)
+
+
+@dataclass
+class _FileModel:
+    """A user's Python file as a nominal model."""
+
+    name: str
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    angles: tuple[str, ...]
+    parameters: dict[str, float]
+    function: Any
+
+    def step(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
+        """Calls the file's `step`; raises ConfigError if its result has the wrong shape."""
+        result = np.array(self.function(x, u, dt, parameters), dtype=np.float64)
+        if result.shape != x.shape:
+            raise ConfigError(f"{self.name}: step returned shape {result.shape}, must be {x.shape}")
+        return result
+
+
+def resolve_source(spec: ModelSpec, base: Path) -> ModelSpec:
+    """Makes a file model's path absolute (relative to `base`) and fills in its source digest."""
+    if not spec.name.endswith(".py"):
+        return spec
+    path = (base / spec.name).resolve()
+    try:
+        source = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{path}: model file cannot be read: {error.strerror}") from None
+    return msgspec.structs.replace(spec, name=str(path), source_digest=digest(source))
+
+
+def _file_model(spec: ModelSpec, where: str) -> NominalModel:
+    path = Path(spec.name)
+    try:
+        source = path.read_bytes()
+        ast.parse(source)
+        module_spec = importlib.util.spec_from_file_location(path.stem, path)
+        if module_spec is None or module_spec.loader is None:
+            raise ConfigError(f"{path}: is not a Python file")
+        module = importlib.util.module_from_spec(module_spec)
+        module_spec.loader.exec_module(module)
+    except ConfigError:
+        raise
+    except OSError as error:
+        raise ConfigError(f"{where}.name: {path} cannot be read: {error.strerror}") from None
+    except Exception as error:  # noqa: BLE001 - a user's file: whatever it raises is its report
+        raise ConfigError(f"{path}: {type(error).__name__}: {error}") from None
+    if spec.source_digest and spec.source_digest != digest(source):
+        raise ConfigError(f"{path}: has changed since the model was saved (digest {digest(source)}, saved {spec.source_digest})")
+    for name in ("STATES", "INPUTS", "PARAMS", "step"):
+        if not hasattr(module, name):
+            raise ConfigError(f"{path}: lacks {name}; a model file has STATES, INPUTS, PARAMS and step(x, u, dt, params)")
+    return _FileModel(
+        str(path),
+        tuple(module.STATES),
+        tuple(module.INPUTS),
+        tuple(getattr(module, "ANGLES", ())),
+        {k: float(v) for k, v in module.PARAMS.items()},
+        module.step,
+    )

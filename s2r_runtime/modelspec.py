@@ -1,0 +1,86 @@
+"""A model as data: a name, a step, parameter values and the effects that were added. What a profile's `[model]` table and a
+repaired model's TOML hold, and what a model digest is taken of.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import msgspec
+
+from s2r_runtime.canonical import digest_of
+from s2r_runtime.errors import ConfigError
+
+
+class EffectSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One effect: its registered name, the input or state it acts on (`*` for all alike), its parameters in SI units."""
+
+    name: str
+    channel: str = "*"
+    parameters: dict[str, float | str | list[list[float]]] = {}
+
+
+class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`name`: a registered model, or the path of a Python file. `dt` in s. `source_digest`: of that file, filled on loading.
+
+    `fitted_on`: digests of the recordings that effects were fitted on; a gap is refused on those (DESIGN G6).
+    """
+
+    name: str
+    dt: float
+    parameters: dict[str, float] = {}
+    effects: tuple[EffectSpec, ...] = ()
+    fitted_on: tuple[str, ...] = ()
+    source_digest: str = ""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.dt < float("inf"):
+            raise ValueError(f"dt is {self.dt} s, must be > 0")
+
+    def digest(self) -> str:
+        """Digest of what the model computes: two specs with the same digest step alike. `fitted_on` is no part of it."""
+        name = "file" if self.source_digest else self.name
+        return digest_of(msgspec.structs.replace(self, name=name, fitted_on=()))
+
+
+def load_model(path: Path) -> ModelSpec:
+    """Reads a model TOML (table `[model]`). Raises ConfigError naming file and field."""
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not TOML: {error}") from None
+    if "model" not in table:
+        raise ConfigError(f"{path}: has no [model] table")
+    try:
+        return msgspec.convert(table["model"], ModelSpec)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{path}: model: {error}") from None
+
+
+def dump_model(spec: ModelSpec, comments: tuple[str, ...] = ()) -> str:
+    """The TOML text of a model; `load_model` of it gives an equal spec. comments: lines for the reader."""
+    lines = [f"# {line}" for line in comments]
+    lines += ["[model]", f"name = {_toml(spec.name)}", f"dt = {spec.dt!r}"]
+    if spec.fitted_on:
+        lines.append(f"fitted_on = {_toml(list(spec.fitted_on))}")
+    if spec.source_digest:
+        lines.append(f"source_digest = {_toml(spec.source_digest)}")
+    if spec.parameters:
+        lines += ["", "[model.parameters]", *(f"{_toml(k)} = {_toml(v)}" for k, v in spec.parameters.items())]
+    for effect in spec.effects:
+        lines += ["", "[[model.effects]]", f"name = {_toml(effect.name)}", f"channel = {_toml(effect.channel)}"]
+        if effect.parameters:
+            lines += ["[model.effects.parameters]", *(f"{_toml(k)} = {_toml(v)}" for k, v in effect.parameters.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: object) -> str:
+    """A TOML literal. JSON's strings are TOML basic strings; keys are written quoted."""
+    if isinstance(value, float):
+        return repr(value)
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_toml(item) for item in value) + "]"
+    return msgspec.json.encode(value).decode()

@@ -1,0 +1,141 @@
+"""Finds plug-ins by entry point, each loaded on its own: one that fails is reported and skipped, never fatal.
+
+Names are unique over all plug-ins. Where two offer the same name the later one is refused and both distributions are named;
+built-in names are taken first, so a third party cannot replace one.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from functools import cache
+from importlib import metadata
+from typing import Any, NamedTuple
+
+import pluggy
+
+from s2r_runtime import hookspecs
+from s2r_runtime.errors import PluginError
+from s2r_runtime.hookspecs import API_VERSION, GROUP, Offer
+
+KINDS = ("transports", "models", "effects", "tasks", "robots")
+
+INSTALL = {"zenoh": "s2r-zenoh", "mavlink": "s2r-mavlink", "can": "s2r-can", "robotarium": "s2r-standins"}
+"""Names that a package of this project offers, for the hint when it is not installed."""
+
+
+class Loaded(NamedTuple):
+    """One plug-in as found. `error` is empty iff it is in use; `offers`: kind -> names."""
+
+    name: str
+    distribution: str
+    version: str
+    error: str
+    offers: dict[str, tuple[str, ...]]
+
+
+class Offered(NamedTuple):
+    """An offer in force and the distribution that made it."""
+
+    offer: Offer
+    distribution: str
+
+
+class Registry:
+    """What is offered, by kind and name. `loaded` lists every plug-in found, the broken ones with their error."""
+
+    def __init__(self) -> None:
+        self.loaded: list[Loaded] = []
+        self._offers: dict[str, dict[str, Offered]] = {kind: {} for kind in KINDS}
+
+    def add(self, name: str, distribution: str, version: str, module: object) -> None:
+        """Takes a plug-in module's offers. A name already taken is refused with both distributions named."""
+        manager = pluggy.PluginManager(GROUP)
+        manager.add_hookspecs(hookspecs)
+        errors: list[str] = []
+        taken: dict[str, tuple[str, ...]] = {}
+        wanted = getattr(module, "S2R_API_VERSION", API_VERSION)
+        if wanted != API_VERSION:
+            self.fail(name, distribution, version, f"written for plug-in API {wanted}, this is API {API_VERSION}")
+            return
+        try:
+            manager.register(module, name)
+            manager.check_pending()
+        except Exception as error:  # noqa: BLE001 - a third party's module: whatever it raises is its report, not our end
+            self.fail(name, distribution, version, f"{type(error).__name__}: {error}")
+            return
+        for kind in KINDS:
+            try:
+                offers = [offer for given in getattr(manager.hook, f"s2r_{kind}")() for offer in given]
+            except Exception as error:  # noqa: BLE001 - as above
+                errors.append(f"s2r_{kind}: {type(error).__name__}: {error}")
+                continue
+            taken[kind] = tuple(o.name for o in offers if self._take(kind, o, distribution, errors))
+        self.loaded.append(Loaded(name, distribution, version, "; ".join(errors), {k: v for k, v in taken.items() if v}))
+
+    def fail(self, name: str, distribution: str, version: str, error: str) -> None:
+        """Notes a plug-in that could not be loaded."""
+        self.loaded.append(Loaded(name, distribution, version, error, {}))
+
+    def _take(self, kind: str, offer: Offer, distribution: str, errors: list[str]) -> bool:
+        if not isinstance(offer, Offer):
+            errors.append(f"s2r_{kind}: offers {type(offer).__name__}, must be Offer(name, target)")
+            return False
+        known = self._offers[kind].get(offer.name)
+        if known is not None:
+            errors.append(f"{kind[:-1]} {offer.name!r} of {distribution} is refused: {known.distribution} has that name")
+            return False
+        self._offers[kind][offer.name] = Offered(offer, distribution)
+        return True
+
+    def names(self, kind: str) -> list[str]:
+        """Registered names of a kind, sorted."""
+        return sorted(self._offers[kind])
+
+    def offered(self, kind: str, name: str) -> Offered:
+        """The offer of that name. Raises PluginError with the nearest name, or what to install."""
+        found = self._offers[kind].get(name)
+        if found is None:
+            raise PluginError(f"unknown {kind[:-1]} {name!r}" + self._hint(kind, name))
+        return found
+
+    def get(self, kind: str, name: str) -> Any:
+        """Imports and returns what is offered. Raises PluginError if it is unknown or its import fails."""
+        offer, distribution = self.offered(kind, name)
+        module, _, attribute = offer.target.partition(":")
+        try:
+            return getattr(importlib.import_module(module), attribute)
+        except Exception as error:  # noqa: BLE001 - as in `add`
+            raise PluginError(f"{kind[:-1]} {name!r} of {distribution} cannot be loaded: {type(error).__name__}: {error}") from None
+
+    def _hint(self, kind: str, name: str) -> str:
+        broken = [f"{p.name} ({p.error})" for p in self.loaded if p.error]
+        if near := difflib.get_close_matches(name, self.names(kind), 1, 0.6):
+            return f"; did you mean {near[0]!r}?"
+        if name in INSTALL:
+            return f"; install the package {INSTALL[name]}" + (f"; plug-ins that failed: {', '.join(broken)}" if broken else "")
+        return f"; there are: {', '.join(self.names(kind)) or 'none'}"
+
+
+@cache
+def registry() -> Registry:
+    """Everything installed, built-ins first. Loaded once a process."""
+    found = Registry()
+    found.add("builtin", "s2r-runtime", _version("s2r-runtime"), importlib.import_module("s2r_runtime.builtin"))
+    points = sorted(metadata.entry_points(group=GROUP), key=lambda p: ((p.dist.name if p.dist else ""), p.name))
+    for point in points:
+        distribution, version = (point.dist.name, point.dist.version) if point.dist else ("?", "?")
+        try:
+            module = point.load()
+        except Exception as error:  # noqa: BLE001 - as in `Registry.add`
+            found.fail(point.name, distribution, version, f"{type(error).__name__}: {error}")
+            continue
+        found.add(point.name, distribution, version, module)
+    return found
+
+
+def _version(distribution: str) -> str:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return "?"

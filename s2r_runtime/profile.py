@@ -1,0 +1,334 @@
+"""One robot = one TOML file. Loads it, validates it, and says on one line what is wrong: where, what it is, what it must be.
+
+Everything a statement depends on is fixed here, before any data are seen. The profile's digest is bound into certificates.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from s2r_runtime.canonical import digest_of
+from s2r_runtime.errors import ConfigError
+from s2r_runtime.modelspec import ModelSpec
+
+
+class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of the profile's tables."""
+
+
+class Robot(_Table, frozen=True):
+    """Who it is. `name` keys state, sockets and topics."""
+
+    name: str
+    description: str = ""
+
+
+class Norm(_Table, frozen=True):
+    """The norm of the discrepancy. Weights by state, each in norm-units per state-unit; a state left out weighs 1."""
+
+    set: Literal["ball", "box"] = "ball"
+    weights: dict[str, float] = {}
+
+
+class Sampling(_Table, frozen=True):
+    """The campaign (paper, section V). `stop_periods`: zero input before x0 is recorded, at least the robot's delay + 1.
+
+    `n` 0: as many samples as the epoch's share of beta asks for. Times in s, lengths in m, gains of the go-to law in 1/s.
+    """
+
+    n: int = 0
+    hold_periods: int = 50
+    stop_periods: int = 4
+    waypoint_radius: float = 0.1
+    waypoint_margin: float = 0.15
+    waypoint_timeout: float = 60.0
+    position_gain: float = 1.0
+    heading_gain: float = 3.0
+    stuck_after: float = 5.0
+    max_rejections: int = 200
+    seed: int = 1
+
+
+class Guarantee(_Table, frozen=True):
+    """epsilon, beta of DESIGN G1 to G4, alpha of the watch's alarm, k discarded samples."""
+
+    epsilon: float = 0.01
+    beta: float = 0.05
+    alpha: float = 0.01
+    discard: int = 0
+
+
+class VerificationSettings(_Table, frozen=True):
+    """`headroom`: verification runs at headroom times the gap's radius, so that growth below it costs nothing.
+
+    `n` 0: as many as the attempt's share of beta asks for. `required`: the laws that must pass; the others are reported.
+    """
+
+    epsilon: float = 0.01
+    n: int = 0
+    threshold: float = 0.0
+    headroom: float = 1.5
+    laws: tuple[Literal["uniform", "persistent", "adversarial"], ...] = ("uniform", "persistent", "adversarial")
+    required: tuple[Literal["uniform", "persistent", "adversarial"], ...] = ("uniform", "persistent")
+    timeout: float = 600.0
+
+
+class TaskChoice(_Table, frozen=True):
+    """Which task, its parameters, and how many scenarios are driven one after the other once deployed (0: no end)."""
+
+    name: str
+    parameters: dict[str, float] = {}
+    episodes: int = 0
+
+
+class Gate(_Table, frozen=True):
+    """Time-outs in s. `latching`: reasons that stay until a person clears them."""
+
+    observation_timeout: float = 0.2
+    command_ttl: float = 0.1
+    controller_deadline: float = 0.05
+    hysteresis: float = 0.1
+    settle_periods: int = 30
+    latching: tuple[str, ...] = ("emergency_stop", "manual_override", "watch_alarm", "controller_fault", "measurement_faults")
+
+
+class Recovery(_Table, frozen=True):
+    """What drives when the gate is closed: `stop` (zero input), `hold` (a fixed `input`), `return` (to `home`, then stop)."""
+
+    kind: Literal["stop", "hold", "return"] = "stop"
+    input: dict[str, float] = {}
+    home: dict[str, float] = {}
+
+
+class Watch(_Table, frozen=True):
+    """`fault_jump`: a discrepancy above it (in the norm's unit) is a fault of measurement, not motion; 0: there is no such rule.
+    More than `max_faults` of them in a deployment close the gate.
+    """
+
+    fault_jump: float = 0.0
+    max_faults: int = 20
+
+
+class CertificateSettings(_Table, frozen=True):
+    """How long a certificate is valid, in s."""
+
+    lifetime: float = 86400.0
+
+
+class Recording(_Table, frozen=True):
+    """Where logs go (relative to the state folder), when they rotate (bytes, s; 0: never)."""
+
+    directory: str = "logs"
+    rotate_bytes: int = 1_000_000_000
+    rotate_after: float = 0.0
+
+
+class Repair(_Table, frozen=True):
+    """`after_campaign`: trace the residual when a campaign ends. Adopting a repaired model is always a person's decision."""
+
+    after_campaign: bool = False
+
+
+class Profile(_Table, frozen=True):
+    """A robot. region: where the certificate holds, bounds by state (an angle may be left out: all of it)."""
+
+    robot: Robot
+    model: ModelSpec
+    region: dict[str, tuple[float, float]]
+    inputs: dict[str, tuple[float, float]]
+    transport: dict[str, Any]
+    task: TaskChoice
+    geofence: dict[str, tuple[float, float]] = {}
+    columns: dict[str, str] = {}
+    norm: Norm = Norm()
+    sampling: Sampling = Sampling()
+    guarantee: Guarantee = Guarantee()
+    verification: VerificationSettings = VerificationSettings()
+    gate: Gate = Gate()
+    recovery: Recovery = Recovery()
+    watch: Watch = Watch()
+    certificate: CertificateSettings = CertificateSettings()
+    recording: Recording = Recording()
+    repair: Repair = Repair()
+    clock: Literal["realtime", "lockstep"] = "realtime"
+
+    def digest(self) -> str:
+        """Digest of everything but the model (it has a digest of its own) and where logs go."""
+        plain = msgspec.to_builtins(self)
+        del plain["model"], plain["recording"]
+        return digest_of(plain)
+
+    def task_digest(self) -> str:
+        """Digest of the task: its name, parameters, threshold and the model step it runs on."""
+        return digest_of(
+            {"task": self.task.name, "parameters": self.task.parameters, "dt": self.model.dt, "threshold": self.verification.threshold}
+        )
+
+
+def load_profile(path: Path) -> Profile:
+    """Reads and checks a profile. Raises ConfigError `path: field is value, must be ...`."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from None
+    return parse_profile(text, str(path), path.parent)
+
+
+def parse_profile(text: str, where: str, base: Path) -> Profile:
+    """As `load_profile`, from text; relative model files are looked up from `base`."""
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{where}: not TOML: {error}") from None
+    try:
+        profile = msgspec.convert(table, Profile)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{where}: {_explain(str(error), table)}") from None
+    for field, value, must in _checks(profile):
+        raise ConfigError(f"{where}: {field} is {value}, must be {must}")
+    return msgspec.structs.replace(profile, model=_resolved(profile.model, where, base))
+
+
+def _resolved(spec: ModelSpec, where: str, base: Path) -> ModelSpec:
+    if not spec.name.endswith(".py"):
+        return spec
+    from s2r_runtime.models.composed import resolve_source  # numpy: only for models from a file
+
+    return resolve_source(spec, base)
+
+
+def check_names(profile: Profile, where: str) -> None:
+    """Checks what needs the models, tasks and transports loaded: names of states and inputs, effects, task parameters."""
+    from s2r_runtime.models.composed import compose
+    from s2r_runtime.plugins import registry
+
+    model = compose(profile.model, f"{where}: model")
+    for table, given, known in (
+        ("region", profile.region, model.states),
+        ("geofence", profile.geofence, model.states),
+        ("norm.weights", profile.norm.weights, model.states),
+        ("recovery.home", profile.recovery.home, model.states),
+        ("inputs", profile.inputs, model.inputs),
+        ("recovery.input", profile.recovery.input, model.inputs),
+    ):
+        for name in given:
+            if name not in known:
+                raise ConfigError(f"{where}: {table}.{name}: model {profile.model.name!r} has no such name; it has: {', '.join(known)}")
+    if missing := [name for name in model.inputs if name not in profile.inputs]:
+        raise ConfigError(f"{where}: inputs lacks bounds for {', '.join(missing)}")
+    if missing := [name for name in model.states if name not in profile.region and name not in model.nominal.angles]:
+        raise ConfigError(f"{where}: region lacks bounds for {', '.join(missing)}")
+    try:
+        task = registry().get("tasks", profile.task.name)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: task.name: {error}") from None
+    task(profile.task.parameters, model.nominal, profile.model.dt)
+    try:
+        transport = registry().get("transports", str(profile.transport.get("name")))
+    except ConfigError as error:
+        raise ConfigError(f"{where}: transport.name: {error}") from None
+    transport({k: v for k, v in profile.transport.items() if k != "name"}, model.states, model.inputs)
+
+
+def _explain(message: str, table: dict[str, Any]) -> str:
+    """msgspec's `Expected X, got Y - at `$.a.b`` in this project's form."""
+    path = re.search(r" - at `\$\.?([^`]*)`$", message)
+    field = path.group(1) if path else ""
+    text = message[: path.start()] if path else message
+    if unknown := re.match(r"Object contains unknown field `(.*)`", text):
+        place = f"{field}." if field else ""
+        near = difflib.get_close_matches(unknown.group(1), _fields_at(field), 1, 0.6)
+        return f"{place}{unknown.group(1)} is not a known setting" + (f"; did you mean {near[0]!r}?" if near else "")
+    if missing := re.match(r"Object missing required field `(.*)`", text):
+        return f"{field + '.' if field else ''}{missing.group(1)} is missing"
+    value: Any = table
+    for key in re.findall(r"[^.\[\]]+", field):
+        value = value[int(key)] if isinstance(value, list) and key.isdigit() else value.get(key) if isinstance(value, dict) else None
+    if wanted := re.match(r"Expected `(.*)`, got `(.*)`", text):
+        return f"{field} is {value!r} ({wanted.group(2)}), must be {wanted.group(1)}"
+    return f"{field}.{text}" if field else text
+
+
+def _fields_at(field: str) -> list[str]:
+    struct: Any = Profile
+    for key in field.split(".") if field else []:
+        names = {f.name: f.type for f in msgspec.structs.fields(struct)}
+        struct = names.get(key)
+        if not (isinstance(struct, type) and issubclass(struct, msgspec.Struct)):
+            return []
+    return [f.name for f in msgspec.structs.fields(struct)]
+
+
+def _checks(p: Profile) -> list[tuple[str, object, str]]:
+    """(field, value, what it must be) for every setting out of its range."""
+    found: list[tuple[str, object, str]] = []
+
+    def need(ok: bool, field: str, value: object, must: str) -> None:
+        if not ok:
+            found.append((field, value, must))
+
+    need(
+        re.fullmatch(r"[a-z0-9][a-z0-9_-]*", p.robot.name) is not None,
+        "robot.name",
+        repr(p.robot.name),
+        "lower-case letters, digits, - and _",
+    )
+    for table, bounds in (("region", p.region), ("inputs", p.inputs), ("geofence", p.geofence)):
+        for name, (low, high) in bounds.items():
+            need(
+                math.isfinite(low) and math.isfinite(high) and low < high,
+                f"{table}.{name}",
+                [low, high],
+                "[low, high] with low < high, finite",
+            )
+    for name, (low, high) in p.inputs.items():
+        need(low <= 0.0 <= high, f"inputs.{name}", [low, high], "an interval around 0 (zero input stops the robot)")
+    for name, weight in p.norm.weights.items():
+        need(0.0 < weight < math.inf, f"norm.weights.{name}", weight, "> 0 and finite")
+    g, s, v, gate = p.guarantee, p.sampling, p.verification, p.gate
+    for field, value in (
+        ("guarantee.epsilon", g.epsilon),
+        ("guarantee.beta", g.beta),
+        ("guarantee.alpha", g.alpha),
+        ("verification.epsilon", v.epsilon),
+    ):
+        need(0.0 < value < 1.0, field, value, "between 0 and 1")
+    need(g.discard >= 0, "guarantee.discard", g.discard, ">= 0")
+    need(s.n >= 0, "sampling.n", s.n, ">= 0 (0: as many as beta asks for)")
+    need(s.hold_periods >= 1, "sampling.hold_periods", s.hold_periods, ">= 1")
+    need(s.stop_periods >= 1, "sampling.stop_periods", s.stop_periods, ">= 1, and at least the robot's delay + 1")
+    for field, value in (
+        ("waypoint_radius", s.waypoint_radius),
+        ("waypoint_timeout", s.waypoint_timeout),
+        ("position_gain", s.position_gain),
+        ("heading_gain", s.heading_gain),
+        ("stuck_after", s.stuck_after),
+    ):
+        need(0.0 < value < math.inf, f"sampling.{field}", value, "> 0")
+    need(v.n >= 0, "verification.n", v.n, ">= 0 (0: as many as beta asks for)")
+    need(1.0 <= v.headroom < math.inf, "verification.headroom", v.headroom, ">= 1")
+    need(math.isfinite(v.threshold), "verification.threshold", v.threshold, "finite")
+    need(
+        bool(v.required) and set(v.required) <= set(v.laws), "verification.required", list(v.required), "at least one of verification.laws"
+    )
+    for field, value in (
+        ("observation_timeout", gate.observation_timeout),
+        ("command_ttl", gate.command_ttl),
+        ("controller_deadline", gate.controller_deadline),
+    ):
+        need(0.0 < value < math.inf, f"gate.{field}", value, "> 0 s")
+    need(0.0 <= gate.hysteresis < math.inf, "gate.hysteresis", gate.hysteresis, ">= 0 s")
+    need(p.certificate.lifetime >= 1.0, "certificate.lifetime", p.certificate.lifetime, ">= 1 s")
+    need(p.task.episodes >= 0, "task.episodes", p.task.episodes, ">= 0 (0: no end)")
+    need(p.watch.fault_jump >= 0.0, "watch.fault_jump", p.watch.fault_jump, ">= 0 (0: no such rule)")
+    need(isinstance(p.transport.get("name"), str), "transport.name", p.transport.get("name"), "the name of a transport")
+    return found

@@ -1,0 +1,1 @@
+"""Scenario laws and safety metrics."""
