@@ -1,0 +1,127 @@
+"""Options that several verbs share: which model, which profile, and numbers with their ranges."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from s2r_runtime.errors import ConfigError, UsageError
+from s2r_runtime.modelspec import ModelSpec, load_model
+from s2r_runtime.profile import Profile, check_names, load_profile
+
+if TYPE_CHECKING:
+    from s2r_runtime.models.composed import ComposedModel
+
+
+def add_model_options(verb: argparse.ArgumentParser) -> None:
+    """--profile, --model, --dt, --param."""
+    verb.add_argument("--profile", type=Path, metavar="P", help="the robot's profile (TOML): model, columns, weights")
+    verb.add_argument(
+        "--model",
+        metavar="M",
+        help="a model's name, a Python file, or a model TOML (written by s2r trace -o); with --profile it replaces the profile's model",
+    )
+    verb.add_argument("--dt", type=float, metavar="DT", help="the model's step in s (with a name or a Python file)")
+    verb.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the model; may be repeated")
+
+
+def chosen_model(args: argparse.Namespace) -> tuple[ComposedModel, Profile | None]:
+    """The model asked for, and the profile if one was named. Raises UsageError or ConfigError."""
+    from s2r_runtime.models.composed import compose, resolve_source
+
+    profile = load_checked(args.profile) if args.profile else None
+    if args.model is None:
+        if profile is None:
+            raise UsageError("which model? give --profile P, or --model M --dt DT")
+        spec, where = profile.model, str(args.profile)
+    elif args.model.endswith(".toml"):
+        spec, where = load_model(Path(args.model)), args.model
+    else:
+        dt = args.dt if args.dt is not None else profile.model.dt if profile else None
+        if dt is None:
+            raise UsageError(f"--model {args.model} needs its step: --dt DT (s)")
+        spec, where = _named(args.model, dt), "--model"
+    if args.dt is not None:
+        spec = _with_dt(spec, args.dt)
+    if args.param:
+        spec = msgspec.structs.replace(spec, parameters={**spec.parameters, **dict(pair(item, "--param") for item in args.param)})
+    return compose(resolve_source(spec, Path.cwd()), where), profile
+
+
+def load_checked(path: Path) -> Profile:
+    """A profile whose names of models, states, tasks and transports were checked too."""
+    profile = load_profile(path)
+    check_names(profile, str(path))
+    return profile
+
+
+def weights_of(states: tuple[str, ...], given: list[str], profile: Profile | None) -> tuple[float, ...]:
+    """(nx,) weights: from --weight STATE=W, else the profile's, else 1. Raises UsageError for an unknown state or W <= 0."""
+    weights = dict(profile.norm.weights) if profile else {}
+    for item in given:
+        name, value = pair(item, "--weight")
+        if name not in states:
+            raise UsageError(f"--weight {item}: the model has no state {name!r}; it has: {', '.join(states)}")
+        if value <= 0.0:
+            raise UsageError(f"--weight {item}: must be > 0")
+        weights[name] = value
+    return tuple(weights.get(name, 1.0) for name in states)
+
+
+def probability(text: str) -> float:
+    """argparse type: a number strictly between 0 and 1."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+    if not 0.0 < value < 1.0:
+        raise argparse.ArgumentTypeError(f"{text} must be between 0 and 1")
+    return value
+
+
+def positive(text: str) -> float:
+    """argparse type: a finite number > 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} must be > 0 and finite")
+    return value
+
+
+def count(text: str) -> int:
+    """argparse type: a whole number >= 0."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} must be a whole number >= 0")
+    return int(text)
+
+
+def _named(name: str, dt: float) -> ModelSpec:
+    try:
+        return ModelSpec(name, dt)
+    except ValueError as error:
+        raise UsageError(f"--dt: {error}") from None
+
+
+def _with_dt(spec: ModelSpec, dt: float) -> ModelSpec:
+    if not 0.0 < dt < float("inf"):
+        raise UsageError(f"--dt is {dt}, must be > 0 s")
+    if spec.fitted_on and dt != spec.dt:
+        raise ConfigError(f"--dt {dt}: the model was fitted at a step of {spec.dt} s; its effects hold for that step")
+    return msgspec.structs.replace(spec, dt=dt)
+
+
+def pair(item: str, option: str) -> tuple[str, float]:
+    """NAME=NUMBER. Raises UsageError naming the option."""
+    name, sign, value = item.partition("=")
+    try:
+        number = float(value)
+    except ValueError:
+        number = float("nan")
+    if not sign or not name or not abs(number) < float("inf"):
+        raise UsageError(f"{option} {item}: must be NAME=NUMBER")
+    return name, number

@@ -1,0 +1,206 @@
+"""Verbs that run the daemon or talk to it: run, sample, deploy, undeploy, revoke, adopt, clear, stop, permit, status."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from s2r_runtime.cli import output
+from s2r_runtime.cli.choices import count, positive
+from s2r_runtime.errors import UsageError
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Adds the verbs of this module."""
+    run = verbs.add_parser("run", help="the daemon: talks to the robot, guards it, records everything")
+    run.add_argument("profile", type=Path, metavar="PROFILE")
+    run.add_argument(
+        "--state", type=Path, metavar="DIR", help="where counters, certificates and logs live (default: the user's state folder, by robot)"
+    )
+    run.add_argument(
+        "--key", type=Path, metavar="FILE", help="signing key (default: one of the robot's own in the state folder, made when first needed)"
+    )
+    run.add_argument("--log", type=Path, metavar="DIR", help="where logs go (default: as the profile says)")
+    run.add_argument("--seed", type=count, help="seed of the campaigns and scenarios (default: the profile's)")
+    run.set_defaults(run=run_daemon)
+
+    sample = verbs.add_parser("sample", help="one sampling campaign, through the running daemon if there is one")
+    sample.add_argument("profile", type=Path, metavar="PROFILE")
+    sample.add_argument("-o", "--output", type=Path, metavar="FILE.mcap", help="the recording (without a running daemon)")
+    sample.add_argument(
+        "-n", type=count, default=0, metavar="N", help="samples, fixed beforehand (default: what the profile or its beta asks for)"
+    )
+    sample.add_argument(
+        "--permit",
+        type=positive,
+        metavar="S",
+        help="without a daemon: for how many seconds the robot may be driven (default 3600). Running this verb is the permit",
+    )
+    sample.add_argument("--cancel", action="store_true", help="stop the running daemon's campaign")
+    _common(sample)
+    sample.set_defaults(run=run_sample)
+
+    deploy = _talker(verbs, "deploy", "let this controller drive, if a certificate covers it; verify it first if none does")
+    deploy.add_argument("controller", type=Path, metavar="CONTROLLER")
+    deploy.add_argument("--certificate", type=Path, metavar="CERT", help="a certificate made by s2r certify")
+    deploy.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the controller; may be repeated")
+    deploy.set_defaults(run=run_deploy)
+
+    undeploy = _talker(verbs, "undeploy", "end the deployment; the recovery controller stops the robot")
+    undeploy.set_defaults(run=lambda a: _say(a, {"verb": "undeploy"}))
+
+    revoke = _talker(verbs, "revoke", "withdraw a certificate, or all of them")
+    revoke.add_argument("certificate", metavar="ID", nargs="?", default="", help="certificate id (default: all)")
+    revoke.set_defaults(run=lambda a: _say(a, {"verb": "revoke", "text": a.certificate}))
+
+    adopt = _talker(verbs, "adopt", "use this model from now on; voids the gap, so a fresh campaign comes next")
+    adopt.add_argument("model", type=Path, metavar="MODEL.toml")
+    adopt.set_defaults(run=run_adopt)
+
+    clear = _talker(verbs, "clear", "clear a latched reason, after looking into it")
+    clear.add_argument("reason", metavar="REASON")
+    clear.set_defaults(run=lambda a: _say(a, {"verb": "clear", "text": a.reason}))
+
+    stop = _talker(verbs, "stop", "emergency stop; latches until cleared")
+    stop.set_defaults(run=lambda a: _say(a, {"verb": "stop"}))
+
+    permit = _talker(verbs, "permit", "let the sampler drive inside the geofence for a limited time")
+    permit.add_argument("seconds", type=positive, metavar="SECONDS")
+    permit.set_defaults(run=lambda a: _say(a, {"verb": "permit", "duration_s": a.seconds}))
+
+    status = _talker(verbs, "status", "what the daemon is doing, and why")
+    status.set_defaults(run=run_status)
+
+
+def _talker(verbs: argparse._SubParsersAction[argparse.ArgumentParser], name: str, summary: str) -> argparse.ArgumentParser:
+    verb = verbs.add_parser(name, help=summary, description=summary)
+    _common(verb)
+    return verb
+
+
+def _common(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument("--robot", metavar="NAME", help="which robot, if several daemons run here")
+    verb.add_argument("--socket", type=Path, metavar="PATH", help="the daemon's control socket, if it is not in the usual place")
+    verb.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def run_daemon(args: argparse.Namespace) -> int:
+    """Runs until SIGTERM or SIGINT. Exit 0 on a clean end."""
+    from s2r_runtime.daemon import Daemon
+    from s2r_runtime.profile import load_profile
+
+    profile = load_profile(args.profile)
+    daemon = Daemon(profile, profile_path=args.profile, state_dir=args.state, key_path=args.key, log_dir=args.log, seed=args.seed)
+    return daemon.run()
+
+
+def run_sample(args: argparse.Namespace) -> int:
+    """Exit 0 if the campaign is complete."""
+    from s2r_runtime import control
+    from s2r_runtime.profile import load_profile
+
+    profile = load_profile(args.profile)
+    socket = args.socket or control.find_socket(args.robot or profile.robot.name, required=False)
+    if socket is not None:
+        if args.output:
+            raise UsageError(
+                f"-o: robot {profile.robot.name!r} has a running daemon, which records the campaign in its own log; leave -o out"
+            )
+        return _say(args, {"verb": "cancel"} if args.cancel else {"verb": "sample", "count": args.n}, socket)
+    if args.cancel:
+        raise UsageError(f"--cancel: no daemon of robot {profile.robot.name!r} is running")
+    from s2r_runtime.daemon import run_campaign
+
+    out = args.output or Path(f"{profile.robot.name}-campaign.mcap")
+    bar = output.Progress("sampling")
+    try:
+        result = run_campaign(profile, args.profile, out, n=args.n, permit_s=args.permit or 3600.0, progress=bar)
+    finally:
+        bar.close()
+    if args.json:
+        output.result_json(result)
+    else:
+        output.out(str(result["text"]))
+    return int(result["exit_code"])
+
+
+def run_deploy(args: argparse.Namespace) -> int:
+    """Exit 0 if the controller drives, 1 if it was refused."""
+    if not args.controller.exists():
+        raise UsageError(f"{args.controller}: no such file; a controller is a Python file with control(x, theta, parameters)")
+    request: dict[str, Any] = {"verb": "deploy", "path": str(args.controller.resolve()), "parameters": _parameters(args.param)}
+    if args.certificate:
+        try:
+            request["certificate"] = args.certificate.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise UsageError(f"{args.certificate}: cannot be read: {error}") from None
+    return _say(args, request)
+
+
+def run_adopt(args: argparse.Namespace) -> int:
+    """Exit 0 if the model is in force."""
+    from s2r_runtime.modelspec import load_model
+
+    load_model(args.model)
+    return _say(args, {"verb": "adopt", "text": args.model.read_text(encoding="utf-8"), "base": str(args.model.resolve().parent)})
+
+
+def run_status(args: argparse.Namespace) -> int:
+    """Exit 0 if a daemon answers."""
+    answer = _call(args, {"verb": "status"})
+    data = dict(answer.get("data") or {})
+    if args.json:
+        output.result_json(data)
+        return int(answer["exit_code"])
+    gate = str(data.pop("gate", "?"))
+    output.out(f"gate        {output.styled(gate, 'green' if gate == 'open' else 'yellow')}  ({data.pop('reason', '')})")
+    for key, value in data.items():
+        output.out(f"{key.replace('_', ' '):11s} {_plain(value)}")
+    return int(answer["exit_code"])
+
+
+def _say(args: argparse.Namespace, request: dict[str, Any], socket: Path | None = None) -> int:
+    answer = _call(args, request, socket)
+    if args.json:
+        output.result_json(answer)
+    else:
+        (output.out if answer["exit_code"] == 0 else output.err)(str(answer["text"]))
+    return int(answer["exit_code"])
+
+
+def _call(args: argparse.Namespace, request: dict[str, Any], socket: Path | None = None) -> dict[str, Any]:
+    from s2r_runtime import control
+
+    path = socket or args.socket or control.find_socket(args.robot)
+    bar = output.Progress(request["verb"])
+
+    def on_progress(line: dict[str, Any]) -> None:
+        if "done" in line and "total" in line:
+            bar(float(line["done"]), float(line["total"]), str(line.get("detail", "")), line.get("seconds_left"))
+        elif line.get("text"):
+            bar.close()
+            output.err(str(line["text"]))
+
+    try:
+        return control.call(path, request, on_progress)
+    finally:
+        bar.close()
+
+
+def _parameters(items: list[str]) -> dict[str, float]:
+    from s2r_runtime.cli.choices import pair
+
+    return dict(pair(item, "--param") for item in items)
+
+
+def _plain(value: object) -> str:
+    if value is None or value == [] or value == "":
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.5g}"
+    if isinstance(value, list):
+        return ", ".join(map(str, value))
+    if isinstance(value, dict):
+        return ", ".join(f"{k} {_plain(v)}" for k, v in value.items()) or "-"
+    return str(value)

@@ -1,0 +1,227 @@
+"""Verbs about evidence: gap (is the model right) and verify (is the controller)."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from s2r_runtime.cli import output
+from s2r_runtime.cli.choices import add_model_options, chosen_model, count, load_checked, pair, positive, probability, weights_of
+
+if TYPE_CHECKING:
+    from s2r_runtime.messages import Gap
+    from s2r_runtime.models.composed import ComposedModel
+    from s2r_runtime.profile import Profile
+
+LAWS = ("uniform", "persistent", "adversarial")
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Adds the verbs of this module."""
+    gap = verbs.add_parser("gap", help="the sim2real gap that a recording shows, and its statement")
+    gap.add_argument("recording", type=Path, metavar="RECORDING", help="a campaign's MCAP, or CSV (.gz)")
+    add_model_options(gap)
+    gap.add_argument("--epsilon", type=probability, metavar="E", help="violation probability (default: the profile's, else 0.01)")
+    gap.add_argument("--beta", type=probability, metavar="B", help="one minus the confidence (default 0.05)")
+    gap.add_argument("--discard", type=count, metavar="K", help="largest discrepancies to leave out, fixed beforehand (default 0)")
+    gap.add_argument("--set", choices=("ball", "box"), help="shape of the gap set (default: the profile's, else ball)")
+    gap.add_argument("--weight", action="append", default=[], metavar="STATE=W", help="weight of a state in the norm; may be repeated")
+    gap.add_argument(
+        "--blocking",
+        type=positive,
+        metavar="S",
+        help="ordinary driving: assume that transitions S seconds apart are independent; the assumption stands in the statement",
+    )
+    gap.add_argument("--json", action="store_true", help="print one JSON object")
+    gap.set_defaults(run=run_gap)
+
+    verify = verbs.add_parser("verify", help="run a controller on the uncertain model and say what that shows")
+    verify.add_argument("controller", type=Path, metavar="CONTROLLER")
+    verify.add_argument("--profile", type=Path, required=True, metavar="P")
+    verify.add_argument("--model", metavar="MODEL.toml", help="a repaired model instead of the profile's")
+    size = verify.add_mutually_exclusive_group(required=True)
+    size.add_argument("--radius", type=positive, metavar="R", help="radius of the gap set")
+    size.add_argument(
+        "--recording", type=Path, metavar="REC", help="take radius and hold gap from this campaign (times the profile's headroom)"
+    )
+    verify.add_argument(
+        "--hold-radius",
+        type=positive,
+        metavar="R",
+        help="hold gap for the persistent law (with --radius; default: the radius times sqrt(hold periods))",
+    )
+    verify.add_argument("-n", type=count, default=0, metavar="N", help="scenarios for each law (default: what beta asks for)")
+    verify.add_argument(
+        "--law",
+        action="append",
+        choices=LAWS,
+        metavar="L",
+        help=f"disturbance law: {', '.join(LAWS)}; may be repeated (default: the profile's)",
+    )
+    verify.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the controller; may be repeated")
+    verify.add_argument("--json", action="store_true", help="print one JSON object")
+    verify.set_defaults(run=run_verify)
+
+
+def run_gap(args: argparse.Namespace) -> int:
+    """Exit 0 with a statement, 3 if the data do not carry one (the numbers are printed all the same)."""
+    from s2r_runtime import gap as gaps
+    from s2r_runtime.transitions import load_transitions
+
+    model, profile = chosen_model(args)
+    found = load_transitions(args.recording, model, dict(profile.columns) if profile else {})
+    if args.blocking:
+        found = gaps.blocked(found, args.blocking)
+    result = gaps.estimate_gap(
+        model,
+        found,
+        epsilon=args.epsilon or (profile.guarantee.epsilon if profile else 0.01),
+        beta=args.beta or (profile.guarantee.beta if profile else 0.05),
+        discard=args.discard if args.discard is not None else (profile.guarantee.discard if profile else 0),
+        kind=args.set or (profile.norm.set if profile else "ball"),
+        weights=weights_of(model.states, args.weight, profile),
+    )
+    answer = gaps.gap_json(result, found, model.states)
+    if args.json:
+        output.result_json(answer)
+    else:
+        _print_gap(answer)
+    return 0 if found.independent else 3
+
+
+def _print_gap(answer: dict[str, Any]) -> None:
+    output.out(f"gap radius      {answer['radius']:.6g}   (unweighted norm: {answer['radius_literal']:.6g})")
+    if answer.get("hold_radius"):
+        output.out(f"hold gap        {answer['hold_radius']:.6g} over {answer['hold_periods']} periods")
+    if answer.get("radius_noise"):
+        output.out(f"noise alone     would make {answer['radius_noise']:.3g} of it")
+    output.out(f"transitions     {answer['n']}, {answer['discarded']} discarded, rejected: {answer['rejected'] or 'none'}")
+    output.out(f"weights         {answer['weights']}  set {answer['set']}")
+    output.out(answer["statement"])
+
+
+def run_verify(args: argparse.Namespace) -> int:
+    """Exit 0 if it passed, 1 if it did not."""
+    from s2r_runtime import verify as verification
+
+    profile = load_checked(args.profile)
+    model = profile_model(args, profile)
+    epoch_gap = gap_of(args.recording, model, profile) if args.recording else None
+    radius = args.radius or (epoch_gap.radius * profile.verification.headroom if epoch_gap else 0.0)
+    if args.radius:
+        hold = args.hold_radius or args.radius * profile.sampling.hold_periods**0.5
+    else:
+        hold = epoch_gap.hold_radius * profile.verification.headroom if epoch_gap else 0.0
+    laws = tuple(args.law) if args.law else profile.verification.laws
+    result = run_verification(
+        args.controller,
+        model,
+        profile,
+        radius=radius,
+        hold_radius=hold,
+        laws=laws,
+        n=args.n,
+        parameters=dict(pair(i, "--param") for i in args.param),
+        attempt=1,
+        beta=profile.guarantee.beta,
+    )
+    answer = verification.verification_json(result, tuple(model.states))
+    if args.json:
+        output.result_json(answer)
+    else:
+        print_verification(answer)
+    return 0 if result.passed else 1
+
+
+def profile_model(args: argparse.Namespace, profile: Profile) -> ComposedModel:
+    """The profile's model, or the one named by --model in its place."""
+    from s2r_runtime.models.composed import compose
+    from s2r_runtime.modelspec import load_model
+
+    if getattr(args, "model", None):
+        return compose(load_model(Path(args.model)), args.model)
+    return compose(profile.model, f"{args.profile}: model")
+
+
+def gap_of(recording: Path, model: ComposedModel, profile: Profile, *, beta: float | None = None, epoch: int = 1) -> Gap:
+    """The gap that a campaign shows under the profile's settings. Raises NotEnoughEvidence if it carries no statement."""
+    from s2r_runtime import gap as gaps
+    from s2r_runtime.errors import NotEnoughEvidence
+    from s2r_runtime.transitions import load_transitions
+
+    found = load_transitions(recording, model, dict(profile.columns))
+    if not found.independent:
+        raise NotEnoughEvidence(
+            f"{recording}: is ordinary driving, not a campaign; its transitions are not independent, so its gap carries no statement"
+        )
+    return gaps.estimate_gap(
+        model,
+        found,
+        epsilon=profile.guarantee.epsilon,
+        beta=beta or profile.guarantee.beta,
+        discard=profile.guarantee.discard,
+        kind=profile.norm.set,
+        weights=weights_of(model.states, [], profile),
+        epoch=epoch,
+    )
+
+
+def run_verification(
+    path: Path,
+    model: ComposedModel,
+    profile: Profile,
+    *,
+    radius: float,
+    hold_radius: float,
+    laws: tuple[str, ...],
+    n: int,
+    parameters: dict[str, float],
+    attempt: int,
+    beta: float,
+) -> Any:
+    """Verification of a controller file under a profile, with progress on a terminal."""
+    from s2r_runtime import controllers
+    from s2r_runtime import verify as verification
+    from s2r_runtime.plugins import registry
+    from s2r_runtime.uncertain import GapSet
+
+    controller = controllers.load(path, parameters)
+    task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
+    # laws asked for by name are what the question is about, even where the profile does not require them
+    required = tuple(law for law in profile.verification.required if law in laws) or laws
+    gap_set = GapSet(profile.norm.set, weights_of(model.states, [], profile), radius, hold_radius, profile.sampling.hold_periods)
+    bar = output.Progress("verifying")
+    try:
+        return verification.verify(
+            controllers.batch_control(controller),
+            task,
+            model,
+            gap_set=gap_set,
+            laws=laws,
+            required=required,
+            n=n or profile.verification.n,
+            epsilon=profile.verification.epsilon,
+            beta=beta,
+            threshold=profile.verification.threshold,
+            seed=verification.seed_for(controller.digest, model.spec.digest(), profile.task_digest(), attempt),
+            attempt=attempt,
+            controller_digest=controller.digest,
+            task_digest=profile.task_digest(),
+            progress=bar,
+        )
+    finally:
+        bar.close()
+
+
+def print_verification(answer: dict[str, Any]) -> None:
+    """The account that a person reads."""
+    why = f": {answer['reason']}" if answer.get("reason") else ""
+    output.out(output.styled("passed", "green") if answer["passed"] else output.styled("not passed", "red") + why)
+    for law, r in answer["laws"].items():
+        failures = f"failures {r['failures']} (at most {r['failure_upper']:.2%})"
+        note = "" if r["required"] else "  (reported, not required)"
+        output.out(f"  {law:12s} {r['n']:6d} scenarios  s* {r['s_star']:+.4f}  {failures}  progress {r['progress']:.3f}{note}")
+    output.out(answer["statement"])
+    for line in answer["not_shown"]:
+        output.out(f"  not shown: {line}")

@@ -1,0 +1,116 @@
+"""Verbs about logs: audit, report, log recover, log info."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from s2r_runtime.cli import output
+from s2r_runtime.errors import UsageError
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Adds the verbs of this module."""
+    audit = verbs.add_parser("audit", help="recompute every number and every decision from the log alone")
+    audit.add_argument("log", type=Path, nargs="+", metavar="LOG", help="a run's files, in order if it was rotated")
+    audit.add_argument(
+        "--key", type=Path, metavar="PUB", help="the public key to trust (default: the one in the log, which shows consistency only)"
+    )
+    audit.add_argument(
+        "--rerun-controllers", action="store_true", help="run the attached controllers again, confined, to recompute verifications"
+    )
+    audit.add_argument("--json", action="store_true", help="print one JSON object")
+    audit.set_defaults(run=run_audit)
+
+    report = verbs.add_parser("report", help="plots and statements of a log on one self-contained page")
+    report.add_argument("log", type=Path, nargs="+", metavar="LOG")
+    report.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.html")
+    report.set_defaults(run=run_report)
+
+    log = verbs.add_parser("log", help="look at a log, or recover what a crash left").add_subparsers(
+        dest="what", metavar="WHAT", required=True
+    )
+    recover = log.add_parser("recover", help="write a clean file with all that is readable, and say what is missing")
+    recover.add_argument("log", type=Path, metavar="LOG")
+    recover.add_argument("-o", "--output", type=Path, required=True, metavar="FILE")
+    recover.add_argument("--json", action="store_true", help="print one JSON object")
+    recover.set_defaults(run=run_recover)
+    info = log.add_parser("info", help="what a log holds, and whether it ends cleanly")
+    info.add_argument("log", type=Path, metavar="LOG")
+    info.add_argument("--json", action="store_true", help="print one JSON object")
+    info.set_defaults(run=run_info)
+
+
+def run_audit(args: argparse.Namespace) -> int:
+    """Exit 0 if all that is there holds, 1 if something does not."""
+    from s2r_runtime import keys
+    from s2r_runtime.audit import audit
+
+    _need(args.log)
+    bar = output.Progress("auditing")
+    try:
+        result = audit(
+            args.log, public_key=keys.load_public(args.key) if args.key else None, rerun_controllers=args.rerun_controllers, progress=bar
+        )
+    finally:
+        bar.close()
+    if args.json:
+        output.result_json(result.to_json())
+    else:
+        output.out(result.text())
+    return 0 if result.ok else 1
+
+
+def run_report(args: argparse.Namespace) -> int:
+    """Exit 0 with the page written."""
+    from s2r_runtime.report import log_page
+
+    _need(args.log)
+    page = log_page(args.log)
+    try:
+        args.output.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{args.output}: cannot be written: {error.strerror}") from None
+    output.out(f"report written to {args.output}")
+    return 0
+
+
+def run_recover(args: argparse.Namespace) -> int:
+    """Exit 0 with a readable file written."""
+    from s2r_runtime.salvage import recover
+
+    _need([args.log])
+    if args.output.resolve() == args.log.resolve():
+        raise UsageError(f"-o {args.output}: is the log itself; the original is kept, name another file")
+    account = recover(args.log, args.output)
+    if args.json:
+        output.result_json(account)
+    else:
+        for key, value in account.items():
+            output.out(f"{key.replace('_', ' '):18s} {value}")
+    return 0
+
+
+def run_info(args: argparse.Namespace) -> int:
+    """Exit 0 if it is a log."""
+    from s2r_runtime.salvage import info
+
+    _need([args.log])
+    facts = info(args.log)
+    if args.json:
+        output.result_json(facts)
+    else:
+        for key, value in facts.items():
+            if isinstance(value, dict):
+                output.out(f"{key.replace('_', ' ')}:")
+                for name, number in value.items():
+                    output.out(f"    {name:30s} {number}")
+            else:
+                output.out(f"{key.replace('_', ' '):18s} {value}")
+    return 0
+
+
+def _need(paths: list[Path]) -> None:
+    for path in paths:
+        if not path.is_file():
+            raise UsageError(f"{path}: no such log file")

@@ -1,0 +1,81 @@
+"""`s2r`: the verbs, their exit codes, and where an error ends up as one line.
+
+Results go to stdout, everything else to stderr. Exit codes: 0 it holds, 1 it does not hold, 2 usage, 3 not enough evidence,
+70 internal error, 78 bad configuration.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from importlib import metadata
+
+from s2r_runtime.cli import output
+from s2r_runtime.errors import NotEnoughEvidence, S2RError
+
+GROUPS = ("demo", "daemon_verbs", "evidence", "trace_verb", "certify", "log_verbs", "setup_verbs")
+"""Modules of this package, each with `add(verbs)` and its functions `run(args) -> int`. Nothing heavy is imported at the top."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """argparse, but an error is one line."""
+
+    def error(self, message: str) -> None:  # type: ignore[override]
+        """Prints the error and where the help is; exits with 2."""
+        output.err(f"{self.prog}: {message} (see {self.prog} --help)")
+        raise SystemExit(2)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    top = _Parser(
+        prog="s2r",
+        description="Measures the gap between a robot and its model, and lets only certified controllers drive.",
+        epilog="exit codes: 0 it holds, 1 it does not hold, 2 usage, 3 not enough evidence, 70 internal error, 78 bad configuration",
+    )
+    top.add_argument("--version", action="version", version=f"s2r {_version()}")
+    verbs = top.add_subparsers(dest="verb", metavar="VERB", required=True, parser_class=_Parser)
+    for group in GROUPS:
+        importlib.import_module(f"s2r_runtime.cli.{group}").add(verbs)
+    return top
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one verb and returns its exit code; errors of the user's are one line on stderr, never a traceback."""
+    args = parser().parse_args(argv)
+    run: Callable[[argparse.Namespace], int] = args.run
+    try:
+        return run(args)
+    except S2RError as error:
+        missing = error.missing if isinstance(error, NotEnoughEvidence) else None
+        output.fail(str(error), error.exit_code, as_json=getattr(args, "json", False), missing=missing)
+        return error.exit_code
+    except KeyboardInterrupt:
+        output.err("interrupted")
+        return 130
+    except BrokenPipeError:
+        # the reader of our stdout is gone; nothing more can be said to it, and Python's own flush at exit would complain
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:  # noqa: BLE001 - a defect of ours: said as one, with its code
+        if os.environ.get("S2R_TRACEBACK"):
+            traceback.print_exc()
+        output.fail(
+            f"internal error: {type(error).__name__}: {error} (set S2R_TRACEBACK=1 to see where)", 70, as_json=getattr(args, "json", False)
+        )
+        return 70
+
+
+def _version() -> str:
+    try:
+        return metadata.version("s2r-runtime")
+    except metadata.PackageNotFoundError:
+        return "(not installed)"
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

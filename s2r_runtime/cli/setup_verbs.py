@@ -1,0 +1,228 @@
+"""Verbs that set things up and look at them: plugin, profile, keys, doctor."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import shutil
+import socket
+import sys
+import sysconfig
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from s2r_runtime.cli import output
+from s2r_runtime.errors import S2RError
+
+MINIMUM_FREE_BYTES = 1_000_000_000
+"""A day of a 100 Hz log is about 2 GB; below half of that a robot should not start a mission."""
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Adds the verbs of this module."""
+    plugin = verbs.add_parser("plugin", help="what is installed").add_subparsers(dest="what", metavar="WHAT", required=True)
+    listing = plugin.add_parser("list", help="every plug-in found, what it offers, and why one could not be loaded")
+    listing.add_argument("--json", action="store_true", help="print one JSON object")
+    listing.set_defaults(run=plugin_list)
+
+    profile = verbs.add_parser("profile", help="check a robot's profile").add_subparsers(dest="what", metavar="WHAT", required=True)
+    check = profile.add_parser("check", help="is this profile valid here, and what does it mean")
+    check.add_argument("profile", type=Path, metavar="PROFILE")
+    check.add_argument("--defaults", action="store_true", help="print every setting in force, the defaults included")
+    check.add_argument("--json", action="store_true", help="print one JSON object")
+    check.set_defaults(run=profile_check)
+
+    keys = verbs.add_parser("keys", help="signing keys").add_subparsers(dest="what", metavar="WHAT", required=True)
+    new = keys.add_parser("new", help="make a key pair that signs certificates and logs")
+    new.add_argument("path", type=Path, nargs="?", metavar="FILE", help="where (default: the user's configuration folder)")
+    new.set_defaults(run=keys_new)
+
+    doctor = verbs.add_parser("doctor", help="what is missing on this machine, and what to do about it")
+    doctor.add_argument("--json", action="store_true", help="print one JSON object")
+    doctor.set_defaults(run=doctor_run)
+
+
+def plugin_list(args: argparse.Namespace) -> int:
+    """Exit 0 if every plug-in found is in use, 1 if one is not."""
+    from s2r_runtime.plugins import registry
+
+    loaded = registry().loaded
+    if args.json:
+        output.result_json({"plugins": [p._asdict() for p in loaded]})
+    else:
+        for plugin in loaded:
+            output.out(
+                f"{plugin.name} ({plugin.distribution} {plugin.version})"
+                + (f"  {output.styled('not in use', 'red')}: {plugin.error}" if plugin.error else "")
+            )
+            for kind, names in plugin.offers.items():
+                output.out(f"    {kind}: {', '.join(names)}")
+    return 1 if any(plugin.error for plugin in loaded) else 0
+
+
+def profile_check(args: argparse.Namespace) -> int:
+    """Exit 0 if the profile is valid here; otherwise ConfigError says what is wrong."""
+    from s2r_runtime.cli.choices import load_checked
+
+    profile = load_checked(args.profile)
+    if args.json:
+        output.result_json(
+            {
+                "ok": True,
+                "robot": profile.robot.name,
+                "digest": profile.digest(),
+                "model_digest": profile.model.digest(),
+                "settings": msgspec.to_builtins(profile),
+            }
+        )
+        return 0
+    model, transport = f"model {profile.model.name} at {profile.model.dt} s", profile.transport["name"]
+    output.out(f"{args.profile}: valid. Robot {profile.robot.name!r}, {model}, task {profile.task.name}, transport {transport}.")
+    if args.defaults:
+        for table, values in msgspec.to_builtins(profile).items():
+            output.out(f"{table} = {msgspec.json.encode(values).decode()}")
+    return 0
+
+
+def keys_new(args: argparse.Namespace) -> int:
+    """Makes a key pair; refuses to overwrite one."""
+    from s2r_runtime import keys
+
+    path = args.path or keys.default_path()
+    public = keys.new(path)
+    output.out(f"private key  {path}  (keep it on the machine that signs; readable by its owner only)")
+    output.out(f"public key   {public}  (give it to whoever checks: s2r audit LOG --key {public})")
+    return 0
+
+
+class Finding(NamedTuple):
+    """One thing looked at. `ok` None: not needed for everything, said for information."""
+
+    what: str
+    ok: bool | None
+    detail: str
+    mend: str = ""
+
+
+def doctor_run(args: argparse.Namespace) -> int:
+    """Exit 0 if nothing that is needed is missing, else 1."""
+    findings = list(_findings())
+    if args.json:
+        output.result_json({"ok": all(f.ok is not False for f in findings), "findings": [f._asdict() for f in findings]})
+    else:
+        for f in findings:
+            mark = {
+                True: output.styled("ok     ", "green"),
+                False: output.styled("missing", "red"),
+                None: output.styled("note   ", "yellow"),
+            }[f.ok]
+            output.out(f"{mark} {f.what}: {f.detail}" + (f"\n        → {f.mend}" if f.mend else ""))
+    return 1 if any(f.ok is False for f in findings) else 0
+
+
+def _findings() -> Iterator[Finding]:
+    ok = sys.version_info >= (3, 11)
+    yield Finding("Python", ok, platform.python_version(), "" if ok else "install Python 3.11 or newer")
+    known = sys.platform == "linux" and platform.machine() in {"x86_64", "aarch64"}
+    yield Finding(
+        "platform", known or None, f"{sys.platform} {sysconfig.get_platform()}", "" if known else "tested on Linux x86-64 and aarch64 only"
+    )
+    yield from _packages()
+    yield from _plugins()
+    yield _loopback()
+    free = shutil.disk_usage(Path.home() if Path.home().exists() else Path("/")).free
+    yield Finding(
+        "disk",
+        free > MINIMUM_FREE_BYTES,
+        f"{free / 1e9:.1f} GB free in the home folder",
+        "" if free > MINIMUM_FREE_BYTES else "free some: a full disk closes the gate",
+    )
+    yield _key()
+    yield _governor()
+    under = bool(os.environ.get("NOTIFY_SOCKET"))
+    systemd = shutil.which("systemctl") is not None
+    yield Finding(
+        "systemd",
+        None if not systemd else True,
+        "notify socket present" if under else "available" if systemd else "not on this machine",
+        "" if systemd else "without it nothing restarts the daemon; see docs/install.md",
+    )
+
+
+def _packages() -> Iterator[Finding]:
+    for name, needed_for in (
+        ("numpy", ""),
+        ("scipy", ""),
+        ("mcap", ""),
+        ("zstandard", ""),
+        ("cryptography", ""),
+        ("msgspec", ""),
+        ("matplotlib", "s2r report"),
+    ):
+        try:
+            yield Finding(name, True, metadata.version(name))
+        except metadata.PackageNotFoundError:
+            yield Finding(
+                name,
+                None if needed_for else False,
+                "not installed" + (f" (for {needed_for})" if needed_for else ""),
+                "pip install 's2r-runtime[report]'" if needed_for else f"pip install {name}",
+            )
+
+
+def _plugins() -> Iterator[Finding]:
+    from s2r_runtime.plugins import registry
+
+    found = registry()
+    for plugin in found.loaded:
+        if plugin.error:
+            yield Finding(f"plug-in {plugin.name}", False, plugin.error, f"pip install --upgrade {plugin.distribution}")
+    transports = found.names("transports")
+    yield Finding("transports", bool(transports), ", ".join(transports) or "none", "" if transports else "pip install s2r-zenoh")
+    robots = found.names("robots")
+    yield Finding(
+        "built-in robots",
+        True if robots else None,
+        ", ".join(robots) or "none",
+        "" if robots else "pip install s2r-standins (for s2r demo)",
+    )
+
+
+def _loopback() -> Finding:
+    try:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+    except OSError as error:
+        return Finding("loopback", False, f"cannot listen on 127.0.0.1: {error.strerror}", "bring up the interface lo")
+    return Finding("loopback", True, "can listen on 127.0.0.1")
+
+
+def _key() -> Finding:
+    from s2r_runtime import keys
+
+    path = keys.default_path()
+    if not path.exists():
+        return Finding("signing key", None, f"none at {path}", "s2r keys new (the daemon makes one of its own for a robot that has none)")
+    try:
+        keys.load(path)
+    except S2RError as error:
+        return Finding("signing key", False, str(error), "")
+    return Finding("signing key", True, str(path))
+
+
+def _governor() -> Finding:
+    governor = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+    if not governor.exists():
+        return Finding("CPU governor", True, "not adjustable here")
+    name = governor.read_text(encoding="ascii").strip()
+    return Finding(
+        "CPU governor",
+        True if name == "performance" else None,
+        name,
+        "" if name == "performance" else "'performance' gives the steadiest latency",
+    )
