@@ -277,6 +277,25 @@ class SourceStopped(Struct, frozen=True, tag="source_stopped"):
     detail: str = ""
 
 
+class SampleTaken(Struct, frozen=True, tag="sample_taken"):
+    """One independent transition of a campaign (DESIGN G1). x0, x1: (nx,), one period apart; u: (nu,), held from x0 on.
+
+    `held`: (nx,), the state after `periods` held periods, or empty if the campaign holds for one period only. `obs_seq0`,
+    `t0_ns`: of the observation that x0 was; the robot's numbers, so that an auditor finds the raw frame.
+    """
+
+    t_ns: int
+    epoch: int
+    index: int
+    obs_seq0: int
+    t0_ns: int
+    u: tuple[float, ...]
+    x0: tuple[float, ...]
+    x1: tuple[float, ...]
+    held: tuple[float, ...]
+    periods: int
+
+
 class CampaignFinished(Struct, frozen=True, tag="campaign_finished"):
     """`complete` iff all samples that were fixed beforehand are there. Stopping early costs the epoch but founds no gap."""
 
@@ -331,7 +350,7 @@ class Requested(Struct, frozen=True, tag="requested"):
 
 Event = (
     Started | Observed | Proposed | Ticked | WallClockRead | LinkChanged | RecorderChanged | OverrideChanged | Measured
-    | SourceStarted | SourceStopped | CampaignFinished | JobFinished | CertificateStored | Requested
+    | SourceStarted | SourceStopped | SampleTaken | CampaignFinished | JobFinished | CertificateStored | Requested
 )  # fmt: skip
 
 
