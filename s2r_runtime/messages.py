@@ -317,6 +317,19 @@ class JobFinished(Struct, frozen=True, tag="job_finished"):
     verification: Verification | None = None
     trace: dict[str, object] | None = None
     error: str = ""
+    safety: dict[str, list[float]] = {}
+    """verify: the safety value of every scenario, by law (for the report; the audit recomputes them)."""
+
+
+class EpisodeEnded(Struct, frozen=True, tag="episode_ended"):
+    """The driving controller finished a scenario of its task (the core counts it). safety, progress: as the task measures them."""
+
+    t_ns: int
+    index: int
+    steps: int
+    safety: float
+    progress: float
+    detail: str = ""
 
 
 class CertificateStored(Struct, frozen=True, tag="certificate_stored"):
@@ -350,7 +363,7 @@ class Requested(Struct, frozen=True, tag="requested"):
 
 Event = (
     Started | Observed | Proposed | Ticked | WallClockRead | LinkChanged | RecorderChanged | OverrideChanged | Measured
-    | SourceStarted | SourceStopped | SampleTaken | CampaignFinished | JobFinished | CertificateStored | Requested
+    | EpisodeEnded | SourceStarted | SourceStopped | SampleTaken | CampaignFinished | JobFinished | CertificateStored | Requested
 )  # fmt: skip
 
 
