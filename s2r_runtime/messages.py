@@ -237,6 +237,23 @@ class RecorderChanged(Struct, frozen=True, tag="recorder_changed"):
     detail: str = ""
 
 
+class AnalyticsChanged(Struct, frozen=True, tag="analytics_changed"):
+    """The process that measures while a controller drives died (or hung), or is there again. Unwatched, nobody drives: the gate
+    closes with the reason `analytics_down`. Up after start unless this says otherwise.
+    """
+
+    t_ns: int
+    up: bool
+    detail: str = ""
+
+
+class Stopping(Struct, frozen=True, tag="stopping"):
+    """Last event of an orderly run: sources are stopped, the recovery command goes out, the memory is persisted."""
+
+    t_ns: int
+    detail: str = ""
+
+
 class OverrideChanged(Struct, frozen=True, tag="override_changed"):
     """A transport's emergency stop or manual override signal (latches until cleared)."""
 
@@ -362,8 +379,8 @@ class Requested(Struct, frozen=True, tag="requested"):
 
 
 Event = (
-    Started | Observed | Proposed | Ticked | WallClockRead | LinkChanged | RecorderChanged | OverrideChanged | Measured
-    | EpisodeEnded | SourceStarted | SourceStopped | SampleTaken | CampaignFinished | JobFinished | CertificateStored | Requested
+    Started | Observed | Proposed | Ticked | WallClockRead | LinkChanged | RecorderChanged | AnalyticsChanged | OverrideChanged | Measured
+    | EpisodeEnded | SourceStarted | SourceStopped | SampleTaken | CampaignFinished | JobFinished | CertificateStored | Requested | Stopping
 )  # fmt: skip
 
 

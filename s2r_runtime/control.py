@@ -1,0 +1,292 @@
+"""The control socket: how `s2r status`, `deploy`, `revoke` and the others talk to the daemon of this machine.
+
+A Unix socket `<robot>.sock` (0600) in a folder of its owner's (0700); the kernel names the peer's user, and only the owner and
+root are heard. One connection is one request: a JSON line `{"verb": ...}`, answered by any number of progress lines and one final
+line that has `exit_code`, `text` and `data`. The server never waits for a client: requests are bounded and must arrive in time,
+and a client that doesn't read its answers is dropped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import selectors
+import socket
+import stat
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from s2r_runtime.errors import ConfigError, UsageError
+
+REQUEST_MAX = 1 << 20
+ANSWER_MAX = 8 << 20
+CLIENTS_MAX = 32
+REQUEST_WITHIN_NS = 5_000_000_000
+FIRST_LINE_WITHIN_S = 15.0
+_PATH_MAX = 107  # sun_path of unix(7), less the final zero
+
+Request = dict[str, Any]
+
+
+def socket_dir() -> Path:
+    """Where this user's sockets are: the service's RUNTIME_DIRECTORY, else XDG_RUNTIME_DIR, else the user's state folder."""
+    if given := os.environ.get("RUNTIME_DIRECTORY"):
+        return Path(given.split(":")[0])
+    if given := os.environ.get("XDG_RUNTIME_DIR"):
+        return Path(given) / "s2r"
+    return state_root() / "run"
+
+
+def state_root() -> Path:
+    """Where robots' state folders are, unless told otherwise."""
+    base = os.environ.get("XDG_STATE_HOME")
+    return (Path(base) if base else Path.home() / ".local" / "state") / "s2r"
+
+
+# ---------------------------------------------------------------- server
+
+
+class Connection:
+    """One client. `answer` keeps what it doesn't take at once; `gone` once it hung up."""
+
+    def __init__(self, server: ControlServer, sock: socket.socket, uid: int, deadline_ns: int) -> None:
+        self.uid, self.gone, self.deadline_ns = uid, False, deadline_ns
+        self._server, self._sock = server, sock
+        self._in, self._out = bytearray(), bytearray()
+        self._asked = self._final = False
+
+    def progress(self, **fields: Any) -> None:
+        """A line on the way: `text`, or `done`, `total`, `detail`."""
+        self._put(fields)
+
+    def answer(self, exit_code: int, text: str, data: object = None) -> None:
+        """The final line; the connection closes after it."""
+        self._put({"exit_code": exit_code, "text": text, "data": data})
+        self._final = True
+        self._flush()
+
+    def close(self) -> None:
+        """Hangs up; may be called twice."""
+        if not self.gone:
+            self.gone = True
+            self._server.forget(self, self._sock)
+            self._sock.close()
+
+    def waiting(self) -> bool:
+        """Whether its request is not there yet."""
+        return not self._asked
+
+    def ready(self, mask: int) -> None:
+        """Called by the loop when the socket can be read or written."""
+        if mask & selectors.EVENT_WRITE:
+            self._flush()
+        if mask & selectors.EVENT_READ and not self.gone:
+            self._receive()
+
+    def _receive(self) -> None:
+        try:
+            data = self._sock.recv(1 << 16)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self.close()
+        elif not self._asked:
+            self._in += data
+            line, end, _ = self._in.partition(b"\n")
+            if end:
+                self._asked = True
+                self._server.handle(self, bytes(line))
+                self._in.clear()
+            elif len(self._in) > REQUEST_MAX:
+                self._asked = True
+                self.answer(2, f"the request is longer than {REQUEST_MAX} bytes")
+
+    def _put(self, fields: dict[str, Any]) -> None:
+        if self.gone or self._final:
+            return
+        self._out += json.dumps(fields, allow_nan=False).encode() + b"\n"
+        self._flush()
+
+    def _flush(self) -> None:
+        try:
+            while self._out and not self.gone:
+                del self._out[: self._sock.send(self._out)]
+        except BlockingIOError:
+            if len(self._out) > ANSWER_MAX:
+                self.close()
+                return
+        except OSError:
+            self.close()
+            return
+        if not self.gone:
+            if self._final and not self._out:
+                self.close()
+            else:
+                self._server.interest(self, self._sock, writing=bool(self._out))
+
+
+class ControlServer:
+    """Listens for the daemon. `on_request(connection, request)` is called for each well-formed request."""
+
+    def __init__(self, path: Path, selector: selectors.BaseSelector, on_request: Callable[[Connection, Request], None]) -> None:
+        self.path = path
+        self._selector, self._on_request = selector, on_request
+        self._socket: socket.socket | None = None
+        self._clients: list[Connection] = []
+
+    def open(self) -> None:
+        """Binds. Raises ConfigError where that is impossible, or another daemon listens there."""
+        if len(os.fsencode(self.path)) > _PATH_MAX:
+            raise ConfigError(f"{self.path}: the path of a socket must be at most {_PATH_MAX} bytes; set XDG_RUNTIME_DIR to a shorter one")
+        if _listening(self.path):
+            raise ConfigError(f"{self.path}: already running: a daemon of this robot listens there")
+        sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
+        try:
+            self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            _check_owner(self.path.parent)
+            self.path.unlink(missing_ok=True)  # left by a daemon that was killed
+            sock.bind(str(self.path))  # between here and chmod the folder's 0700 keeps others out
+            self.path.chmod(0o600)
+            sock.listen(CLIENTS_MAX)
+        except OSError as error:
+            sock.close()
+            raise ConfigError(f"{self.path}: cannot listen: {error.strerror}") from None
+        except ConfigError:
+            sock.close()
+            raise
+        self._socket = sock
+        self._selector.register(sock, selectors.EVENT_READ, self._accept)
+
+    def tick(self, now_ns: int) -> None:
+        """Drops clients whose request doesn't come."""
+        for client in [c for c in self._clients if c.waiting() and now_ns > c.deadline_ns]:
+            client.close()
+
+    def close(self) -> None:
+        """Hangs up on everybody and removes the socket; may be called twice."""
+        for client in list(self._clients):
+            client.close()
+        if self._socket is not None:
+            self._selector.unregister(self._socket)
+            self._socket.close()
+            self._socket = None
+            self.path.unlink(missing_ok=True)
+
+    def handle(self, client: Connection, line: bytes) -> None:
+        """Parses a request line and hands it on."""
+        try:
+            request = json.loads(line)
+        except (ValueError, RecursionError) as error:
+            client.answer(2, f"the request is not JSON: {error}")
+            return
+        if not isinstance(request, dict) or not isinstance(request.get("verb"), str):
+            client.answer(2, 'the request must be an object with a "verb"')
+            return
+        client.progress(accepted=True)
+        self._on_request(client, request)
+
+    def interest(self, client: Connection, sock: socket.socket, *, writing: bool) -> None:
+        """Whether the loop is to call when the socket can be written."""
+        mask = selectors.EVENT_READ | (selectors.EVENT_WRITE if writing else 0)
+        if self._selector.get_key(sock).events != mask:
+            self._selector.modify(sock, mask, client.ready)
+
+    def forget(self, client: Connection, sock: socket.socket) -> None:
+        """A connection is closing."""
+        self._selector.unregister(sock)
+        self._clients.remove(client)
+
+    def _accept(self, _mask: int) -> None:
+        assert self._socket is not None  # noqa: S101 - registered only while open
+        try:
+            sock, _ = self._socket.accept()
+        except OSError:  # it hung up already, or we are out of descriptors: the listener stays
+            return
+        sock.setblocking(False)
+        uid = struct.unpack("3i", sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i")))[1]
+        client = Connection(self, sock, uid, time.monotonic_ns() + REQUEST_WITHIN_NS)
+        self._selector.register(sock, selectors.EVENT_READ, client.ready)
+        self._clients.append(client)
+        if uid not in (0, os.getuid()):
+            client.answer(2, f"user {uid} may not talk to this daemon; it belongs to user {os.getuid()}")
+        elif len(self._clients) > CLIENTS_MAX:
+            client.answer(70, "too many clients at once; try again")
+
+
+def _check_owner(folder: Path) -> None:
+    """Refuses a folder that somebody else owns or may write to. Raises ConfigError."""
+    status = folder.stat()
+    if status.st_uid not in (0, os.getuid()):
+        raise ConfigError(f"{folder}: belongs to user {status.st_uid}; the control socket's folder must be this user's")
+    if stat.S_IMODE(status.st_mode) & 0o077 and status.st_uid == os.getuid():
+        folder.chmod(0o700)
+
+
+# ---------------------------------------------------------------- client
+
+
+def find_socket(robot: str | None = None, *, required: bool = True) -> Path | None:
+    """The socket of the running daemon (of that robot). None if there is none and none is required.
+
+    Raises UsageError when there is none, or when there are several and no robot was named.
+    """
+    folders = list(dict.fromkeys([socket_dir(), state_root() / "run", Path("/run/s2r")]))
+    found: dict[str, Path] = {}
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            for path in sorted(folder.glob("*.sock")):
+                if _listening(path):
+                    found.setdefault(path.stem, path)
+    if robot is not None:
+        found = {name: path for name, path in found.items() if name == robot}
+    if not found:
+        if not required:
+            return None
+        whose = f"of robot {robot!r} " if robot else ""
+        raise UsageError(f"no daemon {whose}is running here (looked in {', '.join(map(str, folders))}); start one: s2r run PROFILE")
+    if len(found) > 1:
+        raise UsageError(f"several daemons run here: {', '.join(found)}; choose one with --robot NAME")
+    return next(iter(found.values()))
+
+
+def call(path: Path, request: Request, on_progress: Callable[[Request], None] | None = None) -> Request:
+    """Sends a request and returns its final answer: `exit_code`, `text`, `data`. Raises UsageError if nobody answers."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
+        sock.settimeout(FIRST_LINE_WITHIN_S)
+        try:
+            sock.connect(str(path))
+            sock.sendall(json.dumps(request).encode() + b"\n")
+            with sock.makefile("rb") as lines:
+                for line in lines:
+                    answer: Request = json.loads(line)
+                    if "exit_code" in answer:
+                        return answer
+                    sock.settimeout(None)  # it was heard; some requests take as long as a campaign
+                    if on_progress is not None and "accepted" not in answer:
+                        on_progress(answer)
+        except PermissionError:
+            raise UsageError(f"{path}: belongs to another user's daemon; only its owner and root may talk to it") from None
+        except TimeoutError:
+            raise UsageError(f"{path}: the daemon does not answer (waited {FIRST_LINE_WITHIN_S:.0f} s)") from None
+        except (OSError, ValueError) as error:
+            raise UsageError(f"{path}: no daemon answers: {error}") from None
+    raise UsageError(f"{path}: the daemon hung up before it answered; its log says why")
+
+
+def _listening(path: Path) -> bool:
+    """Whether somebody accepts connections there. One that we may not talk to counts: it is alive."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
+        sock.settimeout(1.0)
+        try:
+            sock.connect(str(path))
+        except PermissionError:
+            return True
+        except OSError:
+            return False
+    return True

@@ -1,0 +1,69 @@
+"""Profile -> the core's settings, without loading a model: what only the model knows comes as `ModelFacts`.
+
+The model's own module imports numpy, 20 MB that the daemon's process can do without. Its analytics process loads the model
+anyhow and tells the facts when it starts.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from s2r_runtime.messages import Settings
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.profile import Profile
+
+
+class ModelFacts(msgspec.Struct, frozen=True):
+    """A model's names, in order. `angles` are the states that wrap."""
+
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    angles: tuple[str, ...]
+
+
+def settings_of(profile: Profile, model: ModelSpec, facts: ModelFacts, seed: int | None = None) -> Settings:
+    """What the profile fixes for the core. model: the one in force (the profile's, or one adopted since). seed: instead of the
+    profile's.
+
+    An angle without bounds may be anything in its circle. A state that the geofence doesn't name is fenced by the region.
+    """
+    gate, recovery = profile.gate, profile.recovery
+    circle = dict.fromkeys(facts.angles, (-math.pi, math.pi))
+    region = {**circle, **profile.region}
+    fence = {**region, **profile.geofence}
+    held = recovery.input if recovery.kind == "hold" else {}
+    return Settings(
+        robot=profile.robot.name,
+        states=facts.states,
+        inputs=facts.inputs,
+        angles=facts.angles,
+        dt_ns=round(model.dt * 1e9),
+        lockstep=profile.clock == "lockstep",
+        region=tuple(region[name] for name in facts.states),
+        geofence=tuple(fence[name] for name in facts.states),
+        input_bounds=tuple(profile.inputs[name] for name in facts.inputs),
+        observation_timeout_ns=round(gate.observation_timeout * 1e9),
+        command_ttl_ns=round(gate.command_ttl * 1e9),
+        hysteresis_ns=round(gate.hysteresis * 1e9),
+        settle_periods=gate.settle_periods,
+        latching=gate.latching,
+        recovery=recovery.kind,
+        recovery_input=tuple(float(held.get(name, 0.0)) for name in facts.inputs),
+        home=tuple(float(recovery.home.get(name, 0.0)) for name in facts.states),
+        model_name=model.name,
+        model_digest=model.digest(),
+        task_digest=profile.task_digest(),
+        profile_digest=profile.digest(),
+        epsilon=profile.guarantee.epsilon,
+        beta=profile.guarantee.beta,
+        discard=profile.guarantee.discard,
+        campaign_n=profile.sampling.n,
+        headroom=profile.verification.headroom,
+        alpha=profile.guarantee.alpha,
+        max_measurement_faults=profile.watch.max_faults,
+        certificate_lifetime_s=round(profile.certificate.lifetime),
+        seed=profile.sampling.seed if seed is None else seed,
+        trace_after_campaign=profile.repair.after_campaign,
+    )
