@@ -10,13 +10,16 @@ import math
 import re
 import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 
 from s2r_runtime.canonical import digest_of
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.modelspec import ModelSpec
+
+if TYPE_CHECKING:
+    from s2r_runtime.models.composed import ComposedModel
 
 
 class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -208,6 +211,18 @@ def _resolved(spec: ModelSpec, where: str, base: Path) -> ModelSpec:
 
 def check_names(profile: Profile, where: str) -> None:
     """Checks what needs the models, tasks and transports loaded: names of states and inputs, effects, task parameters."""
+    from s2r_runtime.plugins import registry
+
+    model = check_model(profile, where)
+    try:
+        transport = registry().get("transports", str(profile.transport.get("name")))
+    except ConfigError as error:
+        raise ConfigError(f"{where}: transport.name: {error}") from None
+    transport({k: v for k, v in profile.transport.items() if k != "name"}, model.states, model.inputs)
+
+
+def check_model(profile: Profile, where: str) -> ComposedModel:
+    """As `check_names`, all but the transport. Returns the profile's model, composed."""
     from s2r_runtime.models.composed import compose
     from s2r_runtime.plugins import registry
 
@@ -232,11 +247,7 @@ def check_names(profile: Profile, where: str) -> None:
     except ConfigError as error:
         raise ConfigError(f"{where}: task.name: {error}") from None
     task(profile.task.parameters, model.nominal, profile.model.dt)
-    try:
-        transport = registry().get("transports", str(profile.transport.get("name")))
-    except ConfigError as error:
-        raise ConfigError(f"{where}: transport.name: {error}") from None
-    transport({k: v for k, v in profile.transport.items() if k != "name"}, model.states, model.inputs)
+    return model
 
 
 def _explain(message: str, table: dict[str, Any]) -> str:
