@@ -1,0 +1,145 @@
+"""Figures for the reports, as SVG text that stands inside a page. matplotlib (extra `report`), no window, no files."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.errors import ConfigError
+
+Array = NDArray[np.float64]
+
+INK, SOFT, BLUE, ORANGE, RED, GREEN = "#1b2330", "#8a94a3", "#2f6db3", "#d9822b", "#c23030", "#2b8a57"
+CAP_POINTS = 4000
+"""More points than this a line are thinned: a page should stay a page."""
+
+
+def figure(width: float = 7.2, height: float = 2.8, columns: int = 1) -> tuple[Any, list[Any]]:
+    """A figure and its axes in one row, sizes in inches. Raises ConfigError if matplotlib is not installed."""
+    try:
+        import matplotlib as mpl
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ConfigError("plots need matplotlib: pip install 's2r-runtime[report]'") from None
+    mpl.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "s2r", "font.family": "sans-serif", "font.size": 9})
+    fig = Figure(figsize=(width, height), layout="constrained")
+    axes = [fig.add_subplot(1, columns, 1 + i) for i in range(columns)]
+    for ax in axes:
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.tick_params(colors=INK, length=3)
+        ax.grid(visible=True, color="#e7eaee", linewidth=0.6)
+        ax.set_axisbelow(True)
+    return fig, axes
+
+
+def svg(fig: Any, description: str) -> str:
+    """The figure as an <svg> element with a description for readers who can't see it; the same figure gives the same text."""
+    buffer = io.StringIO()
+    fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    body = text[text.index("<svg") :]
+    label = description.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
+    return re.sub(r"<svg ", f'<svg role="img" aria-label="{label}" ', body, count=1)
+
+
+def histogram(values: Sequence[float] | Array, xlabel: str, lines: Mapping[str, tuple[float, str]], description: str) -> str:
+    """Histogram with named vertical lines. lines: label -> (value, colour)."""
+    fig, (ax,) = figure()
+    data = np.asarray(values, dtype=np.float64)
+    if len(data):
+        ax.hist(data, bins=min(60, max(10, round(len(data) ** 0.5) * 2)), color=BLUE, alpha=0.75)
+    for label, (value, colour) in lines.items():
+        ax.axvline(value, color=colour, linewidth=1.6, label=label)
+    if lines:
+        ax.legend(frameon=False, fontsize=8)
+    ax.set_xlabel(xlabel)
+    ax.set_ylabel("count")
+    return svg(fig, description)
+
+
+def histograms(groups: Mapping[str, Sequence[float]], xlabel: str, line: float, description: str) -> str:
+    """One histogram a group, side by side on one scale; `line`: the threshold."""
+    names = list(groups) or ["none"]
+    fig, axes = figure(columns=len(names))
+    values = [v for group in groups.values() for v in group] or [0.0]
+    low, high = min([*values, line]), max([*values, line])
+    bins = np.linspace(low - 0.02 * (high - low + 1e-9), high + 0.02 * (high - low + 1e-9), 32)
+    for ax, name in zip(axes, names, strict=True):
+        ax.hist(groups.get(name, []), bins=bins, color=BLUE, alpha=0.75)
+        ax.axvline(line, color=RED, linewidth=1.4)
+        ax.set_title(name, fontsize=9, loc="left")
+        ax.set_xlabel(xlabel)
+    axes[0].set_ylabel("rollouts")
+    return svg(fig, description)
+
+
+def series(curves: Mapping[str, tuple[Array, Array, str]], xlabel: str, ylabel: str, description: str, *, log: bool = False) -> str:
+    """Lines. curves: label -> (x, y, colour)."""
+    fig, (ax,) = figure()
+    for label, (x, y, colour) in curves.items():
+        step = max(1, len(x) // CAP_POINTS)
+        ax.plot(x[::step], y[::step], color=colour, linewidth=1.1, label=label)
+    if log:
+        ax.set_yscale("log")
+    if curves:
+        ax.legend(frameon=False, fontsize=8)
+    ax.set_xlabel(xlabel)
+    ax.set_ylabel(ylabel)
+    return svg(fig, description)
+
+
+def scatter_pair(x: Array, before: Array, after: Array, xlabel: str, ylabel: str, description: str) -> str:
+    """The same residual against a variable, before and after, on one scale."""
+    fig, axes = figure(columns=2)
+    limit = float(np.max(np.abs(np.concatenate([before, after, [1e-12]])))) * 1.05
+    step = max(1, len(x) // CAP_POINTS)
+    for ax, values, name in ((axes[0], before, "before"), (axes[1], after, "after")):
+        ax.plot(x[::step], values[::step], ".", color=BLUE, markersize=2, alpha=0.5, rasterized=False)
+        ax.set_ylim(-limit, limit)
+        ax.set_title(name, fontsize=9, loc="left")
+        ax.set_xlabel(xlabel)
+    axes[0].set_ylabel(ylabel)
+    return svg(fig, description)
+
+
+def timeline(spans: Sequence[tuple[float, float, bool]], marks: Sequence[tuple[float, str, str]], xlabel: str, description: str) -> str:
+    """The gate over time. spans: (from, to, open); marks: (when, text, colour), numbered below the axis."""
+    fig, (ax,) = figure(height=1.9)
+    ax.grid(visible=False)
+    for begin, end, is_open in spans:
+        ax.axvspan(begin, end, ymin=0.35, ymax=0.75, color=GREEN if is_open else "#d4d9e0", linewidth=0)
+    for number, (when, _text, colour) in enumerate(marks, 1):
+        ax.axvline(when, ymin=0.28, ymax=0.82, color=colour, linewidth=1.2)
+        ax.text(
+            when,
+            0.88 if number % 2 else 0.16,
+            str(number),
+            color=colour,
+            ha="center",
+            va="center",
+            fontsize=8,
+            transform=ax.get_xaxis_transform(),
+        )
+    ax.set_yticks([])
+    ax.spines["left"].set_visible(False)
+    ax.set_xlabel(xlabel)
+    return svg(fig, description)
+
+
+def path(x: Array, y: Array, allowed: NDArray[np.bool_], xlabel: str, ylabel: str, description: str) -> str:
+    """Where the robot went: driven by the certified controller, and by anything else."""
+    fig, (ax,) = figure(width=5.4, height=3.8)
+    step = max(1, len(x) // CAP_POINTS)
+    ax.plot(x[::step], y[::step], color="#c3cad4", linewidth=0.8, label="all of the run")
+    masked = np.where(allowed, 1.0, np.nan)
+    ax.plot((x * masked)[::step], (y * masked)[::step], color=GREEN, linewidth=1.8, label="certified controller")
+    ax.set_aspect("equal")
+    ax.legend(frameon=False, fontsize=8, loc="upper right")
+    ax.set_xlabel(xlabel)
+    ax.set_ylabel(ylabel)
+    return svg(fig, description)
