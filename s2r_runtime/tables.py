@@ -1,0 +1,164 @@
+"""Recordings in table form: CSV, or CSV.gz (DESIGN 8).
+
+A header row; `t` in seconds; one column for each measured state and each input; an optional `segment` column for runs that are
+not contiguous (any labels; the rows of one run stand together); a blank cell means *not received at this stamp*. Stamps do not
+run backwards within a run; equal stamps are allowed (two streams, two rows). Columns that nobody asked for are not looked at.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import gzip
+import io
+import math
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.errors import RecordingError
+
+if TYPE_CHECKING:
+    from _csv import Reader
+
+Array = NDArray[np.float64]
+
+TIME, SEGMENT = "t", "segment"
+
+
+@dataclass(frozen=True)
+class Table:
+    """t: (N,) s. columns: name -> (N,), NaN where nothing was received. segment: (N,) number of the run, 0, 1, ..., or None."""
+
+    t: Array
+    columns: dict[str, Array]
+    segment: NDArray[np.int64] | None
+
+
+def read_csv(path: Path | str, wanted: Sequence[str] | None = None) -> Table:
+    """Reads the columns `wanted` (None: all). Raises RecordingError, one line: file, line, column, value, what would be right."""
+    path = Path(path)
+    rows = csv.reader(io.StringIO(_text(path), newline=""), strict=True)
+    try:
+        header = [name.strip() for name in next(rows)]
+    except StopIteration:
+        raise RecordingError(f"{path}: is empty, must start with a header row") from None
+    except csv.Error as error:
+        raise RecordingError(f"{path}: line 1: not CSV: {error}") from None
+    names = _checked_names(path, header, wanted)
+    cells, lines = _cells(path, rows, len(header))
+    numbers = {name: _numbers(path, name, cells[header.index(name)], lines) for name in (TIME, *names)}
+    t = numbers.pop(TIME)
+    if blank := np.flatnonzero(np.isnan(t)).tolist():
+        raise RecordingError(f"{path}: line {lines[blank[0]]}: column {TIME!r} is blank, every row needs its stamp")
+    segment = _segments(path, cells[header.index(SEGMENT)], lines) if SEGMENT in header else None
+    _check_time(path, t, segment, lines)
+    return Table(t, numbers, segment)
+
+
+def _text(path: Path) -> str:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+    if path.suffix == ".gz" or data.startswith(b"\x1f\x8b"):
+        try:
+            data = gzip.decompress(data)
+        except (OSError, EOFError, zlib.error) as error:
+            raise RecordingError(f"{path}: is not a whole gzip file: {error}") from None
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise RecordingError(f"{path}: line {line}: not UTF-8 text (byte {data[error.start]:#04x})") from None
+    if "\0" in text:
+        raise RecordingError(f"{path}: line {text.count(chr(10), 0, text.index(chr(0))) + 1}: holds a zero byte, is not a CSV file")
+    return text
+
+
+def _checked_names(path: Path, header: list[str], wanted: Sequence[str] | None) -> list[str]:
+    """The columns to read, without `t` and `segment`."""
+    if not any(header):
+        raise RecordingError(f"{path}: is empty, must start with a header row")
+    for name in header:
+        if header.count(name) > 1:
+            raise RecordingError(f"{path}: column {name!r} is there {header.count(name)} times, must be there once")
+    needed = [TIME, *(name for name in wanted or () if name != TIME)]
+    if missing := [name for name in needed if name not in header]:
+        raise RecordingError(f"{path}: {_missing(missing, header)}")
+    return [name for name in (header if wanted is None else needed) if name not in {TIME, SEGMENT, ""}]
+
+
+def _missing(missing: list[str], header: list[str]) -> str:
+    near = {name: difflib.get_close_matches(name, header, 1, 0.5) or [h for h in header if h.lower() == name.lower()] for name in missing}
+    listed = ", ".join(f"{name!r}" + (f" (nearest: {near[name][0]!r})" if near[name] else "") for name in missing)
+    hint = "; are its columns separated by commas?" if len(header) == 1 else ""
+    return f"lacks the column{'s' if len(missing) > 1 else ''} {listed}; it has: {', '.join(header)}{hint}"
+
+
+def _cells(path: Path, rows: Reader, width: int) -> tuple[list[tuple[str, ...]], list[int]]:
+    """Columns of cells, and the line on which each row ends. Blank lines are skipped."""
+    kept, lines = [], []
+    try:
+        for row in rows:
+            if len(row) == width:
+                kept.append(row)
+                lines.append(rows.line_num)
+            elif row:
+                raise RecordingError(f"{path}: line {rows.line_num}: has {len(row)} cells, the header has {width}")
+    except csv.Error as error:
+        raise RecordingError(f"{path}: line {rows.line_num}: not CSV: {error}") from None
+    if not kept:
+        raise RecordingError(f"{path}: has a header and no rows")
+    return list(zip(*kept, strict=True)), lines
+
+
+def _numbers(path: Path, name: str, cells: tuple[str, ...], lines: list[int]) -> Array:
+    """(N,), NaN for blank cells."""
+    try:
+        values = np.array([float(cell) if cell else math.nan for cell in cells])
+    except ValueError:
+        values = np.array([_number(path, name, cell, line) for cell, line in zip(cells, lines, strict=True)])
+    for row in np.flatnonzero(~np.isfinite(values)).tolist():
+        if cells[row].strip():
+            raise RecordingError(
+                f"{path}: line {lines[row]}: column {name!r} is {cells[row]!r}, must be a finite number (or blank: not received)"
+            )
+    return values
+
+
+def _number(path: Path, name: str, cell: str, line: int) -> float:
+    try:
+        return float(cell) if cell.strip() else math.nan
+    except ValueError:
+        raise RecordingError(f"{path}: line {line}: column {name!r} is {cell!r}, must be a number (or blank: not received)") from None
+
+
+def _segments(path: Path, cells: tuple[str, ...], lines: list[int]) -> NDArray[np.int64]:
+    """(N,) 0, 1, ... in order of appearance."""
+    numbers: list[int] = []
+    seen: dict[str, int] = {}
+    for label, rows in groupby(cell.strip() for cell in cells):
+        line = lines[len(numbers)]
+        if not label:
+            raise RecordingError(f"{path}: line {line}: column {SEGMENT!r} is blank, every row needs its segment")
+        if label in seen:
+            raise RecordingError(f"{path}: line {line}: segment {label!r} goes on after another one began; its rows must stand together")
+        seen[label] = len(seen)
+        numbers += [seen[label]] * sum(1 for _ in rows)
+    return np.array(numbers, dtype=np.int64)
+
+
+def _check_time(path: Path, t: Array, segment: NDArray[np.int64] | None, lines: list[int]) -> None:
+    backwards = np.diff(t) < 0.0
+    if segment is not None:
+        backwards &= np.diff(segment) == 0
+    if back := np.flatnonzero(backwards).tolist():
+        row = back[0]
+        raise RecordingError(f"{path}: line {lines[row + 1]}: time runs backwards, from {float(t[row])} s to {float(t[row + 1])} s")

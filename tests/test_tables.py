@@ -1,0 +1,132 @@
+"""Tables: what is read is what is there, and what is wrong is named on one line."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from s2r_runtime.errors import RecordingError
+from s2r_runtime.tables import read_csv
+
+GOOD = "t,x,v\n0.0,1.5,\n0.1,,0.2\n0.1,1.6,\n0.3,1.7,0.1\n"
+
+
+@pytest.fixture
+def write(tmp_path: Path):
+    def writer(content: str | bytes, name: str = "run.csv") -> Path:
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return writer
+
+
+def test_blank_cells_are_not_received_and_equal_stamps_are_allowed(write) -> None:
+    table = read_csv(write(GOOD), ("x", "v"))
+    np.testing.assert_array_equal(table.t, [0.0, 0.1, 0.1, 0.3])
+    np.testing.assert_array_equal(table.columns["x"], [1.5, np.nan, 1.6, 1.7])
+    np.testing.assert_array_equal(table.columns["v"], [np.nan, 0.2, np.nan, 0.1])
+    assert table.segment is None
+
+
+@pytest.mark.parametrize("name", ["run.csv.gz", "run.csv"])
+def test_gzip_reads_like_plain_text_whatever_its_name(write, name: str) -> None:
+    table = read_csv(write(gzip.compress(GOOD.encode()), name))
+    assert list(table.columns) == ["x", "v"]
+    assert len(table.t) == 4
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        GOOD.replace("\n", "\r\n"),
+        "\ufeff" + GOOD,
+        GOOD.replace(",", " , "),
+        '"t","x","v"\n"0.0","1.5",\n0.1,,0.2\n0.1,1.6,\n0.3,1.7,0.1\n\n',
+    ],
+    ids=["windows line ends", "byte order mark", "spaces", "quotes and a blank line"],
+)
+def test_dialects_that_spreadsheets_write_are_read_alike(write, text: str) -> None:
+    table, plain = read_csv(write(text, "a.csv"), ("x", "v")), read_csv(write(GOOD, "b.csv"), ("x", "v"))
+    np.testing.assert_array_equal(table.t, plain.t)
+    np.testing.assert_array_equal(table.columns["x"], plain.columns["x"])
+    np.testing.assert_array_equal(table.columns["v"], plain.columns["v"])
+
+
+def test_only_the_columns_asked_for_must_be_numbers(write) -> None:
+    path = write("t,x,mode\n0,1,manual\n1,2,auto\n")
+    assert list(read_csv(path, ("x",)).columns) == ["x"]
+    with pytest.raises(RecordingError, match=r"line 2: column 'mode' is 'manual'"):
+        read_csv(path)
+
+
+def test_segments_are_numbered_as_they_appear_and_time_may_start_again(write) -> None:
+    table = read_csv(write("segment,t,x\nb,5,1\nb,6,2\na,0,3\na,1,4\n"), ("x",))
+    assert table.segment is not None
+    assert table.segment.tolist() == [0, 0, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty, must start with a header row"),
+        ("\n\n", "is empty, must start with a header row"),
+        ("t,x\n", "has a header and no rows"),
+        ("t,x,y\n0,1\n", "line 2: has 2 cells, the header has 3"),
+        ("t,x\n0,1\n1,2,3\n", "line 3: has 3 cells, the header has 2"),
+        ("t,x\n0,1\n0.5,abc\n", "line 3: column 'x' is 'abc', must be a number (or blank: not received)"),
+        ("t,x\n0,1\n0.5,nan\n", "line 3: column 'x' is 'nan', must be a finite number"),
+        ("t,x\n0,-inf\n", "line 2: column 'x' is '-inf', must be a finite number"),
+        ("t,x\n0,1e999\n", "line 2: column 'x' is '1e999', must be a finite number"),
+        ("t,x\n0,1\n1,1\n0.5,1\n", "line 4: time runs backwards, from 1.0 s to 0.5 s"),
+        ("t,x\n0,1\n,1\n", "line 3: column 't' is blank, every row needs its stamp"),
+        ("t,x\n0,1\nlater,1\n", "line 3: column 't' is 'later'"),
+        ("t,x,x\n0,1,1\n", "column 'x' is there 2 times, must be there once"),
+        ("time,x\n0,1\n", "lacks the column 't'"),
+        ("t,X\n0,1\n", "lacks the column 'x' (nearest: 'X'); it has: t, X"),
+        ("t;x\n0;1\n", "are its columns separated by commas?"),
+        ("segment,t,x\n1,0,1\n2,0,1\n1,1,1\n", "line 4: segment '1' goes on after another one began"),
+        ("segment,t,x\n1,0,1\n,0,1\n", "line 3: column 'segment' is blank"),
+        ("segment,t,x\n1,0,1\n1,-1,1\n", "line 3: time runs backwards"),
+        ('t,x\n0,"1\n', "not CSV"),
+        (b"t,x\n0,\xff\n", "line 2: not UTF-8 text (byte 0xff)"),
+        (b"t,x\n0,\0\n", "line 2: holds a zero byte"),
+    ],
+)
+def test_what_is_wrong_is_named_on_one_line(write, text: str | bytes, message: str) -> None:
+    path = write(text)
+    with pytest.raises(RecordingError) as caught:
+        read_csv(path, ("x",))
+    told = str(caught.value)
+    assert message in told
+    assert told.startswith(str(path))
+    assert "\n" not in told
+    assert caught.value.exit_code == 2
+
+
+def test_all_missing_columns_are_named_with_the_nearest(write) -> None:
+    with pytest.raises(RecordingError, match=r"lacks the columns 'theta' \(nearest: 'thetta'\), 'w'; it has: t, x, thetta"):
+        read_csv(write("t,x,thetta\n0,1,2\n"), ("x", "theta", "w"))
+
+
+@pytest.mark.parametrize("content", [b"t,x\n0,1\n", gzip.compress(b"t,x\n0,1\n")[:-6], b"\x1f\x8bnonsense"])
+def test_a_broken_gzip_file_is_refused(write, content: bytes) -> None:
+    with pytest.raises(RecordingError, match="is not a whole gzip file"):
+        read_csv(write(content, "run.csv.gz"))
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"none\.csv: cannot be read: No such file"):
+        read_csv(tmp_path / "none.csv")
+
+
+def test_a_hundred_thousand_rows_are_read_exactly(write) -> None:
+    n = 100_000
+    rng = np.random.default_rng(4)
+    values = rng.normal(size=(n, 3))
+    body = "\n".join(f"{k * 0.01:.2f},{a!r},{b!r},{c!r}" for k, (a, b, c) in enumerate(values.tolist()))
+    table = read_csv(write(f"t,x,y,v\n{body}\n"), ("x", "y", "v"))
+    np.testing.assert_array_equal(np.column_stack([table.columns[c] for c in ("x", "y", "v")]), values)
