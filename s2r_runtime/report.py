@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -27,10 +28,8 @@ def log_page(paths: Sequence[Path]) -> str:
     story = tell(log.entries())
     name = story.settings.robot if story.settings else "unknown robot"
     when = datetime.fromtimestamp(story.started_unix_s, UTC).strftime("%Y-%m-%d %H:%M UTC")
-    page = Page(
-        f"{name}: what this run showed",
-        f"{when} · {story.records} records · {story.seconds(story.last_ns):.0f} s on the robot's clock · {log.ending()}",
-    )
+    length = f"{story.seconds(story.last_ns):.0f} s on the robot's clock"
+    page = Page(f"{name}: what this run showed", f"{when} · {story.records} records · {length} · {log.ending()}")
     _summary(page, story)
     _timeline(page, story)
     _gaps(page, story, log.models())
@@ -61,7 +60,7 @@ def _timeline(page: Page, story: Story) -> None:
         return
     end = story.seconds(story.last_ns)
     edges = [*story.gate, (end, False, "")]
-    spans = [(begin, after, is_open) for (begin, is_open, _), (after, _, _) in zip(edges, edges[1:], strict=False)]
+    spans = [(begin, after, is_open) for (begin, is_open, _), (after, _, _) in pairwise(edges)]
     page.heading("Gate")
     marks = [(when, what, COLOURS[kind]) for when, what, kind in story.marks]
     page.figure(

@@ -46,9 +46,8 @@ def add_trace(page: Page, trace: dict[str, Any]) -> None:
     _errors(page, trace["error"])
     gap = trace.get("gap") or {}
     if gap.get("before") and gap.get("after"):
-        page.text(
-            f"Gap on transitions the fit never saw: {gap['before']['radius']:.4g} before, {gap['after']['radius']:.4g} after (N = {gap['after']['n']})."
-        )
+        before, after = gap["before"], gap["after"]
+        page.text(f"Gap on transitions the fit never saw: {before['radius']:.4g} before, {after['radius']:.4g} after (N = {after['n']}).")
     if trace["candidates"]:
         page.heading("Candidates", 3)
         page.table(("effect", "acts on", "score"), [(c["name"], c["channel"], f"{c['score']:.1f}") for c in trace["candidates"][:12]])
@@ -58,7 +57,8 @@ def add_trace(page: Page, trace: dict[str, Any]) -> None:
 def _parameters(effects: list[dict[str, Any]]) -> list[tuple[str, str, str, str, str]]:
     rows = []
     for effect in effects:
-        for name, p in effect["parameters"].items() or {"": {}}.items():
+        parameters: dict[str, dict[str, Any]] = effect["parameters"] or {"": {}}
+        for name, p in parameters.items():
             value, low, high = p.get("value"), p.get("low"), p.get("high")
             number = f"{value:.5g} {p.get('unit', '')}" if isinstance(value, float) else str(value or "")
             interval = f"{low:.5g} to {high:.5g}" if isinstance(low, float) and isinstance(high, float) else "-"
