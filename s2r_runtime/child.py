@@ -76,8 +76,8 @@ class Child:
             except BlockingIOError:
                 self._ended = len(self._pending) > PENDING_MAX
                 return
-            except OSError:  # it closed its end: it is gone, or going
-                self._ended = True
+            except OSError:  # it closed its end: it is gone, or going; what it said before can still be read
+                self._pending.clear()
                 return
             del self._pending[:written]
 
@@ -146,3 +146,17 @@ def die_with_parent(parent_pid: int) -> None:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent_pid:
         raise SystemExit(1)  # it died before the call
+
+
+def take_stdout() -> int:
+    """In a child: a descriptor for the lines to the daemon. What else is printed (a plug-in's debug output) goes to stderr."""
+    channel = os.dup(1)
+    os.dup2(2, 1)
+    return channel
+
+
+def say(channel: int, line: bytes) -> None:
+    """In a child: a line to the daemon."""
+    data = line + b"\n"
+    while data:
+        data = data[os.write(channel, data) :]
