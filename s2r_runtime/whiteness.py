@@ -1,0 +1,120 @@
+"""Is there structure in a residual that independent, zero-mean noise would not have? (DESIGN G8: without an answer of no, a
+certificate under the law `uniform` alone is refused, because such a law averages out what a real disturbance does not.)
+
+e: (n, nx), one row a transition, for planar models turned into the body's axes at the start of the step (a lost share of the speed
+has no mean in the world's axes). Three questions, each by a rank or normal statistic, so that the tails of e do not matter:
+
+    mean    |mean_i| sqrt(n) / std_i                                            normal
+    order   sum over lags l of n rho_l^2, rho_l rank autocorrelation            chi-square, 5 degrees
+    input   rank correlation of e_i with each of u, |u|, u_j u_k, u_j |u_k|     normal, times sqrt(n-1)
+
+The smallest p-value counts, times the number of tests (Bonferroni): noise alone is called structured with probability <= ALPHA.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.models.composed import ComposedModel
+
+Array = NDArray[np.float64]
+
+ALPHA = 1e-3
+LAGS = 5
+FEWEST = 30
+"""Below this the statistics are not near their limit laws; then the answer is `not white`, for nothing was shown."""
+
+
+class Whiteness(NamedTuple):
+    """`reason` is empty iff `white`. `dependent`: the order of the samples matters, so they were hardly drawn independently."""
+
+    white: bool
+    reason: str
+    dependent: bool
+
+
+def whiteness(model: ComposedModel, x0: Array, u: Array, e: Array, *, first_lag: int = 1) -> Whiteness:
+    """x0, e: (n, nx); u: (n, nu). first_lag 2: neighbours share a measurement (one transition begins where the last ended)."""
+    n = len(e)
+    if n < FEWEST + LAGS:
+        return Whiteness(False, f"{n} transitions are too few to tell", False)
+    e = body_axes(model, x0, e)
+    inputs = _input_terms(model, u)
+    found: list[tuple[float, str, bool]] = []
+    for column, state in enumerate(model.states):
+        values = e[:, column]
+        if np.max(np.abs(values)) <= 1e-12 * max(1.0, float(np.max(np.abs(x0[:, column])))):
+            continue  # rounding
+        ranks = _ranks(values)
+        found.append((_normal_p(_mean_score(values)), f"the mean of the residual in {state} is {np.mean(values):.3g}, not zero", False))
+        if np.ptp(ranks) > 0.0:
+            found.append((_serial_p(ranks, first_lag), f"the residual in {state} depends on the one before", True))
+            found += [
+                (_normal_p(_correlation(ranks, r) * math.sqrt(n - 1)), f"the residual in {state} depends on {name}", False)
+                for name, r in inputs
+            ]
+    if not found:
+        return Whiteness(True, "", False)
+    dependent = min((p for p, _, serial in found if serial), default=1.0) * len(found) < ALPHA
+    p, reason, _ = min(found)
+    return Whiteness(False, reason, dependent) if p * len(found) < ALPHA else Whiteness(True, "", False)
+
+
+def body_axes(model: ComposedModel, x0: Array, e: Array) -> Array:
+    """e (n, nx) with its (x, y) part turned by -theta, where the model has such states."""
+    if not {"x", "y", "theta"} <= set(model.states):
+        return e
+    x, y, theta = (model.states.index(name) for name in ("x", "y", "theta"))
+    c, s = np.cos(x0[:, theta]), np.sin(x0[:, theta])
+    turned = e.copy()
+    turned[:, x] = c * e[:, x] + s * e[:, y]
+    turned[:, y] = c * e[:, y] - s * e[:, x]
+    return turned
+
+
+def _input_terms(model: ComposedModel, u: Array) -> list[tuple[str, Array]]:
+    """(name, ranks (n,)) of the terms of u that vary."""
+    terms = [(name, u[:, j]) for j, name in enumerate(model.inputs)]
+    terms += [(f"|{name}|", np.abs(u[:, j])) for j, name in enumerate(model.inputs)]
+    for (j, a), (k, b) in itertools.permutations(enumerate(model.inputs), 2):
+        terms.append((f"{a}*|{b}|", u[:, j] * np.abs(u[:, k])))
+        if j < k:
+            terms.append((f"{a}*{b}", u[:, j] * u[:, k]))
+    return [(name, _ranks(values)) for name, values in terms if np.ptp(values) > 0.0]
+
+
+def _ranks(values: Array) -> Array:
+    """Ranks, ties sharing their mean, centred; (n,). Shared ranks keep a quantised sensor from looking ordered."""
+    _, place, counts = np.unique(values, return_inverse=True, return_counts=True)
+    return np.asarray((np.cumsum(counts) - (counts - 1) / 2.0)[place] - (len(values) + 1) / 2.0)
+
+
+def _correlation(a: Array, b: Array) -> float:
+    scale = math.sqrt(float(a @ a) * float(b @ b))
+    return float(a @ b) / scale if scale > 0.0 else 0.0
+
+
+def _mean_score(values: Array) -> float:
+    spread = float(np.std(values))
+    mean = float(np.mean(values))
+    if spread == 0.0:
+        return math.inf if mean else 0.0
+    return mean * math.sqrt(len(values)) / spread
+
+
+def _serial_p(ranks: Array, first_lag: int) -> float:
+    from scipy.special import gammaincc
+
+    total = float(ranks @ ranks)
+    lags = range(first_lag, first_lag + LAGS)
+    statistic = sum(len(ranks) * (float(ranks[lag:] @ ranks[:-lag]) / total) ** 2 for lag in lags)
+    return float(gammaincc(LAGS / 2.0, statistic / 2.0))
+
+
+def _normal_p(z: float) -> float:
+    return math.erfc(abs(z) / math.sqrt(2.0))
