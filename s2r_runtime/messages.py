@@ -82,6 +82,8 @@ class Gap(Struct, frozen=True, tag="gap"):
     rejected: dict[str, int] = {}
     radius_noise: float | None = None
     white: bool = True
+    white_reason: str = ""
+    """What structure the residual has, where it isn't white."""
 
 
 class LawResult(Struct, frozen=True):

@@ -29,40 +29,37 @@ LAGS = 5
 FEWEST = 30
 """Below this the statistics are not near their limit laws; then the answer is `not white`, for nothing was shown."""
 
+DEPENDENT = "depends on the one before"
+"""Stands in the reason where the order of the samples matters: they were hardly drawn independently."""
+
 
 class Whiteness(NamedTuple):
-    """`reason` is empty iff `white`. `dependent`: the order of the samples matters, so they were hardly drawn independently."""
+    """`reason` is empty iff `white`; it holds the phrase DEPENDENT if the order of the samples matters."""
 
     white: bool
     reason: str
-    dependent: bool
 
 
 def whiteness(model: ComposedModel, x0: Array, u: Array, e: Array, *, first_lag: int = 1) -> Whiteness:
     """x0, e: (n, nx); u: (n, nu). first_lag 2: neighbours share a measurement (one transition begins where the last ended)."""
     n = len(e)
     if n < FEWEST + LAGS:
-        return Whiteness(False, f"{n} transitions are too few to tell", False)
+        return Whiteness(False, f"{n} transitions are too few to tell")
     e = body_axes(model, x0, e)
     inputs = _input_terms(model, u)
-    found: list[tuple[float, str, bool]] = []
+    found: list[tuple[float, str]] = []
     for column, state in enumerate(model.states):
         values = e[:, column]
         if np.max(np.abs(values)) <= 1e-12 * max(1.0, float(np.max(np.abs(x0[:, column])))):
             continue  # rounding
         ranks = _ranks(values)
-        found.append((_normal_p(_mean_score(values)), f"the mean of the residual in {state} is {np.mean(values):.3g}, not zero", False))
+        found.append((_normal_p(_mean_score(values)), f"the mean of the residual in {state} is {np.mean(values):.3g}, not zero"))
         if np.ptp(ranks) > 0.0:
-            found.append((_serial_p(ranks, first_lag), f"the residual in {state} depends on the one before", True))
-            found += [
-                (_normal_p(_correlation(ranks, r) * math.sqrt(n - 1)), f"the residual in {state} depends on {name}", False)
-                for name, r in inputs
-            ]
-    if not found:
-        return Whiteness(True, "", False)
-    dependent = min((p for p, _, serial in found if serial), default=1.0) * len(found) < ALPHA
-    p, reason, _ = min(found)
-    return Whiteness(False, reason, dependent) if p * len(found) < ALPHA else Whiteness(True, "", False)
+            found.append((_serial_p(ranks, first_lag), f"the residual in {state} {DEPENDENT}"))
+            score = math.sqrt(n - 1)
+            found += [(_normal_p(score * _correlation(ranks, r)), f"the residual in {state} depends on {name}") for name, r in inputs]
+    structure = sorted((DEPENDENT not in reason, p, reason) for p, reason in found if p * len(found) < ALPHA)
+    return Whiteness(False, structure[0][2]) if structure else Whiteness(True, "")
 
 
 def body_axes(model: ComposedModel, x0: Array, e: Array) -> Array:

@@ -4,6 +4,10 @@
 
 x: (n, nx), u: (n, nu), angles wrapped to (-pi, pi]. The hidden state is a tuple of one array an effect, (n, nh); at rest it is
 what a long time at zero input leaves (a campaign's full stop).
+
+u_act is the input's mean over the step. Where a nominal model says that a state is set to an input at once (`reached`: a wheel's
+speed, a car's speed), that state is the input as it acts at the end of the step; for such models the effects are run in SUBSTEPS parts of
+the step, of which the last one stands for its end.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ import ast
 import importlib.util
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +32,12 @@ from s2r_runtime.plugins import registry
 
 Array = NDArray[np.float64]
 Hidden = tuple[Array, ...]
+
+SUBSTEPS = 5
+"""Parts of a step for models with a state that is `reached` at once: the end is then known to a tenth of a step."""
+
+SETTLE_STEPS = 20_000
+"""Steps after which an effect that is fed a constant counts as settled, whatever it does."""
 
 
 def wrap(angle: Array) -> Array:
@@ -72,25 +83,67 @@ class ComposedModel:
         """Columns of x that wrap."""
         return [self.states.index(name) for name in self.nominal.angles]
 
+    @property
+    def substeps(self) -> int:
+        """Parts of a step in which the effects of stage `input` are run."""
+        dynamic = any(a.effect.stage == "input" for a in self.effects)
+        return SUBSTEPS if dynamic and getattr(self.nominal, "reached", None) else 1
+
+    @cached_property
+    def _rest(self) -> Hidden:
+        """Hidden state at rest of one rollout. An effect behind a bias rests at what the bias makes of zero input."""
+        dt = self.dt / self.substeps
+        acting = np.zeros((1, len(self.inputs)))
+        rest: list[Array] = []
+        for a in self.effects:
+            z = a.effect.hidden(1, self.nominal, a.channel, dt, a.p)
+            if a.effect.stage == "input":
+                given = acting
+                for _ in range(SETTLE_STEPS if np.any(given) and z.size else 1):
+                    acting, after = a.effect.input_step(given, z, self.nominal, a.channel, dt, a.p)
+                    settled = np.allclose(after, z, rtol=1e-12, atol=1e-15)
+                    z = after
+                    if settled:
+                        break
+            rest.append(z)
+        return tuple(rest)
+
     def at_rest(self, n: int) -> Hidden:
         """Hidden state after a long time at zero input."""
-        return tuple(a.effect.hidden(n, self.nominal, a.channel, self.dt, a.p) for a in self.effects)
+        return tuple(np.repeat(z, n, axis=0) for z in self._rest)
+
+    def act(self, u: Array, hidden: Hidden) -> tuple[Array, Array, Hidden]:
+        """Commanded u over one step -> (mean over the step, at its end, hidden')."""
+        parts = self.substeps
+        mean = end = u
+        for part in range(parts):
+            end, after = u, []
+            for a, z in zip(self.effects, hidden, strict=True):
+                if a.effect.stage == "input":
+                    end, z = a.effect.input_step(end, z, self.nominal, a.channel, self.dt / parts, a.p)
+                after.append(z)
+            hidden = tuple(after)
+            mean = end if part == 0 else mean + (end - mean) / (part + 1)
+        return mean, end, hidden
+
+    def advance(self, x: Array, mean: Array, end: Array) -> Array:
+        """x one step later under an input that acts as `act` says; angles are not wrapped."""
+        x_next = self.nominal.step(x, mean, self.dt, self.parameters)
+        if end is not mean:
+            for state, name in getattr(self.nominal, "reached", {}).items():
+                x_next[:, self.states.index(state)] = end[:, self.inputs.index(name)]
+        for a in self.effects:
+            if a.effect.stage == "step":
+                x_next = a.effect.after_step(x, mean, x_next, self.nominal, a.channel, self.dt, a.p)
+        return x_next
 
     def step(self, x: Array, u: Array, hidden: Hidden) -> tuple[Array, Hidden]:
         """One step: (x', hidden')."""
-        after: list[Array] = []
-        acting = u
-        for a, z in zip(self.effects, hidden, strict=True):
-            if a.effect.stage == "input":
-                acting, z = a.effect.input_step(acting, z, self.nominal, a.channel, self.dt, a.p)
-            after.append(z)
-        x_next = self.nominal.step(x, acting, self.dt, self.parameters)
-        for a in self.effects:
-            if a.effect.stage == "step":
-                x_next = a.effect.after_step(x, acting, x_next, self.nominal, a.channel, self.dt, a.p)
+        mean, end, hidden = self.act(u, hidden)
+        x_next = self.advance(x, mean, end)
         for column in self.angle_columns:
             x_next[:, column] = wrap(x_next[:, column])
-        return x_next, tuple(after)
+        return x_next, hidden
 
     def hold(self, x: Array, u: Array, periods: int) -> Array:
         """State after u was held for that many steps from rest, (n, nx)."""
@@ -114,13 +167,15 @@ def compose(spec: ModelSpec, where: str = "model") -> ComposedModel:
         if name not in nominal.parameters:
             known = ", ".join(nominal.parameters) or "none"
             raise ConfigError(f"{where}.parameters.{name}: model {spec.name!r} has no such parameter; it has: {known}")
-    applied = []
+    applied: list[AppliedEffect] = []
     for index, entry in enumerate(spec.effects):
         effect = registry().get("effects", entry.name)
         place = f"{where}.effects[{index}] ({entry.name})"
         channels = effect.channels(nominal)
         if entry.channel not in channels:
             raise ConfigError(f"{place}: channel is {entry.channel!r}, must be one of: {', '.join(channels) or 'none on this model'}")
+        if getattr(effect, "once", False) and any(a.effect is effect for a in applied):
+            raise ConfigError(f"{place}: is there twice, must be there once")
         applied.append(AppliedEffect(effect, entry.channel, _effect_parameters(effect, entry.parameters, place)))
     return ComposedModel(spec, nominal, {**nominal.parameters, **spec.parameters}, tuple(applied))
 

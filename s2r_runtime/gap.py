@@ -1,0 +1,308 @@
+"""Gap of a model on independent transitions (DESIGN G1, G4, G6; paper, theorem 2).
+
+    e_i = x1_i (-) f(x0_i, u_i)          residual, (n, nx), angles wrapped
+    d_i = sqrt(sum_j (w_j e_ij)^2)       ball;   max_j w_j |e_ij|   box;   W fixed beforehand
+    r   = the (k+1)-th largest d_i       P[V(r) > eps] <= P(Bin(n, eps) <= k) <= beta
+
+With the state after h held periods (one value a hold, so independent too), r_h is the same of the h-step discrepancy; then r
+and r_h take beta/2 each. Transitions without it, or too few to pay for both, give h = 1 and r_h = r, which is the same
+statement once more and costs nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.bounds import check_probability, sample_size, scenario_confidence
+from s2r_runtime.errors import ConfigError, NotEnoughEvidence, UsageError
+from s2r_runtime.messages import Gap
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.whiteness import DEPENDENT, whiteness
+
+Array = NDArray[np.float64]
+Kind = Literal["ball", "box"]
+
+NOISE_DRAWS = 200_000
+"""Simulated transitions behind `radius_noise`: its own error is then a few per cent of it."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """All steps of a drive, so that an effect with memory can be carried along: inputs, one (m, nu) a stretch that begins at
+    rest; step: (n,) where each transition stands in them, laid end to end.
+    """
+
+    inputs: tuple[Array, ...]
+    step: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """n transitions. x0, x1: (n, nx); u: (n, nu); t0_s: (n,). held: (n, nx), the state after `hold_periods` held periods, or None.
+
+    `independent`: drawn independently from one law; if not, `doubt` says why, and there is no statement. `assumption`: what the user
+    vouched for instead. `digest`: of the recording's bytes; `samples_digest`: of a campaign's samples, alike in every log that holds
+    them. `noise`: (nx,) standard deviation of the measurements, None if the recording doesn't show it.
+    """
+
+    x0: Array
+    u: Array
+    x1: Array
+    held: Array | None
+    hold_periods: int
+    independent: bool
+    rejected: dict[str, int]
+    digest: str
+    t0_s: Array
+    source: str
+    doubt: str = ""
+    assumption: str = ""
+    samples_digest: str = ""
+    noise: Array | None = None
+    drive: Drive | None = field(default=None, repr=False)
+
+
+def residuals(model: ComposedModel, transitions: Transitions) -> Array:
+    """(n, nx) e = x1 (-) f(x0, u). Samples of a campaign begin at rest; in a drive, memory is carried from its beginning.
+
+    Raises ConfigError if the model's step gives something that isn't finite.
+    """
+    if transitions.drive is None:
+        predicted, _ = model.step(transitions.x0, transitions.u, model.at_rest(len(transitions.u)))
+    else:
+        predicted = _driven(model, transitions, transitions.drive)
+    return _finite(model, model.difference(transitions.x1, predicted))
+
+
+def hold_residuals(model: ComposedModel, transitions: Transitions) -> Array | None:
+    """(n, nx) of the state after the hold; None if the transitions do not have it."""
+    if transitions.held is None or transitions.hold_periods <= 1:
+        return None
+    predicted = model.hold(transitions.x0, transitions.u, transitions.hold_periods)
+    return _finite(model, model.difference(transitions.held, predicted))
+
+
+def discrepancy(e: Array, weights: Array, kind: Kind) -> Array:
+    """(n,) weighted norms of e (n, nx); weights (nx,)."""
+    weighted = np.abs(e * weights)
+    return np.sqrt(np.sum(weighted**2, axis=1)) if kind == "ball" else np.asarray(np.max(weighted, axis=1))
+
+
+def estimate_gap(
+    model: ComposedModel,
+    tr: Transitions,
+    *,
+    epsilon: float,
+    beta: float,
+    discard: int = 0,
+    kind: Kind = "ball",
+    weights: tuple[float, ...] | Array,
+    epoch: int = 1,
+) -> Gap:
+    """The gap at `beta` (the epoch's share). All samples count; N and k were fixed before they were drawn.
+
+    Raises UsageError (range of a number), NotEnoughEvidence (fitted on this recording: G6; too few samples, saying how many more).
+    Transitions that are not independent give their numbers and no statement; how many there are does not matter then.
+    """
+    w = _checked_weights(model, weights, kind)
+    check_probability("epsilon", epsilon)
+    check_probability("beta", beta)
+    if discard < 0:
+        raise UsageError(f"discard is {discard}, must be >= 0")
+    refuse_fitted(model, tr)
+    n = len(tr.x0)
+    needed = sample_size(epsilon, beta, discard)
+    if n < (needed if tr.independent else discard + 1):
+        raise NotEnoughEvidence(_too_few(tr, n, needed, epsilon, beta, discard), needed - n)
+    e = residuals(model, tr)
+    radius = _largest(discrepancy(e, w, kind), discard)
+    e_hold = hold_residuals(model, tr)
+    paid = e_hold is not None and (not tr.independent or scenario_confidence(n, discard, epsilon) <= beta / 2.0)
+    white = whiteness(model, tr.x0, tr.u, e, first_lag=1 if tr.drive is None else 2)
+    return Gap(
+        radius=radius,
+        radius_literal=_largest(discrepancy(e, np.ones_like(w), kind), discard),
+        hold_radius=_largest(discrepancy(e_hold, w, kind), discard) if e_hold is not None and paid else radius,
+        hold_periods=tr.hold_periods if paid else 1,
+        set=kind,
+        weights=tuple(w.tolist()),
+        n=n,
+        discarded=discard,
+        epsilon=epsilon,
+        beta=beta,
+        epoch=epoch,
+        model_digest=model.spec.digest(),
+        transitions_digest=tr.digest,
+        rejected=tr.rejected,
+        radius_noise=radius_of_noise(model, tr, w, kind, discard),
+        white=white.white,
+        white_reason=white.reason,
+    )
+
+
+def refuse_fitted(model: ComposedModel, tr: Transitions) -> None:
+    """Raises NotEnoughEvidence if the model was fitted on this recording or these samples (G6)."""
+    if {tr.digest, tr.samples_digest} & set(model.spec.fitted_on) - {""}:
+        raise NotEnoughEvidence(
+            f"{tr.source}: the model was fitted on this recording, which therefore can't bound its gap; take one that the fit never saw"
+        )
+
+
+def radius_of_noise(model: ComposedModel, tr: Transitions, weights: Array, kind: Kind, discard: int) -> float | None:
+    """What r would be if the model were exact and only the measurements noisy; None where `noise` isn't known.
+
+    The median over simulated campaigns of the same n with Gaussian noise of that size on both x0 and x1. Not an upper bound, and no part
+    of the statement: outliers, quantisation and drift of a sensor aren't in it.
+    """
+    if tr.noise is None:
+        return None
+    rng = np.random.default_rng(0)
+    n = len(tr.x0)
+    largest = []
+    exact, _ = model.step(tr.x0, tr.u, model.at_rest(n))
+    for _ in range(min(101, max(9, NOISE_DRAWS // n))):
+        before, after = rng.normal(size=(2, *tr.x0.shape)) * tr.noise
+        predicted, _ = model.step(tr.x0 + before, tr.u, model.at_rest(n))
+        largest.append(_largest(discrepancy(model.difference(exact + after, predicted), weights, kind), discard))
+    return float(np.median(largest))
+
+
+def blocked(tr: Transitions, seconds: float) -> Transitions:
+    """The first transition of every block of that length; independent under the assumption that blocks are, which is then stated.
+
+    Raises UsageError if the block is not longer than 0. Transitions that are independent anyway come back unchanged.
+    """
+    if not 0.0 < seconds < float("inf"):
+        raise UsageError(f"blocking is {seconds} s, must be > 0")
+    if tr.independent or len(tr.t0_s) == 0:
+        return tr
+    block = np.floor((tr.t0_s - tr.t0_s[0]) / seconds)
+    _, first = np.unique(block, return_index=True)
+    drive = replace(tr.drive, step=tr.drive.step[first]) if tr.drive else None
+    return replace(
+        tr,
+        x0=tr.x0[first],
+        u=tr.u[first],
+        x1=tr.x1[first],
+        held=None if tr.held is None else tr.held[first],
+        t0_s=tr.t0_s[first],
+        independent=True,
+        doubt="",
+        assumption=f"transitions from different blocks of {seconds:g} s of this drive, one from each, are independent and of one law",
+        rejected={**tr.rejected, "blocking": len(tr.x0) - len(first)},
+        drive=drive,
+    )
+
+
+def statement(gap: Gap, independent: bool, *, assumption: str = "", doubt: str = "", states: tuple[str, ...] = ()) -> str:
+    """What G1 says of this gap, and no more."""
+    rank = "largest" if gap.discarded == 0 else f"largest but {gap.discarded}"
+    if not independent:
+        why = doubt or "the transitions were not drawn independently"
+        return f"No statement: {why}. r = {gap.radius:.6g} is the {rank} of these {gap.n} discrepancies and bounds no other."
+    norm = ", ".join(f"{name} {w:g}" for name, w in zip(states or range(len(gap.weights)), gap.weights, strict=True))
+    told = (
+        f"With confidence {_percent(1.0 - gap.beta)}, a new one-step discrepancy drawn from the same law exceeds r = {gap.radius:.6g} "
+        f"({gap.set}, weights {norm}) with probability at most {_percent(gap.epsilon)}"
+    )
+    if gap.hold_periods > 1:
+        told += (
+            f", and one after {gap.hold_periods} held periods exceeds r_h = {gap.hold_radius:.6g} with probability at most "
+            f"{_percent(gap.epsilon)} (either takes half of the {_percent(gap.beta)})"
+        )
+    lines = [told + "."]
+    lines.append(
+        f"{gap.n} independent transitions, {gap.discarded} discarded, both fixed beforehand; for r alone the confidence is "
+        f"{_percent(1.0 - scenario_confidence(gap.n, gap.discarded, gap.epsilon))}."
+    )
+    if assumption:
+        lines.append(f"This rests on an assumption that the user made: {assumption}.")
+    if DEPENDENT in gap.white_reason:
+        lines.append(f"Against the independence speaks that {gap.white_reason}.")
+    noise = f"; noise alone would make about {gap.radius_noise:.3g} of it" if gap.radius_noise is not None else ""
+    lines.append(f"r bounds measured discrepancies, with the measurement noise in them{noise}.")
+    return " ".join(lines)
+
+
+def gap_json(gap: Gap, tr: Transitions, states: tuple[str, ...]) -> dict[str, Any]:
+    """What `s2r gap --json` prints (DESIGN 9)."""
+    return {
+        "radius": gap.radius,
+        "radius_literal": gap.radius_literal,
+        "radius_noise": gap.radius_noise,
+        "hold_radius": gap.hold_radius,
+        "hold_periods": gap.hold_periods,
+        "n": gap.n,
+        "discarded": gap.discarded,
+        "epsilon": gap.epsilon,
+        "beta": gap.beta,
+        "confidence": 1.0 - scenario_confidence(gap.n, gap.discarded, gap.epsilon) if tr.independent else None,
+        "set": gap.set,
+        "weights": dict(zip(states, gap.weights, strict=True)),
+        "independent": tr.independent,
+        "assumption": tr.assumption,
+        "doubt": tr.doubt,
+        "white": gap.white,
+        "white_reason": gap.white_reason,
+        "rejected": gap.rejected,
+        "epoch": gap.epoch,
+        "recording": tr.source,
+        "model_digest": gap.model_digest,
+        "transitions_digest": gap.transitions_digest,
+        "statement": statement(gap, tr.independent, assumption=tr.assumption, doubt=tr.doubt, states=states),
+    }
+
+
+def _driven(model: ComposedModel, tr: Transitions, drive: Drive) -> Array:
+    """(n, nx) predictions with the effects' memory carried along the drive."""
+    acting = []
+    for u in drive.inputs:
+        for a in model.effects:
+            if a.effect.stage == "input":
+                u = a.effect.input_sequence(u, model.nominal, a.channel, model.dt, a.p)
+        acting.append(u)
+    u = np.concatenate(acting)[drive.step]
+    x_next = model.nominal.step(tr.x0, u, model.dt, model.parameters)
+    for a in model.effects:
+        if a.effect.stage == "step":
+            x_next = a.effect.after_step(tr.x0, u, x_next, model.nominal, a.channel, model.dt, a.p)
+    return x_next
+
+
+def _largest(d: Array, k: int) -> float:
+    """The (k+1)-th largest of d (n,)."""
+    return float(np.partition(d, len(d) - 1 - k)[len(d) - 1 - k])
+
+
+def _finite(model: ComposedModel, e: Array) -> Array:
+    if not np.all(np.isfinite(e)):
+        row, column = (int(i) for i in np.argwhere(~np.isfinite(e))[0])
+        raise ConfigError(f"model {model.spec.name!r}: its step gives a {model.states[column]} that isn't finite, at transition {row}")
+    return e
+
+
+def _checked_weights(model: ComposedModel, weights: tuple[float, ...] | Array, kind: str) -> Array:
+    w = np.asarray(weights, dtype=np.float64)
+    if w.shape != (len(model.states),) or not np.all((w > 0.0) & np.isfinite(w)):
+        raise UsageError(f"weights are {w.tolist()}, must be one number > 0 for each of {', '.join(model.states)}")
+    if kind not in {"ball", "box"}:
+        raise UsageError(f"set is {kind!r}, must be ball or box")
+    return w
+
+
+def _too_few(tr: Transitions, n: int, needed: int, epsilon: float, beta: float, discard: int) -> str:
+    if not tr.independent:
+        return f"{tr.source}: {n} transitions are there, {discard} of them to be discarded: nothing is left"
+    out = f"; left out: {', '.join(f'{count} {reason}' for reason, count in sorted(tr.rejected.items()))}" if tr.rejected else ""
+    return (
+        f"{tr.source}: {n} independent transitions, {needed} are needed for epsilon {epsilon:g}, beta {beta:g} "
+        f"and {discard} discarded: {needed - n} more{out}"
+    )
+
+
+def _percent(p: float) -> str:
+    return f"{100.0 * p:.4g} %"
