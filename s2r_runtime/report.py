@@ -49,10 +49,9 @@ def _summary(page: Page, story: Story) -> None:
     last = story.gate[-1] if story.gate else None
     if last is not None:
         page.text(f"The run ends with the gate {'open' if last[1] else 'closed'} ({last[2]}).", "good" if last[1] else "warn")
-    page.text(
-        f"{len(story.gaps)} gap{'s' * (len(story.gaps) != 1)}, {len(story.verifications)} verification attempt{'s' * (len(story.verifications) != 1)}, "
-        f"{len(story.certificates)} certificate{'s' * (len(story.certificates) != 1)}, {len(valid)} of them still valid at the end."
-    )
+    counted = [(story.gaps, "gap"), (story.verifications, "verification attempt"), (story.certificates, "certificate")]
+    words = [f"{len(things)} {name}{'' if len(things) == 1 else 's'}" for things, name in counted]
+    page.text(f"{', '.join(words)}; {len(valid)} still valid at the end.")
 
 
 def _timeline(page: Page, story: Story) -> None:

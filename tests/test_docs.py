@@ -1,0 +1,104 @@
+"""What the docs show is what happens: console blocks are run, Python blocks are run, verbs and hooks are all documented.
+
+A ```console block's lines that begin with `$ ` are commands, the lines after each are its stdout and stderr; `...` stands
+for anything. Blocks marked ```console no-run show what needs hardware, root or minutes; the demo's is run by test_demo.py.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from s2r_runtime import hookspecs
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md")])
+FENCE = re.compile(r"^```(\w+)([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def blocks(language: str) -> list[tuple[str, str]]:
+    """(page and line, text) of every fenced block in that language that is to be run."""
+    found = []
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for match in FENCE.finditer(text):
+            if match.group(1) == language and "no-run" not in match.group(2):
+                line = text.count("\n", 0, match.start()) + 1
+                found.append((f"{page.relative_to(ROOT)}:{line}", match.group(3)))
+    return found
+
+
+def commands(block: str) -> list[tuple[str, str]]:
+    """(command, expected output) pairs of a console block."""
+    pairs: list[tuple[str, str]] = []
+    for line in block.splitlines():
+        if line.startswith("$ "):
+            pairs.append((line[2:], ""))
+        elif pairs:
+            command, expected = pairs[-1]
+            pairs[-1] = (command, expected + line + "\n")
+    return pairs
+
+
+def matches(expected: str, got: str) -> bool:
+    pattern = ".*?".join(re.escape(piece) for piece in re.split(r"\.\.\.", expected.strip()))
+    return re.fullmatch(pattern, got.strip(), re.DOTALL) is not None
+
+
+@pytest.mark.parametrize(("where", "block"), blocks("console"), ids=[w for w, _ in blocks("console")])
+def test_console_block_shows_what_happens(where: str, block: str, tmp_path: Path) -> None:
+    for folder in ("profiles", "controllers"):
+        shutil.copytree(ROOT / folder, tmp_path / folder)
+    environment = {
+        **os.environ,
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        "NO_COLOR": "1",
+        "XDG_CONFIG_HOME": str(tmp_path / "config"),
+    }
+    environment.pop("XDG_RUNTIME_DIR", None)
+    for command, expected in commands(block):
+        done = subprocess.run(
+            ["bash", "-c", command], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=100, check=False
+        )
+        assert matches(expected, done.stdout + done.stderr), f"{where}: {command}\nshown:\n{expected}\ngot:\n{done.stdout}{done.stderr}"
+
+
+@pytest.mark.parametrize(("where", "block"), blocks("python"), ids=[w for w, _ in blocks("python")])
+def test_python_block_runs(where: str, block: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    exec(compile(block, where, "exec"), {"__name__": "docs"})  # noqa: S102 - the docs' own code
+
+
+def test_command_reference_is_the_command_line() -> None:
+    spec = importlib.util.spec_from_file_location("command_reference", ROOT / "tools" / "command_reference.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert (ROOT / "docs" / "commands.md").read_text(encoding="utf-8") == module.text()
+
+
+def test_every_hook_is_documented() -> None:
+    page = (ROOT / "docs" / "plugin-author.md").read_text(encoding="utf-8")
+    hooks = [name for name in vars(hookspecs) if name.startswith("s2r_")]
+    assert hooks
+    assert [name for name in hooks if f"`{name}`" not in page] == []
+
+
+def test_links_lead_somewhere() -> None:
+    links = [(page, target) for page in PAGES for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))]
+    broken = [f"{page.relative_to(ROOT)} -> {target}" for page, target in links if not (page.parent / target).exists()]
+    assert broken == []
+
+
+def test_the_map_of_files_names_every_module() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    modules = [p.stem for p in (ROOT / "s2r_runtime").glob("*.py") if not p.stem.startswith("__")]
+    assert [name for name in modules if not re.search(rf"\b{name}\b", readme)] == []
