@@ -87,7 +87,12 @@ class Transport(Protocol):
 
 
 class NominalModel(Protocol):
-    """One step of `dt`, batched. x: (n, nx), u: (n, nu); all states and inputs in SI units, angles in rad."""
+    """One step of `dt`, batched. x: (n, nx), u: (n, nu); all states and inputs in SI units, angles in rad.
+
+    It may also have: `units` (name of a state or input -> SI unit, for reports); `integration` = "euler" if it has a planar pose (x, y,
+    theta) that is moved along the heading at the start of the step; `reached` (state -> the input that it is set to at once: such
+    a state is compared with the input as it acts at the *end* of the step, the others with its mean over the step).
+    """
 
     name: str
     states: tuple[str, ...]
@@ -118,6 +123,12 @@ class Effect(Protocol):
     Stage `input`: changes the commanded input (n, nu) before the nominal step, with hidden state where it has one.
     Stage `step`: changes the result of the nominal step. An effect of stage `input` is defined by `input_step` and, for
     long recordings, the same thing over time at once, `input_sequence`; the kit checks that the two agree.
+
+    It may also have: `optional` (names of parameters that may be left out); `choices` (parameter -> its words, for one that is
+    not a number); `wrong(p) -> str` (what is wrong with values that are each within bounds, or an empty text); `once` = True (a
+    model has at most one of it); `linear` = True (it commutes with other linear effects, so the tracer tries one place in the
+    list only); and `starts(u, model, channel, dt) -> list[dict]`: parameter values from which the tracer begins, given the input
+    that it would get, u (T, nu). Without it the tracer begins from a grid over the parameters' bounds.
     """
 
     name: str

@@ -194,11 +194,18 @@ def _effect_parameters(effect: Effect, given: dict[str, Any], where: str) -> dic
         if name not in known:
             raise ConfigError(f"{where}: has no parameter {name!r}; it has: {', '.join(known)}")
         bounds = known[name]
+        allowed = getattr(effect, "choices", {}).get(name)
+        if allowed is not None and value not in allowed:
+            raise ConfigError(f"{where}: {name} is {value!r}, must be one of: {', '.join(allowed)}")
+        if allowed is None and isinstance(value, str):
+            raise ConfigError(f"{where}: {name} is {value!r}, must be a number")
         if isinstance(value, int | float) and not bounds.low <= value <= bounds.high:
             raise ConfigError(f"{where}: {name} is {value}, must be in [{bounds.low}, {bounds.high}] {bounds.unit}")
     optional = getattr(effect, "optional", ())
     if missing := [name for name in known if name not in given and name not in optional]:
         raise ConfigError(f"{where}: lacks the parameter {', '.join(missing)}")
+    if wrong := getattr(effect, "wrong", lambda p: "")(given):
+        raise ConfigError(f"{where}: {wrong}")
     return dict(given)
 
 

@@ -1,0 +1,60 @@
+"""An input acts later: u_act(t) = u(t - delay), averaged over the step.
+
+u is constant over each step of dt. With delay = (m + f) dt, 0 <= f < 1, the mean over step k is  (1 - f) u_{k-m} + f u_{k-m-1}.
+Hidden state: the last m + 1 inputs, newest first; zero at rest.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from s2r_runtime.effects.input_effect import Array, InputEffect, Values, columns, replaced
+from s2r_runtime.hookspecs import NominalModel, Parameter
+
+ROUNDING = 1e-9
+"""A delay this close below a whole number of steps is that number."""
+
+
+class InputDelay(InputEffect):
+    """delay in s; on one input, or on all alike (`*`)."""
+
+    name = "input_delay"
+    parameters = (Parameter("delay", "s", 0.0, 10.0, neutral=0.0, kink=True),)
+    all_alike = True
+    linear = True
+
+    def hidden(self, n: int, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+        """(n, c (m + 1)): zero inputs."""
+        whole, _ = _steps(p["delay"], dt)
+        return np.zeros((n, len(columns(model, channel)) * (whole + 1)))
+
+    def input_step(self, u: Array, z: Array, model: NominalModel, channel: str, dt: float, p: Values) -> tuple[Array, Array]:
+        """One step through the line of past inputs."""
+        whole, part = _steps(p["delay"], dt)
+        width = len(columns(model, channel))
+        line = np.concatenate([u[:, columns(model, channel)], z], axis=1).reshape(len(u), whole + 2, width)
+        acting = (1.0 - part) * line[:, whole] + part * line[:, whole + 1]
+        return replaced(u, model, channel, acting), line[:, :-1].reshape(len(u), -1)
+
+    def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+        """The whole recording shifted."""
+        whole, part = _steps(p["delay"], dt)
+        given = u[:, columns(model, channel)]
+        line = np.concatenate([np.zeros((whole + 1, given.shape[1])), given])
+        return replaced(u, model, channel, (1.0 - part) * line[1 : 1 + len(u)] + part * line[: len(u)])
+
+    def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
+        """Half steps at first, then wider, up to half a second or a dozen steps."""
+        wide = [s for s in (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5) if 4.0 * dt < s <= 200.0 * dt]
+        return [{"delay": s} for s in sorted({*(dt * k for k in (0.3, 0.6, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0, 12.0)), *wide})]
+
+
+def _steps(delay: float, dt: float) -> tuple[int, float]:
+    """delay / dt as a whole number of steps and the part of a step that is left."""
+    whole = math.floor(delay / dt + ROUNDING)
+    return whole, max(delay / dt - whole, 0.0)
+
+
+EFFECT = InputDelay()

@@ -1,0 +1,72 @@
+"""How a planar pose is integrated over the step, replacing the nominal model's Euler (heading at the start of the step).
+
+The nominal step turns by phi and moves by d along the first heading. With a constant body twist the pose moves by S d instead, where
+S = [[s, -c], [c, s]] (it commutes with the turn into the world's axes, so the heading itself is not needed):
+
+    euler   s = 1,                               c = 0
+    exact   s = sin(phi)/phi,                    c = (1 - cos(phi))/phi                      (an arc)
+    rk4     s = (1 + 4 cos(phi/2) + cos(phi))/6, c = (4 sin(phi/2) + sin(phi))/6             (Simpson's rule, constant twist)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from s2r_runtime.effects.input_effect import Array, Values
+from s2r_runtime.hookspecs import NominalModel, Parameter
+
+
+class IntegrationScheme:
+    """scheme: euler, exact or rk4. Acts on what the input effects left, wherever it stands in the list."""
+
+    name = "integration_scheme"
+    stage = "step"
+    parameters = (Parameter("scheme", "", 0.0, 0.0),)
+    choices = {"scheme": ("euler", "exact", "rk4")}
+    once = True
+
+    def channels(self, model: NominalModel) -> tuple[str, ...]:
+        """Models that say that they move a pose by Euler."""
+        return ("*",) if getattr(model, "integration", "") == "euler" else ()
+
+    def unit(self, model: NominalModel, channel: str, parameter: str) -> str:
+        """None."""
+        return ""
+
+    def hidden(self, n: int, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+        """None: (n, 0)."""
+        return np.zeros((n, 0))
+
+    def input_step(self, u: Array, z: Array, model: NominalModel, channel: str, dt: float, p: Values) -> tuple[Array, Array]:
+        """Not of stage `input`."""
+        return u, z
+
+    def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+        """Not of stage `input`."""
+        return u
+
+    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+        """The pose's move (n, 2) turned and shortened by S."""
+        px, py, theta = (model.states.index(name) for name in ("x", "y", "theta"))
+        along, across = _factors(x_next[:, theta] - x[:, theta], p["scheme"])
+        dx, dy = x_next[:, px] - x[:, px], x_next[:, py] - x[:, py]
+        after = x_next.copy()
+        after[:, px] = x[:, px] + along * dx - across * dy
+        after[:, py] = x[:, py] + across * dx + along * dy
+        return after
+
+    def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
+        """`rk4` is left out: within a step it cannot be told from `exact`."""
+        return [{"scheme": "exact"}, {"scheme": "euler"}]
+
+
+def _factors(phi: Array, scheme: str) -> tuple[Array, Array]:
+    if scheme == "euler":
+        return np.ones_like(phi), np.zeros_like(phi)
+    if scheme == "rk4":
+        return (1.0 + 4.0 * np.cos(phi / 2.0) + np.cos(phi)) / 6.0, (4.0 * np.sin(phi / 2.0) + np.sin(phi)) / 6.0
+    half = np.sinc(phi / (2.0 * np.pi))  # sin(phi/2) / (phi/2)
+    return np.sinc(phi / np.pi), phi / 2.0 * half * half
+
+
+EFFECT = IntegrationScheme()
