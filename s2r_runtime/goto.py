@@ -59,6 +59,37 @@ def distance(model_name: str, x: Sequence[float], target: Sequence[float]) -> fl
     return _law(model_name)[1](x, target)
 
 
+def reach(model_name: str, x: Sequence[float], u: Sequence[float], duration: float, gains: Gains) -> float:
+    """Distance, in m, beyond which no path of the model leads from x in `duration` s under the held input u."""
+    if model_name == "unicycle":
+        return abs(u[0]) * duration
+    if model_name == "differential_drive":
+        return 0.5 * gains.wheel_radius * abs(u[0] + u[1]) * duration
+    _law(model_name)
+    return math.hypot(x[2], x[3]) * duration + 0.5 * math.hypot(u[0], u[1]) * duration * duration
+
+
+def confined(model_name: str, x: Sequence[float], u: tuple[float, ...], fence: Bounds, guard: float) -> tuple[float, ...]:
+    """u, or only the turn in it where its translation would carry the robot outward within `guard` (m) of the fence.
+
+    fence: bounds of the two position axes, convex, so that the straight way that is left leads to any goal in it. A double
+    integrator cannot turn on the spot: its input is returned as it is.
+    """
+    if model_name == "unicycle":
+        ahead = u[0]
+        turn: tuple[float, ...] = (0.0, u[1])
+    elif model_name == "differential_drive":
+        ahead = u[0] + u[1]
+        turn = (0.5 * (u[0] - u[1]), 0.5 * (u[1] - u[0]))
+    else:
+        return u
+    for axis, direction in ((0, math.cos(x[2])), (1, math.sin(x[2]))):
+        low, high = fence[axis]
+        if (x[axis] > high - guard and ahead * direction > 0.0) or (x[axis] < low + guard and ahead * direction < 0.0):
+            return turn
+    return u
+
+
 def _law(model_name: str) -> tuple[Callable[..., tuple[float, ...]], Callable[..., float]]:
     law = _LAWS.get(model_name)
     if law is None:

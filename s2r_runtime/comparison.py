@@ -1,0 +1,348 @@
+"""Samples the comparison distribution on a robot (paper, section V): the campaign as a pure, seeded, resumable state machine.
+
+One sample, from observations x and inputs u, one each period of dt:
+
+    goto   waypoint ~ uniform(box inside region and geofence); Lyapunov go-to until within `waypoint_radius`
+    stop   zero input for `stop_periods` periods and 0 to 3 more (drawn: a robot or camera with a rhythm of its own is not
+           met at one phase of it again and again)
+    hold   x0 = x now, u ~ uniform(input bounds) held for `hold_periods`; x1 = x one period later; held = x at the hold's end
+
+The law pi of (x0, u): x0 as the stop leaves it inside the region; u uniform over those inputs whose hold cannot leave the
+geofence from x0 (a disc of 1.1 times the commanded way; where the geofence is wider than the region by that much: all of them).
+x0's heading, and on which side of its waypoint it lies, still depend on where the robot came from; the long hold before is what
+makes that nearly as random as a fresh start, as in the paper.
+
+Whether a sample counts is settled by x0, u, stamps and the gate, never by a prediction: nothing here knows the model's, so no
+rejection can depend on the discrepancy. The robot's own motion can cost a sample in one way only, by crossing the geofence, which
+takes one that goes a tenth farther than commanded; those are counted under the gate's reason. One transition a hold (DESIGN G7).
+
+Every draw comes from (seed, epoch, index, run, try): a resumed campaign starts the sample anew with fresh numbers, so what
+an interruption cut off is never repeated and the law is the same. Standard library and message structs only.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import msgspec
+
+from s2r_runtime import goto
+from s2r_runtime.canonical import digest_of
+from s2r_runtime.errors import ConfigError
+from s2r_runtime.messages import Observation, SampleTaken, Settings
+from s2r_runtime.profile import Sampling
+
+Bounds = tuple[tuple[float, float], ...]
+
+STAMP_TOLERANCE = 0.2
+"""Of dt: x1 and the hold's end must be within this of the stamp at which they are due. A period lost is 1.0 off."""
+JITTER_PERIODS = 4
+DRAWS = 1000
+"""Inputs tried at one x0 until one's hold stays inside; the rarest admissible share met in practice is some percent."""
+REACH_SLACK = 1.1
+ATTEMPTS = 5
+"""Waypoints in a row at which the robot did not move before it counts as stuck for good."""
+PAUSE_S = 1.0
+"""Longer silences between observations are an interruption, not time that sampling takes."""
+
+
+class CampaignStep(NamedTuple):
+    """Answer to one observation. `u`: (nu,), what to command. `sample`: there when one was completed by this observation.
+
+    `done`: all n samples are there. `failed`: not empty iff the campaign cannot go on, and why. Both stay so.
+    """
+
+    u: tuple[float, ...]
+    phase: str
+    sample: SampleTaken | None = None
+    done: bool = False
+    failed: str = ""
+
+
+class Progress(NamedTuple):
+    """How far it is. Times in the robot's seconds; `left_s`: None until a sample tells how long one takes."""
+
+    phase: str
+    taken: int
+    n: int
+    rejected: dict[str, int]
+    elapsed_s: float
+    left_s: float | None
+
+
+class Snapshot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a campaign needs to go on after an interruption. `digest`: of what it was begun with."""
+
+    digest: str
+    index: int
+    run: int
+    rejected: dict[str, int]
+    elapsed_ns: int
+
+
+class Campaign:
+    """Draws `n` independent transitions. region, geofence: bounds a state (angles may be bounded by their circle); dt in s.
+
+    epoch, seed: name the draws. gains: of the go-to law. Raises ConfigError for a model without a go-to law, and where the
+    settings leave no room for waypoints.
+    """
+
+    def __init__(
+        self,
+        model_name: str,
+        states: tuple[str, ...],
+        angles: tuple[str, ...],
+        region: Bounds,
+        geofence: Bounds,
+        input_bounds: Bounds,
+        dt: float,
+        settings: Sampling,
+        *,
+        n: int,
+        epoch: int,
+        seed: int,
+        gains: goto.Gains | None = None,
+    ) -> None:
+        self._model = model_name
+        self._gains = gains or goto.Gains(settings.position_gain, settings.heading_gain)
+        goto.distance(model_name, (0.0,) * len(states), (0.0, 0.0))  # the law must exist
+        self._region, self._fence, self._bounds = region, geofence, input_bounds
+        self._circles = {i for i, name in enumerate(states) if name in angles and region[i][1] - region[i][0] > 2.0 * math.pi - 1e-9}
+        self._angles = [i for i, name in enumerate(states) if name in angles]
+        self._settings, self._dt_ns, self._dt = settings, round(dt * 1e9), dt
+        self._n, self._epoch, self._seed = n, epoch, seed
+        self._box = _waypoint_box(states, region, geofence, settings.waypoint_margin)
+        self._guard = min(0.05, 0.5 * settings.waypoint_margin)
+        self._zero = (0.0,) * len(input_bounds)
+        self.digest = digest_of([model_name, states, region, geofence, input_bounds, dt, settings, n, epoch, seed, self._gains])
+        self._index = self._run = self._try = 0
+        self._rejected: dict[str, int] = {}
+        self._elapsed_ns, self._last_ns = 0, -1
+        self._failed = ""
+        self._refused, self._refusals, self._motionless = False, 0, 0
+        self._held_u = self._zero
+        self._mark: tuple[int, tuple[float, ...]] | None = None
+        self._x0: Observation | None = None
+        self._x1: Observation | None = None
+        self._phases: dict[str, Callable[[Observation], CampaignStep]] = {"goto": self._goto, "stop": self._stop, "hold": self._hold}
+        self._begin_try()
+
+    @classmethod
+    def from_settings(cls, settings: Settings, sampling: Sampling, *, n: int, epoch: int, seed: int) -> Campaign:
+        """A campaign as the core's settings and the profile's `[sampling]` describe it."""
+        return cls(
+            settings.model_name,
+            settings.states,
+            settings.angles,
+            settings.region,
+            settings.geofence,
+            settings.input_bounds,
+            settings.dt_ns * 1e-9,
+            sampling,
+            n=n,
+            epoch=epoch,
+            seed=seed,
+        )
+
+    # ------------------------------------------------------------------ interruption
+
+    def snapshot(self) -> dict[str, Any]:
+        """Plain data to go on from. Take one when the campaign begins, after `restore`, and with every sample."""
+        state = Snapshot(self.digest, self._index, self._run, dict(self._rejected), self._elapsed_ns)
+        plain: dict[str, Any] = msgspec.to_builtins(state)
+        return plain
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Goes on from a snapshot, with fresh draws. Raises ConfigError if it is not of a campaign with these settings."""
+        try:
+            state = msgspec.convert(snapshot, Snapshot)
+        except msgspec.ValidationError as error:
+            raise ConfigError(f"campaign snapshot: {error}") from None
+        if state.digest != self.digest:
+            raise ConfigError("campaign snapshot: is of a campaign with other settings; begin a new one")
+        self._index, self._run, self._rejected, self._elapsed_ns = state.index, state.run + 1, dict(state.rejected), state.elapsed_ns
+        self._last_ns, self._try, self._failed, self._refusals, self._motionless = -1, 0, "", 0, 0
+        self._begin_try()
+
+    def progress(self) -> Progress:
+        """Samples so far and the time that the others will take, at the pace so far."""
+        left = self._elapsed_ns * 1e-9 * (self._n - self._index) / self._index if self._index else None
+        return Progress(self._phase, self._index, self._n, dict(self._rejected), self._elapsed_ns * 1e-9, left)
+
+    # ------------------------------------------------------------------ one period
+
+    def step(self, observation: Observation) -> CampaignStep:
+        """What to command in answer to this observation. One call a control instant, in the order of the stamps."""
+        if self._failed or self._index >= self._n:
+            return self._over()
+        now = observation.stamp_ns
+        if self._last_ns < 0:
+            self._last_ns = self._began_ns = now
+        if now < self._last_ns or now - self._last_ns > PAUSE_S * 1e9:
+            if self._phase == "hold":
+                self._reject("interrupted")
+            self._began_ns, self._mark = now, None
+        else:
+            self._elapsed_ns += now - self._last_ns
+        self._last_ns = now
+        if self._failed:
+            return self._over()
+        if observation.fault or len(observation.x) != len(self._region):
+            return self._answer(self._held_u if self._phase == "hold" else self._zero)
+        step = self._phases[self._phase](observation)
+        self._refused = False
+        return step
+
+    def refused(self, obs_seq: int, reason: str) -> None:
+        """The gate refused the answer to that observation: another input acted, so the sample under way is lost.
+
+        On the way to a waypoint nothing is lost, and a stop begins anew; but a gate that lets nothing through for `stuck_after`
+        ends the campaign.
+        """
+        if self._failed or self._index >= self._n:
+            return
+        self._refused = True
+        self._refusals += 1
+        self._mark = None
+        if self._phase == "hold":
+            self._reject(reason)
+        if self._refusals * self._dt >= self._settings.stuck_after and not self._failed:
+            self._failed = f"the gate refuses the sampler ({reason}) since {self._refusals} periods, the last at observation {obs_seq}"
+
+    # ------------------------------------------------------------------ phases
+
+    def _begin_try(self) -> None:
+        """Draws the next waypoint. Each try has random numbers of its own."""
+        self._rng = random.Random(f"{self._seed}/{self._epoch}/{self._index}/{self._run}/{self._try}")
+        self._try += 1
+        self._waypoint = tuple(self._rng.uniform(low, high) for low, high in self._box)
+        self._stop_periods = self._settings.stop_periods + self._rng.randrange(JITTER_PERIODS)
+        self._phase = "goto"
+        self._began_ns = self._last_ns
+        self._held_u, self._mark, self._x0, self._x1 = self._zero, None, None, None
+
+    def _goto(self, observation: Observation) -> CampaignStep:
+        x, now = observation.x, observation.stamp_ns
+        if goto.distance(self._model, x, self._waypoint) <= self._settings.waypoint_radius:
+            self._phase, self._began_ns, self._motionless = "stop", now, 0
+            return self._answer(self._zero)
+        if now - self._began_ns > self._settings.waypoint_timeout * 1e9:
+            return self._again("timeout", observation)
+        u = goto.go_to(self._model, x, self._waypoint, self._bounds, self._gains)
+        if self._mark is None or self._moved(self._mark[1], x) or not any(u):
+            self._mark = (now, x)
+        elif now - self._mark[0] > self._settings.stuck_after * 1e9:
+            self._motionless += 1
+            if self._motionless >= ATTEMPTS:
+                waited = ATTEMPTS * self._settings.stuck_after
+                self._failed = f"stuck: commanded for {waited:g} s toward {ATTEMPTS} waypoints, the robot did not move from {_point(x)}"
+                return self._over()
+            return self._again("stuck", observation)
+        return self._answer(goto.confined(self._model, x, u, self._fence[:2], self._guard))
+
+    def _stop(self, observation: Observation) -> CampaignStep:
+        if self._refused:
+            self._began_ns = observation.stamp_ns
+        if observation.stamp_ns - self._began_ns < (self._stop_periods - 0.5) * self._dt_ns:
+            return self._answer(self._zero)
+        if not self._inside(observation.x, self._region):
+            return self._again("outside_region", observation)
+        u = self._draw_input(observation.x)
+        if u is None:
+            return self._again("outside_geofence", observation)
+        self._phase, self._began_ns, self._held_u, self._x0 = "hold", observation.stamp_ns, u, observation
+        return self._answer(u)
+
+    def _hold(self, observation: Observation) -> CampaignStep:
+        since, dt, periods = observation.stamp_ns - self._began_ns, self._dt_ns, self._settings.hold_periods
+        slack = STAMP_TOLERANCE * dt
+        if self._x1 is None and since >= dt - slack:
+            if since > dt + slack:
+                return self._again("lost_observation", observation)
+            self._x1 = observation
+        if since < periods * dt - slack:
+            return self._answer(self._held_u)
+        if since > periods * dt + slack or self._x1 is None:
+            return self._again("lost_observation", observation)
+        return self._take(observation)
+
+    def _take(self, observation: Observation) -> CampaignStep:
+        """The hold is over: one sample more. The same observation begins the way to the next waypoint."""
+        assert self._x0 is not None  # noqa: S101 - set on entering the hold
+        assert self._x1 is not None  # noqa: S101 - checked by the caller
+        periods = self._settings.hold_periods
+        sample = SampleTaken(
+            t_ns=observation.stamp_ns,
+            epoch=self._epoch,
+            index=self._index,
+            obs_seq0=self._x0.seq,
+            t0_ns=self._x0.stamp_ns,
+            u=self._held_u,
+            x0=self._x0.x,
+            x1=self._x1.x,
+            held=observation.x if periods > 1 else (),
+            periods=periods,
+        )
+        self._index, self._try, self._refusals = self._index + 1, 0, 0
+        self._begin_try()
+        following = self._over() if self._index >= self._n else self._goto(observation)
+        return following._replace(sample=sample)
+
+    # ------------------------------------------------------------------ small parts
+
+    def _answer(self, u: tuple[float, ...]) -> CampaignStep:
+        if not self._refused:
+            self._refusals = 0
+        return CampaignStep(u, self._phase)
+
+    def _over(self) -> CampaignStep:
+        return CampaignStep(self._zero, "over", None, self._index >= self._n, self._failed)
+
+    def _reject(self, reason: str) -> None:
+        """Counts, and begins the sample anew elsewhere; too many end the campaign."""
+        self._rejected[reason] = self._rejected.get(reason, 0) + 1
+        total, most = sum(self._rejected.values()), self._settings.max_rejections
+        if total > most:
+            counts = ", ".join(f"{name} {count}" for name, count in sorted(self._rejected.items()))
+            self._failed = f"more than {most} samples were rejected after {self._index} of {self._n}: {counts}"
+        self._begin_try()
+
+    def _again(self, reason: str, observation: Observation) -> CampaignStep:
+        self._reject(reason)
+        return self._over() if self._failed else self._goto(observation)
+
+    def _draw_input(self, x: tuple[float, ...]) -> tuple[float, ...] | None:
+        """Uniform over the inputs whose hold stays inside the geofence from x; None if there is hardly any."""
+        room = min(min(x[axis] - low, high - x[axis]) for axis, (low, high) in enumerate(self._fence[:2]))
+        duration = self._settings.hold_periods * self._dt
+        for _ in range(DRAWS):
+            u = tuple(self._rng.uniform(low, high) for low, high in self._bounds)
+            if REACH_SLACK * goto.reach(self._model, x, u, duration, self._gains) <= room:
+                return u
+        return None
+
+    def _inside(self, x: tuple[float, ...], bounds: Bounds) -> bool:
+        return all(i in self._circles or low <= x[i] <= high for i, (low, high) in enumerate(bounds))
+
+    def _moved(self, a: tuple[float, ...], b: tuple[float, ...]) -> bool:
+        """A tenth of the waypoint's radius, or as many radians of turn: far above noise, far below a period's worth of stuck_after."""
+        turn = max((abs(math.remainder(b[i] - a[i], 2.0 * math.pi)) for i in self._angles), default=0.0)
+        return max(math.hypot(b[0] - a[0], b[1] - a[1]) / self._settings.waypoint_radius, turn) > 0.1
+
+
+def _waypoint_box(states: tuple[str, ...], region: Bounds, fence: Bounds, margin: float) -> Bounds:
+    """Where waypoints are drawn: the two position axes, `margin` inside of region and geofence."""
+    box = tuple((max(region[i][0], fence[i][0]) + margin, min(region[i][1], fence[i][1]) - margin) for i in (0, 1))
+    for name, (low, high) in zip(states, box, strict=False):
+        if not low < high:
+            raise ConfigError(
+                f"sampling.waypoint_margin is {margin} m: it leaves no room for waypoints along {name!r} in region and geofence"
+            )
+    return box
+
+
+def _point(x: tuple[float, ...]) -> str:
+    return f"({x[0]:.2f}, {x[1]:.2f}) m"
