@@ -131,6 +131,8 @@ class CertificateFacts(Struct, frozen=True):
     verified_radius: float
     issued_unix_s: int
     expires_unix_s: int
+    attempt: int = 0
+    """Verification attempt that it rests on, so that a loaded certificate counts as spent."""
 
 
 # ---------------------------------------------------------------- the core's settings and memory
@@ -171,6 +173,14 @@ class Settings(Struct, frozen=True):
     seed: int
     campaign_timeout_s: float = 0.0
     trace_after_campaign: bool = False
+    required_laws: tuple[str, ...] = ()
+    """Disturbance laws that must pass (DESIGN G8); empty: not said, the verification's own word counts."""
+    campaign_digest: str = ""
+    """Of what a gap rests on besides the model: region, inputs, norm, sampling, guarantee. Another one voids the gap."""
+
+
+MEMORY_SCHEMA = 1
+"""Of `Memory`: a memory of another schema is refused."""
 
 
 class Memory(Struct, frozen=True):
@@ -188,6 +198,14 @@ class Memory(Struct, frozen=True):
     latched: tuple[str, ...] = ()
     campaign_epoch: int = 0
     """Epoch of a campaign that was begun and not finished (0: none); resuming it costs no new epoch."""
+    campaign_n: int = 0
+    """How many samples that campaign fixed beforehand."""
+    campaign_digest: str = ""
+    """`Settings.campaign_digest` when the gap in force was measured."""
+    alarm_epoch: int = 0
+    """Epoch whose gap the watch refuted (0: none): it founds no certificate any more, only a fresh campaign does."""
+    traced: bool = False
+    """An effect was traced in the residual and no model that has it was adopted since (DESIGN G8)."""
 
 
 # ---------------------------------------------------------------- events: into the core
@@ -277,6 +295,8 @@ class Measured(Struct, frozen=True, tag="measured"):
     e_value: float
     n: int
     exceedances: int
+    epoch: int = 0
+    """Of the gap it was measured against; one of another epoch than that in force is ignored (0: not said)."""
 
 
 class SourceStarted(Struct, frozen=True, tag="source_started"):
@@ -363,6 +383,14 @@ class CertificateStored(Struct, frozen=True, tag="certificate_stored"):
     request_id: int = 0
 
 
+class CertificateFailed(Struct, frozen=True, tag="certificate_failed"):
+    """An `IssueCertificate` came to nothing (no key, or it could not be made durable), or a loaded certificate was refused."""
+
+    t_ns: int
+    error: str
+    request_id: int = 0
+
+
 class Requested(Struct, frozen=True, tag="requested"):
     """An operator's decision, from the control socket. `by`: user id of the peer. Unused fields are at their defaults.
 
@@ -382,7 +410,8 @@ class Requested(Struct, frozen=True, tag="requested"):
 
 Event = (
     Started | Observed | Proposed | Ticked | WallClockRead | LinkChanged | RecorderChanged | AnalyticsChanged | OverrideChanged | Measured
-    | EpisodeEnded | SourceStarted | SourceStopped | SampleTaken | CampaignFinished | JobFinished | CertificateStored | Requested | Stopping
+    | EpisodeEnded | SourceStarted | SourceStopped | SampleTaken | CampaignFinished | JobFinished | CertificateStored | CertificateFailed
+    | Requested | Stopping
 )  # fmt: skip
 
 
