@@ -10,6 +10,7 @@ import math
 
 import msgspec
 
+from s2r_runtime.canonical import digest_of
 from s2r_runtime.messages import Settings
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Profile
@@ -66,4 +67,12 @@ def settings_of(profile: Profile, model: ModelSpec, facts: ModelFacts, seed: int
         certificate_lifetime_s=round(profile.certificate.lifetime),
         seed=profile.sampling.seed if seed is None else seed,
         trace_after_campaign=profile.repair.after_campaign,
+        required_laws=profile.verification.required,
+        campaign_digest=campaign_digest(profile),
     )
+
+
+def campaign_digest(profile: Profile) -> str:
+    """Digest of what a gap rests on besides the model: the law of the samples, the norm, and what was fixed beforehand."""
+    tables = (profile.region, profile.geofence, profile.inputs, profile.norm, profile.sampling, profile.guarantee)
+    return digest_of([msgspec.to_builtins(table) for table in tables])
