@@ -1,0 +1,286 @@
+"""Reads a log, in constant memory, and says how it ended.
+
+Nothing is given out before the seal after it was checked: bytes, CRC, sequence, chain, signature. A file that a crash cut
+reads to its last sealed message. What differs from what the writer would have written, be it one bit, ends the reading
+there, with the place named.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import BinaryIO, Literal
+
+import msgspec
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+from mcap.opcode import Opcode
+from mcap.records import Header
+
+from s2r_runtime.blocks import Block, Damage, find, take
+from s2r_runtime.chain import GENESIS, advance, is_signed_by
+from s2r_runtime.channels import CHAIN, CHANNELS, Seal, decoder
+from s2r_runtime.errors import RecordingError
+from s2r_runtime.layout import (
+    ABOUT,
+    LIBRARY,
+    MAGIC,
+    MESSAGE,
+    RECORD,
+    RECOVERED,
+    Attached,
+    attachment_fields,
+    declared,
+    metadata_fields,
+    pack,
+)
+from s2r_runtime.messages import Struct
+from s2r_runtime.summary import tail
+
+_START = MAGIC + pack(Header("", LIBRARY))
+
+
+class Entry(msgspec.Struct, frozen=True, gc=False):
+    """One message. `index`: its number in the run (over all parts); raw: its bytes as recorded."""
+
+    index: int
+    channel: str
+    log_time_ns: int
+    message: Struct
+    raw: bytes
+
+
+class Ending(msgspec.Struct, frozen=True):
+    """How a log ended. `index`: all messages of the run before it are good; `offset`: bytes of the file that are.
+
+    closed: properly, all is there. rotated: likewise, and the next part goes on. cut: the end is not there (a crash), all
+    before it is. broken: something is there that was not recorded like this.
+    """
+
+    kind: Literal["closed", "rotated", "cut", "broken"]
+    index: int
+    offset: int
+    lost_bytes: int
+    detail: str
+
+
+class Reading:
+    """A log file that is being read: iterate it once for its entries, then look at `ending`.
+
+    path: of one part. channels: give out and decode these only (None: all but the seals); all are checked. metadata,
+    attachments: those that stood before what was read so far. Raises RecordingError for a file that is no log of this
+    software, or of another version.
+    """
+
+    def __init__(self, path: Path, channels: Iterable[str] | None = None) -> None:
+        self.path = path
+        self.wanted = frozenset(CHANNELS) - {CHAIN} if channels is None else frozenset(channels)
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.attachments: list[Attached] = []
+        self.ending: Ending | None = None
+        self.signed = False
+        self.counts: dict[str, int] = {}
+        self.run, self.part, self.first_index = "", 0, 0
+        self.public_key = b""
+        self.previous_head = self.head = GENESIS
+        try:
+            self._file: BinaryIO = path.open("rb")
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+        self._size = os.fstat(self._file.fileno()).st_size
+        self._start = self._read_start()
+        self.head, self._index = self.previous_head, self.first_index
+        self._at = self._crc = self._log_time = 0
+        self._seal, self._final = b"", ""
+        self._schemas: dict[int, bytes] = {}
+        self._channels: dict[int, bytes] = {}
+        self._topics: dict[int, str] = {}
+
+    # ---- the start
+
+    def _read_start(self) -> bytes:
+        """Magic, header and the metadata that says what this is. Empty if the file ends before they do."""
+        found = self._file.read(len(_START))
+        if found != _START[: len(found)]:
+            raise RecordingError(f"{self.path}: is not a log of this version of s2r (its first bytes are not those of one)")
+        head = self._file.read(RECORD.size)
+        if len(head) < RECORD.size or len(_START) + RECORD.size + RECORD.unpack(head)[1] > self._size:
+            return b""
+        record = head + self._file.read(RECORD.unpack(head)[1])
+        try:
+            name, about = metadata_fields(record)
+            self.run, self.part, self.first_index = about["run"], int(about["part"]), int(about["first_index"])
+            self.public_key, self.previous_head = bytes.fromhex(about["public_key"]), bytes.fromhex(about["previous_head"])
+            self._key = Ed25519PublicKey.from_public_bytes(self.public_key) if self.public_key else None
+        except (ValueError, KeyError) as error:
+            raise RecordingError(f"{self.path}: its metadata is damaged: {error}") from None
+        if name != ABOUT or head[0] != Opcode.METADATA:
+            raise RecordingError(f"{self.path}: begins with metadata {name!r}, a log begins with {ABOUT!r}")
+        self.metadata[name] = about
+        return found + record
+
+    # ---- the messages
+
+    def __iter__(self) -> Iterator[Entry]:
+        """The entries, once. Afterwards `ending` is there."""
+        try:
+            if not self._start:
+                raise Damage(0, "the file ends before its first record", cut=True)
+            while (block := self._take()) is not None:
+                if block.last:
+                    self._finish(block)
+                    return
+                self._check(block)
+                self._note(block)
+                index, self._at = self._index, block.end
+                self._index += len(block.messages)
+                yield from self._entries(block, index)
+                if block.index_cut:
+                    self._end("cut", "the file ends inside a chunk's index")
+                    return
+            self._end("cut", "the index is missing" if self._final else "the file ends between two chunks")
+        except Damage as damage:
+            self._damaged(damage)
+        finally:
+            self._file.close()
+
+    def _take(self) -> Block | None:
+        start = b"" if self._at else self._start
+        self._file.seek(self._at + len(start))
+        return take(self._file, self._at, self._size, start)
+
+    def _check(self, block: Block) -> None:
+        """Sequence, times, chain and signature of a block."""
+        if self._final:
+            raise Damage(block.offset, "something follows the last seal")
+        schemas, declarations, topics = declared(block.declarations)
+        self._schemas |= schemas
+        self._channels |= declarations
+        self._topics |= topics
+        for number, part in enumerate(block.messages, self._index):
+            if part.sequence != number & 0xFFFFFFFF:
+                raise Damage(block.offset, f"message {number} is missing or out of its place")
+            if part.log_time_ns < self._log_time:
+                raise Damage(block.offset, f"message {number} goes back in time")
+            self._log_time = part.log_time_ns
+        last = block.messages[-1]
+        if self._topics.get(last.channel) != CHAIN:
+            raise Damage(block.offset, "a chunk is not sealed")
+        raw = block.content[last.start :]
+        try:
+            seal = msgspec.json.decode(raw, type=Seal)
+        except msgspec.DecodeError as error:
+            raise Damage(block.offset, f"a seal cannot be read: {error}") from None
+        seal_at = last.start - MESSAGE.size
+        head = advance(self.head, self._seal, [*block.prefix, memoryview(block.content)[:seal_at]])
+        count = self._index + len(block.messages) - 1
+        if msgspec.json.encode(Seal(last.log_time_ns, count, head, self._crc, seal.end, seal.signature)) != raw:
+            raise Damage(block.offset, "the chain does not hold: this is not what was sealed")
+        if self._key is None:
+            if seal.signature:
+                raise Damage(block.offset, "a seal is signed in a log that has no key")
+        elif not is_signed_by(seal, self._key):
+            raise Damage(block.offset, "a seal's signature is not that of the log's key")
+        self.head, self.signed, self._final = head, self._key is not None, seal.end
+        self._seal = block.content[seal_at:]
+        self._crc = self._crc_until(block.end)
+
+    def _crc_until(self, end: int) -> int:
+        self._file.seek(self._at)
+        return zlib.crc32(self._file.read(end - self._at), self._crc)
+
+    def _note(self, block: Block) -> None:
+        for record in block.prefix:
+            data = record[len(self._start) :] if record is block.prefix[0] and block.offset == 0 else record
+            if data and data[0] == Opcode.ATTACHMENT:
+                self.attachments.append(_attached(data, block.offset))
+            elif data:
+                name, fields = _metadata(data, block.offset)
+                self.metadata[name] = fields
+
+    def _entries(self, block: Block, index: int) -> Iterator[Entry]:
+        content, counts, wanted, topics = block.content, self.counts, self.wanted, self._topics
+        for number, part in enumerate(block.messages, index):
+            name = topics.get(part.channel, "")
+            counts[name] = counts.get(name, 0) + 1
+            if name in wanted:
+                raw = content[part.start : part.stop]
+                try:
+                    message = decoder(name).decode(raw)
+                except msgspec.ValidationError as error:
+                    raise RecordingError(f"{self.path}: message {number} ({name}) is of another version: {error}") from None
+                yield Entry(number, name, part.log_time_ns, message, raw)
+            elif name not in CHANNELS:
+                raise RecordingError(f"{self.path}: message {number} is on channel {name!r}, which this version does not know")
+
+    # ---- the end
+
+    def _finish(self, block: Block) -> None:
+        """After the data section: the rest must be exactly what `tail` makes, or a beginning of it."""
+        for record in block.prefix:
+            if record[0] != Opcode.METADATA or _metadata(record, block.offset)[0] != RECOVERED:
+                raise Damage(block.offset, "a record at the end was not sealed")
+            self.metadata[RECOVERED] = _metadata(record, block.offset)[1]
+        self._crc = self._crc_until(block.end)
+        at = self._at = block.end
+        self._file.seek(at)
+        for piece in tail(self._read_at, block.end, self._crc, self._schemas, self._channels):
+            found = self._file.read(len(piece))
+            if found != piece:
+                if at + len(found) == self._size and piece.startswith(found):
+                    self._end("cut", "the file ends inside its index")
+                    return
+                raise Damage(at, "the index at the end is not that of the messages")
+            at += len(piece)
+        if at != self._size:
+            raise Damage(at, "something follows the end")
+        self._at = at
+        if RECOVERED in self.metadata or not self._final:
+            self._end("cut", "was recovered from a file that was cut" if block.prefix else "the last seal is missing")
+        else:
+            self._end("closed" if self._final == "closed" else "rotated", "")
+
+    def _read_at(self, length: int, offset: int) -> bytes:
+        return os.pread(self._file.fileno(), length, offset)
+
+    def _damaged(self, damage: Damage) -> None:
+        """A cut tail has nothing good after it; if there is something, a record in the middle was damaged."""
+        cut = damage.cut or self._zero_from(damage.offset)
+        if cut and find(self._file, damage.offset + 1, self._size) is None:
+            self._end("cut", damage.detail)
+        else:
+            self._end("broken", f"at byte {damage.offset}: {damage.detail}")
+
+    def _zero_from(self, offset: int) -> bool:
+        """Whether only zeros follow: what a file system may leave of a write that a power cut stopped."""
+        self._file.seek(offset)
+        while data := self._file.read(1 << 20):
+            if data.count(0) != len(data):
+                return False
+        return True
+
+    def _end(self, kind: Literal["closed", "rotated", "cut", "broken"], detail: str) -> None:
+        self.ending = Ending(kind, self._index, self._at, self._size - self._at, detail)
+
+
+def _attached(record: bytes, offset: int) -> Attached:
+    try:
+        return attachment_fields(record)
+    except ValueError as error:
+        raise Damage(offset, str(error)) from None
+
+
+def _metadata(record: bytes, offset: int) -> tuple[str, dict[str, str]]:
+    try:
+        return metadata_fields(record)
+    except ValueError as error:
+        raise Damage(offset, str(error)) from None
+
+
+def read(path: Path, channels: Iterable[str] | None = None) -> Reading:
+    """Opens a log for reading: see `Reading`."""
+    return Reading(path, channels)
+
+
+__all__ = ["Ending", "Entry", "Reading", "read"]
