@@ -259,18 +259,15 @@ def gap_json(gap: Gap, tr: Transitions, states: tuple[str, ...]) -> dict[str, An
 
 def _driven(model: ComposedModel, tr: Transitions, drive: Drive) -> Array:
     """(n, nx) predictions with the effects' memory carried along the drive."""
-    acting = []
-    for u in drive.inputs:
-        for a in model.effects:
-            if a.effect.stage == "input":
-                u = a.effect.input_sequence(u, model.nominal, a.channel, model.dt, a.p)
-        acting.append(u)
-    u = np.concatenate(acting)[drive.step]
-    x_next = model.nominal.step(tr.x0, u, model.dt, model.parameters)
-    for a in model.effects:
-        if a.effect.stage == "step":
-            x_next = a.effect.after_step(tr.x0, u, x_next, model.nominal, a.channel, model.dt, a.p)
-    return x_next
+    mean = np.concatenate(drive.inputs)
+    end = mean.copy()
+    row = 0
+    for stretch in drive.inputs if any(a.effect.stage == "input" for a in model.effects) else ():
+        hidden = model.at_rest(1)
+        for u in stretch:
+            mean[row : row + 1], end[row : row + 1], hidden = model.act(u[None, :], hidden)
+            row += 1
+    return model.advance(tr.x0, mean[drive.step], end[drive.step])
 
 
 def _largest(d: Array, k: int) -> float:

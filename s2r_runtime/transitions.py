@@ -1,0 +1,288 @@
+"""A recording -> its transitions, ready for a gap (DESIGN 8, 9; one transition a held input: G7).
+
+MCAP: a campaign's samples are marked (`SampleTaken`). The last campaign that was completed counts, or the epoch asked for; one that was not
+completed gives its samples without a statement, since N was not fixed beforehand. A log without samples is ordinary driving.
+
+CSV with segments: the first row of each is x0. Its input must hold for at least dt; x1 is interpolated linearly at t0 + dt (angles
+unwrapped). Where the input holds h whole steps in every segment used, and the states last as long, the state at t0 + h dt is
+the hold's end. Segments are taken for independent draws that begin at rest: that is what the form says, it can't be checked here
+beyond the order of the samples (`whiteness`). Left out, and counted by reason: `first_row_incomplete`, `no_input`, `input_changed`,
+`too_short`, `state_gap` (x1 would be interpolated across a hole in a stream that is otherwise denser).
+
+CSV without segments: ordinary driving (`driving`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.canonical import digest, digest_of
+from s2r_runtime.driving import Streams, drive_transitions, resolution, state_at, streams_noise
+from s2r_runtime.errors import RecordingError, UsageError
+from s2r_runtime.gap import Transitions
+from s2r_runtime.messages import CampaignFinished, Observed, SampleTaken, Send, Started
+from s2r_runtime.models.composed import ComposedModel, wrap
+from s2r_runtime.tables import read_csv
+
+Array = NDArray[np.float64]
+
+HOLE = 10.0
+"""Segments: x1 is not interpolated across more than this many dt, if that is also this many times the stream's own step: a lost link."""
+
+CHANNELS = ("event/started", "event/observed", "event/sample_taken", "event/campaign_finished", "out/send")
+
+
+def load_transitions(
+    path: Path | str, model: ComposedModel, columns: Mapping[str, str] | None = None, *, epoch: int | None = None
+) -> Transitions:
+    """The transitions of a recording, whichever form it has. columns: model name -> column name, where they differ.
+
+    Raises RecordingError (not readable, columns missing, of another robot).
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            log = file.read(5) == b"\x89MCAP"
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+    if log or path.suffix == ".mcap":
+        return from_mcap(path, model, epoch=epoch)
+    if epoch is not None:
+        raise UsageError(f"{path}: a CSV has no epochs")
+    return from_csv(path, model, columns or {}, model.dt)
+
+
+# ---------------------------------------------------------------- CSV
+
+
+def from_csv(path: Path, model: ComposedModel, columns: Mapping[str, str], dt: float) -> Transitions:
+    """Transitions of `dt` s (the model's step) from a CSV or CSV.gz. Raises RecordingError; UsageError if dt isn't the model's."""
+    if dt != model.dt:
+        raise UsageError(f"dt is {dt} s, the model's step is {model.dt} s")
+    names = [columns.get(name, name) for name in (*model.states, *model.inputs)]
+    table = read_csv(path, names)
+    values = np.column_stack([table.columns[name] for name in names])
+    nx = len(model.states)
+    whole = Streams(table.t, values[:, :nx], values[:, nx:])
+    recording = digest(path.read_bytes())
+    if table.segment is None:
+        return drive_transitions(model, [whole], recording, str(path))
+    edges = np.flatnonzero(np.diff(table.segment, prepend=-1, append=-1))
+    segments = [whole.rows(slice(a, b)) for a, b in pairwise(edges.tolist())]
+    found = _segment_transitions(model, segments, recording, str(path))
+    return replace(found, noise=streams_noise(model, segments))
+
+
+@dataclass(frozen=True)
+class _Start:
+    """A segment whose first transition is there. whole_steps: of dt for which the input held and every state was received."""
+
+    streams: Streams
+    x0: Array
+    u: Array
+    x1: Array
+    whole_steps: int
+
+
+def _segment_transitions(model: ComposedModel, segments: list[Streams], recording: str, source: str) -> Transitions:
+    rejected: dict[str, int] = {}
+    used: list[_Start] = []
+    for segment in segments:
+        start = _first_transition(model, segment)
+        if isinstance(start, str):
+            rejected[start] = rejected.get(start, 0) + 1
+        else:
+            used.append(start)
+    periods = min((start.whole_steps for start in used), default=1)
+    held = None
+    if periods > 1:
+        held = _rows([_states_at(model, s.streams, periods)[0] for s in used], len(model.states))
+    return Transitions(
+        _rows([s.x0 for s in used], len(model.states)),
+        _rows([s.u for s in used], len(model.inputs)),
+        _rows([s.x1 for s in used], len(model.states)),
+        held,
+        max(1, periods),
+        independent=True,
+        rejected=rejected,
+        digest=recording,
+        t0_s=np.array([s.streams.t[0] for s in used]),
+        source=source,
+    )
+
+
+def _first_transition(model: ComposedModel, s: Streams) -> _Start | str:
+    """The segment's transition, or why it has none. Rows with the first row's stamp belong to it."""
+    tolerance = resolution(s.t, model.dt)
+    due = s.t[0] + model.dt
+    first = np.searchsorted(s.t, s.t[0], side="right")
+    x0, u = _first_received(s.x[:first]), _first_received(s.u[:first])
+    if np.isnan(x0).any():
+        return "first_row_incomplete"
+    if np.isnan(u).any():
+        return "no_input"
+    changed = s.t[np.any(np.isfinite(s.u) & (s.u != u), axis=1)]
+    until = float(changed[0]) if len(changed) else np.inf
+    if until < due - tolerance:
+        return "input_changed"
+    last = min(float(s.t[np.isfinite(s.x[:, c])][-1]) for c in range(s.x.shape[1]))
+    if last < due - tolerance:
+        return "too_short"
+    x1, hole = _states_at(model, s, 1)
+    if hole > HOLE * model.dt and hole > HOLE * float(np.median(np.diff(s.t))):
+        return "state_gap"
+    for column in model.angle_columns:
+        x0[column] = wrap(x0[column])
+    return _Start(s, x0, u, x1, int((min(until, last) - s.t[0] + tolerance) / model.dt))
+
+
+def _first_received(rows: Array) -> Array:
+    """(m, c) -> (c,): the last value received at the first stamp, NaN if there is none."""
+    value = np.full(rows.shape[1], np.nan)
+    for row in rows:
+        value = np.where(np.isfinite(row), row, value)
+    return value
+
+
+def _states_at(model: ComposedModel, s: Streams, periods: int) -> tuple[Array, float]:
+    """(states (nx,) `periods` steps after the segment began, the widest hole that was interpolated across)."""
+    when, tolerance = s.t[:1] + periods * model.dt, resolution(s.t, model.dt)
+    x, hole = np.empty(len(model.states)), 0.0
+    for column in range(len(model.states)):
+        angle = column in model.angle_columns
+        value, width = state_at(s, column, when, angle, tolerance)
+        x[column] = wrap(value)[0] if angle else value[0]
+        hole = max(hole, float(width[0]))
+    return x, hole
+
+
+def _rows(rows: Sequence[Array], width: int) -> Array:
+    return np.array(rows) if rows else np.empty((0, width))
+
+
+# ---------------------------------------------------------------- MCAP
+
+
+def from_mcap(path: Path, model: ComposedModel, *, epoch: int | None = None) -> Transitions:
+    """Samples of a log's campaign: the last complete one, or `epoch`. Raises RecordingError."""
+    log = _read_log(path, model)
+    recording = digest(path.read_bytes())
+    if epoch is not None and epoch not in log.samples:
+        there = ", ".join(str(e) for e in log.samples) or "none"
+        raise RecordingError(f"{path}: has no samples of epoch {epoch}; it has samples of: {there}")
+    if not log.samples:
+        return drive_transitions(model, log.stretches(model), recording, str(path))
+    complete = [e for e in log.samples if e in log.finished and log.finished[e].complete and len(log.samples[e]) == log.finished[e].n]
+    chosen = epoch if epoch is not None else (complete or list(log.samples))[-1]
+    ending = log.finished.get(chosen)
+    found = from_samples(
+        log.samples[chosen], rejected=ending.rejected if ending else {}, source=str(path), noise=streams_noise(model, log.stretches(model))
+    )
+    doubt = "" if chosen in complete else _incomplete(chosen, len(log.samples[chosen]), ending)
+    return replace(found, digest=recording, independent=not doubt, doubt=doubt)
+
+
+def from_samples(
+    samples: Sequence[SampleTaken],
+    *,
+    rejected: Mapping[str, int] | None = None,
+    source: str = "campaign",
+    noise: Array | None = None,
+) -> Transitions:
+    """Transitions of one complete campaign's samples; `digest` is that of the samples. Raises RecordingError if there are none."""
+    if not samples:
+        raise RecordingError(f"{source}: holds no samples")
+    samples = sorted(samples, key=lambda s: s.index)
+    if len({(len(s.x0), len(s.x1), len(s.u)) for s in samples}) > 1 or len(samples[0].x0) != len(samples[0].x1):
+        raise RecordingError(f"{source}: its samples are not of one model: they differ in their numbers of states or inputs")
+    kinds = {(len(s.held), s.periods) for s in samples}
+    (width, periods), same_hold = next(iter(kinds)), len(kinds) == 1
+    held = np.array([s.held for s in samples]) if same_hold and width == len(samples[0].x0) and periods > 1 else None
+    data = digest_of([[s.u, s.x0, s.x1, s.held, s.periods] for s in samples])
+    return Transitions(
+        np.array([s.x0 for s in samples], dtype=np.float64),
+        np.array([s.u for s in samples], dtype=np.float64),
+        np.array([s.x1 for s in samples], dtype=np.float64),
+        held,
+        periods if held is not None else 1,
+        independent=True,
+        rejected=dict(rejected or {}),
+        digest=data,
+        t0_s=np.array([s.t0_ns * 1e-9 for s in samples]),
+        source=source,
+        samples_digest=data,
+        noise=noise,
+    )
+
+
+@dataclass
+class _Log:
+    """What a log holds of states, inputs and samples, in its order.
+
+    rows: a list a stretch (a new one wherever the robot's clock went back: it was restarted) of (stamp s, x or (), u or ()).
+    """
+
+    samples: dict[int, list[SampleTaken]]
+    finished: dict[int, CampaignFinished]
+    rows: list[list[tuple[float, tuple[float, ...], tuple[float, ...]]]]
+
+    def stretches(self, model: ComposedModel) -> list[Streams]:
+        """Measured states and inputs sent, by the robot's stamps."""
+        no_x, no_u = (np.nan,) * len(model.states), (np.nan,) * len(model.inputs)
+        found = []
+        for rows in self.rows:
+            rows.sort(key=lambda row: row[0])
+            if rows:
+                t, x, u = zip(*((t, x or no_x, u or no_u) for t, x, u in rows), strict=True)
+                found.append(Streams(np.array(t), np.array(x), np.array(u)))
+        return found
+
+
+def _read_log(path: Path, model: ComposedModel) -> _Log:
+    from s2r_runtime.recording import read
+
+    log = _Log({}, {}, [[]])
+    reading = read(path, CHANNELS)
+    seen: dict[int, tuple[int, int]] = {}  # seq -> (daemon's clock, robot's clock), both ns: when the last observation came
+    for entry in reading:
+        match entry.message:
+            case Started() as started:
+                _check_robot(path, model, started)
+            case Observed(t_ns, observation) if not observation.fault:
+                if seen and observation.stamp_ns < next(iter(seen.values()))[1]:
+                    log.rows.append([])
+                seen = {observation.seq: (t_ns, observation.stamp_ns)}
+                log.rows[-1].append((observation.stamp_ns * 1e-9, observation.x, ()))
+            case Send() as send if send.obs_seq in seen:
+                heard_ns, stamp_ns = seen[send.obs_seq]
+                log.rows[-1].append(((stamp_ns + max(0, send.t_ns - heard_ns)) * 1e-9, (), send.u))
+            case SampleTaken() as sample:
+                log.samples.setdefault(sample.epoch, []).append(sample)
+            case CampaignFinished() as finished:
+                log.finished[finished.epoch] = finished
+    if reading.ending is not None and reading.ending.kind == "broken":
+        raise RecordingError(f"{path}: is damaged {reading.ending.detail}")
+    return log
+
+
+def _check_robot(path: Path, model: ComposedModel, started: Started) -> None:
+    had = started.settings
+    for what, recorded, wanted in (("states", had.states, model.states), ("inputs", had.inputs, model.inputs)):
+        if recorded != wanted:
+            raise RecordingError(f"{path}: was recorded with the {what} {', '.join(recorded)}; the model has {', '.join(wanted)}")
+    if abs(had.dt_ns * 1e-9 - model.dt) > 1e-6 * model.dt:
+        raise RecordingError(f"{path}: was recorded with a step of {had.dt_ns * 1e-9:g} s; the model's is {model.dt:g} s")
+
+
+def _incomplete(epoch: int, n: int, ending: CampaignFinished | None) -> str:
+    if ending is None:
+        return f"campaign {epoch} did not end in this log ({n} samples), so N was not fixed beforehand"
+    if not ending.complete:
+        return f"campaign {epoch} was ended after {n} samples, before all that were fixed beforehand were there"
+    return f"the log holds {n} of the {ending.n} samples of campaign {epoch}"
