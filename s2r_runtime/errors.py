@@ -46,3 +46,9 @@ class ControllerError(S2RError):
     """A controller raised, hung, died, or returned something that is not a finite input of the right shape."""
 
     exit_code = 1
+
+
+def one_line(text: str, length: int = 300) -> str:
+    """Somebody else's text for use in a message: on one line, printable, at most `length` characters."""
+    flat = " ".join("".join(c if c.isprintable() else " " for c in text[: 4 * length]).split())
+    return flat if len(flat) <= length else flat[: length - 3] + "..."

@@ -1,0 +1,198 @@
+"""A child process that is not trusted, seen from the daemon: a socket of lines, a pipe of what it prints, and its end.
+
+Nothing here waits, what is read and kept is bounded, and killing it kills its whole process group. The child confines itself
+(`confinement`); what stands here holds even if it doesn't.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from s2r_runtime.errors import one_line
+
+LINE_MAX = 64 << 10
+"""Bytes. A message has a few hundred; who sends more without an end of line sends no message."""
+READ_MAX = 64 << 10
+"""Bytes taken from the child at a time, from the socket and from the pipe: one that floods costs the loop no more than that."""
+OUTPUT_KEPT = 4 << 10
+"""Bytes of the last that it printed, for the reader."""
+
+
+class ConfinedProcess:
+    """`python -m module DESCRIPTOR PARENT_PID` in a session, a folder and an environment of its own. DESCRIPTOR: its end of the socket."""
+
+    def __init__(self, module: str) -> None:
+        """Starts it. From the main thread: the child dies with the thread that made it. Raises OSError if that can't be."""
+        self._epoll = select.epoll()
+        self._folder = Path(tempfile.mkdtemp(prefix="s2r-controller-"))
+        self._channel, theirs = socket.socketpair()
+        self._printed, writing = os.pipe()
+        try:
+            self._process = subprocess.Popen(
+                # -P: nothing is imported from where this happens to run; -u: what it printed is here when it is killed
+                [sys.executable, "-P", "-B", "-u", "-m", module, str(theirs.fileno()), str(os.getpid())],
+                stdin=subprocess.DEVNULL,
+                stdout=writing,
+                stderr=writing,
+                pass_fds=(theirs.fileno(),),
+                cwd=self._folder,
+                env=_environment(),
+                start_new_session=True,
+            )
+        except BaseException:
+            self._channel.close()
+            os.close(self._printed)
+            self._epoll.close()
+            self._folder.rmdir()
+            raise
+        finally:
+            theirs.close()
+            os.close(writing)
+        self._channel.setblocking(False)
+        os.set_blocking(self._printed, False)
+        self._epoll.register(self._channel, select.EPOLLIN)
+        self._epoll.register(self._printed, select.EPOLLIN)
+        self._out, self._in, self._output = bytearray(), bytearray(), bytearray()
+
+    def fileno(self) -> int:
+        """Readable when there is something to receive, or room for what waits to be sent. Valid until `close`."""
+        return self._epoll.fileno()
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    @property
+    def output(self) -> str:
+        """The last that it printed, on stdout and stderr."""
+        return bytes(self._output).decode("utf-8", "replace")
+
+    def send(self, line: bytes) -> None:
+        """Hands over a line; what it doesn't take at once is kept for `receive` to go on with."""
+        self._out += line
+        self._out += b"\n"
+        self._flush()
+
+    def receive(self) -> tuple[list[bytes], bool]:
+        """Complete lines since the last call, at most READ_MAX bytes of them; and whether more can come.
+
+        A line without end counts as complete, for the reader to refuse.
+        """
+        self._flush()
+        self._drain()
+        if self._channel.fileno() < 0:
+            return [], False
+        try:
+            data = self._channel.recv(READ_MAX)
+        except BlockingIOError:
+            return [], not self.dead()
+        except OSError:
+            data = b""
+        self._in += data
+        *lines, self._in = self._in.split(b"\n")
+        if len(self._in) > LINE_MAX:
+            lines, self._in = [*lines, self._in], bytearray()
+        return [bytes(line) for line in lines], bool(data)
+
+    def dead(self) -> bool:
+        """Whether it ended. It stays a zombie until `kill` has reached its group, so that the group's number is nobody else's."""
+        return self._process.returncode is not None or self._status() is not None
+
+    def ending(self) -> str:
+        """How it ended, in a few words. Waits up to 5 ms: the end of its socket comes a moment before its own."""
+        deadline = time.monotonic() + 0.005
+        while (status := self._status()) is None and time.monotonic() < deadline:
+            time.sleep(0.0005)
+        self._drain()
+        how = "closed its socket"
+        if status is not None:
+            code = status.si_status
+            how = f"exited with status {code}" if status.si_code == os.CLD_EXITED else f"killed by {_signal_name(code)}"
+        last = self.output.strip().splitlines()[-1:]
+        return how + "".join(f"; it last printed: {one_line(line, 200)}" for line in last)
+
+    def kill(self) -> None:
+        """Ends it and all of its group, at once. May be called twice."""
+        if self._process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+        self._drain()
+        self._channel.close()  # which takes it out of the epoll, as below
+        if self._printed >= 0:
+            os.close(self._printed)
+            self._printed = -1
+        self.reap()
+
+    def reap(self) -> bool:
+        """After `kill`: frees what is left of it, once the kernel has ended it. Whether it has."""
+        if self._process.poll() is None:
+            return False
+        shutil.rmtree(self._folder, ignore_errors=True)
+        return True
+
+    def close(self) -> None:
+        """Kills it, waits until it is gone (milliseconds), frees everything. May be called twice."""
+        self.kill()
+        with contextlib.suppress(subprocess.TimeoutExpired):  # in the kernel's hands: nothing here can hurry it
+            self._process.wait(5.0)
+        self.reap()
+        self._epoll.close()
+
+    def _status(self) -> os.waitid_result | None:
+        if self._process.returncode is not None:
+            return None
+        return os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG)
+
+    def _flush(self) -> None:
+        if self._channel.fileno() < 0:
+            return
+        while self._out:
+            try:
+                del self._out[: self._channel.send(self._out)]
+            except BlockingIOError:
+                break
+            except OSError:  # it closed its end; `receive` will see that
+                self._out.clear()
+        self._epoll.modify(self._channel, select.EPOLLIN | (select.EPOLLOUT if self._out else 0))
+
+    def _drain(self) -> None:
+        """Takes what it printed, so that printing doesn't block it."""
+        if self._printed < 0:
+            return
+        with contextlib.suppress(BlockingIOError):
+            data = os.read(self._printed, READ_MAX)
+            self._output += data
+            del self._output[:-OUTPUT_KEPT]
+            if not data:
+                os.close(self._printed)
+                self._printed = -1
+
+
+def _environment() -> dict[str, str]:
+    """The child's, whole: nothing of the daemon's. One thread for BLAS: more would take time from the gate."""
+    return {
+        "PATH": "/usr/local/bin:/usr/bin:/bin",
+        "LANG": "C.UTF-8",
+        "OPENBLAS_NUM_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+        "MKL_NUM_THREADS": "1",
+        "PYTHONHASHSEED": "0",  # one order of sets in every run
+    }
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
