@@ -7,7 +7,7 @@ CSV with segments: the first row of each is x0. Its input must hold for at least
 unwrapped). Where the input holds h whole steps in every segment used, and the states last as long, the state at t0 + h dt is
 the hold's end. Segments are taken for independent draws that begin at rest: that is what the form says, it can't be checked here
 beyond the order of the samples (`whiteness`). Left out, and counted by reason: `first_row_incomplete`, `no_input`, `input_changed`,
-`too_short`, `state_gap` (x1 would be interpolated across a hole in a stream that is otherwise denser).
+`too_short`.
 
 CSV without segments: ordinary driving (`driving`).
 """
@@ -31,9 +31,6 @@ from s2r_runtime.models.composed import ComposedModel, wrap
 from s2r_runtime.tables import read_csv
 
 Array = NDArray[np.float64]
-
-HOLE = 10.0
-"""Segments: x1 is not interpolated across more than this many dt, if that is also this many times the stream's own step: a lost link."""
 
 CHANNELS = ("event/started", "event/observed", "event/sample_taken", "event/campaign_finished", "out/send")
 
@@ -102,7 +99,7 @@ def _segment_transitions(model: ComposedModel, segments: list[Streams], recordin
     periods = min((start.whole_steps for start in used), default=1)
     held = None
     if periods > 1:
-        held = _rows([_states_at(model, s.streams, periods)[0] for s in used], len(model.states))
+        held = _rows([_states_at(model, s.streams, periods) for s in used], len(model.states))
     return Transitions(
         _rows([s.x0 for s in used], len(model.states)),
         _rows([s.u for s in used], len(model.inputs)),
@@ -134,9 +131,7 @@ def _first_transition(model: ComposedModel, s: Streams) -> _Start | str:
     last = min(float(s.t[np.isfinite(s.x[:, c])][-1]) for c in range(s.x.shape[1]))
     if last < due - tolerance:
         return "too_short"
-    x1, hole = _states_at(model, s, 1)
-    if hole > HOLE * model.dt and hole > HOLE * float(np.median(np.diff(s.t))):
-        return "state_gap"
+    x1 = _states_at(model, s, 1)
     for column in model.angle_columns:
         x0[column] = wrap(x0[column])
     return _Start(s, x0, u, x1, int((min(until, last) - s.t[0] + tolerance) / model.dt))
@@ -150,16 +145,15 @@ def _first_received(rows: Array) -> Array:
     return value
 
 
-def _states_at(model: ComposedModel, s: Streams, periods: int) -> tuple[Array, float]:
-    """(states (nx,) `periods` steps after the segment began, the widest hole that was interpolated across)."""
+def _states_at(model: ComposedModel, s: Streams, periods: int) -> Array:
+    """(nx,) the states `periods` steps after the segment began."""
     when, tolerance = s.t[:1] + periods * model.dt, resolution(s.t, model.dt)
-    x, hole = np.empty(len(model.states)), 0.0
+    x = np.empty(len(model.states))
     for column in range(len(model.states)):
         angle = column in model.angle_columns
-        value, width = state_at(s, column, when, angle, tolerance)
+        value, _ = state_at(s, column, when, angle, tolerance)
         x[column] = wrap(value)[0] if angle else value[0]
-        hole = max(hole, float(width[0]))
-    return x, hole
+    return x
 
 
 def _rows(rows: Sequence[Array], width: int) -> Array:
