@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.gap import Drive, Transitions
 from s2r_runtime.models.composed import ComposedModel, wrap
-from s2r_runtime.noise import stream_noise
+from s2r_runtime.sensor_noise import stream_noise
 
 Array = NDArray[np.float64]
 
@@ -148,7 +148,7 @@ def _averages(s: Streams, grid: Array) -> Array:
 
 
 def streams_noise(model: ComposedModel, parts: list[Streams]) -> Array | None:
-    """(nx,) standard deviation of the measurements in these runs together; None where they don't show it (`noise`)."""
+    """(nx,) standard deviation of the measurements in these runs together; None where they do not show it (`sensor_noise`)."""
     if not parts:
         return None
     xs = []
