@@ -1,0 +1,1 @@
+../../../../controllers/grid.py
