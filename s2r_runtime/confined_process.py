@@ -17,6 +17,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import ClassVar
 
 from s2r_runtime.errors import one_line
 
@@ -31,8 +32,12 @@ OUTPUT_KEPT = 4 << 10
 class ConfinedProcess:
     """`python -m module DESCRIPTOR PARENT_PID` in a session, a folder and an environment of its own. DESCRIPTOR: its end of the socket."""
 
+    _dying: ClassVar[list[ConfinedProcess]] = []
+    """Killed and closed, but not gone yet: freeing a gigabyte takes the kernel a while, and nobody waits for that."""
+
     def __init__(self, module: str) -> None:
         """Starts it. From the main thread: the child dies with the thread that made it. Raises OSError if that can't be."""
+        self._dying[:] = [process for process in self._dying if not process.reap()]
         self._epoll = select.epoll()
         self._folder = Path(tempfile.mkdtemp(prefix="s2r-controller-"))
         self._channel, theirs = socket.socketpair()
@@ -142,11 +147,12 @@ class ConfinedProcess:
         return True
 
     def close(self) -> None:
-        """Kills it, waits until it is gone (milliseconds), frees everything. May be called twice."""
+        """Kills it, waits a few milliseconds until it is gone, frees everything. May be called twice."""
         self.kill()
-        with contextlib.suppress(subprocess.TimeoutExpired):  # in the kernel's hands: nothing here can hurry it
-            self._process.wait(5.0)
-        self.reap()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(0.02)
+        if not self.reap() and self not in self._dying:
+            self._dying.append(self)
         self._epoll.close()
 
     def _status(self) -> os.waitid_result | None:

@@ -193,7 +193,7 @@ class HostedController:
             self._process.kill()
 
     def close(self) -> None:
-        """Stops it, waits until it is gone, frees everything. May be called twice."""
+        """Stops it and frees everything, which takes milliseconds. May be called twice."""
         self._running = False
         if self._process is not None:
             self._process.close()

@@ -18,6 +18,7 @@ from typing import Literal
 import msgspec
 
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.ledger import share
 from s2r_runtime.persistence import lock, read, replace, seal, unseal
 
 SCHEMA = 1
@@ -89,7 +90,7 @@ class Ledger:
 
     def spent(self, beta: float) -> float:
         """How much of the budget beta is gone: sum of 3 beta/(pi^2 i^2) over the epochs and over the attempts."""
-        return math.fsum(3.0 * beta / (math.pi * entry.number) ** 2 for entry in self.entries())
+        return math.fsum(share(beta, entry.number) for entry in self.entries())
 
     def _number(self, kind: Literal["epoch", "attempt"], subject: tuple[str, ...], *, again: bool) -> int:
         held = _locked(self.path)

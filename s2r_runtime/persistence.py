@@ -27,10 +27,7 @@ import msgspec
 
 from s2r_runtime.canonical import canonical, digest
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.messages import Memory
-
-SCHEMA = 1
-"""Of `Memory`. A state of another schema is refused, not guessed at."""
+from s2r_runtime.messages import MEMORY_SCHEMA, Memory
 
 FILE_MAX = 64 << 20
 """Bytes. No state is that big; something else bearing its name might be."""
@@ -65,23 +62,23 @@ class StateFolder:
         file = self.path / "state.json"
         if not file.exists():
             self._refuse_a_past(signs)
-            return Memory(robot=self.robot, schema=SCHEMA)
+            return Memory(robot=self.robot, schema=MEMORY_SCHEMA)
         memory = unseal(read(file), "state", Memory, str(file))
         if memory.robot != self.robot:
             raise ConfigError(
                 f"{file}: is the state of robot {memory.robot!r}, not of {self.robot!r}; give each robot a state folder of its own"
             )
-        if memory.schema != SCHEMA:
-            raise ConfigError(f"{file}: has state schema {memory.schema}, this version reads {SCHEMA}")
+        if memory.schema != MEMORY_SCHEMA:
+            raise ConfigError(f"{file}: has state schema {memory.schema}, this version reads {MEMORY_SCHEMA}")
         return memory
 
     def save(self, memory: Memory) -> None:
         """Durable when this returns. Raises OSError if the disk does not take it (the old state is then whole), ValueError if
         the memory is not this robot's.
         """
-        if memory.robot != self.robot or memory.schema != SCHEMA:
+        if memory.robot != self.robot or memory.schema != MEMORY_SCHEMA:
             raise ValueError(
-                f"memory of robot {memory.robot!r}, schema {memory.schema}; this is the state of {self.robot!r}, schema {SCHEMA}"
+                f"memory of robot {memory.robot!r}, schema {memory.schema}; this is the state of {self.robot!r}, schema {MEMORY_SCHEMA}"
             )
         replace(self.path / "state.json", seal("state", memory))
         begun = self.path / "begun"

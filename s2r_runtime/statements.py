@@ -1,0 +1,161 @@
+"""What a certificate shows and what it does not, in sentences made from its numbers (DESIGN 4). They say exactly this and no more.
+
+Numbers are rounded away from what would flatter: bounds up, worst values and confidences down.
+"""
+
+from __future__ import annotations
+
+import math
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
+
+from s2r_runtime.ledger import spent
+from s2r_runtime.messages import Gap, LawResult, Verification
+from s2r_runtime.modelspec import ModelSpec
+
+
+def shown(
+    robot: str, model: ModelSpec, task: str, gap: Gap, verification: Verification, budget: float, assumption: str = ""
+) -> tuple[str, ...]:
+    """The statements G1 to G4 and G8 of this evidence. budget: beta of the robot's life. assumption: one that the user made.
+
+    Whether the numbers carry them is for `certificate.issue` to check.
+    """
+    return (
+        *_gap(robot, model, gap, assumption),
+        *_controller(task, gap, verification),
+        (
+            f"Together (G3). The gap's statement and a failure probability of at most {bound(verification.epsilon)} under every required "
+            f"law hold at once with confidence {confidence(gap.beta + verification.beta)}: the confidences add."
+        ),
+        (
+            f"Over the robot's life (G4). Gap epoch {gap.epoch} spent {bound(gap.beta)} and verification attempt {verification.attempt} "
+            f"{bound(verification.beta)} of beta = {budget:g}; the epochs and attempts up to these spent "
+            f"{bound(spent(budget, gap.epoch, verification.attempt))} of it, and all there will ever be spend no more than all of it."
+        ),
+    )
+
+
+def not_shown(gap: Gap, verification: Verification, horizon: int = 0) -> tuple[str, ...]:
+    """What nobody may read into it. horizon: steps of the task (0: not said)."""
+    run = ""
+    if horizon > 1:
+        once = 1.0 - (1.0 - gap.epsilon) ** horizon
+        run = f" In a run of {horizon} steps even independent discrepancies may exceed r at least once with probability {bound(once)}."
+    required = {law.law for law in verification.laws if law.required}
+    alone = (
+        ("The law uniform alone stands behind this certificate: no persistent disturbance of this size was required to be survived.",)
+        if required == {"uniform"}
+        else ()
+    )
+    return (
+        *alone,
+        (
+            "The gap's statement and the controller's do not compose into a statement about the robot with this controller: the first is "
+            f"about the robot under the sampling law, the second about the uncertain model.{run}"
+        ),
+        (
+            "The inputs change when a controller drives: where it applies inputs rho times as often as they were sampled, epsilon becomes "
+            "rho epsilon."
+        ),
+        (
+            "The disturbance laws are models. Uniform, zero-mean, independent noise averages out where a real, persistent disturbance does "
+            "not: in one and the same ball (r = 0.006) it crashed 0.035 % of runs, a constant lateral push 3.4 %, a push toward the "
+            "nearest wall 22 %."
+        ),
+        (
+            "Measured discrepancies are bounded, not true ones: measurement noise is inside r, and an error that the measurements share "
+            "with the model is not."
+        ),
+        (
+            "Nothing is said about states outside the region of the profile, other tasks and scenario laws, or a robot that has changed "
+            "since the campaign; the watch looks for that while it drives (G5)."
+        ),
+        (
+            "The controller is taken to be a function of the state, the scenario and its parameters: what depends on time, memory, data "
+            "files or how many rollouts it is shown at once is not covered."
+        ),
+        "No closed-loop trials of this controller on the robot (G9) are part of it.",
+    )
+
+
+def _gap(robot: str, model: ModelSpec, gap: Gap, assumption: str) -> tuple[str, ...]:
+    effects = "".join(f" + {effect.name}({effect.channel})" for effect in model.effects)
+    norm = f"{gap.set}, weights {', '.join(f'{w:g}' for w in gap.weights)}"
+    hold = ""
+    if gap.hold_periods > 1:
+        hold = (
+            f", and one after {gap.hold_periods} held periods exceeds r_h = {bound(gap.hold_radius)} with probability at most "
+            f"{bound(gap.epsilon)} (r and r_h each took half of beta = {bound(gap.beta)})"
+        )
+    noise = f"; noise alone would make about {gap.radius_noise:.2g} of r" if gap.radius_noise is not None else ""
+    basis = (
+        f"rests on an assumption that the user made: {assumption}"
+        if assumption
+        else "were drawn independently, one from each held input (G7), each after a random waypoint and a full stop"
+    )
+    whether = "they" if not assumption else "their independence"
+    return (
+        (
+            f"Gap (G1). With confidence {confidence(gap.beta)}, a new discrepancy between robot {robot!r} and one step of {model.dt:g} s "
+            f"of the model {model.name}{effects}, drawn from the campaign's law, exceeds r = {bound(gap.radius)} ({norm}) with probability "
+            f"at most {bound(gap.epsilon)}{hold}."
+        ),
+        (
+            f"It stands on {gap.n} transitions, {gap.discarded or 'none'} of the largest discarded, both numbers fixed beforehand; {whether} {basis}. "
+            f"In the unweighted norm r is {bound(gap.radius_literal)}{noise}."
+        ),
+    )
+
+
+def _controller(task: str, gap: Gap, v: Verification) -> tuple[str, ...]:
+    required = [law for law in v.laws if law.required]
+    beside = [law for law in v.laws if not law.required]
+    grown = v.radius / gap.radius if gap.radius > 0.0 else math.inf
+    times = f", {grown:.3g} times r" if math.isfinite(grown) else ""
+    lines = [_law(task, law, v, times) for law in required]
+    if len(required) > 1:
+        lines.append(
+            f"Each of these {len(required)} values of s* has this confidence on its own; that the failure probability is at most "
+            f"{bound(v.epsilon)} under every required law has it as a whole, because all of them had to pass."
+        )
+    lines += [
+        f"Reported, not required: under the law {law.law} the least of {law.n} safety values was {worst(law.s_star)}, with {law.failures} "
+        f"below the threshold."
+        for law in beside
+    ]
+    return tuple(lines)
+
+
+def _law(task: str, law: LawResult, v: Verification, times: str) -> str:
+    disturbed = f"disturbed within {bound(v.radius)}{times}"
+    if law.law != "uniform":
+        disturbed += f", with at most {bound(v.hold_radius)} over a hold"
+    return (
+        f"Controller (G2, law {law.law}). With confidence {confidence(v.beta)}, a new rollout of the uncertain model ({disturbed}) in a "
+        f"new scenario of the task {task} scores below s* = {worst(law.s_star)} with probability at most {bound(v.epsilon)}; {law.n} "
+        f"scenarios were drawn independently, {law.failures} scored below the threshold {v.threshold:g}, and the probability of that is at most "
+        f"{bound(law.failure_upper)} (Clopper-Pearson, the same confidence)."
+    )
+
+
+_DIGITS = 6
+
+
+def bound(value: float) -> str:
+    """An upper bound, six digits, rounded up."""
+    return _digits(value, ROUND_CEILING)
+
+
+def worst(value: float) -> str:
+    """A least value, six digits, rounded down."""
+    return _digits(value, ROUND_FLOOR)
+
+
+def confidence(beta: float) -> str:
+    """1 - beta in percent, rounded down."""
+    exact = (Decimal(1) - Decimal(beta)) * 100
+    return f"{exact.quantize(Decimal('0.0001'), rounding=ROUND_FLOOR)} %"
+
+
+def _digits(value: float, rounding: str) -> str:
+    return f"{Context(prec=_DIGITS, rounding=rounding).create_decimal(Decimal(repr(value))).normalize():g}"
