@@ -43,7 +43,7 @@ class CheckModel(msgspec.Struct, frozen=True, tag="check_model"):
 
 
 class Watching(msgspec.Struct, frozen=True, tag="watching"):
-    """From here on measure against this gap of this model. n, exceedances: of this epoch so far (a restart goes on there)."""
+    """From here on measure against this gap of this model. n, exceedances, e_value: of this epoch so far (a restart goes on there)."""
 
     model: ModelSpec
     gap: Gap
@@ -51,6 +51,7 @@ class Watching(msgspec.Struct, frozen=True, tag="watching"):
     fault_jump: float
     n: int
     exceedances: int
+    e_value: float | None = None
 
 
 class Ready(msgspec.Struct, frozen=True, tag="ready"):
@@ -215,7 +216,14 @@ def _stream(watching: Watching) -> Stream:
     from s2r_runtime.models.composed import compose
     from s2r_runtime.watch import Stream
 
-    return Stream(compose(watching.model), watching.gap)
+    return Stream(
+        compose(watching.model),
+        watching.gap,
+        fault_jump=watching.fault_jump,
+        n=watching.n,
+        exceedances=watching.exceedances,
+        e_value=watching.e_value,
+    )
 
 
 if __name__ == "__main__":
