@@ -42,8 +42,8 @@ class Part(NamedTuple):
 class Block(NamedTuple):
     """A block in the file: bytes offset..end are all of it. messages: the seal is the last one.
 
-    `last`: it ends with a data end, not a chunk (then there are no messages). `index_cut`: bytes of its message index that are
-    missing at the end of the file.
+    `last`: it ends with a data end, not a chunk (then there are no messages). `lacking`: what the file does not have of its
+    message index.
     """
 
     offset: int
@@ -53,7 +53,7 @@ class Block(NamedTuple):
     declarations: list[bytes]
     messages: list[Part]
     last: bool = False
-    index_cut: int = 0
+    lacking: bytes = b""
 
 
 def take(file: BinaryIO, offset: int, size: int, start: bytes = b"", *, strict: bool = True) -> Block | None:
@@ -105,10 +105,10 @@ def _chunk_block(file: BinaryIO, offset: int, at: int, size: int, prefix: list[b
     expected = index_records(index)
     index_at = at + CHUNK.size + data_size
     found = file.read(len(expected))
-    block = Block(offset, index_at + len(found), prefix, content, declarations, messages, index_cut=len(expected) - len(found))
+    block = Block(offset, index_at + len(found), prefix, content, declarations, messages, lacking=expected[len(found) :])
     if found == expected or (index_at + len(found) == size and expected.startswith(found)):
         return block, False
-    return block._replace(end=index_at, index_cut=len(expected)), True
+    return block._replace(end=index_at, lacking=expected), True
 
 
 def _content(data: bytes, size: int, crc: int, at: int) -> bytes:

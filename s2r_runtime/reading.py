@@ -39,6 +39,7 @@ from s2r_runtime.messages import Struct
 from s2r_runtime.summary import tail
 
 _START = MAGIC + pack(Header("", LIBRARY))
+_ZEROS = 16
 
 
 class Entry(msgspec.Struct, frozen=True, gc=False):
@@ -78,36 +79,81 @@ class Reading:
         self.wanted = frozenset(CHANNELS) - {CHAIN} if channels is None else frozenset(channels)
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: list[Attached] = []
-        self.ending: Ending | None = None
+        self._ending: Ending | None = None
         self.signed = False
         self.counts: dict[str, int] = {}
         self.run, self.part, self.first_index = "", 0, 0
         self.public_key = b""
         self.previous_head = self.head = GENESIS
         try:
-            self._file: BinaryIO = path.open("rb")
+            with path.open("rb") as file:
+                self._size = os.fstat(file.fileno()).st_size
+                self._start = self._read_start(file)
         except OSError as error:
             raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
-        self._size = os.fstat(self._file.fileno()).st_size
-        self._start = self._read_start()
         self.head, self._index = self.previous_head, self.first_index
         self._at = self._crc = self._log_time = 0
         self._seal, self._final = b"", ""
         self._schemas: dict[int, bytes] = {}
         self._channels: dict[int, bytes] = {}
         self._topics: dict[int, str] = {}
+        self.first_ns: int | None = None
+        self.lacking = b""
+        """What a cut file does not have of its last chunk's index."""
+        self.indexed = False
+        """Whether the index at the end is there, and right."""
+
+    @property
+    def ending(self) -> Ending:
+        """How it ended; raises RuntimeError while it has not."""
+        if self._ending is None:
+            raise RuntimeError(f"{self.path}: is still being read")
+        return self._ending
+
+    def to_the_end(self) -> Ending:
+        """Reads all, gives out nothing."""
+        for _ in self:
+            pass
+        return self.ending
+
+    @property
+    def last_ns(self) -> int:
+        """Log time of the last message read."""
+        return self._log_time
+
+    @property
+    def sealed_for_good(self) -> bool:
+        """Whether the seal that nothing follows was read: no message is missing, whatever became of the index."""
+        return bool(self._final)
+
+    @property
+    def chain(self) -> str:
+        """`intact`, `broken`, or `unsigned tail` (a log without a key, or nothing of it)."""
+        if self._ending is not None and self._ending.kind == "broken":
+            return "broken"
+        return "intact" if self.signed else "unsigned tail"
+
+    @property
+    def declarations(self) -> tuple[dict[int, bytes], dict[int, bytes]]:
+        """Schema and channel records read so far, by id."""
+        return self._schemas, self._channels
+
+    @property
+    def start(self) -> bytes:
+        """What the file begins with, up to the metadata that says what it is; empty if it ends before."""
+        return self._start
 
     # ---- the start
 
-    def _read_start(self) -> bytes:
+    def _read_start(self, file: BinaryIO) -> bytes:
         """Magic, header and the metadata that says what this is. Empty if the file ends before they do."""
-        found = self._file.read(len(_START))
+        found = file.read(len(_START))
         if found != _START[: len(found)]:
             raise RecordingError(f"{self.path}: is not a log of this version of s2r (its first bytes are not those of one)")
-        head = self._file.read(RECORD.size)
+        head = file.read(RECORD.size)
         if len(head) < RECORD.size or len(_START) + RECORD.size + RECORD.unpack(head)[1] > self._size:
             return b""
-        record = head + self._file.read(RECORD.unpack(head)[1])
+        record = head + file.read(RECORD.unpack(head)[1])
         try:
             name, about = metadata_fields(record)
             self.run, self.part, self.first_index = about["run"], int(about["part"]), int(about["first_index"])
@@ -124,6 +170,7 @@ class Reading:
 
     def __iter__(self) -> Iterator[Entry]:
         """The entries, once. Afterwards `ending` is there."""
+        self._file: BinaryIO = self.path.open("rb")
         try:
             if not self._start:
                 raise Damage(0, "the file ends before its first record", cut=True)
@@ -136,7 +183,8 @@ class Reading:
                 index, self._at = self._index, block.end
                 self._index += len(block.messages)
                 yield from self._entries(block, index)
-                if block.index_cut:
+                if block.lacking:
+                    self.lacking = block.lacking
                     self._end("cut", "the file ends inside a chunk's index")
                     return
             self._end("cut", "the index is missing" if self._final else "the file ends between two chunks")
@@ -158,6 +206,8 @@ class Reading:
         self._schemas |= schemas
         self._channels |= declarations
         self._topics |= topics
+        if self.first_ns is None:
+            self.first_ns = block.messages[0].log_time_ns
         for number, part in enumerate(block.messages, self._index):
             if part.sequence != number & 0xFFFFFFFF:
                 raise Damage(block.offset, f"message {number} is missing or out of its place")
@@ -235,7 +285,7 @@ class Reading:
             at += len(piece)
         if at != self._size:
             raise Damage(at, "something follows the end")
-        self._at = at
+        self._at, self.indexed = at, True
         if RECOVERED in self.metadata or not self._final:
             self._end("cut", "was recovered from a file that was cut" if block.prefix else "the last seal is missing")
         else:
@@ -245,23 +295,19 @@ class Reading:
         return os.pread(self._file.fileno(), length, offset)
 
     def _damaged(self, damage: Damage) -> None:
-        """A cut tail has nothing good after it; if there is something, a record in the middle was damaged."""
-        cut = damage.cut or self._zero_from(damage.offset)
+        """A cut tail has nothing good after it; if there is something, a record in the middle was damaged.
+
+        Zeros at the end are what a file system may leave of a write that a power cut stopped: a cut too.
+        """
+        self._file.seek(max(0, self._size - _ZEROS))
+        cut = damage.cut or self._file.read() == bytes(_ZEROS)
         if cut and find(self._file, damage.offset + 1, self._size) is None:
             self._end("cut", damage.detail)
         else:
             self._end("broken", f"at byte {damage.offset}: {damage.detail}")
 
-    def _zero_from(self, offset: int) -> bool:
-        """Whether only zeros follow: what a file system may leave of a write that a power cut stopped."""
-        self._file.seek(offset)
-        while data := self._file.read(1 << 20):
-            if data.count(0) != len(data):
-                return False
-        return True
-
     def _end(self, kind: Literal["closed", "rotated", "cut", "broken"], detail: str) -> None:
-        self.ending = Ending(kind, self._index, self._at, self._size - self._at, detail)
+        self._ending = Ending(kind, self._index, self._at, self._size - self._at, detail)
 
 
 def _attached(record: bytes, offset: int) -> Attached:

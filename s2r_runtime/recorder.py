@@ -148,7 +148,7 @@ class Recorder:
                 if self._write(sync=sync) and sync:
                     synced_s = time.monotonic()
             self._finish()
-        except Exception as error:  # noqa: BLE001 - whatever ends the thread must be seen as bad health, not as a trace on stderr
+        except BaseException as error:  # noqa: BLE001 - whatever ends the thread must be seen as bad health, not as a trace on stderr
             self._fault = self._fault or f"the recorder's thread died: {type(error).__name__}: {error}"
         finally:
             with self._room:

@@ -51,10 +51,10 @@ def environment() -> dict[str, str]:
 class Writer:
     """A log being written. Safe to use from several threads; the order of messages is the order of the calls.
 
-    signer: signs every seal; its public key is in the file. metadata: beside `environment()`. rotate_bytes, rotate_s: a new
-    part begins when the file is that large or old (0: only after PART_CHUNKS); it continues the chain. timed: `write` itself
-    closes a chunk that is old enough; switch it off where a thread calls `flush`. Raises RecordingError if the file exists or
-    cannot be made.
+    run: names this run and no other. signer: signs every seal; its public key is in the file. metadata: beside
+    `environment()`. rotate_bytes, rotate_s: a new part begins when the file is that large or old (0: only after PART_CHUNKS);
+    it continues the chain. timed: `write` itself closes a chunk that is old enough; switch it off where a thread calls
+    `flush`. Raises RecordingError if the file exists or cannot be made.
     """
 
     def __init__(
