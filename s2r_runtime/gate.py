@@ -39,8 +39,8 @@ REASONS: tuple[str, ...] = (
     "no_controller",
     "analytics_down",
     "watch_alarm",
-    "no_certificate",
     "certificate_revoked",
+    "no_certificate",
     "certificate_expired",
     "digest_mismatch",
     "radius_above_verified",
@@ -185,15 +185,16 @@ def _about_controller(settings: Settings, s: Situation) -> Verdict | None:
         return _refuse("analytics_down")
     if s.alarmed:
         return _refuse("watch_alarm")
-    return _about_certificate(settings, s) or _about_watch(settings, s)
+    return about_certificate(settings, s) or _about_watch(settings, s)
 
 
-def _about_certificate(settings: Settings, s: Situation) -> Verdict | None:
+def about_certificate(settings: Settings, s: Situation) -> Verdict | None:
+    """The first reason why this certificate does not cover this controller, model, task, profile, epoch and radius now."""
     c = s.certificate
-    if c is None:
-        return _refuse("no_certificate")
     if s.revoked:
         return _refuse("certificate_revoked")
+    if c is None:
+        return _refuse("no_certificate")
     if not s.unix_s < c.expires_unix_s:
         return _refuse("certificate_expired", float(c.expires_unix_s - s.unix_s))
     if not s.unix_s >= c.issued_unix_s - CLOCK_SKEW_S:
@@ -207,7 +208,7 @@ def _about_certificate(settings: Settings, s: Situation) -> Verdict | None:
         or c.epoch != s.epoch
     ):
         return _refuse("digest_mismatch")
-    if not (_finite(s.radius) and _finite(c.verified_radius) and s.radius <= c.verified_radius):
+    if not (finite(s.radius) and finite(c.verified_radius) and s.radius <= c.verified_radius):
         return _refuse("radius_above_verified", c.verified_radius - s.radius)
     return None
 
@@ -226,7 +227,7 @@ def _about_observation(settings: Settings, s: Situation, source: Source, now_ns:
     observation = s.observation
     if observation is None:
         return _refuse("observation_missing")
-    if observation.fault or len(observation.x) != len(settings.states) or not all(map(_finite, observation.x)):
+    if observation.fault or len(observation.x) != len(settings.states) or not all(map(finite, observation.x)):
         return _refuse("observation_invalid")
     age_ns = now_ns - s.observation_ns
     if not 0 <= age_ns <= settings.observation_timeout_ns:
@@ -237,7 +238,7 @@ def _about_observation(settings: Settings, s: Situation, source: Source, now_ns:
 
 
 def _about_command(settings: Settings, s: Situation, command: Command, now_ns: int) -> Verdict | None:
-    if command.fault or len(command.u) != len(settings.inputs) or not all(map(_finite, command.u)):
+    if command.fault or len(command.u) != len(settings.inputs) or not all(map(finite, command.u)):
         return _refuse("command_invalid")
     if s.asked_seq is None or command.obs_seq != s.asked_seq or command.seq <= s.last_command_seq:
         return _refuse("command_out_of_order")
@@ -264,7 +265,7 @@ def _inside(settings: Settings, x: tuple[float, ...], bounds: tuple[tuple[float,
             slacks.append(_slack(value, low, high))
         elif not high - low >= 2.0 * math.pi:
             middle = low + 0.5 * (high - low)
-            off = math.remainder(value - middle, 2.0 * math.pi) if _finite(middle) else math.nan
+            off = math.remainder(value - middle, 2.0 * math.pi) if finite(middle) else math.nan
             slacks.append(_slack(off, low - middle, high - middle))
     return _least(slacks)
 
@@ -280,8 +281,8 @@ def _least(slacks: list[float]) -> float:
     return max(-_MAX, min([_MAX, *slacks])) if slacks else 0.0
 
 
-def _finite(value: float) -> bool:
-    """A number with a finite float (an int may be too big to have one); NaN and inf fail the comparison."""
+def finite(value: float) -> bool:
+    """Whether it is a number with a finite float (an int may be too big to have one); NaN and inf fail the comparison."""
     return isinstance(value, int | float) and -_MAX <= value <= _MAX
 
 

@@ -204,6 +204,9 @@ class Memory(Struct, frozen=True):
     """`Settings.campaign_digest` when the gap in force was measured."""
     alarm_epoch: int = 0
     """Epoch whose gap the watch refuted (0: none): it founds no certificate any more, only a fresh campaign does."""
+    watch_n: int = 0
+    watch_exceedances: int = 0
+    """What the watch has counted in this epoch; its e-value is a function of the two. As of the last time the memory was written."""
     traced: bool = False
     """An effect was traced in the residual and no model that has it was adopted since (DESIGN G8)."""
 

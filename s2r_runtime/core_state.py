@@ -1,0 +1,227 @@
+"""The core's state, and `Turn`: one event's handling, from the state before it to the state and outputs after it.
+
+A state is a frozen struct of plain data: comparable, and what msgspec can write. It holds no clock; `now_ns` is the latest
+event's stamp.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import msgspec
+
+from s2r_runtime.gate import Situation
+from s2r_runtime.messages import Answer, CertificateFacts, Gap, Memory, Observation, Output, Persist, Send, Settings, Source, Struct
+
+NANO = 1_000_000_000
+
+
+class Asked(Struct, frozen=True):
+    """A source was asked about an observation and has not answered yet. `source`: controller or sampler."""
+
+    source: Source
+    obs_seq: int
+    t_ns: int
+
+
+class Campaign(Struct, frozen=True):
+    """A campaign that samples. `running`: its source has started."""
+
+    epoch: int
+    n: int
+    request_id: int
+    running: bool = False
+    taken: int = 0
+
+
+class Deployment(Struct, frozen=True):
+    """The one controller that drives or is to drive. `running`: digest of what really runs, empty until it does.
+
+    verifying: until it has a certificate; starting: until its process answers. `request_id` 0: its request was answered.
+    """
+
+    digest: str
+    request_id: int
+    stage: Literal["verifying", "starting", "running"]
+    certificate_id: str = ""
+    running: str = ""
+
+
+class Job(Struct, frozen=True):
+    """What the worker does. `again`: the radius outgrew a verification of the same request before.
+
+    reverify: of the driving controller, whose certificate `certificate_id` the radius has outgrown.
+    """
+
+    id: int
+    purpose: Literal["gap", "trace", "deploy", "verify", "reverify"]
+    request_id: int
+    epoch: int
+    digest: str = ""
+    attempt: int = 0
+    radius: float = 0.0
+    hold_radius: float = 0.0
+    certificate_id: str = ""
+    again: bool = False
+
+
+VERIFYING = ("deploy", "verify", "reverify")
+
+
+class State(Struct, frozen=True):
+    """All that the core knows.
+
+    unix_s was read at unix_ns. `observation`, `observation_ns`: newest usable one and when it came; `trouble`: why the newest is
+    not usable, or empty; seen_seq: of the newest, usable or not; odd_seq: of one that came out of order. control_seq,
+    control_stamp_ns: of the newest control instant; `answered`: whether it has its Send. `idle`: recovery instants since a source
+    was asked. `repeats`: of an observation whose command was sent. `issuing`: the job whose certificate is being signed.
+    gate_said: the reason last recorded; `ended`: why the last deployment ended. clear_since_ns: since when all standing
+    conditions of the gate hold.
+    """
+
+    settings: Settings | None = None
+    memory: Memory = Memory(robot="", schema=0)
+    refusal: str = ""
+    stopping: bool = False
+    now_ns: int = 0
+    unix_s: int = 0
+    unix_ns: int = 0
+    link_up: bool = False
+    recorder_ok: bool = True
+    analytics_up: bool = True
+    observation: Observation | None = None
+    observation_ns: int = 0
+    trouble: str = ""
+    seen_seq: int | None = None
+    odd_seq: int | None = None
+    control_seq: int | None = None
+    control_stamp_ns: int | None = None
+    answered: bool = True
+    asked: Asked | None = None
+    idle: int = 0
+    repeats: int = 0
+    send_seq: int = 0
+    sent: Send | None = None
+    controller_seq: int = -1
+    sampler_seq: int = -1
+    permit_until_ns: int | None = None
+    campaign: Campaign | None = None
+    deployment: Deployment | None = None
+    jobs: tuple[Job, ...] = ()
+    issuing: Job | None = None
+    next_job: int = 1
+    gate_open: bool = False
+    gate_reason: str = "not_started"
+    gate_said: str = "not_started"
+    ended: str = ""
+    clear_since_ns: int | None = None
+    faults: int = 0
+    e_value: float = 1.0
+    episodes: int = 0
+
+
+def certificate(state: State) -> CertificateFacts | None:
+    """The certificate that the deployment rests on."""
+    wanted = state.deployment.certificate_id if state.deployment else ""
+    return next((facts for facts in state.memory.certificates if facts.id == wanted), None)
+
+
+def usable_gap(state: State) -> Gap | None:
+    """The gap in force, unless the watch refuted it."""
+    gap = state.memory.gap
+    return gap if gap is not None and gap.epoch != state.memory.alarm_epoch else None
+
+
+def job(state: State, *purposes: str) -> Job | None:
+    """The running job of one of these purposes; a certificate that is being signed counts as its verification."""
+    jobs = (*state.jobs, *(() if state.issuing is None else (state.issuing,)))
+    return next((one for one in jobs if one.purpose in purposes), None)
+
+
+def unix_now(state: State) -> int:
+    """The wall clock: the last reading, carried on by the monotonic clock where that is the host's (not in lockstep)."""
+    if state.settings is None or state.settings.lockstep:
+        return state.unix_s
+    return state.unix_s + max(0, state.now_ns - state.unix_ns) // NANO
+
+
+def situation(state: State) -> Situation:
+    """What the gate is to look at."""
+    memory, deployment, gap = state.memory, state.deployment, state.memory.gap
+    asked = state.asked
+    return Situation(
+        clock_ns=state.now_ns,
+        unix_s=unix_now(state),
+        stopping=state.stopping,
+        latched=memory.latched,
+        recorder_ok=state.recorder_ok,
+        link_up=state.link_up,
+        permit_until_ns=state.permit_until_ns,
+        campaign_running=state.campaign is not None and state.campaign.running,
+        controller_digest=deployment.running if deployment is not None and deployment.stage == "running" else None,
+        analytics_up=state.analytics_up,
+        alarmed=gap is not None and gap.epoch == memory.alarm_epoch,
+        verifying=(deployment is not None and deployment.stage == "verifying") or job(state, "reverify") is not None,
+        certificate=certificate(state),
+        revoked=deployment is not None and deployment.certificate_id in memory.revoked,
+        model_digest=memory.model_digest,
+        epoch=0 if gap is None else gap.epoch,
+        radius=math.inf if gap is None else memory.radius,
+        faults=state.faults,
+        observation=state.observation,
+        observation_ns=state.observation_ns,
+        trouble=state.trouble,
+        asked_seq=None if asked is None else asked.obs_seq,
+        asked_ns=0 if asked is None else asked.t_ns,
+        last_command_seq=state.sampler_seq if asked is not None and asked.source == "sampler" else state.controller_seq,
+        clear_since_ns=state.clear_since_ns,
+    )
+
+
+class Turn:
+    """One event being handled: `state` so far, `outputs` in the order in which they take effect. Lives for one call of `handle`."""
+
+    __slots__ = ("_unsaved", "now", "outputs", "settings", "state")
+
+    def __init__(self, state: State, settings: Settings, now_ns: int) -> None:
+        self.state, self.settings, self.now = state, settings, now_ns
+        self.outputs: list[Output] = []
+        self._unsaved = False
+
+    @property
+    def memory(self) -> Memory:
+        """What outlives a restart."""
+        return self.state.memory
+
+    def set(self, **changes: Any) -> None:
+        """Changes fields of the state."""
+        self.state = msgspec.structs.replace(self.state, **changes)
+
+    def remember(self, **changes: Any) -> None:
+        """Changes fields of the memory; persisted at the latest with this event's last output."""
+        self.set(memory=msgspec.structs.replace(self.state.memory, **changes))
+        self._unsaved = True
+
+    def persist(self) -> None:
+        """What was remembered is durable before what is emitted after this."""
+        if self._unsaved:
+            self._unsaved = False
+            self.outputs.append(Persist(self.now, self.state.memory))
+
+    def emit(self, *outputs: Output) -> None:
+        """Adds outputs."""
+        self.outputs.extend(outputs)
+
+    def answer(self, request_id: int, exit_code: int, text: str, *, final: bool = True) -> None:
+        """Replies to a request (0: there is none to reply to)."""
+        if request_id:
+            self.outputs.append(Answer(self.now, request_id, exit_code, text, final))
+
+    def add_job(self, one: Job) -> None:
+        """Notes a job that a StartJob goes out for."""
+        self.set(jobs=(*self.state.jobs, one), next_job=one.id + 1)
+
+    def drop_job(self, one: Job) -> None:
+        """Forgets a job."""
+        self.set(jobs=tuple(other for other in self.state.jobs if other.id != one.id))
