@@ -101,8 +101,8 @@ def _gap(robot: str, model: ModelSpec, gap: Gap, assumption: str) -> tuple[str, 
             f"at most {bound(gap.epsilon)}{hold}."
         ),
         (
-            f"It stands on {gap.n} transitions, {gap.discarded or 'none'} of the largest discarded, both numbers fixed beforehand; {whether} {basis}. "
-            f"In the unweighted norm r is {bound(gap.radius_literal)}{noise}."
+            f"It stands on {gap.n} transitions, {gap.discarded or 'none'} of the largest discarded, both numbers fixed beforehand; "
+            f"{whether} {basis}. In the unweighted norm r is {bound(gap.radius_literal)}{noise}."
         ),
     )
 
@@ -133,8 +133,8 @@ def _law(task: str, law: LawResult, v: Verification, times: str) -> str:
     return (
         f"Controller (G2, law {law.law}). With confidence {confidence(v.beta)}, a new rollout of the uncertain model ({disturbed}) in a "
         f"new scenario of the task {task} scores below s* = {worst(law.s_star)} with probability at most {bound(v.epsilon)}; {law.n} "
-        f"scenarios were drawn independently, {law.failures} scored below the threshold {v.threshold:g}, and the probability of that is at most "
-        f"{bound(law.failure_upper)} (Clopper-Pearson, the same confidence)."
+        f"scenarios were drawn independently, {law.failures} scored below the threshold {v.threshold:g}, and the probability of that is at "
+        f"most {bound(law.failure_upper)} (Clopper-Pearson, the same confidence)."
     )
 
 
