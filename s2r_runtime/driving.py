@@ -81,7 +81,7 @@ def drive_transitions(model: ComposedModel, stretches: list[Streams], digest: st
         steps.append(used + offset)
         inputs.append(mean_u)
         offset += len(mean_u)
-    drive = Drive(tuple(inputs), np.concatenate(steps))
+    drive = Drive(tuple(inputs[1:] or inputs), np.concatenate(steps))
     return Transitions(
         np.concatenate(x0),
         np.concatenate(u),
