@@ -132,8 +132,7 @@ def _enforce(turn: Turn, gap: Gap) -> None:
     old = [facts.id for facts in turn.memory.certificates]
     epochs = max(turn.memory.epochs, gap.epoch)
     turn.remember(gap=gap, radius=gap.radius, epochs=epochs, alarm_epoch=0, campaign_digest=turn.settings.campaign_digest)
-    turn.remember(watch_n=0, watch_exceedances=0)
-    turn.set(e_value=1.0)
+    turn.remember(watch_n=0, watch_exceedances=0, watch_e_value=1.0)
     revoke(turn, old, "new_epoch")
     turn.persist()
     turn.emit(EpochChanged(turn.now, gap.epoch, ledger.share(turn.settings.beta, gap.epoch), gap))
@@ -143,8 +142,7 @@ def void_gap(turn: Turn, reason: str) -> None:
     """No gap any more, nor an unfinished campaign; certificates end with it. Counters stay: what is spent is spent."""
     old = [facts.id for facts in turn.memory.certificates]
     turn.remember(gap=None, radius=0.0, campaign_epoch=0, campaign_n=0, alarm_epoch=0, traced=False)
-    turn.remember(watch_n=0, watch_exceedances=0)
-    turn.set(e_value=1.0)
+    turn.remember(watch_n=0, watch_exceedances=0, watch_e_value=1.0)
     revoke(turn, old, reason)
 
 
@@ -189,8 +187,8 @@ def measured(turn: Turn, event: Measured) -> None:
             turn.set(faults=turn.state.faults + 1)
         regate(turn)
         return
-    counted = msgspec.structs.replace(turn.memory, watch_n=event.n, watch_exceedances=event.exceedances)
-    turn.set(e_value=event.e_value, memory=counted)  # written with whatever is remembered next: a write for each would be too many
+    counted = {"watch_n": event.n, "watch_exceedances": event.exceedances, "watch_e_value": event.e_value}
+    turn.set(memory=msgspec.structs.replace(turn.memory, **counted))  # written with what is remembered next: a write each is too many
     grew = event.discrepancy > turn.memory.radius
     if grew:
         turn.remember(radius=event.discrepancy)

@@ -117,8 +117,17 @@ class State(Struct, frozen=True):
     ended: str = ""
     clear_since_ns: int | None = None
     faults: int = 0
-    e_value: float = 1.0
     episodes: int = 0
+
+    @property
+    def e_value(self) -> float:
+        """The watch's, in this epoch."""
+        return self.memory.watch_e_value
+
+    @property
+    def measured(self) -> int:
+        """Discrepancies that the watch counted in this epoch."""
+        return self.memory.watch_n
 
 
 def certificate(state: State) -> CertificateFacts | None:

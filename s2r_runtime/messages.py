@@ -206,7 +206,8 @@ class Memory(Struct, frozen=True):
     """Epoch whose gap the watch refuted (0: none): it founds no certificate any more, only a fresh campaign does."""
     watch_n: int = 0
     watch_exceedances: int = 0
-    """What the watch has counted in this epoch; its e-value is a function of the two. As of the last time the memory was written."""
+    watch_e_value: float = 1.0
+    """Where the watch of this epoch stood when the memory was last written, so that a restart forgives nothing."""
     traced: bool = False
     """An effect was traced in the residual and no model that has it was adopted since (DESIGN G8)."""
 
