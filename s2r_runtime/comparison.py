@@ -223,6 +223,8 @@ class Campaign:
         self._phase = "goto"
         self._began_ns = self._last_ns
         self._held_u, self._mark, self._x0, self._x1 = self._zero, None, None, None
+        self._standing: Observation | None = None
+        self._before: tuple[float, ...] = ()
 
     def _goto(self, observation: Observation) -> CampaignStep:
         x, now = observation.x, observation.stamp_ns
@@ -244,6 +246,7 @@ class Campaign:
         return self._answer(goto.confined(self._model, x, u, self._fence[:2], self._guard))
 
     def _stop(self, observation: Observation) -> CampaignStep:
+        before, self._standing = self._standing, observation
         if self._refused:
             self._began_ns = observation.stamp_ns
         if observation.stamp_ns - self._began_ns < (self._stop_periods - 0.5) * self._dt_ns:
@@ -254,6 +257,8 @@ class Campaign:
         if u is None:
             return self._again("outside_geofence", observation)
         self._phase, self._began_ns, self._held_u, self._x0 = "hold", observation.stamp_ns, u, observation
+        if before is not None and abs(observation.stamp_ns - before.stamp_ns - self._dt_ns) <= STAMP_TOLERANCE * self._dt_ns:
+            self._before = before.x
         return self._answer(u)
 
     def _hold(self, observation: Observation) -> CampaignStep:
@@ -285,6 +290,7 @@ class Campaign:
             x1=self._x1.x,
             held=observation.x if periods > 1 else (),
             periods=periods,
+            before=self._before,
         )
         self._index, self._try, self._refusals = self._index + 1, 0, 0
         self._begin_try()

@@ -337,6 +337,8 @@ class SampleTaken(Struct, frozen=True, tag="sample_taken"):
     x1: tuple[float, ...]
     held: tuple[float, ...]
     periods: int
+    before: tuple[float, ...] = ()
+    """(nx,), observed one period before x0, while the robot stood still: the two differ by measurement noise alone."""
 
 
 class CampaignFinished(Struct, frozen=True, tag="campaign_finished"):

@@ -28,6 +28,7 @@ from s2r_runtime.errors import RecordingError, UsageError
 from s2r_runtime.gap import Transitions
 from s2r_runtime.messages import CampaignFinished, Observed, SampleTaken, Send, Started
 from s2r_runtime.models.composed import ComposedModel, wrap
+from s2r_runtime.sensor_noise import FEWEST, NORMAL_MAD
 from s2r_runtime.tables import read_csv
 
 Array = NDArray[np.float64]
@@ -175,20 +176,14 @@ def from_mcap(path: Path, model: ComposedModel, *, epoch: int | None = None) -> 
     complete = [e for e in log.samples if e in log.finished and log.finished[e].complete and len(log.samples[e]) == log.finished[e].n]
     chosen = epoch if epoch is not None else (complete or list(log.samples))[-1]
     ending = log.finished.get(chosen)
-    found = from_samples(
-        log.samples[chosen], rejected=ending.rejected if ending else {}, source=str(path), noise=streams_noise(model, log.stretches(model))
-    )
+    found = from_samples(log.samples[chosen], rejected=ending.rejected if ending else {}, source=str(path))
+    if found.noise is None:
+        found = replace(found, noise=streams_noise(model, log.stretches(model)))
     doubt = "" if chosen in complete else _incomplete(chosen, len(log.samples[chosen]), ending)
     return replace(found, digest=recording, independent=not doubt, doubt=doubt)
 
 
-def from_samples(
-    samples: Sequence[SampleTaken],
-    *,
-    rejected: Mapping[str, int] | None = None,
-    source: str = "campaign",
-    noise: Array | None = None,
-) -> Transitions:
+def from_samples(samples: Sequence[SampleTaken], *, rejected: Mapping[str, int] | None = None, source: str = "campaign") -> Transitions:
     """Transitions of one complete campaign's samples; `digest` is that of the samples. Raises RecordingError if there are none."""
     if not samples:
         raise RecordingError(f"{source}: holds no samples")
@@ -211,8 +206,16 @@ def from_samples(
         t0_s=np.array([s.t0_ns * 1e-9 for s in samples]),
         source=source,
         samples_digest=data,
-        noise=noise,
+        noise=_standing_noise(samples),
     )
+
+
+def _standing_noise(samples: Sequence[SampleTaken]) -> Array | None:
+    """(nx,) from two observations of the robot at rest before each sample; the median doesn't mind angles that jump at the cut."""
+    if len(samples) < FEWEST or not all(len(s.before) == len(s.x0) for s in samples):
+        return None
+    spread = np.median(np.abs(np.array([s.x0 for s in samples]) - np.array([s.before for s in samples])), axis=0)
+    return np.asarray(spread / (NORMAL_MAD * np.sqrt(2.0))) if np.all(spread > 0.0) else None
 
 
 @dataclass

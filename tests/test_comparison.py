@@ -352,3 +352,14 @@ def test_model_without_a_way_to_a_waypoint_is_refused() -> None:
 def test_the_daemons_process_gets_no_numpy_from_the_campaign() -> None:
     code = "import sys, s2r_runtime.comparison; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_the_robot_stood_still_in_the_two_observations_up_to_x0() -> None:
+    """Their difference shows the measurement noise; with the robot's own, 5 standard deviations of it are never exceeded here."""
+    noise = 0.0005
+    samples, _ = drive(campaign(20), Robot(noise=noise))
+    for sample in samples:
+        assert all(
+            abs(math.remainder(a - b, 2.0 * math.pi)) < 5.0 * noise * math.sqrt(2.0) for a, b in zip(sample.x0, sample.before, strict=True)
+        )
+    assert any(sample.x0 != sample.before for sample in samples)

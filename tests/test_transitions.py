@@ -8,6 +8,7 @@ import itertools
 import math
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -355,3 +356,20 @@ def test_a_damaged_log_is_refused(tmp_path: Path) -> None:
     path.write_bytes(bytes(data))
     with pytest.raises(RecordingError):
         load_transitions(path, MODEL)
+
+
+def test_two_observations_at_rest_before_each_sample_show_the_noise() -> None:
+    rng = np.random.default_rng(7)
+    sigma = np.array([0.001, 0.002, 0.01])
+
+    def noisy(i: int) -> SampleTaken:
+        x0, before = (np.array([0.0, 1.0, math.pi - 0.001]) + e for e in rng.normal(size=(2, 3)) * sigma)
+        around = [math.remainder(x[2], 2 * math.pi) for x in (x0, before)]
+        return msgspec.structs.replace(sample(i), x0=(*x0[:2].tolist(), around[0]), before=(*before[:2].tolist(), around[1]))
+
+    samples = [noisy(i) for i in range(400)]
+    found = from_samples(samples).noise
+    assert found is not None
+    np.testing.assert_allclose(found[:2], sigma[:2], rtol=0.25)  # a median of 400: standard error 6 %
+    assert from_samples(samples[:20]).noise is None
+    assert from_samples([*samples[:100], sample(100)]).noise is None
