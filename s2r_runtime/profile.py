@@ -99,7 +99,14 @@ class Gate(_Table, frozen=True):
     controller_deadline: float = 0.05
     hysteresis: float = 0.1
     settle_periods: int = 30
-    latching: tuple[str, ...] = ("emergency_stop", "manual_override", "watch_alarm", "controller_fault", "measurement_faults")
+    latching: tuple[str, ...] = (
+        "emergency_stop",
+        "manual_override",
+        "watch_alarm",
+        "controller_fault",
+        "command_invalid",
+        "measurement_faults",
+    )
 
 
 class Recovery(_Table, frozen=True):
