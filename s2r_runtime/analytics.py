@@ -47,10 +47,9 @@ class Watching(msgspec.Struct, frozen=True, tag="watching"):
 
     model: ModelSpec
     gap: Gap
-    alpha: float
     fault_jump: float
-    n: int
-    exceedances: int
+    n: int = 0
+    exceedances: int = 0
     e_value: float | None = None
 
 
@@ -86,7 +85,7 @@ _DECODE_UP = msgspec.json.Decoder(Upward).decode
 
 
 class Analytics:
-    """The daemon's end. `poll` and `measure` give what came; `down` says why it is no more, or nothing."""
+    """The daemon's end. `poll` and `wait` give what came; `down` says why it is no more, or nothing."""
 
     def __init__(self, profile: Profile, where: str) -> None:
         self.down = ""
@@ -130,12 +129,11 @@ class Analytics:
         self._waiting[observation.seq] = time.monotonic_ns() + round(REPLY_WITHIN_S * 1e9)
         self._send(observation)
 
-    def measure(self, observation: Observation) -> list[Upward]:
-        """As `observed`, and waits for its reply. What came before it is returned too, in order."""
-        self.observed(observation)
+    def wait(self) -> list[Upward]:
+        """As `poll`, once every observation has its reply; or it is down."""
         came: list[Upward] = []
         deadline = time.monotonic() + REPLY_WITHIN_S
-        while observation.seq in self._waiting and not self.down:
+        while self._waiting and not self.down:
             line = self._child.wait(deadline - time.monotonic())
             if line is None:
                 self._gone(time.monotonic_ns())
@@ -186,30 +184,35 @@ def main(arguments: list[str]) -> int:
     channel = take_stdout()
     decode = msgspec.json.Decoder(Downward).decode
     stream: Stream | None = None
+    epoch = 0
     for line in sys.stdin.buffer:
         message = decode(line)
         if isinstance(message, Observation):
             measured = stream.observed(message) if stream is not None else None
+            if measured is not None:
+                measured = msgspec.structs.replace(measured, epoch=epoch)
             say(channel, _ENCODE(Reply(message.seq, measured)))
         elif isinstance(message, Send):
             if stream is not None:
                 stream.sent(message)
         elif isinstance(message, Watching):
-            stream = _stream(message)
+            stream, epoch = _stream(message), message.gap.epoch
         else:
             say(channel, _ENCODE(_checked(message)))
     return 0
 
 
 def _checked(message: Setup | CheckModel) -> Ready | Refused:
+    from s2r_runtime.plugins import registry
     from s2r_runtime.profile import check_model
 
-    ref = message.ref if isinstance(message, CheckModel) else 0
+    ref, profile = message.ref if isinstance(message, CheckModel) else 0, message.profile
     try:
-        model = check_model(message.profile, message.where)
+        model = check_model(profile, message.where)
+        task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
     except S2RError as error:
         return Refused(str(error), ref)
-    return Ready(ModelFacts(model.states, model.inputs, tuple(model.nominal.angles)), ref)
+    return Ready(ModelFacts(model.states, model.inputs, tuple(model.nominal.angles), task.horizon), ref)
 
 
 def _stream(watching: Watching) -> Stream:

@@ -57,25 +57,25 @@ class RobotLink:
         """Readable when `receive` has something."""
         return self.transport.fileno()
 
-    def receive(self) -> Iterator[Inbound]:
-        """What came, in order. The caller acts on each before it takes the next."""
+    def receive(self) -> Iterator[tuple[int, Inbound]]:
+        """(arrival on the host's clock, ns; what came), in order. The caller acts on each before it takes the next."""
         try:
             frames = self.transport.receive()
         except Exception as error:  # noqa: BLE001 - a plug-in's defect must not stop the gate
-            yield from self._failed("receive", error)
+            for change in self._failed("receive", error):
+                yield change.t_ns, change
             return
         for frame in frames:
             self._record(frame)
             try:
                 messages = self.transport.decode(frame)
             except Exception as error:  # noqa: BLE001 - as above
-                yield from self._failed("decode", error)
-                continue
+                messages = list(self._failed("decode", error))
             for message in messages:
                 if self._fault and isinstance(message, Observation):
                     self._fault = ""
-                    yield LinkChanged(frame.arrival_ns, up=True, detail="the transport works again")
-                yield message
+                    yield frame.arrival_ns, LinkChanged(frame.arrival_ns, up=True, detail="the transport works again")
+                yield frame.arrival_ns, message
 
     def poll(self, now_ns: int) -> Iterator[LinkChanged]:
         """Link lost or back, by the transport's own time-outs. now_ns: the host's clock."""

@@ -120,7 +120,8 @@ class Sampler:
         self._earlier_logs = kept.logs if kept is not None else ()
         self._campaign, self.epoch, self.n = campaign, order.epoch, order.n
         self._keep()
-        return [SourceStarted(order.t_ns, "sampler", campaign.digest)]
+        # a log that holds all samples of its campaign can be read alone, so those from before are logged again
+        return [SourceStarted(order.t_ns, "sampler", campaign.digest), *self.samples]
 
     def ask(self, t_ns: int, observation: Observation) -> list[Event]:
         """The campaign's answer to an observation."""
@@ -158,9 +159,17 @@ class Sampler:
         p = self._campaign.progress()
         return p.phase, p.taken, p.n, p.rejected, p.left_s
 
-    def forget(self) -> None:
-        """The gap that these samples found is in force: nothing is left to resume."""
-        self._folder.forget_campaign()
+    def recall(self, epoch: int) -> None:
+        """The samples of that epoch's finished campaign, if they were kept: they can still be traced. A kept file that is no good is
+        none: the gap that was found on it stands without it.
+        """
+        try:
+            plain = self._folder.campaign()
+            kept = None if plain is None else msgspec.convert(plain, Kept)
+        except (ConfigError, msgspec.ValidationError):
+            return
+        if kept is not None and kept.epoch == epoch and len(kept.samples) == kept.n:
+            self.epoch, self.n, self.samples, self._earlier_logs = kept.epoch, kept.n, list(kept.samples), kept.logs
 
     def _end(self, t_ns: int, reason: Any, detail: str) -> list[Event]:
         campaign, self._campaign = self._campaign, None

@@ -17,11 +17,12 @@ from s2r_runtime.profile import Profile
 
 
 class ModelFacts(msgspec.Struct, frozen=True):
-    """A model's names, in order. `angles` are the states that wrap."""
+    """A model's names, in order; `angles` are the states that wrap. `horizon`: steps of the profile's task."""
 
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     angles: tuple[str, ...]
+    horizon: int = 0
 
 
 def settings_of(profile: Profile, model: ModelSpec, facts: ModelFacts, seed: int | None = None) -> Settings:

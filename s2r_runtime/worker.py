@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 
 from s2r_runtime.child import Child, die_with_parent, say, take_stdout
+from s2r_runtime.controller_file import ControllerFile
 from s2r_runtime.errors import S2RError
 from s2r_runtime.messages import Gap, SampleTaken, Verification
 from s2r_runtime.profile import Profile
@@ -29,11 +30,18 @@ class GapJob(msgspec.Struct, frozen=True, tag="gap"):
     beta: float
 
 
+class LoadJob(msgspec.Struct, frozen=True, tag="load"):
+    """Read a controller's file and what it imports. In a worker, because a path may be slow, or a pipe."""
+
+    path: str
+    parameters: dict[str, Any]
+
+
 class VerifyJob(msgspec.Struct, frozen=True, tag="verify"):
-    """Roll the controller out on the uncertain model. `controller`: a ControllerFile as plain data; gap: whose set and norm."""
+    """Roll the controller out on the uncertain model. gap: whose set and norm."""
 
     profile: Profile
-    controller: dict[str, Any]
+    controller: ControllerFile
     gap: Gap
     radius: float
     hold_radius: float
@@ -48,12 +56,13 @@ class TraceJob(msgspec.Struct, frozen=True, tag="trace"):
     profile: Profile
     logs: tuple[str, ...]
     samples: tuple[SampleTaken, ...]
+    rejected: dict[str, int]
     epoch: int
     seed: int
     out: str
 
 
-Job = GapJob | VerifyJob | TraceJob
+Job = LoadJob | GapJob | VerifyJob | TraceJob
 
 
 class Progress(msgspec.Struct, frozen=True, tag="progress"):
@@ -65,12 +74,13 @@ class Progress(msgspec.Struct, frozen=True, tag="progress"):
 
 
 class Result(msgspec.Struct, frozen=True, tag="result"):
-    """What a job found: the fields of JobFinished that it fills."""
+    """What a job found: the fields of JobFinished that it fills, or the controller that was loaded."""
 
     gap: Gap | None = None
     verification: Verification | None = None
     trace: dict[str, Any] | None = None
     safety: dict[str, list[float]] = {}
+    controller: ControllerFile | None = None
 
 
 class Failed(msgspec.Struct, frozen=True, tag="failed"):
@@ -151,4 +161,6 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    from s2r_runtime.worker import main as once  # `jobs` imports this module, and its structs must be the same ones
+
+    raise SystemExit(once(sys.argv[1:]))
