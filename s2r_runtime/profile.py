@@ -16,6 +16,7 @@ import msgspec
 
 from s2r_runtime.canonical import digest_of
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.gate import REASONS
 from s2r_runtime.modelspec import ModelSpec
 
 if TYPE_CHECKING:
@@ -345,6 +346,11 @@ def _checks(p: Profile) -> list[tuple[str, object, str]]:
     ):
         need(0.0 < value < math.inf, f"gate.{field}", value, "> 0 s")
     need(0.0 <= gate.hysteresis < math.inf, "gate.hysteresis", gate.hysteresis, ">= 0 s")
+    for reason in gate.latching:  # a misspelt one would never latch
+        near = difflib.get_close_matches(reason, REASONS, 1, 0.6)
+        need(
+            reason in REASONS, "gate.latching", repr(reason), "one of the gate's reasons" + (f"; did you mean {near[0]!r}?" if near else "")
+        )
     need(p.certificate.lifetime >= 1.0, "certificate.lifetime", p.certificate.lifetime, ">= 1 s")
     need(p.task.episodes >= 0, "task.episodes", p.task.episodes, ">= 0 (0: no end)")
     need(p.watch.fault_jump >= 0.0, "watch.fault_jump", p.watch.fault_jump, ">= 0 (0: no such rule)")
