@@ -26,6 +26,7 @@ from s2r_runtime.channels import BY_TYPE, FRAME_IN, FRAME_OUT, NUMBERS
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.layout import MAX_CHUNK, attachment_record
 from s2r_runtime.logfile import End, LogFile, Pending
+from s2r_runtime.logs import Log, read_all
 from s2r_runtime.messages import Frame, Struct
 from s2r_runtime.reading import Ending, Entry, Reading, read
 
@@ -229,4 +230,4 @@ class Writer:
         return bool(old or file.chunks >= PART_CHUNKS or (self._rotate_bytes and file.size >= self._rotate_bytes))
 
 
-__all__ = ["CHUNK_S", "Ending", "Entry", "Reading", "Writer", "environment", "read"]
+__all__ = ["CHUNK_S", "Ending", "Entry", "Log", "Reading", "Writer", "environment", "read", "read_all"]

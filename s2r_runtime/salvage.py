@@ -81,8 +81,8 @@ def info(path: Path) -> dict[str, Any]:
     }
 
 
-def recover(path: Path, out: Path) -> Account:
-    """Writes what is good of a log into a new file, and says what is missing.
+def recover(path: Path, out: Path) -> dict[str, Any]:
+    """Writes what is good of a log into a new file, and gives the `Account` as plain data.
 
     Raises UsageError if `out` exists or cannot be made, RecordingError if there is nothing to recover.
     """
@@ -99,7 +99,8 @@ def recover(path: Path, out: Path) -> Account:
     except OSError as error:
         partial.unlink(missing_ok=True)
         raise UsageError(f"{out}: cannot be written: {error.strerror}") from None
-    return account
+    plain: dict[str, Any] = msgspec.to_builtins(account)
+    return plain
 
 
 class _Good(NamedTuple):
@@ -129,6 +130,8 @@ def _good(path: Path) -> _Good:
         start, tables = reading.start or _new_start(), reading.declarations
         return _Good(start, ending.offset, records, ending, reading.lacking, reading.indexed, reading.sealed_for_good, *tables)
     except RecordingError as error:
+        if not path.is_file():
+            raise
         with path.open("rb") as source:
             size = os.fstat(source.fileno()).st_size
             if find(source, 0, size) is None:
