@@ -115,8 +115,8 @@ class ConfinedProcess:
         return self._process.returncode is not None or self._status() is not None
 
     def ending(self) -> str:
-        """How it ended, in a few words. Waits up to 5 ms: the end of its socket comes a moment before its own."""
-        deadline = time.monotonic() + 0.005
+        """How it ended, in a few words. Waits up to 20 ms: the end of its socket comes a moment before its own."""
+        deadline = time.monotonic() + 0.02
         while (status := self._status()) is None and time.monotonic() < deadline:
             time.sleep(0.0005)
         self._drain()

@@ -1,0 +1,125 @@
+"""A confined process: what it can no longer do, and what goes on."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from s2r_runtime import confinement
+
+pytestmark = pytest.mark.skipif(platform.machine() not in {"x86_64", "aarch64"}, reason="system calls are filtered on these processors")
+
+CONFINED = """
+import os, sys
+from s2r_runtime.confinement import confine
+PATH = sys.argv[1]
+in_force = confine(1 << 28)
+try:
+    exec(sys.argv[2])
+except (OSError, ValueError) as error:
+    print("refused", error)
+else:
+    print("done", *in_force)
+"""
+
+
+def confined(code: str, path: Path) -> str:
+    """What a process prints that confines itself and then runs the code."""
+    command = [sys.executable, "-c", CONFINED, str(path), code]
+    return subprocess.run(command, capture_output=True, text=True, check=True, cwd=path.parent, timeout=60).stdout
+
+
+@pytest.fixture
+def target(tmp_path: Path) -> Path:
+    """A file that stays as it is."""
+    (tmp_path / "target.txt").write_text("kept")
+    return tmp_path / "target.txt"
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import os; os.fork()",
+        "import subprocess; subprocess.run(['/bin/true'])",
+        "import os; os.execv('/bin/true', ['true'])",
+        "import os; os.posix_spawn('/bin/true', ['true'], {})",
+        "import multiprocessing; multiprocessing.Process(target=print).start()",
+        "import socket; socket.socket()",
+        "import socket; socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)",
+        "import urllib.request; urllib.request.urlopen('http://127.0.0.1:1')",
+        "import os; os.kill(os.getppid(), 9)",
+        "import os; os.killpg(0, 9)",
+        "open('new', 'w')",
+        "open('/proc/self/mem', 'r+b')",
+        "open(f'/proc/{__import__(\"os\").getppid()}/mem', 'r+b')",
+        "import os; os.unlink(PATH)",
+        "import os; os.rename(PATH, PATH + 'x')",
+        "import os; os.truncate(PATH, 0)",
+        "import os; os.chmod(PATH, 0o777)",
+        "import os; os.mkdir(PATH + 'd')",
+        "import os; os.symlink(PATH, PATH + 'l')",
+        "import os; os.utime(PATH)",
+        "import os; os.setxattr(PATH, 'user.a', b'b')",
+        "import resource; resource.setrlimit(resource.RLIMIT_AS, (-1, -1))",
+        "import resource; resource.prlimit(0, resource.RLIMIT_AS, (-1, -1))",
+        "import os; os.setpriority(os.PRIO_PROCESS, 0, -5)",
+        "import os; os.sched_setaffinity(0, {0})",
+        "import os; os.setsid()",
+        "import time; time.clock_settime(time.CLOCK_REALTIME, 0)",
+        "import os; os.pidfd_open(os.getppid())",
+    ],
+)
+def test_what_reaches_out_of_the_process_is_refused(target: Path, code: str) -> None:
+    assert confined(code, target).startswith("refused")
+    assert [path.name for path in target.parent.iterdir()] == ["target.txt"]
+    assert target.read_text() == "kept"
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import threading; t = threading.Thread(target=print); t.start(); t.join()",
+        "open(PATH).read()",
+        "import numpy as np; np.linalg.solve(np.eye(50), np.ones(50))",
+        "import resource; resource.getrlimit(resource.RLIMIT_AS)",
+        "import time; time.sleep(0.001)",
+        "bytearray(1 << 27)",
+    ],
+)
+def test_computing_reading_and_threads_go_on(target: Path, code: str) -> None:
+    assert confined(code, target).splitlines()[-1] == "done memory files privileges system_calls"
+
+
+def test_memory_beyond_the_limit_is_refused(target: Path) -> None:
+    code = "try:\n    bytearray(1 << 29)\nexcept MemoryError:\n    raise OSError('no memory')"
+    assert confined(code, target) == "refused no memory\n"
+
+
+def test_a_second_confinement_lifts_nothing(target: Path) -> None:
+    assert confined("confine(1 << 40)", target).startswith("refused")
+
+
+def test_the_filters_program_fits_both_processors() -> None:
+    for machine in ("x86_64", "aarch64"):
+        program = confinement._filter(machine)
+        assert program is not None
+        assert len(program) % 8 == 0
+        assert len(program) // 8 < 4096  # BPF_MAXINSNS
+    assert confinement._filter("riscv64") is None
+
+
+def test_the_numbers_of_the_system_calls_are_the_kernels() -> None:
+    """Where the kernel's headers are installed."""
+    columns = (("/usr/include/x86_64-linux-gnu/asm/unistd_64.h", "__NR_"), ("/usr/include/asm-generic/unistd.h", "__NR3264_"))
+    for column, (header, other_prefix) in enumerate(columns):
+        if not Path(header).exists():
+            continue
+        words = [line.split() for line in Path(header).read_text().splitlines() if line.startswith("#define __NR")]
+        known = {w[1].removeprefix(other_prefix).removeprefix("__NR_"): int(w[2]) for w in words if len(w) > 2 and w[2].isdigit()}
+        for name, numbers in {**confinement._DENIED, **confinement._UNKNOWN}.items():
+            if name in known:
+                assert numbers[column] == known[name], name
