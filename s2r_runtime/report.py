@@ -49,8 +49,8 @@ def _summary(page: Page, story: Story) -> None:
     last = story.gate[-1] if story.gate else None
     if last is not None:
         page.text(f"The run ends with the gate {'open' if last[1] else 'closed'} ({last[2]}).", "good" if last[1] else "warn")
-    counted = [(story.gaps, "gap"), (story.verifications, "verification attempt"), (story.certificates, "certificate")]
-    words = [f"{len(things)} {name}{'' if len(things) == 1 else 's'}" for things, name in counted]
+    counted = [(len(story.gaps), "gap"), (len(story.verifications), "verification attempt"), (len(story.certificates), "certificate")]
+    words = [f"{number} {name}{'' if number == 1 else 's'}" for number, name in counted]
     page.text(f"{', '.join(words)}; {len(valid)} still valid at the end.")
 
 
@@ -68,7 +68,10 @@ def _timeline(page: Page, story: Story) -> None:
     )
     page.items((f"{when:.2f} s: {what}" for when, what, _ in story.marks), "marks")
     if story.refusals:
-        page.table(("commands refused because", "number"), sorted(story.refusals.items(), key=lambda item: -item[1]))
+        page.table(
+            ("commands refused because", "number"),
+            [(reason, n) for n, reason in sorted(((n, r) for r, n in story.refusals.items()), reverse=True)],
+        )
 
 
 def _gaps(page: Page, story: Story, models: dict[str, ModelSpec]) -> None:

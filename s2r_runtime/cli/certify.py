@@ -6,9 +6,11 @@ import argparse
 import time
 from pathlib import Path
 
+import msgspec
+
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import load_checked, pair
-from s2r_runtime.errors import NotEnoughEvidence
+from s2r_runtime.errors import UsageError
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -27,11 +29,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Exit 0 with a certificate written, 1 if the controller did not pass (the attempt is spent all the same)."""
-    from s2r_runtime import certificate, controllers, keys, offline_ledger
+    from s2r_runtime import certificate, controllers, keys, offline_ledger, persistence
     from s2r_runtime import verify as verification
     from s2r_runtime.bounds import attempt_beta, epoch_beta
     from s2r_runtime.canonical import digest
     from s2r_runtime.cli.evidence import gap_of, print_verification, profile_model, run_verification
+    from s2r_runtime.plugins import registry
 
     profile = load_checked(args.profile)
     model = profile_model(args, profile)
@@ -41,31 +44,36 @@ def run(args: argparse.Namespace) -> int:
     try:
         recording = digest(args.recording.read_bytes())
     except OSError as error:
-        raise NotEnoughEvidence(f"{args.recording}: cannot be read: {error.strerror}") from None
+        raise UsageError(f"{args.recording}: cannot be read: {error.strerror}") from None
     ledger = offline_ledger.open_ledger(key_path, profile.robot.name)
-    epoch = ledger.epoch_for(recording, model.spec.digest())
+    epoch = ledger.epoch_for(recording, model.spec.digest(), profile.digest())
     gap = gap_of(args.recording, model, profile, beta=epoch_beta(profile.guarantee.beta, epoch), epoch=epoch)
     attempt = ledger.spend_attempt(controller.digest)
     beta = attempt_beta(profile.guarantee.beta, attempt)
     headroom = profile.verification.headroom
     result = run_verification(
-        args.controller,
+        controller,
         model,
         profile,
         radius=gap.radius * headroom,
         hold_radius=gap.hold_radius * headroom,
         laws=profile.verification.laws,
         n=0,
-        parameters=dict(controller.parameters),
         attempt=attempt,
         beta=beta,
     )
-    if result.passed and (why := verification.refusal(result, gap)):
-        raise NotEnoughEvidence(f"{args.controller}: passed, but is not certified: {why}")
     spent = ledger.spent(profile.guarantee.beta)
     if result.passed:
-        issued = certificate.issue(controller=controller, profile=profile, gap=gap, verification=result, issued_unix_s=int(time.time()))
-        args.output.write_bytes(certificate.sign(issued, key))
+        task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
+        issued = certificate.issue(
+            profile=msgspec.structs.replace(profile, model=model.spec),
+            controller=controller,
+            gap=gap,
+            verification=result,
+            issued_unix_s=int(time.time()),
+            horizon=task.horizon,
+        )
+        persistence.replace(args.output, certificate.sign(issued, key))
     if args.json:
         answer = verification.verification_json(result, tuple(model.states))
         output.result_json(

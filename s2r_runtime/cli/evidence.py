@@ -10,6 +10,7 @@ from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import add_model_options, chosen_model, count, load_checked, pair, positive, probability, weights_of
 
 if TYPE_CHECKING:
+    from s2r_runtime.controllers import ControllerFile
     from s2r_runtime.messages import Gap
     from s2r_runtime.models.composed import ComposedModel
     from s2r_runtime.profile import Profile
@@ -103,6 +104,7 @@ def _print_gap(answer: dict[str, Any]) -> None:
 
 def run_verify(args: argparse.Namespace) -> int:
     """Exit 0 if it passed, 1 if it did not."""
+    from s2r_runtime import controllers
     from s2r_runtime import verify as verification
 
     profile = load_checked(args.profile)
@@ -115,14 +117,13 @@ def run_verify(args: argparse.Namespace) -> int:
         hold = epoch_gap.hold_radius * profile.verification.headroom if epoch_gap else 0.0
     laws = tuple(args.law) if args.law else profile.verification.laws
     result = run_verification(
-        args.controller,
+        controllers.load(args.controller, dict(pair(i, "--param") for i in args.param)),
         model,
         profile,
         radius=radius,
         hold_radius=hold,
         laws=laws,
         n=args.n,
-        parameters=dict(pair(i, "--param") for i in args.param),
         attempt=1,
         beta=profile.guarantee.beta,
     )
@@ -168,7 +169,7 @@ def gap_of(recording: Path, model: ComposedModel, profile: Profile, *, beta: flo
 
 
 def run_verification(
-    path: Path,
+    controller: ControllerFile,
     model: ComposedModel,
     profile: Profile,
     *,
@@ -176,7 +177,6 @@ def run_verification(
     hold_radius: float,
     laws: tuple[str, ...],
     n: int,
-    parameters: dict[str, float],
     attempt: int,
     beta: float,
 ) -> Any:
@@ -186,7 +186,6 @@ def run_verification(
     from s2r_runtime.plugins import registry
     from s2r_runtime.uncertain import GapSet
 
-    controller = controllers.load(path, parameters)
     task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
     # laws asked for by name are what the question is about, even where the profile does not require them
     required = tuple(law for law in profile.verification.required if law in laws) or laws
