@@ -171,7 +171,7 @@ def situation(state: State) -> Situation:
         controller_digest=deployment.running if deployment is not None and deployment.stage == "running" else None,
         analytics_up=state.analytics_up,
         alarmed=gap is not None and gap.epoch == memory.alarm_epoch,
-        verifying=(deployment is not None and deployment.stage == "verifying") or job(state, "reverify") is not None,
+        verifying=deployment is not None and (deployment.stage == "verifying" or job(state, "reverify") is not None),
         certificate=certificate(state),
         revoked=deployment is not None and deployment.certificate_id in memory.revoked,
         model_digest=memory.model_digest,

@@ -1,0 +1,406 @@
+"""Attempts and certificates in the core: what is spent, checked again, issued, installed, outgrown, revoked, loaded."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgspec
+import pytest
+from core_rig import GAP, Rig, S, answers, kinds, memory, of, one
+
+from s2r_runtime import bounds, core, ledger
+from s2r_runtime.messages import (
+    Answer,
+    AttemptEnded,
+    AttemptSpent,
+    CampaignFinished,
+    CertificateFacts,
+    CertificateFailed,
+    CertificateInstalled,
+    CertificateStored,
+    IssueCertificate,
+    JobFinished,
+    LawResult,
+    Memory,
+    Persist,
+    Revoked,
+    Send,
+    SourceStarted,
+    SourceStopped,
+    StartCampaign,
+    StartController,
+    StartJob,
+    StopController,
+    WallClockRead,
+)
+
+# ---------------------------------------------------------------- verification and certificates
+
+
+def test_without_a_gap_nothing_is_verified() -> None:
+    for verb in ("deploy", "verify"):
+        rig = Rig()
+        answer = one(rig.request(verb, digest="controller"), Answer)
+        assert answer.exit_code == 1
+        assert "no gap" in answer.text
+        assert one(rig.request(verb), Answer).exit_code == 2
+        assert rig.state.memory.attempts == 0
+
+
+def test_an_attempt_is_on_disk_before_it_begins_and_runs_at_the_headroom() -> None:
+    rig = Rig()
+    rig.gap()
+    rig.measure(0.012)
+    outputs = rig.request("deploy", digest="controller")
+    assert kinds(outputs) == ["Persist", "AttemptSpent", "StartJob", "GateChanged"]
+    assert one(outputs, Persist).memory.attempts == 1
+    assert one(outputs, AttemptSpent).beta == pytest.approx(bounds.attempt_beta(0.05, 1))
+    job = one(outputs, StartJob)
+    assert (job.kind, job.attempt, job.epoch, job.digest) == ("verify", 1, 1, "controller")
+    assert job.radius == pytest.approx(1.5 * 0.012)
+    assert job.hold_radius == pytest.approx(1.5 * 0.1 * 1.2)
+    assert core.status(rig.state)["reason"] == "verification_running"
+
+
+def test_a_gap_of_zero_grows_to_all_that_the_held_periods_can_add_up_to() -> None:
+    rig = Rig()
+    rig.gap(radius=0.0, hold_radius=0.0)
+    rig.measure(0.002)
+    job = one(rig.request("verify", digest="controller"), StartJob)
+    assert job.radius == pytest.approx(1.5 * 0.002)
+    assert job.hold_radius == pytest.approx(1.5 * 50 * 0.002)
+
+
+def test_seeds_follow_from_digests_and_attempt_so_that_nobody_shops_for_one() -> None:
+    def seed(digest: str, attempts: int, **changes: Any) -> int:
+        rig = Rig(memory(attempts=attempts, certificates=()), **changes)
+        return one(rig.request("verify", digest=digest), StartJob).seed
+
+    assert seed("a", 0) == seed("a", 0) == seed("a", 0, seed=77)
+    assert len({seed("a", 0), seed("b", 0), seed("a", 1), seed("a", 0, task_digest="other"), seed("a", 0, profile_digest="other")}) == 5
+
+
+def test_a_failed_verification_is_a_refusal_that_was_paid_for() -> None:
+    rig = Rig()
+    rig.gap()
+    rig.request("deploy", digest="controller")
+    outputs = rig.verified(passed=False, reason="uniform: s* is -1")
+    assert (one(outputs, AttemptEnded).passed, one(outputs, AttemptEnded).reason) == (False, "uniform: s* is -1")
+    assert one(outputs, Answer).exit_code == 1
+    assert one(outputs, Answer).text.startswith("refused: ")
+    assert of(rig.outputs, StartController) == []
+    assert rig.state.memory.attempts == 1
+    assert core.status(rig.state)["reason"] == "no_certificate"
+    assert one(rig.request("deploy", digest="controller"), StartJob).attempt == 2
+
+
+_LAW = LawResult("uniform", 160, 0.1, 0, 0.01, 1.0, progress_ok=True, required=True, passed=True)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"passed": False},
+        {"radius": 0.0149},
+        {"radius": math.nan},
+        {"hold_radius": 0.0},
+        {"controller_digest": "another"},
+        {"model_digest": "another"},
+        {"task_digest": "another"},
+        {"attempt": 2},
+        {"epsilon": 0.0},
+        {"epsilon": 1e-3},
+        {"laws": ()},
+        {"laws": (_LAW,)},
+        {"threshold": 0.2},
+        {"laws": tuple(msgspec.structs.replace(_LAW, law=law, n=100) for law in ("uniform", "persistent"))},
+        {"laws": tuple(msgspec.structs.replace(_LAW, law=law, n=0) for law in ("uniform", "persistent"))},
+        {"laws": tuple(msgspec.structs.replace(_LAW, law=law, required=False) for law in ("uniform", "persistent"))},
+        {"laws": (_LAW, msgspec.structs.replace(_LAW, law="persistent", passed=False))},
+        {"laws": (_LAW, msgspec.structs.replace(_LAW, law="persistent", progress_ok=False))},
+        {"laws": (_LAW, msgspec.structs.replace(_LAW, law="persistent", s_star=-0.1))},
+    ],
+    ids=lambda changes: str(changes)[:60],
+)
+def test_a_result_that_does_not_show_what_was_asked_is_no_pass(changes: dict[str, Any]) -> None:
+    rig = Rig()
+    rig.gap()
+    rig.request("deploy", digest="controller")
+    outputs = rig.verified(**changes)
+    assert not one(outputs, AttemptEnded).passed
+    assert one(outputs, Answer).exit_code == 1
+    assert of(outputs, IssueCertificate) == []
+
+
+def test_a_worker_that_fails_shows_nothing() -> None:
+    for error in ("timeout after 600 s", ""):
+        rig = Rig()
+        rig.gap()
+        job = one(rig.request("deploy", digest="controller"), StartJob)
+        outputs = rig.feed(JobFinished(rig.t, job.job_id, "verify", error=error))
+        assert not one(outputs, AttemptEnded).passed
+        assert one(outputs, Answer).exit_code == 1
+
+
+def test_uniform_alone_carries_no_certificate_where_the_residual_is_not_white_or_an_effect_is_known() -> None:
+    rig = Rig(required_laws=("uniform",))
+    rig.gap(white=False)
+    assert "not white" in one(rig.request("deploy", digest="controller"), Answer).text
+    assert rig.state.memory.attempts == 0  # refused before it was paid for
+    rig = Rig(memory(traced=True, certificates=()), required_laws=("uniform",))
+    assert "traced" in one(rig.request("deploy", digest="controller"), Answer).text
+    rig = Rig(required_laws=())
+    rig.gap(white=False)
+    rig.request("deploy", digest="controller")
+    outputs = rig.verified(names=("uniform",))
+    assert one(outputs, AttemptEnded).passed
+    assert "not white" in one(outputs, Answer).text
+    rig = Rig(required_laws=("uniform",))
+    rig.gap()
+    rig.request("deploy", digest="controller")
+    assert of(rig.verified(names=("uniform",)), IssueCertificate)
+
+
+def test_a_certificate_is_durable_and_installed_before_its_controller_starts() -> None:
+    rig = Rig()
+    rig.gap()
+    rig.request("deploy", digest="controller")
+    order = one(rig.verified(), IssueCertificate)
+    assert (order.gap, order.lifetime_s) == (rig.state.memory.gap, 1000)
+    assert of(rig.outputs, StartController) == []
+    outputs = rig.stored()
+    assert kinds(outputs)[:3] == ["CertificateInstalled", "Persist", "Answer"]
+    assert one(outputs, Persist).memory.certificates[0].id == "c1"
+    assert one(outputs, StartController) == StartController(rig.t, "controller", "c1")
+    assert kinds(outputs).index("Persist") < kinds(outputs).index("StartController")
+    assert answers(rig)[3] == []
+    rig.feed(SourceStarted(rig.t, "controller", "controller"))
+    assert [a.exit_code for a in answers(rig)[3]] == [0]
+
+
+def test_a_certificate_in_force_is_used_again_without_paying() -> None:
+    rig = Rig()
+    rig.driving()
+    assert one(rig.request("deploy", digest="controller"), Answer).exit_code == 0  # drives already
+    assert one(rig.request("deploy", digest="another"), Answer).exit_code == 2
+    assert one(rig.request("undeploy"), StopController).reason == "undeployed"
+    assert one(rig.request("deploy", digest="controller"), StartController).certificate_id == "c1"
+    assert rig.state.memory.attempts == 1
+    rig.request("undeploy")
+    rig.feed(WallClockRead(rig.t, 2501))
+    assert one(rig.request("deploy", digest="controller"), StartJob).attempt == 2  # expired
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"verified_radius": 0.0149}, "verified"),
+        ({"controller_digest": "x"}, "controller"),
+        ({"epoch": 2}, "epoch"),
+        ({"task_digest": "x"}, "task"),
+    ],
+)
+def test_a_certificate_other_than_the_one_asked_for_is_not_installed(changes: dict[str, Any], word: str) -> None:
+    rig = Rig()
+    rig.gap()
+    rig.request("deploy", digest="controller")
+    rig.verified()
+    assert rig.feed(CertificateStored(rig.t, memory().certificates[0], request_id=77)) == []
+    outputs = rig.stored(**changes)
+    assert of(outputs, CertificateInstalled) == []
+    assert word in one(outputs, Answer).text
+    assert rig.state.memory.certificates == ()
+
+
+def test_a_certificate_that_cannot_be_made_is_a_refusal() -> None:
+    rig = Rig()
+    rig.gap()
+    rig.request("deploy", digest="controller")
+    rig.verified()
+    assert one(rig.feed(CertificateFailed(rig.t, "no key", 77)), Answer).final is False
+    assert "no key" in one(rig.feed(CertificateFailed(rig.t, "no key", 3)), Answer).text
+    assert rig.state.deployment is None
+
+
+@pytest.mark.parametrize("reason", ["digest", "start_failed"])
+def test_what_starts_must_be_what_was_certified(reason: str) -> None:
+    rig = Rig()
+    rig.gap()
+    rig.deploying()
+    if reason == "digest":
+        outputs = rig.feed(SourceStarted(rig.t, "controller", "another"))
+        assert one(outputs, StopController).reason == "digest_mismatch"
+    else:
+        outputs = rig.feed(SourceStopped(rig.t, "controller", "start_failed", "no such file"))
+    assert one(outputs, Answer).exit_code == 1
+    for _ in range(8):
+        assert [send.source for send in of(rig.observe(), Send)] == ["recovery"]
+
+
+def test_a_controller_that_nobody_deployed_is_stopped_and_a_second_one_is_a_fault() -> None:
+    rig = Rig()
+    rig.gap()
+    assert one(rig.feed(SourceStarted(rig.t, "controller", "x")), StopController).reason == "not_requested"
+    rig.request("deploy", digest="controller")
+    assert one(rig.feed(SourceStarted(rig.t, "controller", "x")), StopController).reason == "not_requested"
+    rig.verified()
+    rig.stored()
+    rig.feed(SourceStarted(rig.t, "controller", "controller"))
+    assert of(rig.feed(SourceStarted(rig.t, "controller", "controller")), StopController)
+    assert rig.state.memory.latched == ("controller_fault",)
+
+
+def test_undeploying_answers_whoever_waits_and_what_was_paid_for_stays() -> None:
+    rig = Rig()
+    rig.gap()
+    rig.request("deploy", digest="controller")
+    assert one(rig.request("deploy", digest="controller"), Answer).exit_code == 2
+    assert [a.exit_code for a in of(rig.request("undeploy"), Answer)] == [1, 0]
+    assert one(rig.request("undeploy"), Answer).exit_code == 2
+    assert one(rig.request("verify", digest="controller"), Answer).exit_code == 1  # one is still running
+    rig.verified()
+    assert kinds(rig.stored()) == ["CertificateInstalled", "Persist"]
+    assert of(rig.request("deploy", digest="controller"), StartController)
+
+
+def test_an_undeployed_controllers_failure_or_outgrown_pass_is_told_to_nobody_twice() -> None:
+    for grown, passed in ((False, False), (True, True)):
+        rig = Rig()
+        rig.gap()
+        rig.request("deploy", digest="controller")
+        rig.request("undeploy")
+        if grown:
+            rig.measure(0.5)
+        assert kinds(rig.verified(passed=passed)) == ["AttemptEnded"]
+        assert all(len(found) == 1 for found in answers(rig).values())
+
+
+def test_verify_issues_a_certificate_without_starting_anything() -> None:
+    rig = Rig()
+    rig.gap()
+    rig.request("verify", digest="controller")
+    rig.verified()
+    outputs = rig.stored()
+    assert kinds(outputs) == ["CertificateInstalled", "Persist", "Answer"]
+    assert one(outputs, Answer).exit_code == 0
+    rig.request("verify", digest="other")
+    assert one(rig.verified(passed=False), Answer).exit_code == 1
+
+
+def test_a_pass_that_the_radius_outgrew_is_verified_once_more_and_then_refused() -> None:
+    rig = Rig()
+    rig.gap()
+    rig.request("deploy", digest="controller")
+    rig.measure(0.1)
+    outputs = rig.verified()
+    assert one(outputs, Answer).final is False
+    assert one(outputs, StartJob).radius == pytest.approx(0.15)
+    rig.measure(0.2)
+    outputs = rig.verified()
+    assert one(outputs, Answer).exit_code == 1
+    assert of(outputs, StartJob) == []
+    assert rig.state.memory.attempts == 2
+
+
+def test_a_radius_that_grows_while_the_certificate_is_signed_counts_too() -> None:
+    rig = Rig()
+    rig.gap()
+    rig.request("deploy", digest="controller")
+    rig.verified()
+    rig.measure(0.1)
+    outputs = rig.stored()
+    assert of(outputs, StartController) == []
+    assert one(outputs, StartJob).radius == pytest.approx(0.15)
+    rig.verified()
+    assert one(rig.stored(), StartController).certificate_id == "c2"
+
+
+def test_a_gap_that_changes_while_a_verification_runs_gives_no_certificate() -> None:
+    for late in (False, True):
+        rig = Rig()
+        rig.gap()
+        rig.request("verify", digest="controller")
+        if late:
+            rig.verified()
+        job = one(rig.outputs, StartJob, last=True)
+        n = one(rig.sampling(), StartCampaign).n
+        rig.feed(CampaignFinished(rig.t, 2, n, complete=True, rejected={}))
+        rig.finish_gap(msgspec.structs.replace(GAP, epoch=2, n=n))
+        if late:
+            outputs = rig.stored()
+            assert one(outputs, Revoked).reason == "gap_void"
+        else:
+            rig.outputs.append(job)
+            outputs = rig.verified()
+        assert "does not hold any more" in one(outputs, Answer).text
+        assert rig.state.memory.certificates == ()
+
+
+def test_revoking_stops_the_controller_after_the_robot_was_told() -> None:
+    rig = Rig()
+    rig.driving()
+    outputs = rig.request("revoke", text="c1")
+    assert kinds(outputs)[:4] == ["GateChanged", "Send", "Revoked", "Persist"]
+    assert one(outputs, Send).source == "recovery"
+    assert one(outputs, StopController).reason == "certificate_revoked"
+    assert core.status(rig.state)["reason"] == "certificate_revoked"
+    assert one(rig.request("revoke", text="c1"), Answer).exit_code == 0
+    assert one(rig.request("revoke", text="c9"), Answer).exit_code == 2
+    assert one(rig.request("revoke"), Answer).exit_code == 0
+    assert one(rig.request("deploy", digest="controller"), StartJob).attempt == 2
+    rig.verified()
+    rig.stored()
+    assert "1 certificates" in one(rig.request("revoke"), Answer, last=True).text
+
+
+def loaded(epoch: int = 1, transitions: str = "transitions", **changes: Any) -> CertificateStored:
+    facts = CertificateFacts("offline", "controller", "model", "task", "profile", epoch, 0.01, 0.02, 1500, 2500, 7)
+    gap = msgspec.structs.replace(
+        GAP, epoch=epoch, transitions_digest=transitions, n=ledger.campaign_size(0.03, ledger.share(0.05, epoch), 0)
+    )
+    return CertificateStored(S, msgspec.structs.replace(facts, **changes), gap, 5)
+
+
+def test_a_loaded_certificate_brings_its_gap_if_it_founds_a_later_epoch() -> None:
+    rig = Rig()
+    outputs = rig.feed(loaded(4))
+    assert kinds(outputs) == ["Persist", "EpochChanged", "CertificateInstalled", "Persist", "Answer"]
+    assert (rig.state.memory.epochs, rig.state.memory.attempts) == (4, 7)
+    assert one(rig.request("deploy", digest="controller"), StartController).certificate_id == "offline"
+
+
+def test_a_loaded_certificate_on_the_gap_in_force_is_installed_beside_it() -> None:
+    rig = Rig(memory())
+    rig.feed(loaded())
+    assert [facts.id for facts in rig.state.memory.certificates] == ["offline"]  # it reaches farther
+    rig = Rig(memory())
+    rig.feed(loaded(verified_radius=0.012))
+    assert [facts.id for facts in rig.state.memory.certificates] == ["c1", "offline"]
+
+
+@pytest.mark.parametrize(
+    ("event", "kept", "word"),
+    [
+        (loaded(1, "others"), memory(), "epoch 1"),
+        (loaded(), memory(alarm_epoch=1), "refuted"),
+        (loaded(2, model_digest="another"), memory(), "another epoch or model"),
+        (loaded(2, task_digest="another"), memory(), "task"),
+        (loaded(profile_digest="another"), memory(), "profile"),
+        (loaded(), memory(certificates=(), revoked={"offline": "by_operator"}), "revoked"),
+        (msgspec.structs.replace(loaded(3), gap=msgspec.structs.replace(GAP, epoch=3, n=99)), memory(), "too few"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_loaded_certificate_that_does_not_fit_is_refused(event: CertificateStored, kept: Memory, word: str) -> None:
+    rig = Rig(kept)
+    outputs = rig.feed(event)
+    assert of(outputs, CertificateInstalled) == []
+    assert word in one(outputs, Answer).text
+    assert not one(outputs, Answer).final
+
+
+def test_a_loaded_gap_does_not_come_between_a_campaign() -> None:
+    rig = Rig()
+    rig.sampling()
+    assert "under way" in one(rig.feed(msgspec.structs.replace(loaded(2), t_ns=rig.t)), Answer).text
