@@ -72,6 +72,7 @@ def handle(state: State, event: Event) -> tuple[State, tuple[Output, ...]]:
     turn.set(now_ns=event.t_ns)
     _dispatch(turn, event)
     sources.check_campaign(turn)
+    drive.wake(turn)
     turn.persist()
     return turn.state, tuple(turn.outputs)
 

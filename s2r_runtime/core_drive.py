@@ -5,8 +5,8 @@ the command of the source that was asked, if the gate allows it, else the recove
 recovery command goes out at once when the gate closes between instants, and at the pace of dt while observations fail to come.
 
 In lockstep the robot's clock stands still while nobody answers. With no source to ask, `settle_periods` instants get the
-recovery command; then the core is silent, until a source becomes active (the robot repeats its observation, and that is
-the instant) or a person stops. A repeated observation never begins an instant of its own. If the robot repeats one twice whose
+recovery command; then the core is silent, until a source becomes active (which is asked at once about the instant that waits) or a
+person stops. A repeated observation never begins an instant of its own. If the robot repeats one twice whose
 command was sent, the command was lost on the way and goes out again, the same one.
 """
 
@@ -243,6 +243,12 @@ def _answer_instant(turn: Turn) -> None:
         arrived = turn.state.sent is None or not any(turn.state.sent.u)
         if arrived or settings.recovery != "return":  # on its way home the robot has not settled
             turn.set(idle=state.idle + 1)
+
+
+def wake(turn: Turn) -> None:
+    """Lockstep: an instant that nobody was there to answer still waits, the robot with it; a source that came since is asked."""
+    if turn.settings.lockstep and not turn.state.answered and turn.state.asked is None and active(turn) is not None:
+        _answer_instant(turn)
 
 
 # ---------------------------------------------------------------- answers
