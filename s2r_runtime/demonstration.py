@@ -59,6 +59,7 @@ class Demonstration:
         controller = self._robot.controller("good")
         wrong = ", ".join(self._effects) or "nothing"
         self._tell(f"robot {self._name!r} runs in its own process; what is wrong with it: {wrong} (the daemon isn't told)")
+        self._await_robot()
         if not self._campaign():
             return False
         self._step(f"s2r deploy {controller.name}", "verify the controller against that gap")
@@ -190,6 +191,15 @@ class Demonstration:
                 break
             time.sleep(0.02)
         raise S2RError(f"the daemon did not start: {(self._out / 'daemon.txt').read_text(encoding='utf-8').strip()[-300:]}")
+
+    def _await_robot(self) -> None:
+        limit = time.monotonic() + START_S
+        while time.monotonic() < limit:
+            status = self._call({"verb": "status"})["data"]
+            if status["link"] and status["observation"]:
+                return
+            time.sleep(0.02)
+        raise S2RError(f"the robot did not answer: {(self._out / 'robot.txt').read_text(encoding='utf-8').strip()[-300:]}")
 
     def _end_daemon(self, process: subprocess.Popen[str]) -> None:
         process.terminate()
