@@ -324,7 +324,8 @@ class SampleTaken(Struct, frozen=True, tag="sample_taken"):
     """One independent transition of a campaign (DESIGN G1). x0, x1: (nx,), one period apart; u: (nu,), held from x0 on.
 
     `held`: (nx,), the state after `periods` held periods, or empty if the campaign holds for one period only. `obs_seq0`,
-    `t0_ns`: of the observation that x0 was; the robot's numbers, so that an auditor finds the raw frame.
+    `t0_ns`: of the observation that x0 was; the robot's numbers, so that an auditor finds the raw frame. `again`: logged once more
+    when an interrupted campaign goes on in a new log, so that the log holds all of them; its frames are in the earlier one.
     """
 
     t_ns: int

@@ -121,7 +121,8 @@ class Sampler:
         self._campaign, self.epoch, self.n = campaign, order.epoch, order.n
         self._keep()
         # a log that holds all samples of its campaign can be read alone, so those from before are logged again
-        return [SourceStarted(order.t_ns, "sampler", campaign.digest), *self.samples]
+        again = [msgspec.structs.replace(sample, t_ns=order.t_ns, again=True) for sample in self.samples]
+        return [SourceStarted(order.t_ns, "sampler", campaign.digest), *again]
 
     def ask(self, t_ns: int, observation: Observation) -> list[Event]:
         """The campaign's answer to an observation."""
