@@ -71,7 +71,10 @@ class Transport(Protocol):
         """Called at least every 20 ms with the host's monotonic clock: link lost or back, by the transport's own time-outs."""
 
     def encode(self, command: Command) -> Frame:
-        """The frame that makes the robot apply the command. Raises ValueError if it is not finite or not of shape (nu,)."""
+        """The frame that makes the robot apply the command. Raises ValueError if it is not finite or not of shape (nu,).
+
+        The bytes depend on the command and on what was decoded and encoded before, nothing else: an audit repeats it.
+        """
 
     def send(self, frame: Frame) -> None:
         """Hands the frame to the robot; never blocks longer than a few ms; a drop is counted."""

@@ -48,8 +48,15 @@ class Entry(msgspec.Struct, frozen=True, gc=False):
     index: int
     channel: str
     log_time_ns: int
-    message: Struct
     raw: bytes
+
+    @property
+    def message(self) -> Struct:
+        """The message, decoded each time it is asked for. Raises RecordingError if it is of another version."""
+        try:
+            return decoder(self.channel).decode(self.raw)
+        except msgspec.ValidationError as error:
+            raise RecordingError(f"message {self.index} ({self.channel}) is of another version of s2r: {error}") from None
 
 
 class Ending(msgspec.Struct, frozen=True):
@@ -69,7 +76,7 @@ class Ending(msgspec.Struct, frozen=True):
 class Reading:
     """A log file that is being read: iterate it once for its entries, then look at `ending`.
 
-    path: of one part. channels: give out and decode these only (None: all but the seals); all are checked. metadata,
+    path: of one part. channels: give out these only (None: all but the seals); all are checked. metadata,
     attachments: those that stood before what was read so far. Raises RecordingError for a file that is no log of this
     software, or of another version.
     """
@@ -87,7 +94,7 @@ class Reading:
         self.previous_head = self.head = GENESIS
         try:
             with path.open("rb") as file:
-                self._size = os.fstat(file.fileno()).st_size
+                self.size = os.fstat(file.fileno()).st_size
                 self._start = self._read_start(file)
         except OSError as error:
             raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
@@ -102,6 +109,11 @@ class Reading:
         """What a cut file does not have of its last chunk's index."""
         self.indexed = False
         """Whether the index at the end is there, and right."""
+
+    @property
+    def over(self) -> bool:
+        """Whether it has ended."""
+        return self._ending is not None
 
     @property
     def ending(self) -> Ending:
@@ -139,6 +151,11 @@ class Reading:
         return self._schemas, self._channels
 
     @property
+    def offset(self) -> int:
+        """Bytes of the file that were read and found good."""
+        return self._at
+
+    @property
     def start(self) -> bytes:
         """What the file begins with, up to the metadata that says what it is; empty if it ends before."""
         return self._start
@@ -151,7 +168,7 @@ class Reading:
         if found != _START[: len(found)]:
             raise RecordingError(f"{self.path}: is not a log of this version of s2r (its first bytes are not those of one)")
         head = file.read(RECORD.size)
-        if len(head) < RECORD.size or len(_START) + RECORD.size + RECORD.unpack(head)[1] > self._size:
+        if len(head) < RECORD.size or len(_START) + RECORD.size + RECORD.unpack(head)[1] > self.size:
             return b""
         record = head + file.read(RECORD.unpack(head)[1])
         try:
@@ -196,7 +213,7 @@ class Reading:
     def _take(self) -> Block | None:
         start = b"" if self._at else self._start
         self._file.seek(self._at + len(start))
-        return take(self._file, self._at, self._size, start)
+        return take(self._file, self._at, self.size, start)
 
     def _check(self, block: Block) -> None:
         """Sequence, times, chain and signature of a block."""
@@ -255,12 +272,7 @@ class Reading:
             name = topics.get(part.channel, "")
             counts[name] = counts.get(name, 0) + 1
             if name in wanted:
-                raw = content[part.start : part.stop]
-                try:
-                    message = decoder(name).decode(raw)
-                except msgspec.ValidationError as error:
-                    raise RecordingError(f"{self.path}: message {number} ({name}) is of another version: {error}") from None
-                yield Entry(number, name, part.log_time_ns, message, raw)
+                yield Entry(number, name, part.log_time_ns, content[part.start : part.stop])
             elif name not in CHANNELS:
                 raise RecordingError(f"{self.path}: message {number} is on channel {name!r}, which this version does not know")
 
@@ -278,12 +290,12 @@ class Reading:
         for piece in tail(self._read_at, block.end, self._crc, self._schemas, self._channels):
             found = self._file.read(len(piece))
             if found != piece:
-                if at + len(found) == self._size and piece.startswith(found):
+                if at + len(found) == self.size and piece.startswith(found):
                     self._end("cut", "the file ends inside its index")
                     return
                 raise Damage(at, "the index at the end is not that of the messages")
             at += len(piece)
-        if at != self._size:
+        if at != self.size:
             raise Damage(at, "something follows the end")
         self._at, self.indexed = at, True
         if RECOVERED in self.metadata or not self._final:
@@ -299,15 +311,15 @@ class Reading:
 
         Zeros at the end are what a file system may leave of a write that a power cut stopped: a cut too.
         """
-        self._file.seek(max(0, self._size - _ZEROS))
+        self._file.seek(max(0, self.size - _ZEROS))
         cut = damage.cut or self._file.read() == bytes(_ZEROS)
-        if cut and find(self._file, damage.offset + 1, self._size) is None:
+        if cut and find(self._file, damage.offset + 1, self.size) is None:
             self._end("cut", damage.detail)
         else:
             self._end("broken", f"at byte {damage.offset}: {damage.detail}")
 
     def _end(self, kind: Literal["closed", "rotated", "cut", "broken"], detail: str) -> None:
-        self._ending = Ending(kind, self._index, self._at, self._size - self._at, detail)
+        self._ending = Ending(kind, self._index, self._at, self.size - self._at, detail)
 
 
 def _attached(record: bytes, offset: int) -> Attached:

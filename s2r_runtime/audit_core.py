@@ -1,0 +1,66 @@
+"""Runs the core again over the recorded events: every output must be the recorded one, byte for byte."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import msgspec
+
+from s2r_runtime import core
+from s2r_runtime.audit_findings import Findings, close
+from s2r_runtime.core_state import State
+from s2r_runtime.messages import Event, GateChanged, Output, Send
+from s2r_runtime.reading import Entry
+
+_ENCODE = msgspec.json.Encoder().encode
+
+
+class CoreReplay:
+    """One run's core. After a difference it stops: what follows would only follow from that."""
+
+    def __init__(self, findings: Findings) -> None:
+        self.state: State = core.initial()
+        self._findings = findings
+        self._due: deque[Output] = deque()
+        self.stopped = False
+
+    def event(self, entry: Entry, event: Event) -> tuple[Output, ...]:
+        """Handles an event; the outputs, in the core's order."""
+        if self._due and not self.stopped:
+            self._differ(entry, "an output of the event before is not recorded", None, self._due[0])
+        if self.stopped:
+            return ()
+        self.state, outputs = core.handle(self.state, event)
+        self._due.extend(outputs)
+        self._findings.count("events")
+        return outputs
+
+    def output(self, entry: Entry) -> None:
+        """Compares a recorded output with the one that is due."""
+        if self.stopped:
+            return
+        if not self._due:
+            self._differ(entry, "an output is recorded that the core does not give", entry.raw, None)
+            return
+        due = self._due.popleft()
+        raw = _ENCODE(due)
+        if raw != entry.raw and (self._findings.same_platform or not close(msgspec.json.decode(raw), msgspec.json.decode(entry.raw))):
+            self._differ(entry, "the core gives another output here", entry.raw, due)
+            return
+        self._findings.count("outputs")
+
+    def end(self) -> int:
+        """How many outputs of the last event are not there."""
+        return len(self._due)
+
+    def _differ(self, entry: Entry, what: str, recorded: object, recomputed: object) -> None:
+        self.stopped = True
+        self._findings.differ(entry.index, entry.channel, what, recorded, recomputed)
+
+
+def in_effect_order(outputs: tuple[Output, ...]) -> list[Output]:
+    """The order in which the daemon carries outputs out: where the gate closes, the commands come first."""
+    if not any(isinstance(output, GateChanged) and not output.open for output in outputs):
+        return list(outputs)
+    sends: list[Output] = [output for output in outputs if isinstance(output, Send)]
+    return sends + [output for output in outputs if not isinstance(output, Send)]

@@ -1,0 +1,83 @@
+"""Measures the stream again: observations and commands -> discrepancies and e-values, as the analytics process did (DESIGN G5)."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from s2r_runtime.audit_findings import Findings, alike
+from s2r_runtime.messages import Gap, Measured, Memory, Observation, Send
+from s2r_runtime.reading import Entry
+from s2r_runtime.watch import Stream
+
+if TYPE_CHECKING:
+    from s2r_runtime.models.composed import ComposedModel
+
+
+class WatchReplay:
+    """One run's watch. Replies may come late, but in order, and only a process that died leaves any out."""
+
+    def __init__(self, findings: Findings) -> None:
+        self._findings = findings
+        self._stream: Stream | None = None
+        self._begun: tuple[ComposedModel, Gap, float] | None = None
+        self._memory: Memory | None = None
+        self._stood: Measured | None = None
+        self._due: deque[Measured] = deque()
+
+    def begin(self, model: ComposedModel, gap: Gap, fault_jump: float, memory: Memory) -> None:
+        """A controller starts. memory: the core's, which says where this epoch's watch stands."""
+        self._begun, self._memory = (model, gap, fault_jump), memory
+        self._start()
+
+    def end(self) -> None:
+        """It is stopped; what was measured before may still come."""
+        self._begun, self._stream = None, None
+
+    def analytics(self, *, up: bool) -> None:
+        """The process died, or is there again."""
+        self._stream = None
+        if not up:
+            self._due.clear()
+        elif self._begun is not None:
+            self._start()
+
+    def observed(self, observation: Observation) -> None:
+        """The robot was seen there; before the core hears of it."""
+        if self._stream is not None and self._begun is not None:
+            measured = self._stream.observed(observation)
+            if measured is not None:
+                self._due.append(msgspec.structs.replace(measured, epoch=self._begun[1].epoch))
+
+    def sent(self, send: Send) -> None:
+        """The robot was told this."""
+        if self._stream is not None:
+            self._stream.sent(send)
+
+    def measured(self, entry: Entry, event: Measured) -> None:
+        """A discrepancy is recorded: it must be the next that is due."""
+        self._stood = event
+        due = self._due.popleft() if self._due else None
+        if due is None or not alike(due, msgspec.structs.replace(event, t_ns=0)):
+            what = "the discrepancy (or what the watch makes of it) is another one"
+            self._findings.differ(entry.index, entry.channel, what, entry.raw, due)
+            self._due.clear()
+            return
+        self._findings.count("discrepancies")
+
+    def left_out(self) -> int:
+        """Discrepancies that are due and not recorded (yet)."""
+        return len(self._due)
+
+    def _start(self) -> None:
+        assert self._begun is not None  # noqa: S101 - callers checked
+        assert self._memory is not None  # noqa: S101 - set with it
+        model, gap, fault_jump = self._begun
+        stood = self._stood
+        if stood is not None and stood.epoch == gap.epoch:
+            n, exceedances, e_value = stood.n, stood.exceedances, stood.e_value
+        else:
+            n, exceedances, e_value = self._memory.watch_n, self._memory.watch_exceedances, self._memory.watch_e_value
+        self._stream = Stream(model, gap, fault_jump=fault_jump, n=n, exceedances=exceedances, e_value=e_value)
