@@ -146,7 +146,8 @@ class Actions:
             return
         memory, profile = self._d.state.memory, self._d.profile
         if memory.gap is not None:
-            watching = Watching(profile.model, memory.gap, profile.watch.fault_jump, memory.watch_n, memory.watch_exceedances)
+            stood = (memory.watch_n, memory.watch_exceedances, memory.watch_e_value)
+            watching = Watching(profile.model, memory.gap, profile.watch.fault_jump, *stood)
             self._d.watcher.begin(watching)
         self.episodes.clear()
         self._d.driver.start(file, self._d.settings.seed)

@@ -340,6 +340,7 @@ class SampleTaken(Struct, frozen=True, tag="sample_taken"):
     periods: int
     before: tuple[float, ...] = ()
     """(nx,), observed one period before x0, while the robot stood still: the two differ by measurement noise alone."""
+    again: bool = False
 
 
 class CampaignFinished(Struct, frozen=True, tag="campaign_finished"):
