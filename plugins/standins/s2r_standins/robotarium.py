@@ -275,6 +275,9 @@ def main(argv: list[str] | None = None) -> int:
     options = parser().parse_args(argv)
     if options.parent:
         die_with_parent(options.parent)
+    # a client of a router waits for it inside Zenoh, where Python's handlers do not run
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_DFL)
     try:
         body = Body(_checked(options), tuple(options.start), options.seed)
         connect = options.connect or ("" if options.listen or options.router else CONNECT)

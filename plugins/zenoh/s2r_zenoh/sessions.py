@@ -26,11 +26,12 @@ if TYPE_CHECKING:
     import zenoh
 
 
-def session_config(
-    listen: str, connect: str, lease_s: float, rules: list[dict[str, Any]], file: str, *, mode: str = "peer"
-) -> zenoh.Config:
+def session_config(listen: str, connect: str, lease_s: float, rules: list[dict[str, Any]], file: str) -> zenoh.Config:
     """Configuration of one side's session. rules: what may pass (see `allow`). file: a Zenoh configuration to start from (for
     certificates and passwords); what keeps others out is set after it. Raises ConfigError if the file can't be used.
+
+    A session that connects is a router toward what it connects to: routers do not forward between two peers, and a client's
+    open() would wait for its router.
     """
     import zenoh
 
@@ -46,7 +47,7 @@ def session_config(
         "policies": [{"rules": [rule["id"] for rule in rules], "subjects": ["every_link"]}],
     }
     settings = {
-        "mode": mode,
+        "mode": "router" if connect else "peer",
         "listen/endpoints": [listen] if listen else [],
         "connect/endpoints": [connect] if connect else [],
         # whoever is not there yet, or went away, is sought again soon; open() does not wait for it

@@ -72,6 +72,7 @@ class ZenohTransport:
         self._onlookers: zenoh.Publisher | None = None
         self._sent = self._dropped_out = self._repeated = self._resent = 0
         self._newest, self._answer, self._to_show = b"", b"", b""
+        self._encoded: tuple[bytes, int] = (b"", -1)
         self._heard_ns = 0
         self._up: bool | None = None
 
@@ -147,6 +148,8 @@ class ZenohTransport:
         frames = []
         for arrival_ns, data in self._observations.take():
             self._heard_ns = arrival_ns
+            if not self._newest:
+                self._up = True  # `decode` says so, before anybody acts on the first observation
             if data == self._newest:
                 self._repeated += 1
                 self._send_again()
@@ -181,11 +184,14 @@ class ZenohTransport:
 
     def encode(self, command: Command) -> Frame:
         """The frame of a command. Raises ValueError if it is not finite or not of shape (nu,)."""
-        return Frame(command.t_ns, "command", self._wire.encode(command), inbound=False)
+        frame = Frame(command.t_ns, "command", self._wire.encode(command), inbound=False)
+        self._encoded = (frame.data, command.obs_seq)
+        return frame
 
     def send(self, frame: Frame) -> None:
         """Hands it to the robot; what can't be sent is dropped and counted, never waited for."""
-        self._answer = frame.data
+        if self._encoded == (frame.data, self._wire.newest):
+            self._answer = frame.data
         if self._put(frame.data):
             self._sent += 1
         self._show()

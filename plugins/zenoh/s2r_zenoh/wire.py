@@ -8,7 +8,7 @@
 Order. A robot's `seq` and `stamp_ns` rise within one boot. The same bytes again are a keep-alive and mean nothing new; an older
 `seq` is dropped and counted. A robot that started anew says so by another `boot`, or by having been silent for `restart_ns`: its
 numbers then go on above the old ones (`stamp_ns` by one second at least), so that nobody downstream ever sees a clock run
-backwards, and a link down and up is reported between the two.
+backwards, and a link down and up is reported between the two. The first observation of all reports the link up, before itself.
 """
 
 from __future__ import annotations
@@ -90,6 +90,11 @@ class Wire:
         self._arrival_ns = 0
         self._seq_offset = self._stamp_offset = 0
 
+    @property
+    def newest(self) -> int:
+        """`seq` of the newest good observation, as its receivers see it; -1 before the first."""
+        return self._last.seq + self._seq_offset if self._last else -1
+
     def decode(self, frame: Frame) -> list[Decoded]:
         """What an inbound frame means; see `hookspecs.Transport.decode`."""
         if frame.channel == "observation":
@@ -121,7 +126,7 @@ class Wire:
             x = _ordered(payload.state, self._states, "state")
             if last is None:
                 self._accept(payload, frame)
-                return [Observation(payload.seq, payload.stamp_ns, x)]
+                return [LinkChanged(frame.arrival_ns, up=True), Observation(payload.seq, payload.stamp_ns, x)]
             if payload.boot != last.boot or (payload.seq <= last.seq and frame.arrival_ns - self._arrival_ns >= self._restart_ns):
                 return [*self._restart(payload, frame), self._numbered(payload, x)]
             if payload.seq == last.seq and payload == last:
