@@ -176,7 +176,7 @@ def from_mcap(path: Path, model: ComposedModel, *, epoch: int | None = None) -> 
     complete = [e for e in log.samples if e in log.finished and log.finished[e].complete and len(log.samples[e]) == log.finished[e].n]
     chosen = epoch if epoch is not None else (complete or list(log.samples))[-1]
     ending = log.finished.get(chosen)
-    found = from_samples(log.samples[chosen], rejected=ending.rejected if ending else {}, source=str(path))
+    found = from_samples(list(log.samples[chosen].values()), rejected=ending.rejected if ending else {}, source=str(path))
     if found.noise is None:
         found = replace(found, noise=streams_noise(model, log.stretches(model)))
     doubt = "" if chosen in complete else _incomplete(chosen, len(log.samples[chosen]), ending)
@@ -220,12 +220,12 @@ def _standing_noise(samples: Sequence[SampleTaken]) -> Array | None:
 
 @dataclass
 class _Log:
-    """What a log holds of states, inputs and samples, in its order.
+    """What a log holds of states, inputs and samples (by epoch and index), in its order.
 
     rows: a list a stretch (a new one wherever the robot's clock went back: it was restarted) of (stamp s, x or (), u or ()).
     """
 
-    samples: dict[int, list[SampleTaken]]
+    samples: dict[int, dict[int, SampleTaken]]
     finished: dict[int, CampaignFinished]
     rows: list[list[tuple[float, tuple[float, ...], tuple[float, ...]]]]
 
@@ -260,7 +260,7 @@ def _read_log(path: Path, model: ComposedModel) -> _Log:
                 heard_ns, stamp_ns = seen[send.obs_seq]
                 log.rows[-1].append(((stamp_ns + max(0, send.t_ns - heard_ns)) * 1e-9, (), send.u))
             case SampleTaken() as sample:
-                log.samples.setdefault(sample.epoch, []).append(sample)
+                log.samples.setdefault(sample.epoch, {}).setdefault(sample.index, sample)  # one logged once more is the same
             case CampaignFinished() as finished:
                 log.finished[finished.epoch] = finished
     if reading.ending is not None and reading.ending.kind == "broken":

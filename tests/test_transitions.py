@@ -273,6 +273,14 @@ def test_samples_of_a_campaign_that_is_not_whole_carry_no_statement(tmp_path: Pa
     assert len(tr.x0) == 5
 
 
+def test_a_sample_logged_once_more_counts_once(tmp_path: Path) -> None:
+    samples = [sample(i) for i in range(5)]
+    repeated = [msgspec.structs.replace(s, again=True) for s in samples[:3]]
+    tr = load_transitions(log(tmp_path, [*samples[:3], *repeated, *samples[3:], finished(1, 5)]), MODEL)
+    assert tr.independent
+    assert tr.samples_digest == from_samples(samples).digest
+
+
 def test_samples_have_a_digest_of_their_own_that_every_log_of_them_shares(tmp_path: Path) -> None:
     samples = [sample(i) for i in range(5)]
     one = load_transitions(log(tmp_path, [*samples, finished(1, 5)], "a.mcap"), MODEL)
