@@ -17,6 +17,7 @@ import sys
 import time
 import traceback
 from collections import deque
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -50,7 +51,7 @@ from s2r_runtime.messages import (
 )
 from s2r_runtime.model_store import ModelStore
 from s2r_runtime.modelspec import dump_model
-from s2r_runtime.persistence import StateFolder
+from s2r_runtime.persistence import StateFolder, read, unseal
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import Profile
 from s2r_runtime.robot_link import Clock, Inbound, RobotLink
@@ -70,7 +71,7 @@ class Daemon:
 
     state_dir: counters, certificates, key (default: the user's state folder, by robot). key_path: signing key (default: one in the state
     folder, made when there is none). log_dir: default as the profile says. log_file: one log of this name instead. listen: whether
-    there is a control socket.
+    there is a control socket. on_tick: called with every tick, for whoever runs a daemon in his own process.
     """
 
     def __init__(
@@ -84,10 +85,11 @@ class Daemon:
         log_file: Path | None = None,
         seed: int | None = None,
         listen: bool = True,
+        on_tick: Callable[[Daemon], None] | None = None,
     ) -> None:
         self.profile, self._profile_path, self.seed = profile, profile_path, seed
         self._state_dir = state_dir or control.state_root() / profile.robot.name
-        self._key_path, self._log_file, self._listen = key_path, log_file, listen
+        self._key_path, self._log_file, self._listen, self._on_tick = key_path, log_file, listen, on_tick
         self._log_dir = log_file.parent if log_file else log_dir or self._state_dir / profile.recording.directory
         self.selector = selectors.DefaultSelector()
         self.clock = Clock(lockstep=profile.clock == "lockstep")
@@ -124,6 +126,11 @@ class Daemon:
     def end(self, why: str) -> None:
         """The loop ends with this turn."""
         self._ended = self._ended or why
+
+    def unfinished_campaign(self) -> bool:
+        """Whether there is one to go on with. To be asked before `run`. Raises ConfigError if the state is damaged."""
+        file = self._state_dir / "state.json"
+        return file.exists() and unseal(read(file), "state", Memory, str(file)).campaign_epoch > 0
 
     def say(self, text: str) -> None:
         """A line for the journal."""
@@ -237,6 +244,8 @@ class Daemon:
             self.feed(WallClockRead(0, int(time.time())))
         self.feed(Ticked(0))
         self.desk.tick(now_ns)
+        if self._on_tick is not None:
+            self._on_tick(self)
         self.notifier.alive(now_ns)
         self.notifier.status(f"gate {'open' if self.state.gate_open else 'closed'} ({self.state.gate_reason})")
 

@@ -110,7 +110,7 @@ def run_sample(args: argparse.Namespace) -> int:
         return _say(args, {"verb": "cancel"} if args.cancel else {"verb": "sample", "count": args.n}, socket)
     if args.cancel:
         raise UsageError(f"--cancel: no daemon of robot {profile.robot.name!r} is running")
-    from s2r_runtime.daemon import run_campaign
+    from s2r_runtime.campaign_run import run_campaign
 
     out = args.output or Path(f"{profile.robot.name}-campaign.mcap")
     bar = output.Progress("sampling")
