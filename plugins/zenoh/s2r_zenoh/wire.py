@@ -26,6 +26,8 @@ Decoded = Observation | Command | LinkChanged | OverrideChanged
 
 PAYLOAD_MAX = 65_536
 """Bytes. Longer payloads are malformed; nothing that this software needs comes near."""
+NESTING_MAX = 100
+"""Objects and lists in a payload. How deep a decoder gets depends on its caller's stack; an audit must get as deep as we did."""
 NUMBER_MAX = 1e9
 """Largest magnitude of a state or input: any unit's sane values lie below, and sums of squares of them stay finite."""
 COUNT_MAX = 2**53
@@ -189,9 +191,11 @@ class Wire:
 def _parsed(decoder: msgspec.json.Decoder[T], data: bytes) -> T:
     if len(data) > PAYLOAD_MAX:
         raise Malformed(f"{len(data)} bytes, must be at most {PAYLOAD_MAX}")
+    if data.count(b"[") + data.count(b"{") > NESTING_MAX:
+        raise Malformed(f"more than {NESTING_MAX} objects and lists")
     try:
         return decoder.decode(data)
-    except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+    except (msgspec.MsgspecError, UnicodeError) as error:
         raise Malformed(str(error)[:120]) from None
 
 

@@ -1,0 +1,185 @@
+"""What payloads mean, from the bytes alone."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from s2r_zenoh.wire import PAYLOAD_MAX, Wire
+
+from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
+
+SECOND = 1_000_000_000
+
+
+def wire() -> Wire:
+    return Wire(("x", "theta"), ("v", "w"), restart_ns=SECOND // 2)
+
+
+def frame(payload: Any, arrival_ns: int = 0, channel: str = "observation") -> Frame:
+    data = payload if isinstance(payload, bytes) else json.dumps(payload).encode()
+    return Frame(arrival_ns, channel, data)
+
+
+def observation(seq: int, stamp_ns: int | None = None, boot: int = 0, **state: float) -> dict[str, Any]:
+    return {"seq": seq, "stamp_ns": seq * 1000 if stamp_ns is None else stamp_ns, "state": {"x": 0.1, "theta": 0.2, **state}, "boot": boot}
+
+
+def seen(w: Wire, payload: Any, arrival_ns: int = 0) -> list[Observation]:
+    return [m for m in w.decode(frame(payload, arrival_ns)) if isinstance(m, Observation)]
+
+
+def test_first_observation_reports_the_link_up_before_itself() -> None:
+    up, first = wire().decode(frame(observation(5), 77))
+    assert up == LinkChanged(77, up=True)
+    assert first == Observation(5, 5000, (0.1, 0.2))
+
+
+def test_state_is_taken_by_name_and_what_the_model_does_not_know_is_ignored() -> None:
+    payload = {"stamp_ns": 1, "battery": 0.7, "state": {"theta": 3, "gripper": 1.0, "x": -2.5}, "seq": 0}
+    assert seen(wire(), payload) == [Observation(0, 1, (-2.5, 3.0))]
+
+
+@pytest.mark.parametrize(
+    ("payload", "says"),
+    [
+        (b"", "truncated"),
+        (b"not json", "malformed"),
+        (b"[1, 2]", "Expected `object`"),
+        (b"\xff\xfe\x00", "malformed"),
+        (b'{"seq":1,"stamp_ns":2,"state":{"\xff":1}}', "utf-8"),
+        (b'{"seq":1,"stamp_ns":2,"more":' + b"[" * 60_000, "more than 100 objects"),
+        (b'{"seq":1,"stamp_ns":2,"state":' + b" " * PAYLOAD_MAX, "at most 65536"),
+        (b'{"seq":1,"stamp_ns":2,"state":{"x":NaN,"theta":0}}', "malformed"),
+        (b'{"seq":1,"stamp_ns":2,"state":{"x":1e999,"theta":0}}', "out of range"),
+        (b'{"seq":1,"stamp_ns":2,"state":{"x":-Infinity,"theta":0}}', "malformed"),
+        (b'{"seq":1,"stamp_ns":2,"state":{"x":null,"theta":0}}', "got `null`"),
+        (b'{"seq":1,"stamp_ns":2,"state":{"x":"0.1","theta":0}}', "got `str`"),
+        (b'{"seq":1,"stamp_ns":2,"state":{"x":true,"theta":0}}', "got `bool`"),
+        (observation(1, x=1e12), "x is beyond 1e+09"),
+        ({"seq": 1, "stamp_ns": 2, "state": {"x": 0.1}}, "lacks 'theta'"),
+        ({"seq": 1, "stamp_ns": 2}, "missing required field `state`"),
+        (observation(-1), "seq must be in 0"),
+        (observation(10**30, 5), "seq must be in 0"),
+        (observation(1, -5), "stamp_ns must be in 0"),
+        (b'{"seq":1.5,"stamp_ns":2,"state":{"x":0,"theta":0}}', "got `float`"),
+    ],
+)
+def test_malformed_observation_is_a_fault_with_its_reason_and_no_numbers(payload: Any, says: str) -> None:
+    w = wire()
+    seen(w, observation(3))
+    (fault,) = seen(w, payload)
+    assert fault.x == ()
+    assert says in fault.fault
+    assert fault.fault.startswith("malformed observation: ")
+    assert (fault.seq, fault.stamp_ns) == (3, 3000)
+    assert w.malformed == 1
+    assert seen(w, observation(4)) == [Observation(4, 4000, (0.1, 0.2))], "the next good one counts"
+
+
+def test_repeat_is_nothing_new_and_an_older_one_is_dropped() -> None:
+    w = wire()
+    seen(w, observation(7))
+    assert w.decode(frame(observation(7))) == []
+    assert w.decode(frame(observation(5))) == []
+    assert (w.old, w.lost) == (1, 0)
+    seen(w, observation(10))
+    assert w.lost == 2
+
+
+def test_same_seq_with_other_content_and_a_stamp_that_does_not_rise_are_faults() -> None:
+    w = wire()
+    seen(w, observation(7))
+    assert "used before" in seen(w, observation(7, x=0.5))[0].fault
+    assert "does not rise" in seen(w, observation(8, 7000))[0].fault
+
+
+@pytest.mark.parametrize(("boot", "gap"), [(1, 0), (0, SECOND)])
+def test_robot_started_anew_goes_on_above_its_old_numbers_with_the_link_down_between(boot: int, gap: int) -> None:
+    w = wire()
+    seen(w, observation(900), arrival_ns=5)
+    down, up, after = w.decode(frame(observation(0, 0, boot), arrival_ns=5 + gap))
+    assert isinstance(down, LinkChanged)
+    assert isinstance(up, LinkChanged)
+    assert isinstance(after, Observation)
+    assert (down.up, up.up) == (False, True)
+    assert "started anew" in down.detail
+    assert after.seq > 901
+    assert after.stamp_ns >= 900_000 + SECOND
+    assert seen(w, observation(1, 33, boot), 6 + gap) == [Observation(after.seq + 1, after.stamp_ns + 33, (0.1, 0.2))]
+    answer = json.loads(w.encode(Command(1, 2, "sampler", (0.0, 0.0), after.seq + 1, 3)))
+    assert answer["obs_seq"] == 1, "the robot is answered in its own count"
+
+
+def test_forged_number_from_the_future_locks_the_robot_out_only_until_the_restart_time() -> None:
+    w = wire()
+    seen(w, observation(10), 0)
+    seen(w, observation(10**9), 1)
+    assert seen(w, observation(11), 2) == []
+    assert seen(w, observation(12), 2 + SECOND)[0].x == (0.1, 0.2)
+
+
+def test_keep_alives_of_a_waiting_robot_hold_off_the_restart_time() -> None:
+    w = wire()
+    for quarter in range(12):
+        w.decode(frame(observation(10), quarter * SECOND // 4))
+    assert w.decode(frame(observation(9), 3 * SECOND)) == []
+
+
+def test_command_is_named_inputs_with_all_that_the_robot_needs() -> None:
+    data = wire().encode(Command(12, 400, "controller", (0.1, -0.25), 11, 100_000_000))
+    expected = {"seq": 12, "t_ns": 400, "obs_seq": 11, "ttl_ns": 100_000_000, "source": "controller", "input": {"v": 0.1, "w": -0.25}}
+    assert json.loads(data) == expected
+
+
+def test_proposal_is_somebody_elses_command() -> None:
+    (command,) = wire().decode(frame({"input": {"v": 1, "w": 0.5}, "seq": 3, "obs_seq": 2}, 9, "proposal"))
+    assert command == Command(3, 9, "external", (1.0, 0.5), 2, 0)
+    for bad in (b"", {"input": {"v": 1}}, {"input": {"v": 1e10, "w": 0}}, {"input": {"v": 1, "w": 0}, "seq": -1}):
+        (command,) = wire().decode(frame(bad, 9, "proposal"))
+        assert isinstance(command, Command)
+        assert command.fault
+        assert command.source == "external"
+        assert command.u == ()
+
+
+def test_override_stops_and_so_does_garbage_in_its_place() -> None:
+    w = wire()
+    assert w.decode(frame({"kind": "manual_override", "detail": "stick"}, 4, "override")) == [
+        OverrideChanged(4, "manual_override", "stick")
+    ]
+    for garbage in (b"", b"{}", b'{"kind":"dance"}'):
+        (stop,) = w.decode(frame(garbage, 4, "override"))
+        assert isinstance(stop, OverrideChanged)
+        assert stop.kind == "emergency_stop"
+
+
+def test_frame_of_another_channel_is_not_for_us() -> None:
+    assert wire().decode(frame(b"x", channel="somebody")) == []
+
+
+@given(data=st.binary(max_size=300))
+@settings(max_examples=300, deadline=None, derandomize=True)
+def test_any_bytes_decode_to_something_without_a_number_in_it(data: bytes) -> None:
+    for channel in ("observation", "proposal", "override"):
+        for message in wire().decode(frame(data, channel=channel)):
+            assert getattr(message, "fault", "") or isinstance(message, OverrideChanged)
+
+
+@given(events=st.lists(st.tuples(st.integers(0, 8), st.integers(0, 3), st.integers(0, SECOND)), max_size=30))
+@settings(max_examples=300, deadline=None, derandomize=True)
+def test_numbers_and_stamps_rise_whatever_comes_and_decoding_again_gives_the_same(events: list[tuple[int, int, int]]) -> None:
+    arrival, frames = 0, []
+    for seq, boot, wait in events:
+        arrival += wait
+        frames.append(frame(observation(seq, boot=boot), arrival))
+    w, again = wire(), wire()
+    messages = [m for f in frames for m in w.decode(f)]
+    assert messages == [m for f in frames for m in again.decode(f)]
+    good = [m for m in messages if isinstance(m, Observation) and not m.fault]
+    for field in ("seq", "stamp_ns"):
+        values = [getattr(m, field) for m in good]
+        assert values == sorted(set(values))
