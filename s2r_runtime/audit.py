@@ -112,6 +112,7 @@ def audit(
 
 def _run(run: RunAudit, parts: list[Reading], findings: Findings, tell: _Progress) -> None:
     before: Reading | None = None
+    lost = False
     for reading in parts:
         findings.file = reading.path.name
         if not _continues(before, reading, findings):
@@ -122,6 +123,7 @@ def _run(run: RunAudit, parts: list[Reading], findings: Findings, tell: _Progres
         for number, entry in enumerate(reading):
             if entry.channel == UNRECORDED:
                 _unrecorded(entry.message, findings)
+                lost = True
             else:
                 run.entry(entry)
             if number % PROGRESS_EVERY == 0:
@@ -131,8 +133,7 @@ def _run(run: RunAudit, parts: list[Reading], findings: Findings, tell: _Progres
         if not _ended(reading, findings):
             break
     last = parts[-1] if before is None else before
-    clean = last is parts[-1] and last.over and last.ending.kind == "closed"
-    findings.missing += run.end(clean=clean)
+    run.end(clean=last.over and last.ending.kind == "closed" and not lost)
     for reading in parts:
         if not reading.over:
             reading.to_the_end()
@@ -161,13 +162,13 @@ def _ended(reading: Reading, findings: Findings) -> bool:
     elif end.kind == "cut":
         lost = f" ({end.lost_bytes} bytes could not be used)" if end.lost_bytes else ""
         what = "nothing but the index" if reading.sealed_for_good else "what came after"
-        findings.missing.append(f"{what}: {reading.path.name} was cut after {end.index} messages: {end.detail}{lost}")
+        findings.lack(f"{what}: {reading.path.name} was cut after {end.index} messages: {end.detail}{lost}")
     return end.kind == "rotated" or (end.kind == "cut" and reading.sealed_for_good)
 
 
 def _unrecorded(message: msgspec.Struct, findings: Findings) -> None:
     assert isinstance(message, Unrecorded)  # noqa: S101 - the channel's type
-    findings.missing.append(f"{message.count} messages at the end were not recorded: {message.reason}")
+    findings.lack(f"{message.count} messages at the end were not recorded: {message.reason}")
 
 
 def _chain(readings: Sequence[Reading]) -> str:

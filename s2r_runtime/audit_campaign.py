@@ -66,7 +66,7 @@ class CampaignReplay:
             campaign = Campaign.from_settings(settings, sampling, n=order.n, epoch=order.epoch, seed=order.seed)
             if order.resume:
                 if order.epoch not in self._snapshots:
-                    self._findings.cannot(f"campaign {order.epoch} goes on from an earlier log, which was not given")
+                    self._findings.lack(f"the beginning of campaign {order.epoch}, in an earlier log that was not given")
                     return
                 campaign.restore(self._snapshots[order.epoch])
         except ConfigError:
@@ -122,10 +122,23 @@ class CampaignReplay:
 
     def sample(self, entry: Entry, event: SampleTaken) -> None:
         """A sample: the campaign's, and the robot's."""
+        kept = self.samples.setdefault(event.epoch, [])
+        if event.again:
+            self._once_more(entry, event, kept)
+            return
         if self._campaign is not None:
             self._compare(entry, msgspec.structs.replace(event, t_ns=0), "samples")
         self._find(entry, event)
-        self.samples.setdefault(event.epoch, []).append(event)
+        kept.append(event)
+
+    def _once_more(self, entry: Entry, event: SampleTaken, kept: list[SampleTaken]) -> None:
+        """A sample of before the interruption: the same as it was, if that log was given."""
+        told = next((one for one in kept if one.index == event.index), None)
+        if told is None:
+            kept.append(event)
+            self._findings.lack(f"the frames behind the first samples of campaign {event.epoch}, in an earlier log that was not given")
+        elif msgspec.structs.replace(told, t_ns=0, again=True) != msgspec.structs.replace(event, t_ns=0):
+            self._findings.differ(entry.index, entry.channel, "the sample was another one in the log before", entry.raw, told)
 
     def stopped(self, entry: Entry, event: SourceStopped) -> None:
         """The sampler ends: by itself as the campaign says, or because it was told to."""

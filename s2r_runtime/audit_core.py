@@ -23,6 +23,7 @@ class CoreReplay:
         self._findings = findings
         self._due: deque[Output] = deque()
         self.stopped = False
+        self._last: Entry | None = None
 
     def event(self, entry: Entry, event: Event) -> tuple[Output, ...]:
         """Handles an event; the outputs, in the core's order."""
@@ -32,6 +33,7 @@ class CoreReplay:
             return ()
         self.state, outputs = core.handle(self.state, event)
         self._due.extend(outputs)
+        self._last = entry
         self._findings.count("events")
         return outputs
 
@@ -42,16 +44,21 @@ class CoreReplay:
         if not self._due:
             self._differ(entry, "an output is recorded that the core does not give", entry.raw, None)
             return
-        due = self._due.popleft()
+        due, self._last = self._due.popleft(), entry
         raw = _ENCODE(due)
         if raw != entry.raw and (self._findings.same_platform or not close(msgspec.json.decode(raw), msgspec.json.decode(entry.raw))):
             self._differ(entry, "the core gives another output here", entry.raw, due)
             return
         self._findings.count("outputs")
 
-    def end(self) -> int:
-        """How many outputs of the last event are not there."""
-        return len(self._due)
+    def end(self, *, complete: bool) -> None:
+        """Nothing follows. complete: so the last event's outputs must be there."""
+        if not self._due or self.stopped:
+            return
+        if complete and self._last is not None:
+            self._differ(self._last, "an output of the last event is not recorded", None, self._due[0])
+        else:
+            self._findings.lack(f"{len(self._due)} outputs of the last event")
 
     def _differ(self, entry: Entry, what: str, recorded: object, recomputed: object) -> None:
         self.stopped = True

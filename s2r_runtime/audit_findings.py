@@ -59,6 +59,11 @@ class Findings:
         """Something that is there could not be recomputed here: no pass."""
         self.unchecked[what] = None
 
+    def lack(self, what: str) -> None:
+        """Something is not in what was given. That is no difference."""
+        if what not in self.missing:
+            self.missing.append(what)
+
 
 def close(a: Any, b: Any) -> bool:
     """Equal, but for numbers that are within RELATIVE of each other. a, b: plain data."""

@@ -101,16 +101,16 @@ class RunAudit:
             assert isinstance(message, Frame)  # noqa: S101 - the channel's type
             (self._frames.inbound if message.inbound else self._frames.outbound)(entry, message)
 
-    def end(self, *, clean: bool) -> list[str]:
-        """Nothing follows; what is missing. clean: the log was closed, so nothing may be."""
-        missing = []
+    def end(self, *, clean: bool) -> None:
+        """Nothing follows. clean: the log was closed and lacks nothing, so neither may its last event, if that is an orderly end."""
+        stopped = isinstance(self._event, Stopping)
         if self._frames is not None:
-            self._frames.end(None if isinstance(self._event, Stopping) else self._last_act())
-        if left := self._core.end():
-            missing.append(f"{left} outputs of the last event")
+            self._frames.end(None if stopped else self._last_act())
+        self._core.end(complete=clean and stopped)
+        if clean and not stopped and self._event is not None:
+            self._findings.lack("an orderly end: the daemon broke down, and closed its log")
         if not clean and (left := self._watch.left_out()):
-            missing.append(f"{left} discrepancies of the last observations")
-        return missing
+            self._findings.lack(f"{left} discrepancies of the last observations")
 
     # ---- events
 

@@ -1,0 +1,379 @@
+"""A whole run in one process, in the time it takes to compute it: robot, core, campaign, gap, certificate, drive, watch; and liars.
+
+What the daemon does with processes and sockets is done here by plain calls, in the daemon's order, into a list of what its log
+would hold. A bench that is told to `lie` changes one thing where it arises; all that follows is consistent with the lie.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections import deque
+from pathlib import Path
+from typing import Any, ClassVar
+
+import msgspec
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from s2r_runtime import certificate as certificates
+from s2r_runtime import core, jobs, ledger
+from s2r_runtime import messages as m
+from s2r_runtime.audit_core import in_effect_order
+from s2r_runtime.comparison import Campaign
+from s2r_runtime.controller_file import load
+from s2r_runtime.hookspecs import Offer, hookimpl
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import dump_model
+from s2r_runtime.plugins import registry
+from s2r_runtime.profile import parse_profile
+from s2r_runtime.recording import Writer
+from s2r_runtime.settings import ModelFacts, settings_of
+from s2r_runtime.watch import Stream
+from s2r_runtime.worker import GapJob
+
+KEY = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
+OTHER = Ed25519PrivateKey.from_private_bytes(bytes(range(1, 33)))
+START_UNIX_S = 1_700_000_000
+
+PROFILE = """
+clock = "lockstep"
+[robot]
+name = "bench"
+[model]
+name = "unicycle"
+dt = 0.05
+[region]
+x = [-0.6, 0.6]
+y = [-0.6, 0.6]
+[inputs]
+v = [-0.4, 0.4]
+w = [-3.0, 3.0]
+[geofence]
+x = [-0.9, 0.9]
+y = [-0.9, 0.9]
+[norm]
+weights = { theta = 0.05 }
+[sampling]
+hold_periods = 3
+stop_periods = 2
+waypoint_radius = 0.25
+waypoint_margin = 0.2
+[guarantee]
+epsilon = 0.3
+[verification]
+epsilon = 0.3
+[gate]
+hysteresis = 0.1
+[task]
+name = "bench"
+[transport]
+name = "bench"
+"""
+CONTROLLER = "def control(x, theta, parameters):\n    return 0.0 * x[:, :2] + 0.1\n"
+
+
+class BenchTransport:
+    """JSON, and an external command now and then."""
+
+    OPTIONS: ClassVar[dict[str, str]] = {}
+
+    def __init__(self, options: dict[str, Any], states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
+        self._heard = False
+        self._sent = 0
+
+    def decode(self, frame: m.Frame) -> list[Any]:
+        plain = msgspec.json.decode(frame.data)
+        if "u" in plain:
+            return [m.Command(0, frame.arrival_ns, "external", tuple(plain["u"]), plain["seq"], 0)]
+        found: list[Any] = [] if self._heard else [m.LinkChanged(frame.arrival_ns, up=True)]
+        self._heard = True
+        return [*found, m.Observation(plain["seq"], plain["stamp"], tuple(plain["x"]))]
+
+    def encode(self, command: m.Command) -> m.Frame:
+        self._sent += 1
+        return m.Frame(0, "command", msgspec.json.encode([self._sent, command.seq, command.u]), inbound=False)
+
+
+class BenchTask:
+    """A horizon is all that a certificate's sentences need of a task."""
+
+    horizon = 150
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+
+@hookimpl
+def s2r_tasks() -> list[Offer]:
+    return [Offer("bench", f"{__name__}:BenchTask")]
+
+
+@hookimpl
+def s2r_transports() -> list[Offer]:
+    return [Offer("bench", f"{__name__}:BenchTransport")]
+
+
+def install(module: object) -> None:
+    """Makes the transport known."""
+    if "bench" not in registry().names("transports"):
+        registry().add("bench", "tests", "0", module)
+
+
+class Bench:
+    """One run. `items`: messages, or (name, media type, bytes) to attach. lie_at: how many messages stood before the lie."""
+
+    def __init__(self, folder: Path, lie: str = "", memory: m.Memory | None = None, seed: int = 1) -> None:
+        (folder / "controller.py").write_text(CONTROLLER)
+        self.controller = load(folder / "controller.py")
+        self.profile = parse_profile(PROFILE, "profile.toml", folder)
+        self.model = compose(self.profile.model)
+        facts = ModelFacts(self.model.states, self.model.inputs, tuple(self.model.nominal.angles))
+        self.settings = settings_of(self.profile, self.profile.model, facts)
+        self.lie, self.lie_at = lie, -1
+        self.items: list[Any] = [
+            ("profile.toml", "application/toml", PROFILE.encode()),
+            ("model.toml", "application/toml", dump_model(self.profile.model).encode()),
+        ]
+        self.rng = random.Random(seed)
+        self.transport, self.robot_end = (BenchTransport({}, (), ()) for _ in range(2))
+        self.state = core.initial()
+        self.x, self.u, self.gain = [0.0, 0.0, 0.0], (0.0, 0.0), 1.0
+        self.seq = self.t_ns = self.numbers = self.requests = 0
+        self.queue: deque[m.Event] = deque()
+        self.draining = False
+        self.campaign: Campaign | None = None
+        self.order: m.StartCampaign | None = None
+        self.samples: list[m.SampleTaken] = []
+        self.stream: Stream | None = None
+        self.epoch, self.reason, self.driving = 0, "", False
+        settings = self._told("settings", self.settings, lambda s: msgspec.structs.replace(s, input_bounds=((-9.0, 9.0), (-9.0, 9.0))))
+        self.feed(m.Started(0, START_UNIX_S, settings, memory or m.Memory(robot="bench", schema=m.MEMORY_SCHEMA)))
+
+    # ---- the story
+
+    def sample(self) -> Bench:
+        """A campaign, and its gap."""
+        self.step()
+        self.ask("permit", duration_s=3600.0)
+        self.ask("sample")
+        while self.state.memory.gap is None and self.seq < 20_000:
+            self.step()
+        return self
+
+    def drive(self, periods: int = 100) -> Bench:
+        """Deploys the controller and lets it drive."""
+        self.items.append((f"controller/{self.controller.digest}", "application/json", msgspec.json.encode(self.controller)))
+        self.ask("deploy", digest=self.controller.digest)
+        self.steps(periods)
+        return self
+
+    def interrupt(self) -> None:
+        """The campaign is stopped by a person, and goes on."""
+        self.ask("stop")
+        self.ask("clear", text="emergency_stop")
+        self.ask("sample")
+
+    def stop(self) -> Bench:
+        """An orderly end."""
+        self.feed(m.Stopping(0, "SIGTERM"))
+        return self
+
+    def steps(self, n: int) -> None:
+        for _ in range(n):
+            self.step()
+
+    def ask(self, verb: Any, **fields: Any) -> None:
+        self.requests += 1
+        self.feed(m.Requested(0, self.requests, verb, 0, **fields))
+
+    # ---- one period
+
+    def step(self) -> None:
+        """The robot is observed, answered, and moves."""
+        measured = tuple(v + self.rng.gauss(0.0, 1e-3) for v in self.x)
+        plain = {"seq": self.seq, "stamp": self.seq * 50_000_000, "x": measured}
+        self.receive(msgspec.json.encode(plain))
+        if self.seq % 50 == 7:
+            self.receive(msgspec.json.encode({"u": [9.0, 9.0], "seq": self.seq}))
+        v, w = self.u[0] * self.gain, self.u[1]
+        x, y, theta = self.x
+        self.x = [x + 0.05 * v * math.cos(theta), y + 0.05 * v * math.sin(theta), math.remainder(theta + 0.05 * w, 2 * math.pi)]
+        self.seq += 1
+
+    def receive(self, data: bytes) -> None:
+        frame = m.Frame(self.t_ns + 1, "in", data)
+        self.items.append(frame)
+        for message in self.transport.decode(frame):
+            if isinstance(message, m.Observation):
+                self.t_ns = message.stamp_ns
+                message = self._told("observation", message, lambda o: msgspec.structs.replace(o, x=(0.0, 0.0, 0.0)), self.seq == 200)
+                measured = self.stream.observed(message) if self.stream is not None else None
+                self.observation = message
+                self.feed(m.Observed(0, message))
+                if measured is not None:
+                    measured = self._told("discrepancy", measured, lambda d: msgspec.structs.replace(d, discrepancy=d.discrepancy / 2))
+                    self.feed(msgspec.structs.replace(measured, epoch=self.epoch))
+            elif isinstance(message, m.Command):
+                self.feed(m.Proposed(0, message))
+            else:
+                self.feed(message)
+
+    def feed(self, *events: m.Event) -> None:
+        self.queue.extend(events)
+        if self.draining:
+            return
+        self.draining = True
+        while self.queue:
+            event = msgspec.structs.replace(self.queue.popleft(), t_ns=self.t_ns)
+            self.items.append(event)
+            self.state, outputs = core.handle(self.state, event)
+            outputs = self._decided(outputs)
+            self.items += outputs
+            for output in in_effect_order(tuple(outputs)):
+                self.carry_out(output)
+        self.draining = False
+
+    def _decided(self, outputs: tuple[m.Output, ...]) -> list[m.Output]:
+        kept = list(outputs)
+        for i, output in enumerate(kept):
+            if isinstance(output, m.Decided) and not output.allow and output.source == "external":
+                self.lie_at = len(self._messages()) + i if self.lie == "verdict" and self.lie_at < 0 else self.lie_at
+                kept[i] = msgspec.structs.replace(output, allow=True) if self.lie == "verdict" else output
+            if isinstance(output, m.GateChanged) and output.open and self.lie == "silent opening" and self.lie_at < 0:
+                self.lie_at = len(self._messages()) + i
+                del kept[i]
+                break
+        return kept
+
+    # ---- what outputs do
+
+    def carry_out(self, output: m.Output) -> None:
+        match output:
+            case m.Send():
+                u = self._told("send", output.u, lambda u: (0.4, 0.0), output.source == "controller", before=False)
+                command = m.Command(output.seq, output.t_ns, output.source, output.u, output.obs_seq, output.ttl_ns)
+                if u != output.u:
+                    command = msgspec.structs.replace(command, u=u)
+                self.u = u
+                self.lie_at = len(self._messages()) if self.lie == "send" and u != output.u and self.lie_at < 0 else self.lie_at
+                self.items.append(self.transport.encode(command))
+                if self.stream is not None:
+                    self.stream.sent(output)
+                if output.source == "recovery" and self.campaign is not None:
+                    self.campaign.refused(output.obs_seq, self.reason)
+            case m.Decided():
+                self.reason = output.reason
+            case m.Ask(source="sampler"):
+                self.feed(*self._sampler(output))
+            case m.Ask():
+                self.numbers += 1
+                self.feed(m.Proposed(0, m.Command(self.numbers, self.t_ns, "controller", (0.1, 0.8), output.obs_seq, 100_000_000)))
+            case m.StartCampaign():
+                self.order = output
+                self.campaign = Campaign.from_settings(
+                    self.settings, self.profile.sampling, n=output.n, epoch=output.epoch, seed=output.seed
+                )
+                if output.resume:
+                    self.campaign.restore(self.snapshot)
+                again = [msgspec.structs.replace(sample, again=True) for sample in self.samples]
+                self.snapshot = self.campaign.snapshot()
+                self.feed(m.SourceStarted(0, "sampler", self.campaign.digest), *again)
+            case m.StopCampaign() if self.campaign is not None:
+                assert self.order is not None
+                rejected, self.campaign = self.campaign.progress().rejected, None
+                ended = m.CampaignFinished(0, self.order.epoch, len(self.samples), False, rejected, output.reason)
+                self.feed(m.SourceStopped(0, "sampler", "stopped", output.reason), ended)
+            case m.StartJob(kind="gap"):
+                self.feed(self._gap(output))
+            case m.StartJob(kind="verify"):
+                self.feed(self._verify(output))
+            case m.IssueCertificate():
+                self.feed(self._issue(output))
+            case m.StartController():
+                gap = self.state.memory.gap
+                assert gap is not None
+                self.epoch = gap.epoch
+                memory = self.state.memory
+                self.stream = Stream(self.model, gap, n=memory.watch_n, exceedances=memory.watch_exceedances, e_value=memory.watch_e_value)
+                self.feed(m.SourceStarted(0, "controller", output.digest))
+            case m.StopController():
+                self.stream = None
+            case _:
+                pass
+
+    def _sampler(self, ask: m.Ask) -> list[m.Event]:
+        assert self.campaign is not None
+        assert self.order is not None
+        step = self.campaign.step(self.observation)
+        events: list[m.Event] = []
+        if step.sample is not None:
+            sample = self._told("sample", step.sample, lambda s: msgspec.structs.replace(s, x1=s.x0), len(self.samples) == 3)
+            self.samples.append(sample)
+            self.snapshot = self.campaign.snapshot()
+            events.append(sample)
+        if step.done or step.failed:
+            rejected = self.campaign.progress().rejected
+            self.campaign = None
+            ended = m.CampaignFinished(0, self.order.epoch, len(self.samples), len(self.samples) >= self.order.n, rejected, step.failed)
+            return [*events, m.SourceStopped(0, "sampler", "finished", step.failed), ended]
+        u = self._told("input law", step.u, lambda u: (u[0] / 2, u[1] / 2), step.phase == "hold" and len(self.samples) == 3)
+        self.numbers += 1
+        return [*events, m.Proposed(0, m.Command(self.numbers, ask.t_ns, "sampler", u, ask.obs_seq, 100_000_000))]
+
+    def _gap(self, order: m.StartJob) -> m.JobFinished:
+        gap = jobs.gap(GapJob(self.profile, tuple(self.samples), {}, order.epoch, order.beta))
+        gap = self._told("gap", gap, lambda g: msgspec.structs.replace(g, radius=0.9 * g.radius))
+        return m.JobFinished(0, order.job_id, "gap", gap=gap)
+
+    def _verify(self, order: m.StartJob) -> m.JobFinished:
+        """Numbers as a verification has them; the rollouts are not this bench's business."""
+        n = ledger.sample_size(0.3, order.beta)
+        values = [0.5 + i for i in range(n)]
+        least = self._told("safety", 0.5, lambda s: 0.9)
+        laws = tuple(m.LawResult(law, n, least, 0, 0.3, 1.0, True, law != "adversarial", True) for law in ("uniform", "persistent"))
+        s = self.settings
+        digests = (self.controller.digest, s.model_digest, s.task_digest)
+        found = m.Verification(True, order.radius, order.hold_radius, 0.0, 0.3, order.beta, order.attempt, order.seed, laws, *digests)
+        return m.JobFinished(0, order.job_id, "verify", verification=found, safety={law.law: values for law in laws})
+
+    def _issue(self, order: m.IssueCertificate) -> m.CertificateStored:
+        made = certificates.issue(
+            profile=self.profile,
+            controller=self.controller,
+            gap=order.gap,
+            verification=order.verification,
+            issued_unix_s=START_UNIX_S,
+            lifetime_s=order.lifetime_s,
+            horizon=BenchTask.horizon,
+        )
+        made = self._told("certificate", made, lambda c: msgspec.structs.replace(c, not_shown=()))
+        facts = certificates.facts(made)
+        key = self._told("signer", KEY, lambda _: OTHER)
+        self.items.append((f"certificate/{facts.id}", "application/json", certificates.sign(made, key)))
+        return m.CertificateStored(0, facts, request_id=order.request_id)
+
+    # ---- lies and logs
+
+    def _told(self, name: str, value: Any, lie: Any, when: bool = True, *, before: bool = True) -> Any:
+        """The value, or once, if this bench is to lie about that, another one."""
+        if name != self.lie or not when or self.lie_at >= 0:
+            return value
+        if before:
+            self.lie_at = len(self._messages()) + len(self.queue)
+        return lie(value)
+
+    def _messages(self) -> list[Any]:
+        return [item for item in self.items if not isinstance(item, tuple)]
+
+    def write(self, path: Path, run: str = "bench", key: Ed25519PrivateKey | None = KEY, **options: Any) -> Path:
+        """The log of what happened."""
+        writer = Writer(path, run=run, signer=key, metadata={"robot": "bench"}, timed=False, **options)
+        for number, item in enumerate(self.items):
+            if isinstance(item, tuple):
+                writer.attach(*item)
+            else:
+                writer.write(item, getattr(item, "t_ns", 0))
+            if number % 100 == 0:
+                writer.flush()
+        writer.close()
+        return path

@@ -1,0 +1,291 @@
+"""An honest log holds; a log with one lie in it does not, and the record that the lie stands in is named.
+
+The liars sign their logs with the right key: what is tested here is that nothing is believed which can be computed. Against
+those without the key there are test_chain and test_recording.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from s2r_runtime import messages as m
+from s2r_runtime.audit import AuditResult, audit
+from s2r_runtime.errors import ConfigError, RecordingError
+from s2r_runtime.reading import Entry
+from s2r_runtime.recorder import Recorder
+from s2r_runtime.recording import Writer, read
+from s2r_runtime.salvage import recover
+
+_spec = importlib.util.spec_from_file_location("audit_bench", Path(__file__).parent / "audit_bench.py")
+assert _spec is not None
+assert _spec.loader is not None
+audit_bench = importlib.util.module_from_spec(_spec)
+sys.modules["audit_bench"] = audit_bench
+_spec.loader.exec_module(audit_bench)
+audit_bench.install(audit_bench)
+Bench, KEY, OTHER = audit_bench.Bench, audit_bench.KEY, audit_bench.OTHER
+PUBLIC = KEY.public_key().public_bytes_raw()
+
+
+def whole_run(folder: Path, lie: str = "") -> Any:
+    """Campaign, gap, certificate, a drive, a robot that changes, a certificate at the grown gap, an end."""
+    bench = Bench(folder, lie).sample().drive(60)
+    bench.gain = 2.0
+    bench.steps(60)
+    return bench.stop()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """An honest run, for tests that only read it."""
+    return whole_run(tmp_path_factory.mktemp("run"))
+
+
+def entries(path: Path) -> list[Entry]:
+    return list(read(path))
+
+
+# ---------------------------------------------------------------- honest logs
+
+
+def test_an_honest_run_holds_and_everything_in_it_was_recomputed(run: Any, tmp_path: Path) -> None:
+    path = run.write(tmp_path / "a.mcap")
+    result = audit([path], PUBLIC)
+    assert result.ok, result.text()
+    assert (result.chain, result.first_difference, result.missing, result.unchecked) == ("intact", None, [], [])
+    seen = {kind: sum(isinstance(entry.message, kind) for entry in entries(path)) for kind in (m.Frame, m.Measured, m.SampleTaken)}
+    assert result.recomputed["frames"] == seen[m.Frame] > 500
+    assert result.recomputed["discrepancies"] == seen[m.Measured] > 50
+    assert result.recomputed["samples"] == result.recomputed["samples found in the observations"] == seen[m.SampleTaken] == 14
+    assert result.recomputed["gaps"] == 1
+    events = sum(entry.channel.startswith("event/") for entry in entries(path))
+    outputs = sum(entry.channel.startswith("out/") for entry in entries(path))
+    assert (result.recomputed["events"], result.recomputed["outputs"]) == (events, outputs)
+    assert all(one.valid for one in result.certificates)
+    assert len(result.certificates) >= 1
+    assert result.head == read_head(path)
+
+
+def read_head(path: Path) -> str:
+    reading = read(path)
+    reading.to_the_end()
+    return reading.head.hex()
+
+
+def test_the_result_has_the_keys_that_are_promised_and_is_plain_data(run: Any, tmp_path: Path) -> None:
+    plain = audit([run.write(tmp_path / "a.mcap")]).to_json()
+    assert {"ok", "records", "certificates", "first_difference", "missing", "chain"} <= plain.keys()
+    assert {"id", "valid", "reason"} <= plain["certificates"][0].keys()
+    assert msgspec.json.decode(msgspec.json.encode(plain)) == plain
+
+
+def test_parts_of_a_rotated_log_are_audited_as_one_in_any_order(run: Any, tmp_path: Path) -> None:
+    run.write(tmp_path / "a.mcap", rotate_bytes=30_000)
+    parts = sorted(tmp_path.glob("*.mcap"), key=lambda path: read(path).part, reverse=True)
+    assert len(parts) > 2
+    result = audit(parts)
+    assert result.ok, result.text()
+    without = audit([parts[-1], *parts[:-2]])
+    assert not without.ok
+    assert "a part of the run is missing" in without.unchecked[0]
+    later = audit(parts[:-1])
+    assert not later.ok
+    assert "without the parts before it" in later.unchecked[0]
+
+
+def test_a_log_that_a_crash_cut_anywhere_holds_and_says_what_is_missing(run: Any, tmp_path: Path) -> None:
+    data = run.write(tmp_path / "a.mcap").read_bytes()
+    for tenths in range(1, 10):
+        cut = tmp_path / f"{tenths}.mcap"
+        cut.write_bytes(data[: len(data) * tenths // 10])
+        result = audit([cut])
+        assert result.ok, result.text()
+        assert result.chain == "intact"
+        assert "was cut after" in result.missing[0]
+        recover(cut, tmp_path / f"{tenths}-whole.mcap")
+        again = audit([tmp_path / f"{tenths}-whole.mcap"])
+        assert (again.ok, again.records) == (True, result.records)
+
+
+def test_a_campaign_that_was_interrupted_and_went_on_holds_over_both_logs(tmp_path: Path) -> None:
+    first = Bench(tmp_path)
+    first.step()
+    first.ask("permit", duration_s=3600.0)
+    first.ask("sample")
+    while len(first.samples) < 6:
+        first.step()
+    first.interrupt()
+    while first.state.memory.gap is None:
+        first.step()
+    path = first.drive(30).stop().write(tmp_path / "a.mcap")
+    result = audit([path])
+    assert result.ok, result.text()
+    assert result.recomputed["gaps"] == 1
+    assert result.recomputed["samples"] == 14
+
+
+def test_a_log_that_ran_out_of_disk_holds_and_counts_what_it_lacks(run: Any, tmp_path: Path) -> None:
+    writer = Writer(tmp_path / "a.mcap", run="bench", signer=KEY, timed=False)
+    recorder = Recorder(writer, limit_bytes=100_000)
+    with writer._writing:
+        for item in run.items:
+            if isinstance(item, tuple):
+                recorder.attach(*item)
+            else:
+                recorder.put(item, getattr(item, "t_ns", 0))
+    lost = recorder.close().unrecorded
+    result = audit([tmp_path / "a.mcap"])
+    assert result.ok, result.text()
+    assert f"{lost} messages at the end were not recorded" in result.missing[0]
+
+
+# ---------------------------------------------------------------- keys
+
+
+def test_whose_key_it_is_decides_only_if_one_is_asked_for(run: Any, tmp_path: Path) -> None:
+    path = run.write(tmp_path / "a.mcap")
+    told = audit([path])
+    assert told.ok
+    assert "not compared with a trusted key" in told.signed_by
+    other = audit([path], OTHER.public_key().public_bytes_raw())
+    assert not other.ok
+    assert "NOT by the trusted key" in other.signed_by
+    unsigned = audit([run.write(tmp_path / "b.mcap", key=None)], PUBLIC)
+    assert not unsigned.ok
+    assert unsigned.chain == "unsigned tail"
+
+
+# ---------------------------------------------------------------- lies
+
+
+@pytest.mark.parametrize(
+    ("lie", "what"),
+    [
+        ("observation", "this is not what frame"),
+        ("settings", "the settings are not those of the attached profile"),
+        ("sample", "the campaign gives something else here"),
+        ("input law", "the campaign gives something else here"),
+        ("gap", "the gap of epoch 1 is another one"),
+        ("safety", "the numbers of the law uniform are not those of its scenarios"),
+        ("certificate", "what it says is not what the evidence says"),
+        ("signer", "which is not trusted here"),
+        ("discrepancy", "the discrepancy (or what the watch makes of it) is another one"),
+        ("verdict", "the core gives another output here"),
+        ("silent opening", "the core gives another output here"),
+        ("send", "a frame left that no command of the core makes"),
+    ],
+)
+def test_a_lie_is_named_where_it_stands(tmp_path: Path, lie: str, what: str) -> None:
+    bench = whole_run(tmp_path, lie)
+    assert bench.lie_at >= 0, "the bench never came to lie"
+    path = bench.write(tmp_path / "a.mcap")
+    result = audit([path], PUBLIC)
+    assert not result.ok
+    assert result.chain == "intact", "the liar has the key"
+    assert result.first_difference is not None
+    assert what in result.first_difference.what
+    assert result.first_difference.index == entries(path)[bench.lie_at].index
+    if lie in {"gap", "safety", "certificate", "signer"}:
+        assert not result.certificates[0].valid
+
+
+def tampered(run: Any, path: Path, change: Callable[[list[Any]], int]) -> tuple[AuditResult, int]:
+    """The audit of a log in which something was changed after the fact, and the index of the record that `change` says is wrong."""
+    bench = Bench.__new__(Bench)
+    bench.items = list(run.items)
+    ordinal = change(bench.items)
+    bench.write(path)
+    return audit([path], PUBLIC), entries(path)[ordinal].index
+
+
+def nth(items: list[Any], kind: type, n: int) -> int:
+    return [i for i, item in enumerate(items) if isinstance(item, kind)][n]
+
+
+def ordinal(items: list[Any], at: int) -> int:
+    return sum(not isinstance(item, tuple) for item in items[:at])
+
+
+@pytest.mark.parametrize("kind", [m.Observed, m.Proposed, m.Measured, m.Ask, m.Decided, m.Send, m.GateChanged, m.Persist, m.RadiusGrew])
+def test_a_record_that_was_left_out_is_missed(run: Any, tmp_path: Path, kind: type) -> None:
+    def leave_out(items: list[Any]) -> int:
+        at = nth(items, kind, -1 if kind in {m.GateChanged, m.Persist, m.RadiusGrew} else 40)
+        del items[at]
+        return ordinal(items, at)
+
+    result, index = tampered(run, tmp_path / "a.mcap", leave_out)
+    assert not result.ok
+    assert result.first_difference is not None
+    late = 30 if kind in {m.Observed, m.Proposed, m.Measured} else 3  # an event's absence shows in what it would have led to
+    assert index - 1 <= result.first_difference.index <= index + late
+
+
+@pytest.mark.parametrize("kind", [m.Ticked, m.Send, m.Revoked])
+def test_a_record_that_was_put_in_is_noticed(run: Any, tmp_path: Path, kind: type) -> None:
+    extra = {
+        m.Ticked: m.Measured(0, 3, 0.0, "", 1.0, 1, 0, 1),
+        m.Send: m.Send(0, 1, "controller", (0.4, 0.0), 1, 100_000_000),
+        m.Revoked: m.Revoked(0, "x", "y"),
+    }[kind]
+
+    def put_in(items: list[Any]) -> int:
+        at = nth(items, m.Observed, 100)
+        items.insert(at, extra)
+        return ordinal(items, at)
+
+    result, index = tampered(run, tmp_path / "a.mcap", put_in)
+    assert not result.ok
+    assert result.first_difference is not None
+    assert result.first_difference.index == index
+
+
+def test_evidence_that_is_not_attached_is_missed(run: Any, tmp_path: Path) -> None:
+    for name in ("controller/", "certificate/"):
+        bench = Bench.__new__(Bench)
+        bench.items = [item for item in run.items if not (isinstance(item, tuple) and item[0].startswith(name))]
+        result = audit([bench.write(tmp_path / f"{name[:-1]}.mcap")])
+        assert not result.ok
+        assert not result.certificates[0].valid
+        assert "not attached" in result.certificates[0].reason
+    bench.items = [item for item in run.items if not (isinstance(item, tuple) and item[0] == "profile.toml")]
+    with pytest.raises(ConfigError, match=r"profile\.toml is not attached"):
+        audit([bench.write(tmp_path / "profile.mcap")])
+
+
+def test_a_later_run_cannot_forget_what_an_earlier_one_spent(run: Any, tmp_path: Path) -> None:
+    first = run.write(tmp_path / "a.mcap", run="first")
+    memory = run.state.memory
+    honest = Bench(tmp_path, memory=memory).stop().write(tmp_path / "b.mcap", run="second")
+    assert audit([first, honest]).ok
+    forgetful = Bench(tmp_path, memory=msgspec.structs.replace(memory, attempts=0)).stop().write(tmp_path / "c.mcap", run="third")
+    assert audit([forgetful]).ok, "alone it cannot be told"
+    result = audit([first, forgetful])
+    assert not result.ok
+    assert result.first_difference is not None
+    assert "forgets epochs or attempts" in result.first_difference.what
+
+
+def test_damage_is_named_and_nothing_behind_it_is_believed(run: Any, tmp_path: Path) -> None:
+    data = bytearray(run.write(tmp_path / "a.mcap").read_bytes())
+    data[len(data) // 2] ^= 4
+    (tmp_path / "a.mcap").write_bytes(data)
+    result = audit([tmp_path / "a.mcap"])
+    assert (result.ok, result.chain) == (False, "broken")
+    assert result.first_difference is not None
+    assert "damaged" in result.first_difference.what
+    assert result.records == result.first_difference.index
+
+
+def test_what_is_no_log_is_refused_by_name(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_text("no")
+    with pytest.raises(RecordingError, match=r"a\.mcap"):
+        audit([tmp_path / "a.mcap"])
+    with pytest.raises(RecordingError, match="no log"):
+        audit([])
