@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         )
         persistence.replace(args.output, certificate.sign(issued, key))
     if args.json:
-        answer = verification.verification_json(result, tuple(model.states))
+        answer = verification.verification_json(result)
         output.result_json(
             {
                 **answer,
@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
             }
         )
     else:
-        print_verification(verification.verification_json(result, tuple(model.states)))
+        print_verification(verification.verification_json(result))
         output.out(f"gap epoch {epoch}, verification attempt {attempt}: {spent:.4f} of beta {profile.guarantee.beta} spent")
         output.out(f"certificate written to {args.output}" if result.passed else "no certificate")
     return 0 if result.passed else 1

@@ -172,7 +172,9 @@ def _say(args: argparse.Namespace, request: dict[str, Any], socket: Path | None 
 def _call(args: argparse.Namespace, request: dict[str, Any], socket: Path | None = None) -> dict[str, Any]:
     from s2r_runtime import control
 
-    path: Path = socket or args.socket or control.find_socket(args.robot)
+    path = socket or args.socket or control.find_socket(args.robot)
+    if path is None:
+        raise UsageError("no daemon is running here")
     bar = output.Progress(request["verb"])
 
     def on_progress(line: dict[str, Any]) -> None:

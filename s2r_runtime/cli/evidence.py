@@ -127,7 +127,7 @@ def run_verify(args: argparse.Namespace) -> int:
         attempt=1,
         beta=profile.guarantee.beta,
     )
-    answer = verification.verification_json(result, tuple(model.states))
+    answer = verification.verification_json(result)
     if args.json:
         output.result_json(answer)
     else:
