@@ -122,7 +122,7 @@ def estimate_gap(
     radius = _largest(discrepancy(e, w, kind), discard)
     e_hold = hold_residuals(model, tr)
     paid = e_hold is not None and (not tr.independent or scenario_confidence(n, discard, epsilon) <= beta / 2.0)
-    white = whiteness(model, tr.x0, tr.u, e, first_lag=1 if tr.drive is None else 2)
+    white = whiteness(model, tr.x0, tr.u, e, first_lag=1 if tr.independent else 2)
     return Gap(
         radius=radius,
         radius_literal=_largest(discrepancy(e, np.ones_like(w), kind), discard),
@@ -174,27 +174,28 @@ def radius_of_noise(model: ComposedModel, tr: Transitions, weights: Array, kind:
 def blocked(tr: Transitions, seconds: float) -> Transitions:
     """The first transition of every block of that length; independent under the assumption that blocks are, which is then stated.
 
-    Raises UsageError if the block is not longer than 0. Transitions that are independent anyway come back unchanged.
+    Raises UsageError if the block is not longer than 0, or these are samples of a campaign that isn't whole: no assumption about time
+    mends that. Transitions that are independent anyway come back unchanged.
     """
     if not 0.0 < seconds < float("inf"):
         raise UsageError(f"blocking is {seconds} s, must be > 0")
     if tr.independent or len(tr.t0_s) == 0:
         return tr
+    if tr.drive is None:
+        raise UsageError(f"{tr.source}: blocking is for ordinary driving, here {tr.doubt}")
     block = np.floor((tr.t0_s - tr.t0_s[0]) / seconds)
     _, first = np.unique(block, return_index=True)
-    drive = replace(tr.drive, step=tr.drive.step[first]) if tr.drive else None
     return replace(
         tr,
         x0=tr.x0[first],
         u=tr.u[first],
         x1=tr.x1[first],
-        held=None if tr.held is None else tr.held[first],
         t0_s=tr.t0_s[first],
         independent=True,
         doubt="",
         assumption=f"transitions from different blocks of {seconds:g} s of this drive, one from each, are independent and of one law",
         rejected={**tr.rejected, "blocking": len(tr.x0) - len(first)},
-        drive=drive,
+        drive=replace(tr.drive, step=tr.drive.step[first]),
     )
 
 

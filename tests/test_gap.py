@@ -251,6 +251,13 @@ def test_blocks_must_have_a_length() -> None:
         blocked(transitions(rng.normal(size=(10, 3)), rng), 0.0)
 
 
+def test_blocks_do_not_mend_a_campaign_that_is_not_whole() -> None:
+    rng = np.random.default_rng(12)
+    tr = replace(transitions(rng.normal(size=(10, 3)), rng), independent=False, doubt="the log holds 10 of the 99 samples of campaign 1")
+    with pytest.raises(UsageError, match="blocking is for ordinary driving, here the log holds 10 of the 99"):
+        blocked(tr, 1.0)
+
+
 def test_memory_of_an_effect_is_carried_along_a_drive() -> None:
     """A delayed model on a delayed robot: no residual, though inputs change at every step and some transitions were left out."""
     model = compose(ModelSpec("unicycle", DT, effects=(EffectSpec("input_delay", "*", {"delay": 0.25}),)))
