@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from s2r_runtime import ledger
 from s2r_runtime.bounds import (
     attempt_beta,
     clopper_pearson_lower,
@@ -76,6 +77,15 @@ def test_a_life_of_epochs_spends_half_of_the_budget_and_never_more(spend: object
     tail = 3 * beta / math.pi**2 / last  # sum over i > m of 1/i^2 is below 1/m
     assert total < beta / 2 < total + tail
     assert spend(beta, 1) == pytest.approx(3 * beta / math.pi**2)
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.floats(1e-4, 0.6), st.sampled_from([0.01, 0.05, 0.1]), st.integers(0, 6), st.integers(1, 9))
+def test_the_core_s_own_sums_ask_for_the_same_samples(eps: float, beta: float, k: int, number: int) -> None:
+    """The core may not use scipy; a campaign that it planned must be enough for the gap, and no larger."""
+    share = ledger.share(beta, number)
+    assert share == epoch_beta(beta, number)
+    assert ledger.campaign_size(eps, share, k) == sample_size(eps, share / 2, k)
 
 
 @pytest.mark.parametrize(("failures", "n"), [(0, 299), (1, 50), (3, 50), (49, 50), (7, 1000)])
