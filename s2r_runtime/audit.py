@@ -91,6 +91,7 @@ def audit(
     for parts in runs(paths):
         readings += parts
         _run(RunAudit(across), parts, findings, tell)
+    across.campaigns.end()
     signed_by, trusted_all = _signers(readings, public_key)
     chain = _chain(readings)
     valid = all(one.valid for one in findings.certificates.values())

@@ -39,6 +39,7 @@ class CampaignReplay:
         self.samples: dict[int, list[SampleTaken]] = {}
         self.rejected: dict[int, dict[str, int]] = {}
         self._snapshots: dict[int, dict[str, Any]] = {}
+        self._without_frames: dict[int, int] = {}
         self.begin_run()
 
     def begin_run(self) -> None:
@@ -50,6 +51,14 @@ class CampaignReplay:
         self._observations: deque[Observation] = deque(maxlen=KEPT)
         self._sends: deque[Send] = deque(maxlen=KEPT)
         self._reason = ""
+        self._resumed: dict[str, Any] | None = None
+        self._asked: deque[tuple[Ask, Observation, int]] = deque()
+        self._exact = True
+
+    def end(self) -> None:
+        """No run follows."""
+        for epoch, n in self._without_frames.items():
+            self._findings.lack(f"the frames behind {n} samples of campaign {epoch}, in an earlier log that was cut or not given")
 
     # ---- what the daemon did
 
@@ -62,13 +71,15 @@ class CampaignReplay:
         self._order, self._dt_ns = order, settings.dt_ns
         self._campaign = None
         self._due.clear()
+        self._asked.clear()
         try:
             campaign = Campaign.from_settings(settings, sampling, n=order.n, epoch=order.epoch, seed=order.seed)
             if order.resume:
                 if order.epoch not in self._snapshots:
                     self._findings.lack(f"the beginning of campaign {order.epoch}, in an earlier log that was not given")
                     return
-                campaign.restore(self._snapshots[order.epoch])
+                self._resumed = self._snapshots[order.epoch]
+                campaign.restore(self._resumed)
         except ConfigError:
             return  # it did not start: SourceStopped says so
         self._campaign = campaign
@@ -78,17 +89,36 @@ class CampaignReplay:
     def ask(self, ask: Ask, ttl_ns: int) -> None:
         """The campaign was asked about the newest observation."""
         observation = self._observations[-1] if self._observations else None
-        campaign, order = self._campaign, self._order
-        if campaign is None or order is None or observation is None or observation.seq != ask.obs_seq:
+        if self._campaign is None or observation is None or observation.seq != ask.obs_seq:
             return
-        step = campaign.step(observation)
-        if step.sample is not None:
-            self._due.append(msgspec.structs.replace(step.sample, t_ns=0))
-            self._snapshots[order.epoch] = campaign.snapshot()
-        if step.done or step.failed:
-            self._due.append(SourceStopped(0, "sampler", "finished", step.failed))
-        else:
-            self._due.append(Proposed(0, Command(0, ask.t_ns, "sampler", step.u, observation.seq, ttl_ns)))
+        self._asked.append((ask, observation, ttl_ns))
+        if self._resumed is None:
+            self._settle()
+
+    def _settle(self) -> None:
+        """Answers what was asked. A campaign that goes on is first told where it stood: at the samples that were logged once more.
+
+        The daemon kept those, and may have kept one that a crash cut from the log before; the other counts may lack what it cut.
+        """
+        campaign, order = self._campaign, self._order
+        if campaign is None or order is None:
+            return
+        if self._resumed is not None:
+            taken = len(self.samples.get(order.epoch, ()))
+            if taken != self._resumed["index"]:
+                self._exact = False
+                campaign.restore({**self._resumed, "index": taken})
+            self._resumed, self._snapshots[order.epoch] = None, campaign.snapshot()
+        while self._asked:
+            ask, observation, ttl_ns = self._asked.popleft()
+            step = campaign.step(observation)
+            if step.sample is not None:
+                self._due.append(msgspec.structs.replace(step.sample, t_ns=0))
+                self._snapshots[order.epoch] = campaign.snapshot()
+            if step.done or step.failed:
+                self._due.append(SourceStopped(0, "sampler", "finished", step.failed))
+            else:
+                self._due.append(Proposed(0, Command(0, ask.t_ns, "sampler", step.u, observation.seq, ttl_ns)))
 
     def decided(self, reason: str) -> None:
         """The gate's last word."""
@@ -97,6 +127,7 @@ class CampaignReplay:
     def sent(self, send: Send) -> None:
         """A command left: the recovery's means that the campaign's did not act."""
         self._sends.append(send)
+        self._settle()
         if send.source == "recovery" and self._campaign is not None:
             self._campaign.refused(send.obs_seq, self._reason)
 
@@ -116,6 +147,7 @@ class CampaignReplay:
 
     def proposed(self, entry: Entry, event: Proposed) -> None:
         """The sampler's command."""
+        self._settle()
         if self._campaign is not None:
             command = msgspec.structs.replace(event.command, seq=0)
             self._compare(entry, msgspec.structs.replace(event, t_ns=0, command=command), "campaign commands")
@@ -126,6 +158,7 @@ class CampaignReplay:
         if event.again:
             self._once_more(entry, event, kept)
             return
+        self._settle()
         if self._campaign is not None:
             self._compare(entry, msgspec.structs.replace(event, t_ns=0), "samples")
         self._find(entry, event)
@@ -136,22 +169,25 @@ class CampaignReplay:
         told = next((one for one in kept if one.index == event.index), None)
         if told is None:
             kept.append(event)
-            self._findings.lack(f"the frames behind the first samples of campaign {event.epoch}, in an earlier log that was not given")
+            self._without_frames[event.epoch] = self._without_frames.get(event.epoch, 0) + 1
         elif msgspec.structs.replace(told, t_ns=0, again=True) != msgspec.structs.replace(event, t_ns=0):
             self._findings.differ(entry.index, entry.channel, "the sample was another one in the log before", entry.raw, told)
 
     def stopped(self, entry: Entry, event: SourceStopped) -> None:
         """The sampler ends: by itself as the campaign says, or because it was told to."""
+        self._settle()
         if event.reason == "finished" and self._campaign is not None:
             self._compare(entry, msgspec.structs.replace(event, t_ns=0), "campaign ends")
         self._due.clear()
 
     def finished(self, entry: Entry, event: CampaignFinished) -> None:
         """What it says of itself."""
+        self._settle()
         campaign, order = self._campaign, self._order
         if campaign is not None and order is not None:
             n = len(self.samples.get(order.epoch, ()))
-            told = CampaignFinished(event.t_ns, order.epoch, n, n >= order.n, campaign.progress().rejected, event.detail)
+            rejected = campaign.progress().rejected if self._exact else event.rejected
+            told = CampaignFinished(event.t_ns, order.epoch, n, n >= order.n, rejected, event.detail)
             if told != event:
                 self._findings.differ(entry.index, entry.channel, "the campaign ended otherwise", entry.raw, told)
         self.rejected[event.epoch] = event.rejected
