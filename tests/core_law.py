@@ -1,0 +1,429 @@
+"""DESIGN 5 written down once more, without the gate and without the core's state: what must never have happened.
+
+`Law` sees nothing but events and outputs. It is no rule for how the core goes about it, only for what moves the robot.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import msgspec
+from core_rig import SETTINGS, S, of
+
+from s2r_runtime.messages import (
+    MEMORY_SCHEMA,
+    AnalyticsChanged,
+    Answer,
+    Ask,
+    AttemptSpent,
+    CampaignFinished,
+    CertificateFacts,
+    CertificateStored,
+    Command,
+    Decided,
+    EpochChanged,
+    Event,
+    Gap,
+    GateChanged,
+    IssueCertificate,
+    JobFinished,
+    LinkChanged,
+    Measured,
+    Memory,
+    ModelAdopted,
+    Observation,
+    Observed,
+    Output,
+    OverrideChanged,
+    Persist,
+    Proposed,
+    RecorderChanged,
+    Requested,
+    Revoked,
+    Send,
+    Settings,
+    SourceStarted,
+    SourceStopped,
+    StartCampaign,
+    StartController,
+    Started,
+    StartJob,
+    StopCampaign,
+    StopController,
+    Stopping,
+    WallClockRead,
+)
+
+DT = 100_000_000
+WALK = msgspec.structs.replace(
+    SETTINGS,
+    dt_ns=DT,
+    observation_timeout_ns=5 * DT,
+    command_ttl_ns=2 * DT,
+    hysteresis_ns=2 * DT + 1,
+    settle_periods=3,
+    epsilon=0.2,
+    beta=0.5,
+    max_measurement_faults=2,
+    recovery="hold",
+    recovery_input=(0.05, 5.0),
+    required_laws=("uniform",),
+)
+FAULTS = ("raised", "died", "deadline", "malformed")
+
+
+# ---------------------------------------------------------------- the law
+
+
+@dataclass
+class Law:
+    """What DESIGN 5 allows, from events and outputs alone. `judge` raises AssertionError for what must not have happened."""
+
+    settings: Settings
+    started: bool = False
+    now: int = 0
+    unix: tuple[int, int] = (0, 0)
+    up: frozenset[str] = frozenset()
+    latched: frozenset[str] = frozenset()
+    model: str = ""
+    gap: Gap | None = None
+    radius: float = 0.0
+    alarmed: bool = False
+    stored: tuple[CertificateFacts, ...] = ()
+    revoked: frozenset[str] = frozenset()
+    running: str | None = None
+    faults: int = 0
+    permit: int | None = None
+    sampling: bool = False
+    latest: Observation | None = None
+    latest_ns: int = 0
+    good: Observation | None = None
+    good_ns: int = -(10**18)
+    usable: bool = False
+    asked: Ask | None = None
+    asked_ns: int = 0
+    clear: int | None = None
+    gate: bool = False
+    instant: int | None = None
+    instant_stamp: int | None = None
+    answered: bool = True
+    last: Send | None = None
+    refused: bool = False
+    issuing: frozenset[int] = frozenset()
+    epochs: int = 0
+    attempts: int = 0
+    requests: frozenset[int] = frozenset()
+    final: frozenset[int] = frozenset()
+    disk: Memory = field(default_factory=lambda: Memory("r", MEMORY_SCHEMA))
+
+    def judge(self, event: Event, outputs: tuple[Output, ...]) -> None:
+        """One event and what came of it."""
+        if not self.started and not isinstance(event, Started):
+            assert not of(list(outputs), Send)
+            assert all(isinstance(output, Answer) for output in outputs)
+            self._answers(event, outputs)
+            return
+        anew = event.t_ns < self.now or (isinstance(event, LinkChanged) and not event.up)
+        if event.t_ns < self.now:
+            self.permit = None
+        if anew:
+            self._forget()
+        self.now, self.refused = event.t_ns, False
+        before = self._instant(event)
+        self._facts(event, outputs)
+        self._clear(event)
+        self._sends(event, outputs, before)
+        self._order(outputs)
+        self._answers(event, outputs)
+        self._clear(event)
+        self.started = self.started and not isinstance(event, Stopping)
+        self.last = None if anew else self.last  # what is waiting after this may wait where it waited before
+
+    # ------------------------------------------------------------------ what is so
+
+    def _facts(self, event: Event, outputs: tuple[Output, ...]) -> None:
+        match event:
+            case Started():
+                self.started, self.model, self.unix = True, self.settings.model_digest, (event.unix_s, event.t_ns)
+                self.up = frozenset({"recorder", "analytics"})
+                self.running, self.sampling, self.permit, self.asked = None, False, None, None
+                self.gate, self.answered, self.last = False, True, None
+                self._forget()
+            case WallClockRead():
+                self.unix = (event.unix_s, event.t_ns)
+            case LinkChanged():
+                self._up("link", event.up)
+            case RecorderChanged():
+                self._up("recorder", event.ok)
+            case AnalyticsChanged():
+                self._up("analytics", event.up)
+            case OverrideChanged():
+                self.latched |= {event.kind}
+            case Measured():
+                self._measured(event)
+            case Observed():
+                self._observed(event.observation)
+            case SourceStopped(source="controller"):
+                if self.running is not None and event.reason in FAULTS:
+                    self.latched |= {"controller_fault"}
+                self.running = None
+            case SourceStopped(source="sampler") if event.reason != "finished":
+                self.sampling = False
+            case CampaignFinished():
+                self.sampling = False
+            case SourceStarted(source="controller"):
+                self.running, self.faults = event.digest, 0
+            case SourceStarted(source="sampler"):
+                self.sampling = True
+            case CertificateStored() if event.gap is not None or event.request_id in self.issuing:
+                self.stored = (*self.stored, event.facts)
+            case Proposed():
+                self._proposed(event.command, outputs)
+            case Requested():
+                self._requested(event)
+            case _:
+                pass
+        for output in outputs:
+            match output:
+                case EpochChanged(gap=gap) if gap is not None:
+                    assert isinstance(event, JobFinished | CertificateStored)
+                    assert event.gap == gap
+                    self.gap, self.radius, self.alarmed = gap, gap.radius, False
+                case ModelAdopted():
+                    self.model, self.gap = output.digest, None
+                case Revoked():
+                    self.revoked |= {output.certificate_id}
+                case StopController():
+                    self.running = None
+                case StopCampaign():
+                    self.sampling = False
+                case IssueCertificate():
+                    self.issuing |= {output.request_id}
+                case _:
+                    pass
+
+    def _forget(self) -> None:
+        """The robot's sequence begins anew."""
+        self.usable, self.latest, self.good, self.instant_stamp = False, None, None, None
+
+    def _up(self, what: str, up: bool) -> None:
+        self.up = self.up | {what} if up else self.up - {what}
+
+    def _measured(self, event: Measured) -> None:
+        if self.gap is None or self.alarmed or event.epoch not in (0, self.gap.epoch):
+            return
+        if event.fault or not (math.isfinite(event.discrepancy) and math.isfinite(event.e_value)):
+            self.faults += self.running is not None
+            return
+        self.radius = max(self.radius, event.discrepancy)
+        if event.e_value >= 1.0 / self.settings.alpha:
+            self.alarmed = True
+            self.latched |= {"watch_alarm"}
+            self.revoked |= {facts.id for facts in self.stored if facts.epoch == self.gap.epoch}
+
+    def _observed(self, seen: Observation) -> None:
+        lockstep = self.settings.lockstep
+        if seen == self.good:
+            if lockstep:
+                self.latest, self.usable = seen, True
+            return
+        if self.latest is not None and seen.seq == self.latest.seq and (self.usable or not lockstep or seen.fault):
+            return
+        valid = not seen.fault and len(seen.x) == 3 and all(map(math.isfinite, seen.x))
+        ordered = self.good is None or (seen.seq > self.good.seq and seen.stamp_ns > self.good.stamp_ns)
+        again = lockstep or self.now - self.good_ns > self.settings.observation_timeout_ns
+        self.usable = valid and (ordered or again)
+        if self.usable or not valid:
+            self.latest = seen
+        if self.usable:
+            self.good, self.good_ns = seen, self.now
+
+    def _proposed(self, command: Command, outputs: tuple[Output, ...]) -> None:
+        decided = of(list(outputs), Decided)
+        assert len(decided) == 1
+        asked = self.asked is not None and (self.asked.source, self.asked.obs_seq) == (command.source, command.obs_seq)
+        broken = command.fault or len(command.u) != 2 or not all(map(math.isfinite, command.u))
+        if command.source == "controller" and asked:
+            self.refused = not decided[0].allow and decided[0].reason != "settling"
+            if broken and decided[0].reason == "command_invalid":
+                self.latched |= {"command_invalid"}
+
+    def _requested(self, event: Requested) -> None:
+        if event.verb == "stop":
+            self.latched |= {"emergency_stop"}
+        elif event.verb == "clear":
+            self.latched -= {event.text}
+            if event.text == "measurement_faults":
+                self.faults = 0
+        elif event.verb == "permit" and math.isfinite(event.duration_s) and 0.0 <= event.duration_s <= 86_400.0:
+            self.permit = event.t_ns + round(event.duration_s * S) if event.duration_s else None
+        elif event.verb == "revoke":
+            self.revoked |= {facts.id for facts in self.stored if event.text in ("", facts.id)}
+
+    # ------------------------------------------------------------------ what may drive
+
+    def _against_controller(self) -> str:
+        """Why no controller may drive now, or empty."""
+        s, x = self.settings, self.good.x if self.good else ()
+        wall = self.unix[0] + (0 if s.lockstep else max(0, self.now - self.unix[1]) // S)
+        covers = [
+            c
+            for c in self.stored
+            if (c.controller_digest, c.model_digest, c.task_digest, c.profile_digest)
+            == (self.running, self.model, s.task_digest, s.profile_digest)
+            and self.gap is not None
+            and c.epoch == self.gap.epoch
+            and c.id not in self.revoked
+            and wall < c.expires_unix_s
+            and self.radius <= c.verified_radius
+        ]
+        wrong = {
+            "down": self.up != {"link", "recorder", "analytics"},
+            "latched": bool(self.latched),
+            "nothing runs": self.running is None,
+            "no certificate": not covers,
+            "alarm": self.alarmed,
+            "faults": self.faults > s.max_measurement_faults,
+            "not seen": not self.usable or not 0 <= self.now - self.good_ns <= s.observation_timeout_ns,
+            "outside": not (len(x) == 3 and abs(x[0]) <= 1.6 and abs(x[1]) <= 1.0),
+        }
+        return ", ".join(name for name, so in wrong.items() if so)
+
+    def _against_sampler(self) -> str:
+        x = self.good.x if self.good else ()
+        wrong = {
+            "down": not {"link", "recorder"} <= self.up,
+            "stopped": bool(self.latched & {"emergency_stop", "manual_override"}),
+            "no permit": self.permit is None or self.now >= self.permit,
+            "no campaign": not self.sampling,
+            "not seen": not self.usable or not 0 <= self.now - self.good_ns <= self.settings.observation_timeout_ns,
+            "outside": not (len(x) == 3 and abs(x[0]) <= 2.0 and abs(x[1]) <= 1.5),
+        }
+        return ", ".join(name for name, so in wrong.items() if so)
+
+    def _clear(self, event: Event) -> None:
+        """Since when nothing stands against the controller. A refused command of its own counts as something."""
+        if self._against_controller() or self.refused:
+            self.clear = None
+        elif self.clear is None:
+            self.clear = event.t_ns
+
+    # ------------------------------------------------------------------ what was sent
+
+    def _instant(self, event: Event) -> bool:
+        """Whether this event begins a control instant: an observation in order, at least 0.9 dt after that of the last one. An
+        unusable one can be an instant too, but what stamp it has is believed for one period only.
+        """
+        if not isinstance(event, Observed) or self.asked is not None:
+            return False
+        seen, last = event.observation, self.instant_stamp
+        if seen == self.good or (self.latest is not None and seen.seq == self.latest.seq):
+            return False
+        due = last is None or seen.stamp_ns - last >= 0.9 * DT
+        if seen.fault or len(seen.x) != 3 or not all(map(math.isfinite, seen.x)):
+            if due:
+                self.instant_stamp = seen.stamp_ns if last is None else min(seen.stamp_ns, last + DT)
+            return False
+        fresh = self.good is None or (seen.seq > self.good.seq and seen.stamp_ns > self.good.stamp_ns)
+        return fresh and (due or (last is not None and seen.stamp_ns < last))
+
+    def _sends(self, event: Event, outputs: tuple[Output, ...], instant: bool) -> None:
+        lockstep, sends = self.settings.lockstep, of(list(outputs), Send)
+        if instant and isinstance(event, Observed):
+            assert self.answered or lockstep, "an instant before this one got no command"
+            self.instant, self.instant_stamp, self.answered = event.observation.seq, event.observation.stamp_ns, False
+        for output in outputs:
+            if isinstance(output, GateChanged):
+                self.gate = output.open
+            elif isinstance(output, Ask):
+                assert self.asked is None
+                self.asked, self.asked_ns = output, event.t_ns
+            elif isinstance(output, Send):
+                self._send(event, output)
+        assert len(sends) <= 1, "two commands for one event"
+        if instant and not lockstep:
+            assert self.answered or self.asked is not None, "an instant without command or question"
+        if isinstance(event, Proposed) and event.command.source == "external":
+            assert not sends
+        if isinstance(event, Requested) and event.verb == "stop" and not lockstep:
+            assert sends or event.t_ns < 0
+
+    def _send(self, event: Event, send: Send) -> None:
+        s = self.settings
+        assert len(send.u) == 2
+        assert all(math.isfinite(value) and low <= value <= high for value, (low, high) in zip(send.u, s.input_bounds, strict=True))
+        assert 0 <= send.ttl_ns <= s.command_ttl_ns
+        again = (
+            s.lockstep
+            and isinstance(event, Observed)
+            and self.last is not None
+            and self.last.obs_seq == send.obs_seq
+            and self.asked is None
+        )
+        if send.source == "recovery":
+            if self.latched & {"emergency_stop", "manual_override"} or isinstance(event, Stopping):
+                assert send.u == (0.0, 0.0)
+        elif again:
+            assert self.last is not None
+            assert (send.u, send.source) == (self.last.u, self.last.source)
+        else:
+            assert isinstance(event, Proposed), "a source's command without its proposal"
+            self._allowed(event.command, send)
+        if send.source == "controller":
+            assert not self._against_controller(), self._against_controller()
+            assert self.gate, "it opened before it was recorded"
+            assert self.clear is not None
+            assert self.now - self.clear >= s.hysteresis_ns
+        elif send.source == "sampler":
+            assert not self._against_sampler(), self._against_sampler()
+        else:
+            assert send.source == "recovery", send.source
+        if self.last is not None and self.last.obs_seq == send.obs_seq:
+            assert again or (not s.lockstep and send.source == "recovery"), "a second command for one instant"
+        self.asked, self.answered, self.last = None, True, send
+
+    def _allowed(self, command: Command, send: Send) -> None:
+        assert self.asked is not None, "nobody asked"
+        assert (command.source, command.obs_seq, command.u) == (self.asked.source, self.asked.obs_seq, send.u)
+        assert (send.source, send.obs_seq) == (command.source, command.obs_seq)
+        assert not command.fault
+        ttl = min(command.ttl_ns, self.settings.command_ttl_ns)
+        assert 0 <= self.now - command.t_ns <= ttl
+        assert 0 <= self.now - self.asked_ns <= ttl
+
+    # ------------------------------------------------------------------ order and answers
+
+    def _order(self, outputs: tuple[Output, ...]) -> None:
+        """What is spent, and what certifies, is on disk before anything rests on it."""
+        for output in outputs:
+            match output:
+                case Persist():
+                    assert output.memory.epochs >= self.disk.epochs
+                    assert output.memory.attempts >= self.disk.attempts
+                    assert set(self.disk.revoked) <= set(output.memory.revoked)
+                    self.disk = output.memory
+                case StartCampaign():
+                    assert self.disk.campaign_epoch == output.epoch
+                    assert self.disk.epochs >= output.epoch
+                    assert output.resume or output.epoch > self.epochs
+                    self.epochs = max(self.epochs, output.epoch)
+                case StartJob(kind="verify"):
+                    assert self.disk.attempts == output.attempt > self.attempts
+                    self.attempts = output.attempt
+                case AttemptSpent():
+                    assert self.disk.attempts == output.attempt
+                case StartController():
+                    assert output.certificate_id in {facts.id for facts in self.disk.certificates}
+                case _:
+                    pass
+        assert self.latched <= set(self.disk.latched) or not self.started, "a latch that a restart would forget"
+
+    def _answers(self, event: Event, outputs: tuple[Output, ...]) -> None:
+        if isinstance(event, Requested):
+            self.requests |= {event.request_id}
+        for answer in of(list(outputs), Answer):
+            if answer.final:
+                assert answer.request_id in self.requests
+                assert answer.request_id not in self.final, "answered twice"
+                self.final |= {answer.request_id}
