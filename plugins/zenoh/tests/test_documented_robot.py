@@ -47,3 +47,9 @@ def test_robot_of_the_docs_drives_and_stops_when_its_commands_end() -> None:
     assert len(seen) > 50
     assert 0.05 <= stopped[0] <= 0.05 + 0.5 * 0.2, "it stopped within the last command's time to live and a few periods"
     assert not any(o.fault for o in seen)
+
+
+def test_every_option_and_counter_is_documented() -> None:
+    page = DOCS.read_text(encoding="utf-8")
+    transport = ZenohTransport({"robot_listen": "tcp/127.0.0.1:7461"}, ("x",), ("v",))
+    assert [name for name in (*transport.OPTIONS, *transport.counters()) if f"`{name}`" not in page] == []
