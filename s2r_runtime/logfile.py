@@ -18,11 +18,11 @@ import msgspec
 import zstandard
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from mcap.opcode import Opcode
-from mcap.records import Header
 
 from s2r_runtime.chain import GENESIS, advance, signed
 from s2r_runtime.channels import CHAIN, NUMBERS, Seal
-from s2r_runtime.layout import ABOUT, LIBRARY, MAGIC, MESSAGE, MESSAGE_FIELDS, chunk, declaration, metadata_record, pack
+from s2r_runtime.layout import MESSAGE, MESSAGE_FIELDS, chunk, declaration
+from s2r_runtime.log_start import make_start
 from s2r_runtime.summary import tail
 
 End = Literal["", "rotated", "closed"]
@@ -66,14 +66,14 @@ class Pending:
 class LogFile:
     """The parts of one run's log. about: what their first metadata record says beside the chain's own. Raises OSError."""
 
-    def __init__(self, path: Path, signer: Ed25519PrivateKey | None, about: Mapping[str, str]) -> None:
+    def __init__(self, path: Path, run: str, signer: Ed25519PrivateKey | None, about: Mapping[str, str]) -> None:
         self.parts: list[Path] = []
         self.head = GENESIS
         self.recorded = 0
         """Messages of the run that are in the files and sealed."""
         self.size = self.chunks = 0
         self.opened_s = 0.0
-        self._path, self._signer, self._about = path, signer, dict(about)
+        self._path, self._run, self._signer, self._about = path, run, signer, dict(about)
         self._fd = -1
         self._crc = self._sealed_ns = 0
         self._seal = self._unwritten = b""
@@ -103,8 +103,7 @@ class LogFile:
         self.opened_s = time.monotonic()
         self._schemas, self._channels, self._seal = {}, {}, b""
         key = b"" if self._signer is None else self._signer.public_key().public_bytes_raw()
-        own = {"part": str(part), "public_key": key.hex(), "first_index": str(self.recorded), "previous_head": self.head.hex()}
-        return MAGIC + pack(Header("", LIBRARY)) + metadata_record(ABOUT, {**self._about, **own})
+        return make_start(self._about, run=self._run, part=part, first_index=self.recorded, public_key=key, previous_head=self.head)
 
     def put(self, block: Pending) -> None:
         """Seals a block, once, and hands it to the operating system; after an error call again with the same one."""

@@ -14,31 +14,25 @@ from pathlib import Path
 from typing import BinaryIO, Literal
 
 import msgspec
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from mcap.opcode import Opcode
-from mcap.records import Header
 
 from s2r_runtime.blocks import Block, Damage, find, take
-from s2r_runtime.chain import GENESIS, advance, is_signed_by
+from s2r_runtime.chain import advance, is_signed_by
 from s2r_runtime.channels import CHAIN, CHANNELS, Seal, decoder
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.layout import (
     ABOUT,
-    LIBRARY,
-    MAGIC,
     MESSAGE,
-    RECORD,
     RECOVERED,
     Attached,
     attachment_fields,
     declared,
     metadata_fields,
-    pack,
 )
+from s2r_runtime.log_start import read_start
 from s2r_runtime.messages import Struct
 from s2r_runtime.summary import tail
 
-_START = MAGIC + pack(Header("", LIBRARY))
 _ZEROS = 16
 
 
@@ -84,31 +78,33 @@ class Reading:
     def __init__(self, path: Path, channels: Iterable[str] | None = None) -> None:
         self.path = path
         self.wanted = frozenset(CHANNELS) - {CHAIN} if channels is None else frozenset(channels)
-        self.metadata: dict[str, dict[str, str]] = {}
-        self.attachments: list[Attached] = []
-        self._ending: Ending | None = None
-        self.signed = False
-        self.counts: dict[str, int] = {}
-        self.run, self.part, self.first_index = "", 0, 0
-        self.public_key = b""
-        self.previous_head = self.head = GENESIS
         try:
             with path.open("rb") as file:
                 self.size = os.fstat(file.fileno()).st_size
-                self._start = self._read_start(file)
+                start = read_start(file, path, self.size)
         except OSError as error:
             raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
-        self.head, self._index = self.previous_head, self.first_index
+        self.start = start.raw
+        """What the file begins with, up to the metadata that says what it is; empty if it ends before."""
+        self.run, self.part, self.first_index, self._key = start.run, start.part, start.first_index, start.key
+        self.public_key = b"" if start.key is None else start.key.public_bytes_raw()
+        self.previous_head = self.head = start.previous_head
+        self.metadata: dict[str, dict[str, str]] = {ABOUT: dict(start.fields)}
+        self.attachments: list[Attached] = []
+        self.counts: dict[str, int] = {}
+        self.signed = False
+        self.lacking = b""
+        """What a cut file does not have of its last chunk's index."""
+        self.indexed = False
+        """Whether the index at the end is there, and right."""
+        self._ending: Ending | None = None
+        self._index = self.first_index
         self._at = self._crc = self._log_time = 0
         self._seal, self._final = b"", ""
         self._schemas: dict[int, bytes] = {}
         self._channels: dict[int, bytes] = {}
         self._topics: dict[int, str] = {}
         self.first_ns: int | None = None
-        self.lacking = b""
-        """What a cut file does not have of its last chunk's index."""
-        self.indexed = False
-        """Whether the index at the end is there, and right."""
 
     @property
     def over(self) -> bool:
@@ -155,41 +151,13 @@ class Reading:
         """Bytes of the file that were read and found good."""
         return self._at
 
-    @property
-    def start(self) -> bytes:
-        """What the file begins with, up to the metadata that says what it is; empty if it ends before."""
-        return self._start
-
-    # ---- the start
-
-    def _read_start(self, file: BinaryIO) -> bytes:
-        """Magic, header and the metadata that says what this is. Empty if the file ends before they do."""
-        found = file.read(len(_START))
-        if found != _START[: len(found)]:
-            raise RecordingError(f"{self.path}: is not a log of this version of s2r (its first bytes are not those of one)")
-        head = file.read(RECORD.size)
-        if len(head) < RECORD.size or len(_START) + RECORD.size + RECORD.unpack(head)[1] > self.size:
-            return b""
-        record = head + file.read(RECORD.unpack(head)[1])
-        try:
-            name, about = metadata_fields(record)
-            self.run, self.part, self.first_index = about["run"], int(about["part"]), int(about["first_index"])
-            self.public_key, self.previous_head = bytes.fromhex(about["public_key"]), bytes.fromhex(about["previous_head"])
-            self._key = Ed25519PublicKey.from_public_bytes(self.public_key) if self.public_key else None
-        except (ValueError, KeyError) as error:
-            raise RecordingError(f"{self.path}: its metadata is damaged: {error}") from None
-        if name != ABOUT or head[0] != Opcode.METADATA:
-            raise RecordingError(f"{self.path}: begins with metadata {name!r}, a log begins with {ABOUT!r}")
-        self.metadata[name] = about
-        return found + record
-
     # ---- the messages
 
     def __iter__(self) -> Iterator[Entry]:
         """The entries, once. Afterwards `ending` is there."""
         self._file: BinaryIO = self.path.open("rb")
         try:
-            if not self._start:
+            if not self.start:
                 raise Damage(0, "the file ends before its first record", cut=True)
             while (block := self._take()) is not None:
                 if block.last:
@@ -211,7 +179,7 @@ class Reading:
             self._file.close()
 
     def _take(self) -> Block | None:
-        start = b"" if self._at else self._start
+        start = b"" if self._at else self.start
         self._file.seek(self._at + len(start))
         return take(self._file, self._at, self.size, start)
 
@@ -259,7 +227,7 @@ class Reading:
 
     def _note(self, block: Block) -> None:
         for record in block.prefix:
-            data = record[len(self._start) :] if record is block.prefix[0] and block.offset == 0 else record
+            data = record[len(self.start) :] if record is block.prefix[0] and block.offset == 0 else record
             if data and data[0] == Opcode.ATTACHMENT:
                 self.attachments.append(_attached(data, block.offset))
             elif data:

@@ -80,7 +80,7 @@ class Writer:
         self._next = self._last_ns = self._held_bytes = 0
         self._ended: End = ""
         self._closing = False
-        self._file = LogFile(path, signer, {**environment(), **(metadata or {}), "run": run})
+        self._file = LogFile(path, run, signer, {**environment(), **(metadata or {})})
         try:
             self._open()
         except OSError as error:

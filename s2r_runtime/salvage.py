@@ -15,24 +15,17 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import msgspec
-from mcap.records import Header
 
 from s2r_runtime.blocks import Block, Damage, find, take
-from s2r_runtime.chain import GENESIS
 from s2r_runtime.channels import CHANNELS
 from s2r_runtime.errors import RecordingError, UsageError
-from s2r_runtime.layout import (
-    ABOUT,
-    LIBRARY,
-    MAGIC,
-    RECOVERED,
-    declaration,
-    declared,
-    metadata_record,
-    pack,
-)
+from s2r_runtime.layout import RECOVERED, declaration, declared, metadata_record
+from s2r_runtime.log_start import make_start
 from s2r_runtime.reading import Ending, read
 from s2r_runtime.summary import tail
+
+NEW_START = make_start({}, run="")
+"""For a file whose own start is damaged: nobody knows which run it was."""
 
 
 class Hole(msgspec.Struct, frozen=True):
@@ -127,7 +120,7 @@ def _good(path: Path) -> _Good:
         if not reading.counts and ending.kind != "broken":
             raise RecordingError(f"{path}: holds no message that could be recovered: {ending.detail}")
         records = sum(reading.counts.values())
-        start, tables = reading.start or _new_start(), reading.declarations
+        start, tables = reading.start or NEW_START, reading.declarations
         return _Good(start, ending.offset, records, ending, reading.lacking, reading.indexed, reading.sealed_for_good, *tables)
     except RecordingError as error:
         if not path.is_file():
@@ -136,13 +129,7 @@ def _good(path: Path) -> _Good:
             size = os.fstat(source.fileno()).st_size
             if find(source, 0, size) is None:
                 raise
-        return _Good(_new_start(), 0, 0, Ending("broken", 0, 0, size, str(error)), b"", False, False, {}, {})
-
-
-def _new_start() -> bytes:
-    """For a file whose own start is damaged: nobody knows which run it was."""
-    fields = {"run": "", "part": "1", "public_key": "", "first_index": "0", "previous_head": GENESIS.hex()}
-    return MAGIC + pack(Header("", LIBRARY)) + metadata_record(ABOUT, fields)
+        return _Good(NEW_START, 0, 0, Ending("broken", 0, 0, size, str(error)), b"", False, False, {}, {})
 
 
 def _copy(good: _Good, source: BinaryIO, target: BinaryIO, name: str) -> Account:
