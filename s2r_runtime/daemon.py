@@ -264,7 +264,7 @@ class Daemon:
         elif isinstance(message, Command):
             self.feed(Proposed(0, msgspec.structs.replace(message, source="external")))
         elif isinstance(message, LinkChanged | OverrideChanged):
-            self.feed(msgspec.structs.replace(message, t_ns=0))
+            self.feed(message)
 
     # ------------------------------------------------------------------ events
 
@@ -296,7 +296,6 @@ class Daemon:
         self.settings = settings_of(profile, profile.model, self.facts, self.seed)
         self.driver.use(profile)
         self.watcher.use(profile)
-        self.logbook.attach(f"model/{digest}", "application/toml", dump_model(profile.model).encode())
 
     def next_seq(self) -> int:
         """Number of the next proposed command, whoever proposes it."""
@@ -304,11 +303,13 @@ class Daemon:
         return self._numbers
 
     def _handle(self, event: Event) -> None:
-        if isinstance(event, LinkChanged):
-            self._link_up = event.up
+        t_ns = event.t_ns
+        if isinstance(event, LinkChanged | OverrideChanged):  # a transport's stamps are the host's
+            t_ns = 0
+            self._link_up = event.up if isinstance(event, LinkChanged) else self._link_up
         elif isinstance(event, EpisodeEnded):
             self.actions.episodes.append(event)
-        self._last_ns = max(self._last_ns, event.t_ns or self.clock.now())
+        self._last_ns = max(self._last_ns, t_ns or self.clock.now())
         if event.t_ns != self._last_ns:
             event = msgspec.structs.replace(event, t_ns=self._last_ns)
         self.logbook.put(event, self._last_ns)

@@ -7,6 +7,7 @@ other processes where it could take long.
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from s2r_runtime.control import Connection, ControlServer
 from s2r_runtime.errors import ConfigError, S2RError
 from s2r_runtime.messages import Answer, Requested
 from s2r_runtime.model_store import parse_model
+from s2r_runtime.modelspec import dump_model
 from s2r_runtime.settings import ModelFacts
 from s2r_runtime.status import status
 from s2r_runtime.worker import Failed, LoadJob, Result
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
 
 PLAIN = ("undeploy", "revoke", "clear", "stop", "permit", "sample", "cancel", "trace", "verify")
 """Verbs that the core can have as they are."""
+MOVING = ("sample", "deploy")
+SETTLE_WITHIN_NS = 2_000_000_000
 LOAD_TIMEOUT_S = 30.0
 PROGRESS_NS = 200_000_000
 RESULT_OF = {"sample": "gap", "trace": "trace", "deploy": "verify", "verify": "verify"}
@@ -55,6 +59,7 @@ class Desk:
         self._waiting: dict[int, tuple[str, Connection | None]] = {}
         self.answers: dict[int, Answer] = {}
         self._said = (0, "")
+        self._postponed: list[tuple[Requested, int]] = []
         self._next_progress_ns = 0
 
     def open(self, path: Path) -> None:
@@ -71,6 +76,7 @@ class Desk:
         """Drops silent clients; tells how far a campaign is. now_ns: the host's clock."""
         if self._server is not None:
             self._server.tick(now_ns)
+        self._put()
         if now_ns >= self._next_progress_ns:
             self._next_progress_ns = now_ns + PROGRESS_NS
             sampling = self._d.sampler.progress()
@@ -90,8 +96,27 @@ class Desk:
         self._numbers += 1
         number = self._numbers
         self._waiting[number] = (verb, connection)
-        self._d.feed(Requested(0, number, verb, os.getuid() if connection is None else connection.uid, **fields))
+        by = os.getuid() if connection is None else connection.uid
+        self._postponed.append((Requested(0, number, verb, by, **fields), time.monotonic_ns() + SETTLE_WITHIN_NS))
+        self._put()
         return number
+
+    def _put(self) -> None:
+        """Hands requests to the core, in order. In lockstep one that makes the robot move waits until it stands, which takes
+        milliseconds: when it was typed would otherwise decide at which of the robot's periods its story begins.
+        """
+        while self._postponed:
+            request, limit_ns = self._postponed[0]
+            if request.verb in MOVING and self._settling() and time.monotonic_ns() < limit_ns:
+                return
+            self._postponed.pop(0)
+            self._d.feed(request)
+
+    def _settling(self) -> bool:
+        """Lockstep, nothing drives, and the robot still gets its recovery commands."""
+        state = self._d.state
+        idle = state.campaign is None and state.deployment is None
+        return self._d.clock.lockstep and idle and state.link_up and state.observation is not None and state.answered
 
     def answered(self, answer: Answer) -> None:
         """The core's answer goes to whoever asked."""
@@ -182,6 +207,8 @@ class Desk:
                 connection.answer(70, f"adopt: the model cannot be kept: {error.strerror}")
                 return
             self._d.adopting[spec.digest()] = profile
+            # before the decision, so that a reader of the log has the model when it comes into force
+            self._d.logbook.attach(f"model/{spec.digest()}", "application/toml", dump_model(spec).encode())
             self.request("adopt", connection, digest=spec.digest())
 
         self._numbers += 1

@@ -5,17 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from s2r_runtime.confinement import confine
 from s2r_runtime.controller_file import load
+from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import Gap
 from s2r_runtime.worker import GapJob, Job, LoadJob, Result, TraceJob, VerifyJob
 
 Progress = Callable[[float, float, str], None]
+
+MEMORY_BYTES = 4 << 30
+"""What a controller may use in a verification: thousands of rollouts at once need more than driving, and less than a small computer has."""
 
 
 def run(job: Job, progress: Progress) -> Result:
     """Does it. Raises S2RError with the reason where it can't be done."""
     match job:
         case LoadJob():
+            if not Path(job.path).is_file():  # a device or a pipe may have no end
+                raise ConfigError(f"{job.path}: is no file")
             return Result(controller=load(Path(job.path), job.parameters))
         case GapJob():
             return Result(gap=gap(job))
@@ -46,10 +53,53 @@ def gap(job: GapJob) -> Gap:
 
 
 def verify(job: VerifyJob, progress: Progress) -> Result:
-    """Rollouts of the controller on the uncertain model, under the profile's laws."""
-    raise AssertionError
+    """Rollouts of the controller on the uncertain model, under the profile's laws. The controller's code runs confined."""
+    from s2r_runtime.controllers import batch_control
+    from s2r_runtime.models.composed import compose
+    from s2r_runtime.plugins import registry
+    from s2r_runtime.uncertain import GapSet
+    from s2r_runtime.verify import verify_in_detail
+
+    profile, wanted = job.profile, job.profile.verification
+    model = compose(profile.model)
+    task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
+    confine(MEMORY_BYTES)
+    result, details = verify_in_detail(
+        batch_control(job.controller),
+        task,
+        model,
+        gap_set=GapSet(job.gap.set, job.gap.weights, job.radius, job.hold_radius, job.gap.hold_periods),
+        laws=wanted.laws,
+        required=wanted.required,
+        n=wanted.n,
+        epsilon=wanted.epsilon,
+        beta=job.beta,
+        threshold=wanted.threshold,
+        seed=job.seed,
+        controller_digest=job.controller.digest,
+        task_digest=profile.task_digest(),
+        attempt=job.attempt,
+        progress=progress,
+    )
+    return Result(verification=result, safety={d.law: [round(s, 6) for s in d.rollouts.safety.tolist()] for d in details})
 
 
 def trace(job: TraceJob, progress: Progress) -> Result:
-    """The residual's structure, and the model that has it."""
-    raise AssertionError
+    """The residual's structure, and the model that has it, written to `out` if an effect was named."""
+    from s2r_runtime import persistence
+    from s2r_runtime.models.composed import compose
+    from s2r_runtime.modelspec import dump_model
+    from s2r_runtime.trace import load_dataset
+    from s2r_runtime.trace import trace as find
+
+    profile = job.profile
+    model = compose(profile.model)
+    weights = tuple(profile.norm.weights.get(name, 1.0) for name in model.states)
+    found = find(
+        load_dataset(job.logs, model, profile.columns), model, seed=job.seed, progress=progress, weights=weights, kind=profile.norm.set
+    )
+    text = dump_model(found.spec, found.comments())
+    if found.effects:
+        persistence.replace(Path(job.out), text.encode())
+    path = job.out if found.effects else ""
+    return Result(trace={**found.to_json(), "text": found.text(), "plots": found.plots(), "model": text, "model_path": path})

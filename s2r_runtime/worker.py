@@ -100,7 +100,8 @@ class Worker:
 
     def __init__(self, job: Job, timeout_s: float) -> None:
         self._child = Child("s2r_runtime.worker")
-        self._timeout_s, self._deadline_ns = timeout_s, time.monotonic_ns() + round(timeout_s * 1e9)
+        self._deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
+        self._overdue = f"not done within {timeout_s:g} s" + (" (verification.timeout)" if isinstance(job, VerifyJob) else "")
         self._child.send(_ENCODE(job))
 
     @property
@@ -126,7 +127,7 @@ class Worker:
         if not self._child.alive():
             came.append(Failed(f"the worker died: {self._child.ending()}"))
         elif now_ns > self._deadline_ns:
-            came.append(Failed(f"not done within {self._timeout_s:g} s (verification.timeout)"))
+            came.append(Failed(self._overdue))
         return came
 
     def stop(self) -> None:

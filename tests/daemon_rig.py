@@ -1,221 +1,254 @@
-"""A robot on a Unix datagram socket, its transport, and a daemon that knows that transport: quick to start, no network.
-
-Run as processes of their own:
-    python daemon_rig.py robot DIR [--realtime] [--dt S] [--gain G] [--silent-after N]   a unicycle that writes what it applied to DIR/applied.jsonl
-    python daemon_rig.py daemon PROFILE --state DIR --log DIR [--seed N]                 the real daemon, with the transport `loop` registered
-
-In lockstep the robot publishes observation k, waits for the command that answers it, integrates one period and goes on; it
-repeats the observation every 0.1 s while it waits. In real time it publishes every dt and applies the newest command while its
-time to live lasts.
-"""
+"""A daemon and its robot as processes, talked to over the control socket: what tests of the daemon are written with."""
 
 from __future__ import annotations
 
-import argparse
-import contextlib
 import json
-import math
 import os
-import random
-import select
 import signal
-import socket
+import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
-from s2r_runtime.hookspecs import Offer, hookimpl
-from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
+import msgspec
 
-LINK_LOST_NS = 1_000_000_000
-ROBOT, DAEMON = "robot.sock", "daemon.sock"
+from s2r_runtime import certificate, control, keys
+from s2r_runtime.controller_file import load
+from s2r_runtime.ledger import campaign_size, sample_size, share
+from s2r_runtime.messages import Gap, LawResult, Struct, Verification
+from s2r_runtime.profile import load_profile
+from s2r_runtime.reading import read
+
+PROGRAM = Path(__file__).with_name("loop_robot.py")
+WITHIN_S = 30.0
+"""For anything that should happen soon, on a busy machine."""
+
+PROFILE = """
+clock = "{clock}"
+[robot]
+name = "rig"
+[model]
+name = "unicycle"
+dt = 0.033
+[[model.effects]]
+name = "input_delay"
+channel = "*"
+parameters = {{ delay = 0.033 }}
+[[model.effects]]
+name = "wheel_saturation"
+channel = "*"
+parameters = {{ speed = 0.2, track = 0.105 }}
+[[model.effects]]
+name = "integration_scheme"
+parameters = {{ scheme = "exact" }}
+[region]
+x = [-1.6, 1.6]
+y = [-1.0, 1.0]
+[inputs]
+v = [-0.2, 0.2]
+w = [-3.1, 3.1]
+[norm]
+weights = {{ theta = 0.0525 }}
+[sampling]
+hold_periods = 5
+[guarantee]
+epsilon = 0.3
+beta = 0.5
+[verification]
+epsilon = 0.3
+[gate]
+controller_deadline = 0.5
+command_ttl = 0.5
+observation_timeout = 0.5
+[task]
+name = "grid_world"
+[transport]
+name = "loop"
+folder = "."
+{more}
+"""
+"""epsilon and beta that ask for few samples: what is tested here is not the statistics."""
 
 
-class LoopTransport:
-    """Datagrams to and from the rig's robot."""
+class Rig:
+    """One robot, one daemon (or several after each other), one folder."""
 
-    OPTIONS: ClassVar[dict[str, str]] = {"folder": "where the two sockets are"}
+    def __init__(self, folder: Path, *, clock: str = "lockstep", more: str = "") -> None:
+        self.folder, self.state, self.logs = folder, folder / "state", folder / "logs"
+        self.profile = folder / "rig.toml"
+        self.profile.write_text(PROFILE.format(clock=clock, more=more))
+        self.environment = {**os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder / "home")}
+        self.robot: subprocess.Popen[bytes] | None = None
+        self.daemon: subprocess.Popen[bytes] | None = None
+        self._clock = clock
 
-    def __init__(self, options: dict[str, Any], states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
-        self._folder, self._nx, self._nu = Path(options["folder"]), len(states), len(inputs)
-        self._socket: socket.socket | None = None
-        self._up = False
-        self._heard_ns = 0
-        self._counters = dict.fromkeys(("received", "sent", "dropped_in", "dropped_out", "malformed", "lost"), 0)
+    # ------------------------------------------------------------------ processes
 
-    def open(self) -> None:
-        path = self._folder / DAEMON
-        path.unlink(missing_ok=True)
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
-        self._socket.bind(str(path))
+    def start_robot(self, *options: str) -> None:
+        realtime = ["--realtime"] if self._clock == "realtime" else []
+        self.robot = subprocess.Popen([sys.executable, str(PROGRAM), "robot", str(self.folder), *realtime, *options])
 
-    def fileno(self) -> int:
-        assert self._socket is not None
-        return self._socket.fileno()
+    def start(self, *options: str, environment: dict[str, str] | None = None) -> None:
+        """The daemon; returns when it serves."""
+        self.daemon = self._spawn("daemon", str(self.profile), "--log", str(self.logs), *options, environment=environment)
+        self.until(lambda: control._listening(self.socket) or (self.daemon is not None and self.daemon.poll() is not None))
+        assert self.daemon.poll() is None, self.said()
 
-    def receive(self) -> list[Frame]:
-        assert self._socket is not None
-        frames = []
-        with contextlib.suppress(BlockingIOError):
-            for _ in range(16):
-                frames.append(Frame(time.monotonic_ns(), "observation", self._socket.recv(65536)))
-        self._counters["received"] += len(frames)
-        return frames
+    def refused(self, *options: str) -> tuple[int, str]:
+        """A daemon that does not start: exit code and what it said."""
+        process = self._spawn("daemon", str(self.profile), "--log", str(self.logs), *options, output="refused.txt")
+        return process.wait(WITHIN_S), (self.folder / "refused.txt").read_text()
 
-    def decode(self, frame: Frame) -> list[Observation | Command | LinkChanged | OverrideChanged]:
-        found: list[Observation | Command | LinkChanged | OverrideChanged] = []
-        if not self._up:
-            found.append(LinkChanged(frame.arrival_ns, up=True, detail="heard"))
-        self._up, self._heard_ns = True, frame.arrival_ns
-        try:
-            plain = json.loads(frame.data)
-            if "raise" in plain:
-                raise RuntimeError(plain["raise"])
-            if plain.get("estop"):
-                return [*found, OverrideChanged(frame.arrival_ns, "emergency_stop", "button")]
-            x = tuple(float(v) for v in plain["x"])
-            fault = "" if len(x) == self._nx and all(map(math.isfinite, x)) else "not finite"
-            found.append(Observation(plain["seq"], plain["stamp_ns"], () if fault else x, fault))
-        except (ValueError, KeyError, TypeError):
-            self._counters["malformed"] += 1
-        return found
+    def campaign(self, out: Path, *options: str) -> subprocess.Popen[bytes]:
+        """One campaign without a daemon, under way. Its answer goes to `campaign.json`."""
+        with (self.folder / "campaign.json").open("wb") as answer:
+            return self._spawn("campaign", str(self.profile), str(out), *options, output="campaign.txt", stdout=answer)
 
-    def poll(self, now_ns: int) -> list[LinkChanged]:
-        if self._up and now_ns - self._heard_ns > LINK_LOST_NS:
-            self._up = False
-            return [LinkChanged(now_ns, up=False, detail="silent for 1 s")]
-        return []
+    def _spawn(
+        self, *argv: str, output: str = "daemon.txt", stdout: Any = None, environment: dict[str, str] | None = None
+    ) -> subprocess.Popen[bytes]:
+        with (self.folder / output).open("ab") as sink:
+            return subprocess.Popen(
+                [sys.executable, str(PROGRAM), *argv, "--state", str(self.state)],
+                stdout=stdout or sink,
+                stderr=sink,
+                env={**self.environment, **(environment or {})},
+                cwd=self.folder,
+            )
 
-    def encode(self, command: Command) -> Frame:
-        if len(command.u) != self._nu or not all(map(math.isfinite, command.u)):
-            raise ValueError(f"u is {command.u}")
-        plain = {"seq": command.seq, "u": command.u, "obs_seq": command.obs_seq, "ttl_ns": command.ttl_ns, "source": command.source}
-        return Frame(time.monotonic_ns(), "command", json.dumps(plain).encode(), inbound=False)
+    def stop(self) -> int:
+        """SIGTERM, and the exit code."""
+        assert self.daemon is not None
+        self.daemon.terminate()
+        return self.daemon.wait(WITHIN_S)
 
-    def send(self, frame: Frame) -> None:
-        assert self._socket is not None
-        try:
-            self._socket.sendto(frame.data, str(self._folder / ROBOT))
-            self._counters["sent"] += 1
-        except OSError:
-            self._counters["dropped_out"] += 1
-
-    def counters(self) -> dict[str, int]:
-        return dict(self._counters)
+    def kill(self) -> None:
+        """SIGKILL."""
+        assert self.daemon is not None
+        self.daemon.kill()
+        self.daemon.wait()
 
     def close(self) -> None:
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
+        for process in (self.daemon, self.robot):
+            if process is not None and process.poll() is None:
+                process.send_signal(signal.SIGCONT)
+                process.kill()
+                process.wait()
 
+    def said(self) -> str:
+        """What the daemons said on stderr."""
+        return (self.folder / "daemon.txt").read_text()
 
-@hookimpl
-def s2r_transports() -> list[Offer]:
-    """The transport of this rig."""
-    return [Offer("loop", f"{__name__}:LoopTransport")]
+    # ------------------------------------------------------------------ requests
 
+    @property
+    def socket(self) -> Path:
+        return self.folder / "s2r" / "rig.sock"
 
-def saturated(v: float, w: float, speed: float = 0.2, track: float = 0.105) -> tuple[float, float]:
-    """Each wheel is clipped on its own."""
-    left, right = (min(max(v + side * w * track / 2, -speed), speed) for side in (-1.0, 1.0))
-    return (left + right) / 2, (right - left) / track
+    def ask(self, verb: str, heard: list[dict[str, Any]] | None = None, **fields: Any) -> dict[str, Any]:
+        return control.call(self.socket, {"verb": verb, **fields}, heard.append if heard is not None else None)
 
+    def status(self) -> dict[str, Any]:
+        return dict(self.ask("status")["data"])
 
-class Robot:
-    """A unicycle with arcs, one period of latency, wheels that saturate, a gain on w, and a little noise."""
+    def until(self, condition: Callable[[], Any]) -> Any:
+        """Waits for it; returns its value."""
+        limit = time.monotonic() + WITHIN_S
+        while time.monotonic() < limit:
+            if value := condition():
+                return value
+            time.sleep(0.02)
+        raise AssertionError(f"did not happen within {WITHIN_S} s; the daemon said: {self.said()[-2000:]}")
 
-    def __init__(self, folder: Path, args: argparse.Namespace) -> None:
-        self.folder, self.dt, self.gain, self.args = folder, args.dt, args.gain, args
-        self.x, self.acting = [0.0, 0.0, 0.0], (0.0, 0.0)
-        self.seq = self.stamp_ns = 0
-        self.random = random.Random(args.seed)
-        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        path = folder / ROBOT
-        path.unlink(missing_ok=True)
-        self.socket.bind(str(path))
-        self.applied = (folder / "applied.jsonl").open("a", buffering=1)
+    def until_status(self, **wanted: Any) -> dict[str, Any]:
+        """Waits until the status has these values."""
 
-    def publish(self) -> None:
-        if self.args.silent_after and self.seq >= self.args.silent_after:
-            return
-        x = [v + self.random.gauss(0.0, 1e-4) for v in self.x]
-        x[2] = math.remainder(x[2], 2.0 * math.pi)
-        with contextlib.suppress(OSError):
-            self.socket.sendto(json.dumps({"seq": self.seq, "stamp_ns": self.stamp_ns, "x": x}).encode(), str(self.folder / DAEMON))
+        def there() -> dict[str, Any] | None:
+            found = self.status()
+            return found if all(found[name] == value for name, value in wanted.items()) else None
 
-    def step(self, u: tuple[float, ...]) -> None:
-        v, w = self.acting
-        self.acting = saturated(u[0], u[1] * self.gain)
-        x, y, theta = self.x
-        middle = theta + 0.5 * w * self.dt
-        chord = v * self.dt * (math.sin(0.5 * w * self.dt) / (0.5 * w * self.dt) if w else 1.0)
-        self.x = [x + chord * math.cos(middle), y + chord * math.sin(middle), theta + w * self.dt]
-        self.seq += 1
-        self.stamp_ns += round(self.dt * 1e9)
+        return dict(self.until(there))
 
-    def commands(self, timeout_s: float) -> list[dict[str, Any]]:
-        found = []
-        while select.select([self.socket], [], [], timeout_s)[0]:
-            found.append(json.loads(self.socket.recv(65536)))
-            self.applied.write(json.dumps(found[-1] | {"at": self.seq}) + "\n")
-            timeout_s = 0.0
-        return found
+    def sample(self) -> dict[str, Any]:
+        """A campaign, begun as soon as the robot is seen."""
+        self.until(lambda: self.status()["observation"])
+        self.ask("permit", duration_s=3600.0)
+        return self.ask("sample")
 
-    def lockstep(self) -> None:
-        while True:
-            self.publish()
-            answers = [c for c in self.commands(0.1) if c["obs_seq"] == self.seq]
-            if answers:
-                self.step(answers[-1]["u"])
+    # ------------------------------------------------------------------ controllers
 
-    def realtime(self) -> None:
-        due, u, until = time.monotonic(), (0.0, 0.0), 0.0
-        while True:
-            self.publish()
-            due += self.dt
-            while (left := due - time.monotonic()) > 0:
-                for command in self.commands(left):
-                    u, until = tuple(command["u"]), time.monotonic() + command["ttl_ns"] * 1e-9
-            self.step(u if time.monotonic() < until else (0.0, 0.0))
+    def controller(self, body: str = "    return np.tile([0.0, 0.5], (len(x), 1))\n", name: str = "controller.py") -> Path:
+        """A controller's file; by default it turns on the spot."""
+        path = self.folder / name
+        path.write_text(f"import time\nimport numpy as np\n\n\ndef control(x, theta, parameters):\n{body}")
+        return path
 
+    def certificate(self, controller: Path, *, radius: float = 0.01, verified: float = 0.02, epoch: int = 1) -> str:
+        """A certificate for it, signed with the robot's own key. Its evidence is made up: nothing was sampled or verified."""
+        profile, file = load_profile(self.profile), load(controller)
+        beta, epsilon = profile.guarantee.beta, profile.guarantee.epsilon
+        gap = Gap(
+            radius=radius,
+            radius_literal=radius,
+            hold_radius=radius,
+            hold_periods=5,
+            set="ball",
+            weights=(1.0, 1.0, 0.0525),
+            n=campaign_size(epsilon, share(beta, epoch), 0),
+            discarded=0,
+            epsilon=epsilon,
+            beta=share(beta, epoch),
+            epoch=epoch,
+            model_digest=profile.model.digest(),
+            transitions_digest="sha256:" + "0" * 64,
+        )
+        n = sample_size(profile.verification.epsilon, share(beta, 1))
+        laws = tuple(
+            LawResult(name, n, 0.2, 0, 0.3, 1.0, progress_ok=True, required=True, passed=True) for name in profile.verification.required
+        )
+        verification = Verification(
+            passed=True,
+            radius=verified,
+            hold_radius=verified,
+            threshold=profile.verification.threshold,
+            epsilon=profile.verification.epsilon,
+            beta=share(beta, 1),
+            attempt=1,
+            seed=1,
+            laws=laws,
+            controller_digest=file.digest,
+            model_digest=profile.model.digest(),
+            task_digest=profile.task_digest(),
+        )
+        issued = certificate.issue(
+            profile=profile, controller=file, gap=gap, verification=verification, issued_unix_s=int(time.time()), lifetime_s=3600
+        )
+        return certificate.sign(issued, keys.load(self.state / "key.pem")).decode()
 
-def main() -> int:
-    """One of the two processes."""
-    parser = argparse.ArgumentParser()
-    which = parser.add_subparsers(dest="which", required=True)
-    robot = which.add_parser("robot")
-    robot.add_argument("folder", type=Path)
-    robot.add_argument("--realtime", action="store_true")
-    robot.add_argument("--dt", type=float, default=0.033)
-    robot.add_argument("--gain", type=float, default=1.0)
-    robot.add_argument("--seed", type=int, default=1)
-    robot.add_argument("--silent-after", type=int, default=0)
-    daemon = which.add_parser("daemon")
-    daemon.add_argument("profile", type=Path)
-    daemon.add_argument("--state", type=Path)
-    daemon.add_argument("--log", type=Path)
-    daemon.add_argument("--seed", type=int)
-    args = parser.parse_args()
-    if args.which == "robot":
-        signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
-        rig = Robot(args.folder, args)
-        rig.realtime() if args.realtime else rig.lockstep()
-    from s2r_runtime.daemon import Daemon
-    from s2r_runtime.errors import S2RError
-    from s2r_runtime.plugins import registry
-    from s2r_runtime.profile import load_profile
+    def deploy(self, controller: Path | None = None, **fields: Any) -> dict[str, Any]:
+        """Deploys a controller under a certificate for it."""
+        path = controller or self.controller()
+        self.until(lambda: self.status()["observation"])
+        return self.ask("deploy", path=str(path), certificate=self.certificate(path), **fields)
 
-    registry().add("rig", "tests", "0", sys.modules[__name__])
-    try:
-        return Daemon(
-            load_profile(args.profile), profile_path=args.profile, state_dir=args.state, log_dir=args.log, seed=args.seed
-        ).run()
-    except S2RError as error:
-        print(f"s2r: {error}", file=sys.stderr)
-        return error.exit_code
+    # ------------------------------------------------------------------ what happened
 
+    def messages(self, *channels: str) -> list[Struct]:
+        """What the logs hold on these channels, oldest first."""
+        return [entry.message for path in self.log_files() for entry in read(path, channels)]
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+    def log_files(self) -> list[Path]:
+        return sorted(self.logs.glob("*.mcap"), key=lambda path: path.stat().st_mtime_ns)
+
+    def applied(self) -> list[dict[str, Any]]:
+        """Every command that reached the robot."""
+        return [msgspec.json.decode(line) for line in (self.folder / "applied.jsonl").read_bytes().splitlines()]
+
+    def to_daemon(self, **fields: Any) -> None:
+        """A datagram from somewhere on the robot's side."""
+        import socket
+
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
+            sock.sendto(json.dumps(fields).encode(), str(self.folder / "daemon.sock"))

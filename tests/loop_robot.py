@@ -1,0 +1,248 @@
+"""A robot on a Unix datagram socket, its transport, and a daemon that knows that transport: quick to start, no network.
+
+Run as processes of their own:
+    python loop_robot.py robot DIR [--realtime] [--dt S] [--gain G]          a unicycle that notes what it was told in DIR/applied.jsonl
+    python loop_robot.py daemon PROFILE --state DIR --log DIR [--seed N]     the real daemon, with the transport `loop` registered
+    python loop_robot.py campaign PROFILE OUT --state DIR                    one campaign, as `s2r sample` runs it
+
+In lockstep the robot publishes observation k, waits for the command that answers it, integrates one period and goes on; it
+repeats the observation every 0.1 s while it waits. In real time it publishes every dt and applies the newest command while its
+time to live lasts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import random
+import select
+import signal
+import socket
+import sys
+import time
+from pathlib import Path
+from typing import Any, ClassVar
+
+from s2r_runtime.hookspecs import Offer, hookimpl
+from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
+
+LINK_LOST_NS = 1_000_000_000
+ROBOT, DAEMON = "robot.sock", "daemon.sock"
+
+
+class LoopTransport:
+    """Datagrams to and from the rig's robot."""
+
+    OPTIONS: ClassVar[dict[str, str]] = {"folder": "where the two sockets are"}
+
+    def __init__(self, options: dict[str, Any], states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
+        self._folder, self._nx, self._nu = Path(options["folder"]), len(states), len(inputs)
+        self._socket: socket.socket | None = None
+        self._up = False
+        self._heard_ns = 0
+        self._counters = dict.fromkeys(("received", "sent", "dropped_in", "dropped_out", "malformed", "lost"), 0)
+
+    def open(self) -> None:
+        path = self._folder / DAEMON
+        path.unlink(missing_ok=True)
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._socket.bind(str(path))
+
+    def fileno(self) -> int:
+        assert self._socket is not None
+        return self._socket.fileno()
+
+    def receive(self) -> list[Frame]:
+        assert self._socket is not None
+        frames = []
+        with contextlib.suppress(BlockingIOError):
+            while len(frames) < 16:
+                data = self._socket.recv(65536)
+                frames.append(Frame(time.monotonic_ns(), "observation", data))
+        self._counters["received"] += len(frames)
+        return frames
+
+    def decode(self, frame: Frame) -> list[Observation | Command | LinkChanged | OverrideChanged]:
+        found: list[Observation | Command | LinkChanged | OverrideChanged] = []
+        if not self._up:
+            found.append(LinkChanged(frame.arrival_ns, up=True, detail="heard"))
+        self._up, self._heard_ns = True, frame.arrival_ns
+        try:
+            plain = json.loads(frame.data)
+            if "raise" in plain:
+                raise RuntimeError(plain["raise"])
+            if plain.get("estop"):
+                return [*found, OverrideChanged(frame.arrival_ns, "emergency_stop", "button")]
+            x = tuple(float(v) for v in plain["x"])
+            fault = "" if len(x) == self._nx and all(map(math.isfinite, x)) else "not finite"
+            found.append(Observation(plain["seq"], plain["stamp_ns"], () if fault else x, fault))
+        except (ValueError, KeyError, TypeError):
+            self._counters["malformed"] += 1
+        return found
+
+    def poll(self, now_ns: int) -> list[LinkChanged]:
+        if self._up and now_ns - self._heard_ns > LINK_LOST_NS:
+            self._up = False
+            return [LinkChanged(now_ns, up=False, detail="silent for 1 s")]
+        return []
+
+    def encode(self, command: Command) -> Frame:
+        if len(command.u) != self._nu or not all(map(math.isfinite, command.u)):
+            raise ValueError(f"u is {command.u}")
+        plain = {"seq": command.seq, "u": command.u, "obs_seq": command.obs_seq, "ttl_ns": command.ttl_ns, "source": command.source}
+        return Frame(time.monotonic_ns(), "command", json.dumps(plain).encode(), inbound=False)
+
+    def send(self, frame: Frame) -> None:
+        assert self._socket is not None
+        try:
+            self._socket.sendto(frame.data, str(self._folder / ROBOT))
+            self._counters["sent"] += 1
+        except OSError:
+            self._counters["dropped_out"] += 1
+
+    def counters(self) -> dict[str, int]:
+        return dict(self._counters)
+
+    def close(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+@hookimpl
+def s2r_transports() -> list[Offer]:
+    """The transport of this rig."""
+    return [Offer("loop", f"{__name__}:LoopTransport")]
+
+
+def saturated(v: float, w: float, speed: float = 0.2, track: float = 0.105) -> tuple[float, float]:
+    """Each wheel is clipped on its own."""
+    left, right = (min(max(v + side * w * track / 2, -speed), speed) for side in (-1.0, 1.0))
+    return (left + right) / 2, (right - left) / track
+
+
+class Robot:
+    """A unicycle with arcs, one period of latency, wheels that saturate, a gain on w, and a little noise."""
+
+    def __init__(self, folder: Path, args: argparse.Namespace) -> None:
+        self.folder, self.dt, self.gain, self.args = folder, args.dt, args.gain, args
+        self.x, self.acting = [0.0, 0.0, 0.0], (0.0, 0.0)
+        self.seq = self.stamp_ns = 0
+        self.random = random.Random(args.seed)
+        self.measured = (-1, b"")
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        path = folder / ROBOT
+        path.unlink(missing_ok=True)
+        self.socket.bind(str(path))
+        self.applied = (folder / "applied.jsonl").open("a", buffering=1)
+
+    def publish(self) -> None:
+        if self.seq != self.measured[0]:
+            x = [v + self.random.gauss(0.0, 1e-4) for v in self.x]
+            x[2] = math.remainder(x[2], 2.0 * math.pi)
+            self.measured = (self.seq, json.dumps({"seq": self.seq, "stamp_ns": self.stamp_ns, "x": x}).encode())
+        with contextlib.suppress(OSError):
+            self.socket.sendto(self.measured[1], str(self.folder / DAEMON))
+
+    def step(self, u: tuple[float, ...]) -> None:
+        v, w = self.acting
+        self.acting = saturated(u[0], u[1] * self.gain)
+        x, y, theta = self.x
+        middle = theta + 0.5 * w * self.dt
+        chord = v * self.dt * (math.sin(0.5 * w * self.dt) / (0.5 * w * self.dt) if w else 1.0)
+        self.x = [x + chord * math.cos(middle), y + chord * math.sin(middle), theta + w * self.dt]
+        self.seq += 1
+        self.stamp_ns += round(self.dt * 1e9)
+
+    def commands(self, timeout_s: float) -> list[dict[str, Any]]:
+        found = []
+        while select.select([self.socket], [], [], timeout_s)[0]:
+            found.append(json.loads(self.socket.recv(65536)))
+            self.applied.write(json.dumps(found[-1] | {"at": self.seq}) + "\n")
+            timeout_s = 0.0
+        return found
+
+    def lockstep(self) -> None:
+        while True:
+            self.publish()
+            answers = [c for c in self.commands(0.1) if c["obs_seq"] == self.seq]
+            if answers:
+                self.step(answers[-1]["u"])
+
+    def realtime(self) -> None:
+        due, u, until = time.monotonic(), (0.0, 0.0), 0.0
+        while True:
+            self.publish()
+            due += self.dt
+            while (left := due - time.monotonic()) > 0:
+                for command in self.commands(left):
+                    u, until = tuple(command["u"]), time.monotonic() + command["ttl_ns"] * 1e-9
+            self.step(u if time.monotonic() < until else (0.0, 0.0))
+
+
+def main() -> int:
+    """One of the two processes."""
+    parser = argparse.ArgumentParser()
+    which = parser.add_subparsers(dest="which", required=True)
+    robot = which.add_parser("robot")
+    robot.add_argument("folder", type=Path)
+    robot.add_argument("--realtime", action="store_true")
+    robot.add_argument("--dt", type=float, default=0.033)
+    robot.add_argument("--gain", type=float, default=1.0)
+    robot.add_argument("--seed", type=int, default=1)
+    for name in ("daemon", "campaign"):
+        daemon = which.add_parser(name)
+        daemon.add_argument("profile", type=Path)
+        daemon.add_argument("--state", type=Path)
+        daemon.add_argument("--seed", type=int)
+        daemon.add_argument("--break-at", type=int, default=0, help="the core raises at the observation of this number")
+        if name == "daemon":
+            daemon.add_argument("--log", type=Path)
+        else:
+            daemon.add_argument("out", type=Path)
+    args = parser.parse_args()
+    if args.which == "robot":
+        signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
+        robot_process = Robot(args.folder, args)
+        robot_process.realtime() if args.realtime else robot_process.lockstep()
+    return run(args)
+
+
+def run(args: argparse.Namespace) -> int:
+    """The daemon, or one campaign."""
+    from s2r_runtime import core
+    from s2r_runtime.campaign_run import run_campaign
+    from s2r_runtime.daemon import Daemon
+    from s2r_runtime.errors import S2RError
+    from s2r_runtime.messages import Event, Observed
+    from s2r_runtime.plugins import registry
+    from s2r_runtime.profile import load_profile
+
+    registry().add("rig", "tests", "0", sys.modules[__name__])
+    handle = core.handle
+
+    def breaking(state: core.State, event: Event) -> Any:
+        if isinstance(event, Observed) and event.observation.seq == args.break_at:
+            raise ZeroDivisionError("a defect")
+        return handle(state, event)
+
+    if args.break_at:
+        core.handle = breaking
+    try:
+        profile = load_profile(args.profile)
+        if args.which == "campaign":
+            result = run_campaign(profile, args.profile, args.out, state_dir=args.state, seed=args.seed)
+            print(json.dumps(result))
+            return int(result["exit_code"])
+        return Daemon(profile, profile_path=args.profile, state_dir=args.state, log_dir=args.log, seed=args.seed).run()
+    except S2RError as error:
+        print(f"s2r: {error}", file=sys.stderr)
+        return error.exit_code
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,413 @@
+"""The daemon's life: it starts, samples, records, survives what it must, and ends with the robot recovered."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from daemon_rig import Rig
+
+from s2r_runtime.messages import (
+    CampaignFinished,
+    EpochChanged,
+    Frame,
+    GateChanged,
+    LinkChanged,
+    Observed,
+    RecorderChanged,
+    SampleTaken,
+    Send,
+    Started,
+    Stopping,
+)
+from s2r_runtime.reading import read
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    opened = Rig(tmp_path)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def realtime(tmp_path: Path) -> Iterator[Rig]:
+    opened = Rig(tmp_path, clock="realtime")
+    yield opened
+    opened.close()
+
+
+# ---------------------------------------------------------------- start and end
+
+
+def test_daemon_serves_ends_on_sigterm_with_the_recovery_command_and_leaves_a_closed_log(rig: Rig) -> None:
+    rig.start_robot()
+    rig.start()
+    rig.until(lambda: rig.status()["observation"])
+    status = rig.status()
+    assert (status["gate"], status["reason"], status["link"]) == ("closed", "no_controller", True)
+    assert {"controller", "certificate", "radius", "verified_radius", "e_value", "epoch", "beta_spent", "beta_left"} <= set(status)
+    assert rig.stop() == 0
+    assert not rig.socket.exists()
+    (log,) = rig.log_files()
+    reading = read(log)
+    last = list(reading)[-1]
+    assert reading.ending is not None
+    assert reading.ending.kind == "closed"
+    assert f"log {log} ends at " in rig.said()
+    assert isinstance(rig.messages("event/stopping")[-1], Stopping)
+    assert last.channel.startswith("out/")
+    assert rig.applied()[-1]["source"] == "recovery"
+    assert rig.applied()[-1]["u"] == [0.0, 0.0]
+
+
+def test_key_is_made_once_for_its_owner_alone(rig: Rig) -> None:
+    rig.start()
+    rig.stop()
+    key = rig.state / "key.pem"
+    before = key.read_bytes()
+    assert key.stat().st_mode & 0o777 == 0o600
+    assert "made a signing key" in rig.said()
+    rig.start()
+    rig.stop()
+    assert key.read_bytes() == before
+
+
+def test_second_daemon_of_a_robot_is_refused(rig: Rig) -> None:
+    rig.start()
+    code, said = rig.refused()
+    assert code == 78
+    assert "another process uses the state of robot 'rig'" in said
+    assert rig.status()["gate"] == "closed"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "names"),
+    [
+        ('name = "unicycle"', 'name = "unicicle"', "did you mean 'unicycle'?"),
+        ('name = "grid_world"', 'name = "grid_wold"', "did you mean 'grid_world'?"),
+        ('name = "loop"', 'name = "mavlink"', "install the package s2r-mavlink"),
+        ("x = [-1.6, 1.6]", "z = [-1.6, 1.6]", "region.z"),
+    ],
+)
+def test_profile_that_names_what_is_not_there_is_one_clear_line(rig: Rig, old: str, new: str, names: str) -> None:
+    rig.profile.write_text(rig.profile.read_text().replace(old, new))
+    code, said = rig.refused()
+    assert code == 78
+    assert names in said
+    assert len([line for line in said.splitlines() if "made a signing key" not in line]) == 1
+    assert not list(rig.logs.glob("*.mcap"))
+
+
+def test_service_manager_hears_ready_alive_and_stopping(rig: Rig) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(rig.folder / "notify"))
+        manager.settimeout(30.0)
+        rig.start(environment={"NOTIFY_SOCKET": str(rig.folder / "notify"), "WATCHDOG_USEC": "200000"})
+        said = [manager.recv(1000).decode() for _ in range(4)]
+        assert rig.stop() == 0
+        manager.settimeout(1.0)
+        while said[-1] != "STOPPING=1":
+            said.append(manager.recv(1000).decode())
+    assert said[0].startswith("READY=1")
+    assert said.count("WATCHDOG=1") >= 1
+
+
+def test_robot_that_never_answers_leaves_the_gate_closed_and_sampling_refused(rig: Rig) -> None:
+    rig.start()
+    rig.ask("permit", duration_s=60.0)
+    answer = rig.ask("sample")
+    assert answer["exit_code"] == 1
+    assert "link_down" in answer["text"]
+    assert rig.status()["beta_spent"] == 0.0
+
+
+def test_defect_in_the_core_ends_with_the_recovery_command_and_exit_70(rig: Rig) -> None:
+    rig.start_robot()
+    rig.start("--break-at", "20")
+    assert rig.daemon is not None
+    assert rig.daemon.wait(30.0) == 70
+    assert "ZeroDivisionError: a defect" in rig.said()
+    last = rig.applied()[-1]
+    assert (last["source"], last["u"], last["obs_seq"]) == ("recovery", [0.0, 0.0], 20)
+    reading = read(rig.log_files()[-1])
+    assert list(reading)[-1].channel == "frame/out"
+    assert reading.ending is not None
+    assert reading.ending.kind == "closed"
+
+
+# ---------------------------------------------------------------- requests
+
+
+def test_requests_that_make_no_sense_are_answered_with_their_code(rig: Rig) -> None:
+    rig.start()
+    for request, code, words in (
+        ({"verb": "dance"}, 2, "no such request"),
+        ({"verb": "permit", "duration_s": "long"}, 2, "duration_s"),
+        ({"verb": "permit", "duration_s": -1.0}, 78, "must be >= 0"),
+        ({"verb": "permit", "colour": "red"}, 2, "colour"),
+        ({"verb": "deploy", "path": str(rig.folder / "none.py")}, 78, "none.py"),
+        ({"verb": "deploy", "path": "/dev/zero"}, 78, "/dev/zero"),
+        ({"verb": "adopt", "text": "model = 3"}, 78, "adopt"),
+        ({"verb": "adopt", "text": "[model]\nname = 'bicycle'\ndt = 0.033"}, 78, "adopt"),
+        ({"verb": "adopt", "text": "[model]\nname = 'unicycle'\ndt = 0.1"}, 78, "dt is 0.1 s"),
+        ({"verb": "clear", "text": "nothing"}, 2, "not latched"),
+        ({"verb": "trace"}, 3, "sample first"),
+    ):
+        answer = rig.ask(**request)
+        assert (answer["exit_code"], words in answer["text"]) == (code, True), (request, answer)
+
+
+def test_stop_latches_until_it_is_cleared(rig: Rig) -> None:
+    rig.start_robot()
+    rig.start()
+    rig.until(lambda: rig.status()["observation"])
+    assert rig.ask("stop")["exit_code"] == 0
+    assert rig.status()["latched"] == ["emergency_stop"]
+    rig.kill()
+    rig.start()
+    assert rig.status()["latched"] == ["emergency_stop"]
+    rig.until(lambda: rig.status()["observation"])
+    rig.ask("permit", duration_s=60.0)
+    assert "emergency_stop" in rig.ask("sample")["text"]
+    assert rig.ask("clear", text="emergency_stop")["exit_code"] == 0
+    assert rig.sample()["exit_code"] == 0
+
+
+def test_adopted_model_is_in_force_after_a_restart_and_the_profiles_own_change_ends_that(rig: Rig) -> None:
+    rig.start()
+    profiles = rig.status()["model"]
+    repaired = "[model]\nname = 'unicycle'\ndt = 0.033\n[[model.effects]]\nname = 'input_gain'\nchannel = 'w'\nparameters = {gain = 0.7}\n"
+    assert rig.ask("adopt", text=repaired.replace("gain =", "gian ="))["exit_code"] == 78
+    assert rig.ask("adopt", text=repaired)["exit_code"] == 0
+    adopted = rig.status()["model"]
+    assert adopted != profiles
+    rig.kill()
+    rig.start()
+    assert rig.status()["model"] == adopted
+    rig.stop()
+    rig.profile.write_text(rig.profile.read_text().replace("delay = 0.033", "delay = 0.066"))
+    rig.start()
+    assert rig.status()["model"] not in (adopted, profiles)
+
+
+# ---------------------------------------------------------------- campaigns
+
+
+def test_campaign_founds_a_gap_and_one_seed_gives_one_campaign(tmp_path: Path) -> None:
+    (gap, samples), again = (seeded_campaign(tmp_path / name, "7") for name in ("a", "b"))
+    assert (gap, samples) == again
+    assert (gap["epoch"], gap["n"]) == (1, len(samples))
+
+
+def seeded_campaign(folder: Path, seed: str) -> tuple[dict[str, Any], list[Any]]:
+    folder.mkdir()
+    rig = Rig(folder)
+    try:
+        rig.start_robot()
+        rig.start("--seed", seed)
+        heard: list[dict[str, Any]] = []
+        rig.until(lambda: rig.status()["observation"])
+        rig.ask("permit", duration_s=3600.0)
+        answer = rig.ask("sample", heard)
+        assert answer["exit_code"] == 0, answer
+        assert any("samples taken; computing the gap" in line.get("text", "") for line in heard)
+        rig.stop()
+    finally:
+        rig.close()
+    return answer["data"], [(s.u, s.x0, s.x1, s.held) for s in rig.messages("event/sample_taken") if isinstance(s, SampleTaken)]
+
+
+def test_sampling_needs_a_permit_and_ends_with_it(rig: Rig) -> None:
+    rig.start_robot()
+    rig.start()
+    rig.until(lambda: rig.status()["observation"])
+    refused = rig.ask("sample")
+    assert (refused["exit_code"], "no_permit" in refused["text"]) == (1, True)
+    rig.ask("permit", duration_s=20.0)  # of the robot's time
+    ended = rig.ask("sample")
+    assert ended["exit_code"] == 1
+    assert "permit_expired" in ended["text"]
+    rig.ask("permit", duration_s=3600.0)
+    assert rig.ask("sample")["exit_code"] == 0
+    assert rig.status()["epoch"] == 1
+
+
+def test_campaign_that_was_killed_goes_on_without_a_new_epoch_and_its_log_is_complete(rig: Rig) -> None:
+    rig.start_robot()
+    rig.start()
+    rig.until(lambda: rig.status()["observation"])
+    rig.ask("permit", duration_s=3600.0)
+    with socket.socket(socket.AF_UNIX) as client:
+        client.connect(str(rig.socket))
+        client.sendall(b'{"verb": "sample"}\n')
+        rig.until(lambda: (rig.status()["campaign"] or {}).get("taken", 0) >= 4)
+    rig.kill()
+    rig.start()
+    assert rig.sample()["exit_code"] == 0
+    status = rig.status()
+    assert (status["epoch"], status["unfinished_epoch"]) == (1, None)
+    rig.stop()
+    first, second = rig.log_files()
+    began = [m for m in rig.messages("out/epoch_changed") if isinstance(m, EpochChanged) and m.gap is None]
+    assert len(began) == 1
+    samples = [entry.message for entry in read(second, ["event/sample_taken"])]
+    finished = [entry.message for entry in read(second, ["event/campaign_finished"])]
+    assert [s.index for s in samples if isinstance(s, SampleTaken)] == list(range(len(samples)))
+    assert any(s.again for s in samples if isinstance(s, SampleTaken))
+    assert [(f.n, f.complete) for f in finished if isinstance(f, CampaignFinished)] == [(len(samples), True)]
+    assert {s.x0 for s in [e.message for e in read(first, ["event/sample_taken"])] if isinstance(s, SampleTaken)} <= {
+        s.x0 for s in samples if isinstance(s, SampleTaken)
+    }
+
+
+def test_robot_that_freezes_is_a_lost_link_and_the_campaign_goes_on_when_it_is_back(rig: Rig) -> None:
+    rig.start_robot()
+    rig.start()
+    rig.until(lambda: rig.status()["observation"])
+    rig.ask("permit", duration_s=3600.0)
+    assert rig.robot is not None
+    with socket.socket(socket.AF_UNIX) as client:
+        client.connect(str(rig.socket))
+        client.sendall(b'{"verb": "sample"}\n')
+        rig.until(lambda: (rig.status()["campaign"] or {}).get("taken", 0) >= 2)
+        rig.robot.send_signal(signal.SIGSTOP)
+        rig.until_status(link=False)
+        rig.robot.send_signal(signal.SIGCONT)
+        rig.until(lambda: rig.status()["radius"])
+    changes = [m.up for m in rig.messages("event/link_changed") if isinstance(m, LinkChanged)]
+    assert changes == [True, False, True]
+
+
+def test_one_campaign_runs_without_a_daemon_and_goes_on_after_an_interruption(rig: Rig) -> None:
+    rig.start_robot()
+    out = rig.folder / "campaign.mcap"
+    first = rig.campaign(out)
+    rig.until(lambda: out.exists() and sum(1 for _ in read(out, ["event/sample_taken"])) >= 3)
+    first.send_signal(signal.SIGINT)
+    assert first.wait(30.0) == 1
+    assert "the same command goes on" in json.loads((rig.folder / "campaign.json").read_text())["text"]
+    assert rig.campaign(out).wait(60.0) == 0
+    answer = json.loads((rig.folder / "campaign.json").read_text())
+    assert answer["log"] == str(out.with_stem("campaign-2"))
+    assert answer["gap"]["n"] == answer["n"] == sum(1 for _ in read(Path(answer["log"]), ["event/sample_taken"]))
+    again = rig.campaign(out)
+    assert again.wait(30.0) == 2
+    assert "is there already" in (rig.folder / "campaign.txt").read_text()
+
+
+# ---------------------------------------------------------------- the log
+
+
+def test_kill_loses_at_most_100_ms_of_the_log(realtime: Rig) -> None:
+    realtime.start_robot("--dt", "0.01")
+    realtime.start()
+    realtime.until(lambda: realtime.status()["recorded"] > 300)
+    time.sleep(0.3)
+    realtime.kill()
+    killed_ns = time.monotonic_ns()
+    frames = [m for m in realtime.messages("frame/in") if isinstance(m, Frame)]
+    # the killing itself took a moment, and so did the last datagram; what the log may lack is 100 ms
+    assert killed_ns - frames[-1].arrival_ns < 150_000_000
+
+
+def test_full_disk_closes_the_gate_and_room_opens_the_way_again(realtime: Rig) -> None:
+    realtime.start_robot()
+    realtime.start()
+    assert realtime.daemon is not None
+    realtime.until(lambda: realtime.status()["observation"])
+    size = realtime.log_files()[-1].stat().st_size
+    resource.prlimit(realtime.daemon.pid, resource.RLIMIT_FSIZE, (size + 4096, resource.RLIM_INFINITY))
+    realtime.until_status(gate="closed", reason="recorder_down")
+    assert "link" in realtime.status()
+    realtime.ask("permit", duration_s=60.0)
+    assert "recorder_down" in realtime.ask("sample")["text"]
+    resource.prlimit(realtime.daemon.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    realtime.until_status(recorder="ok", reason="no_controller")
+    assert realtime.stop() == 0
+    assert [m.ok for m in realtime.messages("event/recorder_changed") if isinstance(m, RecorderChanged)] == [False, True]
+    observed = [m.observation.seq for m in realtime.messages("event/observed") if isinstance(m, Observed)]
+    assert observed == list(range(observed[0], observed[-1] + 1))  # nothing recorded was lost meanwhile
+
+
+def test_log_is_the_events_in_the_order_in_which_they_were_handled(rig: Rig) -> None:
+    from s2r_runtime import core
+
+    rig.start_robot()
+    rig.start()
+    assert rig.sample()["exit_code"] == 0
+    rig.stop()
+    state, due = core.initial(), []
+    for entry in read(rig.log_files()[-1]):
+        kind = entry.channel.split("/")[0]
+        if kind == "event":
+            assert due == []
+            state, outputs = core.handle(state, entry.message)
+            due = list(outputs)
+            if any(isinstance(output, GateChanged) and not output.open for output in due):
+                due.sort(key=lambda output: not isinstance(output, Send))
+        elif kind == "out":
+            assert entry.message in due
+            due.remove(entry.message)
+    assert state.stopping
+    assert isinstance(rig.messages("event/started")[0], Started)
+
+
+# ---------------------------------------------------------------- the robot's side
+
+
+def test_transport_that_raises_is_a_lost_link_until_it_works_again(rig: Rig) -> None:
+    rig.start_robot()
+    rig.start()
+    rig.until(lambda: rig.status()["observation"])
+    rig.to_daemon(**{"raise": "a defect of the plug-in"})
+    rig.until(lambda: len(rig.messages("event/link_changed")) >= 3)
+    details = [(m.up, m.detail) for m in rig.messages("event/link_changed") if isinstance(m, LinkChanged)]
+    assert details[1] == (False, "transport: decode raised RuntimeError: a defect of the plug-in")
+    assert details[2][0]
+    rig.until_status(link=True)
+
+
+def test_robots_own_stop_button_latches(rig: Rig) -> None:
+    rig.start_robot()
+    rig.start()
+    rig.until(lambda: rig.status()["observation"])
+    rig.to_daemon(estop=True)
+    rig.until_status(latched=["emergency_stop"])
+
+
+def test_bytes_that_are_no_observation_do_nothing_but_count(rig: Rig) -> None:
+    rig.start_robot()
+    rig.start()
+    rig.until(lambda: rig.status()["observation"])
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
+        for data in (b"", b"\xff\x00", b"{}", b'{"seq": 1, "stamp_ns": 0, "x": [1, 2]}', b'{"seq": 2, "stamp_ns": 0, "x": [NaN, 0, 0]}'):
+            sock.sendto(data, str(rig.folder / "daemon.sock"))
+    rig.until(lambda: rig.status()["counters"]["malformed"] >= 3)
+    rig.ask("permit", duration_s=3600.0)
+    rig.until(lambda: rig.ask("sample")["exit_code"] == 0)  # refused until the robot has repeated what it measured
+
+
+def test_in_real_time_every_observation_gets_its_recovery_command(realtime: Rig) -> None:
+    realtime.start_robot()
+    realtime.start()
+    realtime.until(lambda: realtime.status()["counters"]["sent"] > 30)
+    realtime.stop()
+    observed = [m.observation.seq for m in realtime.messages("event/observed") if isinstance(m, Observed)]
+    answered = {m.obs_seq for m in realtime.messages("out/send") if isinstance(m, Send)}
+    assert set(observed[1:-1]) <= answered
+
+
+def test_process_needs_no_numpy(tmp_path: Path) -> None:
+    program = "import sys, s2r_runtime.daemon, s2r_runtime.campaign_run; sys.exit(bool({'numpy', 'scipy'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=dict(os.environ), check=False).returncode == 0
