@@ -40,6 +40,7 @@ class Demonstration:
         self._change = None if change == "none" else change or CHANGE
         self._begin = time.monotonic()
         self._socket = Path()
+        self._hold_gap = 0.0
 
     def run(self) -> int:
         """The story; exit code of the verb."""
@@ -75,12 +76,22 @@ class Demonstration:
         self._step("s2r permit 3600 && s2r sample", "drive to random states, apply random inputs, measure the gap")
         self._ask({"verb": "permit", "duration_s": 3600.0})
         answer = self._ask({"verb": "sample", "count": 0})
+        gap = answer.get("data") or {}
+        if gap:
+            hold, before = gap["hold_radius"], self._hold_gap
+            self._say(
+                f"after one step {1e3 * gap['radius']:.3g} mm, after {gap['hold_periods']} held steps {1e3 * hold:.3g} mm"
+                + (f" (before the repair {1e3 * before:.3g} mm)" if before else "")
+            )
+            self._hold_gap = hold
         return bool(answer["exit_code"] == 0)
 
     def _repair(self) -> bool:
         self._step("s2r trace", "what does the model lack?")
         answer = self._ask({"verb": "trace"})
         data = answer.get("data") or {}
+        if data.get("text"):
+            self._say(str(data["text"]))
         if answer["exit_code"] != 0 or data.get("verdict") not in {"traced", "ambiguous"} or not data.get("effects"):
             return False
         model = Path(str(data["model_path"]))
@@ -117,6 +128,9 @@ class Demonstration:
             if status.get(key) not in (None, [], {}, ""):
                 self._say(f"{key.replace('_', ' ')}: {status[key]}")
         stopped = status.get("gate") == "closed"
+        if status.get("revoked"):
+            self._step("s2r deploy", "may it drive again?")
+            stopped = self._ask({"verb": "deploy", "path": str(self._robot.controller("good")), "parameters": {}})["exit_code"] != 0
         self._say(
             "the gate is closed and the recovery controller has stopped the robot" if stopped else "the gate is still open",
             "green" if stopped else "red",

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import add_model_options, chosen_model, count, positive
+from s2r_runtime.cli.choices import add_model_options, chosen_model, count, positive, weights_of
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -39,7 +39,16 @@ def run(args: argparse.Namespace) -> int:
     test = load_dataset(args.test, model, columns) if args.test else None
     bar = output.Progress("tracing")
     try:
-        result = trace(data, model, test=test, horizon=args.horizon, seed=args.seed, progress=bar)
+        result = trace(
+            data,
+            model,
+            test=test,
+            horizon=args.horizon,
+            seed=args.seed,
+            progress=bar,
+            weights=weights_of(model.states, [], profile),
+            kind=profile.norm.set if profile else "ball",
+        )
     finally:
         bar.close()
     if args.output:

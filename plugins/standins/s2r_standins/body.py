@@ -31,8 +31,8 @@ class DataSheet(NamedTuple):
     wheel_speed: float = 0.2
     track: float = 0.105
     latency: int = 1
-    sigma_position: float = 0.0005
-    sigma_heading: float = 0.002
+    sigma_position: float = 0.0002
+    sigma_heading: float = 0.001
     integration: str = "exact"
     walls: tuple[float, float] = (2.0, 1.4)
     """Half the arena's length and width, about its middle."""

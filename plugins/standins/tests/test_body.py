@@ -61,7 +61,7 @@ def test_noise_has_the_sigmas_of_the_data_sheet() -> None:
     """4000 values: a standard deviation within 4.5 % but for 6e-5 of seeds (normal, relative error 1/sqrt(2n) = 1.1 %, 4 sigma)."""
     b = body(DataSheet())
     values = [b.observe() for _ in range(4000)]
-    for i, sigma in enumerate((0.0005, 0.0005, 0.002)):
+    for i, sigma in enumerate((0.0002, 0.0002, 0.001)):
         column = [value[i] for value in values]
         assert statistics.pstdev(column) == pytest.approx(sigma, rel=0.045)
         assert abs(statistics.fmean(column)) < 4.0 * sigma / math.sqrt(4000)
