@@ -15,6 +15,7 @@ import msgspec
 
 from s2r_runtime import keys
 from s2r_runtime.audit_campaign import CampaignReplay
+from s2r_runtime.audit_certificates import Certificates
 from s2r_runtime.audit_evidence import Evidence
 from s2r_runtime.audit_findings import CertificateFinding, Difference, Findings
 from s2r_runtime.audit_run import Across, RunAudit
@@ -86,7 +87,7 @@ def audit(
     tell = _Progress(paths, progress)
     trusted = () if public_key is None else (public_key,)
     evidence = Evidence(findings, rerun=rerun_controllers, progress=tell.detail)
-    across = Across(findings, CampaignReplay(findings), evidence, trusted, rerun_controllers)
+    across = Across(findings, CampaignReplay(findings), evidence, Certificates(findings, evidence), trusted, rerun_controllers)
     readings: list[Reading] = []
     for parts in runs(paths):
         readings += parts

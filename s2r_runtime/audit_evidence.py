@@ -7,24 +7,22 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from s2r_runtime import certificate as certificates
-from s2r_runtime import jobs, keys, ledger
-from s2r_runtime.audit_findings import CertificateFinding, Findings, alike
+from s2r_runtime import jobs, ledger
+from s2r_runtime.audit_findings import Findings, alike, close
+from s2r_runtime.bounds import clopper_pearson_upper
 from s2r_runtime.canonical import digest_of
 from s2r_runtime.controller_file import ControllerFile
-from s2r_runtime.errors import ConfigError, S2RError
+from s2r_runtime.errors import S2RError
 from s2r_runtime.layout import Attached
 from s2r_runtime.messages import (
     AttemptSpent,
-    CertificateStored,
     EpochChanged,
     Gap,
     IssueCertificate,
     JobFinished,
+    LawResult,
     Memory,
-    Revoked,
     SampleTaken,
-    Settings,
     StartJob,
     Verification,
 )
@@ -36,6 +34,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
 POLL_S = 0.05
+ROUNDED = 1e-6
+"""Safety values in the log are rounded to fewer digits than the verdicts were made of."""
 
 
 class Evidence:
@@ -46,7 +46,6 @@ class Evidence:
         self._jobs: dict[int, tuple[StartJob, Gap | None]] = {}
         self._gaps: dict[str, str] = {}
         self._verifications: dict[str, str] = {}
-        self._orders: dict[int, tuple[IssueCertificate, bool]] = {}
         self._epochs = self._attempts = 0
 
     # ---- what is spent
@@ -54,7 +53,6 @@ class Evidence:
     def begin_run(self, entry: Entry, memory: Memory) -> None:
         """A run begins with this memory: it may not forget what an earlier run spent."""
         self._jobs.clear()
-        self._orders.clear()
         if memory.epochs < self._epochs or memory.attempts < self._attempts:
             told = {"epochs": self._epochs, "attempts": self._attempts}
             found = {"epochs": memory.epochs, "attempts": memory.attempts}
@@ -145,7 +143,7 @@ class Evidence:
         if not self._rerun:
             self._findings.count("verifications not run again")
             return
-        controller = _controller(attachments, job.digest)
+        controller = attached_controller(attachments, job.digest)
         if controller is None or gap is None:
             self._findings.cannot(f"verification attempt {job.attempt}: the controller is not attached")
             return
@@ -162,123 +160,57 @@ class Evidence:
             self._differ(entry, f"verification attempt {job.attempt} ends otherwise", found, again.verification)
             self._verifications[key] = "its verification ends otherwise when it is run again"
 
-    # ---- certificates
+    # ---- what rests on it
 
-    def issuing(self, order: IssueCertificate, *, traced: bool) -> None:
-        """The core has a certificate signed."""
-        self._orders[order.request_id] = (order, traced)
+    def problem(self, order: IssueCertificate) -> str:
+        """Why this evidence carries no certificate, or empty."""
+        return self._gaps.get(digest_of(order.gap), "") or self._verifications.get(digest_of(order.verification), "")
 
-    def stored(
-        self,
-        entry: Entry,
-        event: CertificateStored,
-        profile: Profile,
-        settings: Settings,
-        horizon: Callable[[], int],
-        attachments: Mapping[str, Attached],
-        trusted: tuple[bytes, ...],
-    ) -> None:
-        """A certificate is in force. trusted: keys whose signature counts; the log's own first."""
-        identity = event.facts.id
-        try:
-            note = self._judged(event, profile, settings, horizon, attachments, trusted)
-            valid = True
-        except ConfigError as error:
-            note, valid = str(error), False
-        self._findings.certificates[identity] = CertificateFinding(identity, valid, note)
-        if not valid:
-            self._differ(entry, f"certificate {identity}: {note}", event.facts, None)
-
-    def revoked(self, output: Revoked) -> None:
-        """It was withdrawn; what it said when it was issued stays as true as it was."""
-        finding = self._findings.certificates.get(output.certificate_id)
-        if finding is not None:
-            finding.reason += f"; revoked later: {output.reason}"
-
-    def _judged(
-        self,
-        event: CertificateStored,
-        profile: Profile,
-        settings: Settings,
-        horizon: Callable[[], int],
-        attachments: Mapping[str, Attached],
-        trusted: tuple[bytes, ...],
-    ) -> str:
-        """Why it stands. Raises ConfigError with why it doesn't."""
-        data = attachments.get(f"certificate/{event.facts.id}")
-        if data is None:
-            raise ConfigError("is not attached to the log")
-        elsewhere = event.gap is not None
-        signer = _signer(data.data)
-        certificate = certificates.load(data.data, {*trusted, signer} if elsewhere else trusted[:1], None, "certificate")
-        if certificates.facts(certificate) != event.facts:
-            raise ConfigError("what the gate was told is not what it says")
-        if elsewhere:
-            known = "a trusted key" if signer in trusted else f"key {keys.fingerprint(signer)}, not compared with a trusted one"
-            return f"signed elsewhere by {known}; its evidence is not in this log"
-        order, traced = self._orders.get(event.request_id, (None, False))
-        if order is None:
-            raise ConfigError("nobody asked for it")
-        for problem in (self._gaps.get(digest_of(order.gap)), self._verifications.get(digest_of(order.verification))):
-            if problem:
-                raise ConfigError(problem)
-        controller = _controller(attachments, certificate.controller_digest)
-        if controller is None:
-            raise ConfigError("the controller that it is of is not attached")
-        if certificate.profile_digest != settings.profile_digest:
-            raise ConfigError("it is of another profile")
-        again = certificates.issue(
-            profile=profile,
-            controller=controller,
-            gap=order.gap,
-            verification=order.verification,
-            issued_unix_s=certificate.issued_unix_s,
-            lifetime_s=order.lifetime_s,
-            horizon=horizon(),
-            traced_not_adopted=traced,
-        )
-        if again.id != certificate.id:
-            raise ConfigError("what it says is not what the evidence says")
-        self._findings.count("certificates")
-        return self._support(order)
-
-    def _support(self, order: IssueCertificate) -> str:
-        gap, verification = digest_of(order.gap), digest_of(order.verification)
-        told = "its gap was computed again" if gap in self._gaps else "its gap is from an earlier log"
-        ran = (
-            "and its verification run again"
-            if self._rerun and verification in self._verifications
-            else "its verification was not run again"
-        )
-        return f"{told}, {ran}"
+    def support(self, order: IssueCertificate) -> str:
+        """How far it was recomputed."""
+        told = "its gap was computed again" if digest_of(order.gap) in self._gaps else "its gap is from an earlier log"
+        ran = self._rerun and digest_of(order.verification) in self._verifications
+        return f"{told}, its verification was {'' if ran else 'not '}run again"
 
     def _differ(self, entry: Entry, what: str, recorded: object, recomputed: object) -> None:
         self._findings.differ(entry.index, entry.channel, what, recorded, recomputed)
 
 
 def _contradiction(v: Verification, job: StartJob, safety: dict[str, list[float]], profile: Profile) -> str:
-    """What in a verification contradicts its order or its scenarios' safety values, or empty."""
-    if (v.attempt, v.seed, v.radius, v.hold_radius) != (job.attempt, job.seed, job.radius, job.hold_radius):
+    """What in a verification contradicts its order, the profile, or its scenarios' safety values, or empty."""
+    if (v.attempt, v.seed, v.radius, v.hold_radius, v.beta) != (job.attempt, job.seed, job.radius, job.hold_radius, job.beta):
         return "the verification is not the one that was ordered"
-    if v.threshold != profile.verification.threshold or v.epsilon != profile.verification.epsilon:
+    wanted = profile.verification
+    if (v.threshold, v.epsilon) != (wanted.threshold, wanted.epsilon):
         return "the verification has another threshold or epsilon than the profile"
     for law in v.laws:
         values = safety.get(law.law)
-        if values is None:
-            continue
-        failures = sum(value < v.threshold for value in values)
-        if (len(values), min(values, default=0.0), failures) != (law.n, law.s_star, law.failures):
+        if law.required != (law.law in wanted.required):
+            return f"whether the law {law.law} is required is not what the profile says"
+        if values is None or not _numbers_fit(law, values, v):
             return f"the numbers of the law {law.law} are not those of its scenarios"
-        if law.passed != (law.s_star >= v.threshold and law.progress_ok):
+        if law.passed != (law.s_star >= v.threshold and law.failures == 0 and law.progress_ok):
             return f"the verdict of the law {law.law} is not that of its numbers"
+    passed = {law.law for law in v.laws if law.passed}
+    if v.passed != (not v.reason) or (v.passed and not set(wanted.required) <= passed):
+        return "the verdict is not that of the laws"
     return ""
+
+
+def _numbers_fit(law: LawResult, values: Sequence[float], v: Verification) -> bool:
+    """values are logged rounded, so a failure may lie on either side of the threshold by that."""
+    if len(values) != law.n or not values:
+        return False
+    surely, at_most = (sum(value < v.threshold + side for value in values) for side in (-ROUNDED, ROUNDED))
+    upper = clopper_pearson_upper(law.failures, law.n, v.beta)
+    return abs(min(values) - law.s_star) <= ROUNDED and surely <= law.failures <= at_most and close(law.failure_upper, upper)
 
 
 def _verdicts(v: Verification) -> list[object]:
     return [v.passed, *((law.law, law.passed, law.progress_ok) for law in v.laws)]
 
 
-def _controller(attachments: Mapping[str, Attached], digest: str) -> ControllerFile | None:
+def attached_controller(attachments: Mapping[str, Attached], digest: str) -> ControllerFile | None:
     """The attached controller of that digest. None if there is none, or what is there has another digest."""
     attached = attachments.get(f"controller/{digest}")
     if attached is None:
@@ -288,18 +220,6 @@ def _controller(attachments: Mapping[str, Attached], digest: str) -> ControllerF
     except msgspec.DecodeError:
         return None
     return file if file.digest == digest else None
-
-
-def _signer(data: bytes) -> bytes:
-    """The public key that stands in a certificate's file; empty if there is none to be seen."""
-
-    class Key(msgspec.Struct):
-        public_key: bytes = b""
-
-    try:
-        return msgspec.json.decode(data, type=Key).public_key
-    except (msgspec.DecodeError, UnicodeDecodeError):
-        return b""
 
 
 def _work(job: VerifyJob, timeout_s: float, progress: Callable[[str], None]) -> Result | Failed:

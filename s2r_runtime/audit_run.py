@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import msgspec
 
 from s2r_runtime.audit_campaign import CampaignReplay
+from s2r_runtime.audit_certificates import Certificates
 from s2r_runtime.audit_core import CoreReplay, in_effect_order
 from s2r_runtime.audit_evidence import Evidence
 from s2r_runtime.audit_findings import Findings
@@ -63,6 +64,7 @@ class Across(NamedTuple):
     findings: Findings
     campaigns: CampaignReplay
     evidence: Evidence
+    certificates: Certificates
     trusted: tuple[bytes, ...]
     rerun: bool
 
@@ -71,7 +73,12 @@ class RunAudit:
     """One run, over all its parts. Raises ConfigError or PluginError where this machine lacks what the log needs."""
 
     def __init__(self, across: Across) -> None:
-        self._findings, self._campaigns, self._evidence = across.findings, across.campaigns, across.evidence
+        self._findings, self._campaigns, self._evidence, self._certificates = (
+            across.findings,
+            across.campaigns,
+            across.evidence,
+            across.certificates,
+        )
         self._trusted, self._rerun = across.trusted, across.rerun
         self._core = CoreReplay(across.findings)
         self._watch = WatchReplay(across.findings)
@@ -83,6 +90,7 @@ class RunAudit:
         self._sent_seq = self._seen_seq = -1
         self._event: Event | None = None
         self._campaigns.begin_run()
+        self._certificates.begin_run()
 
     def part(self, reading: Reading) -> None:
         """The next file."""
@@ -184,7 +192,7 @@ class RunAudit:
         if self._profile is None or settings is None or self._reading is None:
             return
         trusted = (self._reading.public_key, *self._trusted)
-        self._evidence.stored(entry, event, self._profile, settings, self._horizon, self._attached(), trusted)
+        self._certificates.stored(entry, event, self._profile, settings, self._horizon, self._attached(), trusted)
 
     # ---- outputs, as they take effect
 
@@ -216,11 +224,11 @@ class RunAudit:
             case StartJob():
                 self._evidence.ordered(output, state.memory.gap)
             case IssueCertificate():
-                self._evidence.issuing(output, traced=state.memory.traced)
+                self._certificates.issuing(output, traced=state.memory.traced)
             case EpochChanged() | AttemptSpent():
                 self._evidence.spent(entry, output, settings.beta)
             case Revoked():
-                self._evidence.revoked(output)
+                self._certificates.revoked(output)
             case ModelAdopted(digest=adopted):
                 self._profile = self._with_model(profile, adopted)
             case _:

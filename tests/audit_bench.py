@@ -19,6 +19,7 @@ from s2r_runtime import certificate as certificates
 from s2r_runtime import core, jobs, ledger
 from s2r_runtime import messages as m
 from s2r_runtime.audit_core import in_effect_order
+from s2r_runtime.bounds import clopper_pearson_upper
 from s2r_runtime.comparison import Campaign
 from s2r_runtime.controller_file import load
 from s2r_runtime.hookspecs import Offer, hookimpl
@@ -330,7 +331,8 @@ class Bench:
         n = ledger.sample_size(0.3, order.beta)
         values = [0.5 + i for i in range(n)]
         least = self._told("safety", 0.5, lambda s: 0.9)
-        laws = tuple(m.LawResult(law, n, least, 0, 0.3, 1.0, True, law != "adversarial", True) for law in ("uniform", "persistent"))
+        upper = clopper_pearson_upper(0, n, order.beta)
+        laws = tuple(m.LawResult(law, n, least, 0, upper, 1.0, True, True, True) for law in ("uniform", "persistent"))
         s = self.settings
         digests = (self.controller.digest, s.model_digest, s.task_digest)
         found = m.Verification(True, order.radius, order.hold_radius, 0.0, 0.3, order.beta, order.attempt, order.seed, laws, *digests)
