@@ -272,6 +272,8 @@ def proposed(turn: Turn, command: Command) -> None:
             close(turn, verdict.reason)
         if turn.state.asked is not None:
             recover_now(turn)
+        if source == "sampler" and verdict.reason in gate.LATCH_HOLDS_ALL:
+            latch(turn, verdict.reason)
         return
     if source == "controller":
         _open(turn)

@@ -162,6 +162,18 @@ def test_the_sampler_drives_through_the_gate_and_a_refused_command_becomes_recov
     assert not rig.state.gate_open
 
 
+def test_a_sampler_that_left_the_geofence_stays_out_where_the_profile_says_so() -> None:
+    rig = Rig(latching=("outside_geofence",))
+    rig.sampling()
+    rig.observe((2.5, 0.0, 0.0))
+    outputs = rig.propose((0.0, 0.0), "sampler")
+    assert kinds(outputs) == ["Decided", "Send", "StopCampaign", "Answer", "Persist"]
+    assert one(outputs, StopCampaign).reason == "latched:outside_geofence"
+    assert one(rig.request("sample"), Answer).exit_code == 1
+    rig.request("clear", text="outside_geofence")
+    assert one(rig.sampling(), StartCampaign).resume
+
+
 @pytest.mark.parametrize(
     ("event", "reason"),
     [
