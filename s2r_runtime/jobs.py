@@ -14,6 +14,9 @@ from s2r_runtime.worker import GapJob, Job, LoadJob, Result, TraceJob, VerifyJob
 Progress = Callable[[float, float, str], None]
 
 MEMORY_BYTES = 4 << 30
+"""What a verification may hold: its arrays and whatever the controller allocates for some thousand rollouts at once."""
+
+MEMORY_BYTES = 4 << 30
 """What a controller may use in a verification: thousands of rollouts at once need more than driving, and less than a small computer has."""
 
 
@@ -53,53 +56,61 @@ def gap(job: GapJob) -> Gap:
 
 
 def verify(job: VerifyJob, progress: Progress) -> Result:
-    """Rollouts of the controller on the uncertain model, under the profile's laws. The controller's code runs confined."""
+    """Rollouts of the controller on the uncertain model, under the profile's laws. From here on this process runs code that nobody
+    has read, so it is confined first.
+    """
+    import numpy as np
+
     from s2r_runtime.controllers import batch_control
     from s2r_runtime.models.composed import compose
     from s2r_runtime.plugins import registry
     from s2r_runtime.uncertain import GapSet
     from s2r_runtime.verify import verify_in_detail
 
-    profile, wanted = job.profile, job.profile.verification
+    profile, settings = job.profile, job.profile.verification
     model = compose(profile.model)
     task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
     confine(MEMORY_BYTES)
     result, details = verify_in_detail(
-        batch_control(job.controller),
+        batch_control(job.controller, len(model.inputs)),
         task,
         model,
         gap_set=GapSet(job.gap.set, job.gap.weights, job.radius, job.hold_radius, job.gap.hold_periods),
-        laws=wanted.laws,
-        required=wanted.required,
-        n=wanted.n,
-        epsilon=wanted.epsilon,
+        laws=settings.laws,
+        required=settings.required,
+        n=settings.n,
+        epsilon=settings.epsilon,
         beta=job.beta,
-        threshold=wanted.threshold,
+        threshold=settings.threshold,
         seed=job.seed,
+        attempt=job.attempt,
         controller_digest=job.controller.digest,
         task_digest=profile.task_digest(),
-        attempt=job.attempt,
         progress=progress,
     )
-    return Result(verification=result, safety={d.law: [round(s, 6) for s in d.rollouts.safety.tolist()] for d in details})
+    lowest = -np.finfo(np.float64).max  # what `verify` counts a value that is no number as
+    safety = {one.law: np.nan_to_num(one.rollouts.safety, nan=lowest, neginf=lowest, posinf=-lowest).tolist() for one in details}
+    return Result(verification=result, safety=safety)
 
 
 def trace(job: TraceJob, progress: Progress) -> Result:
-    """The residual's structure, and the model that has it, written to `out` if an effect was named."""
-    from s2r_runtime import persistence
+    """What the residual of a campaign depends on, and the model that has it, written to `job.out`. That model names what it was
+    fitted on: the logs as they are now, and the samples, in whatever log they stand (DESIGN G6).
+    """
+    import msgspec
+
     from s2r_runtime.models.composed import compose
     from s2r_runtime.modelspec import dump_model
-    from s2r_runtime.trace import load_dataset
-    from s2r_runtime.trace import trace as find
+    from s2r_runtime.persistence import replace
+    from s2r_runtime.trace import load_dataset, trace
+    from s2r_runtime.transitions import from_samples
 
     profile = job.profile
     model = compose(profile.model)
     weights = tuple(profile.norm.weights.get(name, 1.0) for name in model.states)
-    found = find(
-        load_dataset(job.logs, model, profile.columns), model, seed=job.seed, progress=progress, weights=weights, kind=profile.norm.set
-    )
-    text = dump_model(found.spec, found.comments())
-    if found.effects:
-        persistence.replace(Path(job.out), text.encode())
-    path = job.out if found.effects else ""
-    return Result(trace={**found.to_json(), "text": found.text(), "plots": found.plots(), "model": text, "model_path": path})
+    found = trace(load_dataset(job.logs, model), model, seed=job.seed, progress=progress, weights=weights, kind=profile.norm.set)
+    samples = from_samples(job.samples, source=f"campaign of epoch {job.epoch}").digest
+    fitted = tuple(dict.fromkeys((*found.spec.fitted_on, samples)))
+    text = dump_model(msgspec.structs.replace(found.spec, fitted_on=fitted), found.comments())
+    replace(Path(job.out), text.encode())
+    return Result(trace={**found.to_json(), "text": found.text(), "model_path": job.out, "model_toml": text})

@@ -6,6 +6,7 @@ function of its message: all that it depends on is in there, the seed too.
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 import traceback
@@ -155,7 +156,8 @@ def main(arguments: list[str]) -> int:
     except S2RError as error:
         result = Failed(str(error))
     except Exception as error:  # noqa: BLE001 - whatever a job raises is its result; a verification that failed to run is a refusal
-        traceback.print_exc()
+        with contextlib.suppress(OSError):  # confined, it may not write to a file
+            traceback.print_exc()
         result = Failed(f"{type(error).__name__}: {error}")
     say(channel, _ENCODE(result))
     return 0
