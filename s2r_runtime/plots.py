@@ -15,7 +15,7 @@ from s2r_runtime.errors import ConfigError
 Array = NDArray[np.float64]
 
 INK, SOFT, BLUE, ORANGE, RED, GREEN = "#1b2330", "#8a94a3", "#2f6db3", "#d9822b", "#c23030", "#2b8a57"
-CAP_POINTS = 4000
+CAP_POINTS = 2000
 """More points than this a line are thinned: a page should stay a page."""
 
 
@@ -40,7 +40,7 @@ def figure(width: float = 7.2, height: float = 2.8, columns: int = 1) -> tuple[A
 def svg(fig: Any, description: str) -> str:
     """The figure as an <svg> element with a description for readers who can't see it; the same figure gives the same text."""
     buffer = io.StringIO()
-    fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    fig.savefig(buffer, format="svg", dpi=140, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     body = text[text.index("<svg") :]
     label = description.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
@@ -99,7 +99,8 @@ def scatter_pair(x: Array, before: Array, after: Array, xlabel: str, ylabel: str
     limit = float(np.max(np.abs(np.concatenate([before, after, [1e-12]])))) * 1.05
     step = max(1, len(x) // CAP_POINTS)
     for ax, values, name in ((axes[0], before, "before"), (axes[1], after, "after")):
-        ax.plot(x[::step], values[::step], ".", color=BLUE, markersize=2, alpha=0.5, rasterized=False)
+        # thousands of markers as vectors would weigh megabytes: the points are an embedded picture, axes and words stay vectors
+        ax.plot(x[::step], values[::step], ".", color=BLUE, markersize=2, alpha=0.5, rasterized=True)
         ax.set_ylim(-limit, limit)
         ax.set_title(name, fontsize=9, loc="left")
         ax.set_xlabel(xlabel)
@@ -107,26 +108,31 @@ def scatter_pair(x: Array, before: Array, after: Array, xlabel: str, ylabel: str
     return svg(fig, description)
 
 
-def timeline(spans: Sequence[tuple[float, float, bool]], marks: Sequence[tuple[float, str, str]], xlabel: str, description: str) -> str:
-    """The gate over time. spans: (from, to, open); marks: (when, text, colour), numbered below the axis."""
+def timeline(
+    spans: Sequence[tuple[float, float, str]],
+    marks: Sequence[tuple[float, int, str]],
+    colours: Mapping[str, tuple[str, str]],
+    xlabel: str,
+    description: str,
+) -> str:
+    """What held when. spans: (from, to, kind); marks: (when, number, colour); colours: kind -> (colour, label)."""
     fig, (ax,) = figure(height=1.9)
     ax.grid(visible=False)
-    for begin, end, is_open in spans:
-        ax.axvspan(begin, end, ymin=0.35, ymax=0.75, color=GREEN if is_open else "#d4d9e0", linewidth=0)
-    for number, (when, _text, colour) in enumerate(marks, 1):
-        ax.axvline(when, ymin=0.28, ymax=0.82, color=colour, linewidth=1.2)
-        ax.text(
-            when,
-            0.88 if number % 2 else 0.16,
-            str(number),
-            color=colour,
-            ha="center",
-            va="center",
-            fontsize=8,
-            transform=ax.get_xaxis_transform(),
-        )
+    for kind, (colour, label) in colours.items():
+        bars = [(begin, end - begin) for begin, end, what in spans if what == kind]
+        ax.broken_barh(bars, (0.35, 0.4), color=colour, linewidth=0, label=label)
+    last = {True: -np.inf, False: -np.inf}
+    width = max((end for _, end, _ in spans), default=1.0) - min((begin for begin, _, _ in spans), default=0.0)
+    for when, number, colour in marks:
+        ax.plot([when, when], [0.28, 0.82], color=colour, linewidth=1.2)
+        above = number % 2 == 1
+        if when - last[above] > 0.018 * width:  # numbers that would lie on top of each other are left to the list
+            ax.text(when, 0.9 if above else 0.16, str(number), color=colour, ha="center", va="center", fontsize=8)
+            last[above] = when
+    ax.set_ylim(0.0, 1.0)
     ax.set_yticks([])
     ax.spines["left"].set_visible(False)
+    ax.legend(frameon=False, fontsize=8, ncols=4, loc="upper center", bbox_to_anchor=(0.5, 1.25))
     ax.set_xlabel(xlabel)
     return svg(fig, description)
 

@@ -20,6 +20,8 @@ from s2r_runtime.story import Story, tell
 from s2r_runtime.verify import not_shown
 
 COLOURS = {"good": plots.GREEN, "bad": plots.RED, "plain": plots.SOFT}
+SOURCES = {"sampler": (plots.BLUE, "sampler"), "controller": (plots.GREEN, "certified controller"), "recovery": ("#d4d9e0", "recovery")}
+GATE = {"open": (plots.GREEN, "open"), "closed": ("#d4d9e0", "closed")}
 
 
 def log_page(paths: Sequence[Path]) -> str:
@@ -53,31 +55,64 @@ def _summary(page: Page, story: Story) -> None:
     words = [f"{number} {name}{'' if number == 1 else 's'}" for number, name in counted]
     page.text(f"{', '.join(words)}; {len(valid)} still valid at the end.")
 
+    _before_and_after(page, story)
+
+
+def _before_and_after(page: Page, story: Story) -> None:
+    """The loop in one table: what the repair did to the error and to the gap."""
+    rows = [
+        (f"gap of epoch {g.epoch}: one step / {g.hold_periods} held steps", f"{g.radius:.4g} / {g.hold_radius:.4g}") for g in story.gaps
+    ]
+    for trace in story.traces:
+        named = ", ".join(f"{e['name']}({e['channel']})" for e in trace["effects"]) or trace["verdict"]
+        error = trace["error"]
+        for state, before in error["before"]["rollout_rms"].items():
+            after, unit = error["after"]["rollout_rms"][state], error["unit"].get(state, "")
+            label = f"held-out rms of {state} after {error['before']['rollout_horizon_s']:.2g} s, before → after {named}"
+            rows.append((label, f"{before:.4g} → {after:.4g} {unit}"))
+    if rows:
+        page.table(("in short", ""), rows)
+
 
 def _timeline(page: Page, story: Story) -> None:
     if not story.gate and not story.marks:
         return
     end = story.seconds(story.last_ns)
-    edges = [*story.gate, (end, False, "")]
-    spans = [(begin, after, is_open) for (begin, is_open, _), (after, _, _) in pairwise(edges)]
-    page.heading("Gate")
-    marks = [(when, what, COLOURS[kind]) for when, what, kind in story.marks]
+    page.heading("Who drove, and the gate")
     page.figure(
-        plots.timeline(spans, marks, "s", "gate open and closed over time, with numbered events"),
-        "Green: the gate is open. Numbers: see the list.",
+        plots.timeline(_spans(story.sources, end), _numbered(story, 0.0), SOURCES, "s", "who commanded the robot over time"),
+        "Who commanded the robot. Numbers: the list below.",
     )
+    opened = [when for when, is_open, _ in story.gate if is_open]
+    if opened:
+        begin = max(0.0, opened[0] - 1.0)
+        spans = [
+            (max(b, begin), e, kind) for b, e, kind in _spans([(w, "open" if o else "closed") for w, o, _ in story.gate], end) if e > begin
+        ]
+        page.figure(
+            plots.timeline(spans, _numbered(story, begin), GATE, "s", "gate open and closed while a controller was deployed"),
+            "The gate, from just before it first let a controller through.",
+        )
     page.items((f"{when:.2f} s: {what}" for when, what, _ in story.marks), "marks")
     if story.refusals:
         page.table(
-            ("commands refused because", "number"),
-            [(reason, n) for n, reason in sorted(((n, r) for r, n in story.refusals.items()), reverse=True)],
+            ("commands refused because", "number"), [(r, n) for n, r in sorted(((n, r) for r, n in story.refusals.items()), reverse=True)]
         )
+
+
+def _spans(changes: Sequence[tuple[float, str]], end: float) -> list[tuple[float, float, str]]:
+    """(from, to, what) from (when, what from then on)."""
+    return [(begin, after, what) for (begin, what), (after, _) in pairwise([*changes, (end, "")])]
+
+
+def _numbered(story: Story, begin: float) -> list[tuple[float, int, str]]:
+    return [(when, number, COLOURS[kind]) for number, (when, _, kind) in enumerate(story.marks, 1) if when >= begin]
 
 
 def _gaps(page: Page, story: Story, models: dict[str, ModelSpec]) -> None:
     for gap in story.gaps:
         page.heading(f"Gap of epoch {gap.epoch}")
-        page.text(statement(gap, independent=True), "statement")
+        page.text(statement(gap, independent=True, states=story.settings.states if story.settings else ()), "statement")
         page.table(
             ("radius", "unweighted", "hold gap", "noise alone", "N", "discarded", "ε", "β spent"),
             [

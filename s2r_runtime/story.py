@@ -43,6 +43,8 @@ class Story:
     last_ns: int = 0
     gate: list[tuple[float, bool, str]] = field(default_factory=list)
     """(when, open, reason)"""
+    sources: list[tuple[float, str]] = field(default_factory=list)
+    """(when, who commands from then on): sampler, controller, recovery"""
     marks: list[tuple[float, str, str]] = field(default_factory=list)
     """(when, what, kind) with kind one of good, bad, plain"""
     samples: dict[int, list[m.SampleTaken]] = field(default_factory=dict)
@@ -88,8 +90,10 @@ def _take(story: Story, message: Any) -> None:
     match message:
         case m.Observed(t_ns=t, observation=o) if not o.fault:
             story.poses.add((story.seconds(t), o.x, story._driving))
-        case m.Send(source=source):
+        case m.Send(t_ns=t, source=source):
             story._driving = source == "controller"
+            if not story.sources or story.sources[-1][1] != source:
+                story.sources.append((story.seconds(t), source))
         case m.Measured(t_ns=t, fault="", discrepancy=d, e_value=e):
             story.discrepancies.add((story.seconds(t), d, e, story._radius, story._verified))
         case m.Decided(allow=False, reason=reason):

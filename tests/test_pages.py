@@ -63,12 +63,9 @@ def sample_page() -> str:
         ),
         "a series",
     )
-    page.figure(
-        plots.timeline(
-            [(0.0, 2.0, False), (2.0, 5.0, True), (5.0, 6.0, False)], [(2.0, "opens", plots.GREEN), (5.0, "closes", plots.RED)], "s", "gate"
-        ),
-        "the gate",
-    )
+    spans = [(0.0, 2.0, "closed"), (2.0, 5.0, "open"), (5.0, 6.0, "closed")]
+    marks = [(2.0, 1, plots.GREEN), (5.0, 2, plots.RED)]
+    page.figure(plots.timeline(spans, marks, {"open": (plots.GREEN, "open"), "closed": (plots.SOFT, "closed")}, "s", "gate"), "the gate")
     page.table(("a", "b"), [(1, "<b>not bold</b>")])
     return page.html()
 
