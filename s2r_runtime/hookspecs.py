@@ -127,11 +127,14 @@ class Effect(Protocol):
     Stage `step`: changes the result of the nominal step. An effect of stage `input` is defined by `input_step` and, for
     long recordings, the same thing over time at once, `input_sequence`; the kit checks that the two agree.
 
-    It may also have: `optional` (names of parameters that may be left out); `choices` (parameter -> its words, for one that is
-    not a number); `wrong(p) -> str` (what is wrong with values that are each within bounds, or an empty text); `once` = True (a
-    model has at most one of it); `linear` = True (it commutes with other linear effects, so the tracer tries one place in the
-    list only); and `starts(u, model, channel, dt) -> list[dict]`: parameter values from which the tracer begins, given the input
-    that it would get, u (T, nu). Without it the tracer begins from a grid over the parameters' bounds.
+    It may also have
+    - `optional`: names of parameters that may be left out; `choices`: parameter -> its words, for one that is not a number;
+      `wrong(p) -> str`: what is wrong with values that are each within bounds, or an empty text;
+    - `once` = True: a model has at most one of it; `linear` = True: it commutes with other linear effects, so the tracer tries one
+      place in the list only; `shift` = True: a pure delay, which commutes with all that has no clock of its own;
+    - `within_step(dt, p) -> bool`: whether what acts changes within a step although the input is held over it;
+    - `starts(u, model, channel, dt) -> list[dict]`: parameter values from which the tracer begins, given the input that it would
+      get, u (T, nu). Without it the tracer begins from a grid over the parameters' bounds.
     """
 
     name: str

@@ -24,6 +24,11 @@ class InputDelay(InputEffect):
     parameters = (Parameter("delay", "s", 0.0, 10.0, neutral=0.0, kink=True),)
     all_alike = True
     linear = True
+    shift = True
+
+    def within_step(self, dt: float, p: Values) -> bool:
+        """A delay of whole steps keeps what is constant over a step so."""
+        return _steps(p["delay"], dt)[1] > ROUNDING
 
     def hidden(self, n: int, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
         """(n, c (m + 1)): zero inputs."""

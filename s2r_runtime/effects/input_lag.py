@@ -20,6 +20,10 @@ class InputLag(InputEffect):
     parameters = (Parameter("time_constant", "s", 0.0, 100.0, neutral=0.0),)
     linear = True
 
+    def within_step(self, dt: float, p: Values) -> bool:
+        """The response goes on over the step."""
+        return float(p["time_constant"]) > 0.0
+
     def hidden(self, n: int, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
         """(n, 1): zero."""
         return np.zeros((n, len(columns(model, channel))))

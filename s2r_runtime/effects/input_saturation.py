@@ -23,9 +23,11 @@ class InputSaturation(InputEffect):
         return np.minimum(np.maximum(u, p["low"]), p["high"])
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
-        """Symmetric limits inside what was asked for; one side alone where only one sign was."""
+        """Limits inside what was asked for: symmetric, and on one side alone with the other one out of reach."""
         size = float(np.max(np.abs(u[:, columns(model, channel)]), initial=0.0))
-        return [{"low": -share * size, "high": share * size} for share in (0.95, 0.85, 0.7, 0.55, 0.4, 0.25)] if size else []
+        both = [{"low": -share * size, "high": share * size} for share in (0.95, 0.85, 0.7, 0.55, 0.4, 0.25)]
+        one = [side for share in (0.8, 0.5, 0.3) for side in ({"low": -size, "high": share * size}, {"low": -share * size, "high": size})]
+        return [*both, *one] if size else []
 
 
 EFFECT = InputSaturation()

@@ -6,8 +6,9 @@ x: (n, nx), u: (n, nu), angles wrapped to (-pi, pi]. The hidden state is a tuple
 what a long time at zero input leaves (a campaign's full stop).
 
 u_act is the input's mean over the step. Where a nominal model says that a state is set to an input at once (`reached`: a wheel's
-speed, a car's speed), that state is the input as it acts at the end of the step; for such models the effects are run in SUBSTEPS parts of
-the step, of which the last one stands for its end.
+speed, a car's speed), that state is the input as it acts at the end of the step. What an effect makes of a held input may change within
+the step (`within_step`: a lag, a delay by a part of a step). Where that meets such a state, or an effect that is not linear,
+the effects are run in SUBSTEPS parts of the step, of which the last one stands for its end.
 """
 
 from __future__ import annotations
@@ -34,10 +35,15 @@ Array = NDArray[np.float64]
 Hidden = tuple[Array, ...]
 
 SUBSTEPS = 5
-"""Parts of a step for models with a state that is `reached` at once: the end is then known to a tenth of a step."""
+"""Parts of a step where one is not enough: its end is then known to a tenth of a step."""
 
 SETTLE_STEPS = 20_000
 """Steps after which an effect that is fed a constant counts as settled, whatever it does."""
+
+
+def _never(dt: float, p: dict[str, Any]) -> bool:
+    """An effect that does not say so changes nothing within a step."""
+    return False
 
 
 def wrap(angle: Array) -> Array:
@@ -83,11 +89,13 @@ class ComposedModel:
         """Columns of x that wrap."""
         return [self.states.index(name) for name in self.nominal.angles]
 
-    @property
+    @cached_property
     def substeps(self) -> int:
-        """Parts of a step in which the effects of stage `input` are run."""
-        dynamic = any(a.effect.stage == "input" for a in self.effects)
-        return SUBSTEPS if dynamic and getattr(self.nominal, "reached", None) else 1
+        """Parts of a step in which the effects of stage `input` are run: 1 where that is exact."""
+        chain = [a for a in self.effects if a.effect.stage == "input"]
+        moving = any(getattr(a.effect, "within_step", _never)(self.dt, a.p) for a in chain)
+        needed = getattr(self.nominal, "reached", None) or not all(getattr(a.effect, "linear", False) for a in chain)
+        return SUBSTEPS if moving and needed else 1
 
     @cached_property
     def _rest(self) -> Hidden:

@@ -1,0 +1,238 @@
+"""Noise of a residual: states are measured, so it enters twice, and neighbours are correlated.
+
+    r_k = y_{k+1} (-) f(y_k) = effect + w_k + e_{k+1} - F_k e_k,      w ~ (0, Q),  e ~ (0, R),  Q and R diagonal
+    cov(r_k, r_k) = Q + R + F_k R F_k^T,    cov(r_k, r_{k-1}) = -F_k R   where step k begins where k-1 ended, else 0
+
+S = L L^T is banded (2 nx - 1 below the diagonal); whitened residual z = L^-1 r. Q and R maximise, state by state, the likelihood of
+that state's residual alone (tridiagonal), the others' measurement noise in it taken from the round before: consistent, and a
+thousand times cheaper than the whole likelihood. What remains correlated in z is taken up by an autoregression per state.
+
+Errors have tails: a value of z has the density (1 - TAIL) N(0, 1) + TAIL N(0, WIDE^2), so one wild value costs a few nats, not z^2/2.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+TAIL, WIDE = 0.01, 8.0
+"""Share and size of wild errors in the density above. One such error then costs about log(WIDE / TAIL) = 7 nats."""
+
+OUTLIER = 4.5
+"""|z| above which a step is given a variance of its own when Q and R are estimated; white noise has one such in 150 000."""
+
+ORDERS = 4
+"""Highest order of the autoregression."""
+
+LEAST = 1e-6
+"""Least share of a residual's variance that process and measurement noise are each given: no drift is believed to be exact."""
+
+NARROWEST = 0.7
+"""Least standard deviation of z that is believed: below it the noise stands at its floor, which is meant to stay (and far below it
+there is no noise whose colour could be told)."""
+
+ENOUGH = 6000
+"""Steps from which Q and R are estimated at most; their relative error is then about 2 %."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Variances by state, (nx,): q of the process a step, r of the measurement."""
+
+    q: Array
+    r: Array
+
+    def one_step(self, f: Array) -> Array:
+        """(nx,) standard deviation of a one-step residual, over the F (n, nx, nx) given."""
+        return np.asarray(np.sqrt(self.q + self.r + np.mean(np.einsum("kij,j->ki", f**2, self.r), axis=0)))
+
+
+class Whitener:
+    """z = L^-1 r for r (n, nx) or (n, nx, m). `logdet`: of L. extra: (n, nx) variance added to the diagonal."""
+
+    def __init__(self, noise: Noise, f: Array, joined: Mask, extra: Array | None = None) -> None:
+        from scipy.linalg import lapack
+
+        n, nx = f.shape[:2]
+        rf = f * noise.r  # F R
+        own = np.einsum("kij,klj->kil", rf, f) + np.diag(noise.q + noise.r)
+        if extra is not None:
+            own[:, range(nx), range(nx)] += extra
+        band = np.zeros((2 * nx, n, nx))
+        for a in range(nx):
+            for b in range(nx):
+                if a >= b:
+                    band[a - b, :, b] = own[:, a, b]
+                band[nx + a - b, :-1, b] = np.where(joined[1:], -rf[1:, a, b], 0.0)
+        self._lower, info = lapack.dpbtrf(band.reshape(2 * nx, n * nx), lower=1)
+        if info != 0:
+            raise ValueError("the noise has no positive definite covariance")
+        self.logdet = float(np.sum(np.log(self._lower[0])))
+
+    def __call__(self, r: Array) -> Array:
+        """Same shape as r."""
+        from scipy.linalg import lapack
+
+        flat = r.reshape(r.shape[0] * r.shape[1], -1)
+        z, _ = lapack.dtbtrs(self._lower, flat, uplo="L")
+        return np.asarray(z).reshape(r.shape)
+
+
+def log_density(z: Array) -> Array:
+    """log of the density of z, elementwise, without the normal's constant."""
+    half = 0.5 * z * z
+    return np.asarray(np.logaddexp(math.log(1.0 - TAIL) - half, math.log(TAIL / WIDE) - half / WIDE**2))
+
+
+def weight(z: Array) -> Array:
+    """How much a value counts in least squares, in (WIDE^-2, 1): -(log density)'/z."""
+    wild = 1.0 / (1.0 + np.exp(np.clip(math.log((1.0 - TAIL) * WIDE / TAIL) - 0.5 * z * z * (1.0 - WIDE**-2), -700.0, 700.0)))
+    return np.asarray(1.0 - wild * (1.0 - WIDE**-2))
+
+
+def estimate(r: Array, f: Array, joined: Mask, floor: Array, near: Noise | None = None) -> Noise:
+    """Q and R of the residual r (n, nx). floor: (nx,) least variance. near: where to look first.
+
+    Outlying steps, if they are few, are given a variance of their own, so that they do not count for the others.
+    """
+    rows = _middle(joined, ENOUGH)
+    r, f, joined = r[rows], f[rows], joined[rows].copy()
+    joined[0] = False
+    robust = np.maximum((np.median(np.abs(r), axis=0) / 0.6745) ** 2, floor)
+    rough = np.maximum(np.abs(r) / np.sqrt(robust) / OUTLIER, 1.0) ** 2 - 1.0
+    few = np.mean(rough > 0.0, axis=0) < 0.1  # more than that is no tail but the bulk of what is missing
+    extra = np.where(few, rough * robust, 0.0)
+    noise = _by_state(r, f, joined, extra, near, floor)
+    for _ in range(2):
+        z = Whitener(noise, f, joined, extra)(r)
+        wild = np.abs(z) > OUTLIER
+        if not wild.any():
+            break
+        own = noise.q + noise.r + np.einsum("kij,j->ki", f**2, noise.r)
+        extra += np.where(wild, (z**2 / 4.0) * (own + extra), 0.0)
+        noise = _by_state(r, f, joined, extra, noise, floor)
+    return noise
+
+
+def _middle(joined: Mask, most: int) -> slice:
+    """At most so many steps, from the middle."""
+    n = len(joined)
+    begin = max(0, (n - most) // 2)
+    return slice(begin, min(n, begin + most))
+
+
+def _by_state(r: Array, f: Array, joined: Mask, extra: Array, near: Noise | None, floor: Array) -> Noise:
+    """State by state; twice, if one state's measurement noise is a good part of another's residual."""
+    nx = r.shape[1]
+    q, s = (np.zeros(nx), np.zeros(nx)) if near is None else (near.q.copy(), near.r.copy())
+    square = f**2
+    for _ in range(2):
+        foreign = np.zeros(nx)
+        for i in range(nx):
+            others = square[:, i] @ s - square[:, i, i] * s[i]
+            start = None if near is None else (q[i], s[i])
+            q[i], s[i] = _one_state(r[:, i], f[:, i, i], joined, extra[:, i] + others, float(floor[i]), start)
+        for i in range(nx):
+            foreign[i] = np.mean(square[:, i] @ s - square[:, i, i] * s[i]) / (q[i] + s[i])
+        near = Noise(q, s)
+        if np.all(foreign < 0.02):
+            break
+    return Noise(q, s)
+
+
+def _one_state(r: Array, f: Array, joined: Mask, other: Array, floor: float, near: tuple[float, float] | None) -> tuple[float, float]:
+    """(q, r) of one state by maximum likelihood; pattern search over their logarithms."""
+    from scipy.linalg import lapack
+
+    link = np.where(joined[1:], -f[1:], 0.0)
+    gain = 1.0 + f * f
+
+    def cost(a: float, b: float) -> float:
+        s = math.exp(b)
+        d, e, info = lapack.dpttrf(math.exp(a) + s * gain + other, s * link)
+        if info != 0:
+            return math.inf
+        x, _ = lapack.dpttrs(d, e, r)
+        return 0.5 * float(r @ x) + 0.5 * float(np.log(d).sum())
+
+    total = max(float(np.mean(np.minimum(r * r, 9.0 * max(float(np.median(r * r)), floor)))), floor)
+    low, high = math.log(max(floor, LEAST * total)), math.log(16.0 * total)
+    if near is None:
+        seeds = [(share, (1.0 - share) / 2.0) for share in (1e-3, 0.05, 0.3, 0.7, 0.99)]
+        starts = [(math.log(max(total * a, floor)), math.log(max(total * b, floor))) for a, b in seeds]
+    else:
+        starts = [(min(max(math.log(near[0]), low), high), min(max(math.log(near[1]), low), high))]
+    best, (a, b) = min((cost(*start), start) for start in starts)
+    step, moves = 1.0 if near is None else 0.5, [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]
+    while step > 0.04:
+        for move in list(moves):
+            there = min(max(a + move[0] * step, low), high), min(max(b + move[1] * step, low), high)
+            found = cost(*there) if there != (a, b) else math.inf
+            if found < best - 1e-6:
+                best, (a, b) = found, there
+                moves.remove(move)
+                moves.insert(0, move)
+                break
+        else:
+            step /= 2.0
+    return math.exp(a), math.exp(b)
+
+
+@dataclass(frozen=True)
+class Colour:
+    """Autoregression of z by state: coefficients (nx, ORDERS), scale (nx,)."""
+
+    coefficients: Array
+    scale: Array
+
+    @property
+    def strength(self) -> Array:
+        """(nx,) largest coefficient."""
+        return np.asarray(np.max(np.abs(self.coefficients), axis=1))
+
+    def __call__(self, z: Array, joined: Mask) -> Array:
+        """What of z (n, nx) or (n, nx, m) the past does not foretell, in standard deviations."""
+        out, past = z.copy(), z
+        there = joined.copy()
+        for lag in range(1, self.coefficients.shape[1] + 1):
+            past = np.concatenate([np.zeros_like(past[:1]), past[:-1]])
+            if lag > 1:
+                there = there & np.append(False, there[:-1])
+            shape = (len(z), 1) + (1,) * (z.ndim - 2)
+            c = self.coefficients[:, lag - 1].reshape((1, -1) + (1,) * (z.ndim - 2))
+            out -= np.where(there.reshape(shape), c * past, 0.0)
+        return np.asarray(out / self.scale.reshape((1, -1) + (1,) * (z.ndim - 2)))
+
+
+def colour(z: Array, joined: Mask) -> Colour:
+    """The autoregression that the Bayes criterion chooses for each state, fitted on z cut at 4 standard deviations."""
+    n, nx = z.shape
+    coefficients, scale = np.zeros((nx, ORDERS)), np.ones(nx)
+    clipped = np.clip(z, -4.0, 4.0)
+    lagged = np.zeros((n, ORDERS, nx))
+    there = joined.copy()
+    for lag in range(ORDERS):
+        if lag:
+            there = there & np.append(False, there[:-1])
+        lagged[lag + 1 :, lag] = clipped[: n - lag - 1]
+        lagged[~there, lag] = 0.0
+    for i in range(nx):
+        spread = max(float(np.mean(clipped[:, i] ** 2)), 1e-12)
+        best, own = n * math.log(spread), max(math.sqrt(spread), NARROWEST)
+        scale[i] = own
+        for order in range(1, ORDERS + 1) if spread > 0.25 * NARROWEST**2 else ():
+            x = lagged[:, :order, i]
+            c = np.linalg.solve(x.T @ x + 1e-9 * n * spread * np.eye(order), x.T @ clipped[:, i])
+            left = max(float(np.mean((clipped[:, i] - x @ c) ** 2)), 1e-12)
+            score = n * math.log(left) + (order + 1.0) * math.log(n)
+            if score < best - 1e-9:
+                best, scale[i] = score, own * math.sqrt(left / spread)
+                coefficients[i] = 0.0
+                coefficients[i, :order] = c
+    return Colour(coefficients, scale)
