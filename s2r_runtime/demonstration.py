@@ -106,7 +106,10 @@ class Demonstration:
         if not running:
             self._step(f"s2r deploy {controller.name}", "verify at the new gap; a certificate lets it drive")
             if self._ask({"verb": "deploy", "path": str(controller), "parameters": {}})["exit_code"] != 0:
-                self._say("still refused: what is left of the gap is too much for this controller", "yellow")
+                self._say(
+                    "still refused: on the repaired model, with the gap that is left, this controller does not do its task safely enough",
+                    "yellow",
+                )
                 return True
         return self._watch_it()
 

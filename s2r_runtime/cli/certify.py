@@ -57,6 +57,7 @@ def run(args: argparse.Namespace) -> int:
         profile,
         radius=gap.radius * headroom,
         hold_radius=gap.hold_radius * headroom,
+        hold_periods=gap.hold_periods,
         laws=profile.verification.laws,
         n=0,
         attempt=attempt,

@@ -93,12 +93,14 @@ def run_gap(args: argparse.Namespace) -> int:
 
 def _print_gap(answer: dict[str, Any]) -> None:
     output.out(f"gap radius      {answer['radius']:.6g}   (unweighted norm: {answer['radius_literal']:.6g})")
-    if answer.get("hold_radius"):
+    if answer["hold_periods"] > 1:
         output.out(f"hold gap        {answer['hold_radius']:.6g} over {answer['hold_periods']} periods")
     if answer.get("radius_noise"):
         output.out(f"noise alone     would make {answer['radius_noise']:.3g} of it")
     output.out(f"transitions     {answer['n']}, {answer['discarded']} discarded, rejected: {answer['rejected'] or 'none'}")
-    output.out(f"weights         {answer['weights']}  set {answer['set']}")
+    weights = ", ".join(f"{name} {weight:g}" for name, weight in answer["weights"].items())
+    output.out(f"norm            {answer['set']}, weights {weights}")
+    output.out("residual        " + ("white" if answer["white"] else f"not white: {answer['white_reason']}"))
     output.out(answer["statement"])
 
 
@@ -111,10 +113,8 @@ def run_verify(args: argparse.Namespace) -> int:
     model = profile_model(args, profile)
     epoch_gap = gap_of(args.recording, model, profile) if args.recording else None
     radius = args.radius or (epoch_gap.radius * profile.verification.headroom if epoch_gap else 0.0)
-    if args.radius:
-        hold = args.hold_radius or args.radius * profile.sampling.hold_periods**0.5
-    else:
-        hold = epoch_gap.hold_radius * profile.verification.headroom if epoch_gap else 0.0
+    periods = epoch_gap.hold_periods if epoch_gap else profile.sampling.hold_periods
+    hold = epoch_gap.hold_radius * profile.verification.headroom if epoch_gap else args.hold_radius or radius * periods**0.5
     laws = tuple(args.law) if args.law else profile.verification.laws
     result = run_verification(
         controllers.load(args.controller, dict(pair(i, "--param") for i in args.param)),
@@ -122,6 +122,7 @@ def run_verify(args: argparse.Namespace) -> int:
         profile,
         radius=radius,
         hold_radius=hold,
+        hold_periods=periods,
         laws=laws,
         n=args.n,
         attempt=1,
@@ -175,6 +176,7 @@ def run_verification(
     *,
     radius: float,
     hold_radius: float,
+    hold_periods: int,
     laws: tuple[str, ...],
     n: int,
     attempt: int,
@@ -189,7 +191,7 @@ def run_verification(
     task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
     # laws asked for by name are what the question is about, even where the profile does not require them
     required = tuple(law for law in profile.verification.required if law in laws) or laws
-    gap_set = GapSet(profile.norm.set, weights_of(model.states, [], profile), radius, hold_radius, profile.sampling.hold_periods)
+    gap_set = GapSet(profile.norm.set, weights_of(model.states, [], profile), radius, hold_radius, hold_periods)
     bar = output.Progress("verifying")
     try:
         return verification.verify(

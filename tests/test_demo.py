@@ -1,0 +1,105 @@
+"""The demo, whole: three processes over real Zenoh, with an effect switched on behind the daemon's back."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from s2r_runtime import messages as m
+from s2r_runtime.recording import read_all
+
+
+def s2r(*argv: str | Path, timeout: float = 420) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "s2r_runtime.cli.main", *map(str, argv)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+
+
+@pytest.fixture(scope="module")
+def story(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A whole run with another seed than the docs', and another effect."""
+    out = tmp_path_factory.mktemp("demo") / "run"
+    done = s2r("demo", "--seed", "7", "--effect", "input_gain:v gain=0.8", "--out", out)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return out, done.stdout
+
+
+def events(out: Path) -> list[object]:
+    return [entry.message for entry in read_all(sorted((out / "logs").glob("*.mcap"))).entries()]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(480)
+def test_the_story_refuses_repairs_certifies_drives_and_revokes(story: tuple[Path, str]) -> None:
+    out, text = story
+    for words in (
+        "refused: verification attempt 1",
+        "exit code 1",
+        "input_gain on v",
+        "model adopted",
+        "deployed under certificate",
+        "the gate is closed",
+    ):
+        assert words in text
+    log = events(out)
+    gaps = [e.gap for e in log if isinstance(e, m.EpochChanged) and e.gap is not None]
+    assert len(gaps) == 2
+    assert gaps[1].hold_radius < 0.2 * gaps[0].hold_radius
+    assert any(isinstance(e, m.CertificateInstalled) for e in log)
+    assert any(isinstance(e, m.Revoked) for e in log)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(480)
+def test_the_tracer_found_what_was_switched_on(story: tuple[Path, str]) -> None:
+    traces = [e.trace for e in events(story[0]) if isinstance(e, m.JobFinished) and e.trace is not None]
+    assert len(traces) == 1
+    trace = traces[0]
+    assert trace["verdict"] == "traced"
+    (effect,) = trace["effects"]  # type: ignore[misc]
+    assert (effect["name"], effect["channel"]) == ("input_gain", "v")
+    assert effect["parameters"]["gain"]["value"] == pytest.approx(0.8, rel=0.02)
+    error = trace["error"]
+    assert error["after"]["rollout_rms"]["x"] < 0.2 * error["before"]["rollout_rms"]["x"]  # type: ignore[index]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(480)
+def test_nothing_but_recovery_and_sampler_commands_went_out_without_a_certificate(story: tuple[Path, str]) -> None:
+    certified = False
+    driven = 0
+    for e in events(story[0]):
+        if isinstance(e, m.CertificateInstalled):
+            certified = True
+        elif isinstance(e, m.Revoked):
+            certified = False
+        elif isinstance(e, m.Send) and e.source == "controller":
+            driven += 1
+            assert certified
+    assert driven > 100
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(480)
+def test_its_log_passes_the_audit_by_anybody_who_has_the_public_key(story: tuple[Path, str], tmp_path: Path) -> None:
+    out, _ = story
+    logs = sorted((out / "logs").glob("*.mcap"))
+    done = s2r("audit", *logs, "--key", out / "state" / "key.pub", "--json")
+    answer = json.loads(done.stdout)
+    assert (done.returncode, answer["ok"], answer["chain"], answer["first_difference"]) == (0, True, "intact", None)
+    assert s2r("keys", "new", tmp_path / "other.pem").returncode == 0
+    other = s2r("audit", *logs, "--key", tmp_path / "other.pub")
+    assert other.returncode == 1
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(480)
+def test_its_report_is_one_page_with_the_plots(story: tuple[Path, str]) -> None:
+    page = (story[0] / "report.html").read_text(encoding="utf-8")
+    assert page.count("<svg") >= 8
+    assert len(page) < 5_000_000
+    assert re.findall(r"""(?:src|href)\s*=\s*["'](?!#|data:)[^"']+""", page) == []
