@@ -170,18 +170,19 @@ class Desk:
                 connection.answer(78, result.text if isinstance(result, Failed) else "no controller was loaded")
                 return
             self._d.actions.keep_controller(result.controller)
-            if not request.certificate or self._install(connection, request.certificate):
-                self.request("deploy", connection, digest=result.controller.digest, text=request.path)
+            digest = result.controller.digest
+            if not request.certificate or self._install(connection, request.certificate, digest):
+                self.request("deploy", connection, digest=digest, text=request.path)
 
         self._d.workshop.start(LoadJob(request.path, dict(request.parameters)), LOAD_TIMEOUT_S, loaded)
 
-    def _install(self, connection: Connection, text: str) -> bool:
+    def _install(self, connection: Connection, text: str, digest: str) -> bool:
         """A certificate that came along. Refused, it ends the request: nobody asked for an attempt of this robot's budget instead."""
         self._numbers += 1
         self._waiting[self._numbers] = ("certificate", connection)
         self._said = (0, "")
         try:
-            self._d.feed(issuing.load(self._d, text, "--certificate", self._numbers))
+            self._d.feed(issuing.load(self._d, text, "--certificate", digest, self._numbers))
         except S2RError as error:
             self._said = (error.exit_code, str(error))
         self._waiting.pop(self._numbers)

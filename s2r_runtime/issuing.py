@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from s2r_runtime import certificate as certificates
 from s2r_runtime import keys
-from s2r_runtime.errors import S2RError
+from s2r_runtime.errors import ConfigError, S2RError
 from s2r_runtime.messages import CertificateFailed, CertificateStored, Gap, IssueCertificate
 from s2r_runtime.persistence import replace
 
@@ -37,11 +37,13 @@ def issue(daemon: Daemon, order: IssueCertificate) -> CertificateStored | Certif
         return CertificateFailed(0, str(error), order.request_id)
 
 
-def load(daemon: Daemon, text: str, where: str, request_id: int) -> CertificateStored:
-    """A certificate that a person brings, made elsewhere. Raises ConfigError with what is wrong with it."""
+def load(daemon: Daemon, text: str, where: str, controller: str, request_id: int) -> CertificateStored:
+    """A certificate that a person brings for this controller (digest), made elsewhere. Raises ConfigError with what is wrong with it."""
     trusted = (keys.public_bytes(daemon.key), *keys.load_trusted([daemon.folder.path / "trusted"]))
     data = text.encode()
     certificate = certificates.load(data, trusted, int(time.time()), where)
+    if certificate.controller_digest != controller:
+        raise ConfigError(f"{where}: is of the controller {certificate.controller_digest}; the one to deploy is {controller}")
     stored = _store(daemon, certificate, data, certificate.gap, request_id)
     if isinstance(stored, CertificateFailed):
         raise S2RError(stored.error)

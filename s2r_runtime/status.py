@@ -22,6 +22,8 @@ def status(daemon: Daemon) -> dict[str, Any]:
         "phase": None if sampling is None else sampling[0],
         "rejected": {} if sampling is None else sampling[3],
         "revoked": dict(memory.revoked),
+        "measured": memory.watch_n,
+        "exceedances": memory.watch_exceedances,
         "scenarios": daemon.state.episodes,
         "episodes": [{"index": e.index, "steps": e.steps, "safety": e.safety, "progress": e.progress} for e in daemon.actions.episodes],
         "observation": None if observation is None else {"seq": observation.seq, "x": list(observation.x), "fault": observation.fault},

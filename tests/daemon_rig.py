@@ -239,6 +239,11 @@ class Rig:
         """What the logs hold on these channels, oldest first."""
         return [entry.message for path in self.log_files() for entry in read(path, channels)]
 
+    def s2r(self, *verb: str) -> subprocess.CompletedProcess[str]:
+        """A verb of the command line, which knows this rig's transport too."""
+        argv = [sys.executable, str(PROGRAM), "s2r", *verb]
+        return subprocess.run(argv, capture_output=True, text=True, env=self.environment, cwd=self.folder, check=False, timeout=100)
+
     def log_files(self) -> list[Path]:
         return sorted(self.logs.glob("*.mcap"), key=lambda path: path.stat().st_mtime_ns)
 

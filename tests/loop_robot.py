@@ -4,6 +4,7 @@ Run as processes of their own:
     python loop_robot.py robot DIR [--realtime] [--dt S] [--gain G]          a unicycle that notes what it was told in DIR/applied.jsonl
     python loop_robot.py daemon PROFILE --state DIR --log DIR [--seed N]     the real daemon, with the transport `loop` registered
     python loop_robot.py campaign PROFILE OUT --state DIR                    one campaign, as `s2r sample` runs it
+    python loop_robot.py s2r VERB ...                                        any verb of the command line
 
 In lockstep the robot publishes observation k, waits for the command that answers it, integrates one period and goes on; it
 repeats the observation every 0.1 s while it waits. In real time it publishes every dt and applies the newest command while its
@@ -204,7 +205,14 @@ def main() -> int:
             daemon.add_argument("--log", type=Path)
         else:
             daemon.add_argument("out", type=Path)
+    which.add_parser("s2r").add_argument("verb", nargs=argparse.REMAINDER)
     args = parser.parse_args()
+    if args.which == "s2r":
+        from s2r_runtime.cli.main import main as s2r
+        from s2r_runtime.plugins import registry
+
+        registry().add("rig", "tests", "0", sys.modules[__name__])
+        return s2r(args.verb)
     if args.which == "robot":
         signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
         robot_process = Robot(args.folder, args)
