@@ -107,6 +107,9 @@ class Child:
 
     def ending(self) -> str:
         """How it ended, in a few words."""
+        if self._ended:  # the pipe's end comes a moment before the process's
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(0.05)
         code = self._process.poll()
         if code is None:
             return "no longer answers"
