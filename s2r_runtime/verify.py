@@ -185,7 +185,7 @@ def not_shown() -> list[str]:
         "A controller that drives chooses other inputs than a campaign: where it does so rho times as often, epsilon becomes rho epsilon.",
         "Epsilon is a probability a step: over a run of hundreds of steps the gap may be exceeded at least once.",
         "The disturbance laws are models: independent, zero-mean noise averages out where a real, persistent disturbance does not.",
-        "Nothing is said about scenarios outside the task's law, states outside the region, or a robot that has changed since the campaign.",
+        "Nothing is said about scenarios outside the task's law, states outside the region, or a robot that changed since the campaign.",
     ]
 
 
