@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import configparser
 import contextlib
 import json
 import os
@@ -238,3 +239,17 @@ def test_notifier_without_a_manager_does_nothing(tmp_path: Path) -> None:
         notifier.ready()
         notifier.alive(1)
         notifier.close()
+
+
+def test_service_unit_calls_what_the_command_line_knows_and_waits_for_readiness() -> None:
+    from s2r_runtime.cli.main import parser
+
+    unit = configparser.ConfigParser(strict=False, interpolation=None)
+    unit.optionxform = str  # type: ignore[assignment,method-assign]
+    unit.read(Path(__file__).parent.parent / "tools" / "s2r.service")
+    service = unit["Service"]
+    program, *arguments = service["ExecStart"].split()
+    args = parser().parse_args(arguments)
+    assert (Path(program).name, args.verb, args.state) == ("s2r", "run", Path("/var/lib/s2r"))
+    assert (service["Type"], service["KillMode"], service["RestartPreventExitStatus"]) == ("notify", "mixed", "2 78")
+    assert float(service["WatchdogSec"]) > 0
