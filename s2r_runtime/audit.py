@@ -20,7 +20,7 @@ from s2r_runtime.audit_evidence import Evidence
 from s2r_runtime.audit_findings import CertificateFinding, Difference, Findings
 from s2r_runtime.audit_run import Across, RunAudit
 from s2r_runtime.channels import UNRECORDED, Unrecorded
-from s2r_runtime.layout import ABOUT
+from s2r_runtime.layout import ABOUT, RECOVERED
 from s2r_runtime.logs import runs
 from s2r_runtime.reading import Reading
 from s2r_runtime.recording import environment
@@ -164,6 +164,9 @@ def _ended(reading: Reading, findings: Findings) -> bool:
     elif end.kind == "cut":
         lost = f" ({end.lost_bytes} bytes could not be used)" if end.lost_bytes else ""
         what = "nothing but the index" if reading.sealed_for_good else "what came after"
+        if (known := reading.metadata.get(RECOVERED)) is not None:
+            findings.lack(f"{reading.path.name} was recovered; it lacks {known['missing']}")
+            return False
         findings.lack(f"{what}: {reading.path.name} was cut after {end.index} messages: {end.detail}{lost}")
     return end.kind == "rotated" or (end.kind == "cut" and reading.sealed_for_good)
 

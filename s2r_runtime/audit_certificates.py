@@ -12,7 +12,7 @@ from s2r_runtime.audit_evidence import Evidence, attached_controller
 from s2r_runtime.audit_findings import CertificateFinding, Findings
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
 from s2r_runtime.layout import Attached
-from s2r_runtime.messages import CertificateStored, IssueCertificate, Revoked, Settings
+from s2r_runtime.messages import CertificateStored, IssueCertificate, Memory, Revoked, Settings
 from s2r_runtime.profile import Profile
 from s2r_runtime.reading import Entry
 
@@ -30,6 +30,12 @@ class Certificates:
     def begin_run(self) -> None:
         """A new run numbers its requests anew."""
         self._orders.clear()
+
+    def remembered(self, memory: Memory) -> None:
+        """A run begins with these certificates in force."""
+        for facts in memory.certificates:
+            if facts.id not in self._findings.certificates:
+                self._findings.lack(f"the evidence of certificate {facts.id}, in an earlier log that was not given")
 
     def issuing(self, order: IssueCertificate, *, traced: bool) -> None:
         """The core has a certificate signed."""
@@ -78,7 +84,7 @@ class Certificates:
         elsewhere = event.gap is not None
         signer = _signer(data.data)
         certificate = certificates.load(data.data, {*trusted, signer} if elsewhere else trusted[:1], None, "certificate")
-        if certificates.facts(certificate) != event.facts:
+        if certificates.facts(certificate) != event.facts or event.gap not in (None, certificate.gap):
             raise ConfigError("what the gate was told is not what it says")
         if elsewhere:
             known = "a trusted key" if signer in trusted else f"key {keys.fingerprint(signer)}, not compared with a trusted one"

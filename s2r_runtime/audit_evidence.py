@@ -46,6 +46,7 @@ class Evidence:
         self._jobs: dict[int, tuple[StartJob, Gap | None]] = {}
         self._gaps: dict[str, str] = {}
         self._verifications: dict[str, str] = {}
+        self._in_force: dict[int, Gap] = {}
         self._epochs = self._attempts = 0
 
     # ---- what is spent
@@ -60,17 +61,26 @@ class Evidence:
                 entry.index, entry.channel, "the memory forgets epochs or attempts that an earlier log spent", found, told
             )
         self._epochs, self._attempts = memory.epochs, memory.attempts
+        gap = memory.gap
+        if gap is None:
+            return
+        known = self._in_force.get(gap.epoch)
+        if known is None:
+            self._findings.lack(f"what the gap of epoch {gap.epoch} was computed from, in an earlier log that was not given")
+        elif known != gap:
+            self._findings.differ(entry.index, entry.channel, f"the memory has another gap of epoch {gap.epoch}", gap, known)
 
     def spent(self, entry: Entry, output: EpochChanged | AttemptSpent, beta: float) -> None:
         """An epoch or attempt is begun: the next one, at its share of the budget."""
         if isinstance(output, AttemptSpent):
             number, due = output.attempt, self._attempts + 1
             self._attempts = max(number, self._attempts)
-        elif output.gap is None:
+        elif output.gap is not None:
+            self._in_force[output.epoch] = output.gap
+            return
+        else:
             number, due = output.epoch, self._epochs + 1
             self._epochs = max(number, self._epochs)
-        else:
-            return
         if number < due or output.beta != ledger.share(beta, number):
             self._findings.differ(entry.index, entry.channel, "the budget is not spent in order", output, [due, ledger.share(beta, due)])
         self._findings.count("shares of the budget")

@@ -70,11 +70,15 @@ class Frames:
             self._findings.differ(entry.index, entry.channel, what, None, self._due[0])
             self._due.clear()
 
-    def end(self, last_act: Send | None) -> None:
-        """Nothing follows. last_act: the one command that the daemon gives on its own, when something in it breaks."""
+    def end(self, entry: Entry | None, last_act: Send | None, *, clean: bool) -> None:
+        """Nothing follows. last_act: the one command that the daemon gives on its own, when something in it breaks. clean: and
+        nothing was cut.
+        """
         if last_act is not None and self._left:
             self._sends.append(last_act)
         self._commands_left()
+        if clean and entry is not None:
+            self._events_are_there(entry)
 
     def _commands_left(self) -> None:
         """Frames that left since the event before are its commands', in order. A command without a frame could not be sent."""

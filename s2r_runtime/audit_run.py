@@ -89,6 +89,7 @@ class RunAudit:
         self._models: dict[str, ComposedModel | None] = {}
         self._sent_seq = self._seen_seq = -1
         self._event: Event | None = None
+        self._entry: Entry | None = None
         self._campaigns.begin_run()
         self._certificates.begin_run()
 
@@ -99,6 +100,7 @@ class RunAudit:
 
     def entry(self, entry: Entry) -> None:
         """The next message."""
+        self._entry = entry
         family = entry.channel.partition("/")[0]
         if family == "event":
             self._take(entry, entry.message)  # type: ignore[arg-type]
@@ -113,12 +115,11 @@ class RunAudit:
         """Nothing follows. clean: the log was closed and lacks nothing, so neither may its last event, if that is an orderly end."""
         stopped = isinstance(self._event, Stopping)
         if self._frames is not None:
-            self._frames.end(None if stopped else self._last_act())
+            self._frames.end(self._entry, None if stopped else self._last_act(), clean=clean and stopped)
         self._core.end(complete=clean and stopped)
+        self._watch.finish(self._entry, self._core.state.now_ns, clean=clean)
         if clean and not stopped and self._event is not None:
             self._findings.lack("an orderly end: the daemon broke down, and closed its log")
-        if not clean and (left := self._watch.left_out()):
-            self._findings.lack(f"{left} discrepancies of the last observations")
 
     # ---- events
 
@@ -139,9 +140,9 @@ class RunAudit:
     def _before(self, entry: Entry, event: Event) -> None:
         """What is recomputed of an event, before the core's outputs take effect."""
         match event:
-            case Observed(observation=observation):
+            case Observed(t_ns=t_ns, observation=observation):
                 self._seen_seq = observation.seq
-                self._watch.observed(observation)
+                self._watch.observed(entry, observation, t_ns)
                 self._campaigns.observed(observation)
             case Measured():
                 self._watch.measured(entry, event)
@@ -183,6 +184,7 @@ class RunAudit:
                 entry.index, entry.channel, "the settings are not those of the attached profile and model", settings, told
             )
         self._evidence.begin_run(entry, event.memory)
+        self._certificates.remembered(event.memory)
         options = {name: value for name, value in profile.transport.items() if name != "name"}
         transport = registry().get("transports", str(profile.transport.get("name")))
         self._frames = Frames(transport(options, facts.states, facts.inputs), self._findings)
@@ -218,7 +220,8 @@ class RunAudit:
             case StartController():
                 model = self._compose(profile.model)
                 if state.memory.gap is not None and model is not None:
-                    self._watch.begin(model, state.memory.gap, profile.watch.fault_jump, state.memory)
+                    fault_jump, lockstep = profile.watch.fault_jump, settings.lockstep
+                    self._watch.begin(model, state.memory.gap, fault_jump, state.memory, lockstep=lockstep)
             case StopController():
                 self._watch.end()
             case StartJob():

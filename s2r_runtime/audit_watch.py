@@ -16,8 +16,14 @@ if TYPE_CHECKING:
     from s2r_runtime.models.composed import ComposedModel
 
 
+OVERDUE_NS = 5_000_000_000
+"""In real time. A process that does not answer for two seconds is taken for dead, and that is recorded."""
+
+
 class WatchReplay:
-    """One run's watch. Replies may come late, but in order, and only a process that died leaves any out."""
+    """One run's watch. Replies may come late, but in order, and only a process that died leaves any out. In lockstep the daemon
+    waits for them.
+    """
 
     def __init__(self, findings: Findings) -> None:
         self._findings = findings
@@ -26,9 +32,12 @@ class WatchReplay:
         self._memory: Memory | None = None
         self._stood: Measured | None = None
         self._due: deque[Measured] = deque()
+        """t_ns: of the observation."""
+        self._lockstep = False
 
-    def begin(self, model: ComposedModel, gap: Gap, fault_jump: float, memory: Memory) -> None:
+    def begin(self, model: ComposedModel, gap: Gap, fault_jump: float, memory: Memory, *, lockstep: bool) -> None:
         """A controller starts. memory: the core's, which says where this epoch's watch stands."""
+        self._lockstep = lockstep
         self._begun, self._memory = (model, gap, fault_jump), memory
         self._start()
 
@@ -44,12 +53,13 @@ class WatchReplay:
         elif self._begun is not None:
             self._start()
 
-    def observed(self, observation: Observation) -> None:
+    def observed(self, entry: Entry, observation: Observation, t_ns: int) -> None:
         """The robot was seen there; before the core hears of it."""
         if self._stream is not None and self._begun is not None:
+            self._demand(entry, t_ns)
             measured = self._stream.observed(observation)
             if measured is not None:
-                self._due.append(msgspec.structs.replace(measured, epoch=self._begun[1].epoch))
+                self._due.append(msgspec.structs.replace(measured, t_ns=t_ns, epoch=self._begun[1].epoch))
 
     def sent(self, send: Send) -> None:
         """The robot was told this."""
@@ -60,16 +70,25 @@ class WatchReplay:
         """A discrepancy is recorded: it must be the next that is due."""
         self._stood = event
         due = self._due.popleft() if self._due else None
-        if due is None or not alike(due, msgspec.structs.replace(event, t_ns=0)):
+        if due is None or not alike(due, msgspec.structs.replace(event, t_ns=due.t_ns)):
             what = "the discrepancy (or what the watch makes of it) is another one"
             self._findings.differ(entry.index, entry.channel, what, entry.raw, due)
             self._due.clear()
             return
         self._findings.count("discrepancies")
 
-    def left_out(self) -> int:
-        """Discrepancies that are due and not recorded (yet)."""
-        return len(self._due)
+    def finish(self, entry: Entry | None, t_ns: int, *, clean: bool) -> None:
+        """Nothing follows. clean: and nothing was cut."""
+        if clean and entry is not None and self._stream is not None:
+            self._demand(entry, t_ns)
+        elif self._due and not clean:
+            self._findings.lack(f"{len(self._due)} discrepancies of the last observations")
+
+    def _demand(self, entry: Entry, t_ns: int) -> None:
+        """While a controller is watched, what is due must have come by now."""
+        if self._due and (self._lockstep or t_ns - self._due[0].t_ns > OVERDUE_NS):
+            self._findings.differ(entry.index, entry.channel, "a discrepancy before this is not recorded", None, self._due[0])
+            self._due.clear()
 
     def _start(self) -> None:
         assert self._begun is not None  # noqa: S101 - callers checked

@@ -227,6 +227,18 @@ def test_a_record_that_was_left_out_is_missed(run: Any, tmp_path: Path, kind: ty
     assert index - 1 <= result.first_difference.index <= index + late
 
 
+def test_a_watch_that_falls_silent_is_noticed(run: Any, tmp_path: Path) -> None:
+    def silence(items: list[Any]) -> int:
+        at = nth(items, m.Measured, 30)
+        items[at:] = [item for item in items[at:] if not isinstance(item, m.Measured)]
+        return ordinal(items, at)
+
+    result, index = tampered(run, tmp_path / "a.mcap", silence)
+    assert result.first_difference is not None
+    assert "a discrepancy before this is not recorded" in result.first_difference.what
+    assert index <= result.first_difference.index <= index + 3
+
+
 @pytest.mark.parametrize("kind", [m.Ticked, m.Send, m.Revoked])
 def test_a_record_that_was_put_in_is_noticed(run: Any, tmp_path: Path, kind: type) -> None:
     extra = {
@@ -270,6 +282,22 @@ def test_a_later_run_cannot_forget_what_an_earlier_one_spent(run: Any, tmp_path:
     assert not result.ok
     assert result.first_difference is not None
     assert "forgets epochs or attempts" in result.first_difference.what
+
+
+def test_a_run_that_rests_on_an_earlier_one_holds_with_it_and_alone(tmp_path: Path) -> None:
+    earlier = Bench(tmp_path).sample().drive(60).stop()
+    first = earlier.write(tmp_path / "a.mcap", run="first")
+    second = Bench(tmp_path, memory=earlier.state.memory).drive(60).stop().write(tmp_path / "b.mcap", run="second")
+    for logs in ([first, second], [second]):
+        result = audit(logs)
+        assert result.ok, result.text()
+        assert result.recomputed["discrepancies"] > 50
+        assert bool(result.missing) == (logs == [second]), "alone it says that gap and certificate are from an earlier log"
+    shrunk = msgspec.structs.replace(earlier.state.memory, gap=msgspec.structs.replace(earlier.state.memory.gap, radius=1e-6))
+    third = Bench(tmp_path, memory=shrunk).stop().write(tmp_path / "c.mcap", run="third")
+    result = audit([first, third])
+    assert result.first_difference is not None
+    assert "the memory has another gap of epoch 1" in result.first_difference.what
 
 
 def test_damage_is_named_and_nothing_behind_it_is_believed(run: Any, tmp_path: Path) -> None:
