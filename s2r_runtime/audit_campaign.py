@@ -69,7 +69,7 @@ class CampaignReplay:
     def start(self, order: StartCampaign, settings: Settings, sampling: Sampling) -> None:
         """A campaign begins, or goes on."""
         self._order, self._dt_ns = order, settings.dt_ns
-        self._campaign = None
+        self._campaign, self._doubtful = None, False
         self._due.clear()
         self._asked.clear()
         try:
@@ -131,12 +131,9 @@ class CampaignReplay:
         if send.source == "recovery" and self._campaign is not None:
             self._campaign.refused(send.obs_seq, self._reason)
 
-    def interrupted(self) -> None:
-        """What the daemon did with its orders cannot be told any more (the disk refused the log)."""
-        if self._campaign is not None:
-            self._findings.cannot("a campaign was under way while the log could not be written")
-        self._campaign = None
-        self._due.clear()
+    def doubted(self) -> None:
+        """The disk refused the log: orders that had to be durable first may not have been carried out."""
+        self._doubtful = self._campaign is not None
 
     # ---- what is recorded
 
@@ -196,7 +193,10 @@ class CampaignReplay:
     def _compare(self, entry: Entry, event: SampleTaken | Proposed | SourceStopped, what: str) -> None:
         due = self._due.popleft() if self._due else None
         if due != event:
-            self._findings.differ(entry.index, entry.channel, "the campaign gives something else here", entry.raw, due)
+            if self._doubtful:
+                self._findings.cannot(f"what campaign {self._order.epoch if self._order else 0} did while the log could not be written")
+            else:
+                self._findings.differ(entry.index, entry.channel, "the campaign gives something else here", entry.raw, due)
             self._campaign = None
             return
         self._findings.count(what)

@@ -156,10 +156,12 @@ class RunAudit:
                 self._campaigns.started(entry, event)
             case SourceStopped(source="sampler"):
                 self._campaigns.stopped(entry, event)
+            case SourceStopped(source="controller", reason="start_failed"):
+                self._watch.doubted()
             case AnalyticsChanged(up=up):
                 self._watch.analytics(up=up)
             case RecorderChanged(ok=False):
-                self._campaigns.interrupted()
+                self._campaigns.doubted()
             case CertificateStored():
                 self._stored(entry, event)
             case _:

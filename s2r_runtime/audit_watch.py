@@ -34,16 +34,21 @@ class WatchReplay:
         self._due: deque[Measured] = deque()
         """t_ns: of the observation."""
         self._lockstep = False
+        self._sure = True
 
     def begin(self, model: ComposedModel, gap: Gap, fault_jump: float, memory: Memory, *, lockstep: bool) -> None:
         """A controller starts. memory: the core's, which says where this epoch's watch stands."""
-        self._lockstep = lockstep
+        self._lockstep, self._sure = lockstep, True
         self._begun, self._memory = (model, gap, fault_jump), memory
         self._start()
 
     def end(self) -> None:
         """It is stopped; what was measured before may still come."""
         self._begun, self._stream = None, None
+
+    def doubted(self) -> None:
+        """The controller did not start; whether the watch had been told to begin cannot be seen."""
+        self._sure = False
 
     def analytics(self, *, up: bool) -> None:
         """The process died, or is there again."""
@@ -86,7 +91,7 @@ class WatchReplay:
 
     def _demand(self, entry: Entry, t_ns: int) -> None:
         """While a controller is watched, what is due must have come by now."""
-        if self._due and (self._lockstep or t_ns - self._due[0].t_ns > OVERDUE_NS):
+        if self._sure and self._due and (self._lockstep or t_ns - self._due[0].t_ns > OVERDUE_NS):
             self._findings.differ(entry.index, entry.channel, "a discrepancy before this is not recorded", None, self._due[0])
             self._due.clear()
 
