@@ -19,9 +19,11 @@ from s2r_runtime.audit_certificates import Certificates
 from s2r_runtime.audit_evidence import Evidence
 from s2r_runtime.audit_findings import CertificateFinding, Difference, Findings
 from s2r_runtime.audit_run import Across, RunAudit
+from s2r_runtime.blocks import find
 from s2r_runtime.channels import UNRECORDED, Unrecorded
+from s2r_runtime.errors import RecordingError
 from s2r_runtime.layout import ABOUT, RECOVERED
-from s2r_runtime.logs import runs
+from s2r_runtime.logs import is_log, runs
 from s2r_runtime.reading import Reading
 from s2r_runtime.recording import environment
 
@@ -89,7 +91,11 @@ def audit(
     evidence = Evidence(findings, rerun=rerun_controllers, progress=tell.detail)
     across = Across(findings, CampaignReplay(findings), evidence, Certificates(findings, evidence), trusted, rerun_controllers)
     readings: list[Reading] = []
-    for parts in runs(paths):
+    try:
+        grouped = runs(paths)
+    except RecordingError as error:
+        return _damaged(paths, error)
+    for parts in grouped:
         readings += parts
         _run(RunAudit(across), parts, findings, tell)
     across.campaigns.end()
@@ -110,6 +116,22 @@ def audit(
         unchecked=list(findings.unchecked),
         files=[reading.path.name for reading in readings],
     )
+
+
+def _damaged(paths: Sequence[Path], error: RecordingError) -> AuditResult:
+    """What is said of a log whose very start is damaged. Raises the error again if none of the files is one."""
+    for path in paths:
+        if is_log(path):
+            continue
+        if not path.is_file():
+            raise error
+        with path.open("rb") as file:
+            if find(file, 0, path.stat().st_size) is None:
+                raise error
+        where = Difference(path.name, 0, "log/chain", f"the log is damaged: {error}", "nothing", "nothing")
+        names = [one.name for one in paths]
+        return AuditResult(False, 0, [], where, 1, [], "broken", "whose it is cannot be read", "", {}, [], names)
+    raise error
 
 
 def _run(run: RunAudit, parts: list[Reading], findings: Findings, tell: _Progress) -> None:

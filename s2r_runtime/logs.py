@@ -29,6 +29,15 @@ def runs(paths: Sequence[Path], channels: Iterable[str] | None = None) -> list[l
     return list(found.values())
 
 
+def is_log(path: Path) -> bool:
+    """Whether a file begins as a log of this version does (or would, if it were not cut)."""
+    try:
+        Reading(path)
+    except RecordingError:
+        return False
+    return True
+
+
 class Log:
     """One or more files, read once through. Constant memory but for the attachments."""
 

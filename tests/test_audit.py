@@ -7,6 +7,7 @@ those without the key there are test_chain and test_recording.
 from __future__ import annotations
 
 import importlib.util
+import random
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -309,6 +310,21 @@ def test_damage_is_named_and_nothing_behind_it_is_believed(run: Any, tmp_path: P
     assert result.first_difference is not None
     assert "damaged" in result.first_difference.what
     assert result.records == result.first_difference.index
+
+
+def test_no_flipped_bit_passes_an_audit(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.steps(12)
+    data = bench.stop().write(tmp_path / "a.mcap").read_bytes()
+    assert audit([tmp_path / "a.mcap"]).ok
+    rng = random.Random(1)
+    for place in [*range(8 * 40, 8 * 60), *(rng.randrange(8 * len(data)) for _ in range(300))]:
+        flipped = bytearray(data)
+        flipped[place // 8] ^= 1 << place % 8
+        (tmp_path / "b.mcap").write_bytes(flipped)
+        result = audit([tmp_path / "b.mcap"])
+        assert not result.ok or result.missing, place
+        assert result.chain == "broken" or "was cut" in result.missing[0], place
 
 
 def test_what_is_no_log_is_refused_by_name(tmp_path: Path) -> None:
