@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import load_checked, pair
+from s2r_runtime.cli.choices import controller_at, load_checked
 from s2r_runtime.errors import UsageError
 
 
@@ -29,7 +29,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Exit 0 with a certificate written, 1 if the controller did not pass (the attempt is spent all the same)."""
-    from s2r_runtime import certificate, controllers, keys, offline_ledger, persistence
+    from s2r_runtime import certificate, keys, offline_ledger, persistence
     from s2r_runtime import verify as verification
     from s2r_runtime.bounds import attempt_beta, epoch_beta
     from s2r_runtime.canonical import digest
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     model = profile_model(args, profile)
     key_path = args.key or keys.default_path()
     key = keys.load(key_path)
-    controller = controllers.load(args.controller, dict(pair(i, "--param") for i in args.param))
+    controller = controller_at(args.controller, args.param)
     try:
         recording = digest(args.recording.read_bytes())
     except OSError as error:

@@ -13,6 +13,7 @@ from s2r_runtime.modelspec import ModelSpec, load_model
 from s2r_runtime.profile import Profile, check_names, load_profile
 
 if TYPE_CHECKING:
+    from s2r_runtime.controllers import ControllerFile
     from s2r_runtime.models.composed import ComposedModel
 
 
@@ -49,6 +50,15 @@ def chosen_model(args: argparse.Namespace) -> tuple[ComposedModel, Profile | Non
     if args.param:
         spec = msgspec.structs.replace(spec, parameters={**spec.parameters, **dict(pair(item, "--param") for item in args.param)})
     return compose(resolve_source(spec, Path.cwd()), where), profile
+
+
+def controller_at(path: Path, parameters: list[str]) -> ControllerFile:
+    """The controller in that file. Raises UsageError if there is no such file, ConfigError if it is no controller."""
+    from s2r_runtime import controllers
+
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file; a controller is a Python file with control(x, theta, parameters)")
+    return controllers.load(path, dict(pair(item, "--param") for item in parameters))
 
 
 def load_checked(path: Path) -> Profile:

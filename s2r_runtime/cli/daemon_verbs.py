@@ -87,11 +87,22 @@ def _common(verb: argparse.ArgumentParser) -> None:
 
 def run_daemon(args: argparse.Namespace) -> int:
     """Runs until SIGTERM or SIGINT. Exit 0 on a clean end."""
-    from s2r_runtime.daemon import Daemon
+    from s2r_runtime import analytics
     from s2r_runtime.profile import load_profile
 
     profile = load_profile(args.profile)
-    daemon = Daemon(profile, profile_path=args.profile, state_dir=args.state, key_path=args.key, log_dir=args.log, seed=args.seed)
+    child = analytics.start()  # it loads its libraries while the daemon's are loaded here; it ends with this process
+    from s2r_runtime.daemon import Daemon
+
+    daemon = Daemon(
+        profile,
+        profile_path=args.profile,
+        state_dir=args.state,
+        key_path=args.key,
+        log_dir=args.log,
+        seed=args.seed,
+        analytics=child,
+    )
     return daemon.run()
 
 

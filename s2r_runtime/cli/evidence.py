@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import add_model_options, chosen_model, count, load_checked, pair, positive, probability, weights_of
+from s2r_runtime.cli.choices import add_model_options, chosen_model, controller_at, count, load_checked, positive, probability, weights_of
 
 if TYPE_CHECKING:
     from s2r_runtime.controllers import ControllerFile
@@ -106,7 +106,6 @@ def _print_gap(answer: dict[str, Any]) -> None:
 
 def run_verify(args: argparse.Namespace) -> int:
     """Exit 0 if it passed, 1 if it did not."""
-    from s2r_runtime import controllers
     from s2r_runtime import verify as verification
 
     profile = load_checked(args.profile)
@@ -117,7 +116,7 @@ def run_verify(args: argparse.Namespace) -> int:
     hold = epoch_gap.hold_radius * profile.verification.headroom if epoch_gap else args.hold_radius or radius * periods**0.5
     laws = tuple(args.law) if args.law else profile.verification.laws
     result = run_verification(
-        controllers.load(args.controller, dict(pair(i, "--param") for i in args.param)),
+        controller_at(args.controller, args.param),
         model,
         profile,
         radius=radius,
