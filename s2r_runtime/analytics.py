@@ -84,12 +84,18 @@ _DECODE_UP = msgspec.json.Decoder(Upward).decode
 # ---------------------------------------------------------------- in the daemon
 
 
+def start() -> Child:
+    """The process alone, which loads its libraries and waits: half of the daemon's start, if it is begun before the other half."""
+    return Child("s2r_runtime.analytics")
+
+
 class Analytics:
     """The daemon's end. `poll` and `wait` give what came; `down` says why it is no more, or nothing."""
 
-    def __init__(self, profile: Profile, where: str) -> None:
+    def __init__(self, profile: Profile, where: str, child: Child | None = None) -> None:
+        """child: the process, if it was started earlier (see `start`)."""
         self.down = ""
-        self._child = Child("s2r_runtime.analytics")
+        self._child = child or start()
         self._waiting: dict[int, int] = {}  # observation -> host time at which its reply is overdue, ns
         self._child.send(_ENCODE(Setup(profile, where)))
 
@@ -121,8 +127,9 @@ class Analytics:
         self._send(watching)
 
     def sent(self, send: Send) -> None:
-        """The robot was told this."""
-        self._send(send)
+        """The robot was told this. It goes with the next observation: alone it would only wake the process."""
+        if not self.down:
+            self._child.queue(_ENCODE(send))
 
     def observed(self, observation: Observation) -> None:
         """The robot was seen there; a Reply comes."""
@@ -182,6 +189,8 @@ def main(arguments: list[str]) -> int:
     """Reads messages from stdin until it closes."""
     die_with_parent(int(arguments[0]))
     channel = take_stdout()
+    from s2r_runtime.models import composed  # noqa: F401 - loaded before there is anything to do
+
     decode = msgspec.json.Decoder(Downward).decode
     stream: Stream | None = None
     epoch = 0

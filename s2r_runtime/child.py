@@ -64,9 +64,13 @@ class Child:
 
     def send(self, line: bytes) -> None:
         """Hands a line to the child; keeps what it doesn't take yet (see `flush`)."""
+        self.queue(line)
+        self.flush()
+
+    def queue(self, line: bytes) -> None:
+        """As `send`, with the next `flush`."""
         self._pending += line
         self._pending += b"\n"
-        self.flush()
 
     def flush(self) -> None:
         """Hands over what was kept. Called now and then by the loop."""

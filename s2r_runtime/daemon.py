@@ -26,6 +26,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from s2r_runtime import control, core, keys
 from s2r_runtime.actions import Actions
+from s2r_runtime.child import Child
 from s2r_runtime.core_state import State
 from s2r_runtime.desk import Desk
 from s2r_runtime.driver import Driver
@@ -71,7 +72,8 @@ class Daemon:
 
     state_dir: counters, certificates, key (default: the user's state folder, by robot). key_path: signing key (default: one in the state
     folder, made when there is none). log_dir: default as the profile says. log_file: one log of this name instead. listen: whether
-    there is a control socket. on_tick: called with every tick, for whoever runs a daemon in his own process.
+    there is a control socket. on_tick: called with every tick, for whoever runs a daemon in his own process. analytics: that process,
+    if it was started before this module was loaded.
     """
 
     def __init__(
@@ -86,10 +88,12 @@ class Daemon:
         seed: int | None = None,
         listen: bool = True,
         on_tick: Callable[[Daemon], None] | None = None,
+        analytics: Child | None = None,
     ) -> None:
         self.profile, self._profile_path, self.seed = profile, profile_path, seed
         self._state_dir = state_dir or control.state_root() / profile.robot.name
         self._key_path, self._log_file, self._listen, self._on_tick = key_path, log_file, listen, on_tick
+        self._analytics = analytics
         self._log_dir = log_file.parent if log_file else log_dir or self._state_dir / profile.recording.directory
         self.selector = selectors.DefaultSelector()
         self.clock = Clock(lockstep=profile.clock == "lockstep")
@@ -148,7 +152,7 @@ class Daemon:
         self.models = ModelStore(self.folder.path, profile.model)
         self.profile = profile = self.models.in_force(profile, self.memory)
         self.key = self._load_key()
-        self.watcher = Watcher(self.selector, profile, str(self._profile_path), self.feed)
+        self.watcher = Watcher(self.selector, profile, str(self._profile_path), self.feed, self._analytics)
         stack.callback(self.watcher.close)
         transport = registry().get("transports", str(profile.transport.get("name")))
         self.workshop = Workshop(self.selector)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import msgspec
 
 from s2r_runtime.analytics import Analytics, Ready, Refused, Reply, Upward, Watching
+from s2r_runtime.child import Child
 from s2r_runtime.messages import AnalyticsChanged, Event, Measured, Observation, Send
 from s2r_runtime.profile import Profile
 from s2r_runtime.settings import ModelFacts
@@ -82,10 +83,12 @@ class Workshop:
 class Watcher:
     """The analytics process, kept alive. Events come through `emit`; t_ns is the daemon's to give."""
 
-    def __init__(self, selector: selectors.BaseSelector, profile: Profile, where: str, emit: Callable[[Event], None]) -> None:
-        """Starts it at once: what follows goes on while it loads."""
+    def __init__(
+        self, selector: selectors.BaseSelector, profile: Profile, where: str, emit: Callable[[Event], None], child: Child | None = None
+    ) -> None:
+        """Starts it at once: what follows goes on while it loads. child: the process, if it was started earlier."""
         self._selector, self._profile, self._where, self._emit = selector, profile, where, emit
-        self._analytics: Analytics | None = Analytics(profile, where)
+        self._analytics: Analytics | None = Analytics(profile, where, child)
         self._again_ns = 0
         self._ready = False
         self._checks: dict[int, Callable[[str, ModelFacts | None], None]] = {}

@@ -186,46 +186,8 @@ class Rig:
         return path
 
     def certificate(self, controller: Path, *, radius: float = 0.01, verified: float = 0.02, epoch: int = 1) -> str:
-        """A certificate for it, signed with the robot's own key. Its evidence is made up: nothing was sampled or verified."""
-        profile, file = load_profile(self.profile), load(controller)
-        beta, epsilon = profile.guarantee.beta, profile.guarantee.epsilon
-        gap = Gap(
-            radius=radius,
-            radius_literal=radius,
-            hold_radius=radius,
-            hold_periods=5,
-            set="ball",
-            weights=(1.0, 1.0, 0.0525),
-            n=campaign_size(epsilon, share(beta, epoch), 0),
-            discarded=0,
-            epsilon=epsilon,
-            beta=share(beta, epoch),
-            epoch=epoch,
-            model_digest=profile.model.digest(),
-            transitions_digest="sha256:" + "0" * 64,
-        )
-        n = sample_size(profile.verification.epsilon, share(beta, 1))
-        laws = tuple(
-            LawResult(name, n, 0.2, 0, 0.3, 1.0, progress_ok=True, required=True, passed=True) for name in profile.verification.required
-        )
-        verification = Verification(
-            passed=True,
-            radius=verified,
-            hold_radius=verified,
-            threshold=profile.verification.threshold,
-            epsilon=profile.verification.epsilon,
-            beta=share(beta, 1),
-            attempt=1,
-            seed=1,
-            laws=laws,
-            controller_digest=file.digest,
-            model_digest=profile.model.digest(),
-            task_digest=profile.task_digest(),
-        )
-        issued = certificate.issue(
-            profile=profile, controller=file, gap=gap, verification=verification, issued_unix_s=int(time.time()), lifetime_s=3600
-        )
-        return certificate.sign(issued, keys.load(self.state / "key.pem")).decode()
+        """A made-up certificate, signed with the robot's own key."""
+        return made_up_certificate(self.profile, self.state / "key.pem", controller, radius=radius, verified=verified, epoch=epoch)
 
     def deploy(self, controller: Path | None = None, **fields: Any) -> dict[str, Any]:
         """Deploys a controller under a certificate for it."""
@@ -257,3 +219,46 @@ class Rig:
 
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
             sock.sendto(json.dumps(fields).encode(), str(self.folder / "daemon.sock"))
+
+
+def made_up_certificate(profile_path: Path, key: Path, controller: Path, *, radius: float, verified: float, epoch: int) -> str:
+    """A certificate for a controller. Its evidence is made up: nothing was sampled or verified."""
+    profile, file = load_profile(profile_path), load(controller)
+    beta, epsilon = profile.guarantee.beta, profile.guarantee.epsilon
+    gap = Gap(
+        radius=radius,
+        radius_literal=radius,
+        hold_radius=radius,
+        hold_periods=5,
+        set="ball",
+        weights=(1.0, 1.0, 0.0525),
+        n=campaign_size(epsilon, share(beta, epoch), 0),
+        discarded=0,
+        epsilon=epsilon,
+        beta=share(beta, epoch),
+        epoch=epoch,
+        model_digest=profile.model.digest(),
+        transitions_digest="sha256:" + "0" * 64,
+    )
+    n = sample_size(profile.verification.epsilon, share(beta, 1))
+    laws = tuple(
+        LawResult(name, n, 0.2, 0, 0.3, 1.0, progress_ok=True, required=True, passed=True) for name in profile.verification.required
+    )
+    verification = Verification(
+        passed=True,
+        radius=verified,
+        hold_radius=verified,
+        threshold=profile.verification.threshold,
+        epsilon=profile.verification.epsilon,
+        beta=share(beta, 1),
+        attempt=1,
+        seed=1,
+        laws=laws,
+        controller_digest=file.digest,
+        model_digest=profile.model.digest(),
+        task_digest=profile.task_digest(),
+    )
+    issued = certificate.issue(
+        profile=profile, controller=file, gap=gap, verification=verification, issued_unix_s=int(time.time()), lifetime_s=3600
+    )
+    return certificate.sign(issued, keys.load(key)).decode()
