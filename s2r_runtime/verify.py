@@ -159,18 +159,27 @@ def _tell(progress: Progress, law: str, before: int, total: int) -> Callable[[fl
 
 
 def statement(v: Verification) -> str:
-    """What the rollouts show (G2), and no more."""
+    """What the rollouts show (G2, G8), and no more."""
     if not v.passed:
         return f"Not passed: {v.reason}. Nothing is claimed for this controller at radius {v.radius:.6g}."
     required = [r for r in v.laws if r.required]
     named = ", ".join(f"{r.law} (s* = {r.s_star:.4g}, N = {r.n})" for r in required)
     confidence = 1.0 - max(scenario_confidence(r.n, 0, v.epsilon) for r in required)
-    several = " The laws were read side by side: each statement holds by itself at this confidence." if len(required) > 1 else ""
-    return (
+    told = [
         f"Under each of the disturbance laws {named}: with confidence {_percent_down(confidence)} a new rollout of the uncertain model "
         f"(radius {v.radius:.6g}, hold gap {v.hold_radius:.6g}) scores below s* with probability at most {v.epsilon:g}; "
-        f"s* is at least the threshold {v.threshold:g}.{several}"
-    )
+        f"s* is at least the threshold {v.threshold:g}."
+    ]
+    if len(required) > 1:
+        told.append("The laws were read side by side: each statement holds by itself at this confidence.")
+    if [r.law for r in required] == ["uniform"]:
+        told.append("Only uniform was required: nothing is shown about a disturbance that persists.")
+    told += [
+        f"Reported and not required: under {r.law} s* = {r.s_star:.4g}, {r.failures} of {r.n} rollouts below the threshold."
+        for r in v.laws
+        if not r.required
+    ]
+    return " ".join(told)
 
 
 def _percent_down(share: float) -> str:

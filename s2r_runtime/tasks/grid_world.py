@@ -4,10 +4,11 @@ s = -1 if the robot's disc touched an obstacle cell, a moving obstacle or the ar
 distance travelled along the shortest feasible path to the nearest goal, m: that path's length from the start cell less
 that from the robot's cell at the end, not below 0. So s >= 0 iff it was safe. A scenario ends when the robot's centre is in a goal cell.
 
-The law. Static, goal and start cells are distinct and uniform, given that a goal can be reached from the start over the four neighbours.
-The robot starts at rest, uniform in the start cell given that its clearance is at least `start_clearance`, heading uniform; every
-state other than x, y, theta is 0. Moving obstacles start at the centres of distinct cells, uniform over those that are left and at
-least `clear_cells` (Chebyshev) from the start cell, and move as `movers` says.
+The law. Static, goal and start cells are distinct and uniform, the robot's place uniform in the start cell, its heading uniform;
+all of that given that a goal can be reached from the start over the four neighbours and that the robot's clearance from walls and
+obstacles is at least `start_clearance`. It starts at rest; states other than x, y, theta are 0. Moving obstacles start at the
+centres of distinct cells, uniform over those that are left and at least `clear_cells` (Chebyshev) from the start cell, and move as
+`movers` says.
 """
 
 from __future__ import annotations
@@ -124,13 +125,13 @@ class GridWorld:
         Raises NotEnoughEvidence where the law has none: outside the arena or too near to its wall.
         """
         at = np.asarray(x, dtype=np.float64)[None, :]
-        start, _, _ = self.grid.place(at[:, self._x], at[:, self._y])
         here = f"the robot is at x {at[0, self._x]:.3f}, y {at[0, self._y]:.3f} m"
         empty = np.ones((1, self.grid.size), dtype=np.bool_)
         empty[:, self.grid.inner] = False
         if not np.all(np.isfinite(at)) or self._wall_distance(at, empty)[0] - self._radius < self._start_clearance:
             must = f"inside the arena with its disc at least {self._start_clearance:g} m from the wall"
             raise NotEnoughEvidence(f"task {self.name}: {here}; scenarios start {must}")
+        start, _, _ = self.grid.place(at[:, self._x], at[:, self._y])
 
         def accept(proposed: Layouts) -> Bools:
             states = np.repeat(at, len(proposed.start), axis=0)
