@@ -281,7 +281,7 @@ class Reading:
         """
         self._file.seek(max(0, self.size - _ZEROS))
         cut = damage.cut or self._file.read() == bytes(_ZEROS)
-        if cut and find(self._file, damage.offset + 1, self.size) is None:
+        if cut and find(self._file, self._at + 1, self.size) is None:
             self._end("cut", damage.detail)
         else:
             self._end("broken", f"at byte {damage.offset}: {damage.detail}")
