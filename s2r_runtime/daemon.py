@@ -10,9 +10,8 @@ If something in here breaks, the last act is the recovery command; the exit code
 from __future__ import annotations
 
 import contextlib
-import os
+import gc
 import selectors
-import signal
 import sys
 import time
 import traceback
@@ -22,9 +21,8 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import msgspec
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from s2r_runtime import control, core, keys
+from s2r_runtime import control, core, issuing
 from s2r_runtime.actions import Actions
 from s2r_runtime.child import Child
 from s2r_runtime.core_state import State
@@ -58,10 +56,12 @@ from s2r_runtime.profile import Profile
 from s2r_runtime.robot_link import Clock, Inbound, RobotLink
 from s2r_runtime.sampler import Keeper, Sampler
 from s2r_runtime.settings import ModelFacts, settings_of
+from s2r_runtime.stop_signals import StopSignals
 from s2r_runtime.systemd import Notifier
 from s2r_runtime.workshop import Watcher, Workshop
 
 TICK_NS = 20_000_000
+ROUND_NS = 100_000_000
 WALL_CLOCK_NS = 1_000_000_000
 NEW_LOG_NS = 2_000_000_000
 """Between two attempts to begin a new log after the old one lost a message."""
@@ -108,8 +108,7 @@ class Daemon:
         self._last_ns = 0
         self._numbers = 0
         self._recorder_ok, self._link_up = True, False
-        self._next_tick_ns = self._next_wall_ns = self._next_log_ns = 0
-        self._signal = ""
+        self._next_tick_ns = self._next_round_ns = self._next_wall_ns = self._next_log_ns = 0
         self._ended = ""
 
     # ------------------------------------------------------------------ life
@@ -118,6 +117,8 @@ class Daemon:
         """Serves until SIGTERM or SIGINT (0), or until `end`. Raises ConfigError for what makes a start impossible."""
         with ExitStack() as stack:
             self._open(stack)
+            gc.collect()
+            gc.freeze()  # what is there now stays: collections while a robot is driven have little to look at
             try:
                 self._turn()
                 self._finish()
@@ -146,12 +147,12 @@ class Daemon:
         profile = self.profile
         stack.callback(self.selector.close)
         stack.callback(self.notifier.close)
-        self._catch_signals(stack)
+        self._signals = stack.enter_context(StopSignals(self.selector))
         self.folder = stack.enter_context(StateFolder(self._state_dir, profile.robot.name))
         self.memory = self.folder.memory(self._log_dir.glob(f"{profile.robot.name}-*.mcap") if self._log_file is None else ())
         self.models = ModelStore(self.folder.path, profile.model)
         self.profile = profile = self.models.in_force(profile, self.memory)
-        self.key = self._load_key()
+        self.key = issuing.signing_key(self._key_path, self.folder.path, self.say)
         self.watcher = Watcher(self.selector, profile, str(self._profile_path), self.feed, self._analytics)
         stack.callback(self.watcher.close)
         transport = registry().get("transports", str(profile.transport.get("name")))
@@ -200,32 +201,10 @@ class Daemon:
             ("model.toml", "application/toml", dump_model(self.profile.model).encode()),
         ]
 
-    def _load_key(self) -> Ed25519PrivateKey:
-        path = self._key_path or self.folder.path / "key.pem"
-        if self._key_path is None and not path.exists():
-            keys.new(path)
-            self.say(f"made a signing key for this robot: {path}; give {keys.public_path(path)} to whoever audits its logs")
-        return keys.load(path)
-
-    def _catch_signals(self, stack: ExitStack) -> None:
-        """SIGTERM and SIGINT end the loop. A pipe wakes it up: the handler itself runs between two lines of anything."""
-        reading, writing = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-
-        def handler(number: int, _frame: object) -> None:
-            self._signal = signal.Signals(number).name
-            with contextlib.suppress(OSError):
-                os.write(writing, b"!")
-
-        for number in (signal.SIGTERM, signal.SIGINT):
-            stack.callback(signal.signal, number, signal.signal(number, handler))
-        stack.callback(os.close, writing)
-        stack.callback(os.close, reading)
-        self.selector.register(reading, selectors.EVENT_READ, lambda _: os.read(reading, 100))
-
     # ------------------------------------------------------------------ the loop
 
     def _turn(self) -> None:
-        while not (self._signal or self._ended):
+        while not (self._signals.name or self._ended):
             due_ns = self._next_tick_ns if self.driver.due_ns is None else min(self._next_tick_ns, self.driver.due_ns)
             for key, mask in self.selector.select(max(0, due_ns - time.monotonic_ns()) * 1e-9):
                 key.data(mask)
@@ -240,16 +219,22 @@ class Daemon:
             self.feed(change)
         self.driver.poll(now_ns)
         self.watcher.tick(now_ns)
+        if now_ns >= self._next_round_ns:
+            self._next_round_ns = now_ns + ROUND_NS
+            self._go_round(now_ns)
+        self.feed(Ticked(0))
+        if self._on_tick is not None:
+            self._on_tick(self)
+
+    def _go_round(self, now_ns: int) -> None:
+        """What need not be looked at every 20 ms."""
         self.workshop.tick(now_ns)
         self._look_at_log(now_ns)
         self.actions.tick(now_ns)
         if now_ns >= self._next_wall_ns:
             self._next_wall_ns = now_ns + WALL_CLOCK_NS
             self.feed(WallClockRead(0, int(time.time())))
-        self.feed(Ticked(0))
         self.desk.tick(now_ns)
-        if self._on_tick is not None:
-            self._on_tick(self)
         self.notifier.alive(now_ns)
         self.notifier.status(f"gate {'open' if self.state.gate_open else 'closed'} ({self.state.gate_reason})")
 
@@ -358,7 +343,7 @@ class Daemon:
     def _finish(self) -> None:
         """An orderly end: the recovery command is out and the memory is kept before anything is closed."""
         self.notifier.stopping()
-        self._end_sources(self._signal or self._ended)
+        self._end_sources(self._signals.name or self._ended)
 
     def _last_act(self) -> None:
         """Something here broke. Nothing is asked any more, nothing decided: the robot is told to recover, as its profile says."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,19 @@ from s2r_runtime.messages import CertificateFailed, CertificateStored, Gap, Issu
 from s2r_runtime.persistence import replace
 
 if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
     from s2r_runtime.daemon import Daemon
+
+
+def signing_key(path: Path | None, state: Path, say: Callable[[str], None]) -> Ed25519PrivateKey:
+    """The key at `path`; or the robot's own in the state folder, made when it has none. Raises ConfigError if it is no good."""
+    if path is None:
+        path = state / "key.pem"
+        if not path.exists():
+            public = keys.new(path)
+            say(f"made a signing key for this robot: {path}; give {public} to whoever audits its logs")
+    return keys.load(path)
 
 
 def issue(daemon: Daemon, order: IssueCertificate) -> CertificateStored | CertificateFailed:
