@@ -23,6 +23,7 @@ from s2r_runtime.errors import ControllerError, NotEnoughEvidence, UsageError
 from s2r_runtime.hookspecs import Task
 from s2r_runtime.messages import LawResult, Verification
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.statements import confidence, worst
 from s2r_runtime.uncertain import LAWS, Array, Control, GapSet, Rollouts, roll_out
 
 Progress = Callable[[float, float, str], None]
@@ -163,28 +164,25 @@ def statement(v: Verification) -> str:
     if not v.passed:
         return f"Not passed: {v.reason}. Nothing is claimed for this controller at radius {v.radius:.6g}."
     required = [r for r in v.laws if r.required]
-    named = ", ".join(f"{r.law} (s* = {r.s_star:.4g}, N = {r.n})" for r in required)
-    confidence = 1.0 - max(scenario_confidence(r.n, 0, v.epsilon) for r in required)
+    named = ", ".join(f"{r.law} (s* = {worst(r.s_star)}, N = {r.n})" for r in required)
+    attained = max(scenario_confidence(r.n, 0, v.epsilon) for r in required)
     told = [
-        f"Under each of the disturbance laws {named}: with confidence {_percent_down(confidence)} a new rollout of the uncertain model "
-        f"(radius {v.radius:.6g}, hold gap {v.hold_radius:.6g}) scores below s* with probability at most {v.epsilon:g}; "
-        f"s* is at least the threshold {v.threshold:g}."
+        (
+            f"Under each of the disturbance laws {named}: with confidence {confidence(attained)} a new rollout of the uncertain model "
+            f"(radius {v.radius:.6g}, hold gap {v.hold_radius:.6g}) scores below s* with probability at most {v.epsilon:g}; "
+            f"s* is at least the threshold {v.threshold:g}."
+        )
     ]
     if len(required) > 1:
         told.append("The laws were read side by side: each statement holds by itself at this confidence.")
     if [r.law for r in required] == ["uniform"]:
         told.append("Only uniform was required: nothing is shown about a disturbance that persists.")
     told += [
-        f"Reported and not required: under {r.law} s* = {r.s_star:.4g}, {r.failures} of {r.n} rollouts below the threshold."
+        f"Reported and not required: under {r.law} s* = {worst(r.s_star)}, {r.failures} of {r.n} rollouts below the threshold."
         for r in v.laws
         if not r.required
     ]
     return " ".join(told)
-
-
-def _percent_down(share: float) -> str:
-    """A confidence in per cent, rounded down: no statement is rounded up."""
-    return f"{int(share * 10000) / 100:.2f} %"
 
 
 def not_shown() -> list[str]:
