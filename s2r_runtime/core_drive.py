@@ -70,12 +70,10 @@ def latch(turn: Turn, reason: str) -> None:
 
 
 def recover_now(turn: Turn) -> None:
-    """Sends the recovery command at once: as the answer to a pending instant if there is one. In lockstep only so, because there
-    the robot takes one command per observation.
+    """Sends the recovery command at once: as the answer to the instant that waits for one, if there is one. In lockstep only so,
+    because there the robot takes one command per observation.
     """
-    if turn.state.asked is not None:
-        _send_recovery(turn, turn.state.asked.obs_seq)
-    elif not (turn.settings.lockstep and turn.state.answered):
+    if not (turn.settings.lockstep and turn.state.answered):
         _send_recovery(turn, -1 if turn.state.control_seq is None else turn.state.control_seq)
 
 
@@ -156,12 +154,15 @@ def _trouble(turn: Turn, observation: Observation) -> str:
     if not restarted:
         turn.set(odd_seq=observation.seq)
         return "observation_out_of_order"
+    close(turn, "observation_out_of_order")  # another robot, for all that is known: the gate settles anew
     forget_observations(turn)
     return ""
 
 
 def forget_observations(turn: Turn) -> None:
-    """The robot's sequence and stamps begin anew: link lost, clock stepped back, robot restarted."""
+    """The robot's sequence and stamps begin anew: link lost, clock stepped back, robot restarted. Nobody answers the old ones."""
+    if turn.state.asked is not None:
+        recover_now(turn)
     turn.set(observation=None, trouble="", seen_seq=None, odd_seq=None, control_seq=None, control_stamp_ns=None, answered=True)
 
 

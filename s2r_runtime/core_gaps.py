@@ -183,8 +183,7 @@ def measured(turn: Turn, event: Measured) -> None:
         return
     usable = gate.finite(event.discrepancy) and event.discrepancy >= 0.0 and gate.finite(event.e_value) and event.e_value >= 0.0
     if event.fault or not usable:
-        if turn.state.deployment is not None:
-            turn.set(faults=turn.state.faults + 1)
+        turn.set(faults=turn.state.faults + 1)  # a deployment that begins counts from 0
         regate(turn)
         return
     counted = {"watch_n": event.n, "watch_exceedances": event.exceedances, "watch_e_value": event.e_value}

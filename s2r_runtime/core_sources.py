@@ -37,10 +37,9 @@ def end_deployment(turn: Turn, reason: str, text: str, *, exit_code: int = 1, te
     deployment = turn.state.deployment
     if deployment is None:
         return
-    asked = turn.state.asked
     turn.set(deployment=None, faults=0, ended=reason if reason in gate.REASONS else "")
     regate(turn)
-    if asked is not None and asked.source == "controller" and turn.state.asked is not None:
+    if turn.state.asked is not None and turn.state.asked.source == "controller":
         recover_now(turn)
     if tell and deployment.stage != "verifying":
         turn.emit(StopController(turn.now, reason))
@@ -157,20 +156,14 @@ def halt(turn: Turn, reason: str, detail: str = "") -> None:
 def link_changed(turn: Turn, event: LinkChanged) -> None:
     """The link went or came. What was observed before says nothing about after."""
     turn.set(link_up=event.up)
-    if not event.up:
-        asked = turn.state.asked
-        regate(turn)
-        if asked is not None and turn.state.asked is not None:
-            recover_now(turn)
-        forget_observations(turn)
     regate(turn)
+    if not event.up:
+        forget_observations(turn)
 
 
 def clock_stepped_back(turn: Turn) -> None:
     """The monotonic clock went backward: nothing timed by it holds any more. Goes on from the new reading."""
     close(turn, "clock_backwards")
-    if turn.state.asked is not None:
-        recover_now(turn)
     forget_observations(turn)
     turn.set(now_ns=turn.now, unix_ns=min(turn.state.unix_ns, turn.now), permit_until_ns=None, sent=None)
 

@@ -341,7 +341,7 @@ class Law:
                 self.asked, self.asked_ns = output, event.t_ns
             elif isinstance(output, Send):
                 self._send(event, output)
-        assert len(sends) <= 1, "two commands for one event"
+        assert len({send.obs_seq for send in sends}) == len(sends) <= 2, "two commands for one observation"
         if instant and not lockstep:
             assert self.answered or self.asked is not None, "an instant without command or question"
         if isinstance(event, Proposed) and event.command.source == "external":

@@ -147,7 +147,7 @@ def test_a_campaign_begins_only_where_the_sampler_may_drive(event: Event, word: 
 
 
 def test_the_sampler_drives_through_the_gate_and_a_refused_command_becomes_recovery() -> None:
-    rig = Rig()
+    rig = Rig(latching=("input_out_of_bounds",))  # which is about controllers
     rig.sampling()
     assert one(rig.observe(), Ask).source == "sampler"
     assert one(rig.propose((0.2, 3.0), "sampler"), Send) == Send(rig.t, 2, "sampler", (0.2, 3.0), rig.seq, S // 10)
@@ -158,6 +158,7 @@ def test_the_sampler_drives_through_the_gate_and_a_refused_command_becomes_recov
     assert (one(outputs, Send).source, one(outputs, Send).u) == ("recovery", (0.0, 0.0))
     rig.observe((2.5, 0.0, 0.0))
     assert one(rig.propose((0.0, 0.0), "sampler"), Decided).reason == "outside_geofence"
+    assert rig.state.memory.latched == ()
     assert rig.state.campaign is not None
     assert not rig.state.gate_open
 
@@ -199,7 +200,9 @@ def test_an_interrupted_campaign_goes_on_in_its_epoch_at_no_cost(event: Event, r
     rig.feed(RecorderChanged(rig.t, ok=True))
     rig.t = max(rig.t, event.t_ns)
     rig.request("clear", text="emergency_stop")
-    again = one(rig.sampling(), StartCampaign)
+    outputs = rig.sampling()
+    assert kinds(outputs) == ["StartCampaign"]  # nothing is spent
+    again = one(outputs, StartCampaign)
     assert again == msgspec.structs.replace(begun, t_ns=again.t_ns, resume=True)
     assert rig.state.memory.epochs == 1
 
@@ -222,8 +225,16 @@ def test_cancelling_gives_the_epoch_up_for_good() -> None:
     assert answers(rig)[2][0].exit_code == 1
     assert one(rig.sampling(), StartCampaign).epoch == 2
     rig.request("stop")
-    assert one(rig.request("cancel"), Answer).exit_code == 0  # an interrupted one
+    assert kinds(rig.request("cancel")) == ["Persist", "Answer"]  # an interrupted one
     assert one(rig.request("cancel"), Answer).exit_code == 2
+
+
+def test_a_campaign_that_ends_between_two_questions_sends_nothing() -> None:
+    for event in (CampaignFinished(2 * S, 1, 3, complete=False, rejected={}), Requested(2 * S, 9, "cancel", 1)):
+        rig = Rig()
+        rig.sampling()
+        assert of(rig.feed(event), Send) == []
+    assert rig.feed(SampleTaken(2 * S, 1, 0, 1, 1, (0.0, 0.0), (0.0,) * 3, (0.0,) * 3, (), 1)) == []
 
 
 def test_a_campaign_that_ends_early_founds_no_gap() -> None:
@@ -289,8 +300,19 @@ def test_a_sampler_that_nobody_asked_for_is_stopped() -> None:
     assert rig.feed(SourceStopped(rig.t, "sampler", "stopped")) == []
     rig.sampling()
     assert rig.feed(SourceStopped(rig.t, "sampler", "finished")) == []  # CampaignFinished says the rest
+
+
+def test_a_campaign_and_a_deployment_exclude_each_other() -> None:
+    rig = Rig(memory())
+    rig.sampling()
     assert one(rig.request("sample"), Answer).exit_code == 2
-    assert one(rig.request("deploy", digest="c"), Answer).exit_code == 1
+    assert kinds(rig.request("deploy", digest="controller")) == ["Answer"]
+    assert rig.outputs[-1].exit_code == 1  # type: ignore[union-attr]
+    rig = Rig()
+    rig.driving()
+    rig.request("permit", duration_s=9.0)
+    assert kinds(rig.request("sample")) == ["Answer"]
+    assert rig.outputs[-1].exit_code == 1  # type: ignore[union-attr]
     assert one(Rig(memory()).request("sample", count=-1), Answer).exit_code == 2
 
 
@@ -336,6 +358,9 @@ def test_adopting_a_model_ends_all_that_was_shown_with_the_old_one() -> None:
     assert one(outputs, ModelAdopted) == ModelAdopted(rig.t, "better", 1000)
     assert one(rig.request("adopt", digest="better"), Answer).exit_code == 0
     assert one(rig.request("adopt"), Answer).exit_code == 2
+    same = Rig(memory())
+    assert kinds(same.request("adopt", digest="model")) == ["Answer"]
+    assert same.state.memory == memory()
     assert one(rig.request("deploy", digest="controller"), Answer).exit_code == 1
 
 

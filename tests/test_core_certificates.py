@@ -256,7 +256,10 @@ def test_undeploying_answers_whoever_waits_and_what_was_paid_for_stays() -> None
     rig.gap()
     rig.request("deploy", digest="controller")
     assert one(rig.request("deploy", digest="controller"), Answer).exit_code == 2
-    assert [a.exit_code for a in of(rig.request("undeploy"), Answer)] == [1, 0]
+    rig.feed(SourceStopped(rig.t, "controller", "died"))  # an earlier one's
+    outputs = rig.request("undeploy")
+    assert kinds(outputs) == ["GateChanged", "Answer", "Answer"]
+    assert [a.exit_code for a in of(outputs, Answer)] == [1, 0]
     assert one(rig.request("undeploy"), Answer).exit_code == 2
     assert one(rig.request("verify", digest="controller"), Answer).exit_code == 1  # one is still running
     rig.verified()
@@ -352,6 +355,16 @@ def test_revoking_stops_the_controller_after_the_robot_was_told() -> None:
     rig.verified()
     rig.stored()
     assert "1 certificates" in one(rig.request("revoke"), Answer, last=True).text
+
+
+def test_revoking_another_controllers_certificate_stops_nobody() -> None:
+    rig = Rig()
+    rig.driving()
+    rig.request("verify", digest="next")
+    rig.verified()
+    rig.stored()
+    assert kinds(rig.request("revoke", text="c2")) == ["Revoked", "Persist", "Answer"]
+    assert rig.state.gate_open
 
 
 def loaded(epoch: int = 1, transitions: str = "transitions", **changes: Any) -> CertificateStored:

@@ -151,6 +151,17 @@ def test_a_command_that_was_lost_on_its_way_goes_out_again_the_same() -> None:
     assert sources(rig.repeat()) == ["recovery"]
 
 
+def test_a_lost_command_does_not_go_out_again_while_the_gate_settles() -> None:
+    rig = lockstep()
+    rig.driving()
+    rig.observe()
+    rig.propose()
+    rig.feed(AnalyticsChanged(rig.t, up=False))
+    rig.feed(AnalyticsChanged(rig.t, up=True))
+    rig.repeat()
+    assert sources(rig.repeat()) == ["recovery"]
+
+
 def test_a_samplers_lost_command_goes_out_again_while_it_may_drive() -> None:
     rig = lockstep()
     rig.sampling()
@@ -256,6 +267,26 @@ def test_a_second_answer_closes_the_gate_and_a_late_one_is_only_refused() -> Non
     assert (one(outputs, Decided).reason, sources(outputs)) == ("command_out_of_order", ["recovery"])
     assert kinds(rig.propose()) == ["Decided"]
     assert kinds(rig.propose(source="sampler")) == ["Decided"]
+
+
+def test_a_stray_answer_while_the_gate_settles_leaves_the_question_open() -> None:
+    rig = Rig()
+    rig.deployed()
+    rig.observe()
+    assert kinds(rig.propose(obs_seq=1)) == ["Decided"]
+    assert kinds(rig.propose(source="sampler")) == ["Decided"]
+    assert sources(rig.propose()) == ["recovery"]
+
+
+def test_only_what_closed_an_open_gate_latches() -> None:
+    rig = Rig(latching=("link_down", "no_controller", "observation_missing", "observation_stale"))
+    rig.observe()
+    rig.feed(Ticked(rig.t + S))
+    assert rig.state.memory.latched == ()
+    rig.t += S
+    rig.driving()
+    rig.feed(Ticked(rig.t + S))
+    assert rig.state.memory.latched == ("observation_stale",)
 
 
 @pytest.mark.parametrize("source", ["external", "recovery"])

@@ -69,6 +69,7 @@ def test_a_stop_ends_the_silence_and_the_robot_settles_once_more() -> None:
     assert one(rig.request("stop"), Send).obs_seq == rig.seq
     assert [len(of(rig.observe(), Send)) for _ in range(7)] == [1, 1, 1, 1, 1, 0, 0]
     assert sources(rig.request("stop")) == ["recovery"]
+    assert rig.state.memory.latched == ("emergency_stop",)
 
 
 def test_in_lockstep_a_robot_that_has_its_answer_is_stopped_with_the_next_one() -> None:
@@ -173,6 +174,12 @@ def test_the_stamp_of_an_unusable_observation_may_be_anything() -> None:
     rig = Rig()
     rig.observe((), stamp_ns=10**18, fault="malformed")  # the very first
     assert [len(of(rig.observe(), Send)) for _ in range(3)] == [1, 1, 1]
+    rig = lockstep()  # the robot waits at each of them
+    rig.observe()
+    rig.observe((), stamp_ns=10**18, fault="malformed")
+    assert [len(of(rig.observe((), fault="malformed"), Send)) for _ in range(3)] == [1, 1, 1]
+    rig.feed(Observed(rig.t, Observation(rig.seq, rig.t, (), "malformed")))
+    assert rig.state.trouble == "observation_invalid"
 
 
 def test_outside_the_certified_region_the_recovery_controller_drives() -> None:
@@ -234,9 +241,16 @@ def test_a_robot_that_started_anew_is_taken_for_what_it_is() -> None:
     old(rig, 0, 5)
     assert rig.state.observation.seq == seen
     rig.t += 1
-    assert one(old(rig, 1, 10), Ask).obs_seq == 1
+    outputs = old(rig, 1, 10)
+    assert one(outputs, Ask).obs_seq == 1
+    assert of(outputs, Send) == []
     assert sources(rig.propose()) == ["recovery"]  # settling anew
     assert one(old(rig, 2, 10 + DT), Ask).obs_seq == 2
+    rig.t += S // 5 + 1
+    outputs = old(rig, 0, 3)  # and once more, while the question is open
+    assert not rig.state.gate_open
+    assert (one(outputs, Send).source, one(outputs, Send).obs_seq) == ("recovery", 2)
+    assert one(outputs, Ask).obs_seq == 0
 
     rig = lockstep()  # lockstep: when it repeats itself, waiting
     rig.driving()

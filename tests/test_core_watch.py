@@ -157,5 +157,6 @@ def test_measurement_faults_do_not_grow_the_gap_and_too_many_close_the_gate(chan
     outputs = rig.measure(**changes)
     assert (one(outputs, GateChanged).reason, sources(outputs)) == ("measurement_faults", ["recovery"])
     assert rig.state.memory.radius == 0.01
+    assert rig.state.faults == 3
     rig.request("clear", text="measurement_faults")
     assert reopen(rig) == 3
