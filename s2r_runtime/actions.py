@@ -9,6 +9,7 @@ the event that says so, and the gate hears that the recorder failed.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 KEPT_CONTROLLERS = 8
 """Loaded controllers that are remembered; a deployment that comes later loads its own again."""
+KEPT_EPISODES = 1000
 SAVE_AGAIN_NS = 1_000_000_000
 TRACE_TIMEOUT_S = 600.0
 GAP_TIMEOUT_S = 300.0
@@ -45,7 +47,7 @@ class Actions:
         self.last_sent = 0
         self._reason = ""
         self.results: dict[str, Any] = {}
-        self.episodes: list[m.EpisodeEnded] = []
+        self.episodes: deque[m.EpisodeEnded] = deque(maxlen=KEPT_EPISODES)
         self._memory: m.Memory | None = None
         self._save_again_ns = 0
         self._controllers: dict[str, ControllerFile] = {}

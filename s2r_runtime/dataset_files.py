@@ -19,8 +19,11 @@ from s2r_runtime.models.composed import ComposedModel
 MCAP_MAGIC = b"\x89MCAP"
 
 
-def load_dataset(path: Path | str | Sequence[Path | str], model: ComposedModel, columns: Mapping[str, str] | None = None) -> Dataset:
+def load_dataset(
+    path: Path | str | Sequence[Path | str], model: ComposedModel, columns: Mapping[str, str] | None = None, *, epoch: int | None = None
+) -> Dataset:
     """Reads a recording on the model's grid. columns: name in the model -> column of the table. Several paths: parts of one log.
+    epoch: of a log, only what was recorded while that campaign was under way.
 
     Raises RecordingError (unreadable, lacks a column, too slow for the model's dt).
     """
@@ -28,7 +31,7 @@ def load_dataset(path: Path | str | Sequence[Path | str], model: ComposedModel, 
     digests = tuple(_digest(p) for p in paths)
     source = ", ".join(str(p) for p in paths)
     if _is_log(paths[0]):
-        return from_streams(model, _log_segments(paths, model), source, digests, paths)
+        return from_streams(model, _log_segments(paths, model, epoch), source, digests, paths)
     return from_streams(model, _table_segments(paths[0], model, columns or {}), source, digests, paths)
 
 
@@ -63,15 +66,17 @@ def _table_segments(path: Path, model: ComposedModel, columns: Mapping[str, str]
     return given
 
 
-def _log_segments(paths: tuple[Path, ...], model: ComposedModel) -> list[tuple[Stream, Stream]]:
-    from s2r_runtime.messages import Observed, Send
+def _log_segments(paths: tuple[Path, ...], model: ComposedModel, epoch: int | None) -> list[tuple[Stream, Stream]]:
+    from s2r_runtime.messages import CampaignFinished, Observed, Send, StartCampaign
     from s2r_runtime.reading import read
 
     segments: list[tuple[list[tuple[float, ...]], list[tuple[float, ...]]]] = [([], [])]
     stamps: dict[int, tuple[float, int]] = {}
     last_seq, last = -1, -float("inf")
+    row: tuple[float, ...] = ()
     for path in paths:
-        for entry in read(path, ("event/observed", "out/send")):
+        inside = epoch is None
+        for entry in read(path, ("event/observed", "out/send", "out/start_campaign", "event/campaign_finished")):
             message = entry.message
             if isinstance(message, Observed) and not message.observation.fault:
                 o = message.observation
@@ -84,13 +89,20 @@ def _log_segments(paths: tuple[Path, ...], model: ComposedModel) -> list[tuple[S
                 last_seq, last = o.seq, stamp
                 stamps[o.seq] = (stamp, message.t_ns)
                 _expect(len(o.x) == len(model.states), path, f"observations of {len(o.x)} states, the model has {len(model.states)}")
-                segments[-1][0].append((stamp, *o.x))
-            elif isinstance(message, Send) and message.obs_seq in stamps:
+                row = (stamp, *o.x)
+                if inside:
+                    segments[-1][0].append(row)
+            elif isinstance(message, Send) and inside and message.obs_seq in stamps:
                 stamp, asked_ns = stamps[message.obs_seq]
                 _expect(
                     len(message.u) == len(model.inputs), path, f"commands of {len(message.u)} inputs, the model has {len(model.inputs)}"
                 )
                 segments[-1][1].append((stamp + max(message.t_ns - asked_ns, 0) * 1e-9, *message.u))
+            elif isinstance(message, StartCampaign) and message.epoch == epoch:
+                inside = True
+                segments.append(([row] if row else [], []))  # what the campaign is asked first is about this observation
+            elif isinstance(message, CampaignFinished) and message.epoch == epoch:
+                inside = False
     return [(_stream(y, len(model.states)), _stream(u, len(model.inputs))) for y, u in segments]
 
 

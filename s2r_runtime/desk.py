@@ -57,7 +57,7 @@ class Desk:
         self._server: ControlServer | None = None
         self._numbers = 0
         self._waiting: dict[int, tuple[str, Connection | None]] = {}
-        self.answers: dict[int, Answer] = {}
+        self.answers: dict[int, Answer] = {}  # to requests of this process itself
         self._said = (0, "")
         self._postponed: list[tuple[Requested, int]] = []
         self._next_progress_ns = 0
@@ -127,8 +127,9 @@ class Desk:
                 connection.progress(text=answer.text)
             return
         self._waiting.pop(answer.request_id, None)
-        self.answers[answer.request_id] = answer
-        if connection is not None:
+        if connection is None:
+            self.answers[answer.request_id] = answer
+        else:
             connection.answer(answer.exit_code, answer.text, self.result_of(verb))
 
     def result_of(self, verb: str) -> Any:

@@ -108,7 +108,9 @@ def trace(job: TraceJob, progress: Progress) -> Result:
     profile = job.profile
     model = compose(profile.model)
     weights = tuple(profile.norm.weights.get(name, 1.0) for name in model.states)
-    found = trace(load_dataset(job.logs, model), model, seed=job.seed, progress=progress, weights=weights, kind=profile.norm.set)
+    found = trace(
+        load_dataset(job.logs, model, epoch=job.epoch), model, seed=job.seed, progress=progress, weights=weights, kind=profile.norm.set
+    )
     samples = from_samples(job.samples, source=f"campaign of epoch {job.epoch}").digest
     fitted = tuple(dict.fromkeys((*found.spec.fitted_on, samples)))
     text = dump_model(msgspec.structs.replace(found.spec, fitted_on=fitted), found.comments())

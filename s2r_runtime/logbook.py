@@ -17,7 +17,7 @@ from s2r_runtime.profile import Recording
 from s2r_runtime.recorder import Health, Recorder
 from s2r_runtime.recording import Writer
 
-LOCKSTEP_WAIT_S = 10.0
+LOCKSTEP_WAIT_S = 2.0
 """There the robot waits too, so a log that is written slower than messages come may slow the loop down."""
 Attachment = tuple[str, str, bytes]
 
