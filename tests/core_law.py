@@ -11,49 +11,7 @@ from dataclasses import dataclass, field
 import msgspec
 from core_rig import SETTINGS, S, of
 
-from s2r_runtime.messages import (
-    MEMORY_SCHEMA,
-    AnalyticsChanged,
-    Answer,
-    Ask,
-    AttemptSpent,
-    CampaignFinished,
-    CertificateFacts,
-    CertificateStored,
-    Command,
-    Decided,
-    EpochChanged,
-    Event,
-    Gap,
-    GateChanged,
-    IssueCertificate,
-    JobFinished,
-    LinkChanged,
-    Measured,
-    Memory,
-    ModelAdopted,
-    Observation,
-    Observed,
-    Output,
-    OverrideChanged,
-    Persist,
-    Proposed,
-    RecorderChanged,
-    Requested,
-    Revoked,
-    Send,
-    Settings,
-    SourceStarted,
-    SourceStopped,
-    StartCampaign,
-    StartController,
-    Started,
-    StartJob,
-    StopCampaign,
-    StopController,
-    Stopping,
-    WallClockRead,
-)
+from s2r_runtime import messages as m
 
 DT = 100_000_000
 WALK = msgspec.structs.replace(
@@ -80,51 +38,50 @@ FAULTS = ("raised", "died", "deadline", "malformed")
 class Law:
     """What DESIGN 5 allows, from events and outputs alone. `judge` raises AssertionError for what must not have happened."""
 
-    settings: Settings
+    settings: m.Settings
     started: bool = False
     now: int = 0
     unix: tuple[int, int] = (0, 0)
     up: frozenset[str] = frozenset()
     latched: frozenset[str] = frozenset()
     model: str = ""
-    gap: Gap | None = None
+    gap: m.Gap | None = None
     radius: float = 0.0
     alarmed: bool = False
-    stored: tuple[CertificateFacts, ...] = ()
+    stored: tuple[m.CertificateFacts, ...] = ()
     revoked: frozenset[str] = frozenset()
     running: str | None = None
     faults: int = 0
     permit: int | None = None
     sampling: bool = False
-    latest: Observation | None = None
-    latest_ns: int = 0
-    good: Observation | None = None
+    latest: m.Observation | None = None
+    good: m.Observation | None = None
     good_ns: int = -(10**18)
     usable: bool = False
-    asked: Ask | None = None
+    asked: m.Ask | None = None
     asked_ns: int = 0
     clear: int | None = None
     gate: bool = False
     instant: int | None = None
     instant_stamp: int | None = None
     answered: bool = True
-    last: Send | None = None
+    last: m.Send | None = None
     refused: bool = False
     issuing: frozenset[int] = frozenset()
     epochs: int = 0
     attempts: int = 0
     requests: frozenset[int] = frozenset()
     final: frozenset[int] = frozenset()
-    disk: Memory = field(default_factory=lambda: Memory("r", MEMORY_SCHEMA))
+    disk: m.Memory = field(default_factory=lambda: m.Memory("r", m.MEMORY_SCHEMA))
 
-    def judge(self, event: Event, outputs: tuple[Output, ...]) -> None:
+    def judge(self, event: m.Event, outputs: tuple[m.Output, ...]) -> None:
         """One event and what came of it."""
-        if not self.started and not isinstance(event, Started):
-            assert not of(list(outputs), Send)
-            assert all(isinstance(output, Answer) for output in outputs)
+        if not self.started and not isinstance(event, m.Started):
+            assert not of(list(outputs), m.Send)
+            assert all(isinstance(output, m.Answer) for output in outputs)
             self._answers(event, outputs)
             return
-        anew = event.t_ns < self.now or (isinstance(event, LinkChanged) and not event.up)
+        anew = event.t_ns < self.now or (isinstance(event, m.LinkChanged) and not event.up)
         if event.t_ns < self.now:
             self.permit = None
         if anew:
@@ -137,68 +94,68 @@ class Law:
         self._order(outputs)
         self._answers(event, outputs)
         self._clear(event)
-        self.started = self.started and not isinstance(event, Stopping)
+        self.started = self.started and not isinstance(event, m.Stopping)
         self.last = None if anew else self.last  # what is waiting after this may wait where it waited before
 
     # ------------------------------------------------------------------ what is so
 
-    def _facts(self, event: Event, outputs: tuple[Output, ...]) -> None:
+    def _facts(self, event: m.Event, outputs: tuple[m.Output, ...]) -> None:
         match event:
-            case Started():
+            case m.Started():
                 self.started, self.model, self.unix = True, self.settings.model_digest, (event.unix_s, event.t_ns)
                 self.up = frozenset({"recorder", "analytics"})
                 self.running, self.sampling, self.permit, self.asked = None, False, None, None
                 self.gate, self.answered, self.last = False, True, None
                 self._forget()
-            case WallClockRead():
+            case m.WallClockRead():
                 self.unix = (event.unix_s, event.t_ns)
-            case LinkChanged():
+            case m.LinkChanged():
                 self._up("link", event.up)
-            case RecorderChanged():
+            case m.RecorderChanged():
                 self._up("recorder", event.ok)
-            case AnalyticsChanged():
+            case m.AnalyticsChanged():
                 self._up("analytics", event.up)
-            case OverrideChanged():
+            case m.OverrideChanged():
                 self.latched |= {event.kind}
-            case Measured():
+            case m.Measured():
                 self._measured(event)
-            case Observed():
+            case m.Observed():
                 self._observed(event.observation)
-            case SourceStopped(source="controller"):
+            case m.SourceStopped(source="controller"):
                 if self.running is not None and event.reason in FAULTS:
                     self.latched |= {"controller_fault"}
                 self.running = None
-            case SourceStopped(source="sampler") if event.reason != "finished":
+            case m.SourceStopped(source="sampler") if event.reason != "finished":
                 self.sampling = False
-            case CampaignFinished():
+            case m.CampaignFinished():
                 self.sampling = False
-            case SourceStarted(source="controller"):
+            case m.SourceStarted(source="controller"):
                 self.running, self.faults = event.digest, 0
-            case SourceStarted(source="sampler"):
+            case m.SourceStarted(source="sampler"):
                 self.sampling = True
-            case CertificateStored() if event.gap is not None or event.request_id in self.issuing:
+            case m.CertificateStored() if event.gap is not None or event.request_id in self.issuing:
                 self.stored = (*self.stored, event.facts)
-            case Proposed():
+            case m.Proposed():
                 self._proposed(event.command, outputs)
-            case Requested():
+            case m.Requested():
                 self._requested(event)
             case _:
                 pass
         for output in outputs:
             match output:
-                case EpochChanged(gap=gap) if gap is not None:
-                    assert isinstance(event, JobFinished | CertificateStored)
+                case m.EpochChanged(gap=gap) if gap is not None:
+                    assert isinstance(event, m.JobFinished | m.CertificateStored)
                     assert event.gap == gap
                     self.gap, self.radius, self.alarmed = gap, gap.radius, False
-                case ModelAdopted():
+                case m.ModelAdopted():
                     self.model, self.gap = output.digest, None
-                case Revoked():
+                case m.Revoked():
                     self.revoked |= {output.certificate_id}
-                case StopController():
+                case m.StopController():
                     self.running = None
-                case StopCampaign():
+                case m.StopCampaign():
                     self.sampling = False
-                case IssueCertificate():
+                case m.IssueCertificate():
                     self.issuing |= {output.request_id}
                 case _:
                     pass
@@ -210,7 +167,7 @@ class Law:
     def _up(self, what: str, up: bool) -> None:
         self.up = self.up | {what} if up else self.up - {what}
 
-    def _measured(self, event: Measured) -> None:
+    def _measured(self, event: m.Measured) -> None:
         if self.gap is None or self.alarmed or event.epoch not in (0, self.gap.epoch):
             return
         if event.fault or not (math.isfinite(event.discrepancy) and math.isfinite(event.e_value)):
@@ -222,7 +179,7 @@ class Law:
             self.latched |= {"watch_alarm"}
             self.revoked |= {facts.id for facts in self.stored if facts.epoch == self.gap.epoch}
 
-    def _observed(self, seen: Observation) -> None:
+    def _observed(self, seen: m.Observation) -> None:
         lockstep = self.settings.lockstep
         if seen == self.good:
             if lockstep:
@@ -239,8 +196,8 @@ class Law:
         if self.usable:
             self.good, self.good_ns = seen, self.now
 
-    def _proposed(self, command: Command, outputs: tuple[Output, ...]) -> None:
-        decided = of(list(outputs), Decided)
+    def _proposed(self, command: m.Command, outputs: tuple[m.Output, ...]) -> None:
+        decided = of(list(outputs), m.Decided)
         assert len(decided) == 1
         asked = self.asked is not None and (self.asked.source, self.asked.obs_seq) == (command.source, command.obs_seq)
         broken = command.fault or len(command.u) != 2 or not all(map(math.isfinite, command.u))
@@ -249,7 +206,7 @@ class Law:
             if broken and decided[0].reason == "command_invalid":
                 self.latched |= {"command_invalid"}
 
-    def _requested(self, event: Requested) -> None:
+    def _requested(self, event: m.Requested) -> None:
         if event.verb == "stop":
             self.latched |= {"emergency_stop"}
         elif event.verb == "clear":
@@ -302,7 +259,7 @@ class Law:
         }
         return ", ".join(name for name, so in wrong.items() if so)
 
-    def _clear(self, event: Event) -> None:
+    def _clear(self, event: m.Event) -> None:
         """Since when nothing stands against the controller. A refused command of its own counts as something."""
         if self._against_controller() or self.refused:
             self.clear = None
@@ -311,11 +268,11 @@ class Law:
 
     # ------------------------------------------------------------------ what was sent
 
-    def _instant(self, event: Event) -> bool:
+    def _instant(self, event: m.Event) -> bool:
         """Whether this event begins a control instant: an observation in order, at least 0.9 dt after that of the last one. An
         unusable one can be an instant too, but what stamp it has is believed for one period only.
         """
-        if not isinstance(event, Observed) or self.asked is not None:
+        if not isinstance(event, m.Observed) or self.asked is not None:
             return False
         seen, last = event.observation, self.instant_stamp
         if seen == self.good or (self.latest is not None and seen.seq == self.latest.seq):
@@ -328,47 +285,47 @@ class Law:
         fresh = self.good is None or (seen.seq > self.good.seq and seen.stamp_ns > self.good.stamp_ns)
         return fresh and (due or (last is not None and seen.stamp_ns < last))
 
-    def _sends(self, event: Event, outputs: tuple[Output, ...], instant: bool) -> None:
-        lockstep, sends = self.settings.lockstep, of(list(outputs), Send)
-        if instant and isinstance(event, Observed):
+    def _sends(self, event: m.Event, outputs: tuple[m.Output, ...], instant: bool) -> None:
+        lockstep, sends = self.settings.lockstep, of(list(outputs), m.Send)
+        if instant and isinstance(event, m.Observed):
             assert self.answered or lockstep, "an instant before this one got no command"
             self.instant, self.instant_stamp, self.answered = event.observation.seq, event.observation.stamp_ns, False
         for output in outputs:
-            if isinstance(output, GateChanged):
+            if isinstance(output, m.GateChanged):
                 self.gate = output.open
-            elif isinstance(output, Ask):
+            elif isinstance(output, m.Ask):
                 assert self.asked is None
                 self.asked, self.asked_ns = output, event.t_ns
-            elif isinstance(output, Send):
+            elif isinstance(output, m.Send):
                 self._send(event, output)
         assert len({send.obs_seq for send in sends}) == len(sends) <= 2, "two commands for one observation"
         if instant and not lockstep:
             assert self.answered or self.asked is not None, "an instant without command or question"
-        if isinstance(event, Proposed) and event.command.source == "external":
+        if isinstance(event, m.Proposed) and event.command.source == "external":
             assert not sends
-        if isinstance(event, Requested) and event.verb == "stop" and not lockstep:
+        if isinstance(event, m.Requested) and event.verb == "stop" and not lockstep:
             assert sends or event.t_ns < 0
 
-    def _send(self, event: Event, send: Send) -> None:
+    def _send(self, event: m.Event, send: m.Send) -> None:
         s = self.settings
         assert len(send.u) == 2
         assert all(math.isfinite(value) and low <= value <= high for value, (low, high) in zip(send.u, s.input_bounds, strict=True))
         assert 0 <= send.ttl_ns <= s.command_ttl_ns
         again = (
             s.lockstep
-            and isinstance(event, Observed)
+            and isinstance(event, m.Observed)
             and self.last is not None
             and self.last.obs_seq == send.obs_seq
             and self.asked is None
         )
         if send.source == "recovery":
-            if self.latched & {"emergency_stop", "manual_override"} or isinstance(event, Stopping):
+            if self.latched & {"emergency_stop", "manual_override"} or isinstance(event, m.Stopping):
                 assert send.u == (0.0, 0.0)
         elif again:
             assert self.last is not None
             assert (send.u, send.source) == (self.last.u, self.last.source)
         else:
-            assert isinstance(event, Proposed), "a source's command without its proposal"
+            assert isinstance(event, m.Proposed), "a source's command without its proposal"
             self._allowed(event.command, send)
         if send.source == "controller":
             assert not self._against_controller(), self._against_controller()
@@ -383,7 +340,7 @@ class Law:
             assert again or (not s.lockstep and send.source == "recovery"), "a second command for one instant"
         self.asked, self.answered, self.last = None, True, send
 
-    def _allowed(self, command: Command, send: Send) -> None:
+    def _allowed(self, command: m.Command, send: m.Send) -> None:
         assert self.asked is not None, "nobody asked"
         assert (command.source, command.obs_seq, command.u) == (self.asked.source, self.asked.obs_seq, send.u)
         assert (send.source, send.obs_seq) == (command.source, command.obs_seq)
@@ -394,35 +351,35 @@ class Law:
 
     # ------------------------------------------------------------------ order and answers
 
-    def _order(self, outputs: tuple[Output, ...]) -> None:
+    def _order(self, outputs: tuple[m.Output, ...]) -> None:
         """What is spent, and what certifies, is on disk before anything rests on it."""
         for output in outputs:
             match output:
-                case Persist():
+                case m.Persist():
                     assert output.memory.epochs >= self.disk.epochs
                     assert output.memory.attempts >= self.disk.attempts
                     assert set(self.disk.revoked) <= set(output.memory.revoked)
                     self.disk = output.memory
-                case StartCampaign():
+                case m.StartCampaign():
                     assert self.disk.campaign_epoch == output.epoch
                     assert self.disk.epochs >= output.epoch
                     assert output.resume or output.epoch > self.epochs
                     self.epochs = max(self.epochs, output.epoch)
-                case StartJob(kind="verify"):
+                case m.StartJob(kind="verify"):
                     assert self.disk.attempts == output.attempt > self.attempts
                     self.attempts = output.attempt
-                case AttemptSpent():
+                case m.AttemptSpent():
                     assert self.disk.attempts == output.attempt
-                case StartController():
+                case m.StartController():
                     assert output.certificate_id in {facts.id for facts in self.disk.certificates}
                 case _:
                     pass
         assert self.latched <= set(self.disk.latched) or not self.started, "a latch that a restart would forget"
 
-    def _answers(self, event: Event, outputs: tuple[Output, ...]) -> None:
-        if isinstance(event, Requested):
+    def _answers(self, event: m.Event, outputs: tuple[m.Output, ...]) -> None:
+        if isinstance(event, m.Requested):
             self.requests |= {event.request_id}
-        for answer in of(list(outputs), Answer):
+        for answer in of(list(outputs), m.Answer):
             if answer.final:
                 assert answer.request_id in self.requests
                 assert answer.request_id not in self.final, "answered twice"

@@ -295,6 +295,7 @@ class World:
             self.feed(rng.choice([LinkChanged(t, up), RecorderChanged(t, up), AnalyticsChanged(t, up)]))
             self.feed(LinkChanged(t, True))
         else:
+            self.seq += 1  # what is unusable below has a number of its own
             self.feed(
                 [
                     Proposed(t, msgspec.structs.replace(command, source=rng.choice(["external", "recovery"]))),  # type: ignore[list-item]
@@ -303,7 +304,7 @@ class World:
                     SourceStarted(t, "controller", rng.choice(["c1", "another"])),
                     SourceStopped(t, "controller", rng.choice(["died", "finished"])),
                     SourceStarted(t, "sampler", ""),
-                    Observed(t, Observation(recent.seq + 1, t + 1, (math.nan, 0.0, 0.0))),
+                    Observed(t, Observation(self.seq, t + 1, (math.nan, 0.0, 0.0))),
                     Observed(t, Observation(rng.choice([0, recent.seq + 9]), rng.choice([0, 10**15]), (), "malformed")),
                     Observed(t, Observation(max(0, recent.seq - 2), recent.stamp_ns - 2 * DT, (0.0, 0.0, 0.0))),
                     OverrideChanged(t, rng.choice(["emergency_stop", "manual_override"])),  # type: ignore[arg-type]
