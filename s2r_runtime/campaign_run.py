@@ -15,6 +15,8 @@ import msgspec
 
 from s2r_runtime.daemon import Daemon
 from s2r_runtime.errors import UsageError
+from s2r_runtime.messages import Memory
+from s2r_runtime.persistence import read, unseal
 from s2r_runtime.profile import Profile
 
 ROBOT_WITHIN_S = 15.0
@@ -71,7 +73,7 @@ def run_campaign(
     """
     script = _Script(n, permit_s, progress)
     daemon = Daemon(profile, profile_path=profile_path, state_dir=state_dir, log_file=out, seed=seed, on_tick=script)
-    if out.exists() and not daemon.unfinished_campaign():
+    if out.exists() and not _unfinished(daemon.state_dir / "state.json"):
         raise UsageError(f"{out}: is there already, and there is no unfinished campaign to go on with; name another file")
     code = daemon.run()
     log, sampler = daemon.logbook.paths[-1], daemon.sampler
@@ -88,3 +90,8 @@ def run_campaign(
         "rejected": sampler.rejected,
         "gap": msgspec.to_builtins(daemon.actions.results.get("gap")),
     }
+
+
+def _unfinished(file: Path) -> bool:
+    """Whether this state knows of a campaign to go on with. Raises ConfigError if it is damaged."""
+    return file.exists() and unseal(read(file), "state", Memory, str(file)).campaign_epoch > 0

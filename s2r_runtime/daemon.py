@@ -49,11 +49,10 @@ from s2r_runtime.messages import (
     WallClockRead,
 )
 from s2r_runtime.model_store import ModelStore
-from s2r_runtime.modelspec import dump_model
-from s2r_runtime.persistence import StateFolder, read, unseal
+from s2r_runtime.persistence import StateFolder
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import Profile
-from s2r_runtime.robot_link import Clock, Inbound, RobotLink
+from s2r_runtime.robot_link import Clock, Inbound, link_of
 from s2r_runtime.sampler import Keeper, Sampler
 from s2r_runtime.settings import ModelFacts, settings_of
 from s2r_runtime.stop_signals import StopSignals
@@ -63,8 +62,8 @@ from s2r_runtime.workshop import Watcher, Workshop
 TICK_NS = 20_000_000
 ROUND_NS = 100_000_000
 WALL_CLOCK_NS = 1_000_000_000
-NEW_LOG_NS = 2_000_000_000
-"""Between two attempts to begin a new log after the old one lost a message."""
+NEW_LOG_NS = 1_000_000_000
+"""Between two looks whether a new log can begin after the old one lost a message."""
 
 
 class Daemon:
@@ -91,10 +90,10 @@ class Daemon:
         analytics: Child | None = None,
     ) -> None:
         self.profile, self._profile_path, self.seed = profile, profile_path, seed
-        self._state_dir = state_dir or control.state_root() / profile.robot.name
+        self.state_dir = state_dir or control.state_root() / profile.robot.name
         self._key_path, self._log_file, self._listen, self._on_tick = key_path, log_file, listen, on_tick
         self._analytics = analytics
-        self._log_dir = log_file.parent if log_file else log_dir or self._state_dir / profile.recording.directory
+        self._log_dir = log_file.parent if log_file else log_dir or self.state_dir / profile.recording.directory
         self.selector = selectors.DefaultSelector()
         self.clock = Clock(lockstep=profile.clock == "lockstep")
         self.notifier = Notifier()
@@ -107,7 +106,7 @@ class Daemon:
         self._draining = False
         self._last_ns = 0
         self._numbers = 0
-        self._recorder_ok, self._link_up = True, False
+        self._recorder_ok = True
         self._next_tick_ns = self._next_round_ns = self._next_wall_ns = self._next_log_ns = 0
         self._ended = ""
 
@@ -123,8 +122,8 @@ class Daemon:
                 self._turn()
                 self._finish()
             except Exception:  # noqa: BLE001 - a defect of ours: the robot first, then the report
-                traceback.print_exc()
                 self._last_act()
+                self.say(traceback.format_exc())
                 return 70
         return 0
 
@@ -132,15 +131,11 @@ class Daemon:
         """The loop ends with this turn."""
         self._ended = self._ended or why
 
-    def unfinished_campaign(self) -> bool:
-        """Whether there is one to go on with. To be asked before `run`. Raises ConfigError if the state is damaged."""
-        file = self._state_dir / "state.json"
-        return file.exists() and unseal(read(file), "state", Memory, str(file)).campaign_epoch > 0
-
     def say(self, text: str) -> None:
-        """A line for the journal."""
-        sys.stderr.write(f"s2r: {text}\n")
-        sys.stderr.flush()
+        """A line for the journal, if anybody takes it: stderr may be a file on the disk that is full."""
+        with contextlib.suppress(OSError):
+            sys.stderr.write(f"s2r: {text}\n")
+            sys.stderr.flush()
 
     def _open(self, stack: ExitStack) -> None:
         """What takes long comes first and goes on beside the rest: analytics loads the model while the transport is loaded here."""
@@ -148,14 +143,14 @@ class Daemon:
         stack.callback(self.selector.close)
         stack.callback(self.notifier.close)
         self._signals = stack.enter_context(StopSignals(self.selector))
-        self.folder = stack.enter_context(StateFolder(self._state_dir, profile.robot.name))
+        self.folder = stack.enter_context(StateFolder(self.state_dir, profile.robot.name))
         self.memory = self.folder.memory(self._log_dir.glob(f"{profile.robot.name}-*.mcap") if self._log_file is None else ())
         self.models = ModelStore(self.folder.path, profile.model)
         self.profile = profile = self.models.in_force(profile, self.memory)
         self.key = issuing.signing_key(self._key_path, self.folder.path, self.say)
         self.watcher = Watcher(self.selector, profile, str(self._profile_path), self.feed, self._analytics)
         stack.callback(self.watcher.close)
-        transport = registry().get("transports", str(profile.transport.get("name")))
+        registry().get("transports", str(profile.transport.get("name")))  # loaded here, while analytics loads the model
         self.workshop = Workshop(self.selector)
         stack.callback(self.workshop.close)
         self.logbook = Logbook(
@@ -163,11 +158,10 @@ class Daemon:
         )
         self.facts: ModelFacts = self.watcher.facts()
         self.settings = settings_of(profile, profile.model, self.facts, self.seed)
-        options = {name: value for name, value in profile.transport.items() if name != "name"}
-        self.link = RobotLink(transport(options, self.facts.states, self.facts.inputs), self._record_frame)
-        self.logbook.begin(self._attachments())
+        self.link = link_of(self.profile, self.facts, self._record_frame)
+        self.logbook.begin(self._profile_path, self.profile.model)
         stack.callback(self._close_log)
-        stack.callback(self.link.close)
+        stack.callback(self._close_link)
         self.keeper = Keeper(self.folder, self.say)
         stack.callback(self.keeper.close)
         self.sampler = Sampler(self.folder, self.keeper, profile.sampling, lambda: tuple(map(str, self.logbook.paths)), self.next_seq)
@@ -178,28 +172,28 @@ class Daemon:
         if self._listen:
             self.desk.open(control.socket_dir() / f"{profile.robot.name}.sock")
             stack.callback(self.desk.close)
-        self.link.open()
-        self.selector.register(self.link, selectors.EVENT_READ, self._robot_ready)
+        self._open_link()
         if self.memory.gap is not None:
             self.sampler.recall(self.memory.gap.epoch)
         self._begin_run()
         self.notifier.ready("waiting for the robot")
         self.say(f"robot {profile.robot.name!r}: log {self.logbook.paths[-1]}, state {self.folder.path}")
 
+    def _open_link(self) -> None:
+        self.link.open()
+        self.selector.register(self.link, selectors.EVENT_READ, self._robot_ready)
+
+    def _close_link(self) -> None:
+        with contextlib.suppress(KeyError):  # it did not get that far
+            self.selector.unregister(self.link)
+        self.link.close()
+
     def _begin_run(self) -> None:
         """First events of a log, and what the core cannot know of from before."""
         self.state = core.initial()
         self.feed(Started(0, int(time.time()), self.settings, self.memory))
-        if self._link_up:
-            self.feed(LinkChanged(0, up=True, detail="still up"))
         if not self.watcher.up:
             self.feed(AnalyticsChanged(0, up=False, detail="still down"))
-
-    def _attachments(self) -> list[tuple[str, str, bytes]]:
-        return [
-            ("profile.toml", "application/toml", self._profile_path.read_bytes()),
-            ("model.toml", "application/toml", dump_model(self.profile.model).encode()),
-        ]
 
     # ------------------------------------------------------------------ the loop
 
@@ -293,9 +287,8 @@ class Daemon:
 
     def _handle(self, event: Event) -> None:
         t_ns = event.t_ns
-        if isinstance(event, LinkChanged | OverrideChanged):  # a transport's stamps are the host's
-            t_ns = 0
-            self._link_up = event.up if isinstance(event, LinkChanged) else self._link_up
+        if isinstance(event, LinkChanged | OverrideChanged):
+            t_ns = 0  # a transport's stamps are the host's
         elif isinstance(event, EpisodeEnded):
             self.actions.episodes.append(event)
         self._last_ns = max(self._last_ns, t_ns or self.clock.now())
@@ -318,12 +311,21 @@ class Daemon:
             self.log_changed(ok, health.detail or self.actions.unsaved)
         if self.logbook.faulty and now_ns >= self._next_log_ns:
             self._next_log_ns = now_ns + NEW_LOG_NS
-            self._end_sources("the log failed")
-            if self.logbook.again():
-                self.say(f"the log failed ({health.detail}); a new one begins: {self.logbook.paths[-1]}")
-                self.memory = self.state.memory
-                self._recorder_ok = True
-                self._begin_run()
+            if self.logbook.prepare():
+                self._run_anew()
+
+    def _run_anew(self) -> None:
+        """A new run in a new log. What a transport says depends on all that it heard before, so it begins anew as well: the log alone
+        must say what its frames meant.
+        """
+        self._end_sources("the log failed")
+        self._close_link()
+        self.link = link_of(self.profile, self.facts, self._record_frame)
+        self.logbook.switch()
+        self.say(f"a new log begins: {self.logbook.paths[-1]}")
+        self.memory, self._recorder_ok, self.observation = self.state.memory, True, None
+        self._begin_run()
+        self._open_link()
 
     def log_changed(self, ok: bool, detail: str) -> None:
         """The recorder failed, or works again."""

@@ -10,6 +10,9 @@ from collections.abc import Callable, Iterator
 
 from s2r_runtime.hookspecs import Transport
 from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged, Send
+from s2r_runtime.plugins import registry
+from s2r_runtime.profile import Profile
+from s2r_runtime.settings import ModelFacts
 
 Inbound = Observation | Command | LinkChanged | OverrideChanged
 
@@ -114,3 +117,10 @@ class RobotLink:
         if text != self._fault:
             self._fault = text
             yield LinkChanged(time.monotonic_ns(), up=False, detail=text)
+
+
+def link_of(profile: Profile, facts: ModelFacts, record: Callable[[Frame], None]) -> RobotLink:
+    """The link that the profile describes, not opened yet. Raises ConfigError for an unknown transport or a bad option."""
+    options = {name: value for name, value in profile.transport.items() if name != "name"}
+    transport = registry().get("transports", str(profile.transport.get("name")))
+    return RobotLink(transport(options, facts.states, facts.inputs), record)

@@ -327,17 +327,64 @@ def test_full_disk_closes_the_gate_and_room_opens_the_way_again(realtime: Rig) -
     assert realtime.daemon is not None
     realtime.until(lambda: realtime.status()["observation"])
     size = realtime.log_files()[-1].stat().st_size
-    resource.prlimit(realtime.daemon.pid, resource.RLIMIT_FSIZE, (size + 4096, resource.RLIM_INFINITY))
+    limit_files(realtime.daemon.pid, size + 4096)
     realtime.until_status(gate="closed", reason="recorder_down")
     assert "link" in realtime.status()
     realtime.ask("permit", duration_s=60.0)
     assert "recorder_down" in realtime.ask("sample")["text"]
-    resource.prlimit(realtime.daemon.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    limit_files(realtime.daemon.pid, resource.RLIM_INFINITY)
     realtime.until_status(recorder="ok", reason="no_controller")
     assert realtime.stop() == 0
     assert [m.ok for m in realtime.messages("event/recorder_changed") if isinstance(m, RecorderChanged)] == [False, True]
     observed = [m.observation.seq for m in realtime.messages("event/observed") if isinstance(m, Observed)]
     assert observed == list(range(observed[0], observed[-1] + 1))  # nothing recorded was lost meanwhile
+
+
+def test_log_that_had_to_leave_something_out_ends_there_and_a_new_one_begins_when_there_is_room(realtime: Rig) -> None:
+    realtime.start_robot()
+    realtime.start()
+    assert realtime.daemon is not None
+    realtime.until(lambda: realtime.status()["observation"])
+    limit_files(realtime.daemon.pid, 1000)
+    for _ in range(400):
+        realtime.to_daemon(garbage="x" * 60_000)  # a flood that memory cannot hold for long
+    realtime.until(lambda: "memory for the log is full" in realtime.status()["recorder"] or realtime.status()["recorder"])
+    before = len(realtime.applied())
+    time.sleep(3.0)  # it tries again by now
+    assert realtime.status()["reason"] == "recorder_down"
+    assert len(realtime.applied()) > before  # the robot is told to recover all the same
+    limit_files(realtime.daemon.pid, resource.RLIM_INFINITY)
+    realtime.until_status(recorder="ok", gate="closed", reason="no_controller", link=True)
+    assert realtime.stop() == 0
+    first, second = realtime.log_files()
+    assert [entry.message.count > 0 for entry in read(first, ["log/unrecorded"])] == [True]  # type: ignore[attr-defined]
+    assert next(iter(read(second))).channel == "event/started"
+    assert not list(realtime.logs.glob("*-*-*.mcap"))
+    for log in (first, second):
+        found = json.loads(realtime.s2r("audit", str(log), "--key", str(realtime.state / "key.pub"), "--json").stdout)
+        assert found["ok"], found
+
+
+def test_memory_that_the_disk_refuses_closes_the_gate_and_is_saved_when_there_is_room(realtime: Rig) -> None:
+    realtime.start_robot()
+    realtime.start()
+    assert realtime.daemon is not None
+    realtime.until(lambda: realtime.status()["observation"])
+    limit_files(realtime.daemon.pid, 50)
+    assert realtime.ask("stop")["exit_code"] == 0  # stopping is always possible
+    status = realtime.until(lambda: (found := realtime.status())["recorder"] != "ok" and found)
+    assert (status["gate"], status["latched"]) == ("closed", ["emergency_stop"])
+    limit_files(realtime.daemon.pid, resource.RLIM_INFINITY)
+    realtime.until_status(recorder="ok")
+    realtime.until(lambda: (realtime.state / "state.json").exists() and b"emergency_stop" in (realtime.state / "state.json").read_bytes())
+    realtime.kill()
+    realtime.start()
+    assert realtime.status()["latched"] == ["emergency_stop"]
+
+
+def limit_files(pid: int, size: int) -> None:
+    """What a file of that process may grow to: a full disk, but for the error's number."""
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
 
 
 def test_log_is_the_events_in_the_order_in_which_they_were_handled(rig: Rig) -> None:
