@@ -1,0 +1,100 @@
+"""The daemon with the built-in robot over real Zenoh on loopback: robots that freeze, die and lose messages, and uninvited commands."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from daemon_rig import Rig
+
+from s2r_runtime.messages import Decided, LinkChanged, Proposed, Send
+
+pytest.importorskip("s2r_zenoh")
+pytest.importorskip("s2r_standins")
+
+from s2r_zenoh.testing import free_endpoint, session
+
+
+class ZenohRig(Rig):
+    """As `Rig`, with the built-in robot in lockstep and a profile that reaches it."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.endpoint, self.outside = free_endpoint(), free_endpoint()
+        loop = 'name = "loop"\nfolder = "."\n'
+        zenoh = f'name = "zenoh"\nrobot_listen = "{self.endpoint}"\ncontroller_listen = "{self.outside}"\n'
+        self.profile.write_text(self.profile.read_text().replace(loop, zenoh))
+
+    def start_robot(self, *options: str) -> None:
+        argv = [sys.executable, "-m", "s2r_standins.robotarium", "--connect", self.endpoint, *options]
+        with (self.folder / "robot.txt").open("ab") as sink:
+            self.robot = subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink)
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[ZenohRig]:
+    opened = ZenohRig(tmp_path)
+    yield opened
+    opened.close()
+
+
+def test_campaign_drive_and_audit_over_zenoh(rig: ZenohRig) -> None:
+    rig.start()
+    rig.start_robot()
+    assert rig.sample()["exit_code"] == 0
+    good = Path(__file__).parent.parent / "controllers" / "grid.py"
+    answer = rig.ask("deploy", path=str(good))
+    assert answer["exit_code"] == 0, answer
+    rig.until(lambda: rig.status()["scenarios"] >= 1)
+    assert rig.stop() == 0
+    (log,) = rig.log_files()
+    found = json.loads(rig.s2r("audit", str(log), "--key", str(rig.state / "key.pub"), "--rerun-controllers", "--json").stdout)
+    assert (found["ok"], found["first_difference"], found["chain"]) == (True, None, "intact"), found
+    assert [certificate["valid"] for certificate in found["certificates"]]
+
+
+def test_campaign_outlives_a_robot_that_freezes_dies_and_loses_messages(rig: ZenohRig) -> None:
+    rig.start()
+    rig.start_robot("--lose-commands", "0.02", "--lose-observations", "0.02")
+    rig.until(lambda: rig.status()["observation"])
+    rig.ask("permit", duration_s=3600.0)
+    campaign = subprocess.Popen(
+        [sys.executable, "-m", "s2r_runtime.cli.main", "sample", str(rig.profile), "--socket", str(rig.socket), "--json"],
+        stdout=subprocess.PIPE,
+        env=rig.environment,
+    )
+    assert rig.robot is not None
+    rig.until(lambda: (rig.status()["campaign"] or {}).get("taken", 0) >= 1)
+    rig.robot.send_signal(signal.SIGSTOP)
+    rig.until_status(link=False)
+    rig.robot.send_signal(signal.SIGCONT)
+    rig.until_status(link=True)
+    rig.robot.kill()
+    rig.robot.wait()
+    rig.until_status(link=False)
+    rig.start_robot()
+    out, _ = campaign.communicate(timeout=60.0)
+    answer = json.loads(out)
+    assert answer["exit_code"] == 0, answer
+    assert answer["data"]["n"] >= 8
+    assert [m.up for m in rig.messages("event/link_changed") if isinstance(m, LinkChanged)].count(False) >= 2
+
+
+def test_uninvited_commands_are_logged_and_never_obeyed(rig: ZenohRig) -> None:
+    rig.start()
+    rig.start_robot()
+    rig.until(lambda: rig.status()["observation"])
+    with session("client", connect=rig.outside) as outsider:
+        data = json.dumps({"input": {"v": 0.2, "w": 0.0}, "seq": 1, "obs_seq": 1})
+        rig.until(lambda: outsider.put("s2r/robot/proposal", data) or rig.status()["counters"]["proposals"] > 0)
+    rig.stop()
+    uninvited = [m.command for m in rig.messages("event/proposed") if isinstance(m, Proposed)]
+    assert {command.source for command in uninvited} == {"external"}
+    decided = [m for m in rig.messages("out/decided") if isinstance(m, Decided)]
+    assert [(m.allow, m.reason) for m in decided] == [(False, "source_not_allowed")] * len(uninvited)
+    assert {m.source for m in rig.messages("out/send") if isinstance(m, Send)} == {"recovery"}
