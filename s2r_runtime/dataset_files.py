@@ -103,6 +103,8 @@ def _log_segments(paths: tuple[Path, ...], model: ComposedModel, epoch: int | No
                 segments.append(([row] if row else [], []))  # what the campaign is asked first is about this observation
             elif isinstance(message, CampaignFinished) and message.epoch == epoch:
                 inside = False
+        if reading.ending is not None and reading.ending.kind == "broken":
+            raise RecordingError(f"{path}: is damaged {reading.ending.detail}")
     return [(_stream(y, len(model.states)), _stream(u, len(model.inputs))) for y, u in segments]
 
 

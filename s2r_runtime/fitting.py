@@ -58,12 +58,13 @@ class Fit:
     z: Array
     white: float
     coloured: float
+    idle: int = 0
 
     @property
     def k(self) -> int:
-        """Number of fitted parameters; an effect without any counts as one."""
+        """Number of fitted parameters that these data feel at all (`idle` ones do not); an effect without any counts as one."""
         named = {i for i, _ in self.free}
-        return len(self.free) + sum(1 for i in self.added if i not in named)
+        return max(len(self.free) - self.idle, 0) + sum(1 for i in self.added if i not in named)
 
     @property
     def added(self) -> tuple[int, ...]:
@@ -210,13 +211,20 @@ def _inside(model: ComposedModel, free: Free, values: Array) -> Array:
 
 def fitted(given: Problem, start: Fit, model: ComposedModel, rounds: int = ROUNDS) -> Fit:
     """Parameters and noise in turn, until neither gains. start: whose noise to begin with."""
-    fit = start
+    fit = replace(start, colour=noises.no_colour(start.z.shape[1]))  # what looks like colour may be what the effect explains
     for turn in range(rounds):
         model = refine(given, fit, model)
         before, fit = fit, evaluate(given, model, fit.noise)
         if turn and fit.white - before.white < SETTLED:
             break
-    return fit
+    return replace(fit, idle=_idle(given, fit))
+
+
+def _idle(given: Problem, fit: Fit) -> int:
+    """Parameters that change nothing here: a limit that is never reached."""
+    j = sensitivities(given, fit, fit.model, fit.free, objective(given, fit, fit.model)) if fit.free else np.zeros((1, 0))
+    sizes = np.maximum(np.abs(values_of(fit.model, fit.free)), 1e-9) if fit.free else np.zeros(0)
+    return int(np.count_nonzero(np.sqrt(np.sum(j * j, axis=0)) * sizes < 0.1))
 
 
 def insert(model: ComposedModel, effect: AppliedEffect, place: int) -> ComposedModel:

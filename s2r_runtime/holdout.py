@@ -1,7 +1,8 @@
 """Which transitions the fit sees, and which it never does.
 
-Of one run the last TEST_SHARE of its time is held out; of several runs, whole runs drawn by the seed. Long recordings are thinned for
-the fit: blocks of contiguous steps, evenly spread, each with the inputs before it from which hidden states settle.
+Of one run two stretches are held out, one of them the end (HELD_OUT); of several runs, whole runs drawn by the seed (TEST_SHARE).
+Long recordings are thinned for the fit: blocks of contiguous steps, evenly spread, each with the inputs before it from which
+hidden states settle.
 """
 
 from __future__ import annotations
@@ -17,8 +18,11 @@ from s2r_runtime.residual import Steps, first_steps, steps_of
 
 Mask = NDArray[np.bool_]
 
+HELD_OUT = ((0.3, 0.5), (0.8, 1.0))
+"""Parts of a run's time. Two, so that what the robot did, and what became of it, is seen early and late on both sides."""
+
 TEST_SHARE = 0.4
-"""Of the recording. A third to two fifths is what others hold out on the recordings that are compared with."""
+"""Of the runs: as much as of one run's time."""
 
 FEWEST_RUNS = 5
 """From so many runs on whole runs are held out."""
@@ -45,7 +49,8 @@ def fit_mask(data: Dataset, seed: int) -> Mask:
     seen = np.ones(begin[-1], dtype=bool)
     if len(data.runs) < FEWEST_RUNS:
         for a, b in pairwise(begin.tolist()):
-            seen[b - round(TEST_SHARE * (b - a)) : b] = False
+            for first, last in HELD_OUT:
+                seen[a + round(first * (b - a)) : a + round(last * (b - a))] = False
         return seen
     order = np.random.default_rng(seed).permutation(len(data.runs))
     for i in order[: round(TEST_SHARE * len(data.runs))]:

@@ -50,6 +50,12 @@ MATTERS = 0.05
 COLOURED = 0.2
 """Autoregression coefficient from which noise is called coloured."""
 
+MOST_SCATTER = 5.0
+"""Scatter counts up to this: a dictionary that fits the structure only roughly leaves scores that scatter too."""
+
+PASSES = 3
+"""Of terms and noise in turn."""
+
 RIDGE = 1e-4
 """Of the columns' own size; terms of a dictionary are nearly collinear."""
 
@@ -146,23 +152,26 @@ def _first_look(left: _Left, x: Array) -> float:
 
 
 def _judge(left: _Left, token: str, x: Array) -> _Judged:
-    """Held-out gain. Twice: what is left after the first pass has less noise, under which the second one sees more."""
+    """Held-out gain. Several passes: what is left after one has less noise, under which the next one sees more. The first one takes
+    no colour into account: the colour that is there may well be the structure.
+    """
     whiten: Whitener = left.fit.whiten
-    colour: Colour = left.fit.colour
+    colour: Colour | None = None
     joined = left.given.steps.joined
     betas, gain, scatter = np.zeros((BLOCKS, x.shape[2])), 0.0, 1.0
-    for _ in range(2):
-        betas = _betas(left, x, whiten, colour)
-        rest = left.r - np.einsum("kim,km->ki", x, betas[left.block])
+    for _ in range(PASSES):
+        betas_now = _betas(left, x, whiten, colour)
+        rest = left.r - np.einsum("kim,km->ki", x, betas_now[left.block])
         level = noises.estimate(rest, left.f, joined, left.given.floor, left.fit.noise)
         whiten = Whitener(level, left.f, joined)
         z = whiten(rest)
         colour = noises.colour(z, joined)
         z = colour(z, joined)
         likelihood = float(np.sum(noises.log_density(z))) - whiten.logdet - len(z) * float(np.sum(np.log(colour.scale)))
-        push = colour(whiten(left.r - rest), joined)
-        scatter = _scatter(push * z * noises.weight(z), push, left.block)
-        gain = max(gain, likelihood - left.fit.coloured)
+        if likelihood - left.fit.coloured > gain:
+            push = colour(whiten(left.r - rest), joined)
+            gain, betas = likelihood - left.fit.coloured, betas_now
+            scatter = _scatter(push * z * noises.weight(z), push, left.block)
     return _Judged(token, x, gain, scatter, betas)
 
 
@@ -170,15 +179,17 @@ def _scatter(scores: Array, push: Array, block: NDArray[np.int64]) -> float:
     """How much more the scores of blocks scatter than white noise would let them, as a ratio of variances, at least 1: noise that
     wanders slowly looks like much else."""
     sums = np.bincount(block, scores.sum(axis=1), BLOCKS)
-    return max(1.0, float(np.sum(sums**2) / max(float(np.sum(push**2)), 1e-300)))
+    return min(max(1.0, float(np.sum(sums**2) / max(float(np.sum(push**2)), 1e-300))), MOST_SCATTER)
 
 
-def _betas(left: _Left, x: Array, whiten: Whitener, colour: Colour) -> Array:
+def _betas(left: _Left, x: Array, whiten: Whitener, colour: Colour | None) -> Array:
     """(BLOCKS, m) ridge solutions without each block."""
     joined = left.given.steps.joined
     m = x.shape[2]
-    white = colour(whiten(x), joined).reshape(-1, m)
-    z = colour(whiten(left.r), joined).ravel()
+    white, z = whiten(x), whiten(left.r)
+    if colour is not None:
+        white, z = colour(white, joined), colour(z, joined)
+    white, z = white.reshape(-1, m), z.ravel()
     weighted = white * noises.weight(z)[:, None]
     edges = np.searchsorted(left.block, np.arange(BLOCKS + 1)) * left.r.shape[1]
     products, slopes = np.zeros((BLOCKS, m, m)), np.zeros((BLOCKS, m))

@@ -210,6 +210,11 @@ class Colour:
         return np.asarray(out / self.scale.reshape((1, -1) + (1,) * (z.ndim - 2)))
 
 
+def no_colour(nx: int) -> Colour:
+    """For white noise."""
+    return Colour(np.zeros((nx, ORDERS)), np.ones(nx))
+
+
 def colour(z: Array, joined: Mask) -> Colour:
     """The autoregression that the Bayes criterion chooses for each state, fitted on z cut at 4 standard deviations."""
     n, nx = z.shape

@@ -276,7 +276,7 @@ def rivals(given: Problem, fit: Fit) -> list[Scored]:
         found += [
             Scored(s.name, s.channel, s.score, s.fit)
             for s in scored
-            if s.fit is not None and (s.name, s.channel) != (mine.effect.name, mine.channel) and s.score > here - CLOSE
+            if s.fit is not None and (s.name, s.channel) != (mine.effect.name, mine.channel) and s.score >= here - CLOSE
         ]
     return found
 

@@ -115,7 +115,7 @@ def trace(
         ambiguous_with=tuple(ties),
         candidates=tuple((s.name, s.channel, s.score) for s in chosen.ranking),
         depends_on=structure.tokens,
-        share_left=structure.share,
+        share_left=float(structure.share),
         suggested_excitation=advice(model, [(f.name, f.channel) for f in (*effects, *ties)]) if ties else None,
         faults=checked.faults,
         outliers=checked.outliers + int(np.count_nonzero(np.abs(final.z).max(axis=1) > WILD)),
@@ -225,7 +225,7 @@ def _found(model: ComposedModel, fit: Fit, place: int, ranges: dict[tuple[int, s
     values = {}
     for p in a.effect.parameters:
         if p.name in a.p:
-            low, high = ranges.get((place, p.name), (None, None))
+            low, high = (None if end is None else float(end) for end in ranges.get((place, p.name), (None, None)))
             values[p.name] = (a.p[p.name], low, high, a.effect.unit(model.nominal, a.channel, p.name))
     return Found(a.effect.name, a.channel, values)
 

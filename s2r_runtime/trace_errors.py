@@ -6,7 +6,7 @@ rollout_rms is the error at the end of rollouts of the stated horizon, started a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from s2r_runtime.bounds import scenario_confidence
 from s2r_runtime.dataset import Dataset
 from s2r_runtime.errors import S2RError
-from s2r_runtime.gap import Transitions, discrepancy, residuals
+from s2r_runtime.gap import Transitions, discrepancy, hold_residuals, residuals
 from s2r_runtime.holdout import FEWEST_RUNS
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.residual import Steps, acting, residual, rms, rollout, rollout_starts, state_jacobian
@@ -122,8 +122,8 @@ def gaps(
     """
     campaign = _campaign(before[0], given)
     if campaign is not None:
-        radii = [float(np.max(discrepancy(residuals(model, campaign), weights, kind))) for model, _ in (before, after)]
-        return _gap(radii[0], len(campaign.x0)), _gap(radii[1], len(campaign.x0)), campaign.independent
+        told = [_campaign_gap(model, campaign, weights, kind) for model, _ in (before, after)]
+        return told[0], told[1], campaign.independent
     first, second = (discrepancy(judged.one_step, weights, kind) for _, judged in (before, after))
     return _gap(float(np.max(first)), len(first)), _gap(float(np.max(second)), len(second)), False
 
@@ -132,19 +132,29 @@ def _gap(radius: float, n: int) -> dict[str, Any]:
     return {"radius": radius, "n": n, "epsilon": EPSILON, "beta": scenario_confidence(n, 0, EPSILON)}
 
 
+def _campaign_gap(model: ComposedModel, samples: Transitions, weights: Array, kind: Kind) -> dict[str, Any]:
+    """With what the discrepancy is after the hold: a robot that answers late shows little after one step from rest."""
+    told = _gap(float(np.max(discrepancy(residuals(model, samples), weights, kind))), len(samples.x0))
+    held_too = hold_residuals(model, samples)
+    if held_too is not None:
+        told |= {"hold_radius": float(np.max(discrepancy(held_too, weights, kind))), "hold_periods": samples.hold_periods}
+    return told
+
+
 def _campaign(model: ComposedModel, given: Held) -> Transitions | None:
     """Samples of the recording's campaign that lie in what is held out."""
     if len(given.data.paths) != 1 or given.data.paths[0].suffix != ".mcap" or len(given.data.runs) >= FEWEST_RUNS or not len(given.steps):
         return None
-    from dataclasses import replace
-
     from s2r_runtime.transitions import from_mcap
 
     try:
         found = from_mcap(given.data.paths[0], model)
     except S2RError:
         return None
-    after = found.t0_s - given.data.origin_s >= given.steps.t[0] - 0.5 * given.data.dt
-    if found.drive is not None or np.count_nonzero(after) < 2:
+    nearest = np.searchsorted(given.steps.t, found.t0_s - given.data.origin_s - 0.5 * given.data.dt)
+    apart = given.steps.t[np.minimum(nearest, len(given.steps) - 1)] - (found.t0_s - given.data.origin_s)
+    inside = np.abs(apart) < 0.5 * given.data.dt
+    if found.drive is not None or np.count_nonzero(inside) < 2:
         return None
-    return replace(found, x0=found.x0[after], u=found.u[after], x1=found.x1[after], t0_s=found.t0_s[after], held=None, hold_periods=1)
+    keep = found.held[inside] if found.held is not None else None
+    return replace(found, x0=found.x0[inside], u=found.u[inside], x1=found.x1[inside], t0_s=found.t0_s[inside], held=keep)

@@ -138,6 +138,8 @@ class TraceResult:
         before, after, independent = self.gap
         kind = "independent samples" if independent else "transitions of the drive, which bound no other (no statement)"
         lines.append(f"gap: {before['radius']:.4g} -> {after['radius']:.4g} on {before['n']} {kind}")
+        if "hold_radius" in before:
+            lines.append(f"after {before['hold_periods']} held periods: {before['hold_radius']:.4g} -> {after['hold_radius']:.4g}")
         lines.append(f"fitted on {self.n_fit} transitions, judged on {len(self.held.steps)} that the fit never saw")
         if self.interpolated:
             lines.append("states were interpolated to the model's step: they were not recorded on it")
@@ -190,7 +192,8 @@ class TraceResult:
         begin = first_steps(data)[run]
         first = int(self.held.steps.place[0] - begin)
         y = data.runs[run].y
-        last = min(len(y) - 1, first + max(8 * horizon, 100), first + POINTS)
+        seen = np.flatnonzero(~self.held.within[begin + first : begin + len(y) - 1])
+        last = min(len(y) - 1, first + max(8 * horizon, 100), first + POINTS, *(first + seen[:1]).tolist())
         curves: list[Array] = []
         for model in (self.nominal, self.model):
             act = acting(model, data)

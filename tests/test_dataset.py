@@ -1,0 +1,173 @@
+"""A recording lands on the model's grid as it was measured: exactly where it can, by interpolation where it must."""
+
+import gzip
+import hashlib
+
+import numpy as np
+import pytest
+
+from s2r_runtime.dataset import Stream, from_arrays, from_streams
+from s2r_runtime.dataset_files import load_dataset
+from s2r_runtime.errors import RecordingError
+from s2r_runtime.messages import Observation, Observed, Send
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.recording import Writer
+from s2r_runtime.residual import acting, first_steps, rollout_starts, sequence, steps_of
+
+
+def _model(dt=0.1, name="unicycle", effects=()):
+    return compose(ModelSpec(name, dt, {}, tuple(EffectSpec(*e) for e in effects)))
+
+
+def _streams(n=50, dt=0.1, seed=1):
+    rng = np.random.default_rng(seed)
+    t = dt * np.arange(n)
+    return Stream(t, rng.normal(size=(n, 3))), Stream(t, rng.normal(size=(n, 2)))
+
+
+def test_rows_a_step_apart_are_taken_as_they_are():
+    states, inputs = _streams()
+    data = from_streams(_model(), [(states, inputs)], "here")
+    assert not data.interpolated
+    assert data.substeps == 1
+    assert np.array_equal(data.runs[0].y[:, :2], states.values[:, :2])
+    assert np.array_equal(data.runs[0].u, inputs.values[:-1])
+
+
+def test_rows_a_fraction_of_a_step_apart_are_picked_and_inputs_averaged():
+    states, inputs = _streams(n=41, dt=0.025)
+    data = from_streams(_model(), [(states, inputs)], "here")
+    assert not data.interpolated
+    assert np.array_equal(data.runs[0].y[:, 0], states.values[::4, 0])
+    mean = data.runs[0].u.reshape(10, data.substeps, 2).mean(axis=1)
+    assert np.allclose(mean, inputs.values[:40].reshape(10, 4, 2).mean(axis=1))
+
+
+def test_irregular_rows_are_interpolated_and_far_neighbours_are_not():
+    t = np.concatenate([np.arange(0.0, 5.0, 0.013), np.arange(6.0, 9.0, 0.013)])
+    states = Stream(t, np.stack([2.0 * t, -t, 0.5 * t], axis=1))
+    data = from_streams(_model(), [(states, Stream(t, np.zeros((len(t), 2))))], "here")
+    y = data.runs[0].y
+    grid = 0.1 * np.arange(len(y))
+    good = ~np.isnan(y[:, 0])
+    assert data.interpolated
+    assert np.allclose(y[good, 0], 2.0 * grid[good])
+    assert not good[(grid > 5.03) & (grid < 5.97)].any()
+    assert good[(grid < 4.9) | (grid > 6.1)].all()
+
+
+def test_angles_are_unwrapped_over_the_turn():
+    t = np.arange(0.0, 10.0, 0.02)
+    turned = 1.5 * t
+    states = Stream(t, np.stack([t, t, (turned + np.pi) % (2 * np.pi) - np.pi], axis=1))
+    data = from_streams(_model(), [(states, Stream(t, np.zeros((len(t), 2))))], "here")
+    assert np.allclose(np.diff(data.runs[0].y[:, 2]), 0.15)
+
+
+def test_the_mean_of_a_held_input_over_a_step_is_exact_whatever_its_stamps():
+    t = 0.1 * np.arange(30)
+    states = Stream(t, np.zeros((30, 3)))
+    stamps = np.array([0.0, 0.33, 0.71, 1.234])
+    inputs = Stream(stamps, np.array([[1.0, 0.0], [3.0, 0.0], [-1.0, 0.0], [2.0, 0.0]]))
+    data = from_streams(_model(), [(states, inputs)], "here")
+    mean = data.runs[0].u.reshape(29, data.substeps, 2).mean(axis=1)[:, 0]
+    assert mean[3] == pytest.approx(0.3 * 1.0 + 0.7 * 3.0)
+    assert mean[7] == pytest.approx(0.1 * 3.0 + 0.9 * -1.0)
+    assert mean[12] == pytest.approx(0.34 * -1.0 + 0.66 * 2.0)
+    assert mean[20] == pytest.approx(2.0)
+
+
+def test_an_input_holds_until_the_next_and_is_zero_before_the_first():
+    t = 0.1 * np.arange(20)
+    inputs = Stream(np.array([0.5, 1.0]), np.array([[1.0, np.nan], [np.nan, 2.0]]))
+    data = from_streams(_model(), [(Stream(t, np.zeros((20, 3))), inputs)], "here")
+    assert data.runs[0].u[4].tolist() == [0.0, 0.0]
+    assert data.runs[0].u[7].tolist() == [1.0, 0.0]
+    assert data.runs[0].u[15].tolist() == [1.0, 2.0]
+
+
+def test_rows_too_far_apart_for_the_step_are_refused_with_the_step_that_would_do():
+    with pytest.raises(RecordingError, match=r"states are 0.1 s apart, the model's step is 0.03 s"):
+        from_streams(_model(0.03), [_streams()], "here.csv")
+
+
+def test_a_long_silence_makes_two_runs():
+    states, inputs = _streams(n=60)
+    t = states.t + np.where(np.arange(60) >= 30, 100.0, 0.0)
+    data = from_streams(_model(), [(Stream(t, states.values), Stream(t, inputs.values))], "here")
+    assert [len(run.y) for run in data.runs] == [30, 30]
+    assert data.runs[1].start_s == pytest.approx(103.0)
+
+
+def test_a_table_with_segments_blanks_and_names_of_its_own_is_read(tmp_path):
+    rows = ["part,t,px,y,theta,v,w"]
+    rows += [f"a,{0.1 * k:.3f},{k},0,0,1,0" for k in range(10)]
+    rows += ["a,1.000,,,,2,0", "a,1.100,11,0,0,,"]
+    rows += [f"b,{0.1 * k:.3f},{-k},0,0,1,0" for k in range(5)]
+    text = "\n".join(rows).replace("part", "segment")
+    path = tmp_path / "run.csv.gz"
+    path.write_bytes(gzip.compress(text.encode()))
+    data = load_dataset(path, _model(), {"x": "px"})
+    assert [len(run.y) for run in data.runs] == [12, 5]
+    assert np.isnan(data.runs[0].y[10]).all()
+    assert data.runs[0].u[10, 0] == 2.0
+    assert len(steps_of(data)) == 9 + 4
+    assert data.digests == ("sha256:" + hashlib.sha256(path.read_bytes()).hexdigest(),)
+
+
+def test_a_log_gives_each_command_from_the_observation_that_it_answers(tmp_path):
+    """The robot's clock runs 5 s behind the daemon's; every third answer comes 20 ms late."""
+    path = tmp_path / "run.mcap"
+    writer = Writer(path, run="run")
+    second = 1_000_000_000
+    for k in range(60):
+        stamp, heard = k * second // 10, 5 * second + k * second // 10
+        late = second // 50 if k % 3 == 0 else 0
+        for _ in range(2):  # a robot that waits says the same again
+            writer.write(Observed(heard, Observation(k, stamp, (0.1 * k, 0.0, 0.0))), heard)
+        writer.write(Send(heard + late, k, "sampler", (float(k), 0.0), k, second), heard + late)
+    writer.write(Observed(20 * second, Observation(99, 20 * second, (), "not a number")), 20 * second)
+    writer.close()
+    data = load_dataset(path, _model())
+    assert len(data.runs) == 1
+    assert np.allclose(data.runs[0].y[:, 0], 0.1 * np.arange(60))
+    mean = data.runs[0].u.reshape(59, data.substeps, 2).mean(axis=1)[:, 0]
+    assert mean[31] == pytest.approx(31.0)
+    assert mean[30] == pytest.approx(0.2 * 29.0 + 0.8 * 30.0)
+
+
+def test_parts_of_a_log_are_one_recording(tmp_path):
+    paths = []
+    for part in range(2):
+        paths.append(tmp_path / f"part{part}.mcap")
+        writer = Writer(paths[-1], run=f"run{part}")
+        for k in range(40 * part, 40 * part + 40):
+            t = k * 100_000_000
+            writer.write(Observed(t, Observation(k, t, (0.0, 0.0, 0.0))), t)
+            writer.write(Send(t, k, "sampler", (1.0, 0.0), k, 1), t)
+        writer.close()
+    data = load_dataset(paths, _model())
+    assert [len(run.y) for run in data.runs] == [80]
+    assert data.substeps == 1
+    assert len(data.digests) == 2
+
+
+def test_steps_know_which_of_them_share_a_measurement():
+    y = np.zeros((12, 3))
+    y[5] = np.nan
+    data = from_arrays(_model(), [(y, np.zeros((11, 2))), (np.zeros((4, 3)), np.zeros((3, 2)))])
+    steps = steps_of(data, [(0, 8)])
+    assert steps.place.tolist() == [0, 1, 2, 3, 6, 7, 9, 10, 11, 12, 13]
+    assert steps.joined.tolist() == [False, True, True, True, False, True, False, True, False, True, True]
+    assert first_steps(data).tolist() == [0, 11, 14]
+    assert rollout_starts(data, 3, [(0, 8)]).tolist() == [0, 1, 3, 4, 11]
+
+
+def test_short_runs_side_by_side_act_as_one_after_the_other():
+    effects = [("input_delay", "w", {"delay": 0.17}), ("input_lag", "v", {"time_constant": 0.3})]
+    model, rng = _model(effects=effects), np.random.default_rng(4)
+    runs = [(np.zeros((n + 1, 3)), rng.normal(size=(n, 2))) for n in rng.integers(3, 12, 20)]
+    together = acting(model, from_arrays(model, runs)).mean
+    alone = np.concatenate([sequence(model, model.effects, [u], 0.1) for _, u in runs])
+    assert np.allclose(together, alone, rtol=1e-12, atol=1e-14)

@@ -1,0 +1,107 @@
+"""Faults of measurement are found where they are, and what an effect does is not taken for one."""
+
+import numpy as np
+import pytest
+from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recordings
+
+from s2r_runtime.dataset import Stream, from_streams
+from s2r_runtime.faults import check
+
+STEPS = 900
+
+
+def _checked(spoil=None, effects=(), seed=1):
+    data = recordings(effects, 1, steps=STEPS, seed=seed)[0]
+    if spoil:
+        spoil(data.runs[0].y)
+    return check(declared(), data)
+
+
+def _spike(y):
+    y[500, 1] += 0.1
+    y[800, 2] -= 0.5
+
+
+def _step(y):
+    y[400:, 0] += 0.05
+
+
+def _there_and_back(y):
+    y[400:600, 2] += 0.3
+
+
+def _frozen(y):
+    y[300:360, 2] = y[300, 2]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "found"),
+    [
+        (_spike, [("spike", "y", 500, 500), ("spike", "theta", 800, 800)]),
+        (_step, [("offset_jump", "x", 400, STEPS)]),
+        (_there_and_back, [("offset_jump", "theta", 400, 599)]),
+    ],
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_fault_is_reported_where_it_is(spoil, found, seed):
+    checked = _checked(spoil, seed=seed)
+    assert [(f.kind, f.channel, round(f.from_s / DT), round(f.to_s / DT)) for f in checked.faults] == found
+
+
+def test_a_frozen_heading_is_reported_and_taken_out():
+    rng = np.random.default_rng(2)
+    u = commands(rng, 1, STEPS, DT, [(0.1, 0.2), (0.5, 1.0)], rest=0.0)
+    y = drive(rng, "unicycle", u, ROBOTARIUM, DT, NOISE)
+    _frozen(y[0])
+    t = DT * np.arange(STEPS + 1)
+    checked = check(declared(), from_streams(declared(), [(Stream(t, y[0]), Stream(t[:-1], u[0]))], "here"))
+    (fault,) = checked.faults
+    assert (fault.kind, fault.channel) == ("frozen", "theta")
+    assert fault.from_s == pytest.approx(300 * DT, abs=DT)
+    assert fault.to_s == pytest.approx(359 * DT, abs=DT)
+    assert np.isnan(checked.data.runs[0].y[305:355]).all()
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        (),
+        [("input_gain", "w", {"gain": 0.4})],
+        [("input_lag", "w", {"time_constant": 0.3}), ("input_lag", "v", {"time_constant": 0.3})],
+        [("input_delay", "*", {"delay": 0.3})],
+        [("input_saturation", "w", {"low": -0.5, "high": 0.5})],
+        [("play", "v", {"width": 0.1})],
+    ],
+)
+def test_what_an_effect_does_is_no_fault(effects):
+    for seed in range(4):
+        assert _checked(effects=effects, seed=40 + seed).faults == ()
+
+
+def test_outliers_on_many_rows_are_counted_and_no_faults():
+    rng = np.random.default_rng(3)
+
+    def spoil(y):
+        rows = rng.choice(len(y), 45, replace=False)
+        y[rows] += rng.normal(size=(45, 3)) * [0.03, 0.03, 0.3]
+
+    checked = _checked(spoil)
+    assert checked.faults == ()
+    assert checked.outliers > 30
+
+
+@pytest.mark.parametrize("kind", ["dropout", "clock_step"])
+def test_a_silence_is_told_from_a_clock_that_jumped(kind):
+    rng = np.random.default_rng(9)
+    u = commands(rng, 1, STEPS, DT, [(0.1, 0.2), (-1.0, 1.0)], rest=0.0)
+    y = drive(rng, "unicycle", u, ROBOTARIUM, DT, NOISE)[0]
+    t = DT * np.arange(STEPS + 1)
+    keep = np.ones(STEPS + 1, dtype=bool)
+    if kind == "dropout":
+        keep[400:420] = False
+    else:
+        t[400:] += 20 * DT
+    data = from_streams(declared(), [(Stream(t[keep], y[keep]), Stream(t[:-1], u[0]))], "here")
+    (fault,) = check(declared(), data).faults
+    assert (fault.kind, fault.channel) == (kind, "*")
+    assert fault.from_s == pytest.approx(399 * DT, abs=1e-6)

@@ -1,0 +1,86 @@
+"""The noise of a residual is what measurement and process noise make of it, and is found again from the residual."""
+
+import numpy as np
+import pytest
+
+from s2r_runtime.residual_noise import Noise, Whitener, colour, estimate, log_density, no_colour, weight
+
+
+def _residuals(rng, n, q, r, slope):
+    """Of x+ = F x + w measured as y = x + e; F = [[1, slope], [0, 1]]."""
+    f = np.tile(np.array([[1.0, slope], [0.0, 1.0]]), (n, 1, 1))
+    w, e = rng.normal(size=(n, 2)) * np.sqrt(q), rng.normal(size=(n + 1, 2)) * np.sqrt(r)
+    return w + e[1:] - np.einsum("kij,kj->ki", f, e[:-1]), f
+
+
+def test_whitened_residuals_have_unit_covariance_and_no_memory():
+    rng, q, r = np.random.default_rng(1), np.array([0.5, 0.1]), np.array([1.0, 2.0])
+    n = 20000
+    residual, f = _residuals(rng, n, q, r, 0.3)
+    joined = np.append(False, np.ones(n - 1, dtype=bool))
+    z = Whitener(Noise(q, r), f, joined)(residual)
+    limit = 4.0 / np.sqrt(n)  # four standard errors of a correlation
+    assert np.allclose(np.cov(z.T), np.eye(2), atol=1.5 * limit)
+    for lag in (1, 2, 3):
+        assert np.all(np.abs(z[lag:].T @ z[:-lag] / n) < limit)
+
+
+def test_the_likelihood_of_whitening_is_that_of_the_full_covariance():
+    rng, q, r = np.random.default_rng(2), np.array([0.5, 0.1]), np.array([1.0, 2.0])
+    residual, f = _residuals(rng, 6, q, r, 0.3)
+    joined = np.array([False, True, True, False, True, True])
+    s = np.zeros((12, 12))
+    for k in range(6):
+        s[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = np.diag(q + r) + f[k] @ np.diag(r) @ f[k].T
+        if joined[k]:
+            s[2 * k : 2 * k + 2, 2 * k - 2 : 2 * k] = -f[k] @ np.diag(r)
+            s[2 * k - 2 : 2 * k, 2 * k : 2 * k + 2] = (-f[k] @ np.diag(r)).T
+    whiten = Whitener(Noise(q, r), f, joined)
+    z = whiten(residual)
+    assert float(np.sum(z * z)) == pytest.approx(residual.ravel() @ np.linalg.solve(s, residual.ravel()))
+    assert whiten.logdet == pytest.approx(0.5 * np.linalg.slogdet(s)[1])
+
+
+@pytest.mark.parametrize(("q", "r"), [((1e-9, 1e-9), (1.0, 4.0)), ((0.5, 2.0), (1.0, 4.0)), ((3.0, 3.0), (1e-4, 1e-4))])
+def test_both_variances_are_found_again(q, r):
+    """Their sum's standard error is about 2 % of it at this n; eight times that is never reached by chance."""
+    rng, n = np.random.default_rng(3), 5000
+    residual, f = _residuals(rng, n, np.array(q), np.array(r), 0.2)
+    found = estimate(residual, f, np.append(False, np.ones(n - 1, dtype=bool)), np.full(2, 1e-12))
+    total = np.array(q) + np.array(r)
+    assert np.allclose(found.q, q, atol=0.16 * total.max())
+    assert np.allclose(found.r, r, atol=0.16 * total.max())
+
+
+def test_a_few_wild_rows_do_not_change_the_noise():
+    rng, n = np.random.default_rng(4), 3000
+    residual, f = _residuals(rng, n, np.array([0.01, 0.01]), np.array([1.0, 1.0]), 0.0)
+    joined = np.append(False, np.ones(n - 1, dtype=bool))
+    clean = estimate(residual, f, joined, np.full(2, 1e-12))
+    residual[rng.choice(n, 60, replace=False)] += rng.normal(size=(60, 2)) * 40.0
+    wild = estimate(residual, f, joined, np.full(2, 1e-12))
+    assert np.allclose(wild.q + wild.r, clean.q + clean.r, rtol=0.2)
+
+
+def test_the_weight_is_the_slope_of_the_density_over_the_value():
+    z = np.linspace(0.1, 40.0, 200)
+    h = 1e-5
+    slope = (log_density(z + h) - log_density(z - h)) / (2 * h)
+    assert np.allclose(weight(z), -slope / z, rtol=1e-5, atol=1e-9)
+    assert weight(np.array([1.0]))[0] > 0.99
+    assert weight(np.array([12.0]))[0] < 0.05
+
+
+def test_colour_is_found_in_coloured_noise_and_none_in_white():
+    rng, n = np.random.default_rng(5), 3000
+    white = rng.normal(size=(n, 2))
+    z = white.copy()
+    for k in range(1, n):
+        z[k, 1] = 0.7 * z[k - 1, 1] + white[k, 1]
+    joined = np.append(False, np.ones(n - 1, dtype=bool))
+    found = colour(z, joined)
+    assert found.strength[0] < 0.1
+    assert found.coefficients[1, 0] == pytest.approx(0.7, abs=0.06)
+    left = found(z, joined)
+    assert abs(float(left[1:, 1] @ left[:-1, 1])) / n < 4.0 / np.sqrt(n)
+    assert np.array_equal(no_colour(2)(z, joined), z)

@@ -1,0 +1,93 @@
+"""Where there is nothing to name, or nothing that the library knows, or no way to tell, the tracer says so."""
+
+import math
+
+import numpy as np
+import pytest
+from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recordings, wandering
+
+from s2r_runtime.dataset import from_arrays
+from s2r_runtime.trace import trace
+
+STEPS = 700
+GAIN = [("input_gain", "w", {"gain": 0.75})]
+
+
+def _names(found):
+    return {(e.name, e.channel) for e in found}
+
+
+@pytest.mark.parametrize("inputs", [commands, wandering])
+def test_clean_data_give_no_alarm(inputs):
+    assert [trace(data, declared()).verdict for data in recordings([], 10, steps=STEPS, seed=11, inputs=inputs)] == ["none"] * 10
+
+
+def test_heavy_tails_are_no_effect_and_no_fault():
+    rng = np.random.default_rng(5)
+    for data in recordings([], 4, steps=STEPS, seed=12, noise=0.0 * NOISE):
+        y = data.runs[0].y
+        y += rng.standard_t(3, size=y.shape) * NOISE
+        found = trace(data, declared())
+        assert found.verdict == "none"
+
+
+def test_wandering_yaw_noise_gets_no_name():
+    """An autoregressive disturbance of the yaw rate, 0.05 rad/s, remembered for ten steps."""
+    rng = np.random.default_rng(100)
+    push = np.zeros((4, 1))
+
+    def wander(x, v, w):
+        keep = 0.9**0.1  # ten parts a step
+        push[:, 0] = keep * push[:, 0] + 0.05 * math.sqrt(1 - keep * keep) * rng.normal(size=4)
+        return v, w + push[:, 0], 0.0, 0.0
+
+    assert [trace(data, declared()).verdict for data in recordings([], 4, steps=STEPS, seed=200, outside=wander)] == ["none"] * 4
+
+
+@pytest.mark.parametrize(
+    ("effects", "outside", "depends_on"),
+    [
+        ([("play", "w", {"width": 0.5})], None, "w"),
+        ([], lambda x, v, w: (v * (1 + 0.3 * np.cos(x[:, 2])), w * (1 + 0.3 * np.cos(x[:, 2])), 0.0, 0.0), "heading"),
+        ([], lambda x, v, w: (v, w, -0.06 * x[:, 1], 0.06 * x[:, 0]), "position"),
+    ],
+    ids=["dead zone", "gain that depends on the heading", "position field"],
+)
+def test_an_effect_outside_the_library_gets_no_name_but_what_it_depends_on(effects, outside, depends_on):
+    results = [trace(data, declared()) for data in recordings(effects, 3, steps=1200, seed=21, outside=outside)]
+    assert all(r.verdict == "unexplained" for r in results)
+    assert all(not r.effects for r in results)
+    assert sum(depends_on in r.depends_on for r in results) >= 2
+    assert all(r.spec == declared().spec for r in results)
+
+
+def test_effects_that_the_data_cannot_tell_apart_are_listed_together_with_what_would():
+    """The robot only ever gets w = 0 or 1: a gain and a limit do the same."""
+    rng = np.random.default_rng(4)
+    u = np.zeros((1, 700, 2))
+    u[0, :, 0] = 0.1
+    u[0, 3:, 1] = 1.0
+    y = drive(rng, "unicycle", u, (*ROBOTARIUM, ("input_gain", "w", {"gain": 0.8})), DT, NOISE)
+    found = trace(from_arrays(declared(), [(y[0], u[0])]), declared())
+    assert found.verdict == "ambiguous"
+    assert {("input_gain", "w"), ("input_saturation", "w")} <= _names(found.effects) | _names(found.ambiguous_with)
+    assert "w" in found.suggested_excitation
+
+
+def test_a_sensor_that_jumps_is_a_fault_and_not_an_effect():
+    data = recordings([], 1, steps=STEPS, seed=31)[0]
+    data.runs[0].y[300:, 0] += 0.08
+    found = trace(data, declared())
+    assert found.verdict == "sensor_fault"
+    (fault,) = found.to_json()["faults"]
+    assert (fault["kind"], fault["channel"]) == ("offset_jump", "x")
+    assert fault["from_s"] == pytest.approx(300 * DT)
+
+
+def test_an_effect_is_found_beside_a_fault():
+    data = recordings(GAIN, 1, steps=STEPS, seed=32)[0]
+    data.runs[0].y[200, 1] += 0.3
+    found = trace(data, declared())
+    assert found.verdict == "traced"
+    assert _names(found.effects) == {("input_gain", "w")}
+    assert [f.kind for f in found.faults] == ["spike"]

@@ -1,0 +1,96 @@
+"""The tracer on every built-in model, at other steps and in other units than the built-in robot's."""
+
+import math
+
+import numpy as np
+import pytest
+from trace_robots import GEOMETRY, INPUTS, POSES, commands, drive
+
+from s2r_runtime.dataset import Stream, from_arrays, from_streams
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.trace import trace
+
+ROBOTS = {
+    "unicycle": (0.05, [(-0.5, 0.5), (-2.0, 2.0)], [0.001, 0.001, 0.004]),
+    "differential_drive": (0.05, [(-6.0, 6.0), (-6.0, 6.0)], [0.002, 0.002, 0.004, 0.03, 0.03]),
+    "bicycle": (0.025, [(-0.4, 0.4), (0.0, 2.0)], [0.003, 0.003, 0.004, 0.02]),
+    "double_integrator": (0.1, [(-1.0, 1.0), (-1.0, 1.0)], [0.003, 0.003, 0.005, 0.005]),
+    "joint": (0.01, [(-20.0, 20.0)], [0.0005, 0.005]),
+}
+
+
+def _model(name):
+    arcs = (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),) if name in POSES else ()
+    return compose(ModelSpec(name, ROBOTS[name][0], GEOMETRY.get(name, {}), arcs))
+
+
+def _undeclared(name):
+    """Effects on the model's first or last input, sized to its step and its commands."""
+    dt, bounds, _ = ROBOTS[name]
+    first, last = INPUTS[name][0], INPUTS[name][-1]
+    return {
+        "gain": [("input_gain", last, {"gain": 0.8})],
+        "bias": [("input_bias", first, {"bias": 0.06 * bounds[0][1]})],
+        "lag": [("input_lag", last, {"time_constant": 4 * dt})],
+        "delay": [("input_delay", last, {"delay": 2.4 * dt})],
+        "saturation": [("input_saturation", last, {"low": -0.6 * bounds[-1][1], "high": 0.6 * bounds[-1][1]})],
+        "bias and lag": [("input_bias", last, {"bias": 0.05 * bounds[-1][1]}), ("input_lag", first, {"time_constant": 3 * dt})],
+    }
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_effects_get_their_names_on_every_model_and_clean_data_give_none(name):
+    dt, bounds, noise = ROBOTS[name]
+    model, rng = _model(name), np.random.default_rng(17)
+    u = commands(rng, 1, 900, dt, bounds, hold=(10 * dt, 32 * dt))
+    assert trace(from_arrays(model, [(drive(rng, name, u, [], dt, noise)[0], u[0])]), model).verdict == "none"
+    right = []
+    for effects in _undeclared(name).values():
+        u = commands(rng, 1, 900, dt, bounds, hold=(10 * dt, 32 * dt))
+        found = trace(from_arrays(model, [(drive(rng, name, u, effects, dt, noise)[0], u[0])]), model)
+        right.append((found.verdict, {(e.name, e.channel) for e in found.effects}) == ("traced", {(n, c) for n, c, _ in effects}))
+    assert sum(right) >= 5, list(zip(_undeclared(name), right, strict=True))
+
+
+def test_arcs_are_told_from_an_euler_step():
+    model, rng = compose(ModelSpec("unicycle", 0.1)), np.random.default_rng(3)
+    u = commands(rng, 1, 900, 0.1, [(-0.5, 0.5), (-2.0, 2.0)])
+    y = drive(rng, "unicycle", u, [], 0.1, [0.0005, 0.0005, 0.001])
+    found = trace(from_arrays(model, [(y[0], u[0])]), model)
+    assert [(e.name, e.parameters["scheme"][0]) for e in found.effects] == [("integration_scheme", "exact")]
+
+
+def test_many_runs_are_traced_together_and_whole_runs_are_held_out():
+    dt, bounds, noise = ROBOTS["bicycle"]
+    model, rng = _model("bicycle"), np.random.default_rng(8)
+    effects = [("input_lag", "speed_cmd", {"time_constant": 0.14}), ("input_bias", "steer_cmd", {"bias": -0.03})]
+    u = commands(rng, 20, 120, dt, bounds, rest=0.0)
+    y = drive(rng, "bicycle", u, effects, dt, noise)
+    found = trace(from_arrays(model, list(zip(y, u, strict=True))), model)
+    assert {(e.name, e.channel) for e in found.effects} == {("input_lag", "speed_cmd"), ("input_bias", "steer_cmd")}
+    assert (found.n_fit, len(found.held.steps)) == (12 * 120, 8 * 120)
+
+
+def test_two_streams_with_stamps_of_their_own_give_the_delay_between_them():
+    """Commands at 95 Hz, poses at 62 Hz, both irregular, a model at 10 Hz, a delay of 0.17 s."""
+    rng, dt, fine = np.random.default_rng(6), 0.1, 0.005
+    held = commands(rng, 1, 24000, fine, [(0.0, 0.3), (-1.2, 1.2)], hold=(0.3, 1.5))
+    y = drive(rng, "unicycle", held, [("input_delay", "*", {"delay": 0.17})], fine, [0.0, 0.0, 0.0])[0]
+    model = compose(ModelSpec("unicycle", dt, {}, (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),)))
+    grid = fine * np.arange(len(y))
+    t_y = np.cumsum(rng.uniform(0.008, 0.024, 7000))
+    t_u = np.cumsum(rng.uniform(0.005, 0.016, 11000))
+    t_y, t_u = t_y[t_y < grid[-1]], t_u[t_u < grid[-1]]
+    y[:, 2] = np.unwrap(y[:, 2])
+    states = np.column_stack([np.interp(t_y, grid, y[:, j]) for j in range(3)]) + rng.normal(size=(len(t_y), 3)) * [0.001, 0.001, 0.004]
+    inputs = held[0][np.minimum((t_u / fine).astype(int), len(held[0]) - 1)]
+    gap = (t_y > 50.0) & (t_y < 52.0)
+    data = from_streams(model, [(Stream(t_y[~gap], states[~gap]), Stream(t_u, inputs))], "streams")
+    found = trace(data, model)
+    assert data.interpolated
+    assert {(e.name, e.channel) for e in found.effects} == {("input_delay", "*")}
+    value = found.effects[0].parameters["delay"][0]
+    assert value == pytest.approx(0.17, abs=0.012)  # a command is seen at its stamp, up to 16 ms after it was given
+    assert [f.kind for f in found.faults] == ["dropout"]
+    assert math.isclose(found.faults[0].to_s - found.faults[0].from_s, 2.0, abs_tol=0.06)
