@@ -14,18 +14,18 @@ import numpy as np
 
 PARAMETERS = {
     "speed": 0.15,  # m/s
-    "turn": 2.4,  # yaw rate per heading error, 1/s
+    "turn": 4.4,  # yaw rate per heading error, 1/s
     "max_turn": 2.5,  # rad/s: with it the wheels still reach 0.07 m/s forward
-    "aligned": 0.9,  # cosine of the heading error at which it begins to drive
-    "lookahead": 0.3,  # m
+    "aligned": 0.88,  # cosine of the heading error at which it begins to drive
+    "lookahead": 0.43,  # m
     "body": 0.055,  # its disc, m
-    "margin": 0.016,  # to obstacles, m
+    "margin": 0.0175,  # to obstacles, m
     "wall": 0.06,  # to the arena's wall, m
-    "fade": 0.02,  # this far beside the gap that it aims at, it only goes sideways, m
+    "fade": 0.027,  # this far beside the gap that it aims at, it only goes sideways, m
     "keep": 0.3,  # from a moving obstacle to the middle of a cell that it chooses, m
     "foresight": 2.0,  # s
     "fear": 20.0,  # price of each metre of `keep` that is missing, in metres of way
-    "wary": 0.5,  # nearer than this to a moving obstacle it keeps to the middle, m
+    "wary": 0.4,  # nearer than this to a moving obstacle it keeps to the middle, m
 }
 
 
