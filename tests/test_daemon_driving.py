@@ -106,8 +106,11 @@ def test_certificate_with_one_bit_changed_is_refused_and_nothing_is_spent(rig: R
     ids=["raises", "hangs", "nan", "wrong shape", "exits"],
 )
 def test_controller_that_fails_stops_the_robot_and_stays_out_until_a_person_clears_it(rig: Rig, body: str, reason: str) -> None:
-    driving(rig, body)
+    rig.start_robot()
+    rig.start()
+    assert rig.deploy(rig.controller(body))["exit_code"] == 0
     rig.until_status(latched=["controller_fault"], driving="recovery")
+    assert [m.open for m in rig.messages("out/gate_changed") if isinstance(m, GateChanged)].count(True) == 1  # it drove, and failed then
     stopped = [m for m in rig.messages("event/source_stopped") if isinstance(m, SourceStopped) and m.source == "controller"]
     assert [m.reason for m in stopped] == [reason]
     assert rig.applied()[-1]["source"] == "recovery"
