@@ -201,6 +201,6 @@ void roll_out(const Setting *g, const double *start, const uint8_t *blocked, con
             if (!outcome) outcome = now, at = cell;
         }
         double left = w.distance[at];
-        safety[i] = outcome == 1 ? -1.0 : fmax(first - left, 0.0);
+        safety[i] = outcome == 1 ? -1.0 : fmax(rint((first - left) / g->cell) * g->cell, 0.0);
     }
 }

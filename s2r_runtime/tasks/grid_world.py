@@ -255,7 +255,8 @@ class GridWorld:
     def progress(self, tally: Tally) -> Array:
         """Distance travelled along the shortest path, m, >= 0. Cells from which no goal can be reached count as none."""
         left = tally.distance.take(np.arange(len(tally.cell)) * self.grid.size + tally.cell)
-        return np.maximum(tally.start_distance - left, 0.0)
+        cells = np.rint((tally.start_distance - left) / self.grid.cell)  # whole cells: no dust of subtracting multiples of one
+        return np.maximum(cells * self.grid.cell, 0.0)
 
     def done(self, tally: Tally) -> Bools:
         """Crashed or arrived."""
