@@ -1,4 +1,4 @@
-"""The theorems as pure functions (DESIGN G1, G2, G4, G9). No data, no state; every argument is a number.
+"""The theorems as pure functions (guarantee G1, G2, G4, G9). No data, no state; every argument is a number.
 
 Scenario bound with discards. N discrepancies drawn independently from one law, k of them discarded, N and k fixed
 beforehand, r the (k+1)-th largest, V(r) = P[a new one > r]. Let q = inf {x : P[X > x] <= eps}. Then V(r) > eps iff r < q iff at

@@ -1,4 +1,4 @@
-"""A certificate: what was shown of one controller on one model of one robot in one task, and an Ed25519 signature (DESIGN 5).
+"""A certificate: what was shown of one controller on one model of one robot in one task, and an Ed25519 signature (docs/gate.md).
 
     content   = canonical JSON of `Certificate`            id = its SHA-256
     file      = canonical JSON of {certificate, id, public_key, signature}
@@ -18,9 +18,9 @@ import msgspec
 
 from s2r_runtime import keys, statements
 from s2r_runtime.canonical import canonical, digest
-from s2r_runtime.controller_file import ControllerFile, Identity
+from s2r_runtime.controllers.file import ControllerFile, Identity
+from s2r_runtime.core.ledger import binomial_tail, campaign_size, sample_size, share
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
-from s2r_runtime.ledger import binomial_tail, campaign_size, sample_size, share
 from s2r_runtime.messages import CertificateFacts, Gap, Struct, Verification
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Profile

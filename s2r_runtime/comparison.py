@@ -14,7 +14,7 @@ makes that nearly as random as a fresh start, as in the paper.
 
 Whether a sample counts is settled by x0, u, stamps and the gate, never by a prediction: nothing here knows the model's, so no
 rejection can depend on the discrepancy. The robot's own motion can cost a sample in one way only, by crossing the geofence, which
-takes one that goes a tenth farther than commanded; those are counted under the gate's reason. One transition a hold (DESIGN G7).
+takes one that goes a tenth farther than commanded; those are counted under the gate's reason. One transition a hold (guarantee G7).
 
 Every draw comes from (seed, epoch, index, run, try): a resumed campaign starts the sample anew with fresh numbers, so what
 an interruption cut off is never repeated and the law is the same. Standard library and message structs only.

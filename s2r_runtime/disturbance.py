@@ -1,4 +1,4 @@
-"""The gap set D and the laws that disturbances are drawn from (paper, eq. uncertain_model; DESIGN G8). Batched over n rollouts.
+"""The gap set D and the laws that disturbances are drawn from (paper, eq. uncertain_model; guarantee G8). Batched over n rollouts.
 
     D = {d : |d|_W <= r},   |d|_W = sqrt(sum_i (w_i d_i)^2) (ball) or max_i w_i |d_i| (box)
 

@@ -1,4 +1,4 @@
-"""Transitions of ordinary driving: a stream of measured states and a stream of inputs, neither on the other's stamps (DESIGN 8).
+"""Transitions of ordinary driving: a stream of measured states and a stream of inputs, neither on the other's stamps (docs/log-format.md).
 
 A grid of the model's step dt is laid over the drive from the first stamp at which every state was received; x0 and x1 of transition k are
 the states at t_k and t_k + dt, each interpolated linearly between its own two neighbours (angles unwrapped), and u is the held

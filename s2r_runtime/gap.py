@@ -1,4 +1,4 @@
-"""Gap of a model on independent transitions (DESIGN G1, G4, G6; paper, theorem 2).
+"""Gap of a model on independent transitions (guarantee G1, G4, G6; paper, theorem 2).
 
     e_i = x1_i (-) f(x0_i, u_i)          residual, (n, nx), angles wrapped
     d_i = sqrt(sum_j (w_j e_ij)^2)       ball;   max_j w_j |e_ij|   box;   W fixed beforehand
@@ -230,7 +230,7 @@ def statement(gap: Gap, independent: bool, *, assumption: str = "", doubt: str =
 
 
 def gap_json(gap: Gap, tr: Transitions, states: tuple[str, ...]) -> dict[str, Any]:
-    """What `s2r gap --json` prints (DESIGN 9)."""
+    """What `s2r gap --json` prints (docs/json.md)."""
     return {
         "radius": gap.radius,
         "radius_literal": gap.radius_literal,

@@ -1,4 +1,4 @@
-"""The gate: may this command move the robot now? (DESIGN 5)
+"""The gate: may this command move the robot now? (docs/gate.md)
 
     verdict = decide(settings, situation, command, now_ns)
 
@@ -62,7 +62,7 @@ REASONS: tuple[str, ...] = (
 """Every reason why the gate can be closed."""
 
 ALWAYS_LATCHING = ("emergency_stop", "manual_override")
-"""These latch whatever the profile says (DESIGN 5)."""
+"""These latch whatever the profile says (docs/gate.md)."""
 
 LATCH_HOLDS_ALL = (*ALWAYS_LATCHING, "recorder_down", "link_down", "clock_backwards", "measurement_faults", "outside_geofence")
 """Latched, these hold back the sampler too. The others are about the controller; sampling anew may be their remedy."""

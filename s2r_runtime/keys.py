@@ -2,7 +2,7 @@
 
 Private: PEM (PKCS8, not encrypted), readable by its owner only; public: PEM beside it, `<name>.pub`. Both are what `openssl` reads
 and writes. The private key stays on the machine that signs; whoever checks needs the public one. A new pair comes with
-an empty ledger of offline certification (DESIGN G4): a key without its ledger certifies nothing.
+an empty ledger of offline certification (guarantee G4): a key without its ledger certifies nothing.
 """
 
 from __future__ import annotations

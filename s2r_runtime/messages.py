@@ -60,7 +60,7 @@ class Command(Struct, frozen=True, tag="command"):
 
 
 class Gap(Struct, frozen=True, tag="gap"):
-    """Gap of a model on one campaign (DESIGN G1). `radius` in the weighted norm's unit; weights: (nx,).
+    """Gap of a model on one campaign (guarantee G1). `radius` in the weighted norm's unit; weights: (nx,).
 
     `hold_radius`: the same bound for the discrepancy after `hold_periods` held periods. `radius_noise`: what measurement
     noise alone would make of `radius`.
@@ -101,7 +101,7 @@ class LawResult(Struct, frozen=True):
 
 
 class Verification(Struct, frozen=True, tag="verification"):
-    """Rollouts of the uncertain model and what they show (DESIGN G2, G8)."""
+    """Rollouts of the uncertain model and what they show (guarantee G2, G8)."""
 
     passed: bool
     radius: float
@@ -174,7 +174,7 @@ class Settings(Struct, frozen=True):
     campaign_timeout_s: float = 0.0
     trace_after_campaign: bool = False
     required_laws: tuple[str, ...] = ()
-    """Disturbance laws that must pass (DESIGN G8); empty: not said, the verification's own word counts."""
+    """Disturbance laws that must pass (guarantee G8); empty: not said, the verification's own word counts."""
     campaign_digest: str = ""
     """Of what a gap rests on besides the model: region, inputs, norm, sampling, guarantee. Another one voids the gap."""
 
@@ -209,7 +209,7 @@ class Memory(Struct, frozen=True):
     watch_e_value: float = 1.0
     """Where the watch of this epoch stood when the memory was last written, so that a restart forgives nothing."""
     traced: bool = False
-    """An effect was traced in the residual and no model that has it was adopted since (DESIGN G8)."""
+    """An effect was traced in the residual and no model that has it was adopted since (guarantee G8)."""
 
 
 # ---------------------------------------------------------------- events: into the core
@@ -321,7 +321,7 @@ class SourceStopped(Struct, frozen=True, tag="source_stopped"):
 
 
 class SampleTaken(Struct, frozen=True, tag="sample_taken"):
-    """One independent transition of a campaign (DESIGN G1). x0, x1: (nx,), one period apart; u: (nu,), held from x0 on.
+    """One independent transition of a campaign (guarantee G1). x0, x1: (nx,), one period apart; u: (nu,), held from x0 on.
 
     `held`: (nx,), the state after `periods` held periods, or empty if the campaign holds for one period only. `obs_seq0`,
     `t0_ns`: of the observation that x0 was; the robot's numbers, so that an auditor finds the raw frame. `again`: logged once more

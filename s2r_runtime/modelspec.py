@@ -24,7 +24,7 @@ class EffectSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """`name`: a registered model, or the path of a Python file. `dt` in s. `source_digest`: of that file, filled on loading.
 
-    `fitted_on`: digests of the recordings that effects were fitted on; a gap is refused on those (DESIGN G6).
+    `fitted_on`: digests of the recordings that effects were fitted on; a gap is refused on those (guarantee G6).
     """
 
     name: str

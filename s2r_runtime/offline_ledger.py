@@ -1,4 +1,4 @@
-"""The ledger of offline certification: which gap epochs and verification attempts a key has paid for, by robot (DESIGN G4).
+"""The ledger of offline certification: which gap epochs and verification attempts a key has paid for, by robot (guarantee G4).
 
     epoch i spends 3 beta / (pi^2 i^2), attempt j spends 3 beta / (pi^2 j^2)
 
@@ -17,9 +17,9 @@ from typing import Literal
 
 import msgspec
 
+from s2r_runtime.core.ledger import share
+from s2r_runtime.daemon.persistence import lock, read, replace, seal, unseal
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.ledger import share
-from s2r_runtime.persistence import lock, read, replace, seal, unseal
 
 SCHEMA = 1
 

@@ -61,7 +61,7 @@ class Sampling(_Table, frozen=True):
 
 
 class Guarantee(_Table, frozen=True):
-    """epsilon, beta of DESIGN G1 to G4, alpha of the watch's alarm, k discarded samples."""
+    """epsilon, beta of guarantee G1 to G4, alpha of the watch's alarm, k discarded samples."""
 
     epsilon: float = 0.01
     beta: float = 0.05

@@ -1,4 +1,4 @@
-"""What a certificate shows and what it does not, in sentences made from its numbers (DESIGN 4). They say exactly this and no more.
+"""What a certificate shows and what it does not, in sentences made from its numbers (docs/guarantee.md). They say exactly this and no more.
 
 Numbers are rounded away from what would flatter: bounds up, worst values and confidences down.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 
-from s2r_runtime.ledger import spent
+from s2r_runtime.core.ledger import spent
 from s2r_runtime.messages import Gap, LawResult, Verification
 from s2r_runtime.modelspec import ModelSpec
 

@@ -1,4 +1,4 @@
-"""A recording -> its transitions, ready for a gap (DESIGN 8, 9; one transition a held input: G7).
+"""A recording -> its transitions, ready for a gap (docs/log-format.md, 9; one transition a held input: G7).
 
 MCAP: a campaign's samples are marked (`SampleTaken`). The last campaign that was completed counts, or the epoch asked for; one that was not
 completed gives its samples without a statement, since N was not fixed beforehand. A log without samples is ordinary driving.
@@ -242,7 +242,7 @@ class _Log:
 
 
 def _read_log(path: Path, model: ComposedModel) -> _Log:
-    from s2r_runtime.recording import read
+    from s2r_runtime.recording.writer import read
 
     log = _Log({}, {}, [[]])
     reading = read(path, CHANNELS)

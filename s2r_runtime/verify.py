@@ -1,4 +1,4 @@
-"""Controller x task x uncertain model -> least safety value and what it shows (paper, corollary 2; DESIGN G2, G8).
+"""Controller x task x uncertain model -> least safety value and what it shows (paper, corollary 2; guarantee G2, G8).
 
 N scenarios drawn independently, one rollout each, s* the least of the N safety values: with confidence 1 - (1 - eps)^N a new rollout of
 the uncertain model under the same disturbance law scores below s* with probability at most eps.
@@ -38,7 +38,7 @@ class Detail:
 
 
 def seed_for(controller_digest: str, model_digest: str, task_digest: str, attempt: int) -> int:
-    """The seed of an attempt, 0 .. 2^63 - 1: a function of what is verified and how often that was tried (DESIGN G2)."""
+    """The seed of an attempt, 0 .. 2^63 - 1: a function of what is verified and how often that was tried (guarantee G2)."""
     text = f"{controller_digest}\n{model_digest}\n{task_digest}\n{attempt}"
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
 

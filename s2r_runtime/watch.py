@@ -1,4 +1,4 @@
-"""Sequential watch on the stream of discrepancies while a controller drives (DESIGN G5). No independence is assumed.
+"""Sequential watch on the stream of discrepancies while a controller drives (guarantee G5). No independence is assumed.
 
 X_i = 1 iff the i-th counted discrepancy exceeds the epoch's own r (never a grown one). Null hypothesis: P(X_i = 1 | past) <= eps.
 For any p in (eps, 1) and any start k the product

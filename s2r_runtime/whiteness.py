@@ -1,4 +1,4 @@
-"""Is there structure in a residual that independent, zero-mean noise would not have? (DESIGN G8: without an answer of no, a
+"""Is there structure in a residual that independent, zero-mean noise would not have? (guarantee G8: without an answer of no, a
 certificate under the law `uniform` alone is refused, because such a law averages out what a real disturbance does not.)
 
 e: (n, nx), one row a transition, for planar models turned into the body's axes at the start of the step (a lost share of the speed

@@ -16,21 +16,23 @@ import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from s2r_runtime import certificate as certificates
-from s2r_runtime import core, jobs, ledger
 from s2r_runtime import messages as m
-from s2r_runtime.audit_core import in_effect_order
+from s2r_runtime.audit.core import in_effect_order
 from s2r_runtime.bounds import clopper_pearson_upper
 from s2r_runtime.comparison import Campaign
-from s2r_runtime.controller_file import load
+from s2r_runtime.controllers.file import load
+from s2r_runtime.core import ledger
+from s2r_runtime.core import reducer as core
+from s2r_runtime.daemon import jobs
+from s2r_runtime.daemon.settings import ModelFacts, settings_of
+from s2r_runtime.daemon.worker import GapJob
 from s2r_runtime.hookspecs import Offer, hookimpl
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import dump_model
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import parse_profile
-from s2r_runtime.recording import Writer
-from s2r_runtime.settings import ModelFacts, settings_of
+from s2r_runtime.recording.writer import Writer
 from s2r_runtime.watch import Stream
-from s2r_runtime.worker import GapJob
 
 KEY = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
 OTHER = Ed25519PrivateKey.from_private_bytes(bytes(range(1, 33)))

@@ -1,4 +1,4 @@
-"""DESIGN 5 written down once more, without the gate and without the core's state: what must never have happened.
+"""docs/gate.md written down once more, without the gate and without the core's state: what must never have happened.
 
 `Law` sees nothing but events and outputs. It is no rule for how the core goes about it, only for what moves the robot.
 """
@@ -36,7 +36,7 @@ FAULTS = ("raised", "died", "deadline", "malformed")
 
 @dataclass
 class Law:
-    """What DESIGN 5 allows, from events and outputs alone. `judge` raises AssertionError for what must not have happened."""
+    """What docs/gate.md allows, from events and outputs alone. `judge` raises AssertionError for what must not have happened."""
 
     settings: m.Settings
     started: bool = False

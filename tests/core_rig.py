@@ -7,8 +7,9 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from s2r_runtime import core, ledger
-from s2r_runtime.core_state import State
+from s2r_runtime.core import ledger
+from s2r_runtime.core import reducer as core
+from s2r_runtime.core.state import State
 from s2r_runtime.messages import (
     MEMORY_SCHEMA,
     Answer,

@@ -12,7 +12,8 @@ import msgspec
 from core_law import DT, FAULTS, WALK, Law
 from core_rig import GAP, S
 
-from s2r_runtime import core, ledger
+from s2r_runtime.core import ledger
+from s2r_runtime.core import reducer as core
 from s2r_runtime.messages import (
     MEMORY_SCHEMA,
     AnalyticsChanged,

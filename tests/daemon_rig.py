@@ -14,12 +14,13 @@ from typing import Any
 
 import msgspec
 
-from s2r_runtime import certificate, control, keys
-from s2r_runtime.controller_file import load
-from s2r_runtime.ledger import campaign_size, sample_size, share
+from s2r_runtime import certificate, keys
+from s2r_runtime.controllers.file import load
+from s2r_runtime.core.ledger import campaign_size, sample_size, share
+from s2r_runtime.daemon import control
 from s2r_runtime.messages import Gap, LawResult, Struct, Verification
 from s2r_runtime.profile import load_profile
-from s2r_runtime.reading import read
+from s2r_runtime.recording.reading import read
 
 PROGRAM = Path(__file__).with_name("loop_robot.py")
 WITHIN_S = 30.0

@@ -222,9 +222,9 @@ def main() -> int:
 
 def run(args: argparse.Namespace) -> int:
     """The daemon, or one campaign."""
-    from s2r_runtime import core
-    from s2r_runtime.campaign_run import run_campaign
-    from s2r_runtime.daemon import Daemon
+    from s2r_runtime.core import reducer as core
+    from s2r_runtime.daemon.campaign_run import run_campaign
+    from s2r_runtime.daemon.loop import Daemon
     from s2r_runtime.errors import S2RError
     from s2r_runtime.messages import Event, Observed
     from s2r_runtime.plugins import registry

@@ -17,12 +17,12 @@ import msgspec
 import pytest
 
 from s2r_runtime import messages as m
-from s2r_runtime.audit import AuditResult, audit
+from s2r_runtime.audit.log import AuditResult, audit
 from s2r_runtime.errors import ConfigError, RecordingError
-from s2r_runtime.reading import Entry
-from s2r_runtime.recorder import Recorder
-from s2r_runtime.recording import Writer, read
-from s2r_runtime.salvage import recover
+from s2r_runtime.recording.reading import Entry
+from s2r_runtime.recording.recorder import Recorder
+from s2r_runtime.recording.salvage import recover
+from s2r_runtime.recording.writer import Writer, read
 
 _spec = importlib.util.spec_from_file_location("audit_bench", Path(__file__).parent / "audit_bench.py")
 assert _spec is not None

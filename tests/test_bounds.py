@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from s2r_runtime import ledger
 from s2r_runtime.bounds import (
     attempt_beta,
     clopper_pearson_lower,
@@ -19,6 +18,7 @@ from s2r_runtime.bounds import (
     sample_size,
     scenario_confidence,
 )
+from s2r_runtime.core import ledger
 from s2r_runtime.errors import UsageError
 
 SIZES = (1, 2, 7, 50, 99, 299)

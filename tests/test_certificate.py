@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 from s2r_runtime import certificate, keys, statements
 from s2r_runtime.certificate import Certificate
-from s2r_runtime.controller_file import ControllerFile
+from s2r_runtime.controllers.file import ControllerFile
+from s2r_runtime.core.ledger import binomial_tail, campaign_size, sample_size, share
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, S2RError
-from s2r_runtime.ledger import binomial_tail, campaign_size, sample_size, share
 from s2r_runtime.messages import Gap, LawResult, Verification
 from s2r_runtime.profile import Profile, parse_profile
 

@@ -12,13 +12,13 @@ import pytest
 import zstandard
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from s2r_runtime.blocks import take
-from s2r_runtime.chain import GENESIS, advance, is_signed_by, signed
-from s2r_runtime.channels import Seal
 from s2r_runtime.errors import RecordingError
-from s2r_runtime.layout import MESSAGE, chunk
 from s2r_runtime.messages import Ticked
-from s2r_runtime.recording import Writer, read
+from s2r_runtime.recording.blocks import take
+from s2r_runtime.recording.chain import GENESIS, advance, is_signed_by, signed
+from s2r_runtime.recording.channels import Seal
+from s2r_runtime.recording.layout import MESSAGE, chunk
+from s2r_runtime.recording.writer import Writer, read
 
 KEY = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
 OTHER = Ed25519PrivateKey.from_private_bytes(bytes(range(1, 33)))

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from s2r_runtime import confinement
+from s2r_runtime.controllers import confinement
 
 pytestmark = pytest.mark.skipif(platform.machine() not in {"x86_64", "aarch64"}, reason="system calls are filtered on these processors")
 
 CONFINED = """
 import os, sys
-from s2r_runtime.confinement import confine
+from s2r_runtime.controllers.confinement import confine
 PATH = sys.argv[1]
 in_force = confine(1 << 28)
 try:

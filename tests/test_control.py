@@ -17,10 +17,10 @@ from pathlib import Path
 
 import pytest
 
-from s2r_runtime import control
-from s2r_runtime.control import Connection, ControlServer, Request, call, find_socket
+from s2r_runtime.daemon import control
+from s2r_runtime.daemon.control import Connection, ControlServer, Request, call, find_socket
+from s2r_runtime.daemon.systemd import Notifier
 from s2r_runtime.errors import ConfigError, UsageError
-from s2r_runtime.systemd import Notifier
 
 
 class Desk:

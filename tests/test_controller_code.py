@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from s2r_runtime.controller_code import Malformed, Raised, batch_control
-from s2r_runtime.controller_file import ControllerFile, load
+from s2r_runtime.controllers.code import Malformed, Raised, batch_control
+from s2r_runtime.controllers.file import ControllerFile, load
 from s2r_runtime.errors import ControllerError
 
 GOOD = """

@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from s2r_runtime.controller_file import load
+from s2r_runtime.controllers.file import load
 from s2r_runtime.errors import ConfigError
 
 GOOD = """
@@ -139,5 +139,7 @@ def test_a_library_that_may_be_missing_is_part_of_the_digest(tmp_path: Path) -> 
 
 
 def test_the_daemon_loads_controllers_without_numpy() -> None:
-    code = "import sys, s2r_runtime.controllers, s2r_runtime.certificate, s2r_runtime.persistence; print('numpy' in sys.modules)"
+    code = (
+        "import sys, s2r_runtime.controllers.hosted, s2r_runtime.certificate, s2r_runtime.daemon.persistence; print('numpy' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "False"

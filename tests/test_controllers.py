@@ -19,9 +19,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from s2r_runtime.controller_code import batch_control
-from s2r_runtime.controllers import ControllerFile, HostedController, Ready, Reply, Stopped, load
-from s2r_runtime.episodes import Episodes
+from s2r_runtime.controllers.code import batch_control
+from s2r_runtime.controllers.episodes import Episodes
+from s2r_runtime.controllers.hosted import ControllerFile, HostedController, Ready, Reply, Stopped, load
 from s2r_runtime.messages import Observation
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
@@ -312,7 +312,7 @@ def test_a_question_that_is_no_state_is_the_callers_fault(tmp_path: Path) -> Non
 PARENT = """
 import sys, time
 from pathlib import Path
-from s2r_runtime.controllers import HostedController, load
+from s2r_runtime.controllers.hosted import HostedController, load
 from s2r_runtime.messages import Observation
 from s2r_runtime.modelspec import ModelSpec
 host = HostedController(load(Path(sys.argv[1])), model=ModelSpec("unicycle", 0.033), nx=3, nu=2, task=None, seed=7)

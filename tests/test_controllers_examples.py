@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from s2r_runtime.bounds import attempt_beta, clopper_pearson_upper, epoch_beta, sample_size
-from s2r_runtime.controllers import batch_control, load
+from s2r_runtime.controllers.hosted import batch_control, load
 from s2r_runtime.gap import Transitions, estimate_gap
 from s2r_runtime.messages import Gap, Verification
 from s2r_runtime.models.composed import ComposedModel, compose

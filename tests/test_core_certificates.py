@@ -9,7 +9,8 @@ import msgspec
 import pytest
 from core_rig import GAP, Rig, answers, kinds, memory, of, one
 
-from s2r_runtime import bounds, core
+from s2r_runtime import bounds
+from s2r_runtime.core import reducer as core
 from s2r_runtime.messages import (
     Answer,
     AttemptEnded,

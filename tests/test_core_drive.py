@@ -9,7 +9,7 @@ import msgspec
 import pytest
 from core_rig import DT, Rig, S, kinds, lockstep, memory, of, one, reason, reopen, sources
 
-from s2r_runtime import core
+from s2r_runtime.core import reducer as core
 from s2r_runtime.messages import (
     AnalyticsChanged,
     Answer,

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 from core_rig import GAP, Rig, S, kinds, memory, of, one
 
-from s2r_runtime import ledger
+from s2r_runtime.core import ledger
 from s2r_runtime.messages import (
     Answer,
     CertificateFacts,

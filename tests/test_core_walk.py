@@ -11,8 +11,8 @@ import pytest
 from core_law import DT
 from core_world import World
 
-from s2r_runtime import core
-from s2r_runtime.core_state import State
+from s2r_runtime.core import reducer as core
+from s2r_runtime.core.state import State
 from s2r_runtime.messages import (
     AnalyticsChanged,
     Command,

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from core_rig import Rig, answers, kinds, of, one, reason, reopen, sources
 
-from s2r_runtime import core
+from s2r_runtime.core import reducer as core
 from s2r_runtime.messages import (
     AlarmRaised,
     Answer,

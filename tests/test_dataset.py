@@ -6,14 +6,14 @@ import hashlib
 import numpy as np
 import pytest
 
-from s2r_runtime.dataset import Stream, from_arrays, from_streams
-from s2r_runtime.dataset_files import load_dataset
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.messages import Observation, Observed, Send
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.recording import Writer
-from s2r_runtime.residual import acting, first_steps, rollout_starts, sequence, steps_of
+from s2r_runtime.recording.writer import Writer
+from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
+from s2r_runtime.trace.dataset_files import load_dataset
+from s2r_runtime.trace.residual import acting, first_steps, rollout_starts, sequence, steps_of
 
 
 def _model(dt=0.1, name="unicycle", effects=()):

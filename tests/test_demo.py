@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from s2r_runtime import messages as m
-from s2r_runtime.recording import read_all
+from s2r_runtime.recording.writer import read_all
 
 
 def s2r(*argv: str | Path, timeout: float = 420) -> subprocess.CompletedProcess[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from s2r_runtime.episodes import Episodes
+from s2r_runtime.controllers.episodes import Episodes
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry

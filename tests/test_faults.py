@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recordings
 
-from s2r_runtime.dataset import Stream, from_streams
-from s2r_runtime.faults import check
+from s2r_runtime.trace.dataset import Stream, from_streams
+from s2r_runtime.trace.faults import check
 
 STEPS = 900
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from s2r_runtime import plots
-from s2r_runtime.page import Page
+from s2r_runtime.report import plots
+from s2r_runtime.report.page import Page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = (

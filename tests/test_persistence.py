@@ -13,11 +13,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from s2r_runtime import offline_ledger, persistence
+from s2r_runtime import offline_ledger
+from s2r_runtime.core.ledger import share
+from s2r_runtime.daemon import persistence
+from s2r_runtime.daemon.persistence import StateFolder
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.ledger import share
 from s2r_runtime.messages import MEMORY_SCHEMA, CertificateFacts, Gap, Memory
-from s2r_runtime.persistence import StateFolder
 
 GAP = Gap(0.25, 0.5, 0.75, 50, "ball", (1.0, 1.0, 0.0525), 161, 0, 0.03, 0.0152, 1, "sha256:aa", "sha256:bb", {"out_of_region": 3})
 FACTS = CertificateFacts("sha256:01", "sha256:02", "sha256:03", "sha256:04", "sha256:05", 1, 0.25, 0.375, 1000, 2000, 1)
@@ -107,7 +108,8 @@ def test_state_of_another_robot_schema_or_kind_is_refused(tmp_path: Path) -> Non
 
 
 def test_two_processes_cannot_share_a_state(tmp_path: Path) -> None:
-    code = "import sys; from pathlib import Path; from s2r_runtime.persistence import StateFolder; StateFolder(Path(sys.argv[1]), 'rover')"
+    code = "import sys; from pathlib import Path; from s2r_runtime.daemon.persistence import StateFolder as Folder"
+    code += "; Folder(Path(sys.argv[1]), 'rover')"
     with StateFolder(tmp_path, "rover"):
         second = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=False)
     assert "another process uses the state of robot 'rover'" in second.stderr
@@ -165,7 +167,7 @@ WRITER = """
 import sys
 from pathlib import Path
 from s2r_runtime.messages import MEMORY_SCHEMA, Memory
-from s2r_runtime.persistence import StateFolder
+from s2r_runtime.daemon.persistence import StateFolder
 folder = StateFolder(Path(sys.argv[1]), "rover")
 attempts = folder.memory().attempts
 while True:

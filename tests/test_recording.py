@@ -21,11 +21,11 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from mcap.reader import NonSeekingReader, make_reader
 
-from s2r_runtime.channels import CHANNELS, Unrecorded, schema
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.messages import Ask, Command, Decided, Frame, Measured, Observation, Observed, Proposed, Send, Struct, Ticked
-from s2r_runtime.recorder import Recorder
-from s2r_runtime.recording import Writer, read
+from s2r_runtime.recording.channels import CHANNELS, Unrecorded, schema
+from s2r_runtime.recording.recorder import Recorder
+from s2r_runtime.recording.writer import Writer, read
 
 KEY = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from s2r_runtime.residual_noise import Noise, Whitener, colour, estimate, log_density, no_colour, weight
+from s2r_runtime.trace.residual_noise import Noise, Whitener, colour, estimate, log_density, no_colour, weight
 
 
 def _residuals(rng, n, q, r, slope):

@@ -11,8 +11,8 @@ from mcap.reader import NonSeekingReader, make_reader
 
 from s2r_runtime.errors import RecordingError, UsageError
 from s2r_runtime.messages import Frame, Struct, Ticked
-from s2r_runtime.recording import Writer, read
-from s2r_runtime.salvage import info, recover
+from s2r_runtime.recording.salvage import info, recover
+from s2r_runtime.recording.writer import Writer, read
 
 KEY = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
 PER_CHUNK = 20

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from trace_robots import declared, recordings
 
-from s2r_runtime.dataset import from_arrays
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import dump_model, load_model
-from s2r_runtime.trace import trace
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.tracer import trace
 
 SETS, STEPS = 3, 700
 

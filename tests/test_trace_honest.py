@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recordings, wandering
 
-from s2r_runtime.dataset import from_arrays
-from s2r_runtime.trace import trace
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.tracer import trace
 
 STEPS = 700
 GAIN = [("input_gain", "w", {"gain": 0.75})]

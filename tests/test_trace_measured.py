@@ -11,7 +11,7 @@ import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.trace import load_dataset, trace
+from s2r_runtime.trace.tracer import load_dataset, trace
 
 FOLDER = Path(os.environ.get("S2R_DATA", Path(__file__).parents[2] / "shared" / "data"))
 RECORDING = FOLDER / "mrclam_ds4_robot3.csv.gz"

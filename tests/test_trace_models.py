@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from trace_robots import GEOMETRY, INPUTS, POSES, commands, drive
 
-from s2r_runtime.dataset import Stream, from_arrays, from_streams
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace import trace
+from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
+from s2r_runtime.trace.tracer import trace
 
 ROBOTS = {
     "unicycle": (0.05, [(-0.5, 0.5), (-2.0, 2.0)], [0.001, 0.001, 0.004]),

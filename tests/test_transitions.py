@@ -17,7 +17,7 @@ from s2r_runtime.gap import estimate_gap, hold_residuals, residuals
 from s2r_runtime.messages import CampaignFinished, Event, Observation, Observed, SampleTaken, Send
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.recording import Writer
+from s2r_runtime.recording.writer import Writer
 from s2r_runtime.transitions import from_samples, load_transitions
 
 DT = 0.1

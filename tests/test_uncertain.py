@@ -1,4 +1,4 @@
-"""Promises of the disturbance laws (DESIGN G8) and of the rollouts that they disturb."""
+"""Promises of the disturbance laws (guarantee G8) and of the rollouts that they disturb."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from s2r_runtime.bounds import clopper_pearson_lower, clopper_pearson_upper
-from s2r_runtime.controllers import batch_control, load
+from s2r_runtime.controllers.hosted import batch_control, load
 from s2r_runtime.disturbance import LAWS, Ahead
 from s2r_runtime.errors import ControllerError, UsageError
 from s2r_runtime.models.composed import ComposedModel, compose

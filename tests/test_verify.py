@@ -1,4 +1,4 @@
-"""Promises of the verification (DESIGN G2, G8): what passes, what cannot, what is claimed, and how often that is wrong."""
+"""Promises of the verification (guarantee G2, G8): what passes, what cannot, what is claimed, and how often that is wrong."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from s2r_runtime.bounds import attempt_beta, clopper_pearson_lower, clopper_pearson_upper, sample_size
 from s2r_runtime.canonical import canonical
-from s2r_runtime.controllers import batch_control, load
+from s2r_runtime.controllers.hosted import batch_control, load
 from s2r_runtime.errors import ControllerError, NotEnoughEvidence, UsageError
 from s2r_runtime.messages import Verification
 from s2r_runtime.models.composed import compose

@@ -15,15 +15,15 @@ import msgspec
 import pytest
 from daemon_rig import PROFILE
 
-from s2r_runtime import jobs
-from s2r_runtime.analytics import Analytics, Ready, Refused, Reply, Watching
 from s2r_runtime.child import Child
-from s2r_runtime.controller_file import load
+from s2r_runtime.controllers.file import load
+from s2r_runtime.core.ledger import share
+from s2r_runtime.daemon import jobs
+from s2r_runtime.daemon.analytics import Analytics, Ready, Refused, Reply, Watching
+from s2r_runtime.daemon.worker import Failed, GapJob, Job, LoadJob, Progress, Result, Upward, VerifyJob, Worker
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.ledger import share
 from s2r_runtime.messages import Gap, Observation, SampleTaken, Send
 from s2r_runtime.profile import Profile, parse_profile
-from s2r_runtime.worker import Failed, GapJob, Job, LoadJob, Progress, Result, Upward, VerifyJob, Worker
 
 WITHIN_S = 60.0
 GRID = Path(__file__).parent.parent / "controllers" / "grid.py"
@@ -148,7 +148,7 @@ def test_killed_worker_is_a_job_that_failed() -> None:
     worker.stop()
 
 
-@pytest.mark.parametrize("module", ["s2r_runtime.worker", "s2r_runtime.analytics"])
+@pytest.mark.parametrize("module", ["s2r_runtime.daemon.worker", "s2r_runtime.daemon.analytics"])
 def test_children_end_when_their_parent_is_killed(module: str) -> None:
     program = f"import time; from s2r_runtime.child import Child; c = Child('{module}'); print(c.pid, flush=True); time.sleep(60)"
     parent = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
@@ -167,7 +167,7 @@ def test_child_that_does_not_read_is_bounded_and_one_that_left_is_noticed(monkey
     from s2r_runtime import child
 
     monkeypatch.setattr(child, "PENDING_MAX", 1 << 20)
-    one = Child("s2r_runtime.worker")
+    one = Child("s2r_runtime.daemon.worker")
     os.kill(one.pid, signal.SIGSTOP)
     for _ in range(64):
         one.send(b"x" * (1 << 16))

@@ -2,7 +2,7 @@
 
     tools/bench_coverage.py [--repetitions 1000] [--seed 1] [--json]
 
-G1: the built-in robot's campaign (DESIGN section 4; paper, section V) in a vectorised form: 2 x repetitions robots side by side, each with
+G1: the built-in robot's campaign (docs/guarantee.md; paper, section V) in a vectorised form: 2 x repetitions robots side by side, each with
 latency of one period, clipped wheels, arcs and pose noise, drive to waypoints, stop, and hold one input for 50 periods. One half are the
 experiments, each bounded by `s2r_runtime.gap`; the other half are the law: V(r) is counted on all their discrepancies together.
 G2: rollouts of the uncertain model, in groups of N; V(s*) is counted on as many others.
@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.bounds import clopper_pearson_lower, sample_size, scenario_confidence
-from s2r_runtime.controllers import batch_control, load
+from s2r_runtime.controllers.hosted import batch_control, load
 from s2r_runtime.gap import Transitions, discrepancy, estimate_gap, hold_residuals, residuals
 from s2r_runtime.models.composed import ComposedModel, compose, wrap
 from s2r_runtime.modelspec import EffectSpec, ModelSpec

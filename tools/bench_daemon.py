@@ -80,7 +80,7 @@ class Bench:
             yield from ended(subprocess.Popen(argv, stdout=sink, stderr=sink, env=self.environment))
 
     def ask(self, verb: str, **fields: Any) -> dict[str, Any]:
-        from s2r_runtime import control
+        from s2r_runtime.daemon import control
 
         limit = time.monotonic() + 30.0
         path = self.folder / "s2r" / "robotarium.sock"
@@ -193,7 +193,7 @@ def measured(bench: Bench, seconds: float) -> dict[str, float]:
 def first_observation_ns(log: Path) -> int:
     """When the first frame was in the daemon's hands (host's monotonic clock)."""
     from s2r_runtime.messages import Frame
-    from s2r_runtime.reading import read
+    from s2r_runtime.recording.reading import read
 
     for entry in read(log, ["frame/in"]):
         if isinstance(entry.message, Frame):
@@ -206,8 +206,8 @@ def first_observation_ns(log: Path) -> int:
 
 def decisions(logs: list[Path]) -> dict[str, dict[str, float]]:
     """Time of `core.handle`, µs, by event; `proposed` holds the gate's decision and the command."""
-    from s2r_runtime import core
-    from s2r_runtime.reading import read
+    from s2r_runtime.core import reducer as core
+    from s2r_runtime.recording.reading import read
 
     events = [entry.message for log in logs for entry in read(log) if entry.channel.startswith("event/")]
     times: dict[str, list[float]] = {}

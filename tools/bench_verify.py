@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.controllers import batch_control, load
+from s2r_runtime.controllers.hosted import batch_control, load
 from s2r_runtime.hookspecs import Scenario
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.profile import load_profile

@@ -1,4 +1,4 @@
-"""s2r certify: gap + verify + sign, offline. The budget is kept in a ledger beside the key (DESIGN G4)."""
+"""s2r certify: gap + verify + sign, offline. The budget is kept in a ledger beside the key (guarantee G4)."""
 
 from __future__ import annotations
 
@@ -29,11 +29,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Exit 0 with a certificate written, 1 if the controller did not pass (the attempt is spent all the same)."""
-    from s2r_runtime import certificate, keys, offline_ledger, persistence
+    from s2r_runtime import certificate, keys, offline_ledger
     from s2r_runtime import verify as verification
     from s2r_runtime.bounds import attempt_beta, epoch_beta
     from s2r_runtime.canonical import digest
     from s2r_runtime.cli.evidence import gap_of, print_verification, profile_model, run_verification
+    from s2r_runtime.daemon import persistence
     from s2r_runtime.plugins import registry
 
     profile = load_checked(args.profile)

@@ -13,7 +13,7 @@ from s2r_runtime.modelspec import ModelSpec, load_model
 from s2r_runtime.profile import Profile, check_names, load_profile
 
 if TYPE_CHECKING:
-    from s2r_runtime.controllers import ControllerFile
+    from s2r_runtime.controllers.hosted import ControllerFile
     from s2r_runtime.models.composed import ComposedModel
 
 
@@ -54,7 +54,7 @@ def chosen_model(args: argparse.Namespace) -> tuple[ComposedModel, Profile | Non
 
 def controller_at(path: Path, parameters: list[str]) -> ControllerFile:
     """The controller in that file. Raises UsageError if there is no such file, ConfigError if it is no controller."""
-    from s2r_runtime import controllers
+    from s2r_runtime.controllers import hosted as controllers
 
     if not path.is_file():
         raise UsageError(f"{path}: no such file; a controller is a Python file with control(x, theta, parameters)")

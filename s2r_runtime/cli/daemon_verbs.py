@@ -87,12 +87,12 @@ def _common(verb: argparse.ArgumentParser) -> None:
 
 def run_daemon(args: argparse.Namespace) -> int:
     """Runs until SIGTERM or SIGINT. Exit 0 on a clean end."""
-    from s2r_runtime import analytics
+    from s2r_runtime.daemon import analytics
     from s2r_runtime.profile import load_profile
 
     profile = load_profile(args.profile)
     child = analytics.start()  # it loads its libraries while the daemon's are loaded here; it ends with this process
-    from s2r_runtime.daemon import Daemon
+    from s2r_runtime.daemon.loop import Daemon
 
     daemon = Daemon(
         profile,
@@ -108,7 +108,7 @@ def run_daemon(args: argparse.Namespace) -> int:
 
 def run_sample(args: argparse.Namespace) -> int:
     """Exit 0 if the campaign is complete."""
-    from s2r_runtime import control
+    from s2r_runtime.daemon import control
     from s2r_runtime.profile import load_profile
 
     profile = load_profile(args.profile)
@@ -121,7 +121,7 @@ def run_sample(args: argparse.Namespace) -> int:
         return _say(args, {"verb": "cancel"} if args.cancel else {"verb": "sample", "count": args.n}, socket)
     if args.cancel:
         raise UsageError(f"--cancel: no daemon of robot {profile.robot.name!r} is running")
-    from s2r_runtime.campaign_run import run_campaign
+    from s2r_runtime.daemon.campaign_run import run_campaign
 
     out = args.output or Path(f"{profile.robot.name}-campaign.mcap")
     bar = output.Progress("sampling")
@@ -181,7 +181,7 @@ def _say(args: argparse.Namespace, request: dict[str, Any], socket: Path | None 
 
 
 def _call(args: argparse.Namespace, request: dict[str, Any], socket: Path | None = None) -> dict[str, Any]:
-    from s2r_runtime import control
+    from s2r_runtime.daemon import control
 
     path = socket or args.socket or control.find_socket(args.robot)
     if path is None:

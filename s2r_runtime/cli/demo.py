@@ -29,6 +29,6 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Exit 0 if the story ended as evidence demands (also where it ends with a refusal) and its log passes the audit."""
-    from s2r_runtime.demonstration import Demonstration
+    from s2r_runtime.cli.demonstration import Demonstration
 
     return Demonstration(args.robot, args.out, args.seed, args.effect, args.change).run()

@@ -10,7 +10,7 @@ from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import add_model_options, chosen_model, controller_at, count, load_checked, positive, probability, weights_of
 
 if TYPE_CHECKING:
-    from s2r_runtime.controllers import ControllerFile
+    from s2r_runtime.controllers.hosted import ControllerFile
     from s2r_runtime.messages import Gap
     from s2r_runtime.models.composed import ComposedModel
     from s2r_runtime.profile import Profile
@@ -182,8 +182,8 @@ def run_verification(
     beta: float,
 ) -> Any:
     """Verification of a controller file under a profile, with progress on a terminal."""
-    from s2r_runtime import controllers
     from s2r_runtime import verify as verification
+    from s2r_runtime.controllers import hosted as controllers
     from s2r_runtime.plugins import registry
     from s2r_runtime.uncertain import GapSet
 

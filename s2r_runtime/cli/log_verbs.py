@@ -44,7 +44,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def run_audit(args: argparse.Namespace) -> int:
     """Exit 0 if all that is there holds, 1 if something does not."""
     from s2r_runtime import keys
-    from s2r_runtime.audit import audit
+    from s2r_runtime.audit.log import audit
 
     _need(args.log)
     bar = output.Progress("auditing")
@@ -63,7 +63,7 @@ def run_audit(args: argparse.Namespace) -> int:
 
 def run_report(args: argparse.Namespace) -> int:
     """Exit 0 with the page written."""
-    from s2r_runtime.report import log_page
+    from s2r_runtime.report.run_page import log_page
 
     _need(args.log)
     page = log_page(args.log)
@@ -77,7 +77,7 @@ def run_report(args: argparse.Namespace) -> int:
 
 def run_recover(args: argparse.Namespace) -> int:
     """Exit 0 with a readable file written."""
-    from s2r_runtime.salvage import recover
+    from s2r_runtime.recording.salvage import recover
 
     _need([args.log])
     if args.output.resolve() == args.log.resolve():
@@ -93,7 +93,7 @@ def run_recover(args: argparse.Namespace) -> int:
 
 def run_info(args: argparse.Namespace) -> int:
     """Exit 0 if it is a log."""
-    from s2r_runtime.salvage import info
+    from s2r_runtime.recording.salvage import info
 
     _need([args.log])
     facts = info(args.log)

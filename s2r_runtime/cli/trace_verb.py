@@ -31,7 +31,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def run(args: argparse.Namespace) -> int:
     """Exit 0 with any verdict, 3 with too little data."""
     from s2r_runtime.modelspec import dump_model
-    from s2r_runtime.trace import load_dataset, trace
+    from s2r_runtime.trace.tracer import load_dataset, trace
 
     model, profile = chosen_model(args)
     columns = dict(profile.columns) if profile else {}
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     if args.output:
         args.output.write_text(dump_model(result.spec, result.comments()), encoding="utf-8")
     if args.report:
-        from s2r_runtime.report_trace import trace_page
+        from s2r_runtime.report.trace_section import trace_page
 
         args.report.write_text(trace_page(result), encoding="utf-8")
     if args.json:

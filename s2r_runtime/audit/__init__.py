@@ -1,0 +1,1 @@
+"""Recomputes a log from itself, and names the first record that differs."""

@@ -1,0 +1,127 @@
+"""Holds every certificate against what the log shows: signature, bindings, evidence, and the very sentences (docs/guarantee.md, 5)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from s2r_runtime import certificate as certificates
+from s2r_runtime import keys
+from s2r_runtime.audit.evidence import Evidence, attached_controller
+from s2r_runtime.audit.findings import CertificateFinding, Findings
+from s2r_runtime.errors import ConfigError, NotEnoughEvidence
+from s2r_runtime.messages import CertificateStored, IssueCertificate, Memory, Revoked, Settings
+from s2r_runtime.profile import Profile
+from s2r_runtime.recording.layout import Attached
+from s2r_runtime.recording.reading import Entry
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+
+class Certificates:
+    """Of all runs."""
+
+    def __init__(self, findings: Findings, evidence: Evidence) -> None:
+        self._findings, self._evidence = findings, evidence
+        self._orders: dict[int, tuple[IssueCertificate, bool]] = {}
+
+    def begin_run(self) -> None:
+        """A new run numbers its requests anew."""
+        self._orders.clear()
+
+    def remembered(self, memory: Memory) -> None:
+        """A run begins with these certificates in force."""
+        for facts in memory.certificates:
+            if facts.id not in self._findings.certificates:
+                self._findings.lack(f"the evidence of certificate {facts.id}, in an earlier log that was not given")
+
+    def issuing(self, order: IssueCertificate, *, traced: bool) -> None:
+        """The core has a certificate signed."""
+        self._orders[order.request_id] = (order, traced)
+
+    def stored(
+        self,
+        entry: Entry,
+        event: CertificateStored,
+        profile: Profile,
+        settings: Settings,
+        horizon: Callable[[], int],
+        attachments: Mapping[str, Attached],
+        trusted: tuple[bytes, ...],
+    ) -> None:
+        """A certificate is in force. trusted: keys whose signature counts; the log's own first."""
+        identity = event.facts.id
+        try:
+            note = self._judged(event, profile, settings, horizon, attachments, trusted)
+            valid = True
+        except (ConfigError, NotEnoughEvidence) as error:
+            note, valid = str(error), False
+        self._findings.certificates[identity] = CertificateFinding(identity, valid, note)
+        if not valid:
+            self._findings.differ(entry.index, entry.channel, f"certificate {identity}: {note}", event.facts, None)
+
+    def revoked(self, output: Revoked) -> None:
+        """It was withdrawn; what it said when it was issued stays as true as it was."""
+        finding = self._findings.certificates.get(output.certificate_id)
+        if finding is not None:
+            finding.reason += f"; revoked later: {output.reason}"
+
+    def _judged(
+        self,
+        event: CertificateStored,
+        profile: Profile,
+        settings: Settings,
+        horizon: Callable[[], int],
+        attachments: Mapping[str, Attached],
+        trusted: tuple[bytes, ...],
+    ) -> str:
+        """Why it stands. Raises ConfigError with why it doesn't."""
+        data = attachments.get(f"certificate/{event.facts.id}")
+        if data is None:
+            raise ConfigError("is not attached to the log")
+        elsewhere = event.gap is not None
+        signer = _signer(data.data)
+        certificate = certificates.load(data.data, {*trusted, signer} if elsewhere else trusted[:1], None, "certificate")
+        if certificates.facts(certificate) != event.facts or event.gap not in (None, certificate.gap):
+            raise ConfigError("what the gate was told is not what it says")
+        if elsewhere:
+            known = "a trusted key" if signer in trusted else f"key {keys.fingerprint(signer)}, not compared with a trusted one"
+            return f"signed elsewhere by {known}; its evidence is not in this log"
+        order, traced = self._orders.get(event.request_id, (None, False))
+        if order is None:
+            raise ConfigError("nobody asked for it")
+        if problem := self._evidence.problem(order):
+            raise ConfigError(problem)
+        controller = attached_controller(attachments, certificate.controller_digest)
+        if controller is None:
+            raise ConfigError("the controller that it is of is not attached")
+        if certificate.profile_digest != settings.profile_digest:
+            raise ConfigError("it is of another profile")
+        again = certificates.issue(
+            profile=profile,
+            controller=controller,
+            gap=order.gap,
+            verification=order.verification,
+            issued_unix_s=certificate.issued_unix_s,
+            lifetime_s=order.lifetime_s,
+            horizon=horizon(),
+            traced_not_adopted=traced,
+        )
+        if again.id != certificate.id:
+            raise ConfigError("what it says is not what the evidence says")
+        self._findings.count("certificates")
+        return self._evidence.support(order)
+
+
+def _signer(data: bytes) -> bytes:
+    """The public key that stands in a certificate's file; empty if there is none to be seen."""
+
+    class Key(msgspec.Struct):
+        public_key: bytes = b""
+
+    try:
+        return msgspec.json.decode(data, type=Key).public_key
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        return b""

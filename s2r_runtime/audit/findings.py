@@ -1,0 +1,93 @@
+"""What an audit finds: the first difference, what was recomputed, what could not be, what is missing, which certificates stand."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgspec
+
+RELATIVE = 1e-9
+"""How far a number from another platform's arithmetic may be off (docs/log-format.md)."""
+SHOWN = 600
+"""Characters of a record in a difference."""
+
+
+class Difference(msgspec.Struct, frozen=True):
+    """A record that does not follow from those before it. `index`: its number in the run."""
+
+    file: str
+    index: int
+    channel: str
+    what: str
+    recorded: str
+    recomputed: str
+
+
+class CertificateFinding(msgspec.Struct):
+    """Whether the log carries what a certificate says, and why (not)."""
+
+    id: str
+    valid: bool
+    reason: str
+
+
+class Findings:
+    """Collects. `file`, `same_platform`: of what is being read now."""
+
+    def __init__(self) -> None:
+        self.file = ""
+        self.same_platform = True
+        self.first: Difference | None = None
+        self.differences = 0
+        self.counts: dict[str, int] = {}
+        self.unchecked: dict[str, None] = {}
+        self.missing: list[str] = []
+        self.certificates: dict[str, CertificateFinding] = {}
+
+    def differ(self, index: int, channel: str, what: str, recorded: Any, recomputed: Any) -> None:
+        """A difference; the first one is kept."""
+        self.differences += 1
+        if self.first is None:
+            self.first = Difference(self.file, index, channel, what, _shown(recorded), _shown(recomputed))
+
+    def count(self, what: str, n: int = 1) -> None:
+        """So many of these were recomputed."""
+        self.counts[what] = self.counts.get(what, 0) + n
+
+    def cannot(self, what: str) -> None:
+        """Something that is there could not be recomputed here: no pass."""
+        self.unchecked[what] = None
+
+    def lack(self, what: str) -> None:
+        """Something is not in what was given. That is no difference."""
+        if what not in self.missing:
+            self.missing.append(what)
+
+
+def close(a: Any, b: Any) -> bool:
+    """Equal, but for numbers that are within RELATIVE of each other. a, b: plain data."""
+    if isinstance(a, float) or isinstance(b, float):
+        if not (isinstance(a, int | float) and isinstance(b, int | float)):
+            return False
+        return a == b or math.isclose(a, b, rel_tol=RELATIVE, abs_tol=1e-300)
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(close(value, b[key]) for key, value in a.items())
+    if isinstance(a, list | tuple) and isinstance(b, list | tuple):
+        return len(a) == len(b) and all(map(close, a, b))
+    return bool(a == b)
+
+
+def alike(a: msgspec.Struct, b: msgspec.Struct) -> bool:
+    """As `close`, of two messages."""
+    return type(a) is type(b) and (a == b or close(msgspec.to_builtins(a), msgspec.to_builtins(b)))
+
+
+def _shown(value: Any) -> str:
+    if value is None or isinstance(value, str):
+        text = value or "nothing"
+    elif isinstance(value, bytes):
+        text = value.decode(errors="replace")
+    else:
+        text = msgspec.json.encode(value).decode()
+    return text if len(text) <= SHOWN else text[:SHOWN] + "…"

@@ -1,0 +1,115 @@
+"""Decodes the raw frames again, and encodes the commands again: what was acted on must be what came, what left what was decided."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import msgspec
+
+from s2r_runtime.audit.findings import Findings
+from s2r_runtime.daemon.robot_link import Inbound
+from s2r_runtime.hookspecs import Transport
+from s2r_runtime.messages import Command, Event, Frame, LinkChanged, Observation, Observed, OverrideChanged, Proposed, Send
+from s2r_runtime.recording.reading import Entry
+
+
+class Frames:
+    """One run's frames, through a transport of the log's own profile that is never opened."""
+
+    def __init__(self, transport: Transport, findings: Findings) -> None:
+        self._transport, self._findings = transport, findings
+        self._due: deque[Inbound] = deque()
+        self._source = 0
+        self._sends: deque[Send] = deque()
+        self._left: deque[tuple[Entry, Frame]] = deque()
+
+    def inbound(self, entry: Entry, frame: Frame) -> None:
+        """A frame came. Everything that the one before was decoded to must have become an event by now."""
+        self._commands_left()
+        self._events_are_there(entry)
+        self._source = entry.index
+        try:
+            self._due.extend(self._transport.decode(frame))
+        except Exception:  # noqa: BLE001 - a plug-in's defect; the daemon took it for a lost link and went on, and so does this
+            self._due.clear()
+        self._findings.count("frames")
+
+    def event(self, entry: Entry, event: Event) -> None:
+        """An event: one that only a frame can have brought must be the next that a frame did bring."""
+        self._commands_left()
+        due = self._due[0] if self._due else None
+        if isinstance(event, LinkChanged):
+            if isinstance(due, LinkChanged) and (due.up, due.detail) == (event.up, event.detail):
+                self._due.popleft()
+            return  # otherwise it is the daemon's own: a time-out
+        told = _message(event)
+        if told is None:
+            return
+        if isinstance(due, OverrideChanged):
+            due = msgspec.structs.replace(due, t_ns=0)
+        elif isinstance(due, Command):
+            due = msgspec.structs.replace(due, source="external")
+        if told != due:
+            what = f"this is not what frame {self._source} says"
+            self._findings.differ(entry.index, entry.channel, what, entry.raw, due)
+            self._due.clear()
+            return
+        self._due.popleft()
+
+    def send(self, send: Send) -> None:
+        """The core had this sent."""
+        self._sends.append(send)
+
+    def outbound(self, entry: Entry, frame: Frame) -> None:
+        """A frame left."""
+        self._left.append((entry, frame))
+
+    def _events_are_there(self, entry: Entry) -> None:
+        if self._due:
+            what = f"frame {self._source} says more than the events that follow it"
+            self._findings.differ(entry.index, entry.channel, what, None, self._due[0])
+            self._due.clear()
+
+    def end(self, entry: Entry | None, last_act: Send | None, *, clean: bool) -> None:
+        """Nothing follows. last_act: the one command that the daemon gives on its own, when something in it breaks. clean: and
+        nothing was cut.
+        """
+        if last_act is not None and self._left:
+            self._sends.append(last_act)
+        self._commands_left()
+        if clean and entry is not None:
+            self._events_are_there(entry)
+
+    def _commands_left(self) -> None:
+        """Frames that left since the event before are its commands', in order. A command without a frame could not be sent."""
+        while self._sends:
+            encoded = self._encoded(self._sends.popleft())
+            if self._left and encoded == self._left[0][1].data:
+                self._left.popleft()
+                self._findings.count("frames")
+            else:
+                self._findings.count("commands that did not leave")
+        if self._left:
+            entry, _ = self._left[0]
+            self._findings.differ(entry.index, entry.channel, "a frame left that no command of the core makes", entry.raw, None)
+            self._left.clear()
+
+    def _encoded(self, send: Send) -> bytes | None:
+        """Each command is encoded once, in order, as the daemon did: a transport may count them."""
+        command = Command(send.seq, send.t_ns, send.source, send.u, send.obs_seq, send.ttl_ns)
+        try:
+            return self._transport.encode(command).data
+        except ValueError:
+            return None
+
+
+def _message(event: Event) -> Inbound | None:
+    """What a frame must have said for this event; None for events that do not come from frames."""
+    if isinstance(event, Observed):
+        observation: Observation = event.observation
+        return observation
+    if isinstance(event, Proposed) and event.command.source == "external":
+        return event.command
+    if isinstance(event, OverrideChanged):
+        return msgspec.structs.replace(event, t_ns=0)
+    return None

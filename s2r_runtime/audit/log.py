@@ -1,0 +1,237 @@
+"""Recomputes a log from itself: chain and signatures, frames, the core, discrepancies, campaigns, gaps, verifications, certificates.
+
+Nothing in the log is taken for true that follows from something else in it. What does not follow is what came from outside: the
+frames' bytes, the clock, what people asked for, what a controller answered; those are vouched for by the chain alone. One pass,
+constant memory but for attachments and campaign samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from s2r_runtime import keys
+from s2r_runtime.audit.campaign import CampaignReplay
+from s2r_runtime.audit.certificates import Certificates
+from s2r_runtime.audit.evidence import Evidence
+from s2r_runtime.audit.findings import CertificateFinding, Difference, Findings
+from s2r_runtime.audit.run import Across, RunAudit
+from s2r_runtime.errors import RecordingError
+from s2r_runtime.recording.blocks import find
+from s2r_runtime.recording.channels import UNRECORDED, Unrecorded
+from s2r_runtime.recording.layout import ABOUT, RECOVERED
+from s2r_runtime.recording.logs import is_log, runs
+from s2r_runtime.recording.reading import Reading
+from s2r_runtime.recording.writer import environment
+
+PROGRESS_EVERY = 2000
+"""Messages between two looks at how far it is."""
+PLATFORM = ("python", "platform", "byteorder", "version.numpy", "version.scipy", "version.s2r-runtime")
+"""Where these are the same, numbers must be identical."""
+
+
+class AuditResult(msgspec.Struct, frozen=True):
+    """What an audit says (docs/json.md).
+
+    `ok`: everything that is there was recomputed and holds. `chain`: intact, broken or unsigned tail. `recomputed`: how many of what.
+    `unchecked`: what could not be recomputed here, and why: then it is not ok. `signed_by`: the key, and whether it is one that was
+    asked for. `head`: of the chain, to compare with what the daemon printed.
+    """
+
+    ok: bool
+    records: int
+    certificates: list[CertificateFinding]
+    first_difference: Difference | None
+    differences: int
+    missing: list[str]
+    chain: str
+    signed_by: str
+    head: str
+    recomputed: dict[str, int]
+    unchecked: list[str]
+    files: list[str]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data."""
+        plain: dict[str, Any] = msgspec.to_builtins(self)
+        return plain
+
+    def text(self) -> str:
+        """For people."""
+        lines = [f"{'holds' if self.ok else 'DOES NOT HOLD'}: {self.records} records in {', '.join(self.files)}"]
+        lines.append(f"chain        {self.chain}; {self.signed_by}; head {self.head}")
+        if self.first_difference is not None:
+            d = self.first_difference
+            lines.append(f"differs      {self.differences} times, first at record {d.index} ({d.channel}) of {d.file}: {d.what}")
+            lines += [f"  recorded   {d.recorded}", f"  recomputed {d.recomputed}"]
+        lines += [f"missing      {one}" for one in self.missing]
+        lines += [f"unchecked    {one}" for one in self.unchecked]
+        lines += [f"certificate  {one.id}: {'valid' if one.valid else 'NOT VALID'}: {one.reason}" for one in self.certificates]
+        lines.append("recomputed   " + (", ".join(f"{count} {what}" for what, count in self.recomputed.items()) or "nothing"))
+        return "\n".join(lines)
+
+
+def audit(
+    paths: Sequence[Path],
+    public_key: bytes | None = None,
+    rerun_controllers: bool = False,
+    progress: Callable[[float, float, str], None] | None = None,
+) -> AuditResult:
+    """Audits the files of one or more runs of a robot. public_key: the Ed25519 key that must have signed them, 32 bytes.
+
+    rerun_controllers: run the attached controllers' code, confined, to repeat the verifications. progress: (done, total, what).
+    Raises RecordingError for a file that is no log, ConfigError or PluginError where this machine lacks what the log needs.
+    """
+    findings = Findings()
+    tell = _Progress(paths, progress)
+    trusted = () if public_key is None else (public_key,)
+    evidence = Evidence(findings, rerun=rerun_controllers, progress=tell.detail)
+    across = Across(findings, CampaignReplay(findings), evidence, Certificates(findings, evidence), trusted, rerun_controllers)
+    readings: list[Reading] = []
+    try:
+        grouped = runs(paths)
+    except RecordingError as error:
+        return _damaged(paths, error)
+    for parts in grouped:
+        readings += parts
+        _run(RunAudit(across), parts, findings, tell)
+    across.campaigns.end()
+    signed_by, trusted_all = _signers(readings, public_key)
+    chain = _chain(readings)
+    valid = all(one.valid for one in findings.certificates.values())
+    return AuditResult(
+        ok=findings.first is None and not findings.unchecked and chain != "broken" and trusted_all and valid,
+        records=sum(sum(reading.counts.values()) for reading in readings),
+        certificates=list(findings.certificates.values()),
+        first_difference=findings.first,
+        differences=findings.differences,
+        missing=findings.missing,
+        chain=chain,
+        signed_by=signed_by,
+        head=readings[-1].head.hex(),
+        recomputed=dict(sorted(findings.counts.items())),
+        unchecked=list(findings.unchecked),
+        files=[reading.path.name for reading in readings],
+    )
+
+
+def _damaged(paths: Sequence[Path], error: RecordingError) -> AuditResult:
+    """What is said of a log whose very start is damaged. Raises the error again if none of the files is one."""
+    for path in paths:
+        if is_log(path):
+            continue
+        if not path.is_file():
+            raise error
+        with path.open("rb") as file:
+            if find(file, 0, path.stat().st_size) is None:
+                raise error
+        where = Difference(path.name, 0, "log/chain", f"the log is damaged: {error}", "nothing", "nothing")
+        names = [one.name for one in paths]
+        return AuditResult(False, 0, [], where, 1, [], "broken", "whose it is cannot be read", "", {}, [], names)
+    raise error
+
+
+def _run(run: RunAudit, parts: list[Reading], findings: Findings, tell: _Progress) -> None:
+    before: Reading | None = None
+    lost = False
+    for reading in parts:
+        findings.file = reading.path.name
+        if not _continues(before, reading, findings):
+            break
+        here = environment()
+        findings.same_platform = all(reading.metadata.get(ABOUT, {}).get(key) == here.get(key) for key in PLATFORM)
+        run.part(reading)
+        for number, entry in enumerate(reading):
+            if entry.channel == UNRECORDED:
+                _unrecorded(entry.message, findings)
+                lost = True
+            else:
+                run.entry(entry)
+            if number % PROGRESS_EVERY == 0:
+                tell.at(reading)
+        tell.over(reading)
+        before = reading
+        if not _ended(reading, findings):
+            break
+    last = parts[-1] if before is None else before
+    run.end(clean=last.over and last.ending.kind == "closed" and not lost)
+    for reading in parts:
+        if not reading.over:
+            reading.to_the_end()
+
+
+def _continues(before: Reading | None, reading: Reading, findings: Findings) -> bool:
+    """Whether a part goes on where the one before ended."""
+    if before is None:
+        if reading.part > 1:
+            findings.cannot(f"{reading.path.name} is part {reading.part} of its run; without the parts before it nothing can be recomputed")
+        return reading.part <= 1
+    if reading.part != before.part + 1 or reading.public_key != before.public_key:
+        findings.cannot(f"between {before.path.name} and {reading.path.name} a part of the run is missing")
+        return False
+    if reading.previous_head != before.head or reading.first_index != before.ending.index:
+        findings.differ(reading.first_index, "log/chain", "this part does not continue the one before", reading.previous_head, before.head)
+        return False
+    return True
+
+
+def _ended(reading: Reading, findings: Findings) -> bool:
+    """Notes how a file ended; whether a next part can go on from it."""
+    end = reading.ending
+    if end.kind == "broken":
+        findings.differ(end.index, "log/chain", f"the log is damaged: {end.detail}", None, None)
+    elif end.kind == "cut":
+        lost = f" ({end.lost_bytes} bytes could not be used)" if end.lost_bytes else ""
+        what = "nothing but the index" if reading.sealed_for_good else "what came after"
+        if (known := reading.metadata.get(RECOVERED)) is not None:
+            findings.lack(f"{reading.path.name} was recovered; it lacks {known['missing']}")
+            return False
+        findings.lack(f"{what}: {reading.path.name} was cut after {end.index} messages: {end.detail}{lost}")
+    return end.kind == "rotated" or (end.kind == "cut" and reading.sealed_for_good)
+
+
+def _unrecorded(message: msgspec.Struct, findings: Findings) -> None:
+    assert isinstance(message, Unrecorded)  # noqa: S101 - the channel's type
+    findings.lack(f"{message.count} messages at the end were not recorded: {message.reason}")
+
+
+def _chain(readings: Sequence[Reading]) -> str:
+    states = {reading.chain for reading in readings}
+    return next((state for state in ("broken", "unsigned tail") if state in states), "intact")
+
+
+def _signers(readings: Sequence[Reading], wanted: bytes | None) -> tuple[str, bool]:
+    """Who signed, in words; and whether that is who was asked for (or nobody was)."""
+    found = list(dict.fromkeys(reading.public_key for reading in readings))
+    names = ", ".join(keys.fingerprint(key) if key else "nobody" for key in found)
+    if wanted is None:
+        return f"signed by {names}, not compared with a trusted key", True
+    if found == [wanted]:
+        return f"signed by {names}, the trusted key", True
+    return f"signed by {names}, NOT by the trusted key {keys.fingerprint(wanted)}", False
+
+
+class _Progress:
+    """Bytes done of all files."""
+
+    def __init__(self, paths: Sequence[Path], progress: Callable[[float, float, str], None] | None) -> None:
+        self._call = progress
+        self._total = float(sum(path.stat().st_size for path in paths if path.exists()))
+        self._before = self._done = 0.0
+
+    def at(self, reading: Reading) -> None:
+        """So far in a file."""
+        self._done = self._before + reading.offset
+        self.detail("")
+
+    def over(self, reading: Reading) -> None:
+        """A file is done."""
+        self._before += reading.size
+
+    def detail(self, what: str) -> None:
+        """What is done now."""
+        if self._call is not None:
+            self._call(self._done, self._total, what)

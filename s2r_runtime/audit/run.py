@@ -1,0 +1,295 @@
+"""One run's log, entry by entry, through everything that recomputes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import msgspec
+
+from s2r_runtime.audit.campaign import CampaignReplay
+from s2r_runtime.audit.certificates import Certificates
+from s2r_runtime.audit.core import CoreReplay, in_effect_order
+from s2r_runtime.audit.evidence import Evidence
+from s2r_runtime.audit.findings import Findings
+from s2r_runtime.audit.frames import Frames
+from s2r_runtime.audit.watch import WatchReplay
+from s2r_runtime.canonical import digest
+from s2r_runtime.daemon.model_store import parse_model
+from s2r_runtime.daemon.settings import ModelFacts, settings_of
+from s2r_runtime.errors import ConfigError
+from s2r_runtime.messages import (
+    AnalyticsChanged,
+    Ask,
+    AttemptSpent,
+    CampaignFinished,
+    CertificateStored,
+    Decided,
+    EpochChanged,
+    Event,
+    Frame,
+    IssueCertificate,
+    JobFinished,
+    Measured,
+    ModelAdopted,
+    Observed,
+    Output,
+    Proposed,
+    RecorderChanged,
+    Revoked,
+    SampleTaken,
+    Send,
+    SourceStarted,
+    SourceStopped,
+    StartCampaign,
+    StartController,
+    Started,
+    StartJob,
+    StopController,
+    Stopping,
+)
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.plugins import registry
+from s2r_runtime.profile import Profile, parse_profile
+from s2r_runtime.recording.layout import Attached
+from s2r_runtime.recording.reading import Entry, Reading
+
+if TYPE_CHECKING:
+    from s2r_runtime.models.composed import ComposedModel
+
+
+class Across(NamedTuple):
+    """What goes on from run to run. trusted: keys of the person who audits. rerun: whether attached code may run."""
+
+    findings: Findings
+    campaigns: CampaignReplay
+    evidence: Evidence
+    certificates: Certificates
+    trusted: tuple[bytes, ...]
+    rerun: bool
+
+
+class RunAudit:
+    """One run, over all its parts. Raises ConfigError or PluginError where this machine lacks what the log needs."""
+
+    def __init__(self, across: Across) -> None:
+        self._findings, self._campaigns, self._evidence, self._certificates = (
+            across.findings,
+            across.campaigns,
+            across.evidence,
+            across.certificates,
+        )
+        self._trusted, self._rerun = across.trusted, across.rerun
+        self._core = CoreReplay(across.findings)
+        self._watch = WatchReplay(across.findings)
+        self._frames: Frames | None = None
+        self._profile: Profile | None = None
+        self._reading: Reading | None = None
+        self._attachments: dict[str, Attached] = {}
+        self._models: dict[str, ComposedModel | None] = {}
+        self._sent_seq = self._seen_seq = -1
+        self._event: Event | None = None
+        self._entry: Entry | None = None
+        self._campaigns.begin_run()
+        self._certificates.begin_run()
+
+    def part(self, reading: Reading) -> None:
+        """The next file."""
+        self._attached()
+        self._reading = reading
+
+    def entry(self, entry: Entry) -> None:
+        """The next message."""
+        self._entry = entry
+        family = entry.channel.partition("/")[0]
+        if family == "event":
+            self._take(entry, entry.message)  # type: ignore[arg-type]
+        elif family == "out":
+            self._core.output(entry)
+        elif family == "frame" and self._frames is not None:
+            message = entry.message
+            assert isinstance(message, Frame)  # noqa: S101 - the channel's type
+            (self._frames.inbound if message.inbound else self._frames.outbound)(entry, message)
+
+    def end(self, *, clean: bool) -> None:
+        """Nothing follows. clean: the log was closed and lacks nothing, so neither may its last event, if that is an orderly end."""
+        stopped = isinstance(self._event, Stopping)
+        if self._frames is not None:
+            self._frames.end(self._entry, None if stopped else self._last_act(), clean=clean and stopped)
+        self._core.end(complete=clean and stopped)
+        self._watch.finish(self._entry, self._core.state.now_ns, clean=clean)
+        if clean and not stopped and self._event is not None:
+            self._findings.lack("an orderly end: the daemon broke down, and closed its log")
+
+    # ---- events
+
+    def _take(self, entry: Entry, event: Event) -> None:
+        self._event = event
+        if isinstance(event, Started):
+            self._begin(entry, event)
+        if self._frames is not None:
+            self._frames.event(entry, event)
+        self._before(entry, event)
+        outputs = self._core.event(entry, event)
+        for output in in_effect_order(outputs):
+            self._output(entry, output)
+        if isinstance(event, JobFinished) and self._profile is not None:
+            samples, rejected = self._campaigns.samples, self._campaigns.rejected
+            self._evidence.finished(entry, event, self._profile, samples, rejected, self._attached())
+
+    def _before(self, entry: Entry, event: Event) -> None:
+        """What is recomputed of an event, before the core's outputs take effect."""
+        match event:
+            case Observed(t_ns=t_ns, observation=observation):
+                self._seen_seq = observation.seq
+                self._watch.observed(entry, observation, t_ns)
+                self._campaigns.observed(observation)
+            case Measured():
+                self._watch.measured(entry, event)
+            case Proposed() if event.command.source == "sampler":
+                self._campaigns.proposed(entry, event)
+            case SampleTaken():
+                self._campaigns.sample(entry, event)
+            case CampaignFinished():
+                self._campaigns.finished(entry, event)
+            case SourceStarted(source="sampler"):
+                self._campaigns.started(entry, event)
+            case SourceStopped(source="sampler"):
+                self._campaigns.stopped(entry, event)
+            case SourceStopped(source="controller", reason="start_failed"):
+                self._watch.doubted()
+            case AnalyticsChanged(up=up):
+                self._watch.analytics(up=up)
+            case RecorderChanged(ok=False):
+                self._campaigns.doubted()
+            case CertificateStored():
+                self._stored(entry, event)
+            case _:
+                pass
+
+    def _begin(self, entry: Entry, event: Started) -> None:
+        """The run's first event: the profile, model and transport that all that follows is computed with."""
+        attached = self._attached()
+        for name in ("profile.toml", "model.toml"):
+            if name not in attached:
+                raise ConfigError(f"{self._where()}: {name} is not attached, so nothing can be recomputed")
+        profile = parse_profile(attached["profile.toml"].data.decode(), f"{self._where()}: profile.toml", Path())
+        self._profile = self._with_model(profile, event.settings.model_digest)
+        settings = event.settings
+        facts = ModelFacts(settings.states, settings.inputs, settings.angles)
+        model = self._compose(self._profile.model)
+        if model is not None:
+            facts = ModelFacts(model.states, model.inputs, tuple(model.nominal.angles))
+        told = settings_of(self._profile, self._profile.model, facts, settings.seed)
+        if told != settings:
+            self._findings.differ(
+                entry.index, entry.channel, "the settings are not those of the attached profile and model", settings, told
+            )
+        self._evidence.begin_run(entry, event.memory)
+        self._certificates.remembered(event.memory)
+        options = {name: value for name, value in profile.transport.items() if name != "name"}
+        transport = registry().get("transports", str(profile.transport.get("name")))
+        self._frames = Frames(transport(options, facts.states, facts.inputs), self._findings)
+
+    def _stored(self, entry: Entry, event: CertificateStored) -> None:
+        settings = self._core.state.settings
+        if self._profile is None or settings is None or self._reading is None:
+            return
+        trusted = (self._reading.public_key, *self._trusted)
+        self._certificates.stored(entry, event, self._profile, settings, self._horizon, self._attached(), trusted)
+
+    # ---- outputs, as they take effect
+
+    def _output(self, entry: Entry, output: Output) -> None:
+        state, profile = self._core.state, self._profile
+        settings = state.settings
+        if profile is None or settings is None:
+            return
+        match output:
+            case Send():
+                self._sent_seq = output.seq
+                self._watch.sent(output)
+                self._campaigns.sent(output)
+                if self._frames is not None:
+                    self._frames.send(output)
+            case Ask(source="sampler"):
+                self._campaigns.ask(output, settings.command_ttl_ns)
+            case Decided():
+                self._campaigns.decided(output.reason)
+            case StartCampaign():
+                in_force = settings_of(profile, profile.model, ModelFacts(settings.states, settings.inputs, settings.angles), settings.seed)
+                self._campaigns.start(output, in_force, profile.sampling)
+            case StartController():
+                model = self._compose(profile.model)
+                if state.memory.gap is not None and model is not None:
+                    fault_jump, lockstep = profile.watch.fault_jump, settings.lockstep
+                    self._watch.begin(model, state.memory.gap, fault_jump, state.memory, lockstep=lockstep)
+            case StopController():
+                self._watch.end()
+            case StartJob():
+                self._evidence.ordered(output, state.memory.gap)
+            case IssueCertificate():
+                self._certificates.issuing(output, traced=state.memory.traced)
+            case EpochChanged() | AttemptSpent():
+                self._evidence.spent(entry, output, settings.beta)
+            case Revoked():
+                self._certificates.revoked(output)
+            case ModelAdopted(digest=adopted):
+                self._profile = self._with_model(profile, adopted)
+            case _:
+                pass
+
+    # ---- what the log's attachments say
+
+    def _where(self) -> str:
+        return str(self._reading.path) if self._reading is not None else "log"
+
+    def _attached(self) -> dict[str, Attached]:
+        """By name; those of earlier parts count."""
+        if self._reading is not None:
+            self._attachments.update((one.name, one) for one in self._reading.attachments)
+        return self._attachments
+
+    def _with_model(self, profile: Profile, wanted: str) -> Profile:
+        """The profile with the model of that digest, which must be attached."""
+        for name, one in self._attached().items():
+            if name == "model.toml" or name.startswith("model/"):
+                spec = parse_model(one.data.decode(), ".", f"{self._where()}: {name}")
+                if spec.digest() == wanted:
+                    return msgspec.structs.replace(profile, model=spec)
+        raise ConfigError(f"{self._where()}: the model {wanted} is not attached")
+
+    def _compose(self, spec: ModelSpec) -> ComposedModel | None:
+        key = spec.digest()
+        if key not in self._models:
+            self._models[key] = self._composed(spec)
+        return self._models[key]
+
+    def _composed(self, spec: ModelSpec) -> ComposedModel | None:
+        """The model, ready to compute; None for a Python file, which runs only if that was asked for and it is the same file."""
+        from s2r_runtime.models.composed import compose
+
+        if spec.name.endswith(".py"):
+            path = Path(spec.name)
+            same = self._rerun and path.is_file() and digest(path.read_bytes()) == spec.source_digest
+            if not same:
+                self._findings.cannot(f"the model is the file {spec.name}, which runs only with --rerun-controllers and unchanged")
+                return None
+        return compose(spec, f"{self._where()}: model")
+
+    def _horizon(self) -> int:
+        """Of the profile's task."""
+        profile = self._profile
+        model = self._compose(profile.model) if profile is not None else None
+        if profile is None or model is None:
+            return 0
+        return int(registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt).horizon)
+
+    def _last_act(self) -> Send | None:
+        """What the daemon sends when it breaks down (exit code 70)."""
+        state = self._core.state
+        settings = state.settings
+        if settings is None:
+            return None
+        held = settings.recovery_input if settings.recovery == "hold" else (0.0,) * len(settings.inputs)
+        return Send(state.now_ns, self._sent_seq + 1, "recovery", held, self._seen_seq, settings.command_ttl_ns)

@@ -1,0 +1,315 @@
+"""The demo's story. Each step is a request that a person could type; what comes back decides how the story goes on.
+
+It is honest about its robot: if no effect is switched on, nothing is refused; if the tracer cannot name the effect, the
+robot stays parked; and the run ends with the audit of its own log.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from s2r_runtime.cli import output
+from s2r_runtime.daemon import control
+from s2r_runtime.errors import S2RError, UsageError
+from s2r_runtime.plugins import registry
+
+EFFECT = "input_gain:w gain=0.7"
+CHANGE = "input_gain:v gain=0.25"
+CHANGE_AFTER_S = 15.0
+"""Robot seconds after the deployment: two scenarios of 6.6 s are driven before the robot changes."""
+START_S, STOP_S, CAMPAIGN_S = 20.0, 20.0, 900.0
+
+
+class Demonstration:
+    """One run of the demo. Its folder holds everything: profile, state, log, models, report."""
+
+    def __init__(self, robot: str, out: Path | None, seed: int, effects: list[str] | None, change: str | None) -> None:
+        self._robot = registry().get("robots", robot)
+        self._name = robot
+        self._out = _fresh(out)
+        self._seed = seed
+        self._effects = [e for e in ([EFFECT] if effects is None else effects) if e != "none"]
+        self._change = None if change == "none" else change or CHANGE
+        self._begin = time.monotonic()
+        self._socket = Path()
+        self._hold_gap = 0.0
+
+    def run(self) -> int:
+        """The story; exit code of the verb."""
+        ports = _free_ports(2)
+        profile = self._write_profile(ports)
+        with ExitStack() as stack:
+            robot = stack.enter_context(self._robot_process(ports))
+            daemon = stack.enter_context(self._daemon(profile))
+            held = self._story(robot, profile)
+            self._end_daemon(daemon)
+        return self._afterwards(held)
+
+    # ------------------------------------------------------------------ the story
+
+    def _story(self, robot: subprocess.Popen[str], profile: Path) -> bool:
+        """Up to the last refusal. True if what was expected of the runtime happened."""
+        controller = self._robot.controller("good")
+        wrong = ", ".join(self._effects) or "nothing"
+        self._tell(f"robot {self._name!r} runs in its own process; what is wrong with it: {wrong} (the daemon isn't told)")
+        self._await_robot()
+        if not self._campaign():
+            return False
+        self._step(f"s2r deploy {controller.name}", "verify the controller against that gap")
+        if self._ask({"verb": "deploy", "path": str(controller), "parameters": {}})["exit_code"] == 0:
+            self._say("the controller is covered as it is: there is nothing to repair", "green")
+            return self._drive(robot, controller, running=True)
+        if not self._repair():
+            self._say("no effect can be named with confidence, so nothing is repaired and the robot stays parked", "yellow")
+            return True
+        return self._campaign() and self._drive(robot, controller, running=False)
+
+    def _campaign(self) -> bool:
+        self._step("s2r permit 3600 && s2r sample", "drive to random states, apply random inputs, measure the gap")
+        self._ask({"verb": "permit", "duration_s": 3600.0})
+        answer = self._ask({"verb": "sample", "count": 0})
+        gap = answer.get("data") or {}
+        if gap:
+            hold, before = gap["hold_radius"], self._hold_gap
+            self._say(
+                f"after one step {1e3 * gap['radius']:.3g} mm, after {gap['hold_periods']} held steps {1e3 * hold:.3g} mm"
+                + (f" (before the repair {1e3 * before:.3g} mm)" if before else "")
+            )
+            self._hold_gap = hold
+        return bool(answer["exit_code"] == 0)
+
+    def _repair(self) -> bool:
+        self._step("s2r trace", "what does the model lack?")
+        answer = self._ask({"verb": "trace"})
+        data = answer.get("data") or {}
+        if data.get("text"):
+            self._say(str(data["text"]))
+        if answer["exit_code"] != 0 or data.get("verdict") not in {"traced", "ambiguous"} or not data.get("effects"):
+            return False
+        model = Path(str(data["model_path"]))
+        self._step(f"s2r adopt {model.name}", "use the repaired model; its gap comes from a fresh campaign")
+        text = model.read_text(encoding="utf-8")
+        return bool(self._ask({"verb": "adopt", "text": text, "base": str(model.parent)})["exit_code"] == 0)
+
+    def _drive(self, robot: subprocess.Popen[str], controller: Path, *, running: bool) -> bool:
+        if self._change:
+            self._say(f"(in {CHANGE_AFTER_S:.0f} s of its own time the robot will change: {self._change}; nobody is told)", "dim")
+            self._to_robot(robot, f"effect {self._change} @+{CHANGE_AFTER_S}")
+        if not running:
+            self._step(f"s2r deploy {controller.name}", "verify at the new gap; a certificate lets it drive")
+            if self._ask({"verb": "deploy", "path": str(controller), "parameters": {}})["exit_code"] != 0:
+                self._say(
+                    "still refused: on the repaired model, with the gap that is left, this controller does not do its task safely enough",
+                    "yellow",
+                )
+                return True
+        return self._watch_it()
+
+    def _watch_it(self) -> bool:
+        """Follows the drive until the gate closed for good, or the scenarios are done."""
+        status: dict[str, Any] = {}
+        shown = 0
+        limit = time.monotonic() + CAMPAIGN_S
+        while time.monotonic() < limit:
+            status = dict(self._call({"verb": "status"}).get("data") or {})
+            for episode in status.get("episodes", [])[shown:]:
+                self._say(f"scenario {episode['index']}: safety value {episode['safety']:+.2f} m after {episode['steps']} steps")
+                shown += 1
+            if not status.get("controller") and not status.get("job"):
+                break
+            time.sleep(0.05)
+        self._step("s2r status", "")
+        for key in ("gate", "reason", "radius", "verified_radius", "e_value", "epoch", "attempts", "beta_spent", "latched", "revoked"):
+            if status.get(key) not in (None, [], {}, ""):
+                self._say(f"{key.replace('_', ' ')}: {status[key]}")
+        stopped = status.get("gate") == "closed"
+        if status.get("revoked"):
+            self._step("s2r deploy", "may it drive again?")
+            stopped = self._ask({"verb": "deploy", "path": str(self._robot.controller("good")), "parameters": {}})["exit_code"] != 0
+        self._say(
+            "the gate is closed and the recovery controller has stopped the robot" if stopped else "the gate is still open",
+            "green" if stopped else "red",
+        )
+        return stopped
+
+    def _afterwards(self, held: bool) -> int:
+        log, public = sorted((self._out / "logs").glob("*.mcap")), self._out / "state" / "key.pub"
+        names = " ".join(str(path) for path in log)
+        self._step(f"s2r audit {names} --key {public} --rerun-controllers", "recompute everything from the log alone")
+        audited = _s2r("audit", *map(str, log), "--key", str(public), "--rerun-controllers")
+        report = self._out / "report.html"
+        self._step(f"s2r report {names} -o {report}", "")
+        reported = _s2r("report", *map(str, log), "-o", str(report))
+        seconds = time.monotonic() - self._begin
+        output.out()
+        output.out(f"{'done' if held and not audited else 'NOT as it should be'} in {seconds:.0f} s.  log: {names}  report: {report}")
+        output.out(
+            f"next: open {report};  s2r log info {log[-1] if log else ''};  s2r demo --effect none;  docs/robot-owner.md for your own robot"
+        )
+        return 0 if held and audited == 0 and reported == 0 else 1
+
+    # ------------------------------------------------------------------ processes
+
+    def _write_profile(self, ports: list[int]) -> Path:
+        text = str(self._robot.profile_text(f"tcp/127.0.0.1:{ports[0]}", f"tcp/127.0.0.1:{ports[1]}"))
+        path = self._out / f"{self._name}.toml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    @contextmanager
+    def _robot_process(self, ports: list[int]) -> Iterator[subprocess.Popen[str]]:
+        argv = self._robot.command(self._seed, self._effects, connect=f"tcp/127.0.0.1:{ports[0]}")
+        with (self._out / "robot.txt").open("w", encoding="utf-8") as sink:
+            process = subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=sink, stderr=sink, text=True)
+            try:
+                yield process
+            finally:
+                _end(process)
+
+    @contextmanager
+    def _daemon(self, profile: Path) -> Iterator[subprocess.Popen[str]]:
+        state = self._out / "state"
+        argv = [
+            sys.executable,
+            "-m",
+            "s2r_runtime.cli.main",
+            "run",
+            str(profile),
+            "--state",
+            str(state),
+            "--log",
+            str(self._out / "logs"),
+            "--seed",
+            str(self._seed),
+        ]
+        with (self._out / "daemon.txt").open("w", encoding="utf-8") as sink:
+            environment = {**os.environ, "XDG_RUNTIME_DIR": str(_private(self._out / "run"))}
+            process = subprocess.Popen(argv, stdout=sink, stderr=sink, text=True, env=environment)
+            try:
+                self._socket = self._await_socket(process)
+                yield process
+            finally:
+                _end(process)
+
+    def _await_socket(self, process: subprocess.Popen[str]) -> Path:
+        limit = time.monotonic() + START_S
+        while time.monotonic() < limit:
+            if found := list((self._out / "run").rglob("*.sock")):
+                return found[0]
+            if process.poll() is not None:
+                break
+            time.sleep(0.02)
+        raise S2RError(f"the daemon did not start: {(self._out / 'daemon.txt').read_text(encoding='utf-8').strip()[-300:]}")
+
+    def _await_robot(self) -> None:
+        limit = time.monotonic() + START_S
+        while time.monotonic() < limit:
+            status = self._call({"verb": "status"})["data"]
+            if status["link"] and status["observation"]:
+                return
+            time.sleep(0.02)
+        raise S2RError(f"the robot did not answer: {(self._out / 'robot.txt').read_text(encoding='utf-8').strip()[-300:]}")
+
+    def _end_daemon(self, process: subprocess.Popen[str]) -> None:
+        process.terminate()
+        try:
+            process.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            self._say("the daemon did not end when asked to", "red")
+
+    def _to_robot(self, robot: subprocess.Popen[str], line: str) -> None:
+        if robot.stdin is not None:
+            robot.stdin.write(line + "\n")
+            robot.stdin.flush()
+            time.sleep(0.3)  # its time stands still while nobody commands it, so the moment does not depend on this
+
+    # ------------------------------------------------------------------ words
+
+    def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
+        answer = self._call(request)
+        good = answer["exit_code"] == 0
+        self._say(str(answer["text"]), "green" if good else "red")
+        if not good:
+            self._say(f"exit code {answer['exit_code']}", "red")
+        return answer
+
+    def _call(self, request: dict[str, Any]) -> dict[str, Any]:
+        bar = output.Progress("   " + str(request["verb"]))
+
+        def on_progress(line: dict[str, Any]) -> None:
+            if "total" in line:
+                bar(float(line["done"]), float(line["total"]), str(line.get("detail", "")), line.get("seconds_left"))
+            elif line.get("text"):
+                bar.close()
+                self._say(str(line["text"]), "dim")
+
+        try:
+            return control.call(self._socket, request, on_progress)
+        finally:
+            bar.close()
+
+    def _step(self, command: str, why: str) -> None:
+        output.out()
+        output.out(output.styled(f"$ {command}", "bold") + (f"   # {why}" if why else ""))
+        sys.stdout.flush()
+
+    def _tell(self, text: str) -> None:
+        output.out(text)
+        sys.stdout.flush()
+
+    def _say(self, text: str, style: str = "") -> None:
+        for line in text.split("\n"):
+            output.out("   " + (output.styled(line, style) if style else line))
+        sys.stdout.flush()
+
+
+def _fresh(out: Path | None) -> Path:
+    """A folder of this run's own: counters and logs of an earlier run are never mixed in or overwritten."""
+    if out is not None:
+        if out.exists() and any(out.iterdir()):
+            raise UsageError(f"--out {out}: is not empty; name a new folder")
+        chosen = out
+    else:
+        number = 1 + max((int(p.name[4:]) for p in Path("s2r-demo").glob("run-*") if p.name[4:].isdecimal()), default=0)
+        chosen = Path("s2r-demo") / f"run-{number:03d}"
+    try:
+        chosen.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{chosen}: cannot be made: {error.strerror}") from None
+    return chosen.resolve()
+
+
+def _private(folder: Path) -> Path:
+    folder.mkdir(mode=0o700, exist_ok=True)
+    return folder
+
+
+def _free_ports(number: int) -> list[int]:
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(number)]
+        for s in sockets:
+            s.bind(("127.0.0.1", 0))
+        return [int(s.getsockname()[1]) for s in sockets]
+
+
+def _s2r(*argv: str) -> int:
+    sys.stdout.flush()
+    return subprocess.call([sys.executable, "-m", "s2r_runtime.cli.main", *argv])
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    if process.poll() is None:
+        process.terminate()
+        try:
+            process.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

@@ -1,0 +1,1 @@
+"""Controllers: loaded and digested as bytes, run confined in a process of their own."""

@@ -1,0 +1,247 @@
+"""Loads controllers, and hosts one in a process of its own, for the daemon: nothing here ever waits.
+
+    host = HostedController(file, model=..., nx=3, nu=2, task=..., seed=1)
+    host.start()                       -> Ready(digest) or Stopped(...) from a later `poll`
+    host.ask(observation, deadline)    -> Reply(obs_seq, u, ...) or Stopped(...) from a later `poll`
+
+The child is not trusted. It gets the bytes that were digested, one question at a time, and a deadline for each; whatever else
+than an answer in time comes from it (an error, a malformed line, an answer to nothing, silence, its end) is a
+`Stopped` with the reason, and its whole process group is killed. What it can't do meanwhile stands in `confinement`.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import msgspec
+
+from s2r_runtime.controllers.confined_process import ConfinedProcess
+from s2r_runtime.controllers.episodes import Episode
+from s2r_runtime.controllers.file import ControllerFile, Identity, load
+from s2r_runtime.controllers.hosting import Chosen, Ended, Loaded, Message, Package, Question, Up
+from s2r_runtime.errors import ControllerError, one_line
+from s2r_runtime.messages import Observation
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.profile import TaskChoice
+
+if TYPE_CHECKING:
+    from s2r_runtime.controllers.code import Control
+
+__all__ = ["ControllerFile", "HostedController", "Identity", "Ready", "Reply", "Stopped", "batch_control", "load"]
+
+DETAIL_MAX = 400
+"""Characters of the child's own account that are passed on."""
+MEMORY_BYTES = 1 << 30
+"""What a controller may allocate, beyond its libraries."""
+START_TIMEOUT_S = 30.0
+"""Importing numerical libraries takes seconds on a small computer with a cold disk."""
+
+Reason = Literal["finished", "raised", "died", "deadline", "malformed", "start_failed"]
+
+
+class Ready(NamedTuple):
+    """It can be asked. digest: of what runs there. contained: see `confinement.confine`."""
+
+    digest: str
+    contained: tuple[str, ...]
+
+
+class Reply(NamedTuple):
+    """What it wants to do, u (nu,), finite. `latency_ns`: from `ask` until it was read. The rest is the child's word only."""
+
+    obs_seq: int
+    u: tuple[float, ...]
+    episode: Episode | None
+    ended: Episode | None
+    latency_ns: int
+
+
+class Stopped(NamedTuple):
+    """It is gone; nothing comes after this. ended: the scenario that ended with the last one, if it finished."""
+
+    reason: Reason
+    detail: str
+    ended: Episode | None = None
+
+
+class _Asked(NamedTuple):
+    question: Question
+    deadline_ns: int
+    asked_ns: int
+
+
+_DECODER = msgspec.json.Decoder(Message)
+
+
+def batch_control(file: ControllerFile, nu: int | None = None) -> Control:
+    """`control(x, theta) -> u` in this process, on the digested bytes (see `controller_code`). Imports numpy."""
+    from s2r_runtime.controllers.code import batch_control as batched
+
+    return batched(file, nu)
+
+
+class HostedController:
+    """One controller in one child process, from `start` to `close`. Not restarted: another start is another object."""
+
+    def __init__(
+        self,
+        file: ControllerFile,
+        *,
+        model: ModelSpec,
+        nx: int,
+        nu: int,
+        task: TaskChoice | None,
+        seed: int,
+        memory_bytes: int = MEMORY_BYTES,
+        start_timeout_s: float = START_TIMEOUT_S,
+    ) -> None:
+        self.file, self._nx, self._nu = file, nx, nu
+        self._package = Package(file, model, nu, task, seed, memory_bytes)
+        self._start_timeout_ns = round(start_timeout_s * 1e9)
+        self._start_deadline_ns = 0
+        self._process: ConfinedProcess | None = None
+        self._running = False
+        self._digest, self._ready = "", False
+        self._asked: _Asked | None = None
+        self._waiting: _Asked | None = None
+
+    def start(self) -> None:
+        """Starts the process and hands it the bytes; `poll` says when it is ready. From the main thread, whose end is the child's.
+
+        Raises ControllerError if no process can be started.
+        """
+        try:
+            self._process = ConfinedProcess("s2r_runtime.controllers.hosting")
+        except OSError as error:
+            raise ControllerError(f"{self.file.path}: no process can be started for it: {error.strerror}") from None
+        self._running = True
+        self._start_deadline_ns = time.monotonic_ns() + self._start_timeout_ns
+        self._process.send(msgspec.json.encode(self._package))
+
+    def fileno(self) -> int:
+        """Readable when `poll` has something to do. Valid from `start` to `close`; raises ValueError before."""
+        return self._there().fileno()
+
+    @property
+    def pid(self) -> int:
+        """The child's process id. Raises ValueError before `start`."""
+        return self._there().pid
+
+    @property
+    def output(self) -> str:
+        """The last that the controller printed, on stdout and stderr."""
+        return self._process.output if self._process is not None else ""
+
+    @property
+    def deadline_ns(self) -> int | None:
+        """When `poll` should be called at the latest, on the host's monotonic clock; None: nothing is awaited."""
+        if not self._running:
+            return None
+        if not self._ready:
+            return self._start_deadline_ns
+        return self._asked.deadline_ns if self._asked is not None else None
+
+    def ask(self, observation: Observation, deadline_ns: int) -> None:
+        """Asks what to do about an observation; the answer must be there by then (host's monotonic clock).
+
+        While it works on an earlier one this one waits, and takes the place of one that waits. After a `Stopped`
+        nothing happens. Raises ValueError for a state that is not finite or not (nx,), or before it is ready.
+        """
+        if self._process is not None and not self._running:
+            return
+        if not self._ready:
+            raise ValueError("the controller is not ready to be asked")
+        if len(observation.x) != self._nx or not all(map(math.isfinite, observation.x)):
+            raise ValueError(f"observation {observation.seq} has x {observation.x}, must be {self._nx} finite numbers")
+        asked = _Asked(Question(observation.seq, observation.x), deadline_ns, time.monotonic_ns())
+        if self._asked is not None:
+            self._waiting = asked
+        else:
+            self._put(asked)
+
+    def poll(self, now_ns: int) -> list[Ready | Reply | Stopped]:
+        """What happened since the last call. Call it when `fileno` is readable, at `deadline_ns`, and every 20 ms anyway.
+
+        An answer that is there counts, also if this call comes after its deadline: the daemon was late then, and the gate
+        judges how old it is.
+        """
+        if self._process is None:
+            return []
+        if not self._running:
+            self._process.reap()
+            return []
+        found: list[Ready | Reply | Stopped] = []
+        lines, open_ = self._process.receive()
+        for line in lines:
+            if (event := self._take(line)) is not None:
+                found.append(event)
+            if isinstance(event, Stopped):
+                break
+        else:
+            stopped = self._silence(now_ns) if open_ else self._fault("died", self._process.ending())
+            found += [stopped] if stopped is not None else []
+        if found and isinstance(found[-1], Stopped):
+            self.stop()
+        return found
+
+    def stop(self) -> None:
+        """Kills the child and all of its process group, at once; no `Stopped` follows. May be called twice."""
+        self._running = False
+        if self._process is not None:
+            self._process.kill()
+
+    def close(self) -> None:
+        """Stops it and frees everything, which takes milliseconds. May be called twice."""
+        self._running = False
+        if self._process is not None:
+            self._process.close()
+
+    def _there(self) -> ConfinedProcess:
+        if self._process is None:
+            raise ValueError("the controller was not started")
+        return self._process
+
+    def _put(self, asked: _Asked) -> None:
+        self._asked, self._waiting = asked, None
+        self._there().send(msgspec.json.encode(asked.question))
+
+    def _take(self, line: bytes) -> Ready | Reply | Stopped | None:
+        try:
+            message = _DECODER.decode(line)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+            return self._fault("malformed", f"sent {line[:60]!r}, which is no answer")
+        match message:
+            case Loaded() if not self._digest:
+                self._digest = message.digest
+                return None
+            case Up() if self._digest == self.file.digest and not self._ready:
+                self._ready = True
+                return Ready(self._digest, message.contained)
+            case Chosen() if self._asked is not None and message.obs_seq == self._asked.question.obs_seq:
+                return self._reply(message, self._asked)
+            case Ended():
+                return self._fault(message.reason, one_line(message.detail, DETAIL_MAX), message.ended)
+        return self._fault("malformed", f"sent a message out of turn: {line[:60]!r}")
+
+    def _reply(self, message: Chosen, asked: _Asked) -> Reply | Stopped:
+        if len(message.u) != self._nu or not all(map(math.isfinite, message.u)):
+            return self._fault("malformed", f"answered {message.u[:8]}, must be {self._nu} finite numbers")
+        latency_ns = time.monotonic_ns() - asked.asked_ns
+        self._asked = None
+        if self._waiting is not None:
+            self._put(self._waiting)
+        return Reply(message.obs_seq, message.u, message.episode, message.ended, latency_ns)
+
+    def _silence(self, now_ns: int) -> Stopped | None:
+        if not self._ready and now_ns > self._start_deadline_ns:
+            return self._fault("deadline", f"was not ready after {self._start_timeout_ns / 1e9:g} s")
+        if self._asked is not None and now_ns > self._asked.deadline_ns:
+            allowed_ms = (self._asked.deadline_ns - self._asked.asked_ns) / 1e6
+            return self._fault("deadline", f"did not answer observation {self._asked.question.obs_seq} within {allowed_ms:.0f} ms")
+        return None
+
+    def _fault(self, reason: Reason, detail: str, ended: Episode | None = None) -> Stopped:
+        """Before it was ready every reason is a failed start."""
+        return Stopped(reason, detail, ended) if self._ready else Stopped("start_failed", f"{reason}: {detail}")

@@ -1,0 +1,162 @@
+"""The controller's process: `python -m s2r_runtime.controllers.hosting DESCRIPTOR PARENT_PID`, started by `controllers.HostedController`.
+
+One JSON line a message over the socket that it was given, and nothing else goes there; what the controller prints goes to another pipe.
+
+    parent: Package                    the bytes to run, the task, the seed
+    child:  Loaded(digest)             of the bytes it received, on the versions it has, before any of them ran
+    child:  Up(contained)              the process is confined and the controller's module has run
+    parent: Question(obs_seq, x)       child: Chosen(obs_seq, u, ...)      and so on
+    child:  Ended(reason, detail)      the last message: raised, malformed, finished
+
+Whoever reads this side's messages must not trust them: after `Loaded`, code runs here that nobody has read.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import gc
+import socket
+import sys
+from typing import TYPE_CHECKING, BinaryIO, Literal
+
+import msgspec
+
+from s2r_runtime.controllers.episodes import Episode, Episodes
+from s2r_runtime.controllers.file import ControllerFile
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.profile import TaskChoice
+
+if TYPE_CHECKING:
+    from s2r_runtime.controllers.code import Control
+
+
+class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of what goes over the socket."""
+
+
+class Package(_Message, frozen=True):
+    """Everything the child needs. task None: the controller sees an empty `theta`."""
+
+    file: ControllerFile
+    model: ModelSpec
+    nu: int
+    task: TaskChoice | None
+    seed: int
+    memory_bytes: int
+
+
+class Question(_Message, frozen=True):
+    """What to do at x (nx,)?"""
+
+    obs_seq: int
+    x: tuple[float, ...]
+
+
+class Loaded(_Message, frozen=True, tag="loaded"):
+    """Digest of what is about to run."""
+
+    digest: str
+
+
+class Up(_Message, frozen=True, tag="up"):
+    """Ready for questions. contained: see `confinement.confine`."""
+
+    contained: tuple[str, ...]
+
+
+class Chosen(_Message, frozen=True, tag="chosen"):
+    """The answer: u (nu,). episode: where the scenario stands; ended: the one that ended with this observation."""
+
+    obs_seq: int
+    u: tuple[float, ...]
+    episode: Episode | None
+    ended: Episode | None
+
+
+class Ended(_Message, frozen=True, tag="ended"):
+    """No more answers."""
+
+    reason: Literal["raised", "malformed", "finished"]
+    detail: str
+    ended: Episode | None = None
+
+
+Message = Loaded | Up | Chosen | Ended
+
+
+def main(arguments: list[str]) -> int:
+    """The child's life. Returns the exit code."""
+    from s2r_runtime.child import die_with_parent
+
+    descriptor, parent = (int(text) for text in arguments)
+    die_with_parent(parent)
+    faulthandler.enable()
+    channel = socket.socket(fileno=descriptor)
+    lines = channel.makefile("rb")
+    try:
+        _send(channel, _host(channel, lines))
+    except (BrokenPipeError, ConnectionResetError):
+        return 1  # the daemon is gone, and this process with it
+    return 0
+
+
+def _send(channel: socket.socket, message: Message) -> None:
+    channel.sendall(msgspec.json.encode(message) + b"\n")
+
+
+def _host(channel: socket.socket, lines: BinaryIO) -> Ended:
+    """Loads, confines, and answers until there is a reason to end."""
+    from s2r_runtime.controllers.code import Malformed, batch_control
+    from s2r_runtime.controllers.confinement import confine
+    from s2r_runtime.errors import S2RError
+
+    package = msgspec.json.decode(lines.readline(), type=Package)
+    _send(channel, Loaded(package.file.as_found_here().digest))
+    try:
+        episodes = _episodes(package)
+        contained = confine(package.memory_bytes)
+        control = batch_control(package.file, package.nu)
+        gc.collect()
+        gc.freeze()  # what is there now stays; collections while driving have little to look at
+        _send(channel, Up(contained))
+        for line in lines:
+            answer = _answer(msgspec.json.decode(line, type=Question), episodes, control)
+            if isinstance(answer, Ended):
+                return answer
+            _send(channel, answer)
+    except Malformed as error:
+        return Ended("malformed", str(error))
+    except S2RError as error:
+        return Ended("raised", str(error))
+    return Ended("finished", "no more questions")
+
+
+def _episodes(package: Package) -> Episodes | None:
+    from s2r_runtime.models.composed import compose
+    from s2r_runtime.plugins import registry
+
+    if package.task is None:
+        return None
+    model = compose(package.model)
+    task = registry().get("tasks", package.task.name)(package.task.parameters, model.nominal, package.model.dt)
+    return Episodes(task, package.seed, package.task.episodes)
+
+
+def _answer(question: Question, episodes: Episodes | None, control: Control) -> Chosen | Ended:
+    import numpy as np
+
+    theta, episode, ended = {}, None, None
+    if episodes is not None:
+        try:
+            seen, episode, ended = episodes.look(np.array(question.x))
+        except Exception as error:  # noqa: BLE001 - a third party's task: what it raises ends this drive, with its name
+            return Ended("raised", f"task: {type(error).__name__}: {error}")
+        if seen is None:
+            return Ended("finished", f"all {episode.index + 1} scenarios are over", ended)
+        theta = seen
+    u = control(np.array([question.x]), theta)
+    return Chosen(question.obs_seq, tuple(u[0].tolist()), episode, ended)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

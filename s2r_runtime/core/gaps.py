@@ -1,0 +1,215 @@
+"""Campaigns, the gap that they found, how it grows, and the watch that refutes it (guarantee G1, G4, G5).
+
+Epoch i is spent when its campaign is begun: persisted first. The gap of a finished campaign ends every certificate of the one
+before. While it is in force, a discrepancy above it makes the radius grow at once, and an alarm of the watch ends it.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from s2r_runtime import gate
+from s2r_runtime.core import ledger
+from s2r_runtime.core.certificates import ROUNDING, facts_problem, install, reverify_if_due, revoke
+from s2r_runtime.core.drive import latch, recover_now, regate
+from s2r_runtime.core.sources import end_deployment
+from s2r_runtime.core.state import Campaign, Job, Turn, certificate, job, usable_gap
+from s2r_runtime.messages import (
+    AlarmRaised,
+    CampaignFinished,
+    CertificateStored,
+    EpochChanged,
+    Gap,
+    JobFinished,
+    Measured,
+    RadiusGrew,
+    StartCampaign,
+    StartJob,
+)
+
+# ---------------------------------------------------------------- campaigns
+
+
+def begin_campaign(turn: Turn, count: int, request_id: int) -> None:
+    """Begins a campaign, or goes on with one that was begun. count: how many samples, 0 for the profile's number."""
+    memory, settings = turn.memory, turn.settings
+    resume = memory.campaign_epoch > 0
+    epoch = memory.campaign_epoch if resume else memory.epochs + 1
+    share = ledger.share(settings.beta, epoch)
+    n = memory.campaign_n if resume else count or settings.campaign_n
+    if resume and count not in (0, n):
+        turn.answer(request_id, 2, f"the campaign of epoch {epoch} fixed {n} samples when it began; ask for {n}, or cancel it first")
+        return
+    try:
+        needed = ledger.campaign_size(settings.epsilon, share, settings.discard)
+    except ValueError as error:
+        turn.answer(request_id, 3, f"epoch {epoch}: {error}")
+        return
+    n = n or needed
+    if n < needed:
+        asked = f"epoch {epoch} needs at least {needed} samples at epsilon {settings.epsilon:g} with {settings.discard} discarded"
+        turn.answer(request_id, 3, f"{asked}; {n} are {needed - n} too few")
+        return
+    turn.set(campaign=Campaign(epoch, n, request_id))
+    if not resume:
+        turn.remember(epochs=epoch, campaign_epoch=epoch, campaign_n=n)
+        turn.persist()
+        turn.emit(EpochChanged(turn.now, epoch, share))
+    seed = ledger.seed("campaign", settings.robot, memory.model_digest, settings.profile_digest, settings.seed, epoch)
+    turn.emit(StartCampaign(turn.now, epoch, n, share, seed, resume))
+
+
+def campaign_finished(turn: Turn, event: CampaignFinished) -> None:
+    """All samples are there: the gap is computed. Or they are not: the epoch stays begun, and a person may go on with it."""
+    campaign, asked = turn.state.campaign, turn.state.asked
+    if campaign is None or event.epoch != campaign.epoch:
+        return
+    turn.set(campaign=None)
+    if asked is not None and asked.source == "sampler":
+        recover_now(turn)
+    if not event.complete or event.n != campaign.n:
+        why = f": {event.detail}" if event.detail else ""
+        text = f"campaign of epoch {event.epoch} ended after {event.n} of {campaign.n} samples{why}; s2r sample goes on with it"
+        turn.answer(campaign.request_id, 3, text)
+        return
+    one = Job(turn.state.next_job, "gap", campaign.request_id, campaign.epoch)
+    turn.add_job(one)
+    turn.emit(StartJob(turn.now, one.id, "gap", epoch=one.epoch, beta=ledger.share(turn.settings.beta, one.epoch)))
+    turn.answer(one.request_id, 0, f"{campaign.n} samples taken; computing the gap", final=False)
+
+
+def begin_trace(turn: Turn, gap: Gap, request_id: int) -> None:
+    """Traces the residual of the campaign behind this gap."""
+    one = Job(turn.state.next_job, "trace", request_id, gap.epoch)
+    turn.add_job(one)
+    turn.emit(StartJob(turn.now, one.id, "trace", epoch=one.epoch))
+
+
+def trace_finished(turn: Turn, done: Job, event: JobFinished) -> None:
+    """What the tracer says is a finding for a person to act on; here it only counts that an effect is known and not adopted."""
+    verdict = event.trace.get("verdict") if event.trace is not None else None
+    if event.error or not isinstance(verdict, str):
+        turn.answer(done.request_id, 1, f"no trace: {event.error or 'the worker returned none'}")
+        return
+    gap = turn.memory.gap
+    if verdict in ("traced", "ambiguous") and gap is not None and gap.epoch == done.epoch and not turn.memory.traced:
+        turn.remember(traced=True)
+    turn.answer(done.request_id, 0, f"residual of epoch {done.epoch} traced: {verdict}")
+
+
+# ---------------------------------------------------------------- the gap in force
+
+
+def gap_finished(turn: Turn, done: Job, event: JobFinished) -> None:
+    """The campaign's gap comes into force."""
+    gap = event.gap
+    problem = event.error or ("the worker returned none" if gap is None else _gap_problem(turn, gap, done.epoch))
+    if gap is None or problem:
+        turn.answer(done.request_id, 1, f"no gap: {problem}; s2r sample tries again with the samples that are there")
+        return
+    turn.remember(campaign_epoch=0, campaign_n=0, traced=False)
+    _enforce(turn, gap)
+    turn.answer(done.request_id, 0, f"gap of epoch {gap.epoch}: {gap.radius:.6g} at epsilon {gap.epsilon:g}, from {gap.n} samples")
+    if turn.settings.trace_after_campaign and job(turn.state, "trace") is None:
+        begin_trace(turn, gap, 0)
+
+
+def _gap_problem(turn: Turn, gap: Gap, epoch: int) -> str:
+    """Why this gap does not carry its statement (guarantee G1), or empty."""
+    settings = turn.settings
+    if gap.epoch != epoch or gap.model_digest != turn.memory.model_digest:
+        return "it is of another epoch or model"
+    if not all(gate.finite(value) and value >= 0.0 for value in (gap.radius, gap.hold_radius)):
+        return "its radius is not a finite number >= 0"
+    if gap.epsilon != settings.epsilon or gap.discarded != settings.discard:
+        return "its epsilon or discards are not the profile's"
+    half = 0.5 * ledger.share(settings.beta, epoch)
+    if gap.n < 1 or ledger.binomial_tail(gap.n, gap.discarded, gap.epsilon) > half * (1.0 + ROUNDING):
+        return f"{gap.n} samples are too few for the share of epoch {epoch}"
+    return ""
+
+
+def _enforce(turn: Turn, gap: Gap) -> None:
+    old = [facts.id for facts in turn.memory.certificates]
+    epochs = max(turn.memory.epochs, gap.epoch)
+    turn.remember(gap=gap, radius=gap.radius, epochs=epochs, alarm_epoch=0, campaign_digest=turn.settings.campaign_digest)
+    turn.remember(watch_n=0, watch_exceedances=0, watch_e_value=1.0)
+    revoke(turn, old, "new_epoch")
+    turn.persist()
+    turn.emit(EpochChanged(turn.now, gap.epoch, ledger.share(turn.settings.beta, gap.epoch), gap))
+
+
+def void_gap(turn: Turn, reason: str) -> None:
+    """No gap any more, nor an unfinished campaign; certificates end with it. Counters stay: what is spent is spent."""
+    old = [facts.id for facts in turn.memory.certificates]
+    turn.remember(gap=None, radius=0.0, campaign_epoch=0, campaign_n=0, alarm_epoch=0, traced=False)
+    turn.remember(watch_n=0, watch_exceedances=0, watch_e_value=1.0)
+    revoke(turn, old, reason)
+
+
+def certificate_loaded(turn: Turn, event: CertificateStored, gap: Gap) -> None:
+    """A certificate came from a file, with the gap that it rests on: that of this epoch, or one that founds a later epoch."""
+    facts, memory = event.facts, turn.memory
+    same = memory.gap is not None and (memory.gap.epoch, memory.gap.transitions_digest) == (gap.epoch, gap.transitions_digest)
+    problem = ""
+    if same:
+        if usable_gap(turn.state) is None:
+            problem = f"the watch refuted the gap of epoch {gap.epoch}"
+    elif gap.epoch <= memory.epochs:
+        problem = f"it rests on a gap of epoch {gap.epoch}, and {memory.epochs} have begun here"
+    elif turn.state.campaign is not None or job(turn.state, "gap") is not None:
+        problem = "a campaign is under way"
+    else:
+        problem = _gap_problem(turn, gap, gap.epoch)
+    if not problem:
+        grounded = facts.epoch == gap.epoch and facts.model_digest == gap.model_digest
+        problem = "" if grounded else "its gap is of another epoch or model"
+    if not problem and not same:
+        _enforce(turn, gap)
+    problem = problem or facts_problem(turn, facts, facts.controller_digest, 0.0)
+    if problem:
+        turn.answer(event.request_id, 1, f"certificate {facts.id} refused: {problem}", final=False)
+        return
+    install(turn, facts)
+    turn.answer(event.request_id, 0, f"certificate {facts.id} loaded", final=False)
+
+
+# ---------------------------------------------------------------- the watch
+
+
+def measured(turn: Turn, event: Measured) -> None:
+    """One discrepancy of the stream. Beyond the radius the gap grows; the gate closes first where that leaves what was verified."""
+    gap = usable_gap(turn.state)
+    if gap is None or event.epoch not in (0, gap.epoch):
+        return
+    usable = gate.finite(event.discrepancy) and event.discrepancy >= 0.0 and gate.finite(event.e_value) and event.e_value >= 0.0
+    if event.fault or not usable:
+        turn.set(faults=turn.state.faults + 1)  # a deployment that begins counts from 0
+        regate(turn)
+        return
+    counted = {"watch_n": event.n, "watch_exceedances": event.exceedances, "watch_e_value": event.e_value}
+    turn.set(memory=msgspec.structs.replace(turn.memory, **counted))  # written with what is remembered next: a write each is too many
+    grew = event.discrepancy > turn.memory.radius
+    if grew:
+        turn.remember(radius=event.discrepancy)
+    alarm = event.e_value >= 1.0 / turn.settings.alpha
+    if alarm:
+        turn.remember(alarm_epoch=gap.epoch)
+    facts = certificate(turn.state)
+    regate(turn)
+    if grew:
+        verified = facts.verified_radius if facts is not None else 0.0
+        turn.emit(RadiusGrew(turn.now, turn.memory.radius, verified, event.obs_seq))
+    if alarm:
+        _alarm(turn, event, gap)
+    turn.persist()
+    reverify_if_due(turn)
+
+
+def _alarm(turn: Turn, event: Measured, gap: Gap) -> None:
+    """The gap is refuted: everything that rests on it ends."""
+    latch(turn, "watch_alarm")
+    turn.emit(AlarmRaised(turn.now, event.e_value, turn.settings.alpha, gap.epoch))
+    old = [facts.id for facts in turn.memory.certificates if facts.epoch == gap.epoch]
+    end_deployment(turn, "watch_alarm", f"refused: watch_alarm: the gap of epoch {gap.epoch} was refuted")
+    revoke(turn, old, "watch_alarm")

@@ -1,0 +1,205 @@
+"""What a person asks for, over the control socket. Every request gets exactly one final answer, at once or when it is done.
+
+Exit codes as on the command line: 0 it holds, 1 it does not hold (refused), 2 it made no sense, 3 not enough evidence, 78 bad
+configuration.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from s2r_runtime import gate
+from s2r_runtime.core.certificates import begin_verification, refusal_to_verify, revoke, start_controller, valid_certificate
+from s2r_runtime.core.drive import recover_now, regate
+from s2r_runtime.core.gaps import begin_campaign, begin_trace, void_gap
+from s2r_runtime.core.sources import check_campaign, end_deployment, stop
+from s2r_runtime.core.state import NANO, VERIFYING, Deployment, Turn, job, situation
+from s2r_runtime.messages import ModelAdopted, Requested, StopCampaign
+
+LONGEST_PERMIT_S = 86_400.0
+"""A permit is a person's presence, given for a limited time; nobody watches a robot for longer than a day."""
+
+HINTS = {
+    "no_permit": "give one: s2r permit DURATION",
+    "permit_expired": "give another: s2r permit DURATION",
+    "emergency_stop": "s2r clear emergency_stop, when it is safe",
+    "manual_override": "s2r clear manual_override, when it is safe",
+    "link_down": "the robot is not there",
+    "recorder_down": "nothing can be recorded; is the disk full?",
+    "observation_missing": "nothing was observed yet",
+    "observation_stale": "the robot is not observed any more",
+    "outside_geofence": "the sampler may only drive inside it; bring the robot back",
+}
+
+
+def requested(turn: Turn, request: Requested) -> None:
+    """Does what is asked, or says why not."""
+    match request.verb:
+        case "deploy":
+            _deploy(turn, request)
+        case "verify":
+            _verify(turn, request)
+        case "undeploy":
+            _undeploy(turn, request)
+        case "revoke":
+            _revoke(turn, request)
+        case "adopt":
+            _adopt(turn, request)
+        case "clear":
+            _clear(turn, request)
+        case "stop":
+            stop(turn, "emergency_stop", f"by user {request.by}")
+            turn.persist()
+            turn.answer(request.request_id, 0, "stopped; nothing drives until: s2r clear emergency_stop")
+        case "permit":
+            _permit(turn, request)
+        case "sample":
+            _sample(turn, request)
+        case "cancel":
+            _cancel(turn, request)
+        case "trace":
+            _trace(turn, request)
+
+
+def _deploy(turn: Turn, request: Requested) -> None:
+    state, digest = turn.state, request.digest
+    stopped = next((reason for reason in gate.ALWAYS_LATCHING if reason in turn.memory.latched), "")
+    if not digest:
+        turn.answer(request.request_id, 2, "deploy needs a controller")
+    elif state.deployment is not None and state.deployment.stage == "running" and state.deployment.digest == digest:
+        turn.answer(request.request_id, 0, "this controller is deployed already")
+    elif state.deployment is not None:
+        turn.answer(request.request_id, 2, "another deployment is in force or under way; first: s2r deploy --undeploy")
+    elif stopped:
+        turn.answer(request.request_id, 1, f"refused: {stopped}: {HINTS[stopped]}")
+    elif state.campaign is not None or job(state, "gap") is not None:
+        turn.answer(request.request_id, 1, "refused: a campaign is under way")
+    elif (facts := valid_certificate(turn, digest)) is not None:
+        start_controller(turn, Deployment(digest, request.request_id, "starting"), facts)
+    elif refusal := refusal_to_verify(turn):
+        turn.answer(request.request_id, 1, f"refused: {refusal}")
+    else:
+        turn.set(deployment=Deployment(digest, request.request_id, "verifying"), ended="")
+        begin_verification(turn, "deploy", digest, request.request_id)
+
+
+def _verify(turn: Turn, request: Requested) -> None:
+    if not request.digest:
+        turn.answer(request.request_id, 2, "verify needs a controller")
+    elif refusal := refusal_to_verify(turn):
+        turn.answer(request.request_id, 1, f"refused: {refusal}")
+    else:
+        begin_verification(turn, "verify", request.digest, request.request_id)
+
+
+def _undeploy(turn: Turn, request: Requested) -> None:
+    if turn.state.deployment is None:
+        turn.answer(request.request_id, 2, "no controller is deployed")
+        return
+    end_deployment(turn, "undeployed", "refused: undeployed before it drove")
+    turn.answer(request.request_id, 0, "undeployed")
+
+
+def _revoke(turn: Turn, request: Requested) -> None:
+    known = [facts.id for facts in turn.memory.certificates]
+    if not request.text:
+        revoke(turn, known, "by_operator")
+        turn.answer(request.request_id, 0, f"{len(known)} certificates revoked" if known else "there is no certificate to revoke")
+    elif request.text in known:
+        revoke(turn, [request.text], "by_operator")
+        turn.answer(request.request_id, 0, f"certificate {request.text} revoked")
+    elif request.text in turn.memory.revoked:
+        turn.answer(request.request_id, 0, f"certificate {request.text} was revoked before: {turn.memory.revoked[request.text]}")
+    else:
+        turn.answer(request.request_id, 2, f"no certificate {request.text}; in force: {', '.join(known) or 'none'}")
+
+
+def _adopt(turn: Turn, request: Requested) -> None:
+    state = turn.state
+    if not request.digest:
+        turn.answer(request.request_id, 2, "adopt needs a model")
+    elif request.digest == turn.memory.model_digest:
+        turn.answer(request.request_id, 0, "this model is in force already")
+    elif state.deployment is not None or state.campaign is not None:
+        turn.answer(request.request_id, 1, "refused: a model is adopted only while nothing drives; undeploy or cancel first")
+    elif job(state, "gap", "trace", *VERIFYING) is not None:
+        turn.answer(request.request_id, 1, "refused: the worker still works with the model in force")
+    else:
+        void_gap(turn, "model_changed")
+        turn.remember(model_digest=request.digest)
+        turn.persist()
+        turn.emit(ModelAdopted(turn.now, request.digest, request.by))
+        regate(turn)
+        turn.answer(request.request_id, 0, "model adopted; its gap is not known yet: s2r sample")
+
+
+def _clear(turn: Turn, request: Requested) -> None:
+    reason, latched = request.text.removeprefix("latched:"), turn.memory.latched
+    if reason not in latched:
+        held = f"latched: {', '.join(latched)}" if latched else "nothing is latched"
+        turn.answer(request.request_id, 2, f"{reason or 'no reason'} is not latched; {held}")
+        return
+    turn.remember(latched=tuple(other for other in latched if other != reason))
+    turn.persist()
+    if reason == "measurement_faults":
+        turn.set(faults=0)
+    if reason == turn.state.ended:
+        turn.set(ended="")
+    regate(turn)
+    still = "; the gap stays refuted, sample anew: s2r sample" if reason == "watch_alarm" and turn.memory.alarm_epoch else ""
+    turn.answer(request.request_id, 0, f"{reason} cleared{still}")
+
+
+def _permit(turn: Turn, request: Requested) -> None:
+    seconds = request.duration_s
+    if not (math.isfinite(seconds) and 0.0 <= seconds <= LONGEST_PERMIT_S):
+        turn.answer(request.request_id, 2, f"a permit lasts 0 (none) to {LONGEST_PERMIT_S:g} s, not {seconds}")
+        return
+    turn.set(permit_until_ns=turn.now + round(seconds * NANO) if seconds > 0.0 else None)
+    check_campaign(turn)
+    turn.answer(request.request_id, 0, f"the sampler may drive for {seconds:g} s" if seconds > 0.0 else "the sampler may not drive")
+
+
+def _sample(turn: Turn, request: Requested) -> None:
+    state = turn.state
+    ready = msgspec.structs.replace(situation(state), campaign_running=True)
+    refusal = gate.standing(turn.settings, ready, "sampler", turn.now)
+    if state.campaign is not None or job(state, "gap") is not None:
+        turn.answer(request.request_id, 2, "a campaign is under way already")
+    elif state.deployment is not None:
+        turn.answer(request.request_id, 1, "refused: a controller is deployed; undeploy it first")
+    elif request.count < 0:
+        turn.answer(request.request_id, 2, f"{request.count} samples make no campaign")
+    elif refusal is not None:
+        hint = HINTS.get(refusal.reason.removeprefix("latched:"), "")
+        turn.answer(request.request_id, 1, f"refused: {refusal.reason}" + (f": {hint}" if hint else ""))
+    else:
+        begin_campaign(turn, request.count, request.request_id)
+
+
+def _cancel(turn: Turn, request: Requested) -> None:
+    campaign, asked, epoch = turn.state.campaign, turn.state.asked, turn.memory.campaign_epoch
+    if job(turn.state, "gap") is not None or not epoch:
+        turn.answer(request.request_id, 2, "there is no campaign to cancel")
+        return
+    turn.set(campaign=None)
+    if asked is not None and asked.source == "sampler":
+        recover_now(turn)
+    if campaign is not None:
+        turn.emit(StopCampaign(turn.now, "cancelled"))
+        turn.answer(campaign.request_id, 1, f"campaign of epoch {epoch} cancelled after {campaign.taken} of {campaign.n} samples")
+    turn.remember(campaign_epoch=0, campaign_n=0)
+    turn.persist()
+    turn.answer(request.request_id, 0, f"campaign of epoch {epoch} cancelled; its share of beta is spent")
+
+
+def _trace(turn: Turn, request: Requested) -> None:
+    gap = turn.memory.gap
+    if gap is None:
+        turn.answer(request.request_id, 3, "there is no finished campaign to trace; sample first: s2r sample")
+    elif job(turn.state, "trace") is not None:
+        turn.answer(request.request_id, 2, "the residual is being traced already")
+    else:
+        begin_trace(turn, gap, request.request_id)

@@ -1,0 +1,242 @@
+"""The analytics process: observations and commands -> discrepancies and the watch's e-value, while a controller drives.
+
+It has a process of its own because one busy Python thread costs the gate 5 ms at the median, and because numpy lives here and not
+with the gate. Both ends are in this file: `Analytics` in the daemon (no numpy), `main` in the child. One JSON line a message, in
+order; every `Observation` is answered by one `Reply`, so that the daemon can wait for it (lockstep) or miss it (a hang).
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from s2r_runtime.child import Child, die_with_parent, say, take_stdout
+from s2r_runtime.daemon.settings import ModelFacts
+from s2r_runtime.errors import ConfigError, S2RError
+from s2r_runtime.messages import Gap, Measured, Observation, Send
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.profile import Profile
+
+if TYPE_CHECKING:
+    from s2r_runtime.watch import Stream
+
+REPLY_WITHIN_S = 2.0
+"""A step of a model takes well under a millisecond; a process that is silent this long is stopped, swapped out or dead."""
+
+
+class Setup(msgspec.Struct, frozen=True, tag="setup"):
+    """First message: check this profile, and tell the facts of its model."""
+
+    profile: Profile
+    where: str
+
+
+class CheckModel(msgspec.Struct, frozen=True, tag="check_model"):
+    """Whether this model could replace the profile's. `ref` comes back."""
+
+    ref: int
+    profile: Profile
+    where: str
+
+
+class Watching(msgspec.Struct, frozen=True, tag="watching"):
+    """From here on measure against this gap of this model. n, exceedances, e_value: of this epoch so far (a restart goes on there)."""
+
+    model: ModelSpec
+    gap: Gap
+    fault_jump: float
+    n: int = 0
+    exceedances: int = 0
+    e_value: float | None = None
+
+
+class Ready(msgspec.Struct, frozen=True, tag="ready"):
+    """The profile or model is sound."""
+
+    facts: ModelFacts
+    ref: int = 0
+
+
+class Refused(msgspec.Struct, frozen=True, tag="refused"):
+    """The profile or model is not."""
+
+    text: str
+    ref: int = 0
+
+
+class Reply(msgspec.Struct, frozen=True, tag="reply"):
+    """To an observation: what was measured with it, if a transition ended there. The child has no clock: t_ns is 0."""
+
+    obs_seq: int
+    measured: Measured | None
+
+
+Downward = Setup | CheckModel | Watching | Observation | Send
+Upward = Ready | Refused | Reply
+
+_ENCODE = msgspec.json.Encoder().encode
+_DECODE_UP = msgspec.json.Decoder(Upward).decode
+
+
+# ---------------------------------------------------------------- in the daemon
+
+
+def start() -> Child:
+    """The process alone, which loads its libraries and waits: half of the daemon's start, if it is begun before the other half."""
+    return Child("s2r_runtime.daemon.analytics")
+
+
+class Analytics:
+    """The daemon's end. `poll` and `wait` give what came; `down` says why it is no more, or nothing."""
+
+    def __init__(self, profile: Profile, where: str, child: Child | None = None) -> None:
+        """child: the process, if it was started earlier (see `start`)."""
+        self.down = ""
+        self._child = child or start()
+        self._waiting: dict[int, int] = {}  # observation -> host time at which its reply is overdue, ns
+        self._child.send(_ENCODE(Setup(profile, where)))
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._child.pid
+
+    def fileno(self) -> int:
+        """Readable when `poll` has something."""
+        return self._child.fileno()
+
+    def facts(self, timeout_s: float = 30.0) -> ModelFacts:
+        """Waits for the answer to the set-up. Raises ConfigError with what is wrong with the profile."""
+        line = self._child.wait(timeout_s)
+        if line is None:
+            raise ConfigError(f"the analytics process did not start: {self._child.ending()}")
+        answer = _DECODE_UP(line)
+        if isinstance(answer, Ready):
+            return answer.facts
+        raise ConfigError(answer.text if isinstance(answer, Refused) else "the analytics process is out of step")
+
+    def check(self, ref: int, profile: Profile, where: str) -> None:
+        """Asks whether the profile's model can be used; `poll` brings Ready or Refused with this ref."""
+        self._send(CheckModel(ref, profile, where))
+
+    def watch(self, watching: Watching) -> None:
+        """Begins to measure."""
+        self._send(watching)
+
+    def sent(self, send: Send) -> None:
+        """The robot was told this. It goes with the next observation: alone it would only wake the process."""
+        if not self.down:
+            self._child.queue(_ENCODE(send))
+
+    def observed(self, observation: Observation) -> None:
+        """The robot was seen there; a Reply comes."""
+        self._waiting[observation.seq] = time.monotonic_ns() + round(REPLY_WITHIN_S * 1e9)
+        self._send(observation)
+
+    def wait(self) -> list[Upward]:
+        """As `poll`, once every observation has its reply; or it is down."""
+        came: list[Upward] = []
+        deadline = time.monotonic() + REPLY_WITHIN_S
+        while self._waiting and not self.down:
+            line = self._child.wait(deadline - time.monotonic())
+            if line is None:
+                self._gone(time.monotonic_ns())
+                break
+            came += self._taken(line)
+        return came
+
+    def poll(self, now_ns: int) -> list[Upward]:
+        """What came since the last call; notices a process that died or hangs."""
+        if self.down:
+            return []
+        self._child.flush()
+        came = [message for line in self._child.lines() for message in self._taken(line)]
+        self._gone(now_ns)
+        return came
+
+    def stop(self) -> None:
+        """Ends the process; may be called twice."""
+        self.down = self.down or "stopped"
+        self._child.stop()
+
+    def _send(self, message: Downward) -> None:
+        if not self.down:
+            self._child.send(_ENCODE(message))
+
+    def _taken(self, line: bytes) -> list[Upward]:
+        try:
+            message = _DECODE_UP(line)
+        except msgspec.DecodeError as error:
+            self.down = f"analytics is out of step: {error}"
+            return []
+        if isinstance(message, Reply):
+            self._waiting.pop(message.obs_seq, None)
+        return [message]
+
+    def _gone(self, now_ns: int) -> None:
+        overdue = next(iter(self._waiting.values()), now_ns)
+        if not self._child.alive() or overdue < now_ns:
+            self.down = f"analytics: {self._child.ending()}"
+
+
+# ---------------------------------------------------------------- in the child
+
+
+def main(arguments: list[str]) -> int:
+    """Reads messages from stdin until it closes."""
+    die_with_parent(int(arguments[0]))
+    channel = take_stdout()
+    from s2r_runtime.models import composed  # noqa: F401 - loaded before there is anything to do
+
+    decode = msgspec.json.Decoder(Downward).decode
+    stream: Stream | None = None
+    epoch = 0
+    for line in sys.stdin.buffer:
+        message = decode(line)
+        if isinstance(message, Observation):
+            measured = stream.observed(message) if stream is not None else None
+            if measured is not None:
+                measured = msgspec.structs.replace(measured, epoch=epoch)
+            say(channel, _ENCODE(Reply(message.seq, measured)))
+        elif isinstance(message, Send):
+            if stream is not None:
+                stream.sent(message)
+        elif isinstance(message, Watching):
+            stream, epoch = _stream(message), message.gap.epoch
+        else:
+            say(channel, _ENCODE(_checked(message)))
+    return 0
+
+
+def _checked(message: Setup | CheckModel) -> Ready | Refused:
+    from s2r_runtime.plugins import registry
+    from s2r_runtime.profile import check_model
+
+    ref, profile = message.ref if isinstance(message, CheckModel) else 0, message.profile
+    try:
+        model = check_model(profile, message.where)
+        task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
+    except S2RError as error:
+        return Refused(str(error), ref)
+    return Ready(ModelFacts(model.states, model.inputs, tuple(model.nominal.angles), task.horizon), ref)
+
+
+def _stream(watching: Watching) -> Stream:
+    from s2r_runtime.models.composed import compose
+    from s2r_runtime.watch import Stream
+
+    return Stream(
+        compose(watching.model),
+        watching.gap,
+        fault_jump=watching.fault_jump,
+        n=watching.n,
+        exceedances=watching.exceedances,
+        e_value=watching.e_value,
+    )
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

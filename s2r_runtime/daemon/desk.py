@@ -1,0 +1,217 @@
+"""Where requests from the control socket become the core's, and its answers go back to whoever asked.
+
+What must be looked at before the core hears of it (a controller's file, a model, a certificate) is looked at here, in
+other processes where it could take long.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from s2r_runtime.daemon import issuing
+from s2r_runtime.daemon.control import Connection, ControlServer
+from s2r_runtime.daemon.model_store import parse_model
+from s2r_runtime.daemon.settings import ModelFacts
+from s2r_runtime.daemon.status import status
+from s2r_runtime.daemon.worker import Failed, LoadJob, Result
+from s2r_runtime.errors import ConfigError, S2RError
+from s2r_runtime.messages import Answer, Requested
+from s2r_runtime.modelspec import dump_model
+
+if TYPE_CHECKING:
+    from s2r_runtime.daemon.loop import Daemon
+
+PLAIN = ("undeploy", "revoke", "clear", "stop", "permit", "sample", "cancel", "trace", "verify")
+"""Verbs that the core can have as they are."""
+MOVING = ("sample", "deploy")
+SETTLE_WITHIN_NS = 2_000_000_000
+LOAD_TIMEOUT_S = 30.0
+PROGRESS_NS = 200_000_000
+RESULT_OF = {"sample": "gap", "trace": "trace", "deploy": "verify", "verify": "verify"}
+"""Whose result goes with the answer to a verb."""
+
+
+class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a client may ask. deploy: path, parameters, certificate (text). adopt: text of the model's TOML, base its folder."""
+
+    verb: str
+    path: str = ""
+    parameters: dict[str, float | str | bool] = {}
+    certificate: str = ""
+    text: str = ""
+    base: str = ""
+    duration_s: float = 0.0
+    count: int = 0
+
+
+class Desk:
+    """Numbers requests, and remembers who waits for an answer."""
+
+    def __init__(self, daemon: Daemon) -> None:
+        self._d = daemon
+        self._server: ControlServer | None = None
+        self._numbers = 0
+        self._waiting: dict[int, tuple[str, Connection | None]] = {}
+        self.answers: dict[int, Answer] = {}  # to requests of this process itself
+        self._said = (0, "")
+        self._postponed: list[tuple[Requested, int]] = []
+        self._next_progress_ns = 0
+
+    def open(self, path: Path) -> None:
+        """Listens. Raises ConfigError if another daemon does."""
+        self._server = ControlServer(path, self._d.selector, self._requested)
+        self._server.open()
+
+    def close(self) -> None:
+        """Hangs up."""
+        if self._server is not None:
+            self._server.close()
+
+    def tick(self, now_ns: int) -> None:
+        """Drops silent clients; tells how far a campaign is. now_ns: the host's clock."""
+        if self._server is not None:
+            self._server.tick(now_ns)
+        self._put()
+        if now_ns >= self._next_progress_ns:
+            self._next_progress_ns = now_ns + PROGRESS_NS
+            sampling = self._d.sampler.progress()
+            if sampling is not None:
+                phase, taken, n, rejected, left_s = sampling
+                detail = phase + "".join(f", {count} {reason}" for reason, count in sorted(rejected.items()))
+                self.progress(taken, n, detail, None if self._d.clock.lockstep else left_s)
+
+    def progress(self, done: float, total: float, detail: str, left_s: float | None = None) -> None:
+        """How far what is being waited for is."""
+        for _, connection in self._waiting.values():
+            if connection is not None:
+                connection.progress(done=done, total=total, detail=detail, seconds_left=left_s)
+
+    def request(self, verb: Any, connection: Connection | None = None, **fields: Any) -> int:
+        """Puts a request to the core; its number. by: the connection's user, or this process's."""
+        self._numbers += 1
+        number = self._numbers
+        self._waiting[number] = (verb, connection)
+        by = os.getuid() if connection is None else connection.uid
+        self._postponed.append((Requested(0, number, verb, by, **fields), time.monotonic_ns() + SETTLE_WITHIN_NS))
+        self._put()
+        return number
+
+    def _put(self) -> None:
+        """Hands requests to the core, in order. In lockstep one that makes the robot move waits until it stands, which takes
+        milliseconds: when it was typed would otherwise decide at which of the robot's periods its story begins.
+        """
+        while self._postponed:
+            request, limit_ns = self._postponed[0]
+            if request.verb in MOVING and self._settling() and time.monotonic_ns() < limit_ns:
+                return
+            self._postponed.pop(0)
+            self._d.feed(request)
+
+    def _settling(self) -> bool:
+        """Lockstep, nothing drives, and the robot still gets its recovery commands."""
+        state = self._d.state
+        idle = state.campaign is None and state.deployment is None
+        return self._d.clock.lockstep and idle and state.link_up and state.observation is not None and state.answered
+
+    def answered(self, answer: Answer) -> None:
+        """The core's answer goes to whoever asked."""
+        verb, connection = self._waiting.get(answer.request_id, ("", None))
+        if not answer.final:
+            self._said = (answer.exit_code, answer.text)
+            if connection is not None:
+                connection.progress(text=answer.text)
+            return
+        self._waiting.pop(answer.request_id, None)
+        if connection is None:
+            self.answers[answer.request_id] = answer
+        else:
+            connection.answer(answer.exit_code, answer.text, self.result_of(verb))
+
+    def result_of(self, verb: str) -> Any:
+        """The newest result of what the verb asks for, as plain data."""
+        return msgspec.to_builtins(self._d.actions.results.get(RESULT_OF.get(verb, "")))
+
+    # ------------------------------------------------------------------ the socket
+
+    def _requested(self, connection: Connection, plain: dict[str, Any]) -> None:
+        try:
+            request = msgspec.convert(plain, Request, strict=False)
+        except msgspec.ValidationError as error:
+            connection.answer(2, f"{plain['verb']}: {error}")
+            return
+        try:
+            self._serve(connection, request)
+        except S2RError as error:
+            connection.answer(error.exit_code, str(error))
+
+    def _serve(self, connection: Connection, request: Request) -> None:
+        match request.verb:
+            case "status":
+                found = status(self._d)
+                connection.answer(0, f"gate {found['gate']} ({found['reason']})", found)
+            case "deploy":
+                self._deploy(connection, request)
+            case "adopt":
+                self._adopt(connection, request)
+            case verb if verb in PLAIN:
+                if not 0.0 <= request.duration_s < float("inf") or not 0 <= request.count < 2**31:
+                    raise ConfigError(f"{verb}: duration_s is {request.duration_s} and count {request.count}, must be >= 0 and finite")
+                self.request(verb, connection, text=request.text, duration_s=request.duration_s, count=request.count)
+            case verb:
+                connection.answer(2, f"{verb}: no such request; there are: status, deploy, adopt, {', '.join(PLAIN)}")
+
+    def _deploy(self, connection: Connection, request: Request) -> None:
+        def loaded(result: Result | Failed) -> None:
+            if isinstance(result, Failed) or result.controller is None:
+                connection.answer(78, result.text if isinstance(result, Failed) else "no controller was loaded")
+                return
+            self._d.actions.keep_controller(result.controller)
+            digest = result.controller.digest
+            if not request.certificate or self._install(connection, request.certificate, digest):
+                self.request("deploy", connection, digest=digest, text=request.path)
+
+        self._d.workshop.start(LoadJob(request.path, dict(request.parameters)), LOAD_TIMEOUT_S, loaded)
+
+    def _install(self, connection: Connection, text: str, digest: str) -> bool:
+        """A certificate that came along. Refused, it ends the request: nobody asked for an attempt of this robot's budget instead."""
+        self._numbers += 1
+        self._waiting[self._numbers] = ("certificate", connection)
+        self._said = (0, "")
+        try:
+            self._d.feed(issuing.load(self._d, text, "--certificate", digest, self._numbers))
+        except S2RError as error:
+            self._said = (error.exit_code, str(error))
+        self._waiting.pop(self._numbers)
+        if self._said[0]:
+            connection.answer(*self._said)
+        return not self._said[0]
+
+    def _adopt(self, connection: Connection, request: Request) -> None:
+        """Looks whether the model can take the place of the one in force; the robot has the same states, inputs and step either way."""
+        spec = parse_model(request.text, request.base, "adopt")
+        current = self._d.profile
+        if spec.dt != current.model.dt:
+            raise ConfigError(f"adopt: model.dt is {spec.dt} s, must be the profile's {current.model.dt} s")
+        profile = msgspec.structs.replace(current, model=spec)
+
+        def checked(wrong: str, facts: ModelFacts | None) -> None:
+            if wrong or facts != self._d.facts:
+                connection.answer(78, wrong or "adopt: the model has other states or inputs than the robot's")
+                return
+            try:
+                self._d.models.keep(spec)
+            except OSError as error:
+                connection.answer(70, f"adopt: the model cannot be kept: {error.strerror}")
+                return
+            self._d.adopting[spec.digest()] = profile
+            # before the decision, so that a reader of the log has the model when it comes into force
+            self._d.logbook.attach(f"model/{spec.digest()}", "application/toml", dump_model(spec).encode())
+            self.request("adopt", connection, digest=spec.digest())
+
+        self._numbers += 1
+        self._d.watcher.check(self._numbers, profile, "adopt", checked)

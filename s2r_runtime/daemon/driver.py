@@ -1,0 +1,121 @@
+"""The source `controller` inside the daemon: the hosted process's answers and its end, as events for the core."""
+
+from __future__ import annotations
+
+import selectors
+import time
+from collections.abc import Callable
+
+from s2r_runtime.controllers.episodes import Episode
+from s2r_runtime.controllers.file import ControllerFile
+from s2r_runtime.controllers.hosted import HostedController, Ready, Reply, Stopped
+from s2r_runtime.errors import ControllerError
+from s2r_runtime.messages import Command, EpisodeEnded, Event, Observation, Proposed, Settings, SourceStarted, SourceStopped
+from s2r_runtime.profile import Profile
+
+LOCKSTEP_DEADLINE_S = 1.0
+"""The robot waits for the answer there, so a host that is slow for a moment need not end a drive."""
+
+
+class Driver:
+    """At most one controller at a time. Events come through `emit`, their time from `now`."""
+
+    def __init__(
+        self,
+        selector: selectors.BaseSelector,
+        profile: Profile,
+        settings: Callable[[], Settings],
+        emit: Callable[[Event], None],
+        now: Callable[[], int],
+        next_seq: Callable[[], int],
+    ) -> None:
+        """settings: those in force. next_seq: numbers the commands of all sources."""
+        self._selector, self._profile, self._settings = selector, profile, settings
+        self._emit, self._now, self._next_seq = emit, now, next_seq
+        self._host: HostedController | None = None
+        deadline_s = profile.gate.controller_deadline
+        self._deadline_ns = round(1e9 * (max(deadline_s, LOCKSTEP_DEADLINE_S) if profile.clock == "lockstep" else deadline_s))
+        self.latency_ns = 0
+
+    @property
+    def running(self) -> bool:
+        """Whether there is a controller's process."""
+        return self._host is not None
+
+    @property
+    def pid(self) -> int:
+        """Its process id, or 0."""
+        return self._host.pid if self._host is not None else 0
+
+    @property
+    def due_ns(self) -> int | None:
+        """When `poll` must be called at the latest (host's clock)."""
+        return self._host.deadline_ns if self._host is not None else None
+
+    def start(self, file: ControllerFile, seed: int) -> None:
+        """Starts the process; SourceStarted or SourceStopped(start_failed) follows."""
+        self.stop()
+        settings = self._settings()
+        host = HostedController(
+            file, model=self._profile.model, nx=len(settings.states), nu=len(settings.inputs), task=self._profile.task, seed=seed
+        )
+        try:
+            host.start()
+        except ControllerError as error:
+            host.close()
+            self._emit(SourceStopped(self._now(), "controller", "start_failed", str(error)))
+            return
+        self._host = host
+        self._selector.register(host, selectors.EVENT_READ, lambda _: self.poll(time.monotonic_ns()))
+
+    def use(self, profile: Profile) -> None:
+        """The profile with another model from here on."""
+        self._profile = profile
+
+    def ask(self, observation: Observation) -> None:
+        """Asks what to do about it; Proposed or SourceStopped follows."""
+        if self._host is None:
+            return
+        try:
+            self._host.ask(observation, time.monotonic_ns() + self._deadline_ns)
+        except ValueError as error:
+            self._end(SourceStopped(self._now(), "controller", "raised", str(error)))
+
+    def poll(self, now_ns: int) -> None:
+        """Takes what came. now_ns: the host's clock."""
+        if self._host is None:
+            return
+        for message in self._host.poll(now_ns):
+            t_ns = self._now()
+            if isinstance(message, Reply):
+                self.latency_ns = message.latency_ns
+                self._episode(t_ns, message.ended)
+                ttl_ns = self._settings().command_ttl_ns
+                self._emit(Proposed(t_ns, Command(self._next_seq(), t_ns, "controller", message.u, message.obs_seq, ttl_ns)))
+            elif isinstance(message, Stopped):
+                self._episode(t_ns, message.ended)
+                self._end(SourceStopped(t_ns, "controller", message.reason, message.detail))
+            elif isinstance(message, Ready):
+                self._emit(SourceStarted(t_ns, "controller", message.digest))
+            if self._host is None:  # what an answer led to has stopped it
+                return
+
+    def stop(self) -> None:
+        """Kills it; no event follows. May be called twice."""
+        if self._host is not None:
+            host, self._host = self._host, None
+            self._selector.unregister(host)
+            host.close()
+
+    def _end(self, event: SourceStopped) -> None:
+        self.stop()
+        self._emit(event)
+
+    def _episode(self, t_ns: int, ended: Episode | None) -> None:
+        if ended is not None:
+            self._emit(EpisodeEnded(t_ns, ended.index, ended.k, ended.safety or 0.0, ended.progress or 0.0, _missing(ended)))
+
+
+def _missing(ended: Episode) -> str:
+    """What the task had no finite value for: the message has a number for each."""
+    return ", ".join(f"no {name}" for name, value in (("safety", ended.safety), ("progress", ended.progress)) if value is None)

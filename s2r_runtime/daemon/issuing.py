@@ -1,0 +1,85 @@
+"""Certificates in the daemon: signed when the core says so, loaded when a person brings one; durable before the core hears of it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from s2r_runtime import certificate as certificates
+from s2r_runtime import keys
+from s2r_runtime.daemon.persistence import replace
+from s2r_runtime.errors import ConfigError, S2RError
+from s2r_runtime.messages import CertificateFailed, CertificateStored, Gap, IssueCertificate
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+    from s2r_runtime.daemon.loop import Daemon
+
+
+def signing_key(path: Path | None, state: Path, say: Callable[[str], None]) -> Ed25519PrivateKey:
+    """The key at `path`; or the robot's own in the state folder, made when it has none. Raises ConfigError if it is no good."""
+    if path is None:
+        path = state / "key.pem"
+        if not path.exists():
+            public = keys.new(path)
+            say(f"made a signing key for this robot: {path}; give {public} to whoever audits its logs")
+    return keys.load(path)
+
+
+def issue(daemon: Daemon, order: IssueCertificate) -> CertificateStored | CertificateFailed:
+    """Signs what was shown and stores it."""
+    file = daemon.actions.controller(order.verification.controller_digest)
+    if file is None:
+        return CertificateFailed(0, "the controller's file is not loaded any more; deploy it again", order.request_id)
+    try:
+        certificate = certificates.issue(
+            profile=daemon.profile,
+            controller=file,
+            gap=order.gap,
+            verification=order.verification,
+            issued_unix_s=int(time.time()),
+            lifetime_s=order.lifetime_s,
+            horizon=daemon.facts.horizon,
+            traced_not_adopted=daemon.state.memory.traced,
+        )
+        return _store(daemon, certificate, certificates.sign(certificate, daemon.key), None, order.request_id)
+    except S2RError as error:
+        return CertificateFailed(0, str(error), order.request_id)
+
+
+def load(daemon: Daemon, text: str, where: str, controller: str, request_id: int) -> CertificateStored:
+    """A certificate that a person brings for this controller (digest), made elsewhere. Raises ConfigError with what is wrong with it."""
+    trusted = (keys.public_bytes(daemon.key), *keys.load_trusted([daemon.folder.path / "trusted"]))
+    data = text.encode()
+    certificate = certificates.load(data, trusted, int(time.time()), where)
+    if certificate.controller_digest != controller:
+        raise ConfigError(f"{where}: is of the controller {certificate.controller_digest}; the one to deploy is {controller}")
+    stored = _store(daemon, certificate, data, certificate.gap, request_id)
+    if isinstance(stored, CertificateFailed):
+        raise S2RError(stored.error)
+    return stored
+
+
+def _store(
+    daemon: Daemon, certificate: certificates.Certificate, data: bytes, gap: Gap | None, request_id: int
+) -> CertificateStored | CertificateFailed:
+    """Into the log and the state folder, and to the disk."""
+    facts = certificates.facts(certificate)
+    folder = daemon.folder.path / "certificates"
+    daemon.logbook.attach(f"certificate/{facts.id}", "application/json", data)
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        replace(certificate_file(folder, facts.id), data)
+    except OSError as error:
+        return CertificateFailed(0, f"the certificate cannot be stored: {error.strerror}", request_id)
+    if not daemon.logbook.durable():
+        return CertificateFailed(0, "the certificate cannot be logged: the disk does not take the log", request_id)
+    return CertificateStored(0, facts, gap, request_id)
+
+
+def certificate_file(folder: Path, identity: str) -> Path:
+    """Where a certificate of that id is."""
+    return folder / f"{identity.removeprefix('sha256:')}.json"

@@ -1,0 +1,366 @@
+"""The daemon: wires the robot, the core, the recorder and the helpers together, and turns one loop.
+
+Everything that happens becomes an event, is logged, goes through the core, and what comes out is logged and carried out, in this
+order. What decides has no clock and no I/O (`core`); what is here decides nothing. An opening of the gate, a certificate, the memory
+and what was spent are on the disk before what follows them takes effect; a closing takes effect first and is logged next.
+
+If something in here breaks, the last act is the recovery command; the exit code is then 70, and the service manager starts anew.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import selectors
+import sys
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+import msgspec
+
+from s2r_runtime.child import Child
+from s2r_runtime.core import reducer as core
+from s2r_runtime.core.state import State
+from s2r_runtime.daemon import control, issuing
+from s2r_runtime.daemon.actions import Actions
+from s2r_runtime.daemon.desk import Desk
+from s2r_runtime.daemon.driver import Driver
+from s2r_runtime.daemon.logbook import Logbook
+from s2r_runtime.daemon.model_store import ModelStore
+from s2r_runtime.daemon.persistence import StateFolder
+from s2r_runtime.daemon.robot_link import Clock, Inbound, link_of
+from s2r_runtime.daemon.sampler import Keeper, Sampler
+from s2r_runtime.daemon.settings import ModelFacts, settings_of
+from s2r_runtime.daemon.stop_signals import StopSignals
+from s2r_runtime.daemon.systemd import Notifier
+from s2r_runtime.daemon.workshop import Watcher, Workshop
+from s2r_runtime.messages import (
+    AnalyticsChanged,
+    Command,
+    EpisodeEnded,
+    Event,
+    Frame,
+    LinkChanged,
+    Memory,
+    Observation,
+    Observed,
+    OverrideChanged,
+    Proposed,
+    RecorderChanged,
+    Send,
+    Started,
+    Stopping,
+    Ticked,
+    WallClockRead,
+)
+from s2r_runtime.plugins import registry
+from s2r_runtime.profile import Profile
+
+TICK_NS = 20_000_000
+ROUND_NS = 100_000_000
+WALL_CLOCK_NS = 1_000_000_000
+NEW_LOG_NS = 1_000_000_000
+"""Between two looks whether a new log can begin after the old one lost a message."""
+
+
+class Daemon:
+    """One robot's daemon. `run` returns the exit code; everything else is for the parts of the daemon.
+
+    state_dir: counters, certificates, key (default: the user's state folder, by robot). key_path: signing key (default: one in the state
+    folder, made when there is none). log_dir: default as the profile says. log_file: one log of this name instead. listen: whether
+    there is a control socket. on_tick: called with every tick, for whoever runs a daemon in his own process. analytics: that process,
+    if it was started before this module was loaded.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        *,
+        profile_path: Path,
+        state_dir: Path | None = None,
+        key_path: Path | None = None,
+        log_dir: Path | None = None,
+        log_file: Path | None = None,
+        seed: int | None = None,
+        listen: bool = True,
+        on_tick: Callable[[Daemon], None] | None = None,
+        analytics: Child | None = None,
+    ) -> None:
+        self.profile, self._profile_path, self.seed = profile, profile_path, seed
+        self.state_dir = state_dir or control.state_root() / profile.robot.name
+        self._key_path, self._log_file, self._listen, self._on_tick = key_path, log_file, listen, on_tick
+        self._analytics = analytics
+        self._log_dir = log_file.parent if log_file else log_dir or self.state_dir / profile.recording.directory
+        self.selector = selectors.DefaultSelector()
+        self.clock = Clock(lockstep=profile.clock == "lockstep")
+        self.notifier = Notifier()
+        self.state: State = core.initial()
+        self.memory: Memory
+        self.observation: Observation | None = None
+        self.adopting: dict[str, Profile] = {}
+        self.began_ns = time.monotonic_ns()
+        self._queue: deque[Event] = deque()
+        self._draining = False
+        self._last_ns = 0
+        self._numbers = 0
+        self._recorder_ok = True
+        self._next_tick_ns = self._next_round_ns = self._next_wall_ns = self._next_log_ns = 0
+        self._ended = ""
+
+    # ------------------------------------------------------------------ life
+
+    def run(self) -> int:
+        """Serves until SIGTERM or SIGINT (0), or until `end`. Raises ConfigError for what makes a start impossible."""
+        with ExitStack() as stack:
+            self._open(stack)
+            gc.collect()
+            gc.freeze()  # what is there now stays: collections while a robot is driven have little to look at
+            try:
+                self._turn()
+                self._finish()
+            except Exception:  # noqa: BLE001 - a defect of ours: the robot first, then the report
+                self._last_act()
+                self.say(traceback.format_exc())
+                return 70
+        return 0
+
+    def end(self, why: str) -> None:
+        """The loop ends with this turn."""
+        self._ended = self._ended or why
+
+    def say(self, text: str) -> None:
+        """A line for the journal, if anybody takes it: stderr may be a file on the disk that is full."""
+        with contextlib.suppress(OSError):
+            sys.stderr.write(f"s2r: {text}\n")
+            sys.stderr.flush()
+
+    def _open(self, stack: ExitStack) -> None:
+        """What takes long comes first and goes on beside the rest: analytics loads the model while the transport is loaded here."""
+        profile = self.profile
+        stack.callback(self.selector.close)
+        stack.callback(self.notifier.close)
+        self._signals = stack.enter_context(StopSignals(self.selector))
+        self.folder = stack.enter_context(StateFolder(self.state_dir, profile.robot.name))
+        self.memory = self.folder.memory(self._log_dir.glob(f"{profile.robot.name}-*.mcap") if self._log_file is None else ())
+        self.models = ModelStore(self.folder.path, profile.model)
+        self.profile = profile = self.models.in_force(profile, self.memory)
+        self.key = issuing.signing_key(self._key_path, self.folder.path, self.say)
+        self.watcher = Watcher(self.selector, profile, str(self._profile_path), self.feed, self._analytics)
+        stack.callback(self.watcher.close)
+        registry().get("transports", str(profile.transport.get("name")))  # loaded here, while analytics loads the model
+        self.workshop = Workshop(self.selector)
+        stack.callback(self.workshop.close)
+        self.logbook = Logbook(
+            self._log_dir, profile.robot.name, profile.recording, self.key, lockstep=self.clock.lockstep, file=self._log_file
+        )
+        self.facts: ModelFacts = self.watcher.facts()
+        self.settings = settings_of(profile, profile.model, self.facts, self.seed)
+        self.link = link_of(self.profile, self.facts, self._record_frame)
+        self.logbook.begin(self._profile_path, self.profile.model)
+        stack.callback(self._close_log)
+        stack.callback(self._close_link)
+        self.keeper = Keeper(self.folder, self.say)
+        stack.callback(self.keeper.close)
+        self.sampler = Sampler(self.folder, self.keeper, profile.sampling, lambda: tuple(map(str, self.logbook.paths)), self.next_seq)
+        self.driver = Driver(self.selector, profile, lambda: self.settings, self.feed, self.clock.now, self.next_seq)
+        stack.callback(self.driver.stop)
+        self.actions = Actions(self)
+        self.desk = Desk(self)
+        if self._listen:
+            self.desk.open(control.socket_dir() / f"{profile.robot.name}.sock")
+            stack.callback(self.desk.close)
+        self._open_link()
+        if self.memory.gap is not None:
+            self.sampler.recall(self.memory.gap.epoch)
+        self._begin_run()
+        self.notifier.ready("waiting for the robot")
+        self.say(f"robot {profile.robot.name!r}: log {self.logbook.paths[-1]}, state {self.folder.path}")
+
+    def _open_link(self) -> None:
+        self.link.open()
+        self.selector.register(self.link, selectors.EVENT_READ, self._robot_ready)
+
+    def _close_link(self) -> None:
+        with contextlib.suppress(KeyError):  # it did not get that far
+            self.selector.unregister(self.link)
+        self.link.close()
+
+    def _begin_run(self) -> None:
+        """First events of a log, and what the core cannot know of from before."""
+        self.state = core.initial()
+        self.feed(Started(0, int(time.time()), self.settings, self.memory))
+        if not self.watcher.up:
+            self.feed(AnalyticsChanged(0, up=False, detail="still down"))
+
+    # ------------------------------------------------------------------ the loop
+
+    def _turn(self) -> None:
+        while not (self._signals.name or self._ended):
+            due_ns = self._next_tick_ns if self.driver.due_ns is None else min(self._next_tick_ns, self.driver.due_ns)
+            for key, mask in self.selector.select(max(0, due_ns - time.monotonic_ns()) * 1e-9):
+                key.data(mask)
+            now_ns = time.monotonic_ns()
+            if now_ns >= due_ns:
+                self._tick(now_ns)
+
+    def _tick(self, now_ns: int) -> None:
+        """What time alone brings. now_ns: the host's clock."""
+        self._next_tick_ns = now_ns + TICK_NS
+        for change in self.link.poll(now_ns):
+            self.feed(change)
+        self.driver.poll(now_ns)
+        self.watcher.tick(now_ns)
+        if now_ns >= self._next_round_ns:
+            self._next_round_ns = now_ns + ROUND_NS
+            self._go_round(now_ns)
+        self.feed(Ticked(0))
+        if self._on_tick is not None:
+            self._on_tick(self)
+
+    def _go_round(self, now_ns: int) -> None:
+        """What need not be looked at every 20 ms."""
+        self.workshop.tick(now_ns)
+        self._look_at_log(now_ns)
+        self.actions.tick(now_ns)
+        if now_ns >= self._next_wall_ns:
+            self._next_wall_ns = now_ns + WALL_CLOCK_NS
+            self.feed(WallClockRead(0, int(time.time())))
+        self.desk.tick(now_ns)
+        self.notifier.alive(now_ns)
+        self.notifier.status(f"gate {'open' if self.state.gate_open else 'closed'} ({self.state.gate_reason})")
+
+    def _robot_ready(self, _mask: int) -> None:
+        for arrival_ns, message in self.link.receive():
+            self._from_robot(arrival_ns, message)
+
+    def _from_robot(self, arrival_ns: int, message: Inbound) -> None:
+        if isinstance(message, Observation):
+            self.clock.seen(message)
+            self.observation = message
+            self.watcher.observed(message)
+            self.feed(Observed(self.clock.now() if self.clock.lockstep else arrival_ns, message))
+            if self.clock.lockstep:
+                self.watcher.wait()
+        elif isinstance(message, Command):
+            self.feed(Proposed(0, msgspec.structs.replace(message, source="external")))
+        elif isinstance(message, LinkChanged | OverrideChanged):
+            self.feed(message)
+
+    # ------------------------------------------------------------------ events
+
+    def feed(self, *events: Event) -> None:
+        """Takes events in; when this returns they are carried out, unless it was called while others are. An event whose t_ns is 0
+        is given the time now; no event is earlier than the one before.
+        """
+        self._queue.extend(events)
+        if self._draining:
+            return
+        self._draining = True
+        try:
+            while self._queue:
+                self._handle(self._queue.popleft())
+        finally:
+            self._draining = False
+
+    def feed_first(self, event: Event) -> None:
+        """As `feed`, before all that wait."""
+        self._queue.appendleft(event)
+        self.feed()
+
+    def use_model(self, digest: str) -> None:
+        """A model was adopted: everything that is started from here on uses it."""
+        profile = self.adopting.pop(digest, None)
+        if profile is None or profile.model.digest() != digest:
+            return  # it is in force already
+        self.profile = profile
+        self.settings = settings_of(profile, profile.model, self.facts, self.seed)
+        self.driver.use(profile)
+        self.watcher.use(profile)
+
+    def next_seq(self) -> int:
+        """Number of the next proposed command, whoever proposes it."""
+        self._numbers += 1
+        return self._numbers
+
+    def _handle(self, event: Event) -> None:
+        t_ns = event.t_ns
+        if isinstance(event, LinkChanged | OverrideChanged):
+            t_ns = 0  # a transport's stamps are the host's
+        elif isinstance(event, EpisodeEnded):
+            self.actions.episodes.append(event)
+        self._last_ns = max(self._last_ns, t_ns or self.clock.now())
+        if event.t_ns != self._last_ns:
+            event = msgspec.structs.replace(event, t_ns=self._last_ns)
+        self.logbook.put(event, self._last_ns)
+        self.state, outputs = core.handle(self.state, event)
+        self.actions.carry_out(outputs)
+
+    def _record_frame(self, frame: Frame) -> None:
+        self.logbook.put(frame, self._last_ns)
+
+    # ------------------------------------------------------------------ the log
+
+    def _look_at_log(self, now_ns: int) -> None:
+        """Says when the log fails or works again; begins a new one, and with it a new run, when the old one is at its end."""
+        health = self.logbook.health()
+        ok = health.ok and not self.actions.unsaved
+        if ok != self._recorder_ok:
+            self.log_changed(ok, health.detail or self.actions.unsaved)
+        if self.logbook.faulty and now_ns >= self._next_log_ns:
+            self._next_log_ns = now_ns + NEW_LOG_NS
+            if self.logbook.prepare():
+                self._run_anew()
+
+    def _run_anew(self) -> None:
+        """A new run in a new log. What a transport says depends on all that it heard before, so it begins anew as well: the log alone
+        must say what its frames meant.
+        """
+        self._end_sources("the log failed")
+        self._close_link()
+        self.link = link_of(self.profile, self.facts, self._record_frame)
+        self.logbook.switch()
+        self.say(f"a new log begins: {self.logbook.paths[-1]}")
+        self.memory, self._recorder_ok, self.observation = self.state.memory, True, None
+        self._begin_run()
+        self._open_link()
+
+    def log_changed(self, ok: bool, detail: str) -> None:
+        """The recorder failed, or works again."""
+        self._recorder_ok = ok
+        self.say("the log works again" if ok else f"the log failed: {detail}")
+        self.feed_first(RecorderChanged(0, ok, detail))
+
+    def _end_sources(self, why: str) -> None:
+        self.feed(*self.sampler.stop(0, why))
+        self.feed(Stopping(0, why))
+        self.driver.stop()
+        self.watcher.end()
+        self.workshop.close()
+
+    # ------------------------------------------------------------------ the end
+
+    def _finish(self) -> None:
+        """An orderly end: the recovery command is out and the memory is kept before anything is closed."""
+        self.notifier.stopping()
+        self._end_sources(self._signals.name or self._ended)
+
+    def _last_act(self) -> None:
+        """Something here broke. Nothing is asked any more, nothing decided: the robot is told to recover, as its profile says."""
+        with contextlib.suppress(Exception):
+            held = self.settings.recovery_input if self.settings.recovery == "hold" else (0.0,) * len(self.facts.inputs)
+            number = self.actions.last_sent + 1
+            seen = self.observation.seq if self.observation is not None else -1
+            for _ in self.link.send(Send(self._last_ns, number, "recovery", held, seen, self.settings.command_ttl_ns)):
+                pass
+        with contextlib.suppress(Exception):
+            self.driver.stop()
+
+    def _close_log(self) -> None:
+        health, head = self.logbook.close()
+        if not health.ok:
+            self.say(f"the log lacks {health.unrecorded} messages: {health.detail}")
+        self.say(f"log {self.logbook.paths[-1]} ends at {head}")

@@ -1,0 +1,38 @@
+"""What `s2r status` says: the core's state, and how the daemon and the robot's link are."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import TYPE_CHECKING, Any
+
+from s2r_runtime.core import reducer as core
+
+if TYPE_CHECKING:
+    from s2r_runtime.daemon.loop import Daemon
+
+
+def status(daemon: Daemon) -> dict[str, Any]:
+    """Plain data: what the core says (docs/json.md), and beside it the campaign under way, the scenarios driven, the log, the processes."""
+    found, sampling, health = core.status(daemon.state), daemon.sampler.progress(), daemon.logbook.health()
+    memory, observation = daemon.state.memory, daemon.observation
+    return found | {
+        "robot": daemon.settings.robot,
+        "job": daemon.state.jobs[0].purpose if daemon.state.jobs else None,
+        "phase": None if sampling is None else sampling[0],
+        "rejected": {} if sampling is None else sampling[3],
+        "revoked": dict(memory.revoked),
+        "measured": memory.watch_n,
+        "exceedances": memory.watch_exceedances,
+        "scenarios": daemon.state.episodes,
+        "episodes": [{"index": e.index, "steps": e.steps, "safety": e.safety, "progress": e.progress} for e in daemon.actions.episodes],
+        "observation": None if observation is None else {"seq": observation.seq, "x": list(observation.x), "fault": observation.fault},
+        "analytics": "up" if daemon.watcher.up else "down",
+        "recorder": "ok" if health.ok else health.detail,
+        "log": str(daemon.logbook.paths[-1]),
+        "recorded": health.recorded,
+        "counters": daemon.link.counters(),
+        "controller_latency_ms": daemon.driver.latency_ns * 1e-6,
+        "uptime_s": (time.monotonic_ns() - daemon.began_ns) * 1e-9,
+        "pids": {"daemon": os.getpid(), "analytics": daemon.watcher.pid, "controller": daemon.driver.pid},
+    }

@@ -1,0 +1,169 @@
+"""The worker process: one job, one process. It gets the job as a JSON line, tells its progress, and ends with a result or an error.
+
+Both ends are in this file: `Worker` in the daemon (no numpy), `main` in the child; what the jobs do is in `jobs`. A job is a pure
+function of its message: all that it depends on is in there, the seed too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+import traceback
+from typing import Any
+
+import msgspec
+
+from s2r_runtime.child import Child, die_with_parent, say, take_stdout
+from s2r_runtime.controllers.file import ControllerFile
+from s2r_runtime.errors import S2RError
+from s2r_runtime.messages import Gap, SampleTaken, Verification
+from s2r_runtime.profile import Profile
+
+
+class GapJob(msgspec.Struct, frozen=True, tag="gap"):
+    """Bound the gap of the profile's model on a campaign's samples. beta: what the epoch spends, on both radii together."""
+
+    profile: Profile
+    samples: tuple[SampleTaken, ...]
+    rejected: dict[str, int]
+    epoch: int
+    beta: float
+
+
+class LoadJob(msgspec.Struct, frozen=True, tag="load"):
+    """Read a controller's file and what it imports. In a worker, because a path may be slow, or a pipe."""
+
+    path: str
+    parameters: dict[str, Any]
+
+
+class VerifyJob(msgspec.Struct, frozen=True, tag="verify"):
+    """Roll the controller out on the uncertain model. gap: whose set and norm."""
+
+    profile: Profile
+    controller: ControllerFile
+    gap: Gap
+    radius: float
+    hold_radius: float
+    attempt: int
+    seed: int
+    beta: float
+
+
+class TraceJob(msgspec.Struct, frozen=True, tag="trace"):
+    """Trace the residual in a campaign's samples and logs. out: where the repaired model is written."""
+
+    profile: Profile
+    logs: tuple[str, ...]
+    samples: tuple[SampleTaken, ...]
+    rejected: dict[str, int]
+    epoch: int
+    seed: int
+    out: str
+
+
+Job = LoadJob | GapJob | VerifyJob | TraceJob
+
+
+class Progress(msgspec.Struct, frozen=True, tag="progress"):
+    """done of total, and what is being done."""
+
+    done: float
+    total: float
+    detail: str = ""
+
+
+class Result(msgspec.Struct, frozen=True, tag="result"):
+    """What a job found: the fields of JobFinished that it fills, or the controller that was loaded."""
+
+    gap: Gap | None = None
+    verification: Verification | None = None
+    trace: dict[str, Any] | None = None
+    safety: dict[str, list[float]] = {}
+    controller: ControllerFile | None = None
+
+
+class Failed(msgspec.Struct, frozen=True, tag="failed"):
+    """Why a job has no result, in one line."""
+
+    text: str
+
+
+Upward = Progress | Result | Failed
+
+_ENCODE = msgspec.json.Encoder().encode
+_DECODE_UP = msgspec.json.Decoder(Upward).decode
+
+
+class Worker:
+    """The daemon's end. `poll` gives progress and, last, a Result or Failed: always one of them, whatever happens to the process."""
+
+    def __init__(self, job: Job, timeout_s: float) -> None:
+        self._child = Child("s2r_runtime.daemon.worker")
+        self._deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
+        self._overdue = f"not done within {timeout_s:g} s" + (" (verification.timeout)" if isinstance(job, VerifyJob) else "")
+        self._child.send(_ENCODE(job))
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._child.pid
+
+    def fileno(self) -> int:
+        """Readable when `poll` has something."""
+        return self._child.fileno()
+
+    def poll(self, now_ns: int) -> list[Upward]:
+        """What came since the last call, and the end where it died or its time is over. Call at least every second."""
+        self._child.flush()
+        came: list[Upward] = []
+        for line in self._child.lines():
+            try:
+                came.append(_DECODE_UP(line))
+            except msgspec.DecodeError as error:
+                came.append(Failed(f"the worker is out of step: {error}"))
+            if not isinstance(came[-1], Progress):
+                return came
+        if not self._child.alive():
+            came.append(Failed(f"the worker died: {self._child.ending()}"))
+        elif now_ns > self._deadline_ns:
+            came.append(Failed(self._overdue))
+        return came
+
+    def stop(self) -> None:
+        """Ends the process; may be called twice."""
+        self._child.stop()
+
+
+def main(arguments: list[str]) -> int:
+    """Does the one job on stdin."""
+    die_with_parent(int(arguments[0]))
+    channel = take_stdout()
+    spoken = 0.0
+
+    def progress(done: float, total: float, detail: str = "") -> None:
+        nonlocal spoken
+        if time.monotonic() - spoken > 0.1:
+            spoken = time.monotonic()
+            say(channel, _ENCODE(Progress(done, total, detail)))
+
+    job = msgspec.json.decode(sys.stdin.buffer.readline(), type=Job)
+    try:
+        from s2r_runtime.daemon.jobs import run
+
+        result: Upward = run(job, progress)
+    except S2RError as error:
+        result = Failed(str(error))
+    except Exception as error:  # noqa: BLE001 - whatever a job raises is its result; a verification that failed to run is a refusal
+        with contextlib.suppress(OSError):  # confined, it may not write to a file
+            traceback.print_exc()
+        result = Failed(f"{type(error).__name__}: {error}")
+    say(channel, _ENCODE(result))
+    return 0
+
+
+if __name__ == "__main__":
+    from s2r_runtime.daemon.worker import main as once  # `jobs` imports this module, and its structs must be the same ones
+
+    raise SystemExit(once(sys.argv[1:]))

@@ -1,0 +1,181 @@
+"""One run's log on the disk, block by block: seals, compresses, appends, completes, and begins the next part.
+
+After an error of the operating system the file is as it was, and the same call tries the same bytes again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+import zlib
+from array import array
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import zstandard
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from mcap.opcode import Opcode
+
+from s2r_runtime.recording.chain import GENESIS, advance, signed
+from s2r_runtime.recording.channels import CHAIN, NUMBERS, Seal
+from s2r_runtime.recording.layout import MESSAGE, MESSAGE_FIELDS, chunk, declaration
+from s2r_runtime.recording.start import make_start
+from s2r_runtime.recording.summary import tail
+
+End = Literal["", "rotated", "closed"]
+_CHAIN = NUMBERS[CHAIN]
+
+
+class Pending:
+    """What gathers between two seals: records outside the chunk, then the chunk's messages.
+
+    `seal_index`: the number reserved for its seal; `end`: whether the file ends with it; `held`: its bytes as accounted for.
+    """
+
+    __slots__ = ("content", "end", "held", "index", "opened_s", "prefix", "seal_index")
+
+    def __init__(self) -> None:
+        self.prefix: list[bytes] = []
+        self.content = bytearray()
+        self.index: dict[int, array[int]] = {}
+        self.opened_s = time.monotonic()
+        self.seal_index = 0
+        self.held = 0
+        self.end: End = ""
+
+    def add(self, channel: int, number: int, t_ns: int, raw: bytes) -> None:
+        """Takes a message in. number: its index in the run."""
+        pairs = self.index.get(channel)
+        if pairs is None:
+            pairs = self.index[channel] = array("Q")
+        pairs.append(t_ns)
+        pairs.append(len(self.content))
+        self.content += MESSAGE.pack(Opcode.MESSAGE, MESSAGE_FIELDS + len(raw), channel, number & 0xFFFFFFFF, t_ns, t_ns)
+        self.content += raw
+
+    def declare(self, preamble: bytes) -> None:
+        """Puts schema and channel records before the messages."""
+        self.content[:0] = preamble
+        for pairs in self.index.values():
+            pairs[1::2] = array("Q", [offset + len(preamble) for offset in pairs[1::2]])
+
+
+class LogFile:
+    """The parts of one run's log. about: what their first metadata record says beside the chain's own. Raises OSError."""
+
+    def __init__(self, path: Path, run: str, signer: Ed25519PrivateKey | None, about: Mapping[str, str]) -> None:
+        self.parts: list[Path] = []
+        self.head = GENESIS
+        self.recorded = 0
+        """Messages of the run that are in the files and sealed."""
+        self.size = self.chunks = 0
+        self.opened_s = 0.0
+        self._path, self._run, self._signer, self._about = path, run, signer, dict(about)
+        self._fd = -1
+        self._crc = self._sealed_ns = 0
+        self._seal = self._unwritten = b""
+        self._schemas: dict[int, bytes] = {}
+        self._channels: dict[int, bytes] = {}
+        self._compressor = zstandard.ZstdCompressor(level=1)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a part to write to."""
+        return self._fd >= 0
+
+    def open(self) -> bytes:
+        """Makes the next part. Gives the bytes it begins with: they belong before the next block's records."""
+        part = len(self.parts) + 1
+        path = self._path if part == 1 else self._path.with_suffix(f".{part:03d}{self._path.suffix}")
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        try:
+            _sync_folder(path.parent)
+        except OSError:
+            os.close(fd)
+            path.unlink()
+            raise
+        self._fd = fd
+        self.parts.append(path)
+        self.size = self._crc = self.chunks = 0
+        self.opened_s = time.monotonic()
+        self._schemas, self._channels, self._seal = {}, {}, b""
+        key = b"" if self._signer is None else self._signer.public_key().public_bytes_raw()
+        return make_start(self._about, run=self._run, part=part, first_index=self.recorded, public_key=key, previous_head=self.head)
+
+    def put(self, block: Pending) -> None:
+        """Seals a block, once, and hands it to the operating system; after an error call again with the same one."""
+        if not self._unwritten:
+            self._unwritten = self._sealed(block)
+        self._append(self._unwritten)
+        self._crc = zlib.crc32(self._unwritten, self._crc)
+        self._unwritten = b""
+        self.chunks += 1
+        self.recorded = block.seal_index + 1
+
+    def sync(self, *, all_of_it: bool) -> None:
+        """Returns once what was written is on the disk; all_of_it: the file's own times too."""
+        if self._fd >= 0:
+            (os.fsync if all_of_it else os.fdatasync)(self._fd)
+
+    def complete(self) -> None:
+        """Writes what follows the data, and closes the part. After an error the file ends with the data, as before."""
+        data_end = self.size
+        try:
+            for piece in tail(self._read_at, data_end, self._crc, self._schemas, self._channels):
+                self._append(piece)
+                time.sleep(0)  # the index of a long log takes a second: other threads get their turn
+            os.fsync(self._fd)
+        except OSError:
+            self.size = data_end
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._fd, data_end)
+            raise
+        self.abandon()
+
+    def abandon(self) -> None:
+        """Closes the part as it is."""
+        if self._fd >= 0:
+            os.close(self._fd)
+        self._fd = -1
+
+    def _sealed(self, block: Pending) -> bytes:
+        new = sorted(channel for channel in {*block.index, _CHAIN} if channel not in self._channels)
+        for channel in new:
+            self._schemas[channel], self._channels[channel] = declaration(channel)
+        if new:
+            block.declare(b"".join(self._schemas[channel] + self._channels[channel] for channel in new))
+        first = next(iter(block.index.values()))[0] if block.index else self._sealed_ns
+        last = max((pairs[-2] for pairs in block.index.values()), default=self._sealed_ns)
+        head = advance(self.head, self._seal, [*block.prefix, block.content])
+        seal = signed(Seal(last, block.seal_index, head, self._crc, block.end), self._signer)
+        start = len(block.content)
+        block.add(_CHAIN, block.seal_index, last, msgspec.json.encode(seal))
+        self.head, self._seal, self._sealed_ns = head, bytes(block.content[start:]), last
+        return b"".join([*block.prefix, chunk(bytes(block.content), block.index, first, last, self._compressor)])
+
+    def _read_at(self, length: int, offset: int) -> bytes:
+        return os.pread(self._fd, length, offset)
+
+    def _append(self, data: bytes) -> None:
+        """All of it or nothing: after an error the file is cut back to where it was."""
+        view, at = memoryview(data), self.size
+        try:
+            while view:
+                written = os.pwrite(self._fd, view, at)
+                view, at = view[written:], at + written
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._fd, self.size)
+            raise
+        self.size = at
+
+
+def _sync_folder(path: Path) -> None:
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)

@@ -1,0 +1,312 @@
+"""Reads a log, in constant memory, and says how it ended.
+
+Nothing is given out before the seal after it was checked: bytes, CRC, sequence, chain, signature. A file that a crash cut
+reads to its last sealed message. What differs from what the writer would have written, be it one bit, ends the reading
+there, with the place named.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import BinaryIO, Literal
+
+import msgspec
+from mcap.opcode import Opcode
+
+from s2r_runtime.errors import RecordingError
+from s2r_runtime.messages import Struct
+from s2r_runtime.recording.blocks import Block, Damage, find, take
+from s2r_runtime.recording.chain import advance, is_signed_by
+from s2r_runtime.recording.channels import CHAIN, CHANNELS, Seal, decoder
+from s2r_runtime.recording.layout import (
+    ABOUT,
+    MESSAGE,
+    RECOVERED,
+    Attached,
+    attachment_fields,
+    declared,
+    metadata_fields,
+)
+from s2r_runtime.recording.start import read_start
+from s2r_runtime.recording.summary import tail
+
+_ZEROS = 16
+
+
+class Entry(msgspec.Struct, frozen=True, gc=False):
+    """One message. `index`: its number in the run (over all parts); raw: its bytes as recorded."""
+
+    index: int
+    channel: str
+    log_time_ns: int
+    raw: bytes
+
+    @property
+    def message(self) -> Struct:
+        """The message, decoded each time it is asked for. Raises RecordingError if it is of another version."""
+        try:
+            return decoder(self.channel).decode(self.raw)
+        except msgspec.ValidationError as error:
+            raise RecordingError(f"message {self.index} ({self.channel}) is of another version of s2r: {error}") from None
+
+
+class Ending(msgspec.Struct, frozen=True):
+    """How a log ended. `index`: all messages of the run before it are good; `offset`: bytes of the file that are.
+
+    closed: properly, all is there. rotated: likewise, and the next part goes on. cut: the end is not there (a crash), all
+    before it is. broken: something is there that was not recorded like this.
+    """
+
+    kind: Literal["closed", "rotated", "cut", "broken"]
+    index: int
+    offset: int
+    lost_bytes: int
+    detail: str
+
+
+class Reading:
+    """A log file that is being read: iterate it once for its entries, then look at `ending`.
+
+    path: of one part. channels: give out these only (None: all but the seals); all are checked. metadata,
+    attachments: those that stood before what was read so far. Raises RecordingError for a file that is no log of this
+    software, or of another version.
+    """
+
+    def __init__(self, path: Path, channels: Iterable[str] | None = None) -> None:
+        self.path = path
+        self.wanted = frozenset(CHANNELS) - {CHAIN} if channels is None else frozenset(channels)
+        try:
+            with path.open("rb") as file:
+                self.size = os.fstat(file.fileno()).st_size
+                start = read_start(file, path, self.size)
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+        self.start = start.raw
+        """What the file begins with, up to the metadata that says what it is; empty if it ends before."""
+        self.run, self.part, self.first_index, self._key = start.run, start.part, start.first_index, start.key
+        self.public_key = b"" if start.key is None else start.key.public_bytes_raw()
+        self.previous_head = self.head = start.previous_head
+        self.metadata: dict[str, dict[str, str]] = {ABOUT: dict(start.fields)}
+        self.attachments: list[Attached] = []
+        self.counts: dict[str, int] = {}
+        self.signed = False
+        self.lacking = b""
+        """What a cut file does not have of its last chunk's index."""
+        self.indexed = False
+        """Whether the index at the end is there, and right."""
+        self._ending: Ending | None = None
+        self._index = self.first_index
+        self._at = self._crc = self._log_time = 0
+        self._seal, self._final = b"", ""
+        self._schemas: dict[int, bytes] = {}
+        self._channels: dict[int, bytes] = {}
+        self._topics: dict[int, str] = {}
+        self.first_ns: int | None = None
+
+    @property
+    def over(self) -> bool:
+        """Whether it has ended."""
+        return self._ending is not None
+
+    @property
+    def ending(self) -> Ending:
+        """How it ended; raises RuntimeError while it has not."""
+        if self._ending is None:
+            raise RuntimeError(f"{self.path}: is still being read")
+        return self._ending
+
+    def to_the_end(self) -> Ending:
+        """Reads all, gives out nothing."""
+        for _ in self:
+            pass
+        return self.ending
+
+    @property
+    def last_ns(self) -> int:
+        """Log time of the last message read."""
+        return self._log_time
+
+    @property
+    def sealed_for_good(self) -> bool:
+        """Whether the seal that nothing follows was read: no message is missing, whatever became of the index."""
+        return bool(self._final)
+
+    @property
+    def chain(self) -> str:
+        """`intact`, `broken`, or `unsigned tail` (a log without a key, or nothing of it)."""
+        if self._ending is not None and self._ending.kind == "broken":
+            return "broken"
+        return "intact" if self.signed else "unsigned tail"
+
+    @property
+    def declarations(self) -> tuple[dict[int, bytes], dict[int, bytes]]:
+        """Schema and channel records read so far, by id."""
+        return self._schemas, self._channels
+
+    @property
+    def offset(self) -> int:
+        """Bytes of the file that were read and found good."""
+        return self._at
+
+    # ---- the messages
+
+    def __iter__(self) -> Iterator[Entry]:
+        """The entries, once. Afterwards `ending` is there."""
+        self._file: BinaryIO = self.path.open("rb")
+        try:
+            if not self.start:
+                raise Damage(0, "the file ends before its first record", cut=True)
+            while (block := self._take()) is not None:
+                if block.last:
+                    self._finish(block)
+                    return
+                self._check(block)
+                self._note(block)
+                index, self._at = self._index, block.end
+                self._index += len(block.messages)
+                yield from self._entries(block, index)
+                if block.lacking:
+                    self.lacking = block.lacking
+                    self._end("cut", "the file ends inside a chunk's index")
+                    return
+            self._end("cut", "the index is missing" if self._final else "the file ends between two chunks")
+        except Damage as damage:
+            self._damaged(damage)
+        finally:
+            self._file.close()
+
+    def _take(self) -> Block | None:
+        start = b"" if self._at else self.start
+        self._file.seek(self._at + len(start))
+        return take(self._file, self._at, self.size, start)
+
+    def _check(self, block: Block) -> None:
+        """Sequence, times, chain and signature of a block."""
+        if self._final:
+            raise Damage(block.offset, "something follows the last seal")
+        schemas, declarations, topics = declared(block.declarations)
+        self._schemas |= schemas
+        self._channels |= declarations
+        self._topics |= topics
+        if self.first_ns is None:
+            self.first_ns = block.messages[0].log_time_ns
+        for number, part in enumerate(block.messages, self._index):
+            if part.sequence != number & 0xFFFFFFFF:
+                raise Damage(block.offset, f"message {number} is missing or out of its place")
+            if part.log_time_ns < self._log_time:
+                raise Damage(block.offset, f"message {number} goes back in time")
+            self._log_time = part.log_time_ns
+        last = block.messages[-1]
+        if self._topics.get(last.channel) != CHAIN:
+            raise Damage(block.offset, "a chunk is not sealed")
+        raw = block.content[last.start :]
+        try:
+            seal = msgspec.json.decode(raw, type=Seal)
+        except msgspec.DecodeError as error:
+            raise Damage(block.offset, f"a seal cannot be read: {error}") from None
+        seal_at = last.start - MESSAGE.size
+        head = advance(self.head, self._seal, [*block.prefix, memoryview(block.content)[:seal_at]])
+        count = self._index + len(block.messages) - 1
+        if msgspec.json.encode(Seal(last.log_time_ns, count, head, self._crc, seal.end, seal.signature)) != raw:
+            raise Damage(block.offset, "the chain does not hold: this is not what was sealed")
+        if self._key is None:
+            if seal.signature:
+                raise Damage(block.offset, "a seal is signed in a log that has no key")
+        elif not is_signed_by(seal, self._key):
+            raise Damage(block.offset, "a seal's signature is not that of the log's key")
+        self.head, self.signed, self._final = head, self._key is not None, seal.end
+        self._seal = block.content[seal_at:]
+        self._crc = self._crc_until(block.end)
+
+    def _crc_until(self, end: int) -> int:
+        self._file.seek(self._at)
+        return zlib.crc32(self._file.read(end - self._at), self._crc)
+
+    def _note(self, block: Block) -> None:
+        for record in block.prefix:
+            data = record[len(self.start) :] if record is block.prefix[0] and block.offset == 0 else record
+            if data and data[0] == Opcode.ATTACHMENT:
+                self.attachments.append(_attached(data, block.offset))
+            elif data:
+                name, fields = _metadata(data, block.offset)
+                self.metadata[name] = fields
+
+    def _entries(self, block: Block, index: int) -> Iterator[Entry]:
+        content, counts, wanted, topics = block.content, self.counts, self.wanted, self._topics
+        for number, part in enumerate(block.messages, index):
+            name = topics.get(part.channel, "")
+            counts[name] = counts.get(name, 0) + 1
+            if name in wanted:
+                yield Entry(number, name, part.log_time_ns, content[part.start : part.stop])
+            elif name not in CHANNELS:
+                raise RecordingError(f"{self.path}: message {number} is on channel {name!r}, which this version does not know")
+
+    # ---- the end
+
+    def _finish(self, block: Block) -> None:
+        """After the data section: the rest must be exactly what `tail` makes, or a beginning of it."""
+        for record in block.prefix:
+            if record[0] != Opcode.METADATA or _metadata(record, block.offset)[0] != RECOVERED:
+                raise Damage(block.offset, "a record at the end was not sealed")
+            self.metadata[RECOVERED] = _metadata(record, block.offset)[1]
+        self._crc = self._crc_until(block.end)
+        at = self._at = block.end
+        self._file.seek(at)
+        for piece in tail(self._read_at, block.end, self._crc, self._schemas, self._channels):
+            found = self._file.read(len(piece))
+            if found != piece:
+                if at + len(found) == self.size and piece.startswith(found):
+                    self._end("cut", "the file ends inside its index")
+                    return
+                raise Damage(at, "the index at the end is not that of the messages")
+            at += len(piece)
+        if at != self.size:
+            raise Damage(at, "something follows the end")
+        self._at, self.indexed = at, True
+        if RECOVERED in self.metadata or not self._final:
+            self._end("cut", "was recovered from a file that was cut" if block.prefix else "the last seal is missing")
+        else:
+            self._end("closed" if self._final == "closed" else "rotated", "")
+
+    def _read_at(self, length: int, offset: int) -> bytes:
+        return os.pread(self._file.fileno(), length, offset)
+
+    def _damaged(self, damage: Damage) -> None:
+        """A cut tail has nothing good after it; if there is something, a record in the middle was damaged.
+
+        Zeros at the end are what a file system may leave of a write that a power cut stopped: a cut too.
+        """
+        self._file.seek(max(0, self.size - _ZEROS))
+        cut = damage.cut or self._file.read() == bytes(_ZEROS)
+        if cut and find(self._file, self._at + 1, self.size) is None:
+            self._end("cut", damage.detail)
+        else:
+            self._end("broken", f"at byte {damage.offset}: {damage.detail}")
+
+    def _end(self, kind: Literal["closed", "rotated", "cut", "broken"], detail: str) -> None:
+        self._ending = Ending(kind, self._index, self._at, self.size - self._at, detail)
+
+
+def _attached(record: bytes, offset: int) -> Attached:
+    try:
+        return attachment_fields(record)
+    except ValueError as error:
+        raise Damage(offset, str(error)) from None
+
+
+def _metadata(record: bytes, offset: int) -> tuple[str, dict[str, str]]:
+    try:
+        return metadata_fields(record)
+    except ValueError as error:
+        raise Damage(offset, str(error)) from None
+
+
+def read(path: Path, channels: Iterable[str] | None = None) -> Reading:
+    """Opens a log for reading: see `Reading`."""
+    return Reading(path, channels)
+
+
+__all__ = ["Ending", "Entry", "Reading", "read"]

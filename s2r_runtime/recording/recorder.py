@@ -1,0 +1,189 @@
+"""The recorder: a log written by a thread of its own, so that a slow disk holds up nobody.
+
+`put` encodes the message and returns (about 3 µs); the thread seals, compresses and writes every `chunk_s`. A log has no holes: a
+message that cannot be taken, because memory is full or it cannot be encoded, is the end of the log. It and all that come
+after it are counted, the recorder's health stays bad until a new one is made, and the log says how many it lacks. A disk that is
+full for a while is no end: what is in memory is written when there is room.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from typing import NamedTuple
+
+from s2r_runtime.messages import Struct
+from s2r_runtime.recording.channels import Unrecorded
+from s2r_runtime.recording.writer import Writer
+
+LIMIT_BYTES = 16 << 20
+"""Memory for what the disk has not taken: at 100 Hz about a minute and a half."""
+RETRY_S = 0.2
+"""After a failed write."""
+STALLED_S = 0.5
+"""Older than that and not in the file: the disk (or the thread) hangs."""
+SYNC_S = 5.0
+"""How much of the log a power cut may take, where nothing asked for more."""
+
+
+class Health(NamedTuple):
+    """`ok` iff every message so far is in the file or about to be. `unrecorded`: how many never will."""
+
+    ok: bool
+    detail: str
+    unrecorded: int
+    pending_bytes: int
+    recorded: int
+
+
+class Recorder:
+    """Owns a `Writer` made with `timed=False`. limit_bytes: what may wait in memory. block_s: how long `put` may wait for
+    room (lockstep, where the robot waits too); 0: it never waits.
+    """
+
+    def __init__(self, writer: Writer, *, limit_bytes: int = LIMIT_BYTES, block_s: float = 0.0) -> None:
+        self._writer = writer
+        self._limit_bytes, self._block_s = limit_bytes, block_s
+        self._wake = threading.Event()
+        self._room = threading.Condition()
+        self._lock = threading.Lock()
+        self._fault = ""
+        self._trouble = ""
+        self._unrecorded = 0
+        self._last_ns = 0
+        self._flushed_s = time.monotonic()
+        self._requested = self._granted = 0
+        self._ending = self._over = False
+        self._head = ""
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread.start()
+
+    # ---- the gate's thread: nothing here waits for the disk, but `durable` and `close`
+
+    def put(self, message: Struct, t_ns: int) -> bool:
+        """Records a message, in the order of the calls. False: it is not recorded, and the log ends before it."""
+        if self._fault or self._writer.pending_bytes > self._limit_bytes:
+            return self._squeeze(message, t_ns)
+        return self._take(message, t_ns)
+
+    def attach(self, name: str, media_type: str, data: bytes) -> bool:
+        """Puts a file into the log, in the order of the calls. False: as for `put`."""
+        if self._fault:
+            return False
+        self._writer.attach(name, media_type, data)
+        return True
+
+    def durable(self, timeout_s: float = 5.0) -> bool:
+        """Waits until all that was put so far is on the disk (fsync). False: it is not, or not within the time."""
+        with self._room:
+            self._requested += 1
+            ticket = self._requested
+            self._wake.set()
+            self._room.wait_for(lambda: self._granted >= ticket or self._over, timeout_s)
+            return self._granted >= ticket and not self._fault
+
+    def health(self) -> Health:
+        """How it is; never waits."""
+        pending = self._writer.pending_bytes
+        detail = self._fault or self._trouble
+        if not detail and not self._thread.is_alive() and not self._ending:
+            detail = "the recorder's thread is dead"
+        if not detail and pending and (late := time.monotonic() - self._flushed_s) > STALLED_S + self._writer.chunk_s:
+            detail = f"nothing reached the disk for {late:.1f} s"
+        return Health(not detail, detail, self._unrecorded, pending, self._writer.recorded)
+
+    @property
+    def head(self) -> str:
+        """Head of the chain, in hex; the last one once closed."""
+        return self._head or self._writer.head
+
+    def close(self, timeout_s: float = 10.0) -> Health:
+        """Writes what is there, seals the log for good, and ends the thread. Not ok: what was not recorded, and why."""
+        self._ending = True
+        self._wake.set()
+        self._thread.join(timeout_s)
+        health = self.health()
+        if not self._head and health.ok:
+            return health._replace(ok=False, detail=f"the log could not be closed within {timeout_s} s")
+        return health
+
+    def _take(self, message: Struct, t_ns: int) -> bool:
+        try:
+            self._writer.write(message, t_ns)
+        except ValueError as error:
+            return self._lost(f"a message cannot be recorded: {error}")
+        self._last_ns = t_ns
+        if self._writer.full_blocks:
+            self._wake.set()
+        return True
+
+    def _squeeze(self, message: Struct, t_ns: int) -> bool:
+        """There is no room: waits for some, as long as it may."""
+        if self._fault:
+            return self._lost(self._fault)
+        if self._block_s:
+            with self._room:
+                self._wake.set()
+                self._room.wait_for(lambda: self._writer.pending_bytes <= self._limit_bytes, self._block_s)
+        if self._writer.pending_bytes > self._limit_bytes:
+            return self._lost(self._trouble or "memory for the log is full: the disk is too slow")
+        return self._take(message, t_ns)
+
+    def _lost(self, reason: str) -> bool:
+        with self._lock:
+            self._fault = self._fault or reason
+            self._unrecorded += 1
+        return False
+
+    # ---- its own thread
+
+    def _run(self) -> None:
+        try:
+            synced_s = time.monotonic()
+            while not self._ending:
+                self._wake.wait(RETRY_S if self._trouble else self._writer.chunk_s)
+                self._wake.clear()
+                sync = time.monotonic() - synced_s >= SYNC_S
+                if self._write(sync=sync) and sync:
+                    synced_s = time.monotonic()
+            self._finish()
+        except BaseException as error:  # noqa: BLE001 - whatever ends the thread must be seen as bad health, not as a trace on stderr
+            self._fault = self._fault or f"the recorder's thread died: {type(error).__name__}: {error}"
+        finally:
+            with self._room:
+                self._over = True
+                self._room.notify_all()
+
+    def _write(self, *, sync: bool) -> bool:
+        with self._room:
+            ticket = self._requested
+        try:
+            if ticket > self._granted:
+                self._writer.durable()
+            else:
+                self._writer.flush()
+                if sync:
+                    self._writer.sync()
+        except OSError as error:
+            self._trouble = f"the log cannot be written: {error.strerror}"
+            return False
+        self._trouble = ""
+        self._flushed_s = time.monotonic()
+        with self._room:
+            self._granted = ticket
+            self._room.notify_all()
+        return True
+
+    def _finish(self) -> None:
+        """Last words and the final seal; tries again for as long as `close` waits, which is for the caller to bound."""
+        if self._unrecorded:
+            with contextlib.suppress(ValueError):
+                self._writer.write(Unrecorded(self._last_ns, self._unrecorded, self._fault), self._last_ns)
+        while True:
+            try:
+                self._head = self._writer.close()
+                return
+            except OSError as error:
+                self._trouble = f"the log cannot be written: {error.strerror}"
+                time.sleep(RETRY_S)

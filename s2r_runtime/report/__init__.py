@@ -1,0 +1,1 @@
+"""Pages: what a log shows, what a trace found."""

@@ -1,0 +1,1 @@
+"""From the residual to the effect that a model lacks, and the error before and after."""

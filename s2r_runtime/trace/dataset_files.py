@@ -1,0 +1,140 @@
+"""Datasets from files: a table (CSV, CSV.gz) or a log of the daemon (MCAP, one part or several).
+
+In a log the states are the observations that carry no fault, on the robot's clock. A command acts from the stamp of the observation
+that it answers, plus what the daemon took to answer (`obs_seq` ties the two clocks together); in lockstep that is nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from s2r_runtime.errors import RecordingError
+from s2r_runtime.messages import CampaignFinished, Observed, Send, StartCampaign, Started
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace.dataset import Array, Dataset, Stream, columns_of, from_streams
+
+MCAP_MAGIC = b"\x89MCAP"
+
+Row = tuple[float, ...]
+
+
+def load_dataset(
+    path: Path | str | Sequence[Path | str], model: ComposedModel, columns: Mapping[str, str] | None = None, *, epoch: int | None = None
+) -> Dataset:
+    """Reads a recording on the model's grid. columns: name in the model -> column of the table. Several paths: parts of one log.
+    epoch: of a log, only what was recorded while that campaign was under way.
+
+    Raises RecordingError (unreadable, lacks a column, too slow for the model's dt).
+    """
+    paths = tuple(Path(p) for p in ([path] if isinstance(path, str | Path) else path))
+    digests = tuple(_digest(p) for p in paths)
+    source = ", ".join(str(p) for p in paths)
+    if _is_log(paths[0]):
+        return from_streams(model, _log_segments(paths, model, epoch), source, digests, paths)
+    return from_streams(model, _table_segments(paths[0], model, columns or {}), source, digests, paths)
+
+
+def _digest(path: Path) -> str:
+    """As guarantee G6 wants it: of the file's bytes."""
+    try:
+        with path.open("rb") as file:
+            return "sha256:" + hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _is_log(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
+
+
+def _table_segments(path: Path, model: ComposedModel, columns: Mapping[str, str]) -> list[tuple[Stream, Stream]]:
+    from s2r_runtime.tables import read_csv
+
+    names = columns_of(model, columns)
+    table = read_csv(path, list(names.values()))
+    states = np.column_stack([table.columns[names[s]] for s in model.states])
+    inputs = np.column_stack([table.columns[names[i]] for i in model.inputs])
+    where = np.zeros(len(table.t), dtype=np.int64) if table.segment is None else table.segment
+    given = []
+    for segment in np.unique(where):
+        rows = where == segment
+        t, y, u = table.t[rows], states[rows], inputs[rows]
+        measured, commanded = ~np.isnan(y).all(axis=1), ~np.isnan(u).all(axis=1)
+        given.append((Stream(t[measured], y[measured]), Stream(t[commanded], u[commanded])))
+    return given
+
+
+def _log_segments(paths: tuple[Path, ...], model: ComposedModel, epoch: int | None) -> list[tuple[Stream, Stream]]:
+    from s2r_runtime.recording.reading import read
+
+    log = _Log(model, epoch)
+    for path in paths:
+        reading = read(path, ("event/started", "event/observed", "out/send", "out/start_campaign", "event/campaign_finished"))
+        for entry in reading:
+            log.take(entry.message, path)
+        if reading.ending is not None and reading.ending.kind == "broken":
+            raise RecordingError(f"{path}: is damaged {reading.ending.detail}")
+    return [(_stream(y, len(model.states)), _stream(u, len(model.inputs))) for y, u in log.segments]
+
+
+class _Log:
+    """Collects segments of (stamp, state) and (stamp, input) rows from a log's messages, in their order. epoch: as in `load_dataset`."""
+
+    def __init__(self, model: ComposedModel, epoch: int | None) -> None:
+        self.segments: list[tuple[list[Row], list[Row]]] = [([], [])]
+        self._model, self._epoch = model, epoch
+        self._inside = epoch is None
+        self._stamps: dict[int, tuple[float, int]] = {}
+        self._last: tuple[int, float] = (-1, -float("inf"))
+        self._row: Row = ()
+
+    def take(self, message: object, path: Path) -> None:
+        """The next message."""
+        if isinstance(message, Started):
+            had, has = message.settings, self._model
+            _expect(had.states == has.states, path, f"the states {', '.join(had.states)}; the model has {', '.join(has.states)}")
+            _expect(had.inputs == has.inputs, path, f"the inputs {', '.join(had.inputs)}; the model has {', '.join(has.inputs)}")
+        elif isinstance(message, Observed) and not message.observation.fault:
+            self._observed(message, path)
+        elif isinstance(message, Send) and self._inside and message.obs_seq in self._stamps:
+            stamp, asked_ns = self._stamps[message.obs_seq]
+            nu = len(self._model.inputs)
+            _expect(len(message.u) == nu, path, f"commands of {len(message.u)} inputs, the model has {nu}")
+            self.segments[-1][1].append((stamp + max(message.t_ns - asked_ns, 0) * 1e-9, *message.u))
+        elif isinstance(message, StartCampaign) and message.epoch == self._epoch:
+            self._inside = True
+            self.segments.append(([self._row] if self._row else [], []))  # what the campaign is asked first is about this observation
+        elif isinstance(message, CampaignFinished) and message.epoch == self._epoch:
+            self._inside = False
+
+    def _observed(self, message: Observed, path: Path) -> None:
+        o, (last_seq, last) = message.observation, self._last
+        stamp, nx = o.stamp_ns * 1e-9, len(self._model.states)
+        if o.seq < last_seq and stamp < last:  # both go back: the robot was started anew
+            self.segments.append(([], []))
+            self._stamps.clear()
+        elif stamp <= last:
+            return
+        self._last = o.seq, stamp
+        self._stamps[o.seq] = stamp, message.t_ns
+        _expect(len(o.x) == nx, path, f"observations of {len(o.x)} states, the model has {nx}")
+        self._row = (stamp, *o.x)
+        if self._inside:
+            self.segments[-1][0].append(self._row)
+
+
+def _expect(ok: bool, path: Path, what: str) -> None:
+    if not ok:
+        raise RecordingError(f"{path}: has {what}")
+
+
+def _stream(rows: list[Row], width: int) -> Stream:
+    """Sorted by stamp; equal stamps keep their order."""
+    table: Array = np.array(rows, dtype=np.float64).reshape(-1, 1 + width)
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    return Stream(table[:, 0], table[:, 1:])

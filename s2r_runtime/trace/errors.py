@@ -1,0 +1,160 @@
+"""Error of a model on transitions that its fit never saw: one step, rollouts, the gap, and what noise alone would make of them.
+
+rollout_rms is the error at the end of rollouts of the stated horizon, started at every row that has one ahead of it (docs/tracing.md).
+`Judged` holds the arrays behind the numbers, for plots.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.bounds import scenario_confidence
+from s2r_runtime.errors import S2RError
+from s2r_runtime.gap import Transitions, discrepancy, hold_residuals, residuals
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.holdout import FEWEST_RUNS
+from s2r_runtime.trace.residual import Steps, acting, residual, rms, rollout, rollout_starts, state_jacobian
+from s2r_runtime.trace.residual_noise import Noise
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Kind = Literal["ball", "box"]
+
+EPSILON = 0.01
+"""Of the gap that is reported; its beta follows from the number of transitions."""
+
+FLOOR_STARTS = 2000
+"""Simulated rollouts behind the noise floor; its own error is then 2 %."""
+
+MANY = 20_000_000
+"""Model steps in rollouts from which on not every row is started from, but as many as that allows, evenly."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """What is held out. steps: its transitions; within: (M,) steps a rollout may touch; horizon in steps."""
+
+    data: Dataset
+    steps: Steps
+    left_out: tuple[tuple[int, int], ...]
+    within: Mask
+    horizon: int
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Of one model. one_step: (n, nx) residuals; ends: (m, nx) errors at the ends of rollouts."""
+
+    one_step: Array
+    ends: Array
+
+    def error(self, states: tuple[str, ...], horizon_s: float) -> dict[str, Any]:
+        """docs/json.md's `before` and `after`."""
+        return {
+            "one_step_rms": dict(zip(states, rms(self.one_step).tolist(), strict=True)),
+            "rollout_rms": dict(zip(states, (rms(self.ends) if len(self.ends) else rms(self.one_step)).tolist(), strict=True)),
+            "rollout_horizon_s": horizon_s,
+        }
+
+
+def held(data: Dataset, steps: Steps, left_out: tuple[tuple[int, int], ...], within: Mask, horizon_s: float) -> Held:
+    """With the longest horizon up to the one asked for that some row has ahead of it."""
+    ahead = max(1, round(horizon_s / data.dt))
+    while ahead > 1 and not len(rollout_starts(data, ahead, left_out, within)):
+        ahead = max(1, ahead // 2)
+    return Held(data, steps, left_out, within, ahead)
+
+
+def judge(model: ComposedModel, given: Held) -> Judged:
+    """The model's errors on what is held out."""
+    act = acting(model, given.data)
+    starts = _starts(given)
+    return Judged(residual(model, given.steps, act), rollout(model, given.data, act, starts, given.horizon).error)
+
+
+def better(given: Held, model: ComposedModel, other: ComposedModel, share: float) -> bool:
+    """Whether some error of `model`, at one step, a quarter of the horizon or all of it, is lower by that share than the other's."""
+    first, second = acting(model, given.data), acting(other, given.data)
+    for ahead in sorted({1, max(1, given.horizon // 4), given.horizon}):
+        starts = rollout_starts(given.data, ahead, given.left_out, given.within)
+        starts = starts[:: max(1, len(starts) // FLOOR_STARTS)]
+        errors = [rms(rollout(m, given.data, act, starts, ahead).error) for m, act in ((model, first), (other, second))]
+        if len(starts) and np.any(errors[1] > (1.0 + share) * errors[0]):
+            return True
+    return False
+
+
+def _starts(given: Held) -> NDArray[np.int64]:
+    starts = rollout_starts(given.data, given.horizon, given.left_out, given.within)
+    return starts[:: max(1, len(starts) * given.horizon // MANY)]
+
+
+def noise_floor(model: ComposedModel, noise: Noise, given: Held, seed: int) -> tuple[Array, Array]:
+    """(nx,) rms that the noise alone makes of a one-step residual, and of a rollout's end: both by simulation from measured states."""
+    act = acting(model, given.data)
+    one = noise.one_step(state_jacobian(model, given.steps, act))
+    starts = _starts(given)
+    starts = starts[:: max(1, len(starts) // FLOOR_STARTS)]
+    if not len(starts):
+        return one, one
+    rng = np.random.default_rng(seed)
+    begin = np.cumsum([0] + [len(run.y) - 1 for run in given.data.runs])
+    rows = starts + np.searchsorted(begin, starts, side="right") - 1
+    clean = np.concatenate([run.y for run in given.data.runs])[rows]
+    noisy = clean + rng.normal(size=clean.shape) * np.sqrt(noise.r)
+    for h in range(given.horizon):
+        mean, end = act.mean[starts + h], act.end[starts + h]
+        clean = model.advance(clean, mean, end)
+        noisy = model.advance(noisy, mean, end) + rng.normal(size=clean.shape) * np.sqrt(noise.q)
+    return one, rms(model.difference(clean, noisy) + rng.normal(size=clean.shape) * np.sqrt(noise.r))
+
+
+def gaps(
+    before: tuple[ComposedModel, Judged], after: tuple[ComposedModel, Judged], given: Held, weights: Array, kind: Kind
+) -> tuple[dict[str, Any], dict[str, Any], bool]:
+    """docs/json.md's `gap` before and after, and whether its transitions were drawn independently: a campaign's samples where the log has
+    some that were held out, else all held-out transitions (numbers without a statement).
+    """
+    campaign = _campaign(before[0], given)
+    if campaign is not None:
+        told = [_campaign_gap(model, campaign, weights, kind) for model, _ in (before, after)]
+        return told[0], told[1], campaign.independent
+    first, second = (discrepancy(judged.one_step, weights, kind) for _, judged in (before, after))
+    return _gap(float(np.max(first)), len(first)), _gap(float(np.max(second)), len(second)), False
+
+
+def _gap(radius: float, n: int) -> dict[str, Any]:
+    return {"radius": radius, "n": n, "epsilon": EPSILON, "beta": scenario_confidence(n, 0, EPSILON)}
+
+
+def _campaign_gap(model: ComposedModel, samples: Transitions, weights: Array, kind: Kind) -> dict[str, Any]:
+    """With what the discrepancy is after the hold: a robot that answers late shows little after one step from rest."""
+    told = _gap(float(np.max(discrepancy(residuals(model, samples), weights, kind))), len(samples.x0))
+    held_too = hold_residuals(model, samples)
+    if held_too is not None:
+        told |= {"hold_radius": float(np.max(discrepancy(held_too, weights, kind))), "hold_periods": samples.hold_periods}
+    return told
+
+
+def _campaign(model: ComposedModel, given: Held) -> Transitions | None:
+    """Samples of the recording's campaign that lie in what is held out."""
+    if len(given.data.paths) != 1 or given.data.paths[0].suffix != ".mcap" or len(given.data.runs) >= FEWEST_RUNS or not len(given.steps):
+        return None
+    from s2r_runtime.transitions import from_mcap
+
+    try:
+        found = from_mcap(given.data.paths[0], model)
+    except S2RError:
+        return None
+    nearest = np.searchsorted(given.steps.t, found.t0_s - given.data.origin_s - 0.5 * given.data.dt)
+    apart = given.steps.t[np.minimum(nearest, len(given.steps) - 1)] - (found.t0_s - given.data.origin_s)
+    inside = np.abs(apart) < 0.5 * given.data.dt
+    if found.drive is not None or np.count_nonzero(inside) < 2:
+        return None
+    keep = found.held[inside] if found.held is not None else None
+    return replace(found, x0=found.x0[inside], u=found.u[inside], x1=found.x1[inside], t0_s=found.t0_s[inside], held=keep)

@@ -1,0 +1,268 @@
+"""Where the measurements, not the motion, are wrong: found before any fit, reported as intervals, left out of the fit.
+
+    dropout      nothing was measured for longer than usual
+    clock_step   as above, but the robot moved as in one usual interval: the stamps jumped, not time
+    frozen       a state repeats exactly while the model says that it moves
+    spike        one row (or few) away from where the rows before and after, and the model, say it is; and back
+    offset_jump  one transition by more than the inputs could move the state, and it stays there; to the end, or until it jumps back
+
+A fault must be beyond what any effect on the input could do: an effect that the model lacks is not to be explained away as a
+fault. Spikes on more than RARE of the rows are no faults but heavy tails: they are left out too, and counted as outliers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace.dataset import Dataset, Pause
+from s2r_runtime.trace.residual import Acting, acting, first_steps
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+SIGMAS = 8.0
+"""Robust standard deviations from which a single residual is suspected."""
+
+TAIL_SIGMAS = 3.5
+"""Robust standard deviations of both legs of a spike that count as tails: white noise has one in a million."""
+
+BEYOND = 2.2
+"""Times the largest move in a step: a command that reverses and is late, or followed with a lag, leaves up to twice that."""
+
+RARE = 0.01
+"""Share of rows above which spikes are a property of the sensor's noise."""
+
+FROZEN_ROWS = 5
+"""Rows that repeat a state exactly before it counts as frozen."""
+
+LONG_FROZEN = 50
+"""Rows of exact repeats that need no catching up to count as frozen."""
+
+LONG = 3.5
+"""Usual intervals without a measurement before it is called a dropout."""
+
+BRIEF = 4
+"""Rows that a spike lasts at most; a jump that comes back later is an offset."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """An interval of the recording, s since its first stamp. channel: a state, or `*`. kind: as docs/json.md."""
+
+    from_s: float
+    to_s: float
+    channel: str
+    kind: str
+
+
+@dataclass(frozen=True)
+class Checked:
+    """data: with faulty rows taken out (NaN); left_out: (run, step) transitions across a jump; outliers: rows taken out as such."""
+
+    data: Dataset
+    faults: tuple[Fault, ...]
+    left_out: tuple[tuple[int, int], ...]
+    outliers: int
+
+
+def check(model: ComposedModel, data: Dataset) -> Checked:
+    """Finds the faults and takes them out."""
+    act = acting(model, data)
+    faults = [_of_pause(model, data, act, pause) for pause in data.pauses]
+    found = [f for f in faults if f is not None]
+    bad = [np.zeros(run.y.shape, dtype=bool) for run in data.runs]
+    left_out: list[tuple[int, int]] = []
+    spikes: list[Fault] = []
+    reach = _reach(model, data, act)
+    tails = 0
+    for i in range(len(data.runs)):
+        tails += _tails(model, data, act, i, reach)
+        found += _frozen(model, data, act, i, bad[i], reach)
+        some, jumps, cut = _jumps(model, data, act, i, bad[i], reach)
+        spikes += some
+        found += jumps
+        left_out += cut
+    rows = sum(len(run.y) for run in data.runs)
+    many = tails > max(RARE * rows, 3.0)
+    runs = tuple(replace(run, y=np.where(b.any(axis=1, keepdims=True), np.nan, run.y)) for run, b in zip(data.runs, bad, strict=True))
+    if many:  # two of them in a row look like a jump
+        found = [f for f in found if f.kind != "offset_jump"]
+    faults_ = tuple(sorted([*found, *([] if many else spikes)], key=lambda f: (f.from_s, f.channel)))
+    return Checked(replace(data, runs=runs), faults_, tuple(sorted(set(left_out))), len(spikes) if many else 0)
+
+
+@dataclass(frozen=True)
+class _Reach:
+    """noise: (nx,) robust standard deviation of a residual; move: (nx,) largest move in a step that the model foresees."""
+
+    noise: Array
+    move: Array
+    instant: Mask
+
+
+def _reach(model: ComposedModel, data: Dataset, act: Acting) -> _Reach:
+    e, moves = [], []
+    for i, run in enumerate(data.runs):
+        p = _predicted(model, data, act, i)
+        e.append(model.difference(run.y[1:], p))
+        moves.append(model.difference(p, run.y[:-1]))
+    residuals, move = np.concatenate(e), np.concatenate(moves)
+    good = np.flatnonzero(np.isfinite(residuals).all(axis=1))
+    instant = np.array([s in getattr(model.nominal, "reached", {}) for s in model.states])
+    if not len(good):
+        return _Reach(np.ones(len(model.states)), np.ones(len(model.states)), instant)
+    noise = np.median(np.abs(residuals[good]), axis=0) / 0.6745
+    largest = np.quantile(np.abs(move[good]), 0.999, axis=0)
+    return _Reach(np.maximum(noise, 1e-12), largest, instant)
+
+
+def _predicted(model: ComposedModel, data: Dataset, act: Acting, run: int) -> Array:
+    begin = first_steps(data)[run]
+    y = data.runs[run].y[:-1]
+    here = slice(begin, begin + len(y))
+    return model.advance(y, act.mean[here], act.end[here])
+
+
+def _of_pause(model: ComposedModel, data: Dataset, act: Acting, pause: Pause) -> Fault | None:
+    """A long interval: had the robot moved on meanwhile, or only its clock?"""
+    run = data.runs[pause.run]
+    first = round((pause.from_s - run.start_s) / data.dt)
+    steps = max(1, round((pause.to_s - pause.from_s) / data.dt))
+    usual = max(1, round(pause.usual_s / data.dt))
+    begin = first_steps(data)[pause.run]
+    x = pause.before[None, :].copy()
+    after_usual = x
+    for k in range(first, min(first + steps, len(run.y) - 1)):
+        x = model.advance(x, act.mean[begin + k : begin + k + 1], act.end[begin + k : begin + k + 1])
+        if k == first + usual - 1:
+            after_usual = x
+    measured = pause.after[None, :]
+    on, stood = np.abs(model.difference(measured, x)[0]), np.abs(model.difference(measured, after_usual)[0])
+    apart = np.abs(model.difference(x, after_usual)[0])
+    noise = 4.0 * _pause_noise(model, data, act, pause.run)
+    as_usual = bool(np.all(stood <= np.maximum(0.3 * apart, noise)))
+    if usual < steps and as_usual and np.any((apart > noise) & (on > 0.6 * apart) & _moving(model, data, act, pause.run, first)):
+        return Fault(pause.from_s, pause.to_s, "*", "clock_step")
+    return Fault(pause.from_s, pause.to_s, "*", "dropout") if pause.to_s - pause.from_s > LONG * pause.usual_s else None
+
+
+def _moving(model: ComposedModel, data: Dataset, act: Acting, run: int, first: int) -> Mask:
+    """(nx,) states that moved before this row about as the model says: a robot that is about to start may be late without a fault."""
+    y = data.runs[run].y[max(0, first - 3) : first + 1]
+    foreseen = model.difference(_predicted(model, data, act, run)[max(0, first - 3) : first], y[:-1])
+    return np.asarray(np.abs(np.sum(model.difference(y[1:], y[:-1]), axis=0)) > 0.5 * np.abs(np.sum(foreseen, axis=0)))
+
+
+def _pause_noise(model: ComposedModel, data: Dataset, act: Acting, run: int) -> Array:
+    e = model.difference(data.runs[run].y[1:], _predicted(model, data, act, run))
+    return np.asarray(np.nanmedian(np.abs(e), axis=0) / 0.6745) if not np.isnan(e).all() else np.zeros(e.shape[1])
+
+
+def _frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: _Reach) -> list[Fault]:
+    """Exact repeats through which the model moves the state by more than noise and quantisation, and after which it catches up.
+
+    Without catching up the robot itself may have stood still; only a long silence is then a fault.
+    """
+    run = data.runs[i]
+    if len(run.y) < FROZEN_ROWS + 1:
+        return []
+    predicted = _predicted(model, data, act, i)
+    moves, e = model.difference(predicted, run.y[:-1]), model.difference(run.y[1:], predicted)
+    found = []
+    for j, name in enumerate(model.states):
+        change = np.abs(np.diff(run.y[:, j]))
+        if reach.instant[j] or not np.any(change > 0.0):
+            continue
+        least = SIGMAS * reach.noise[j] + 3.0 * float(np.min(change[change > 0.0]))
+        for a, b in _stretches(change == 0.0):
+            expected = float(np.nansum(moves[a:b, j]))
+            if b - a < FROZEN_ROWS or abs(expected) < least:
+                continue
+            off = float(e[min(b, len(e) - 1), j]) - expected
+            off = math.remainder(off, math.tau) if name in model.nominal.angles else off
+            caught_up = b < len(e) and abs(off) < 0.5 * abs(expected)
+            if caught_up or (b - a > LONG_FROZEN and abs(expected) > 10.0 * reach.move[j]):
+                bad[a + 1 : b + 1, j] = True
+                found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
+    return found
+
+
+def _stretches(yes: Mask) -> list[tuple[int, int]]:
+    """[a, b) of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], yes.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _jumps(
+    model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: _Reach
+) -> tuple[list[Fault], list[Fault], list[tuple[int, int]]]:
+    """(spikes, offset jumps, transitions across jumps) of one run."""
+    run = data.runs[i]
+    if len(run.y) < 3:
+        return [], [], []
+    e = model.difference(run.y[1:], _predicted(model, data, act, i))
+    change = model.difference(run.y[1:].copy(), run.y[:-1])
+    spikes: list[Fault] = []
+    jumps: list[Fault] = []
+    cut: list[tuple[int, int]] = []
+    for j, name in enumerate(model.states):
+        series = np.nan_to_num(change[:, j] if reach.instant[j] else e[:, j])
+        limit = SIGMAS * reach.noise[j] + BEYOND * reach.move[j]
+        single: list[int] = []
+        for k in np.flatnonzero(np.abs(series) > limit).tolist():
+            if bad[k, j] or bad[k + 1, j]:  # the end of something that is taken out already
+                continue
+            rows = _there_and_back(series, k)
+            if rows is None:
+                around = np.abs(np.concatenate([series[max(k - 2, 0) : k], series[k + 1 : k + 3]]))
+                if np.all(around < 0.3 * abs(series[k])):  # an effect's onset dies away, a jump does not
+                    single.append(k)
+                continue
+            bad[rows[0] : rows[1] + 1, j] = True
+            spikes.append(Fault(run.start_s + data.dt * rows[0], run.start_s + data.dt * rows[1], name, "spike"))
+        if not reach.instant[j]:
+            for k, back in _offsets(series, single):
+                end = len(run.y) - 1 if back is None else back
+                jumps.append(Fault(run.start_s + data.dt * (k + 1), run.start_s + data.dt * end, name, "offset_jump"))
+                cut += [(i, k)] if back is None else [(i, k), (i, back)]
+                if name in model.nominal.angles and end - k < len(run.y) // 2:
+                    bad[k + 1 : end + 1, j] = True  # a heading that is off leaves the motion
+    return spikes, jumps, cut
+
+
+def _tails(model: ComposedModel, data: Dataset, act: Acting, i: int, reach: _Reach) -> int:
+    """Rows that are away from both neighbours by more than white noise would have them, whatever the inputs could do."""
+    run = data.runs[i]
+    e = np.nan_to_num(model.difference(run.y[1:], _predicted(model, data, act, i)))
+    first, second = e[:-1], e[1:]
+    back = np.abs(first + second) < 0.35 * np.maximum(np.abs(first), np.abs(second))
+    away = np.minimum(np.abs(first), np.abs(second)) > TAIL_SIGMAS * reach.noise
+    return int(np.count_nonzero((back & away & ~reach.instant).any(axis=1)))
+
+
+def _there_and_back(series: Array, k: int) -> tuple[int, int] | None:
+    """First and last row that are away, if the residual at step k is one leg of a spike."""
+    for length in range(1, BRIEF + 1):
+        for begin in (k, k - length):
+            legs = series[max(begin, 0) : begin + length + 1]
+            if len(legs) == length + 1 and abs(float(np.sum(legs))) < 0.35 * abs(float(series[k])):
+                return begin + 1, begin + length
+    return None
+
+
+def _offsets(series: Array, single: list[int]) -> list[tuple[int, int | None]]:
+    """Each jump with the one that takes it back, if there is one."""
+    found: list[tuple[int, int | None]] = []
+    left = list(single)
+    while left:
+        k = left.pop(0)
+        back = next((m for m in left if abs(float(series[m] + series[k])) < 0.35 * abs(float(series[k]))), None)
+        if back is not None:
+            left.remove(back)
+        found.append((k, back))
+    return found

@@ -1,0 +1,238 @@
+"""How well a composed model explains the transitions: its parameters, its own noise, its log likelihood.
+
+    z = C(L^-1 r)            whitened by the noise that the model itself leaves (`noise`), then by its autoregression
+    log likelihood           sum log density(z) - log|L| - n sum log scale
+
+`white` is that with C left out, `coloured` with it: a rival that says "just more noise" or "coloured noise" has the same means as the
+model with an effect. Parameters are refined by Gauss-Newton with the weights of the density, damped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.models.composed import AppliedEffect, ComposedModel
+from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.residual import Steps, acting, residual, state_jacobian
+from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
+
+Array = NDArray[np.float64]
+Free = tuple[tuple[int, str], ...]
+
+EXACT = 3e-4
+"""Least standard deviation of noise, as a share of how far the state moves in a step: no model is meant more exactly than that, and data
+without noise stay solvable."""
+
+WIDEST = 5.0
+"""Cap of the widening of intervals: beyond it the model is wrong and no interval is right."""
+
+ITERATIONS = 8
+ROUNDS = 6
+SETTLED = 0.3
+"""Nats below which another round of parameters and noise is not worth it."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Transitions that a model is to explain. floor: (nx,) least variance of noise."""
+
+    data: Dataset
+    steps: Steps
+    floor: Array
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model on a problem. free: (index of the effect, parameter) of what was fitted; z: (n, nx); white, coloured: log likelihoods."""
+
+    model: ComposedModel
+    free: Free
+    noise: Noise
+    colour: Colour
+    whiten: Whitener
+    z: Array
+    white: float
+    coloured: float
+    idle: int = 0
+
+    @property
+    def k(self) -> int:
+        """Number of fitted parameters that these data feel at all (`idle` ones do not); an effect without any counts as one."""
+        named = {i for i, _ in self.free}
+        return max(len(self.free) - self.idle, 0) + sum(1 for i in self.added if i not in named)
+
+    @property
+    def added(self) -> tuple[int, ...]:
+        """Places of the effects that the data, not the user, put there."""
+        return tuple(i for i, a in enumerate(self.model.effects) if isinstance(a, Added))
+
+
+@dataclass(frozen=True)
+class Added(AppliedEffect):
+    """An effect that the tracer added."""
+
+
+def problem(data: Dataset, steps: Steps) -> Problem:
+    """Of these transitions."""
+    moved = np.std(steps.y1 - steps.y0, axis=0) + 1e-9 * np.std(steps.y0, axis=0) + 1e-12
+    return Problem(data, steps, (EXACT * moved) ** 2)
+
+
+def evaluate(given: Problem, model: ComposedModel, near: Noise | None = None) -> Fit:
+    """The model as it stands, with its own noise. near: noise from which its estimate begins."""
+    act = acting(model, given.data)
+    r = residual(model, given.steps, act)
+    f = state_jacobian(model, given.steps, act)
+    level = noises.estimate(r, f, given.steps.joined, given.floor, near)
+    whiten = Whitener(level, f, given.steps.joined)
+    z = whiten(r)
+    colour = noises.colour(z, given.steps.joined)
+    white = float(np.sum(noises.log_density(z))) - whiten.logdet
+    left = float(np.sum(noises.log_density(colour(z, given.steps.joined))))
+    coloured = left - whiten.logdet - len(z) * float(np.sum(np.log(colour.scale)))
+    return Fit(model, free_of(model), level, colour, whiten, z, white, coloured)
+
+
+def free_of(model: ComposedModel) -> Free:
+    """Numeric parameters of the added effects."""
+    return tuple(
+        (i, p.name)
+        for i, a in enumerate(model.effects)
+        if isinstance(a, Added)
+        for p in a.effect.parameters
+        if isinstance(a.p.get(p.name), float)
+    )
+
+
+def values_of(model: ComposedModel, free: Free) -> Array:
+    """(k,) current values."""
+    return np.array([float(model.effects[i].p[name]) for i, name in free])
+
+
+def with_values(model: ComposedModel, free: Free, values: Array) -> ComposedModel | None:
+    """The model with these values, None if they are not allowed."""
+    effects = list(model.effects)
+    for (i, name), value in zip(free, values.tolist(), strict=True):
+        bounds = next(p for p in effects[i].effect.parameters if p.name == name)
+        if not bounds.low <= value <= bounds.high:
+            return None
+        effects[i] = replace(effects[i], p={**effects[i].p, name: value})
+    for i in {i for i, _ in free}:
+        if getattr(effects[i].effect, "wrong", lambda p: "")(effects[i].p):
+            return None
+    return replace(model, effects=tuple(effects))
+
+
+def objective(given: Problem, fit: Fit, model: ComposedModel) -> Array:
+    """z (n, nx) of a model under the noise of a fit."""
+    r = residual(model, given.steps, acting(model, given.data))
+    return fit.colour(fit.whiten(r), given.steps.joined)
+
+
+def sensitivities(given: Problem, fit: Fit, model: ComposedModel, free: Free, z: Array) -> Array:
+    """dz/dp, (n nx, k), one-sided differences inside the bounds."""
+    now = values_of(model, free)
+    columns = []
+    for j, h in enumerate(_differences(given, model, free)):
+        for signed in (h, -h):
+            there = now.copy()
+            there[j] += signed
+            other = with_values(model, free, there)
+            if other is not None:
+                columns.append(((objective(given, fit, other) - z) / signed).ravel())
+                break
+        else:
+            columns.append(np.zeros(z.size))
+    return np.stack(columns, axis=1)
+
+
+def widening(scores: Array, covariance: Array, nx: int, blocks: int) -> Array:
+    """(k,) ratio of the sandwich's standard deviation to the plain one, within [1, WIDEST]. scores: (n nx, k), in order of time.
+
+    Where noise wanders more slowly than the likelihood knows, the scores of blocks of time scatter more than it says.
+    """
+    n = len(scores) // nx
+    edges = (np.arange(blocks + 1) * n // blocks) * nx
+    sums = np.stack([scores[a:b].sum(axis=0) for a, b in pairwise(edges.tolist())])
+    sandwich = covariance @ (sums.T @ sums) @ covariance
+    ratio = np.sqrt(np.diag(sandwich) / np.maximum(np.diag(covariance), 1e-300))
+    return np.asarray(np.clip(ratio, 1.0, WIDEST))
+
+
+def _differences(given: Problem, model: ComposedModel, free: Free) -> list[float]:
+    """Wide enough that a kink is seen, small against the value."""
+    steps = []
+    for i, name in free:
+        a = model.effects[i]
+        p = next(p for p in a.effect.parameters if p.name == name)
+        usual = given.data.dt if p.unit == "s" else 1e-3
+        steps.append((1e-3 if p.kink else 1e-4) * max(abs(float(a.p[name]) - (p.neutral or 0.0)), usual))
+    return steps
+
+
+def refine(given: Problem, fit: Fit, model: ComposedModel, free: Free | None = None) -> ComposedModel:
+    """Parameters that maximise the likelihood under the noise of `fit`, from where the model stands."""
+    free = free_of(model) if free is None else free
+    if not free:
+        return model
+    z = objective(given, fit, model)
+    best = float(np.sum(noises.log_density(z)))
+    damping = 1e-4
+    for _ in range(ITERATIONS):
+        j = sensitivities(given, fit, model, free, z)
+        w = noises.weight(z).ravel()
+        normal, slope = j.T @ (j * w[:, None]), j.T @ (w * z.ravel())
+        before = best
+        while damping < 1e6:
+            damped = normal + np.diag(damping * np.diag(normal) + 1e-12 * np.max(np.diag(normal), initial=1e-300))
+            other = with_values(model, free, _inside(model, free, values_of(model, free) - np.linalg.solve(damped, slope)))
+            if other is not None:
+                z_other = objective(given, fit, other)
+                reached = float(np.sum(noises.log_density(z_other)))
+                if reached > best:
+                    model, z, best, damping = other, z_other, reached, damping / 10.0
+                    break
+            damping *= 10.0
+        damping = max(damping, 1e-8)
+        if best - before < 0.02:
+            break
+    return model
+
+
+def _inside(model: ComposedModel, free: Free, values: Array) -> Array:
+    bounds = [next(p for p in model.effects[i].effect.parameters if p.name == name) for i, name in free]
+    return np.clip(values, [b.low for b in bounds], [b.high for b in bounds])
+
+
+def fitted(given: Problem, start: Fit, model: ComposedModel, rounds: int = ROUNDS) -> Fit:
+    """Parameters and noise in turn, until neither gains. start: whose noise to begin with."""
+    fit = replace(start, colour=noises.no_colour(start.z.shape[1]))  # what looks like colour may be what the effect explains
+    for turn in range(rounds):
+        model = refine(given, fit, model)
+        before, fit = fit, evaluate(given, model, fit.noise)
+        if turn and fit.white - before.white < SETTLED:
+            break
+    return replace(fit, idle=_idle(given, fit))
+
+
+def _idle(given: Problem, fit: Fit) -> int:
+    """Parameters that change nothing here: a limit that is never reached."""
+    j = sensitivities(given, fit, fit.model, fit.free, objective(given, fit, fit.model)) if fit.free else np.zeros((1, 0))
+    sizes = np.maximum(np.abs(values_of(fit.model, fit.free)), 1e-9) if fit.free else np.zeros(0)
+    return int(np.count_nonzero(np.sqrt(np.sum(j * j, axis=0)) * sizes < 0.1))
+
+
+def insert(model: ComposedModel, effect: AppliedEffect, place: int) -> ComposedModel:
+    """The model with an added effect at a place of its list."""
+    added = Added(effect.effect, effect.channel, effect.p)
+    return replace(model, effects=(*model.effects[:place], added, *model.effects[place:]))
+
+
+def without(model: ComposedModel, place: int) -> ComposedModel:
+    """The model less one effect."""
+    return replace(model, effects=(*model.effects[:place], *model.effects[place + 1 :]))

@@ -1,0 +1,92 @@
+"""Which transitions the fit sees, and which it never does.
+
+Of one run two stretches are held out, one of them the end (HELD_OUT); of several runs, whole runs drawn by the seed (TEST_SHARE).
+Long recordings are thinned for the fit: blocks of contiguous steps, evenly spread, each with the inputs before it from which
+hidden states settle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.trace.dataset import Dataset, Run
+from s2r_runtime.trace.residual import Steps, first_steps, steps_of
+
+Mask = NDArray[np.bool_]
+
+HELD_OUT = ((0.3, 0.5), (0.8, 1.0))
+"""Parts of a run's time. Two, so that what the robot did, and what became of it, is seen early and late on both sides."""
+
+TEST_SHARE = 0.4
+"""Of the runs: as much as of one run's time."""
+
+FEWEST_RUNS = 5
+"""From so many runs on whole runs are held out."""
+
+BLOCK = 500
+"""Steps of a block when a long recording is thinned."""
+
+SETTLE_S = 3.0
+"""Inputs before a block, s (30 to 600 steps): hidden states have settled then, or nearly."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Some of a dataset: steps that count, and (run, step) that do not although they are there."""
+
+    data: Dataset
+    steps: Steps
+    left_out: tuple[tuple[int, int], ...]
+
+
+def fit_mask(data: Dataset, seed: int) -> Mask:
+    """(M,) steps, of the runs laid end to end, that the fit may see."""
+    begin = first_steps(data)
+    seen = np.ones(begin[-1], dtype=bool)
+    if len(data.runs) < FEWEST_RUNS:
+        for a, b in pairwise(begin.tolist()):
+            for first, last in HELD_OUT:
+                seen[a + round(first * (b - a)) : a + round(last * (b - a))] = False
+        return seen
+    order = np.random.default_rng(seed).permutation(len(data.runs))
+    for i in order[: round(TEST_SHARE * len(data.runs))]:
+        seen[begin[i] : begin[i + 1]] = False
+    return seen
+
+
+def part(data: Dataset, left_out: tuple[tuple[int, int], ...], seen: Mask, most: int) -> Part:
+    """The part of a dataset with these steps, at most about `most` of them."""
+    begin = first_steps(data)
+    blocks = _blocks(begin, seen, most)
+    settle = int(np.clip(SETTLE_S / data.dt, 30, 600))
+    runs: list[Run] = []
+    out: list[tuple[int, int]] = []
+    known = set(left_out)
+    for run, a, b in blocks:
+        early = max(0, a - settle)
+        given = data.runs[run]
+        y = given.y[early : b + 1].copy()
+        y[: a - early] = np.nan
+        out += [(len(runs), k - early) for k in range(early, b) if (run, k) in known] if known else []
+        runs.append(Run(given.start_s + data.dt * early, y, given.u[early * data.substeps : b * data.substeps]))
+    made = replace(data, runs=tuple(runs))
+    return Part(made, steps_of(made, out), tuple(out))
+
+
+def _blocks(begin: NDArray[np.int64], seen: Mask, most: int) -> list[tuple[int, int, int]]:
+    """(run, first step, step after the last) of what is kept, evenly over what may be seen."""
+    stretches = []
+    for run, (a, b) in enumerate(pairwise(begin.tolist())):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], seen[a:b].astype(np.int8), [0]])))
+        stretches += [(run, int(p), int(q)) for p, q in zip(edges[::2], edges[1::2], strict=True)]
+    total = sum(q - p for _, p, q in stretches)
+    if total <= most * 1.2:
+        return stretches
+    pieces = [(run, k, min(k + BLOCK, q)) for run, p, q in stretches for k in range(p, q, BLOCK)]
+    count = max(1, round(most / (total / len(pieces))))
+    chosen = np.unique(np.linspace(0, len(pieces) - 1, count).round().astype(int))
+    return [pieces[i] for i in chosen]

@@ -1,0 +1,228 @@
+"""What is left in the residual of the final model, named by what it depends on.
+
+A group is a set of dictionaries of terms (see `lack_of_fit_terms`), all of which depend on the same thing. A dictionary is judged like a
+rival model: its terms are added to the step,
+
+    r = sum_j beta_j X_j + noise,        beta by ridge on all blocks of time but the one that is judged
+
+and its gain is the log likelihood of what is left, with noise and colour re-estimated for it, less that of the model without
+it. The best group is named, then those that add to it. A group counts only if it is significant after correction for
+everything tried and if the rollouts' errors fall with it: structure that nobody would notice is none. A residual that is
+only correlated in time, whatever the inputs do, is `noise`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.fitting import Fit, Problem
+from s2r_runtime.trace.lack_of_fit_terms import dictionaries
+from s2r_runtime.trace.residual import acting, residual, rms, rollout, rollout_starts, state_jacobian
+from s2r_runtime.trace.residual_noise import Colour, Whitener
+
+Array = NDArray[np.float64]
+
+ALPHA = 1e-3
+"""Chance that clean data show structure, as far as the likelihood is right."""
+
+BLOCKS = 8
+"""Of the cross-validation."""
+
+FEW = 8
+"""Dictionaries that are judged with their own noise, after a first look under the model's."""
+
+EACH = 0.5
+"""Nats a column that one dictionary must gain beyond another one: the smaller of two that hold the truth is named."""
+
+ADDS = 0.1
+"""A further group is named if it adds this share of what is explained already."""
+
+MATTERS = 0.05
+"""Structure counts if taking it up lowers some rollout error by this share."""
+
+COLOURED = 0.2
+"""Autoregression coefficient from which noise is called coloured."""
+
+MOST_SCATTER = 5.0
+"""Scatter counts up to this: a dictionary that fits the structure only roughly leaves scores that scatter too."""
+
+PASSES = 3
+"""Of terms and noise in turn."""
+
+RIDGE = 1e-4
+"""Of the columns' own size; terms of a dictionary are nearly collinear."""
+
+
+@dataclass(frozen=True)
+class Structure:
+    """tokens: docs/json.md's `depends_on`, most important first. matters: it shows in rollouts.
+
+    share: part of all that the nominal model lacks which is still left (0 where there is nothing). gains: nats by group.
+    """
+
+    tokens: tuple[str, ...]
+    matters: bool
+    share: float
+    gains: dict[str, float]
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """A dictionary X (n, nx, m) with its held-out gain and beta (BLOCKS, m) without each block. scatter: see `_scatter`."""
+
+    token: str
+    x: Array
+    gain: float
+    scatter: float
+    betas: Array
+
+
+@dataclass(frozen=True)
+class _Left:
+    """What is to be explained. r: (n, nx); f: (n, nx, nx); block: (n,)."""
+
+    given: Problem
+    fit: Fit
+    r: Array
+    f: Array
+    block: NDArray[np.int64]
+
+
+def lack_of_fit(given: Problem, fit: Fit, nominal: Fit, horizon: int) -> Structure:
+    """Structure left by `fit`; how much of what `nominal` leaves that is."""
+    act = acting(fit.model, given.data)
+    n = len(given.steps)
+    block = np.minimum(np.arange(n) * BLOCKS // n, BLOCKS - 1)
+    left = _Left(given, fit, residual(fit.model, given.steps, act), state_jacobian(fit.model, given.steps, act), block)
+    found = [(token, _columns(terms)) for token, terms in dictionaries(given, fit.model, act)]
+    found = [(token, x) for token, x in found if x.shape[2]]
+    chosen, gains = _forward(left, found)
+    coloured = ("noise",) if np.any(fit.colour.strength > COLOURED) else ()
+    if not chosen:
+        return Structure(coloured, False, 0.0, gains)
+    matters, share = _weight_of(left, nominal, chosen[-1], horizon)
+    tokens = tuple(dict.fromkeys(judged.token for judged in chosen))
+    return Structure(tokens if matters else coloured, matters, share, gains)
+
+
+def _columns(terms: Sequence[Array]) -> Array:
+    """Terms (n, nx) side by side on a scale of 1, (n, nx, m); those that vanish are dropped."""
+    x = np.stack(terms, axis=2)
+    size = np.sqrt(np.mean(x**2, axis=(0, 1)))
+    return np.asarray(x[:, :, size > 1e-12] / size[size > 1e-12])
+
+
+def _forward(left: _Left, found: Sequence[tuple[str, Array]]) -> tuple[list[_Judged], dict[str, float]]:
+    """The best group, then those that add to it; the last one holds the columns of all."""
+    threshold = math.log(len(found) / ALPHA)
+    looked = sorted(((_first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True)
+    gains = {token: 0.0 for token, _ in found}
+    chosen: list[_Judged] = []
+    rest = [found[i] for _, i in looked[:FEW]]
+    while rest and len(chosen) < 3:
+        before = chosen[-1] if chosen else None
+        judged = [_judge(left, token, x if before is None else np.concatenate([before.x, x], axis=2)) for token, x in rest]
+        if before is None:
+            for j in judged:
+                gains[j.token] = max(gains[j.token], j.gain)
+            rest = [(token, x) for token, x in rest if gains[token] > threshold]
+        best = max(judged, key=lambda j: j.gain - EACH * j.x.shape[2])
+        reached = before.gain if before else 0.0
+        if best.gain - reached < max(threshold * best.scatter, ADDS * reached):
+            break
+        chosen.append(best)
+        rest = [(token, x) for token, x in rest if token != best.token]
+    return chosen, gains
+
+
+def _first_look(left: _Left, x: Array) -> float:
+    """Nats that the dictionary explains under the model's own noise, less one a column."""
+    white = left.fit.whiten(x).reshape(-1, x.shape[2])
+    z = left.fit.z.ravel()
+    weighted = white * noises.weight(z)[:, None]
+    slope = weighted.T @ z
+    return 0.5 * float(slope @ _solve(white.T @ weighted, slope)) - float(x.shape[2])
+
+
+def _judge(left: _Left, token: str, x: Array) -> _Judged:
+    """Held-out gain. Several passes: what is left after one has less noise, under which the next one sees more. The first one takes
+    no colour into account: the colour that is there may well be the structure.
+    """
+    whiten: Whitener = left.fit.whiten
+    colour: Colour | None = None
+    joined = left.given.steps.joined
+    betas, gain, scatter = np.zeros((BLOCKS, x.shape[2])), 0.0, 1.0
+    for _ in range(PASSES):
+        betas_now = _betas(left, x, whiten, colour)
+        rest = left.r - np.einsum("kim,km->ki", x, betas_now[left.block])
+        level = noises.estimate(rest, left.f, joined, left.given.floor, left.fit.noise)
+        whiten = Whitener(level, left.f, joined)
+        z = whiten(rest)
+        colour = noises.colour(z, joined)
+        z = colour(z, joined)
+        likelihood = float(np.sum(noises.log_density(z))) - whiten.logdet - len(z) * float(np.sum(np.log(colour.scale)))
+        if likelihood - left.fit.coloured > gain:
+            push = colour(whiten(left.r - rest), joined)
+            gain, betas = likelihood - left.fit.coloured, betas_now
+            scatter = _scatter(push * z * noises.weight(z), push, left.block)
+    return _Judged(token, x, gain, scatter, betas)
+
+
+def _scatter(scores: Array, push: Array, block: NDArray[np.int64]) -> float:
+    """How much more the scores of blocks scatter than white noise would let them, as a ratio of variances, at least 1: noise that
+    wanders slowly looks like much else."""
+    sums = np.bincount(block, scores.sum(axis=1), BLOCKS)
+    return min(max(1.0, float(np.sum(sums**2) / max(float(np.sum(push**2)), 1e-300))), MOST_SCATTER)
+
+
+def _betas(left: _Left, x: Array, whiten: Whitener, colour: Colour | None) -> Array:
+    """(BLOCKS, m) ridge solutions without each block."""
+    joined = left.given.steps.joined
+    m = x.shape[2]
+    white, z = whiten(x), whiten(left.r)
+    if colour is not None:
+        white, z = colour(white, joined), colour(z, joined)
+    white, z = white.reshape(-1, m), z.ravel()
+    weighted = white * noises.weight(z)[:, None]
+    edges = np.searchsorted(left.block, np.arange(BLOCKS + 1)) * left.r.shape[1]
+    products, slopes = np.zeros((BLOCKS, m, m)), np.zeros((BLOCKS, m))
+    for b, here in enumerate(slice(p, q) for p, q in pairwise(edges.tolist())):
+        products[b], slopes[b] = white[here].T @ weighted[here], weighted[here].T @ z[here]
+    return np.stack([_solve(products.sum(axis=0) - products[b], slopes.sum(axis=0) - slopes[b]) for b in range(BLOCKS)])
+
+
+def _solve(product: Array, slope: Array) -> Array:
+    m = len(slope)
+    ridge = np.diag(RIDGE * np.diag(product) + 1e-12 * float(np.trace(product)) / m + 1e-300)
+    return np.asarray(np.linalg.solve(product + ridge, slope))
+
+
+def _weight_of(left: _Left, nominal: Fit, judged: _Judged, horizon: int) -> tuple[bool, float]:
+    """Whether the structure shows in rollouts, and what share of all that the nominal model lacks it is."""
+    data, steps, model = left.given.data, left.given.steps, left.fit.model
+    act, act_nominal = acting(model, data), acting(nominal.model, data)
+    extra = np.zeros((len(act.mean), left.r.shape[1]))
+    extra[steps.place] = np.einsum("kim,km->ki", judged.x, judged.betas[left.block])
+    there = np.zeros(len(act.mean), dtype=bool)
+    there[steps.place] = True
+    matters, worst, share = False, 1.0 + MATTERS, 0.0
+    for ahead in sorted({1, max(1, horizon // 4), horizon}):
+        starts = rollout_starts(data, ahead, within=there)
+        starts = starts[:: max(1, len(starts) // 1200)]
+        if len(starts) < 10:
+            continue
+        before = rms(rollout(nominal.model, data, act_nominal, starts, ahead).error)
+        now = rms(rollout(model, data, act, starts, ahead).error)
+        after = rms(rollout(model, data, act, starts, ahead, extra).error)
+        for b, n, a in zip(before, now, after, strict=True):
+            matters = matters or bool(n > (1.0 + MATTERS) * a)
+            if max(b, n) > worst * a:
+                worst, share = max(b, n) / a, max(n * n - a * a, 0.0) / max(b * b - a * a, n * n - a * a)
+    return matters, share

@@ -1,0 +1,129 @@
+"""Terms that a residual can depend on, in dictionaries by what they depend on (docs/tracing.md: the tokens of `depends_on`).
+
+A term is c(y, u, t) d: a number for every transition times a direction of the state in which it pushes. Directions of a model
+with a planar pose: along, across and about the body, each further state, and the world's axes; of another one: where its inputs push.
+Small dictionaries stand beside larger ones of the same group: with few data the small one is judged better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace.fitting import Problem
+from s2r_runtime.trace.residual import Acting
+
+Array = NDArray[np.float64]
+Terms = list[Array]
+
+VELOCITIES = ("speed", "vx", "vy", "qd", "wheel_left", "wheel_right")
+
+
+def dictionaries(given: Problem, model: ComposedModel, act: Acting) -> Iterator[tuple[str, Terms]]:
+    """(token, terms (n, nx) each)."""
+    steps = given.steps
+    body, world = _directions(given, model, act)
+    u = act.mean[steps.place]
+    size = np.maximum(np.max(np.abs(u), axis=0), 1e-12)
+    u = u / size
+    t = (steps.t - steps.t[0]) / max(steps.t[-1] - steps.t[0], 1e-9)
+    one = np.ones(len(u))
+    yield "constant", _push([one], [*body, *world])
+    for j, name in enumerate(model.inputs):
+        yield from ((name, _push(terms, body)) for terms in _static(u[:, j]))
+        yield from ((f"memory({name})", _push(terms, body)) for terms in _memory(act.mean[:, j] / size[j], steps.place))
+        yield f"time*{name}", _push([t * u[:, j]], body)
+        yield f"time*{name}", _push([np.where(t > s, u[:, j], 0.0) for s in np.linspace(0.1, 0.9, 9)], body)
+        for i in range(j):
+            pair = [u[:, i] * u[:, j], np.abs(u[:, i]) * u[:, j], u[:, i] * np.abs(u[:, j]), np.abs(u[:, i] * u[:, j])]
+            yield f"{model.inputs[i]}*{name}", _push(pair, body)
+    for name, terms, directions in _of_states(model, steps.y0, u, body, world):
+        yield name, _push(terms, directions)
+    yield "time", _push([one, t], [*body, *world])
+    yield "time", _push([one, *(f(2.0 * np.pi * k * t) for k in (0.5, 1.0, 1.5, 2.0) for f in (np.sin, np.cos))], [*body, *world])
+    yield "time", _push([one, *(np.where(t > s, one, 0.0) for s in np.linspace(0.1, 0.9, 9))], body)
+
+
+def _static(u: Array) -> Iterator[Terms]:
+    """Shapes of one input, on a scale of 1: a few, and many."""
+    a = np.abs(u)
+    yield [u, u * a, np.sign(u) * (a > 0.02)]
+    yield [u, a, u * a, u * u, np.sign(u) * (a > 0.02), *(np.sign(u) * np.maximum(a - s, 0.0) for s in (0.1, 0.25, 0.5, 0.75))]
+
+
+def _memory(u: Array, place: NDArray[np.int64]) -> Iterator[Terms]:
+    """Earlier values of one input, and its slow means, less its present one. The first steps of a run see the run before: few, and
+    harmless."""
+    yield [u[np.maximum(place - lag, 0)] - u[place] for lag in (1, 2)]
+    terms = [u[np.maximum(place - lag, 0)] - u[place] for lag in (1, 2, 3, 5, 8)]
+    total = np.concatenate([[0.0], np.cumsum(u)])
+    for width in (12, 30, 80):
+        begin = np.maximum(place - width, 0)
+        terms.append((total[place] - total[begin]) / np.maximum(place - begin, 1) - u[place])
+    yield terms
+
+
+def _of_states(model: ComposedModel, y: Array, u: Array, body: Terms, world: Terms) -> Iterator[tuple[str, Terms, Terms]]:
+    """Terms in the heading, the position, the speed, and any other state of a model of the user's own, and where they push."""
+    known: set[str] = set()
+    inputs, one = [u[:, j] for j in range(u.shape[1])], np.ones(len(u))
+    for name in model.nominal.angles:
+        angle = y[:, model.states.index(name)]
+        token = "heading" if name in {"theta", "heading", "yaw"} else name
+        first, second = [np.cos(angle), np.sin(angle)], [np.cos(2.0 * angle), np.sin(2.0 * angle)]
+        known.add(name)
+        yield token, first, body
+        yield token, [c * v for c in first for v in inputs], body
+        yield token, [c * v for c in [*first, *second] for v in [one, *inputs]], body
+    position = [_scaled(y[:, i]) for i, name in enumerate(model.states) if name in {"x", "y", "z", "q"}]
+    if position:
+        known |= {"x", "y", "z", "q"}
+        squares = [a * b for i, a in enumerate(position) for b in position[: i + 1]]
+        yield "position", [one, *position], world or body
+        yield "position", [a * v for a in position for v in inputs], body
+        yield "position", [one, *position, *squares, *(a**3 for a in position)], [*body, *world]
+    speed = [_scaled(y[:, i], centred=False) for i, name in enumerate(model.states) if name in VELOCITIES]
+    if speed:
+        known |= set(VELOCITIES)
+        yield "speed", speed, body
+        yield "speed", [f for v in speed for f in (v, np.abs(v) * v, v**3, np.tanh(v / 0.05), np.abs(v))], body
+    for i, name in enumerate(model.states):
+        if name not in known:
+            v = _scaled(y[:, i])
+            yield name, [v, v * v, v**3, np.sign(v), *(v * w for w in inputs)], [*body, *world]
+
+
+def _scaled(v: Array, *, centred: bool = True) -> Array:
+    v = v - float(np.mean(v)) if centred else v
+    return v / max(float(np.max(np.abs(v))), 1e-12)
+
+
+def _push(terms: Sequence[Array], directions: Sequence[Array]) -> Terms:
+    return [c[:, None] * d for c in terms for d in directions]
+
+
+def _directions(given: Problem, model: ComposedModel, act: Acting) -> tuple[list[Array], list[Array]]:
+    """((n, nx) each) in which something can push: along, across and about the body and each further state; and the world's axes. For a
+    model without a planar pose, where its inputs push.
+    """
+    n, nx = given.steps.y0.shape
+    unit = np.eye(nx)
+    if {"x", "y", "theta"} <= set(model.states):
+        x, y, theta = (model.states.index(name) for name in ("x", "y", "theta"))
+        c, s = np.cos(given.steps.y0[:, theta]), np.sin(given.steps.y0[:, theta])
+        along, across = np.zeros((n, nx)), np.zeros((n, nx))
+        along[:, x], along[:, y], across[:, x], across[:, y] = c, s, -s, c
+        others = [np.tile(unit[i], (n, 1)) for i in range(nx) if i not in {x, y}]
+        return [along, across, *others], [np.tile(unit[x], (n, 1)), np.tile(unit[y], (n, 1))]
+    mean, end = act.mean[given.steps.place], act.end[given.steps.place]
+    here = model.advance(given.steps.y0, mean, end)
+    pushed = []
+    for j in range(mean.shape[1]):
+        h = 1e-4 * max(1.0, float(np.max(np.abs(mean[:, j]), initial=0.0)))
+        up = np.zeros(mean.shape[1])
+        up[j] = h
+        pushed.append((model.advance(given.steps.y0, mean + up, end + up) - here) / h)
+    return pushed, []

@@ -1,0 +1,188 @@
+"""Residual of a composed model on a dataset, one step and over rollouts.
+
+    e_k     = y_{k+1} (-) f(y_k, a_k)                    one step, (n, nx); a_k: the input as it acts over step k
+    e_{k,H} = y_{k+H} (-) f^H(y_k, a_k .. a_{k+H-1})     at the end of a rollout of H steps, open loop
+    F_k     = df/dx at (y_k, a_k), (n, nx, nx)
+
+Effects of stage `input` filter the command, which is known without noise: their hidden states are exact, over all of a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.models.composed import AppliedEffect, ComposedModel
+from s2r_runtime.trace.dataset import Dataset
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Steps:
+    """n transitions in order of time. place: (n,) step in the runs laid end to end; joined: (n,) starts where the one before ended.
+
+    y0, y1: (n, nx) measured at start and end; t: (n,) s since the recording's first stamp; run: (n,).
+    """
+
+    place: Index
+    run: Index
+    t: Array
+    y0: Array
+    y1: Array
+    joined: Mask
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+    def take(self, rows: Index | Mask) -> Steps:
+        """Some of them, in the same order."""
+        place = self.place[rows]
+        joined: Mask = (
+            np.append(False, (np.diff(place) == 1) & (np.diff(self.run[rows]) == 0)) if len(place) else np.zeros(0, dtype=np.bool_)
+        )
+        return Steps(place, self.run[rows], self.t[rows], self.y0[rows], self.y1[rows], joined & self.joined[rows])
+
+
+@dataclass(frozen=True)
+class Acting:
+    """The input as it acts over every step of all runs laid end to end: mean over the step, and at its end, (M, nu)."""
+
+    mean: Array
+    end: Array
+
+
+def first_steps(data: Dataset) -> Index:
+    """(runs + 1,) where each run's steps begin in the runs laid end to end."""
+    return np.cumsum([0] + [len(run.y) - 1 for run in data.runs])
+
+
+def steps_of(data: Dataset, left_out: Sequence[tuple[int, int]] = ()) -> Steps:
+    """All transitions with both ends measured. left_out: (run, step) that do not count."""
+    begin = first_steps(data)
+    ends = [(run.y[:-1], run.y[1:]) for run in data.runs]
+    y0, y1 = np.concatenate([a for a, _ in ends]), np.concatenate([b for _, b in ends])
+    where = np.repeat(np.arange(len(data.runs)), np.diff(begin))
+    t = np.concatenate([run.start_s + data.dt * np.arange(len(run.y) - 1) for run in data.runs])
+    good = ~(np.isnan(y0).any(axis=1) | np.isnan(y1).any(axis=1))
+    good[[begin[run] + k for run, k in left_out]] = False
+    place = np.arange(len(t))
+    everything = Steps(place, where, t, y0, y1, np.append(False, where[1:] == where[:-1]) if len(t) else good)
+    return everything.take(np.flatnonzero(good))
+
+
+def acting(model: ComposedModel, data: Dataset, effects: Sequence[AppliedEffect] | None = None) -> Acting:
+    """The input as it acts after the effects of stage `input` (None: the model's)."""
+    chain = [a for a in (model.effects if effects is None else effects) if a.effect.stage == "input"]
+    u = sequence(model, chain, [run.u for run in data.runs], data.dt / data.substeps)
+    if data.substeps == 1:
+        return Acting(u, u)
+    table = u.reshape(-1, data.substeps * u.shape[1])
+    mean = table @ np.tile(np.eye(u.shape[1]) / data.substeps, (data.substeps, 1))
+    return Acting(mean, table[:, -u.shape[1] :].copy())
+
+
+def sequence(model: ComposedModel, chain: Sequence[AppliedEffect], inputs: Sequence[Array], dt: float) -> Array:
+    """Inputs of each run, (T_i, nu), through a chain of effects from rest; laid end to end, (sum T_i, nu)."""
+    longest = max(len(u) for u in inputs)
+    if chain and len(inputs) > max(8, longest // 2):
+        return _side_by_side(model, chain, inputs, dt)
+    done = []
+    for u in inputs:
+        for a in chain:
+            u = a.effect.input_sequence(u, model.nominal, a.channel, dt, a.p)
+        done.append(u)
+    return np.concatenate(done)
+
+
+def _side_by_side(model: ComposedModel, chain: Sequence[AppliedEffect], inputs: Sequence[Array], dt: float) -> Array:
+    """Many short runs: all of them one step at a time."""
+    lengths = np.array([len(u) for u in inputs])
+    table = np.zeros((lengths.max(), len(inputs), inputs[0].shape[1]))
+    for i, u in enumerate(inputs):
+        table[: len(u), i] = u
+    hidden = [a.effect.hidden(len(inputs), model.nominal, a.channel, dt, a.p) for a in chain]
+    for row in range(len(table)):
+        u = table[row]
+        for j, a in enumerate(chain):
+            u, hidden[j] = a.effect.input_step(u, hidden[j], model.nominal, a.channel, dt, a.p)
+        table[row] = u
+    return np.concatenate([table[:n, i] for i, n in enumerate(lengths)])
+
+
+def predicted(model: ComposedModel, steps: Steps, act: Acting) -> Array:
+    """f(y0, a), (n, nx), angles not wrapped."""
+    return model.advance(steps.y0, act.mean[steps.place], act.end[steps.place])
+
+
+def residual(model: ComposedModel, steps: Steps, act: Acting) -> Array:
+    """y1 (-) f(y0, a), (n, nx)."""
+    return model.difference(steps.y1, predicted(model, steps, act))
+
+
+def state_jacobian(model: ComposedModel, steps: Steps, act: Acting) -> Array:
+    """F, (n, nx, nx), by central differences of a millionth of the state's size."""
+    nx = steps.y0.shape[1]
+    f = np.empty((len(steps), nx, nx))
+    mean, end = act.mean[steps.place], act.end[steps.place]
+    for j in range(nx):
+        h = 1e-6 * max(1.0, float(np.max(np.abs(steps.y0[:, j]), initial=0.0)))
+        up, down = steps.y0.copy(), steps.y0.copy()
+        up[:, j] += h
+        down[:, j] -= h
+        f[:, :, j] = (model.advance(up, mean, end) - model.advance(down, mean, end)) / (2.0 * h)
+    return f
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """Errors at the end of rollouts of `horizon` steps: error (m, nx); place: (m,) the step each starts at."""
+
+    horizon: int
+    place: Index
+    error: Array
+
+
+def rollout_starts(data: Dataset, horizon: int, left_out: Sequence[tuple[int, int]] = (), within: Mask | None = None) -> Index:
+    """Steps (in the runs laid end to end) with a measured start, a measured end `horizon` steps on in the same run, and nothing left out
+    between. within: (M,) steps that a rollout may touch.
+    """
+    begin = first_steps(data)
+    blocked = np.zeros(begin[-1] + 1)
+    blocked[[begin[run] + k for run, k in left_out]] = 1
+    if within is not None:
+        blocked[: len(within)] += ~within
+    count = np.concatenate([[0.0], np.cumsum(blocked)])
+    found = []
+    for i, run in enumerate(data.runs):
+        good: Mask = ~np.asarray(np.isnan(run.y).any(axis=1))
+        last = len(run.y) - horizon
+        if last > 0:
+            k = np.flatnonzero(good[:last] & good[horizon:]) + begin[i]
+            found.append(k[count[k + horizon] == count[k]])
+    return np.concatenate(found).astype(np.int64) if found else np.zeros(0, dtype=np.int64)
+
+
+def rollout(model: ComposedModel, data: Dataset, act: Acting, starts: Index, horizon: int, extra: Array | None = None) -> Rollouts:
+    """Rolls out from every start at once. extra: (M, nx), added to the state after each step (what a lack-of-fit model says)."""
+    begin = first_steps(data)
+    run = np.searchsorted(begin, starts, side="right") - 1
+    y = np.concatenate([r.y for r in data.runs])
+    rows = starts + run  # a run has one row more than it has steps
+    x = y[rows]
+    for h in range(horizon):
+        place = starts + h
+        x = model.advance(x, act.mean[place], act.end[place])
+        if extra is not None:
+            x = x + extra[place]
+    return Rollouts(horizon, starts, model.difference(y[rows + horizon], x))
+
+
+def rms(e: Array) -> Array:
+    """(nx,) root mean square over rows; NaN if there are none."""
+    return np.sqrt(np.mean(e**2, axis=0)) if len(e) else np.full(e.shape[1], np.nan)

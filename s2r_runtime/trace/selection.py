@@ -1,0 +1,290 @@
+"""Which effects does the residual call for? Forward selection, exchange, backward elimination.
+
+    gain(M)       = log likelihood of M, noise as it estimates it itself, less that of the model without the effect;
+                    the smaller of white and coloured: "just more noise" and "coloured noise" are rivals
+    significant   gain > log(tried / ALPHA) + k/2 log n               (k parameters; everything tried is paid for)
+    relevant      some rollout's rms error falls by RELEVANT, on blocks that the parameters (all but those blocks) never saw
+
+Screening is linear in cost: every start of every candidate is one column, whitened together under the present model's noise; the best
+few are fitted as composed models. A candidate's score is its gain less its price.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.models.composed import AppliedEffect, ComposedModel
+from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.candidates import Candidate, candidates
+from s2r_runtime.trace.fitting import (
+    WIDEST,
+    Added,
+    Fit,
+    Problem,
+    evaluate,
+    fitted,
+    objective,
+    sensitivities,
+    values_of,
+    widening,
+    with_values,
+    without,
+)
+from s2r_runtime.trace.residual import acting, predicted, rms, rollout, rollout_starts
+
+Array = NDArray[np.float64]
+
+ALPHA = 1e-3
+"""Chance of naming anything on clean data, as far as the likelihood is right."""
+
+RELEVANT = 0.05
+"""An effect that lowers no rollout error by this share is left out: nobody would notice it."""
+
+FEW = 8
+"""Candidates that are fitted as composed models, after screening."""
+
+HOPELESS, HOPELESS_SHARE = 2.0, 0.05
+"""A candidate that screening gives fewer nats, or less than this share of the best one's, is not fitted."""
+
+MOST = 5
+"""Effects that are looked for at most."""
+
+SCORE_BLOCKS = 10
+"""Blocks of time whose scores are compared: long against what noise remembers, many enough to tell."""
+
+BLOCKS = 5
+"""Of the cross-validation."""
+
+CLOSE = 3.0
+"""Rivals whose score is within this (nats) of the best cannot be told from it: odds of 20 to 1."""
+
+STARTS = 1200
+"""Rollouts that relevance is judged on at most."""
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A candidate that was tried. score: its gain less its price, in nats."""
+
+    name: str
+    channel: str
+    score: float
+    fit: Fit | None = None
+
+
+@dataclass(frozen=True)
+class Selection:
+    """fit: the model chosen; nominal: as given. tried: columns paid for; ranking: best score of each (effect, channel) on the nominal
+    model; rivals: models that replace one effect and explain as much.
+    """
+
+    nominal: Fit
+    fit: Fit
+    tried: int
+    ranking: tuple[Scored, ...]
+    rivals: tuple[Scored, ...]
+
+
+def gain(fit: Fit, base: Fit) -> float:
+    """Nats that `fit` explains beyond `base`, noise re-estimated under both, white and coloured."""
+    return min(fit.white - base.white, fit.coloured - base.coloured)
+
+
+def price(k: int, n: int) -> float:
+    """Of k parameters on n transitions."""
+    return 0.5 * k * math.log(max(n, 2))
+
+
+def select(given: Problem, model: ComposedModel, horizon: int, progress: Callable[[float], None]) -> Selection:
+    """The effects that the transitions call for."""
+    nominal = evaluate(given, model)
+    fit, tried = nominal, 0
+    ranking: list[Scored] = []
+    for step in range(MOST):
+        found, columns = best_candidates(given, fit)
+        tried = max(tried, columns)
+        if not ranking:
+            ranking = found
+        progress(0.1 + 0.6 * (step + 1) / (MOST + 1))
+        chosen = next((s.fit for s in found if s.fit is not None and accepted(given, s.fit, fit, tried, horizon)), None)
+        if chosen is None:
+            break
+        chosen = fitted(given, chosen, chosen.model)
+        fit = exchanged(given, chosen) if len(chosen.added) > 1 else chosen
+    fit = pruned(given, fit, tried, horizon)
+    progress(0.8)
+    return Selection(nominal, fit, tried, tuple(ranking), tuple(rivals(given, fit)))
+
+
+def best_candidates(given: Problem, base: Fit, few: int = FEW) -> tuple[list[Scored], int]:
+    """The candidates for one more effect, fitted, best score first; and how many columns were tried."""
+    found = candidates(base.model, given.data)
+    screened, columns = screen(given, base, found)
+    scored: dict[tuple[str, str], Scored] = {}
+    promising = [item for item in screened[:few] if item[0] > max(HOPELESS, HOPELESS_SHARE * screened[0][0])]
+    for _, candidate, start in promising:
+        fit = fitted(given, base, start, 2)
+        value = gain(fit, base) - price(fit.k - base.k, len(given.steps))
+        key = (candidate.name, candidate.channel)
+        if key not in scored or value > scored[key].score:
+            scored[key] = Scored(*key, value, fit)
+    for guess, candidate, _ in screened[len(promising) :]:
+        scored.setdefault((candidate.name, candidate.channel), Scored(candidate.name, candidate.channel, min(guess, 0.0)))
+    return sorted(scored.values(), key=lambda s: (s.fit is None, -s.score)), columns
+
+
+def screen(given: Problem, base: Fit, found: Sequence[Candidate]) -> tuple[list[tuple[float, Candidate, ComposedModel]], int]:
+    """(gain under the base's noise, candidate, its best start), best first."""
+    before = predicted(base.model, given.steps, acting(base.model, given.data))
+    starts = [(c, m) for c in found for m in c.models(base.model)]
+    level = float(np.sum(noises.log_density(base.z)))
+    best: dict[tuple[str, str, int], tuple[float, Candidate, ComposedModel]] = {}
+    for chunk in range(0, len(starts), 32):
+        part = starts[chunk : chunk + 32]
+        moved = np.stack([predicted(m, given.steps, acting(m, given.data)) - before for _, m in part], axis=2)
+        whitened = base.whiten(moved)
+        for (candidate, model), column in zip(part, np.moveaxis(whitened, 2, 0), strict=True):
+            value, start = _at_best_size(base, model, column)
+            key = (candidate.name, candidate.channel, candidate.place)
+            if key not in best or value - level > best[key][0]:
+                best[key] = (value - level, candidate, start)
+    ordered = sorted(best.values(), key=lambda item: -item[0])
+    return [item for item in ordered if item[0] > 0.0] + [item for item in ordered if item[0] <= 0.0], len(starts)
+
+
+def _at_best_size(base: Fit, model: ComposedModel, column: Array) -> tuple[float, ComposedModel]:
+    """Log density of what is left, at the start or, for one parameter with a neutral value, at its best multiple."""
+    left = float(np.sum(noises.log_density(base.z - column)))
+    size = float(np.sum(column * column))
+    place = next((i for i, a in enumerate(model.effects) if isinstance(a, Added) and not any(a is b for b in base.model.effects)), None)
+    if place is None or size <= 0.0:
+        return left, model
+    a = model.effects[place]
+    parameters = [p for p in a.effect.parameters if isinstance(a.p.get(p.name), float)]
+    if len(parameters) != 1 or parameters[0].neutral is None or parameters[0].kink:
+        return left, model
+    scale = float(np.sum(column * base.z)) / size
+    neutral = parameters[0].neutral
+    value = neutral + scale * (a.p[parameters[0].name] - neutral)
+    other = with_values(model, ((place, parameters[0].name),), np.array([value]))
+    scaled = float(np.sum(noises.log_density(base.z - scale * column)))
+    return (scaled, other) if other is not None and scaled > left else (left, model)
+
+
+def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int) -> bool:
+    """Significant and relevant."""
+    return significant(given, fit, base, tried) and relevant(given, fit, base, horizon)
+
+
+def significant(given: Problem, fit: Fit, base: Fit, tried: int) -> bool:
+    """Beyond chance, everything tried paid for; the gain shrunk by how much more than white noise the scores of blocks scatter."""
+    needed = math.log(max(tried, 1) / ALPHA) + price(fit.k - base.k, len(given.steps))
+    reached = gain(fit, base)
+    if reached <= needed or reached > WIDEST**2 * needed or not fit.free:
+        return reached > needed
+    there = names(base.model)
+    new = [i for i, (place, _) in enumerate(fit.free) if _name(fit.model.effects[place]) not in there]
+    z = objective(given, fit, fit.model)
+    j = sensitivities(given, fit, fit.model, fit.free, z)
+    w = noises.weight(z).ravel()
+    covariance = np.linalg.pinv(j.T @ (j * w[:, None]), rcond=1e-12, hermitian=True)
+    wider = widening(j * (w * z.ravel())[:, None], np.asarray(covariance), z.shape[1], SCORE_BLOCKS)
+    return reached > needed * float(np.max(wider[new], initial=1.0)) ** 2
+
+
+def relevant(given: Problem, fit: Fit, base: Fit, horizon: int) -> bool:
+    """Whether some state's error at one step, a quarter of the horizon or all of it falls by RELEVANT, cross-validated."""
+    for steps in sorted({1, max(1, horizon // 4), horizon}):
+        before, after = held_out_errors(given, base, steps), held_out_errors(given, fit, steps)
+        if np.any(before > (1.0 + RELEVANT) * after):
+            return True
+    return False
+
+
+def held_out_errors(given: Problem, fit: Fit, horizon: int) -> Array:
+    """(nx,) rms at the end of rollouts, in blocks of time, each under parameters from the other blocks."""
+    starts = rollout_starts(given.data, horizon)
+    starts = starts[np.isin(starts, given.steps.place)]
+    starts = starts[:: max(1, len(starts) // STARTS)]
+    if not len(starts):
+        return np.full(given.steps.y0.shape[1], np.nan)
+    edges = np.quantile(given.steps.place, np.linspace(0.0, 1.0, BLOCKS + 1))
+    errors = []
+    for block, model in enumerate(_less_each_block(given, fit, edges)):
+        inside = starts[(starts >= edges[block]) & ((starts < edges[block + 1]) | (block == BLOCKS - 1))]
+        if len(inside):
+            errors.append(rollout(model, given.data, acting(model, given.data), inside, horizon).error)
+    return rms(np.concatenate(errors))
+
+
+def _less_each_block(given: Problem, fit: Fit, edges: Array) -> list[ComposedModel]:
+    """The model refitted without each block, to first order."""
+    free = fit.free
+    if not free:
+        return [fit.model] * BLOCKS
+    z = objective(given, fit, fit.model)
+    j = sensitivities(given, fit, fit.model, free, z)
+    w = noises.weight(z).ravel()
+    block = np.repeat(np.clip(np.searchsorted(edges, given.steps.place, side="right") - 1, 0, BLOCKS - 1), z.shape[1])
+    models = []
+    for b in range(BLOCKS):
+        rest = block != b
+        jw = j[rest] * w[rest, None]
+        normal = j[rest].T @ jw
+        step = np.linalg.lstsq(normal + 1e-9 * np.diag(np.diag(normal)), jw.T @ z.ravel()[rest], rcond=1e-10)[0]
+        models.append(with_values(fit.model, free, values_of(fit.model, free) - step) or fit.model)
+    return models
+
+
+def exchanged(given: Problem, fit: Fit) -> Fit:
+    """Replaces an earlier effect where another one does better beside the later ones: the first choice was made without them."""
+    for place in fit.added[:-1]:
+        base = fitted(given, fit, without(fit.model, place), 1)
+        found, _ = best_candidates(given, base, 4)
+        best = found[0].fit if found else None
+        if best is not None and gain(best, fit) > price(best.k - fit.k, len(given.steps)) + CLOSE:
+            fit = fitted(given, best, best.model)
+    return fit
+
+
+def pruned(given: Problem, fit: Fit, tried: int, horizon: int) -> Fit:
+    """Drops every effect that the others make superfluous."""
+    again = True
+    while again and fit.added:
+        again = False
+        for place in fit.added:
+            less = fitted(given, fit, without(fit.model, place), 1)
+            if not accepted(given, fit, less, tried, horizon):
+                fit, again = less, True
+                break
+    return fit
+
+
+def rivals(given: Problem, fit: Fit) -> list[Scored]:
+    """Models with one effect replaced by another, of which the likelihood says the same."""
+    found = []
+    for place in fit.added:
+        mine = fit.model.effects[place]
+        base = fitted(given, fit, without(fit.model, place), 1)
+        scored, _ = best_candidates(given, base, 6)
+        here = gain(fit, base) - price(fit.k - base.k, len(given.steps))
+        found += [
+            Scored(s.name, s.channel, s.score, s.fit)
+            for s in scored
+            if s.fit is not None and (s.name, s.channel) != (mine.effect.name, mine.channel) and s.score >= here - CLOSE
+        ]
+    return found
+
+
+def names(model: ComposedModel) -> tuple[tuple[str, str], ...]:
+    """(effect, channel) of what was added, sorted."""
+    return tuple(sorted(_name(a) for a in model.effects if isinstance(a, Added)))
+
+
+def _name(a: AppliedEffect) -> tuple[str, str]:
+    return a.effect.name, a.channel

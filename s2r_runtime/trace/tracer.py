@@ -1,0 +1,239 @@
+"""Residual -> effect -> repaired model -> error before and after (docs/tracing.md).
+
+    1  faults of measurement are found and taken out                                   faults
+    2  part of the recording is held out; the fit never sees it                        holdout
+    3  effects are selected, noise estimated under each hypothesis                     selection, fitting, residual_noise
+    4  what is left is tested for structure, named by what it depends on               lack_of_fit
+    5  a verdict; errors and gap before and after on what was held out                 trace_errors, trace_result
+
+Verdicts: `none`, `traced`, `ambiguous` (rivals explain as much), `unexplained` (structure that no effect in the library accounts for; a
+name found on the way is withdrawn if what is left is a large part), `sensor_fault`. Deterministic: the same recording, model
+and seed give the same result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+
+from s2r_runtime.errors import NotEnoughEvidence, UsageError
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.dataset_files import load_dataset
+from s2r_runtime.trace.errors import Held, Kind, better, gaps, held, judge, noise_floor
+from s2r_runtime.trace.excitation import advice
+from s2r_runtime.trace.faults import Checked, check
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, problem, without
+from s2r_runtime.trace.holdout import BLOCK, Part, fit_mask, part
+from s2r_runtime.trace.intervals import intervals
+from s2r_runtime.trace.lack_of_fit import Structure, lack_of_fit
+from s2r_runtime.trace.residual import Mask, steps_of
+from s2r_runtime.trace.result import Found, TraceResult, Verdict
+from s2r_runtime.trace.selection import Selection, select
+
+__all__ = ["Dataset", "TraceResult", "load_dataset", "trace"]
+
+Progress = Callable[[float, float, str], None]
+
+FEWEST = 60
+"""Usable transitions below which nothing is said: a fit on 36 of them, and 24 to judge it."""
+
+FIT_STEPS = 4000
+"""Transitions that a fit uses at most; a parameter that matters is then known to about a per cent."""
+
+STRUCTURE_STEPS = 2500
+"""Transitions that the lack of fit is tested on at most."""
+
+LARGE = 0.3
+"""If more than this share of what the nominal model lacks is still left, a name found on the way is withdrawn."""
+
+WILD = 5.0
+"""Standard deviations of a whitened residual from which it is counted as an outlier (and has next to no weight)."""
+
+CONFIRMED = 0.01
+"""An effect stays if it lowers some error on held-out data by this share."""
+
+SAME_KIND = 0.05
+"""As LARGE, where what is left depends on the very thing that the named effect is about: then its shape is wrong."""
+
+
+def trace(
+    dataset: Dataset,
+    model: ComposedModel,
+    *,
+    test: Dataset | None = None,
+    horizon: float = 1.0,
+    seed: int = 0,
+    progress: Progress | None = None,
+    weights: tuple[float, ...] | None = None,
+    kind: Kind = "ball",
+) -> TraceResult:
+    """What the model lacks. test: another recording to judge on; horizon: of the rollouts, s; weights (nx,), kind: the gap's norm.
+
+    Raises NotEnoughEvidence if there are too few transitions or nothing was asked of the robot, UsageError if dataset and
+    model do not belong together.
+    """
+    say: Progress = progress or (lambda done, total, detail: None)
+    _belongs(dataset, model)
+    say(0.0, 100.0, "looking for faults of measurement")
+    checked = check(model, dataset)
+    seen = fit_mask(checked.data, seed) if test is None else np.ones(sum(len(r.y) - 1 for r in checked.data.runs), dtype=bool)
+    fit_part = part(checked.data, checked.left_out, seen, FIT_STEPS)
+    judged_on = _held_out(checked, seen, test, model, horizon)
+    _enough(dataset, fit_part, judged_on)
+    given = problem(fit_part.data, fit_part.steps)
+    ahead = max(1, min(round(horizon / dataset.dt), len(given.steps) // 4))
+    say(5.0, 100.0, "looking for effects")
+    chosen = select(given, model, ahead, lambda share: say(5.0 + 75.0 * share, 100.0, "looking for effects"))
+    chosen = _confirmed(given, chosen, judged_on)
+    say(80.0, 100.0, "testing what is left")
+    structure = _structure(given, chosen, ahead)
+    verdict = _verdict(chosen, structure, checked)
+    say(90.0, 100.0, "judging on held-out data")
+    w = np.ones(len(model.states)) if weights is None else np.asarray(weights, dtype=np.float64)
+    final = _final(chosen, verdict)
+    ranges = intervals(given, final)
+    ties = (
+        [_found(model, s.fit, place, {}) for s in chosen.rivals if s.fit for place in _new(s.fit, chosen.fit)]
+        if verdict == "ambiguous"
+        else []
+    )
+    before, after = judge(model, judged_on), judge(final.model, judged_on)
+    one, end = noise_floor(final.model, final.noise, judged_on, seed)
+    gap_before, gap_after, independent = gaps((model, before), (final.model, after), judged_on, w, kind)
+    effects = tuple(_found(model, final, place, ranges) for place in final.added)
+    partial = () if final is chosen.fit else tuple(_found(model, chosen.fit, place, {}) for place in chosen.fit.added)
+    say(100.0, 100.0, verdict)
+    return TraceResult(
+        verdict=verdict,
+        effects=effects,
+        partial=partial,
+        ambiguous_with=tuple(ties),
+        candidates=tuple((s.name, s.channel, s.score) for s in chosen.ranking),
+        depends_on=structure.tokens,
+        share_left=float(structure.share),
+        suggested_excitation=advice(model, [(f.name, f.channel) for f in (*effects, *ties)]) if ties else None,
+        faults=checked.faults,
+        outliers=checked.outliers + int(np.count_nonzero(np.abs(final.z).max(axis=1) > WILD)),
+        spec=_spec(model, final, dataset),
+        model=final.model,
+        nominal=model,
+        before=before,
+        after=after,
+        floor=(one, end),
+        gap=(gap_before, gap_after, independent),
+        held=judged_on,
+        n_fit=len(given.steps),
+        n_rows=dataset.rows,
+        source=dataset.source,
+        interpolated=dataset.interpolated,
+    )
+
+
+def _belongs(data: Dataset, model: ComposedModel) -> None:
+    if (data.states, data.inputs, data.dt) != (model.states, model.inputs, model.dt):
+        raise UsageError(
+            f"{data.source}: was laid on a grid for states {', '.join(data.states)}, inputs {', '.join(data.inputs)}, dt {data.dt:g} s; "
+            f"the model has {', '.join(model.states)}, {', '.join(model.inputs)}, {model.dt:g} s"
+        )
+
+
+def _held_out(checked: Checked, seen: Mask, test: Dataset | None, model: ComposedModel, horizon: float) -> Held:
+    """The transitions that the fit does not see."""
+    if test is not None:
+        _belongs(test, model)
+        other = check(model, test)
+        everything = np.ones(sum(len(run.y) - 1 for run in other.data.runs), dtype=bool)
+        return held(other.data, steps_of(other.data, other.left_out), other.left_out, everything, horizon)
+    steps = steps_of(checked.data, checked.left_out)
+    return held(checked.data, steps.take(np.flatnonzero(~seen[steps.place])), checked.left_out, ~seen, horizon)
+
+
+def _enough(data: Dataset, fit_part: Part, judged_on: Held) -> None:
+    usable = len(fit_part.steps) + len(judged_on.steps)
+    if usable < FEWEST or not len(judged_on.steps):
+        raise NotEnoughEvidence(
+            f"{data.source}: {usable} usable transitions of {data.dt:g} s, at least {FEWEST} are needed: {max(FEWEST - usable, 1)} more",
+            max(FEWEST - usable, 1),
+        )
+    u = np.concatenate([run.u for run in fit_part.data.runs])
+    if not np.any(u):
+        raise NotEnoughEvidence(
+            f"{data.source}: every input is zero in the part that is fitted; nothing can be traced until the robot is asked to move"
+        )
+
+
+def _confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
+    """Less the effects without which the held-out data are foretold as well: what wandered in the fit's part need not go on."""
+    fit, again = chosen.fit, True
+    while again and fit.added:
+        again = False
+        for place in fit.added:
+            less = fitted(given, fit, without(fit.model, place), 2)
+            if not better(judged_on, fit.model, less.model, CONFIRMED):
+                fit, again = less, True
+                break
+    return chosen if fit is chosen.fit else replace(chosen, fit=fit, rivals=() if not fit.added else chosen.rivals)
+
+
+def _structure(given: Problem, chosen: Selection, horizon: int) -> Structure:
+    """Of what the chosen model leaves; on a part of a long recording."""
+    if len(given.steps) <= STRUCTURE_STEPS:
+        return lack_of_fit(given, chosen.fit, chosen.nominal, horizon)
+    block = len(given.steps) * BLOCK // STRUCTURE_STEPS
+    few = Problem(given.data, given.steps.take(np.flatnonzero(np.arange(len(given.steps)) % block < BLOCK)), given.floor)
+    return lack_of_fit(few, evaluate(few, chosen.fit.model), evaluate(few, chosen.nominal.model), horizon)
+
+
+def _verdict(chosen: Selection, structure: Structure, checked: Checked) -> Verdict:
+    """One of the five."""
+    faulty = any(fault.kind != "dropout" for fault in checked.faults)
+    if not chosen.fit.added:
+        return "unexplained" if structure.matters else "sensor_fault" if faulty else "none"
+    about = {token for place in chosen.fit.added for token in _about(chosen.fit.model, place)}
+    limit = SAME_KIND if about & set(structure.tokens) else LARGE
+    if structure.matters and structure.share > limit:
+        return "unexplained"
+    return "ambiguous" if chosen.rivals else "traced"
+
+
+def _about(model: ComposedModel, place: int) -> list[str]:
+    """Tokens that speak of the same thing as an effect does."""
+    a = model.effects[place]
+    names = model.inputs if a.channel == "*" else (a.channel,)
+    memory = a.effect.stage == "input" and a.effect.hidden(1, model.nominal, a.channel, model.dt, a.p).size > 0
+    return [f"memory({name})" if memory else name for name in names]
+
+
+def _final(chosen: Selection, verdict: Verdict) -> Fit:
+    """The model that is handed on: with the effects, unless their names were withdrawn."""
+    return chosen.nominal if verdict in {"unexplained", "sensor_fault", "none"} else chosen.fit
+
+
+def _new(fit: Fit, other: Fit) -> list[int]:
+    """Places of the effects of one fit that the other does not have."""
+    there = {(a.effect.name, a.channel) for a in other.model.effects}
+    return [i for i in fit.added if (fit.model.effects[i].effect.name, fit.model.effects[i].channel) not in there]
+
+
+def _found(model: ComposedModel, fit: Fit, place: int, ranges: dict[tuple[int, str], tuple[float, float]]) -> Found:
+    a = fit.model.effects[place]
+    values = {}
+    for p in a.effect.parameters:
+        if p.name in a.p:
+            low, high = (None if end is None else float(end) for end in ranges.get((place, p.name), (None, None)))
+            values[p.name] = (a.p[p.name], low, high, a.effect.unit(model.nominal, a.channel, p.name))
+    return Found(a.effect.name, a.channel, values)
+
+
+def _spec(model: ComposedModel, final: Fit, data: Dataset) -> ModelSpec:
+    """The repaired model; the one given, if nothing was added."""
+    if not final.added:
+        return model.spec
+    effects = tuple(EffectSpec(a.effect.name, a.channel, a.p) for a in final.model.effects)
+    fitted_on = tuple(dict.fromkeys((*model.spec.fitted_on, *data.digests)))
+    return msgspec.structs.replace(model.spec, effects=effects, fitted_on=fitted_on)
