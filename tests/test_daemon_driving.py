@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from daemon_rig import Rig
+from daemon_rig import Rig, made_up_certificate
 
+from s2r_runtime import keys
 from s2r_runtime.messages import AnalyticsChanged, Decided, GateChanged, Measured, Revoked, Send, SourceStopped
 
 
@@ -195,6 +197,44 @@ def test_verification_of_a_real_gap_decides_who_drives(rig: Rig) -> None:
     rig.until(lambda: rig.status()["scenarios"] >= 1)
     assert list((rig.state / "certificates").glob("*.json"))
     assert {m.source for m in rig.messages("out/send") if isinstance(m, Send)} == {"recovery", "sampler", "controller"}
+
+
+def test_certificate_signed_elsewhere_counts_only_if_its_key_is_trusted(rig: Rig) -> None:
+    rig.start_robot()
+    rig.start()
+    rig.until(lambda: rig.status()["observation"])
+    controller, office = rig.controller(), rig.folder / "office.pem"
+    keys.new(office)
+    made = made_up_certificate(rig.profile, office, controller, radius=0.01, verified=0.02, epoch=1)
+    refused = rig.ask("deploy", path=str(controller), certificate=made)
+    assert (refused["exit_code"], "not trusted here" in refused["text"]) == (78, True), refused
+    (rig.state / "trusted").mkdir()
+    shutil.copy(keys.public_path(office), rig.state / "trusted" / "office.pub")
+    accepted = rig.ask("deploy", path=str(controller), certificate=made)
+    assert accepted["exit_code"] == 0, accepted
+    rig.until_status(gate="open")
+
+
+def test_effect_that_was_traced_and_adopted_makes_a_smaller_gap_and_its_own_samples_never_bound_it(rig: Rig) -> None:
+    rig.start_robot("--gain", "0.7")
+    rig.start()
+    before = rig.sample()
+    trace = rig.ask("trace")
+    assert trace["exit_code"] == 0, trace
+    (effect,) = trace["data"]["effects"]
+    assert (effect["name"], effect["channel"]) == ("input_gain", "w")
+    gain = effect["parameters"]["gain"]
+    assert gain["low"] <= 0.7 <= gain["high"]
+    model = Path(trace["data"]["model_path"])
+    assert rig.ask("adopt", text=model.read_text(), base=str(model.parent))["exit_code"] == 0
+    status = rig.status()
+    assert (status["radius"], status["epoch"]) == (None, 1)
+    after = rig.sample()
+    assert (after["exit_code"], after["data"]["epoch"]) == (0, 2), after
+    assert after["data"]["hold_radius"] < 0.5 * before["data"]["hold_radius"]
+    rig.stop()
+    own = rig.s2r("gap", str(rig.log_files()[0]), "--profile", str(rig.profile), "--model", str(model), "--epsilon", "0.3")
+    assert own.returncode == 0, own.stderr  # its last campaign is the fresh one
 
 
 def test_in_real_time_a_controller_drives_at_the_robots_pace(tmp_path: Path) -> None:
