@@ -81,7 +81,7 @@ class VerificationSettings(_Table, frozen=True):
     headroom: float = 1.5
     laws: tuple[Literal["uniform", "persistent", "adversarial"], ...] = ("uniform", "persistent", "adversarial")
     required: tuple[Literal["uniform", "persistent", "adversarial"], ...] = ("uniform", "persistent")
-    timeout: float = 600.0
+    timeout: float = 60.0
 
 
 class TaskChoice(_Table, frozen=True):

@@ -164,3 +164,25 @@ def test_doctor_and_plugins_say_what_is_here() -> None:
     assert json.loads(s2r("doctor", "--json").stdout)["ok"] is True
     listed = json.loads(s2r("plugin", "list", "--json").stdout)["plugins"]
     assert {p["name"] for p in listed} >= {"builtin", "zenoh", "standins"}
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [
+        ("import os\ndef control(x, theta, parameters):\n    os._exit(0)\n", "died"),
+        ("def control(x, theta, parameters):\n    while True:\n        pass\n", "not done within"),
+        ("def control(x, theta, parameters):\n    raise KeyError('gain')\n", "KeyError"),
+        ("def control(x, theta, parameters):\n    return x[:, :1]\n", "shape"),
+        ("import numpy as np\ndef control(x, theta, parameters):\n    return np.full((len(x), 2), np.nan)\n", "finite"),
+        ("import numpy as np\ndef control(x, theta, parameters):\n    return np.zeros((len(x), 2))\n", "standing still"),
+    ],
+)
+def test_a_controller_that_fails_never_passes(tmp_path: Path, code: str, reason: str) -> None:
+    controller, profile = tmp_path / "bad.py", tmp_path / "robot.toml"
+    controller.write_text(code)
+    profile.write_text(PROFILE.read_text().replace("[verification]", "[verification]\ntimeout = 4.0"))
+    done = s2r("verify", controller, "--profile", profile, "--radius", "0.0015", "--hold-radius", "0.002", "--json")
+    assert done.returncode == 1, done.stderr
+    answer = json.loads(done.stdout)
+    assert answer["passed"] is False
+    assert reason in answer["reason"]

@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     from s2r_runtime import verify as verification
     from s2r_runtime.bounds import attempt_beta, epoch_beta
     from s2r_runtime.canonical import digest
-    from s2r_runtime.cli.evidence import gap_of, print_verification, profile_model, run_verification
+    from s2r_runtime.cli.evidence import at_headroom, gap_of, print_verification, profile_model, run_verification
     from s2r_runtime.daemon import persistence
     from s2r_runtime.plugins import registry
 
@@ -51,19 +51,8 @@ def run(args: argparse.Namespace) -> int:
     gap = gap_of(args.recording, model, profile, beta=epoch_beta(profile.guarantee.beta, epoch), epoch=epoch)
     attempt = ledger.spend_attempt(controller.digest)
     beta = attempt_beta(profile.guarantee.beta, attempt)
-    headroom = profile.verification.headroom
-    result = run_verification(
-        controller,
-        model,
-        profile,
-        radius=gap.radius * headroom,
-        hold_radius=gap.hold_radius * headroom,
-        hold_periods=gap.hold_periods,
-        laws=profile.verification.laws,
-        n=0,
-        attempt=attempt,
-        beta=beta,
-    )
+    against = at_headroom(gap, profile)
+    result = run_verification(controller, model, profile, gap=against, laws=profile.verification.laws, n=0, attempt=attempt, beta=beta)
     spent = ledger.spent(profile.guarantee.beta)
     if result.passed:
         task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)

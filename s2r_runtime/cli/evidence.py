@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import add_model_options, chosen_model, controller_at, count, load_checked, positive, probability, weights_of
+from s2r_runtime.errors import NotEnoughEvidence
 
 if TYPE_CHECKING:
     from s2r_runtime.controllers.hosted import ControllerFile
-    from s2r_runtime.messages import Gap
+    from s2r_runtime.daemon.worker import Failed, VerifyJob
+    from s2r_runtime.messages import Gap, Verification
     from s2r_runtime.models.composed import ComposedModel
     from s2r_runtime.profile import Profile
 
@@ -111,28 +116,44 @@ def run_verify(args: argparse.Namespace) -> int:
     profile = load_checked(args.profile)
     model = profile_model(args, profile)
     epoch_gap = gap_of(args.recording, model, profile) if args.recording else None
-    radius = args.radius or (epoch_gap.radius * profile.verification.headroom if epoch_gap else 0.0)
-    periods = epoch_gap.hold_periods if epoch_gap else profile.sampling.hold_periods
-    hold = epoch_gap.hold_radius * profile.verification.headroom if epoch_gap else args.hold_radius or radius * periods**0.5
     laws = tuple(args.law) if args.law else profile.verification.laws
-    result = run_verification(
-        controller_at(args.controller, args.param),
-        model,
-        profile,
-        radius=radius,
-        hold_radius=hold,
-        hold_periods=periods,
-        laws=laws,
-        n=args.n,
-        attempt=1,
-        beta=profile.guarantee.beta,
-    )
+    gap = at_headroom(epoch_gap, profile) if epoch_gap else _gap_at(args.radius, args.hold_radius, model, profile)
+    controller = controller_at(args.controller, args.param)
+    result = run_verification(controller, model, profile, gap=gap, laws=laws, n=args.n, attempt=1, beta=profile.guarantee.beta)
     answer = verification.verification_json(result)
     if args.json:
         output.result_json(answer)
     else:
         print_verification(answer)
     return 0 if result.passed else 1
+
+
+def at_headroom(gap: Gap, profile: Profile) -> Gap:
+    """The gap that is verified against: both radii times the profile's headroom."""
+    headroom = profile.verification.headroom
+    return msgspec.structs.replace(gap, radius=gap.radius * headroom, hold_radius=gap.hold_radius * headroom)
+
+
+def _gap_at(radius: float, hold_radius: float | None, model: ComposedModel, profile: Profile) -> Gap:
+    """A gap of that radius that nobody measured: for `--radius`."""
+    from s2r_runtime.messages import Gap
+
+    periods = profile.sampling.hold_periods
+    return Gap(
+        radius=radius,
+        radius_literal=radius,
+        hold_radius=hold_radius or radius * periods**0.5,
+        hold_periods=periods,
+        set=profile.norm.set,
+        weights=weights_of(model.states, [], profile),
+        n=0,
+        discarded=0,
+        epsilon=profile.guarantee.epsilon,
+        beta=profile.guarantee.beta,
+        epoch=0,
+        model_digest=model.spec.digest(),
+        transitions_digest="",
+    )
 
 
 def profile_model(args: argparse.Namespace, profile: Profile) -> ComposedModel:
@@ -148,7 +169,6 @@ def profile_model(args: argparse.Namespace, profile: Profile) -> ComposedModel:
 def gap_of(recording: Path, model: ComposedModel, profile: Profile, *, beta: float | None = None, epoch: int = 1) -> Gap:
     """The gap that a campaign shows under the profile's settings. Raises NotEnoughEvidence if it carries no statement."""
     from s2r_runtime import gap as gaps
-    from s2r_runtime.errors import NotEnoughEvidence
     from s2r_runtime.transitions import load_transitions
 
     found = load_transitions(recording, model, dict(profile.columns))
@@ -173,44 +193,70 @@ def run_verification(
     model: ComposedModel,
     profile: Profile,
     *,
-    radius: float,
-    hold_radius: float,
-    hold_periods: int,
+    gap: Gap,
     laws: tuple[str, ...],
     n: int,
     attempt: int,
     beta: float,
-) -> Any:
-    """Verification of a controller file under a profile, with progress on a terminal."""
-    from s2r_runtime import verify as verification
-    from s2r_runtime.controllers import hosted as controllers
-    from s2r_runtime.plugins import registry
-    from s2r_runtime.uncertain import GapSet
+) -> Verification:
+    """Verification on `gap` under a profile, in a worker process: the controller's code runs confined, silenced, and for a limited time.
 
-    task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
+    A controller that ends the worker or outlasts `verification.timeout` has not passed, with that as the reason.
+    """
+    from s2r_runtime import messages
+    from s2r_runtime import verify as verification
+    from s2r_runtime.bounds import sample_size
+    from s2r_runtime.daemon.worker import VerifyJob
+
     # laws asked for by name are what the question is about, even where the profile does not require them
     required = tuple(law for law in profile.verification.required if law in laws) or laws
-    gap_set = GapSet(profile.norm.set, weights_of(model.states, [], profile), radius, hold_radius, hold_periods)
-    bar = output.Progress("verifying")
-    try:
-        return verification.verify(
-            controllers.batch_control(controller),
-            task,
-            model,
-            gap_set=gap_set,
-            laws=laws,
-            required=required,
-            n=n or profile.verification.n,
-            epsilon=profile.verification.epsilon,
-            beta=beta,
-            threshold=profile.verification.threshold,
-            seed=verification.seed_for(controller.digest, model.spec.digest(), profile.task_digest(), attempt),
-            attempt=attempt,
-            controller_digest=controller.digest,
-            task_digest=profile.task_digest(),
-            progress=bar,
+    needed = sample_size(profile.verification.epsilon, beta)
+    if 0 < n < needed:
+        raise NotEnoughEvidence(
+            f"-n {n}: {needed} scenarios are needed for epsilon {profile.verification.epsilon:g} and beta {beta:.4g}: {needed - n} more",
+            needed - n,
         )
+    settings = msgspec.structs.replace(profile.verification, laws=laws, required=required, n=n or profile.verification.n)
+    asked = msgspec.structs.replace(profile, model=model.spec, verification=settings)
+    seed = verification.seed_for(controller.digest, model.spec.digest(), profile.task_digest(), attempt)
+    done = _work(VerifyJob(asked, controller, gap, gap.radius, gap.hold_radius, attempt, seed, beta), settings.timeout)
+    if isinstance(done, messages.Verification):
+        return done
+    return messages.Verification(
+        passed=False,
+        radius=gap.radius,
+        hold_radius=gap.hold_radius,
+        threshold=settings.threshold,
+        epsilon=settings.epsilon,
+        beta=beta,
+        attempt=attempt,
+        seed=seed,
+        laws=(),
+        controller_digest=controller.digest,
+        model_digest=model.spec.digest(),
+        task_digest=profile.task_digest(),
+        reason=done.text,
+    )
+
+
+def _work(job: VerifyJob, timeout_s: float) -> Verification | Failed:
+    """The job's verification, or why there is none; progress on a terminal."""
+    from s2r_runtime.daemon.worker import Failed, Progress, Worker
+
+    bar = output.Progress("verifying")
+    worker = Worker(job, timeout_s)
+    try:
+        while True:
+            for message in worker.poll(time.monotonic_ns()):
+                if isinstance(message, Progress):
+                    bar(message.done, message.total, message.detail)
+                elif isinstance(message, Failed):
+                    return message
+                else:
+                    return message.verification or Failed("the worker gave no verification")
+            time.sleep(0.01)
     finally:
+        worker.stop()
         bar.close()
 
 
@@ -223,5 +269,5 @@ def print_verification(answer: dict[str, Any]) -> None:
         note = "" if r["required"] else "  (reported, not required)"
         output.out(f"  {law:12s} {r['n']:6d} scenarios  s* {r['s_star']:+.4f}  {failures}  progress {r['progress']:.3f}{note}")
     output.out(answer["statement"])
-    for line in answer["not_shown"]:
+    for line in answer["not_shown"] if answer["passed"] else ():
         output.out(f"  not shown: {line}")
