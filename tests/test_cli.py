@@ -174,7 +174,7 @@ def test_doctor_and_plugins_say_what_is_here() -> None:
         ("def control(x, theta, parameters):\n    raise KeyError('gain')\n", "KeyError"),
         ("def control(x, theta, parameters):\n    return x[:, :1]\n", "shape"),
         ("import numpy as np\ndef control(x, theta, parameters):\n    return np.full((len(x), 2), np.nan)\n", "finite"),
-        ("import numpy as np\ndef control(x, theta, parameters):\n    return np.zeros((len(x), 2))\n", "standing still"),
+        ("import numpy as np\ndef control(x, theta, parameters):\n    return np.zeros((len(x), 2))\n", "under uniform"),
     ],
 )
 def test_a_controller_that_fails_never_passes(tmp_path: Path, code: str, reason: str) -> None:
@@ -186,3 +186,15 @@ def test_a_controller_that_fails_never_passes(tmp_path: Path, code: str, reason:
     answer = json.loads(done.stdout)
     assert answer["passed"] is False
     assert reason in answer["reason"]
+
+
+@pytest.mark.parametrize("option", ["-o", "--report"])
+def test_trace_checks_where_its_output_goes_before_it_works(table: Path, tmp_path: Path, option: str) -> None:
+    refused(s2r("trace", table, *MODEL, option, tmp_path / "none" / "a.toml"), 2, "a.toml", "no folder")
+    refused(s2r("trace", table, *MODEL, option, tmp_path), 2, "is a folder")
+
+
+@pytest.mark.parametrize("verb", [("report",), ("log", "recover")])
+def test_verbs_about_logs_check_where_their_output_goes_before_they_work(table: Path, tmp_path: Path, verb: tuple[str, ...]) -> None:
+    refused(s2r(*verb, table, "-o", tmp_path / "none" / "a.out"), 2, "a.out", "no folder")
+    refused(s2r(*verb, table, "-o", tmp_path), 2, "is a folder")
