@@ -13,8 +13,6 @@ the effects are run in SUBSTEPS parts of the step, of which the last one stands 
 
 from __future__ import annotations
 
-import ast
-import importlib.util
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,6 +26,7 @@ from numpy.typing import NDArray
 from s2r_runtime.canonical import digest
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import Effect, NominalModel
+from s2r_runtime.models.file_model import load_file_model
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
 
@@ -170,7 +169,7 @@ class ComposedModel:
 
 def compose(spec: ModelSpec, where: str = "model") -> ComposedModel:
     """The model that a spec describes. Raises ConfigError (unknown names with the nearest known one, bad parameters)."""
-    nominal = _file_model(spec, where) if spec.name.endswith(".py") else _registered(spec, where)
+    nominal = load_file_model(spec, where) if spec.name.endswith(".py") else _registered(spec, where)
     for name in spec.parameters:
         if name not in nominal.parameters:
             known = ", ".join(nominal.parameters) or "none"
@@ -217,25 +216,6 @@ def _effect_parameters(effect: Effect, given: dict[str, Any], where: str) -> dic
     return dict(given)
 
 
-@dataclass
-class _FileModel:
-    """A user's Python file as a nominal model."""
-
-    name: str
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
-    angles: tuple[str, ...]
-    parameters: dict[str, float]
-    function: Any
-
-    def step(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
-        """Calls the file's `step`; raises ConfigError if its result has the wrong shape."""
-        result = np.array(self.function(x, u, dt, parameters), dtype=np.float64)
-        if result.shape != x.shape:
-            raise ConfigError(f"{self.name}: step returned shape {result.shape}, must be {x.shape}")
-        return result
-
-
 def resolve_source(spec: ModelSpec, base: Path) -> ModelSpec:
     """Makes a file model's path absolute (relative to `base`) and fills in its source digest."""
     if not spec.name.endswith(".py"):
@@ -246,34 +226,3 @@ def resolve_source(spec: ModelSpec, base: Path) -> ModelSpec:
     except OSError as error:
         raise ConfigError(f"{path}: model file cannot be read: {error.strerror}") from None
     return msgspec.structs.replace(spec, name=str(path), source_digest=digest(source))
-
-
-def _file_model(spec: ModelSpec, where: str) -> NominalModel:
-    path = Path(spec.name)
-    try:
-        source = path.read_bytes()
-        ast.parse(source)
-        module_spec = importlib.util.spec_from_file_location(path.stem, path)
-        if module_spec is None or module_spec.loader is None:
-            raise ConfigError(f"{path}: is not a Python file")
-        module = importlib.util.module_from_spec(module_spec)
-        module_spec.loader.exec_module(module)
-    except ConfigError:
-        raise
-    except OSError as error:
-        raise ConfigError(f"{where}.name: {path} cannot be read: {error.strerror}") from None
-    except Exception as error:  # noqa: BLE001 - a user's file: whatever it raises is its report
-        raise ConfigError(f"{path}: {type(error).__name__}: {error}") from None
-    if spec.source_digest and spec.source_digest != digest(source):
-        raise ConfigError(f"{path}: has changed since the model was saved (digest {digest(source)}, saved {spec.source_digest})")
-    for name in ("STATES", "INPUTS", "PARAMS", "step"):
-        if not hasattr(module, name):
-            raise ConfigError(f"{path}: lacks {name}; a model file has STATES, INPUTS, PARAMS and step(x, u, dt, params)")
-    return _FileModel(
-        str(path),
-        tuple(module.STATES),
-        tuple(module.INPUTS),
-        tuple(getattr(module, "ANGLES", ())),
-        {k: float(v) for k, v in module.PARAMS.items()},
-        module.step,
-    )

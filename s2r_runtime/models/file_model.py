@@ -1,0 +1,115 @@
+"""A user's Python file as a nominal model: whatever it does wrong is one line that names the file and the place in it.
+
+What it prints goes to stderr, since stdout belongs to the results of the program that uses it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import sys
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.canonical import digest
+from s2r_runtime.errors import ConfigError, one_line
+from s2r_runtime.hookspecs import NominalModel
+from s2r_runtime.modelspec import ModelSpec
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class FileModel:
+    """The names in the file, and its `step`."""
+
+    name: str
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    angles: tuple[str, ...]
+    parameters: dict[str, float]
+    function: Callable[..., Any]
+
+    def step(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
+        """Calls the file's `step`: x (n, nx), u (n, nu) -> (n, nx).
+
+        Raises ConfigError if it raises or exits, or if its result has the wrong shape, or is not finite where x and u are.
+        """
+        try:
+            # a division by zero shows in the result, which is checked
+            with contextlib.redirect_stdout(sys.stderr), np.errstate(all="ignore"):
+                result = np.array(self.function(x, u, dt, parameters), dtype=np.float64)
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - a user's file: whatever it raises is its report
+            raise _failed(self.name, "step", error) from None
+        if result.shape != x.shape:
+            raise ConfigError(f"{self.name}: step returned shape {result.shape}, must be {x.shape}")
+        given = np.isfinite(np.hstack([x, u])).all(axis=1, keepdims=True)
+        wrong = np.argwhere(~np.isfinite(result) & given)
+        if len(wrong):
+            row, column = map(int, wrong[0])
+            raise ConfigError(
+                f"{self.name}: step returned {result[row, column]} for state {self.states[column]!r} in row {row}"
+                f" (x = {x[row].tolist()}, u = {u[row].tolist()}), must be finite"
+            )
+        return result
+
+
+def load_file_model(spec: ModelSpec, where: str) -> NominalModel:
+    """The model in the file that `spec` names. Raises ConfigError saying what is wrong, and in which line."""
+    path = Path(spec.name)
+    try:
+        source = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{where}.name: {path} cannot be read: {error.strerror}") from None
+    module = _run(path)
+    if spec.source_digest and spec.source_digest != digest(source):
+        raise ConfigError(f"{path}: has changed since the model was saved (digest {digest(source)}, saved {spec.source_digest})")
+    for name in ("STATES", "INPUTS", "PARAMS", "step"):
+        if not hasattr(module, name):
+            raise ConfigError(f"{path}: lacks {name}; a model file has STATES, INPUTS, PARAMS and step(x, u, dt, params)")
+    if not callable(module.step):
+        raise ConfigError(f"{path}: step is {module.step!r}, must be a function step(x, u, dt, params)")
+    try:
+        parameters = {str(k): float(v) for k, v in dict(module.PARAMS).items()}
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{path}: PARAMS must be a dict of numbers: {error}") from None
+    states, inputs, angles = (_names(path, module, name) for name in ("STATES", "INPUTS", "ANGLES"))
+    return FileModel(str(path), states, inputs, angles, parameters, module.step)
+
+
+def _run(path: Path) -> ModuleType:
+    """The module that the file makes."""
+    module_spec = importlib.util.spec_from_file_location(path.stem, path)
+    if module_spec is None or module_spec.loader is None:
+        raise ConfigError(f"{path}: is not a Python file")
+    module = importlib.util.module_from_spec(module_spec)
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            module_spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - a user's file: whatever it raises is its report
+        raise _failed(str(path), "loading it", error) from None
+    return module
+
+
+def _names(path: Path, module: ModuleType, name: str) -> tuple[str, ...]:
+    given = getattr(module, name, ())
+    if not isinstance(given, tuple | list) or not all(isinstance(one, str) for one in given):
+        raise ConfigError(f"{path}: {name} is {given!r}, must be a tuple of names")
+    return tuple(given)
+
+
+def _failed(path: str, doing: str, error: BaseException) -> ConfigError:
+    """What the file raised, and the last of its lines that took part."""
+    line = error.lineno if isinstance(error, SyntaxError) and error.filename == path else None
+    for frame in traceback.extract_tb(error.__traceback__):
+        if frame.filename == path:
+            line = frame.lineno
+    what = "ended the program (SystemExit)" if isinstance(error, SystemExit) else f"raised {type(error).__name__}: {one_line(str(error))}"
+    return ConfigError(f"{path}{'' if line is None else f', line {line}'}: {doing} {what}")

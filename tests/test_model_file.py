@@ -1,0 +1,72 @@
+"""A model file of the user's own: it is a model like any other, and what it does wrong is told with its place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from s2r_runtime.errors import ConfigError
+from s2r_runtime.models.composed import ComposedModel, compose
+from s2r_runtime.modelspec import ModelSpec
+
+HEAD = 'import sys\nimport numpy as np\nSTATES = ("x", "v")\nINPUTS = ("force",)\nPARAMS = {"mass": 2.0}\n'
+STEP = "def step(x, u, dt, params):\n    "
+GOOD = 'return np.column_stack([x[:, 0] + dt * x[:, 1], x[:, 1] + dt * u[:, 0] / params["mass"]])\n'
+
+
+def model(tmp_path: Path, text: str) -> ComposedModel:
+    path = tmp_path / "own.py"
+    path.write_text(text)
+    return compose(ModelSpec(str(path), 0.1))
+
+
+def test_a_file_is_a_model(tmp_path: Path) -> None:
+    after, _ = model(tmp_path, HEAD + STEP + GOOD).step(np.array([[1.0, 2.0]]), np.array([[4.0]]), ())
+    assert after[0] == pytest.approx([1.2, 2.2])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (HEAD + "sys.exit(0)\n" + STEP + GOOD, r"own\.py, line 6: loading it ended the program"),
+        (HEAD + "1 / 0\n" + STEP + GOOD, r"own\.py, line 6: loading it raised ZeroDivisionError"),
+        (HEAD + "def step(:\n", r"own\.py, line 6: loading it raised SyntaxError"),
+        (HEAD, r"own\.py: lacks step"),
+        (HEAD + "step = 3\n", r"own\.py: step is 3, must be a function"),
+        (HEAD + 'PARAMS = {"mass": "heavy"}\n' + STEP + GOOD, r"own\.py: PARAMS must be a dict of numbers"),
+        (HEAD + "STATES = 2\n" + STEP + GOOD, r"own\.py: STATES is 2, must be a tuple of names"),
+    ],
+)
+def test_a_file_that_is_no_model_is_refused_with_its_place(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        model(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ("raise KeyError('zz')\n", r"own\.py, line 7: step raised KeyError: 'zz'"),
+        ("sys.exit(0)\n", r"own\.py, line 7: step ended the program"),
+        ("return np.zeros((len(x), 3))\n", r"step returned shape \(2, 3\), must be \(2, 2\)"),
+        ("y = x.copy(); y[1, 1] = np.nan; return y\n", r"step returned nan for state 'v' in row 1 .*must be finite"),
+        ("return x / 0.0\n", r"step returned inf for state 'x' in row 0"),
+    ],
+)
+def test_a_step_that_fails_is_told_with_its_place(tmp_path: Path, body: str, words: str) -> None:
+    own = model(tmp_path, HEAD + STEP + body)
+    with pytest.raises(ConfigError, match=words):
+        own.step(np.ones((2, 2)), np.ones((2, 1)), ())
+
+
+def test_what_is_not_finite_already_is_not_the_files_fault(tmp_path: Path) -> None:
+    after, _ = model(tmp_path, HEAD + STEP + GOOD).step(np.array([[np.inf, 1.0]]), np.ones((1, 1)), ())
+    assert after[0, 0] == np.inf
+
+
+def test_what_a_file_prints_goes_to_stderr(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model(tmp_path, HEAD + 'print("loading")\n' + STEP + 'print("stepping"); ' + GOOD).step(np.ones((1, 2)), np.ones((1, 1)), ())
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err == "loading\nstepping\n"
