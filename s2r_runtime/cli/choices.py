@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -59,6 +60,19 @@ def controller_at(path: Path, parameters: list[str]) -> ControllerFile:
     if not path.is_file():
         raise UsageError(f"{path}: no such file; a controller is a Python file with control(x, theta, parameters)")
     return controllers.load(path, dict(pair(item, "--param") for item in parameters))
+
+
+def writable(path: Path | None) -> None:
+    """Refuses a place where no file can be written, before the work whose result it is for. Raises UsageError."""
+    if path is None:
+        return
+    folder = path.parent
+    if path.is_dir():
+        raise UsageError(f"{path}: is a folder, must be a file")
+    if not folder.is_dir():
+        raise UsageError(f"{path}: cannot be written: there is no folder {folder}")
+    if not os.access(path if path.exists() else folder, os.W_OK):
+        raise UsageError(f"{path}: cannot be written: permission denied")
 
 
 def load_checked(path: Path) -> Profile:

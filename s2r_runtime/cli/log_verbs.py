@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from s2r_runtime.cli import output
+from s2r_runtime.cli.choices import writable
 from s2r_runtime.errors import UsageError
 
 
@@ -66,6 +67,7 @@ def run_report(args: argparse.Namespace) -> int:
     from s2r_runtime.report.run_page import log_page
 
     _need(args.log)
+    writable(args.output)
     page = log_page(args.log)
     try:
         args.output.write_text(page, encoding="utf-8")
@@ -82,6 +84,7 @@ def run_recover(args: argparse.Namespace) -> int:
     _need([args.log])
     if args.output.resolve() == args.log.resolve():
         raise UsageError(f"-o {args.output}: is the log itself; the original is kept, name another file")
+    writable(args.output)
     account = recover(args.log, args.output)
     if args.json:
         output.result_json(account)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import add_model_options, chosen_model, count, positive, weights_of
+from s2r_runtime.cli.choices import add_model_options, chosen_model, count, positive, weights_of, writable
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -33,6 +33,8 @@ def run(args: argparse.Namespace) -> int:
     from s2r_runtime.modelspec import dump_model
     from s2r_runtime.trace.tracer import load_dataset, trace
 
+    writable(args.output)
+    writable(args.report)
     model, profile = chosen_model(args)
     columns = dict(profile.columns) if profile else {}
     data = load_dataset(args.recording, model, columns)
