@@ -124,6 +124,25 @@ def test_controller_that_fails_in_verification_has_not_passed(tmp_path: Path, bo
     assert words in said.verification.reason
 
 
+def test_prints_of_a_controller_cost_nothing_even_where_stderr_is_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "grid.py"
+    loud = "    import sys\n    print('step', flush=True)\n    print('step', file=sys.stderr, flush=True)\n"
+    path.write_text("def control(x, theta, parameters):\n" + loud + "    return x[:, :2] * 0\n")
+    kept = os.dup(2)
+    with (tmp_path / "stderr").open("wb") as file:
+        os.dup2(file.fileno(), 2)
+        try:
+            said = finished(verify_job(path))[-1]
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+    assert isinstance(said, Result), said
+    assert said.verification is not None
+    assert "Error" not in said.verification.reason
+    assert said.safety
+    assert b"step" not in (tmp_path / "stderr").read_bytes()
+
+
 def test_controller_that_hangs_in_verification_is_killed_in_time(tmp_path: Path) -> None:
     path = tmp_path / "slow.py"
     path.write_text("import time\n\n\ndef control(x, theta, parameters):\n    time.sleep(1000)\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,9 +13,6 @@ from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import Gap
 
 Progress = Callable[[float, float, str], None]
-
-MEMORY_BYTES = 4 << 30
-"""What a verification may hold: its arrays and whatever the controller allocates for some thousand rollouts at once."""
 
 MEMORY_BYTES = 4 << 30
 """What a controller may use in a verification: thousands of rollouts at once need more than driving, and less than a small computer has."""
@@ -70,6 +68,7 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
     profile, settings = job.profile, job.profile.verification
     model = compose(profile.model)
     task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
+    _discard_prints()
     confine(MEMORY_BYTES)
     result, details = verify_in_detail(
         batch_control(job.controller, len(model.inputs)),
@@ -91,6 +90,16 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
     lowest = -np.finfo(np.float64).max  # what `verify` counts a value that is no number as
     safety = {one.law: np.nan_to_num(one.rollouts.safety, nan=lowest, neginf=lowest, posinf=-lowest).tolist() for one in details}
     return Result(verification=result, safety=safety)
+
+
+def _discard_prints() -> None:
+    """What the controller prints goes nowhere. Confined, this process may not make a file longer: were stderr one, a print would raise
+    OSError, and a controller that prints would not pass.
+    """
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(nowhere, stream)
+    os.close(nowhere)
 
 
 def trace(job: TraceJob, progress: Progress) -> Result:
