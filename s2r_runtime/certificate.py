@@ -36,6 +36,10 @@ CLOCKS_APART_S = 60
 _DOMAIN = b"s2r certificate 1\n"
 
 
+class UntrustedKey(ConfigError):
+    """A certificate whose signer is not among the keys that are trusted here."""
+
+
 class Certificate(Struct, frozen=True):
     """Everything that was shown, and what it is bound to. `budget`: beta of the robot's life, of which gap and verification are shares."""
 
@@ -145,7 +149,7 @@ def load(data: bytes, trusted_keys: Iterable[bytes], now_unix_s: int | None = No
     trusted = tuple(trusted_keys)
     if signed.public_key not in trusted:
         known = ", ".join(map(keys.fingerprint, trusted)) or "none"
-        raise ConfigError(
+        raise UntrustedKey(
             f"{where}: is signed with the key {keys.fingerprint(signed.public_key)}, which is not trusted here (trusted: {known})"
         )
     if not keys.fits(signed.public_key, signed.signature, _DOMAIN + content):

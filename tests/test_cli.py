@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import gzip
 import json
+import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -198,3 +200,29 @@ def test_trace_checks_where_its_output_goes_before_it_works(table: Path, tmp_pat
 def test_verbs_about_logs_check_where_their_output_goes_before_they_work(table: Path, tmp_path: Path, verb: tuple[str, ...]) -> None:
     refused(s2r(*verb, table, "-o", tmp_path / "none" / "a.out"), 2, "a.out", "no folder")
     refused(s2r(*verb, table, "-o", tmp_path), 2, "is a folder")
+
+
+def test_a_socket_where_nobody_listens_is_told_in_words(tmp_path: Path) -> None:
+    done = s2r("status", "--socket", tmp_path / "none.sock")
+    refused(done, 2, "none.sock: no daemon answers: No such file or directory")
+    assert "Errno" not in done.stderr
+
+
+def test_what_the_daemon_refuses_is_told_as_the_programs_own_errors_are(tmp_path: Path) -> None:
+    path = tmp_path / "s"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(str(path))
+        listener.listen()
+
+        def answer() -> None:
+            connection, _ = listener.accept()
+            with connection:
+                connection.recv(4096)
+                connection.sendall(b'{"exit_code": 1, "text": "nothing drives"}\n')
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        done = s2r("undeploy", "--socket", path)
+        thread.join()
+    refused(done, 1)
+    assert done.stderr == "s2r: nothing drives\n"

@@ -208,6 +208,8 @@ def test_certificate_signed_elsewhere_counts_only_if_its_key_is_trusted(rig: Rig
     made = made_up_certificate(rig.profile, office, controller, radius=0.01, verified=0.02, epoch=1)
     refused = rig.ask("deploy", path=str(controller), certificate=made)
     assert (refused["exit_code"], "not trusted here" in refused["text"]) == (78, True), refused
+    for remedy in (f"{rig.state / 'trusted'}/", "s2r run --key FILE", f"s2r certify --key {rig.state / 'key.pem'}"):
+        assert remedy in refused["text"]
     (rig.state / "trusted").mkdir()
     shutil.copy(keys.public_path(office), rig.state / "trusted" / "office.pub")
     accepted = rig.ask("deploy", path=str(controller), certificate=made)

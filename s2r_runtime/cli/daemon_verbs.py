@@ -144,8 +144,10 @@ def run_deploy(args: argparse.Namespace) -> int:
     if args.certificate:
         try:
             request["certificate"] = args.certificate.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise UsageError(f"{args.certificate}: cannot be read: {error}") from None
+        except OSError as error:
+            raise UsageError(f"{args.certificate}: cannot be read: {error.strerror}") from None
+        except UnicodeDecodeError:
+            raise UsageError(f"{args.certificate}: is no certificate: not UTF-8 text") from None
     return _say(args, request)
 
 
@@ -175,8 +177,10 @@ def _say(args: argparse.Namespace, request: dict[str, Any], socket: Path | None 
     answer = _call(args, request, socket)
     if args.json:
         output.result_json(answer)
+    elif answer["exit_code"] == 0:
+        output.out(str(answer["text"]))
     else:
-        (output.out if answer["exit_code"] == 0 else output.err)(str(answer["text"]))
+        output.err(f"s2r: {answer['text']}")
     return int(answer["exit_code"])
 
 

@@ -274,7 +274,9 @@ def call(path: Path, request: Request, on_progress: Callable[[Request], None] | 
             raise UsageError(f"{path}: belongs to another user's daemon; only its owner and root may talk to it") from None
         except TimeoutError:
             raise UsageError(f"{path}: the daemon does not answer (waited {FIRST_LINE_WITHIN_S:.0f} s)") from None
-        except (OSError, ValueError) as error:
+        except OSError as error:
+            raise UsageError(f"{path}: no daemon answers: {error.strerror or error}") from None
+        except ValueError as error:
             raise UsageError(f"{path}: no daemon answers: {error}") from None
     raise UsageError(f"{path}: the daemon hung up before it answered; its log says why")
 

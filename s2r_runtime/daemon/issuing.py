@@ -52,9 +52,16 @@ def issue(daemon: Daemon, order: IssueCertificate) -> CertificateStored | Certif
 
 def load(daemon: Daemon, text: str, where: str, controller: str, request_id: int) -> CertificateStored:
     """A certificate that a person brings for this controller (digest), made elsewhere. Raises ConfigError with what is wrong with it."""
-    trusted = (keys.public_bytes(daemon.key), *keys.load_trusted([daemon.folder.path / "trusted"]))
+    folder = daemon.folder.path
+    trusted = (keys.public_bytes(daemon.key), *keys.load_trusted([folder / "trusted"]))
     data = text.encode()
-    certificate = certificates.load(data, trusted, int(time.time()), where)
+    try:
+        certificate = certificates.load(data, trusted, int(time.time()), where)
+    except certificates.UntrustedKey as error:
+        raise ConfigError(
+            f"{error}; put the signer's public key (.pub) into {folder / 'trusted'}/, or run the daemon with the signer's key"
+            f" (s2r run --key FILE), or certify with this daemon's (s2r certify --key {folder / 'key.pem'}, if run without --key)"
+        ) from None
     if certificate.controller_digest != controller:
         raise ConfigError(f"{where}: is of the controller {certificate.controller_digest}; the one to deploy is {controller}")
     stored = _store(daemon, certificate, data, certificate.gap, request_id)
