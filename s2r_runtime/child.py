@@ -51,7 +51,7 @@ class Child:
         self._pending = bytearray()
         self._read = bytearray()
         self._lines: list[bytes] = []
-        self._ended = False
+        self._ended = self._full = False
 
     @property
     def pid(self) -> int:
@@ -63,21 +63,28 @@ class Child:
         return self._out.fileno()
 
     def send(self, line: bytes) -> None:
-        """Hands a line to the child; keeps what it doesn't take yet (see `flush`)."""
+        """Hands a line to the child; keeps what it doesn't take yet (see `retry`)."""
         self.queue(line)
         self.flush()
 
     def queue(self, line: bytes) -> None:
-        """As `send`, with the next `flush`."""
+        """As `send`, together with the next line that is sent."""
         self._pending += line
         self._pending += b"\n"
 
+    def retry(self) -> None:
+        """Hands over what the child did not take earlier. Called now and then by the loop."""
+        if self._full:
+            self.flush()
+
     def flush(self) -> None:
-        """Hands over what was kept. Called now and then by the loop."""
+        """Hands over everything, as far as the child takes it."""
+        self._full = False
         while self._pending and not self._ended:
             try:
                 written = os.write(self._in.fileno(), self._pending[:PIPE_BYTES])
             except BlockingIOError:
+                self._full = True
                 self._ended = len(self._pending) > PENDING_MAX
                 return
             except OSError:  # it closed its end: it is gone, or going; what it said before can still be read
@@ -97,12 +104,12 @@ class Child:
         while True:
             if self._lines:
                 return self._lines.pop(0)
-            self.flush()
+            self.retry()
             left = deadline - time.monotonic()
             if self._ended or left <= 0.0:
                 return None
             # 20 ms: what the pipe didn't take is offered again
-            select.select([self._out], [], [], min(left, 0.02) if self._pending else left)
+            select.select([self._out], [], [], min(left, 0.02) if self._full else left)
             self._fill()
 
     def alive(self) -> bool:

@@ -68,6 +68,7 @@ class ConfinedProcess:
         self._epoll.register(self._channel, select.EPOLLIN)
         self._epoll.register(self._printed, select.EPOLLIN)
         self._out, self._in, self._output = bytearray(), bytearray(), bytearray()
+        self._writing = False
 
     def fileno(self) -> int:
         """Readable when there is something to receive, or room for what waits to be sent. Valid until `close`."""
@@ -170,7 +171,9 @@ class ConfinedProcess:
                 break
             except OSError:  # it closed its end; `receive` will see that
                 self._out.clear()
-        self._epoll.modify(self._channel, select.EPOLLIN | (select.EPOLLOUT if self._out else 0))
+        if self._writing != bool(self._out):
+            self._writing = bool(self._out)
+            self._epoll.modify(self._channel, select.EPOLLIN | (select.EPOLLOUT if self._writing else 0))
 
     def _drain(self) -> None:
         """Takes what it printed, so that printing doesn't block it."""

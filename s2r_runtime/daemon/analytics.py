@@ -7,6 +7,7 @@ order; every `Observation` is answered by one `Reply`, so that the daemon can wa
 
 from __future__ import annotations
 
+import gc
 import sys
 import time
 from typing import TYPE_CHECKING
@@ -152,7 +153,7 @@ class Analytics:
         """What came since the last call; notices a process that died or hangs."""
         if self.down:
             return []
-        self._child.flush()
+        self._child.retry()
         came = [message for line in self._child.lines() for message in self._taken(line)]
         self._gone(now_ns)
         return came
@@ -206,6 +207,8 @@ def main(arguments: list[str]) -> int:
                 stream.sent(message)
         elif isinstance(message, Watching):
             stream, epoch = _stream(message), message.gap.epoch
+            gc.collect()
+            gc.freeze()  # what a step leaves behind is little; it need not be looked for among all that stays
         else:
             say(channel, _ENCODE(_checked(message)))
     return 0

@@ -116,7 +116,7 @@ class Worker:
 
     def poll(self, now_ns: int) -> list[Upward]:
         """What came since the last call, and the end where it died or its time is over. Call at least every second."""
-        self._child.flush()
+        self._child.retry()
         came: list[Upward] = []
         for line in self._child.lines():
             try:
