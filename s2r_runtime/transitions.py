@@ -7,7 +7,8 @@ CSV with segments: the first row of each is x0. Its input must hold for at least
 unwrapped). Where the input holds h whole steps in every segment used, and the states last as long, the state at t0 + h dt is
 the hold's end. Segments are taken for independent draws that begin at rest: that is what the form says, it can't be checked here
 beyond the order of the samples (`whiteness`). Left out, and counted by reason: `first_row_incomplete`, `no_input`, `input_changed`,
-`too_short`.
+`too_short`; `not_received`, where rows reach t0 + dt and a state in them does not; `duplicate_stamp`, all rows on one stamp; `too_coarse`,
+the rows around t0 + dt more than 1.5 dt apart, so that x1 would be made up.
 
 CSV without segments: ordinary driving (`driving`).
 """
@@ -23,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.canonical import digest, digest_of
-from s2r_runtime.driving import Streams, drive_transitions, resolution, state_at, streams_noise
+from s2r_runtime.driving import MAX_GAP, Streams, drive_transitions, resolution, state_at, streams_noise
 from s2r_runtime.errors import RecordingError, UsageError
 from s2r_runtime.gap import Transitions
 from s2r_runtime.messages import CampaignFinished, Observed, SampleTaken, Send, Started
@@ -97,10 +98,21 @@ def _segment_transitions(model: ComposedModel, segments: list[Streams], recordin
             rejected[start] = rejected.get(start, 0) + 1
         else:
             used.append(start)
+    coarse = rejected.get("too_coarse", 0)
+    if coarse > len(segments) / 2:
+        apart = float(np.median(np.concatenate([np.diff(s.t) for s in segments])))
+        raise RecordingError(
+            f"{source}: rows are {apart:g} s apart, the model's step is {model.dt:g} s, so {coarse} of {len(segments)} segments show "
+            "nothing of one step; is t in seconds?"
+        )
     periods = min((start.whole_steps for start in used), default=1)
     held = None
     if periods > 1:
-        held = _rows([_states_at(model, s.streams, periods) for s in used], len(model.states))
+        ends = [_states_at(model, s.streams, periods) for s in used]
+        if all(measured for _, measured in ends):
+            held = _rows([x for x, _ in ends], len(model.states))
+        else:
+            periods = 1
     return Transitions(
         _rows([s.x0 for s in used], len(model.states)),
         _rows([s.u for s in used], len(model.inputs)),
@@ -131,11 +143,20 @@ def _first_transition(model: ComposedModel, s: Streams) -> _Start | str:
         return "input_changed"
     last = min(float(s.t[np.isfinite(s.x[:, c])][-1]) for c in range(s.x.shape[1]))
     if last < due - tolerance:
-        return "too_short"
-    x1 = _states_at(model, s, 1)
+        return _why_short(s, due - tolerance)
+    x1, measured = _states_at(model, s, 1)
+    if not measured:
+        return "too_coarse"
     for column in model.angle_columns:
         x0[column] = wrap(x0[column])
     return _Start(s, x0, u, x1, int((min(until, last) - s.t[0] + tolerance) / model.dt))
+
+
+def _why_short(s: Streams, due: float) -> str:
+    """Why a state was not received until then."""
+    if s.t[-1] >= due:
+        return "not_received"
+    return "duplicate_stamp" if len(s.t) > 1 and s.t[-1] == s.t[0] else "too_short"
 
 
 def _first_received(rows: Array) -> Array:
@@ -146,15 +167,16 @@ def _first_received(rows: Array) -> Array:
     return value
 
 
-def _states_at(model: ComposedModel, s: Streams, periods: int) -> Array:
-    """(nx,) the states `periods` steps after the segment began."""
+def _states_at(model: ComposedModel, s: Streams, periods: int) -> tuple[Array, bool]:
+    """(nx,) the states `periods` steps after the segment began; and whether rows near enough say so."""
     when, tolerance = s.t[:1] + periods * model.dt, resolution(s.t, model.dt)
-    x = np.empty(len(model.states))
+    x, widest = np.empty(len(model.states)), 0.0
     for column in range(len(model.states)):
         angle = column in model.angle_columns
-        value, _ = state_at(s, column, when, angle, tolerance)
+        value, width = state_at(s, column, when, angle, tolerance)
+        widest = max(widest, float(width[0]))
         x[column] = wrap(value)[0] if angle else value[0]
-    return x
+    return x, widest <= MAX_GAP * model.dt + 2.0 * tolerance
 
 
 def _rows(rows: Sequence[Array], width: int) -> Array:

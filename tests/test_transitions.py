@@ -67,6 +67,18 @@ def test_segments_that_give_no_transition_are_counted_by_reason(tmp_path: Path) 
     assert tr.rejected == {"input_changed": 1, "too_short": 1, "no_input": 1, "first_row_incomplete": 1}
 
 
+def test_rows_too_far_apart_to_show_one_step_are_no_transition(tmp_path: Path) -> None:
+    good = [f"g{i},{t},0,0,0,0.1,0.5" for i in range(3) for t in (0.0, 0.1)]
+    coarse = ["coarse,0.0,0,0,0,0.1,0.5", "coarse,1.0,0,0,0,0.1,0.5"]
+    blank = ["blank,0.0,0,0,0,0.1,0.5", "blank,0.1,,0,0,0.1,0.5"]
+    twice = ["twice,0.0,0,0,0,0.1,0.5", "twice,0.0,0,0,0,0.1,0.5"]
+    tr = load_transitions(table(tmp_path, good + coarse + blank + twice), MODEL)
+    assert tr.rejected == {"too_coarse": 1, "not_received": 1, "duplicate_stamp": 1}
+    assert len(tr.x0) == 3
+    with pytest.raises(RecordingError, match=r"rows are 100 s apart, the model's step is 0\.1 s.*is t in seconds\?"):
+        load_transitions(table(tmp_path, [f"s{i},{t},0,0,0,0.1,0.5" for i in range(3) for t in (0, 100)]), MODEL)
+
+
 def test_an_input_that_changes_when_the_step_is_over_has_held_long_enough(tmp_path: Path) -> None:
     rows = [f"{s},{s * 0.7 + k / 10:.1f},0,0,0,{0.1 if k == 0 else 0.2},0" for s in range(7) for k in range(3)]
     assert load_transitions(table(tmp_path, rows), MODEL).rejected == {}
