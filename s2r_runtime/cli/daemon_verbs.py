@@ -216,6 +216,8 @@ def _plain(value: object) -> str:
         return "-"
     if isinstance(value, float):
         return f"{value:.5g}"
+    if isinstance(value, list) and all(isinstance(item, dict) for item in value):  # scenarios: there may be a thousand of them
+        return f"{len(value)}, the last: {_plain(value[-1])}"
     if isinstance(value, list):
         return ", ".join(map(str, value))
     if isinstance(value, dict):
