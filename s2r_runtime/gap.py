@@ -171,15 +171,22 @@ def radius_of_noise(model: ComposedModel, tr: Transitions, weights: Array, kind:
     return float(np.median(largest))
 
 
-def blocked(tr: Transitions, seconds: float) -> Transitions:
+def blocked(tr: Transitions, seconds: float, dt: float) -> Transitions:
     """The first transition of every block of that length; independent under the assumption that blocks are, which is then stated.
 
-    Raises UsageError if the block is not longer than 0, or these are samples of a campaign that isn't whole: no assumption about time
-    mends that. Transitions that are independent anyway come back unchanged.
+    dt: the model's step, s; neighbours share a measurement, so a block takes two steps at least. The digests stay those of the
+    recording. Raises UsageError if the block is shorter, or these are no drive: segments and samples of a campaign are independent
+    already, or for a reason that no assumption about time mends.
     """
     if not 0.0 < seconds < float("inf"):
         raise UsageError(f"blocking is {seconds} s, must be > 0")
-    if tr.independent or len(tr.t0_s) == 0:
+    if seconds < 2.0 * dt * (1.0 - 1e-9):
+        raise UsageError(
+            f"blocking is {seconds:g} s, must be at least two steps of the model, {2.0 * dt:g} s: neighbours share a measurement"
+        )
+    if tr.independent:
+        raise UsageError(f"{tr.source}: blocking is for ordinary driving and has no use here: its transitions count as independent already")
+    if len(tr.t0_s) == 0:
         return tr
     if tr.drive is None:
         raise UsageError(f"{tr.source}: blocking is for ordinary driving, here {tr.doubt}")
@@ -224,9 +231,14 @@ def statement(gap: Gap, independent: bool, *, assumption: str = "", doubt: str =
         lines.append(f"This rests on an assumption that the user made: {assumption}.")
     if DEPENDENT in gap.white_reason:
         lines.append(f"Against the independence speaks that {gap.white_reason}.")
-    noise = f"; noise alone would make about {gap.radius_noise:.3g} of it" if gap.radius_noise is not None else ""
+    noise = f"; noise alone would make about {noise_share(gap.radius_noise, gap.radius)} of it" if gap.radius_noise is not None else ""
     lines.append(f"r bounds measured discrepancies, with the measurement noise in them{noise}.")
     return " ".join(lines)
+
+
+def noise_share(noise: float, radius: float) -> str:
+    """How much of r measurement noise explains, for a sentence: no more than all of it."""
+    return "all" if noise >= 0.95 * radius else f"{noise:.3g}"
 
 
 def gap_json(gap: Gap, tr: Transitions, states: tuple[str, ...]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import pytest
 
 from s2r_runtime.bounds import clopper_pearson_lower, clopper_pearson_upper, sample_size, scenario_confidence
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, UsageError
-from s2r_runtime.gap import Drive, Transitions, blocked, discrepancy, estimate_gap, gap_json, residuals, statement
+from s2r_runtime.gap import Drive, Transitions, blocked, discrepancy, estimate_gap, gap_json, noise_share, residuals, statement
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.whiteness import whiteness
@@ -233,7 +233,7 @@ def test_driving_gives_numbers_and_no_statement_until_blocks_are_vouched_for() -
     assert gap.radius == pytest.approx(np.linalg.norm(e, axis=1).max())
     assert gap_json(gap, tr, UNICYCLE.states)["independent"] is False
     assert statement(gap, False, doubt=tr.doubt).startswith("No statement: ordinary driving.")
-    vouched = blocked(tr, 1.0)
+    vouched = blocked(tr, 1.0, DT)
     assert vouched.independent
     assert len(vouched.x0) == 100
     np.testing.assert_allclose(np.diff(vouched.t0_s), 1.0)
@@ -248,14 +248,27 @@ def test_driving_gives_numbers_and_no_statement_until_blocks_are_vouched_for() -
 def test_blocks_must_have_a_length() -> None:
     rng = np.random.default_rng(12)
     with pytest.raises(UsageError, match="must be > 0"):
-        blocked(transitions(rng.normal(size=(10, 3)), rng), 0.0)
+        blocked(transitions(rng.normal(size=(10, 3)), rng), 0.0, DT)
+
+
+def test_blocks_are_two_steps_or_more_and_for_drives_only() -> None:
+    tr = transitions(np.zeros((10, 3)), np.random.default_rng(12))
+    with pytest.raises(UsageError, match=r"must be at least two steps of the model, 0\.2 s"):
+        blocked(tr, 0.19, DT)
+    with pytest.raises(UsageError, match="has no use here"):
+        blocked(tr, 1.0, DT)
+
+
+def test_noise_explains_no_more_than_all_of_the_gap() -> None:
+    assert noise_share(0.3, 0.1) == "all"
+    assert noise_share(0.05, 0.1) == "0.05"
 
 
 def test_blocks_do_not_mend_a_campaign_that_is_not_whole() -> None:
     rng = np.random.default_rng(12)
     tr = replace(transitions(rng.normal(size=(10, 3)), rng), independent=False, doubt="the log holds 10 of the 99 samples of campaign 1")
     with pytest.raises(UsageError, match="blocking is for ordinary driving, here the log holds 10 of the 99"):
-        blocked(tr, 1.0)
+        blocked(tr, 1.0, DT)
 
 
 def test_memory_of_an_effect_is_carried_along_a_drive() -> None:

@@ -78,7 +78,7 @@ def run_gap(args: argparse.Namespace) -> int:
     model, profile = chosen_model(args)
     found = load_transitions(args.recording, model, dict(profile.columns) if profile else {})
     if args.blocking:
-        found = gaps.blocked(found, args.blocking)
+        found = gaps.blocked(found, args.blocking, model.dt)
     result = gaps.estimate_gap(
         model,
         found,
@@ -101,7 +101,9 @@ def _print_gap(answer: dict[str, Any]) -> None:
     if answer["hold_periods"] > 1:
         output.out(f"hold gap        {answer['hold_radius']:.6g} over {answer['hold_periods']} periods")
     if answer.get("radius_noise"):
-        output.out(f"noise alone     would make {answer['radius_noise']:.3g} of it")
+        from s2r_runtime.gap import noise_share
+
+        output.out(f"noise alone     would make about {noise_share(answer['radius_noise'], answer['radius'])} of it")
     output.out(f"transitions     {answer['n']}, {answer['discarded']} discarded, rejected: {answer['rejected'] or 'none'}")
     weights = ", ".join(f"{name} {weight:g}" for name, weight in answer["weights"].items())
     output.out(f"norm            {answer['set']}, weights {weights}")
