@@ -18,7 +18,7 @@ import pytest
 
 from s2r_runtime import messages as m
 from s2r_runtime.audit.log import AuditResult, audit
-from s2r_runtime.errors import ConfigError, RecordingError
+from s2r_runtime.errors import ConfigError, NotEnoughEvidence, RecordingError
 from s2r_runtime.recording.reading import Entry
 from s2r_runtime.recording.recorder import Recorder
 from s2r_runtime.recording.salvage import recover
@@ -51,6 +51,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 def entries(path: Path) -> list[Entry]:
     return list(read(path))
+
+
+def test_a_log_without_a_record_proves_nothing(tmp_path: Path) -> None:
+    empty = tmp_path / "empty.mcap"
+    empty.touch()
+    with pytest.raises(NotEnoughEvidence, match="no record could be read"):
+        audit([empty])
 
 
 # ---------------------------------------------------------------- honest logs

@@ -19,7 +19,7 @@ from s2r_runtime.audit.certificates import Certificates
 from s2r_runtime.audit.evidence import Evidence
 from s2r_runtime.audit.findings import CertificateFinding, Difference, Findings
 from s2r_runtime.audit.run import Across, RunAudit
-from s2r_runtime.errors import RecordingError
+from s2r_runtime.errors import NotEnoughEvidence, RecordingError
 from s2r_runtime.recording.blocks import find
 from s2r_runtime.recording.channels import UNRECORDED, Unrecorded
 from s2r_runtime.recording.layout import ABOUT, RECOVERED
@@ -83,7 +83,8 @@ def audit(
     """Audits the files of one or more runs of a robot. public_key: the Ed25519 key that must have signed them, 32 bytes.
 
     rerun_controllers: run the attached controllers' code, confined, to repeat the verifications. progress: (done, total, what).
-    Raises RecordingError for a file that is no log, ConfigError or PluginError where this machine lacks what the log needs.
+    Raises RecordingError for a file that is no log, NotEnoughEvidence if no record can be read,
+    ConfigError or PluginError where this machine lacks what the log needs.
     """
     findings = Findings()
     tell = _Progress(paths, progress)
@@ -98,13 +99,16 @@ def audit(
     for parts in grouped:
         readings += parts
         _run(RunAudit(across), parts, findings, tell)
+    records = sum(sum(reading.counts.values()) for reading in readings)
+    if not records and findings.first is None and _chain(readings) != "broken":
+        raise NotEnoughEvidence(f"{', '.join(str(path) for path in paths)}: no record could be read, so there is nothing to audit")
     across.campaigns.end()
     signed_by, trusted_all = _signers(readings, public_key)
     chain = _chain(readings)
     valid = all(one.valid for one in findings.certificates.values())
     return AuditResult(
         ok=findings.first is None and not findings.unchecked and chain != "broken" and trusted_all and valid,
-        records=sum(sum(reading.counts.values()) for reading in readings),
+        records=records,
         certificates=list(findings.certificates.values()),
         first_difference=findings.first,
         differences=findings.differences,
