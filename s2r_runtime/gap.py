@@ -46,7 +46,8 @@ class Transitions:
 
     `independent`: drawn independently from one law; if not, `doubt` says why, and there is no statement. `assumption`: what the user
     vouched for instead. `digest`: of the recording's bytes; `samples_digest`: of a campaign's samples, alike in every log that holds
-    them. `noise`: (nx,) standard deviation of the measurements, None if the recording doesn't show it.
+    them; `content_digest`: of a table's numbers, however they are written.
+    `noise`: (nx,) standard deviation of the measurements, None if the recording doesn't show it.
     """
 
     x0: Array
@@ -62,6 +63,7 @@ class Transitions:
     doubt: str = ""
     assumption: str = ""
     samples_digest: str = ""
+    content_digest: str = ""
     noise: Array | None = None
     drive: Drive | None = field(default=None, repr=False)
 
@@ -146,7 +148,7 @@ def estimate_gap(
 
 def refuse_fitted(model: ComposedModel, tr: Transitions) -> None:
     """Raises NotEnoughEvidence if the model was fitted on this recording or these samples (G6)."""
-    if {tr.digest, tr.samples_digest} & set(model.spec.fitted_on) - {""}:
+    if {tr.digest, tr.samples_digest, tr.content_digest} & set(model.spec.fitted_on) - {""}:
         raise NotEnoughEvidence(
             f"{tr.source}: the model was fitted on this recording, which therefore can't bound its gap; take one that the fit never saw"
         )

@@ -70,12 +70,13 @@ def from_csv(path: Path, model: ComposedModel, columns: Mapping[str, str], dt: f
     nx = len(model.states)
     whole = Streams(table.t, values[:, :nx], values[:, nx:])
     recording = digest(path.read_bytes())
+    content = table.content_digest(names)
     if table.segment is None:
-        return drive_transitions(model, [whole], recording, str(path))
+        return replace(drive_transitions(model, [whole], recording, str(path)), content_digest=content)
     edges = np.flatnonzero(np.diff(table.segment, prepend=-1, append=-1))
     segments = [whole.rows(slice(a, b)) for a, b in pairwise(edges.tolist())]
     found = _segment_transitions(model, segments, recording, str(path))
-    return replace(found, noise=streams_noise(model, segments))
+    return replace(found, noise=streams_noise(model, segments), content_digest=content)
 
 
 @dataclass(frozen=True)

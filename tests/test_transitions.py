@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 from s2r_runtime.errors import NotEnoughEvidence, RecordingError, UsageError
-from s2r_runtime.gap import estimate_gap, hold_residuals, residuals
+from s2r_runtime.gap import blocked, estimate_gap, hold_residuals, refuse_fitted, residuals
 from s2r_runtime.messages import CampaignFinished, Event, Observation, Observed, SampleTaken, Send
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.recording.writer import Writer
+from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.transitions import from_samples, load_transitions
 
 DT = 0.1
@@ -393,3 +394,18 @@ def test_two_observations_at_rest_before_each_sample_show_the_noise() -> None:
     np.testing.assert_allclose(found[:2], sigma[:2], rtol=0.25)  # a median of 400: standard error 6 %
     assert from_samples(samples[:20]).noise is None
     assert from_samples([*samples[:100], sample(100)]).noise is None
+
+
+def test_a_recording_that_was_fitted_on_is_known_again_packed_reformatted_and_in_blocks(tmp_path: Path) -> None:
+    rows = [f"{k * DT:.1f},{k}.0,0.0,0.0,0.1,0.5" for k in range(200)]
+    original = table(tmp_path, rows, "t,x,y,theta,v,w")
+    reformatted = table(tmp_path, [row.replace(".0,", ".00,") for row in rows], "t,x,y,theta,v,w", "again.csv")
+    packed = tmp_path / "packed.csv.gz"
+    packed.write_bytes(gzip.compress(original.read_bytes()))
+    other = table(tmp_path, [*rows[:-1], rows[-1].replace("0.5", "0.6")], "t,x,y,theta,v,w", "other.csv")
+    fitted = compose(ModelSpec("unicycle", DT, fitted_on=load_dataset(original, MODEL).digests))
+    for path in (original, reformatted, packed):
+        for tr in (load_transitions(path, fitted), blocked(load_transitions(path, fitted), 0.5, DT)):
+            with pytest.raises(NotEnoughEvidence, match="fitted on this recording"):
+                refuse_fitted(fitted, tr)
+    refuse_fitted(fitted, load_transitions(other, fitted))

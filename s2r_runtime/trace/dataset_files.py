@@ -35,7 +35,8 @@ def load_dataset(
     source = ", ".join(str(p) for p in paths)
     if _is_log(paths[0]):
         return from_streams(model, _log_segments(paths, model, epoch), source, digests, paths)
-    return from_streams(model, _table_segments(paths[0], model, columns or {}), source, digests, paths)
+    segments, content = _table_segments(paths[0], model, columns or {})
+    return from_streams(model, segments, source, (*digests, content), paths)
 
 
 def _digest(path: Path) -> str:
@@ -52,7 +53,8 @@ def _is_log(path: Path) -> bool:
         return file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
 
 
-def _table_segments(path: Path, model: ComposedModel, columns: Mapping[str, str]) -> list[tuple[Stream, Stream]]:
+def _table_segments(path: Path, model: ComposedModel, columns: Mapping[str, str]) -> tuple[list[tuple[Stream, Stream]], str]:
+    """The segments, and the digest of what the table says, however it is written."""
     from s2r_runtime.tables import read_csv
 
     names = columns_of(model, columns)
@@ -66,7 +68,7 @@ def _table_segments(path: Path, model: ComposedModel, columns: Mapping[str, str]
         t, y, u = table.t[rows], states[rows], inputs[rows]
         measured, commanded = ~np.isnan(y).all(axis=1), ~np.isnan(u).all(axis=1)
         given.append((Stream(t[measured], y[measured]), Stream(t[commanded], u[commanded])))
-    return given
+    return given, table.content_digest(list(names.values()))
 
 
 def _log_segments(paths: tuple[Path, ...], model: ComposedModel, epoch: int | None) -> list[tuple[Stream, Stream]]:
