@@ -7,6 +7,7 @@ from pathlib import Path
 
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import add_model_options, chosen_model, count, positive, weights_of, writable
+from s2r_runtime.errors import UsageError
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -39,6 +40,8 @@ def run(args: argparse.Namespace) -> int:
     columns = dict(profile.columns) if profile else {}
     data = load_dataset(args.recording, model, columns)
     test = load_dataset(args.test, model, columns) if args.test else None
+    if test and set(test.digests) & set(data.digests):
+        raise UsageError(f"--test {args.test}: is the recording that the fit is made on; take one that the fit never sees")
     bar = output.Progress("tracing")
     try:
         result = trace(
