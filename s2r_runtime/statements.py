@@ -87,7 +87,7 @@ def _gap(robot: str, model: ModelSpec, gap: Gap, assumption: str) -> tuple[str, 
             f", and one after {gap.hold_periods} held periods exceeds r_h = {bound(gap.hold_radius)} with probability at most "
             f"{bound(gap.epsilon)} (r and r_h each took half of beta = {bound(gap.beta)})"
         )
-    noise = f"; noise alone would make about {gap.radius_noise:.2g} of r" if gap.radius_noise is not None else ""
+    noise = f"; noise alone would make about {min(gap.radius_noise, gap.radius):.2g} of r" if gap.radius_noise is not None else ""
     basis = (
         f"rests on an assumption that the user made: {assumption}"
         if assumption

@@ -188,7 +188,7 @@ def test_a_model_that_gives_nan_is_named(tmp_path) -> None:
     )
     model = compose(ModelSpec(str(source), DT))
     rng = np.random.default_rng(9)
-    with np.errstate(all="ignore"), pytest.raises(ConfigError, match="its step gives a x that isn't finite, at transition 0"):
+    with np.errstate(all="ignore"), pytest.raises(ConfigError, match="step returned nan for state 'x' in row 0"):
         estimate_gap(model, transitions(rng.normal(size=(300, 3)), rng), epsilon=0.05, beta=0.05, weights=ONES)
 
 
