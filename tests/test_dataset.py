@@ -113,7 +113,7 @@ def test_a_table_with_segments_blanks_and_names_of_its_own_is_read(tmp_path):
     assert np.isnan(data.runs[0].y[10]).all()
     assert data.runs[0].u[10, 0] == 2.0
     assert len(steps_of(data)) == 9 + 4
-    assert data.digests == ("sha256:" + hashlib.sha256(path.read_bytes()).hexdigest(),)
+    assert data.digests[0] == "sha256:" + hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def test_a_log_gives_each_command_from_the_observation_that_it_answers(tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recordings, wandering
 
+from s2r_runtime.errors import NotEnoughEvidence
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.tracer import trace
 
@@ -91,3 +92,51 @@ def test_an_effect_is_found_beside_a_fault():
     assert found.verdict == "traced"
     assert _names(found.effects) == {("input_gain", "w")}
     assert [f.kind for f in found.faults] == ["spike"]
+
+
+def _driven(steps=STEPS, seed=41):
+    return recordings([], 1, steps=steps, seed=seed)[0].runs[0]
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda y, u: (y, u[:, ::-1].copy()),
+        lambda y, u: (y[:, [1, 0, 2]].copy(), u),
+        lambda y, u: (np.column_stack([y[:, :2], np.degrees(y[:, 2])]), u),
+    ],
+    ids=["inputs swapped", "axes swapped", "degrees"],
+)
+def test_columns_that_are_not_what_they_say_get_no_effect_for_an_explanation(spoil):
+    run = _driven(1200)
+    y, u = spoil(run.y, run.u[::5])
+    found = trace(from_arrays(declared(), [(y, u)]), declared())
+    assert found.verdict == "unexplained"
+    assert found.effects == ()
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_a_robot_that_stood_still_although_it_was_asked_to_move_shows_nothing(noise):
+    run = _driven()
+    y = np.repeat(run.y[:1], len(run.y), axis=0) + noise * NOISE * np.random.default_rng(2).normal(size=run.y.shape)
+    with pytest.raises(NotEnoughEvidence, match="stood still although it was asked to move"):
+        trace(from_arrays(declared(), [(y, run.u[::5])]), declared())
+
+
+def test_a_sensor_that_froze_halfway_is_a_fault():
+    data = recordings([], 1, steps=STEPS, seed=42)[0]
+    data.runs[0].y[STEPS // 2 :] = data.runs[0].y[STEPS // 2]
+    found = trace(data, declared())
+    assert found.verdict == "sensor_fault"
+    assert "frozen" in {f.kind for f in found.faults}
+
+
+def test_a_heading_sensor_that_jumped_for_good_is_a_fault():
+    data = recordings([], 1, steps=STEPS, seed=43)[0]
+    data.runs[0].y[STEPS // 2 :, 2] += 0.7
+    assert trace(data, declared()).verdict == "sensor_fault"
+
+
+def test_measurements_without_noise_are_no_effect():
+    for data in recordings([], 3, steps=STEPS, seed=44, noise=0.0 * NOISE):
+        assert trace(data, declared()).verdict == "none"

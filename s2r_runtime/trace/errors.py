@@ -89,6 +89,15 @@ def better(given: Held, model: ComposedModel, other: ComposedModel, share: float
     return False
 
 
+def displacement(given: Held) -> Array:
+    """(m, nx) how far measured states went in the horizon, from every start of a rollout."""
+    starts = _starts(given)
+    begin = np.cumsum([0] + [len(run.y) - 1 for run in given.data.runs])
+    rows = starts + np.searchsorted(begin, starts, side="right") - 1
+    y = np.concatenate([run.y for run in given.data.runs])
+    return np.asarray(y[rows + given.horizon] - y[rows])
+
+
 def _starts(given: Held) -> NDArray[np.int64]:
     starts = rollout_starts(given.data, given.horizon, given.left_out, given.within)
     return starts[:: max(1, len(starts) * given.horizon // MANY)]

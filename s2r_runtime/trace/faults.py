@@ -40,6 +40,9 @@ RARE = 0.01
 FROZEN_ROWS = 5
 """Rows that repeat a state exactly before it counts as frozen."""
 
+RIGHT_AT_FIRST = 0.3
+"""Of a heading that jumped for good, what was before counts if it is at least this part of the run."""
+
 LONG_FROZEN = 50
 """Rows of exact repeats that need no catching up to count as frozen."""
 
@@ -230,8 +233,9 @@ def _jumps(
                 end = len(run.y) - 1 if back is None else back
                 jumps.append(Fault(run.start_s + data.dt * (k + 1), run.start_s + data.dt * end, name, "offset_jump"))
                 cut += [(i, k)] if back is None else [(i, k), (i, back)]
-                if name in model.nominal.angles and end - k < len(run.y) // 2:
-                    bad[k + 1 : end + 1, j] = True  # a heading that is off leaves the motion
+                if name in model.nominal.angles:  # a heading that is off leaves the motion; it was right at first, if that is long enough
+                    off = slice(k + 1, end + 1) if back is not None or k >= RIGHT_AT_FIRST * len(bad) else slice(0, k + 1)
+                    bad[off, j] = True
     return spikes, jumps, cut
 
 

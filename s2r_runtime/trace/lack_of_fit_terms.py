@@ -19,6 +19,12 @@ from s2r_runtime.trace.residual import Acting
 Array = NDArray[np.float64]
 Terms = list[Array]
 
+HARMONICS = 6
+"""Of the heading: grooves, cables and slopes have few."""
+
+PATCHES = 5
+"""Along each axis of the region: what lies on a part of the floor is then seen if the part is a fifth of it."""
+
 VELOCITIES = ("speed", "vx", "vy", "qd", "wheel_left", "wheel_right")
 
 
@@ -40,8 +46,9 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting) -> Iterator[
         for i in range(j):
             pair = [u[:, i] * u[:, j], np.abs(u[:, i]) * u[:, j], u[:, i] * np.abs(u[:, j]), np.abs(u[:, i] * u[:, j])]
             yield f"{model.inputs[i]}*{name}", _push(pair, body)
-    for name, terms, directions in _of_states(model, steps.y0, u, body, world):
-        yield name, _push(terms, directions)
+    pushes = [u[:, j][:, None] * own for j, own in enumerate(_own(given, model, act))]
+    for name, terms, directions in _of_states(model, steps.y0, u, body, world, pushes):
+        yield name, terms if directions is None else _push(terms, directions)
     yield "time", _push([one, t], [*body, *world])
     yield "time", _push([one, *(f(2.0 * np.pi * k * t) for k in (0.5, 1.0, 1.5, 2.0) for f in (np.sin, np.cos))], [*body, *world])
     yield "time", _push([one, *(np.where(t > s, one, 0.0) for s in np.linspace(0.1, 0.9, 9))], body)
@@ -66,8 +73,12 @@ def _memory(u: Array, place: NDArray[np.int64]) -> Iterator[Terms]:
     yield terms
 
 
-def _of_states(model: ComposedModel, y: Array, u: Array, body: Terms, world: Terms) -> Iterator[tuple[str, Terms, Terms]]:
-    """Terms in the heading, the position, the speed, and any other state of a model of the user's own, and where they push."""
+def _of_states(
+    model: ComposedModel, y: Array, u: Array, body: Terms, world: Terms, pushes: Terms
+) -> Iterator[tuple[str, Terms, Terms | None]]:
+    """Terms in the heading, the position, the speed, and any other state of a model of the user's own, and where they push. pushes: what
+    each input does now, for terms that say how much more or less of it there is (None: they push by themselves).
+    """
     known: set[str] = set()
     inputs, one = [u[:, j] for j in range(u.shape[1])], np.ones(len(u))
     for name in model.nominal.angles:
@@ -78,12 +89,17 @@ def _of_states(model: ComposedModel, y: Array, u: Array, body: Terms, world: Ter
         yield token, first, body
         yield token, [c * v for c in first for v in inputs], body
         yield token, [c * v for c in [*first, *second] for v in [one, *inputs]], body
+        ripples = [wave(k * angle) for k in range(1, HARMONICS + 1) for wave in (np.cos, np.sin)]
+        yield token, ripples, body
+        yield token, [c[:, None] * p for c in ripples for p in pushes], None
+        yield from ((token, [c * v for c in ripples], body) for v in inputs)
     position = [_scaled(y[:, i]) for i, name in enumerate(model.states) if name in {"x", "y", "z", "q"}]
     if position:
         known |= {"x", "y", "z", "q"}
         squares = [a * b for i, a in enumerate(position) for b in position[: i + 1]]
         yield "position", [one, *position], world or body
         yield "position", [a * v for a in position for v in inputs], body
+        yield "position", [c[:, None] * p for c in _patches(position) for p in pushes], None
         yield "position", [one, *position, *squares, *(a**3 for a in position)], [*body, *world]
     speed = [_scaled(y[:, i], centred=False) for i, name in enumerate(model.states) if name in VELOCITIES]
     if speed:
@@ -94,6 +110,13 @@ def _of_states(model: ComposedModel, y: Array, u: Array, body: Terms, world: Ter
         if name not in known:
             v = _scaled(y[:, i])
             yield name, [v, v * v, v**3, np.sign(v), *(v * w for w in inputs)], [*body, *world]
+
+
+def _patches(position: Sequence[Array]) -> Terms:
+    """Smooth bumps over where the robot was: a grid of PATCHES along each axis (at most two axes)."""
+    centres = np.linspace(-0.8, 0.8, PATCHES)
+    bumps = [[np.exp(-0.5 * ((p - c) * PATCHES / 1.6) ** 2) for c in centres] for p in position[:2]]
+    return bumps[0] if len(bumps) == 1 else [a * b for a in bumps[0] for b in bumps[1]]
 
 
 def _scaled(v: Array, *, centred: bool = True) -> Array:
@@ -118,6 +141,11 @@ def _directions(given: Problem, model: ComposedModel, act: Acting) -> tuple[list
         along[:, x], along[:, y], across[:, x], across[:, y] = c, s, -s, c
         others = [np.tile(unit[i], (n, 1)) for i in range(nx) if i not in {x, y}]
         return [along, across, *others], [np.tile(unit[x], (n, 1)), np.tile(unit[y], (n, 1))]
+    return _own(given, model, act), []
+
+
+def _own(given: Problem, model: ComposedModel, act: Acting) -> Terms:
+    """(n, nx) by input: where it pushes."""
     mean, end = act.mean[given.steps.place], act.end[given.steps.place]
     here = model.advance(given.steps.y0, mean, end)
     pushed = []
@@ -126,4 +154,4 @@ def _directions(given: Problem, model: ComposedModel, act: Acting) -> tuple[list
         up = np.zeros(mean.shape[1])
         up[j] = h
         pushed.append((model.advance(given.steps.y0, mean + up, end + up) - here) / h)
-    return pushed, []
+    return pushed

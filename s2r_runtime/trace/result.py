@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,9 @@ from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.errors import Held, Judged
 from s2r_runtime.trace.faults import Fault
 from s2r_runtime.trace.residual import acting, first_steps, rms
+from s2r_runtime.trace.verdict import Verdict
 
 Array = NDArray[np.float64]
-Verdict = Literal["none", "traced", "ambiguous", "unexplained", "sensor_fault"]
 Value = tuple[Any, float | None, float | None, str]
 
 POINTS = 4000

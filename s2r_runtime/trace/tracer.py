@@ -4,39 +4,39 @@
     2  part of the recording is held out; the fit never sees it                        holdout
     3  effects are selected, noise estimated under each hypothesis                     selection, fitting, residual_noise
     4  what is left is tested for structure, named by what it depends on               lack_of_fit
-    5  a verdict; errors and gap before and after on what was held out                 trace_errors, trace_result
+    5  a verdict; errors and gap before and after on what was held out                 verdict, errors, result
 
-Verdicts: `none`, `traced`, `ambiguous` (rivals explain as much), `unexplained` (structure that no effect in the library accounts for; a
-name found on the way is withdrawn if what is left is a large part), `sensor_fault`. Deterministic: the same recording, model
-and seed give the same result.
+Deterministic: the same recording, model and seed give the same result.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.dataset_files import load_dataset
-from s2r_runtime.trace.errors import Held, Kind, better, gaps, held, judge, noise_floor
+from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge, noise_floor
 from s2r_runtime.trace.excitation import advice
 from s2r_runtime.trace.faults import Checked, check
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, problem, without
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, problem
 from s2r_runtime.trace.holdout import BLOCK, Part, fit_mask, part
 from s2r_runtime.trace.intervals import intervals
 from s2r_runtime.trace.lack_of_fit import Structure, lack_of_fit
-from s2r_runtime.trace.residual import Mask, steps_of
-from s2r_runtime.trace.result import Found, TraceResult, Verdict
+from s2r_runtime.trace.residual import Mask, first_steps, rms, steps_of
+from s2r_runtime.trace.result import Found, TraceResult
 from s2r_runtime.trace.selection import Selection, select
+from s2r_runtime.trace.verdict import confirmed, final_fit, foretells, verdict_of
 
 __all__ = ["Dataset", "TraceResult", "load_dataset", "trace"]
 
+Array = NDArray[np.float64]
 Progress = Callable[[float, float, str], None]
 
 FEWEST = 60
@@ -48,17 +48,12 @@ FIT_STEPS = 4000
 STRUCTURE_STEPS = 2500
 """Transitions that the lack of fit is tested on at most."""
 
-LARGE = 0.3
-"""If more than this share of what the nominal model lacks is still left, a name found on the way is withdrawn."""
+MOVED, ASKED = 1.5, 5.0
+"""A robot whose measurements lie apart after the horizon as they do after one step has stood still; it was asked to move if the
+model would have it that much farther away."""
 
 WILD = 5.0
 """Standard deviations of a whitened residual from which it is counted as an outlier (and has next to no weight)."""
-
-CONFIRMED = 0.01
-"""An effect stays if it lowers some error on held-out data by this share."""
-
-SAME_KIND = 0.05
-"""As LARGE, where what is left depends on the very thing that the named effect is about: then its shape is wrong."""
 
 
 def trace(
@@ -84,35 +79,48 @@ def trace(
     seen = fit_mask(checked.data, seed) if test is None else np.ones(sum(len(r.y) - 1 for r in checked.data.runs), dtype=bool)
     fit_part = part(checked.data, checked.left_out, seen, FIT_STEPS)
     judged_on = _held_out(checked, seen, test, model, horizon)
-    _enough(dataset, fit_part, judged_on)
+    ahead = max(1, min(round(horizon / dataset.dt), len(fit_part.steps) // 4))
+    _enough(dataset, model, fit_part, judged_on, ahead)
     given = problem(fit_part.data, fit_part.steps)
-    ahead = max(1, min(round(horizon / dataset.dt), len(given.steps) // 4))
     say(5.0, 100.0, "looking for effects")
     chosen = select(given, model, ahead, lambda share: say(5.0 + 75.0 * share, 100.0, "looking for effects"))
-    chosen = _confirmed(given, chosen, judged_on)
+    chosen = confirmed(given, chosen, judged_on)
     say(80.0, 100.0, "testing what is left")
     structure = _structure(given, chosen, ahead)
-    verdict = _verdict(chosen, structure, checked)
     say(90.0, 100.0, "judging on held-out data")
     w = np.ones(len(model.states)) if weights is None else np.asarray(weights, dtype=np.float64)
-    final = _final(chosen, verdict)
+    result = _result(dataset, checked, given, chosen, structure, judged_on, seed, w, kind)
+    say(100.0, 100.0, result.verdict)
+    return result
+
+
+def _result(
+    dataset: Dataset,
+    checked: Checked,
+    given: Problem,
+    chosen: Selection,
+    structure: Structure,
+    judged_on: Held,
+    seed: int,
+    weights: Array,
+    kind: Kind,
+) -> TraceResult:
+    """Verdict, intervals, errors and gap before and after."""
+    model = chosen.nominal.model
+    before, after = judge(model, judged_on), judge(chosen.fit.model, judged_on)
+    verdict = verdict_of(chosen, structure, checked.faults, foretells(after, judged_on))
+    final = final_fit(chosen, verdict)
+    after = before if final is chosen.nominal else after
+    gap_before, gap_after, independent = gaps((model, before), (final.model, after), judged_on, weights, kind)
     ranges = intervals(given, final)
-    ties = (
-        [_found(model, s.fit, place, {}) for s in chosen.rivals if s.fit for place in _new(s.fit, chosen.fit)]
-        if verdict == "ambiguous"
-        else []
-    )
-    before, after = judge(model, judged_on), judge(final.model, judged_on)
-    one, end = noise_floor(final.model, final.noise, judged_on, seed)
-    gap_before, gap_after, independent = gaps((model, before), (final.model, after), judged_on, w, kind)
     effects = tuple(_found(model, final, place, ranges) for place in final.added)
-    partial = () if final is chosen.fit else tuple(_found(model, chosen.fit, place, {}) for place in chosen.fit.added)
-    say(100.0, 100.0, verdict)
+    rivals = [s.fit for s in chosen.rivals if s.fit is not None] if verdict == "ambiguous" else []
+    ties = tuple(_found(model, fit, place, {}) for fit in rivals for place in _new(fit, final))
     return TraceResult(
         verdict=verdict,
         effects=effects,
-        partial=partial,
-        ambiguous_with=tuple(ties),
+        partial=() if final is chosen.fit else tuple(_found(model, chosen.fit, place, {}) for place in chosen.fit.added),
+        ambiguous_with=ties,
         candidates=tuple((s.name, s.channel, s.score) for s in chosen.ranking),
         depends_on=structure.tokens,
         share_left=float(structure.share),
@@ -124,7 +132,7 @@ def trace(
         nominal=model,
         before=before,
         after=after,
-        floor=(one, end),
+        floor=noise_floor(final.model, final.noise, judged_on, seed),
         gap=(gap_before, gap_after, independent),
         held=judged_on,
         n_fit=len(given.steps),
@@ -153,31 +161,22 @@ def _held_out(checked: Checked, seen: Mask, test: Dataset | None, model: Compose
     return held(checked.data, steps.take(np.flatnonzero(~seen[steps.place])), checked.left_out, ~seen, horizon)
 
 
-def _enough(data: Dataset, fit_part: Part, judged_on: Held) -> None:
+def _enough(data: Dataset, model: ComposedModel, fit_part: Part, judged_on: Held, ahead: int) -> None:
+    """Raises NotEnoughEvidence if there is too little to fit and to judge, or if nothing happened."""
     usable = len(fit_part.steps) + len(judged_on.steps)
     if usable < FEWEST or not len(judged_on.steps):
         raise NotEnoughEvidence(
             f"{data.source}: {usable} usable transitions of {data.dt:g} s, at least {FEWEST} are needed: {max(FEWEST - usable, 1)} more",
             max(FEWEST - usable, 1),
         )
-    u = np.concatenate([run.u for run in fit_part.data.runs])
-    if not np.any(u):
+    if not any(np.any(run.u) for run in fit_part.data.runs):
         raise NotEnoughEvidence(
             f"{data.source}: every input is zero in the part that is fitted; nothing can be traced until the robot is asked to move"
         )
-
-
-def _confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
-    """Less the effects without which the held-out data are foretold as well: what wandered in the fit's part need not go on."""
-    fit, again = chosen.fit, True
-    while again and fit.added:
-        again = False
-        for place in fit.added:
-            less = fitted(given, fit, without(fit.model, place), 2)
-            if not better(judged_on, fit.model, less.model, CONFIRMED):
-                fit, again = less, True
-                break
-    return chosen if fit is chosen.fit else replace(chosen, fit=fit, rivals=() if not fit.added else chosen.rivals)
+    here = Held(fit_part.data, fit_part.steps, fit_part.left_out, np.ones(first_steps(fit_part.data)[-1], dtype=bool), ahead)
+    went, jitter = rms(displacement(here)), rms(model.difference(fit_part.steps.y1, fit_part.steps.y0))
+    if np.all(went < MOVED * jitter + 1e-12) and np.any(rms(judge(model, here).ends) > ASKED * went):
+        raise NotEnoughEvidence(f"{data.source}: the robot stood still although it was asked to move; nothing can be traced until it moves")
 
 
 def _structure(given: Problem, chosen: Selection, horizon: int) -> Structure:
@@ -187,31 +186,6 @@ def _structure(given: Problem, chosen: Selection, horizon: int) -> Structure:
     block = len(given.steps) * BLOCK // STRUCTURE_STEPS
     few = Problem(given.data, given.steps.take(np.flatnonzero(np.arange(len(given.steps)) % block < BLOCK)), given.floor)
     return lack_of_fit(few, evaluate(few, chosen.fit.model), evaluate(few, chosen.nominal.model), horizon)
-
-
-def _verdict(chosen: Selection, structure: Structure, checked: Checked) -> Verdict:
-    """One of the five."""
-    faulty = any(fault.kind != "dropout" for fault in checked.faults)
-    if not chosen.fit.added:
-        return "unexplained" if structure.matters else "sensor_fault" if faulty else "none"
-    about = {token for place in chosen.fit.added for token in _about(chosen.fit.model, place)}
-    limit = SAME_KIND if about & set(structure.tokens) else LARGE
-    if structure.matters and structure.share > limit:
-        return "unexplained"
-    return "ambiguous" if chosen.rivals else "traced"
-
-
-def _about(model: ComposedModel, place: int) -> list[str]:
-    """Tokens that speak of the same thing as an effect does."""
-    a = model.effects[place]
-    names = model.inputs if a.channel == "*" else (a.channel,)
-    memory = a.effect.stage == "input" and a.effect.hidden(1, model.nominal, a.channel, model.dt, a.p).size > 0
-    return [f"memory({name})" if memory else name for name in names]
-
-
-def _final(chosen: Selection, verdict: Verdict) -> Fit:
-    """The model that is handed on: with the effects, unless their names were withdrawn."""
-    return chosen.nominal if verdict in {"unexplained", "sensor_fault", "none"} else chosen.fit
 
 
 def _new(fit: Fit, other: Fit) -> list[int]:

@@ -1,0 +1,88 @@
+"""The verdict, from what was selected, what is left of it, what the held-out data say of it, and the faults found.
+
+sensor_fault   nothing is missing, but measurements are wrong in places
+none           nothing beyond noise
+unexplained    structure is left that no effect accounts for: nothing was found; or what was found leaves a large part, or has the
+               wrong shape for what it acts on; or the model with it foretells the held-out data no better than `stays where it is`
+ambiguous      rivals explain as much
+traced         otherwise
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace.errors import Held, Judged, better, displacement
+from s2r_runtime.trace.faults import Fault
+from s2r_runtime.trace.fitting import Fit, Problem, fitted, without
+from s2r_runtime.trace.lack_of_fit import Structure
+from s2r_runtime.trace.residual import rms
+from s2r_runtime.trace.selection import Selection
+
+Verdict = Literal["none", "traced", "ambiguous", "unexplained", "sensor_fault"]
+
+LARGE = 0.3
+"""If more than this share of what the nominal model lacks is still left, a name found on the way is withdrawn."""
+
+SAME_KIND = 0.05
+"""As LARGE, where what is left depends on the very thing that the named effect is about: then its shape is wrong."""
+
+CONFIRMED = 0.01
+"""An effect stays if it lowers some error on held-out data by this share."""
+
+FORETELLS, NEARER = 0.7, 0.95
+"""A model whose rollouts end farther off than these shares of the way that the robot went foretells nothing worth a name."""
+
+
+def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
+    """Less the effects without which the held-out data are foretold as well: what wandered in the fit's part need not go on."""
+    fit, again = chosen.fit, True
+    while again and fit.added:
+        again = False
+        for place in fit.added:
+            less = fitted(given, fit, without(fit.model, place), 2)
+            if not better(judged_on, fit.model, less.model, CONFIRMED):
+                fit, again = less, True
+                break
+    return chosen if fit is chosen.fit else replace(chosen, fit=fit, rivals=() if not fit.added else chosen.rivals)
+
+
+def verdict_of(chosen: Selection, structure: Structure, faults: tuple[Fault, ...], foretold: bool) -> Verdict:
+    """One of the five."""
+    faulty = any(fault.kind != "dropout" for fault in faults)
+    if not chosen.fit.added:
+        return "unexplained" if structure.matters else "sensor_fault" if faulty else "none"
+    about = {token for place in chosen.fit.added for token in _about(chosen.fit.model, place)}
+    limit = SAME_KIND if about & set(structure.tokens) else LARGE
+    if not foretold or (structure.matters and structure.share > limit):
+        return "unexplained"
+    return "ambiguous" if chosen.rivals else "traced"
+
+
+def foretells(judged: Judged, given: Held) -> bool:
+    """Whether rollouts end nearer to the measurement than the state was from which they began: clearly in some state, and in every one that
+    goes somewhere (much farther in the horizon than in a step, which noise does not).
+    """
+    if not len(judged.ends):
+        return True
+    gone, step = rms(displacement(given)), rms(given.steps.y1 - given.steps.y0)
+    share = rms(judged.ends) / np.maximum(gone, 1e-300)
+    goes = gone > min(5.0, 0.5 * given.horizon) * step
+    return not goes.any() or bool(np.any(share[goes] < FORETELLS) and np.all(share[goes] < NEARER))
+
+
+def final_fit(chosen: Selection, verdict: Verdict) -> Fit:
+    """The model that is handed on: with the effects, unless their names were withdrawn."""
+    return chosen.nominal if verdict in {"unexplained", "sensor_fault", "none"} else chosen.fit
+
+
+def _about(model: ComposedModel, place: int) -> list[str]:
+    """Tokens that speak of the same thing as an effect does."""
+    a = model.effects[place]
+    names = model.inputs if a.channel == "*" else (a.channel,)
+    memory = a.effect.stage == "input" and a.effect.hidden(1, model.nominal, a.channel, model.dt, a.p).size > 0
+    return [f"memory({name})" if memory else name for name in names]
