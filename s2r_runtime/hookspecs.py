@@ -132,6 +132,7 @@ class Effect(Protocol):
       `wrong(p) -> str`: what is wrong with values that are each within bounds, or an empty text;
     - `once` = True: a model has at most one of it; `linear` = True: it commutes with other linear effects, so the tracer tries one
       place in the list only; `shift` = True: a pure delay, which commutes with all that has no clock of its own;
+    - `side_by_side` = True: `input_sequence` also takes u (T, runs, nu), many short runs at once;
     - `within_step(dt, p) -> bool`: whether what acts changes within a step although the input is held over it;
     - `starts(u, model, channel, dt) -> list[dict]`: parameter values from which the tracer begins, given the input that it would
       get, u (T, nu). Without it the tracer begins from a grid over the parameters' bounds.

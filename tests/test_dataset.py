@@ -11,6 +11,7 @@ from s2r_runtime.messages import Observation, Observed, Send
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.recording.writer import Writer
+from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.residual import acting, first_steps, rollout_starts, sequence, steps_of
@@ -171,3 +172,27 @@ def test_short_runs_side_by_side_act_as_one_after_the_other():
     together = acting(model, from_arrays(model, runs)).mean
     alone = np.concatenate([sequence(model, model.effects, [u], 0.1) for _, u in runs])
     assert np.allclose(together, alone, rtol=1e-12, atol=1e-14)
+
+
+def test_what_was_before_a_run_is_told_from_its_first_steps():
+    model = _model(0.1)
+    u = np.tile([[0.5, 0.3]], (40, 1))
+    under_way = np.zeros((41, 3))
+    for k in range(40):
+        under_way[k + 1] = model.nominal.step(under_way[k : k + 1], u[k : k + 1], 0.1, {})[0]
+    from_rest = np.concatenate([np.repeat(under_way[:1], 5, axis=0), under_way[:-5]])
+    data = with_history(model, from_arrays(model, [(under_way, u), (from_rest, u)]))
+    assert np.isnan(data.runs[0].y[:30]).all()
+    assert np.array_equal(data.runs[0].u[:30], u[:30])
+    assert data.runs[0].start_s == pytest.approx(-3.0)
+    assert len(data.runs[1].y) == 41
+    assert len(steps_of(data)) == 80
+
+
+def test_a_silence_in_which_inputs_went_on_is_not_silent():
+    t = 0.1 * np.arange(60)
+    keep = (t < 3.0) | (t > 4.0)
+    states = Stream(t[keep], np.zeros((int(keep.sum()), 3)))
+    for stamps, silent in ((t, False), (t[keep], True)):
+        data = from_streams(_model(), [(states, Stream(stamps, np.zeros((len(stamps), 2))))], "here")
+        assert [p.silent for p in data.pauses] == [silent]

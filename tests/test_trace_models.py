@@ -94,3 +94,16 @@ def test_two_streams_with_stamps_of_their_own_give_the_delay_between_them():
     assert value == pytest.approx(0.17, abs=0.012)  # a command is seen at its stamp, up to 16 ms after it was given
     assert [f.kind for f in found.faults] == ["dropout"]
     assert math.isclose(found.faults[0].to_s - found.faults[0].from_s, 2.0, abs_tol=0.06)
+
+
+def test_runs_that_begin_under_way_show_the_same_lag_as_those_from_rest():
+    """Each run is cut out of a drive: before its first row the first command had been held for a while."""
+    dt, _, noise = ROBOTS["bicycle"]
+    model, rng = _model("bicycle"), np.random.default_rng(9)
+    u = commands(rng, 12, 260, dt, [(-0.4, 0.4), (0.5, 2.0)], rest=0.0, hold=(1.5, 3.0))
+    u[:, :140] = u[:, 139:140]
+    y = drive(rng, "bicycle", u, [("input_lag", "speed_cmd", {"time_constant": 0.3})], dt, noise)
+    runs = [(states[120:], inputs[120:]) for states, inputs in zip(y, u, strict=True)]
+    found = trace(from_arrays(model, runs), model)
+    assert {(e.name, e.channel) for e in found.effects} == {("input_lag", "speed_cmd")}
+    assert found.effects[0].parameters["time_constant"][0] == pytest.approx(0.3, rel=0.05)

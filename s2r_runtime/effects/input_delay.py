@@ -46,8 +46,8 @@ class InputDelay(InputEffect):
     def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
         """The whole recording shifted."""
         whole, part = _steps(p["delay"], dt)
-        given = u[:, columns(model, channel)]
-        line = np.concatenate([np.zeros((whole + 1, given.shape[1])), given])
+        given = u[..., columns(model, channel)]
+        line = np.concatenate([np.zeros((whole + 1, *given.shape[1:])), given])
         return replaced(u, model, channel, (1.0 - part) * line[1 : 1 + len(u)] + part * line[: len(u)])
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:

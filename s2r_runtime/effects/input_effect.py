@@ -27,6 +27,7 @@ class InputEffect:
     optional: tuple[str, ...] = ()
     all_alike = False
     linear = False
+    side_by_side = True
 
     def channels(self, model: NominalModel) -> tuple[str, ...]:
         """Every input; `*` first where it is offered."""
@@ -43,7 +44,7 @@ class InputEffect:
         return np.zeros((n, 0))
 
     def act(self, u: Array, p: Values) -> Array:
-        """The channel's input (n, c) -> as it acts, (n, c)."""
+        """The channel's input (..., c) -> as it acts, (..., c)."""
         return u
 
     def input_step(self, u: Array, z: Array, model: NominalModel, channel: str, dt: float, p: Values) -> tuple[Array, Array]:
@@ -51,8 +52,8 @@ class InputEffect:
         return self.input_sequence(u, model, channel, dt, p), z
 
     def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
-        """u (T, nu) -> as it acts, (T, nu)."""
-        return replaced(u, model, channel, self.act(u[:, columns(model, channel)], p))
+        """u (T, nu) -> as it acts, (T, nu); or (T, runs, nu)."""
+        return replaced(u, model, channel, self.act(u[..., columns(model, channel)], p))
 
     def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
         """Not of stage `step`: nothing changes."""
@@ -65,7 +66,7 @@ def columns(model: NominalModel, channel: str) -> list[int]:
 
 
 def replaced(u: Array, model: NominalModel, channel: str, acting: Array) -> Array:
-    """u (n, nu) with the channel's columns set to acting (n, c)."""
+    """u (..., nu) with the channel's columns set to acting (..., c)."""
     after = u.copy()
-    after[:, columns(model, channel)] = acting
+    after[..., columns(model, channel)] = acting
     return after

@@ -39,11 +39,11 @@ class InputLag(InputEffect):
         from scipy.linalg import lapack
 
         keep, mean = _factors(p["time_constant"], dt)
-        given = u[:, columns(model, channel)]
+        given = u[..., columns(model, channel)]
         band = np.empty((2, len(u)))
         band[0], band[1] = 1.0, -keep
-        after, _ = lapack.dtbtrs(band, (1.0 - keep) * given, uplo="L", diag="U")
-        before = np.concatenate([np.zeros((1, given.shape[1])), after[:-1]])
+        after, _ = lapack.dtbtrs(band, (1.0 - keep) * given.reshape(len(u), -1), uplo="L", diag="U")
+        before = np.concatenate([np.zeros((1, *given.shape[1:])), after[:-1].reshape(given[:-1].shape)])
         return replaced(u, model, channel, given + (before - given) * mean)
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:

@@ -25,9 +25,9 @@ class WheelSaturation(InputEffect):
     def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
         """Clips both wheels."""
         half = p["track"] / 2.0
-        left = np.clip(u[:, 0] - half * u[:, 1], -p["speed"], p["speed"])
-        right = np.clip(u[:, 0] + half * u[:, 1], -p["speed"], p["speed"])
-        return replaced(u, model, channel, np.stack([(left + right) / 2.0, (right - left) / p["track"]], axis=1))
+        left = np.clip(u[..., 0] - half * u[..., 1], -p["speed"], p["speed"])
+        right = np.clip(u[..., 0] + half * u[..., 1], -p["speed"], p["speed"])
+        return replaced(u, model, channel, np.stack([(left + right) / 2.0, (right - left) / p["track"]], axis=-1))
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
         """Tracks around the one at which both inputs load the wheels alike, limits inside what was asked for."""

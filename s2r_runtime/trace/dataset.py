@@ -46,7 +46,7 @@ class Stream:
 
 @dataclass(frozen=True)
 class Pause:
-    """No states between two stamps of a run, seconds; rows of the grid around it; states before and after, (nx,)."""
+    """No states between two stamps of a run, seconds; states before and after, (nx,). silent: nor any input."""
 
     from_s: float
     to_s: float
@@ -54,6 +54,7 @@ class Pause:
     usual_s: float
     before: Array
     after: Array
+    silent: bool = True
 
 
 @dataclass(frozen=True)
@@ -121,7 +122,7 @@ def from_streams(
     pauses: list[Pause] = []
     for states, inputs in stretches:
         t0 = float(states.t[0])
-        pauses += _pauses(states, len(runs), spacing, origin, dt)
+        pauses += _pauses(states, inputs.t, len(runs), spacing, origin, dt)
         y = _grid_exact(states, dt) if exact else _grid_interpolated(states, dt, model.angle_columns, spacing)
         u = _grid_inputs(inputs, t0, len(y) - 1, dt, parts)
         runs.append(Run(t0 - origin, _unwrapped(y, model.angle_columns), u))
@@ -259,11 +260,13 @@ def _grid_inputs(inputs: Stream, t0: float, steps: int, dt: float, parts: int) -
     return mean
 
 
-def _pauses(states: Stream, run: int, usual: float, origin: float, dt: float) -> list[Pause]:
-    """Intervals between states clearly longer than usual, and than a step."""
-    gaps = np.flatnonzero(np.diff(states.t) > max(1.7 * usual, 1.5 * dt)).tolist()
-    t, v = states.t, states.values
-    return [Pause(float(t[i] - origin), float(t[i + 1] - origin), run, usual, v[i], v[i + 1]) for i in gaps]
+def _pauses(states: Stream, stamps: Array, run: int, usual: float, origin: float, dt: float) -> list[Pause]:
+    """Intervals between states clearly longer than usual, and than a step. stamps: of the inputs."""
+    t, v, found = states.t, states.values, []
+    for i in np.flatnonzero(np.diff(t) > max(1.7 * usual, 1.5 * dt)).tolist():
+        between = np.count_nonzero((stamps > t[i] + 0.5 * usual) & (stamps < t[i + 1] - 0.5 * usual))
+        found.append(Pause(float(t[i] - origin), float(t[i + 1] - origin), run, usual, v[i], v[i + 1], between == 0))
+    return found
 
 
 def _unwrapped(y: Array, angles: list[int]) -> Array:

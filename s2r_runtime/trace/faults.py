@@ -40,6 +40,9 @@ RARE = 0.01
 FROZEN_ROWS = 5
 """Rows that repeat a state exactly before it counts as frozen."""
 
+AROUND = 4
+"""Steps before and after a silence from which the robot's pace is taken."""
+
 RIGHT_AT_FIRST = 0.3
 """Of a heading that jumped for good, what was before counts if it is at least this part of the run."""
 
@@ -76,12 +79,12 @@ class Checked:
 def check(model: ComposedModel, data: Dataset) -> Checked:
     """Finds the faults and takes them out."""
     act = acting(model, data)
-    faults = [_of_pause(model, data, act, pause) for pause in data.pauses]
+    reach = _reach(model, data, act)
+    faults = [_of_pause(model, data, pause, reach) for pause in data.pauses]
     found = [f for f in faults if f is not None]
     bad = [np.zeros(run.y.shape, dtype=bool) for run in data.runs]
     left_out: list[tuple[int, int]] = []
     spikes: list[Fault] = []
-    reach = _reach(model, data, act)
     tails = 0
     for i in range(len(data.runs)):
         tails += _tails(model, data, act, i, reach)
@@ -131,39 +134,24 @@ def _predicted(model: ComposedModel, data: Dataset, act: Acting, run: int) -> Ar
     return model.advance(y, act.mean[here], act.end[here])
 
 
-def _of_pause(model: ComposedModel, data: Dataset, act: Acting, pause: Pause) -> Fault | None:
-    """A long interval: had the robot moved on meanwhile, or only its clock?"""
+def _of_pause(model: ComposedModel, data: Dataset, pause: Pause, reach: _Reach) -> Fault | None:
+    """A long interval: had the robot gone on meanwhile, or only its clock? Judged by how fast it went before and after, not by the model,
+    which may lack what made it slow. Where inputs went on being received, the clock did too.
+    """
     run = data.runs[pause.run]
-    first = round((pause.from_s - run.start_s) / data.dt)
-    steps = max(1, round((pause.to_s - pause.from_s) / data.dt))
-    usual = max(1, round(pause.usual_s / data.dt))
-    begin = first_steps(data)[pause.run]
-    x = pause.before[None, :].copy()
-    after_usual = x
-    for k in range(first, min(first + steps, len(run.y) - 1)):
-        x = model.advance(x, act.mean[begin + k : begin + k + 1], act.end[begin + k : begin + k + 1])
-        if k == first + usual - 1:
-            after_usual = x
-    measured = pause.after[None, :]
-    on, stood = np.abs(model.difference(measured, x)[0]), np.abs(model.difference(measured, after_usual)[0])
-    apart = np.abs(model.difference(x, after_usual)[0])
-    noise = 4.0 * _pause_noise(model, data, act, pause.run)
-    as_usual = bool(np.all(stood <= np.maximum(0.3 * apart, noise)))
-    if usual < steps and as_usual and np.any((apart > noise) & (on > 0.6 * apart) & _moving(model, data, act, pause.run, first)):
-        return Fault(pause.from_s, pause.to_s, "*", "clock_step")
+    first, last = (round((at - run.start_s) / data.dt) for at in (pause.from_s, pause.to_s))
+    before = model.difference(run.y[max(0, first - AROUND) + 1 : first + 1], run.y[max(0, first - AROUND) : first])
+    after = model.difference(run.y[last + 1 : last + AROUND + 1], run.y[last : last + AROUND][: len(run.y[last + 1 : last + AROUND + 1])])
+    steps, usual = (pause.to_s - pause.from_s) / data.dt, pause.usual_s / data.dt
+    if pause.silent and min(np.count_nonzero(np.isfinite(d).all(axis=1)) for d in (before, after)) >= 2:
+        pace = 0.5 * (np.nanmean(before, axis=0) + np.nanmean(after, axis=0))
+        went = model.difference(pause.after[None, :], pause.before[None, :].copy())[0]
+        apart, noise = np.abs(pace) * (steps - usual), 4.0 * reach.noise
+        stood = np.abs(went - pace * usual) <= np.maximum(0.3 * apart, noise)
+        steady = np.abs(np.nanmean(before, axis=0) - np.nanmean(after, axis=0)) < 0.5 * np.abs(pace)
+        if np.any(stood & steady & (apart > 2.0 * noise)) and np.all(stood | reach.instant):
+            return Fault(pause.from_s, pause.to_s, "*", "clock_step")
     return Fault(pause.from_s, pause.to_s, "*", "dropout") if pause.to_s - pause.from_s > LONG * pause.usual_s else None
-
-
-def _moving(model: ComposedModel, data: Dataset, act: Acting, run: int, first: int) -> Mask:
-    """(nx,) states that moved before this row about as the model says: a robot that is about to start may be late without a fault."""
-    y = data.runs[run].y[max(0, first - 3) : first + 1]
-    foreseen = model.difference(_predicted(model, data, act, run)[max(0, first - 3) : first], y[:-1])
-    return np.asarray(np.abs(np.sum(model.difference(y[1:], y[:-1]), axis=0)) > 0.5 * np.abs(np.sum(foreseen, axis=0)))
-
-
-def _pause_noise(model: ComposedModel, data: Dataset, act: Acting, run: int) -> Array:
-    e = model.difference(data.runs[run].y[1:], _predicted(model, data, act, run))
-    return np.asarray(np.nanmedian(np.abs(e), axis=0) / 0.6745) if not np.isnan(e).all() else np.zeros(e.shape[1])
 
 
 def _frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: _Reach) -> list[Fault]:

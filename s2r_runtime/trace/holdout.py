@@ -43,18 +43,22 @@ class Part:
     left_out: tuple[tuple[int, int], ...]
 
 
-def fit_mask(data: Dataset, seed: int) -> Mask:
-    """(M,) steps, of the runs laid end to end, that the fit may see."""
+def fit_mask(data: Dataset, seed: int, *, everything: bool = False) -> Mask:
+    """(M,) steps, of the runs laid end to end, that the fit may see. everything: another recording is the judge."""
     begin = first_steps(data)
-    seen = np.ones(begin[-1], dtype=bool)
-    if len(data.runs) < FEWEST_RUNS:
-        for a, b in pairwise(begin.tolist()):
+    seen = np.zeros(begin[-1], dtype=bool)
+    held_out: list[int] = []
+    if not everything and len(data.runs) >= FEWEST_RUNS:
+        held_out = np.random.default_rng(seed).permutation(len(data.runs))[: round(TEST_SHARE * len(data.runs))].tolist()
+    for i, run in enumerate(data.runs):
+        there = np.flatnonzero(~np.isnan(run.y).any(axis=1))
+        if i in held_out or len(there) < 2:
+            continue
+        a, length = int(begin[i] + there[0]), int(there[-1] - there[0])
+        seen[a : a + length] = True
+        if not everything and len(data.runs) < FEWEST_RUNS:
             for first, last in HELD_OUT:
-                seen[a + round(first * (b - a)) : a + round(last * (b - a))] = False
-        return seen
-    order = np.random.default_rng(seed).permutation(len(data.runs))
-    for i in order[: round(TEST_SHARE * len(data.runs))]:
-        seen[begin[i] : begin[i + 1]] = False
+                seen[a + round(first * length) : a + round(last * length)] = False
     return seen
 
 

@@ -90,7 +90,7 @@ def acting(model: ComposedModel, data: Dataset, effects: Sequence[AppliedEffect]
 def sequence(model: ComposedModel, chain: Sequence[AppliedEffect], inputs: Sequence[Array], dt: float) -> Array:
     """Inputs of each run, (T_i, nu), through a chain of effects from rest; laid end to end, (sum T_i, nu)."""
     longest = max(len(u) for u in inputs)
-    if chain and len(inputs) > max(8, longest // 2):
+    if chain and len(inputs) > 3 and len(inputs) * longest < 2 * sum(len(u) for u in inputs):
         return _side_by_side(model, chain, inputs, dt)
     done = []
     for u in inputs:
@@ -101,18 +101,21 @@ def sequence(model: ComposedModel, chain: Sequence[AppliedEffect], inputs: Seque
 
 
 def _side_by_side(model: ComposedModel, chain: Sequence[AppliedEffect], inputs: Sequence[Array], dt: float) -> Array:
-    """Many short runs: all of them one step at a time."""
+    """Many short runs at once; an effect that cannot do that is taken step by step."""
     lengths = np.array([len(u) for u in inputs])
     table = np.zeros((lengths.max(), len(inputs), inputs[0].shape[1]))
     for i, u in enumerate(inputs):
         table[: len(u), i] = u
-    hidden = [a.effect.hidden(len(inputs), model.nominal, a.channel, dt, a.p) for a in chain]
-    for row in range(len(table)):
-        u = table[row]
-        for j, a in enumerate(chain):
-            u, hidden[j] = a.effect.input_step(u, hidden[j], model.nominal, a.channel, dt, a.p)
-        table[row] = u
-    return np.concatenate([table[:n, i] for i, n in enumerate(lengths)])
+    for a in chain:
+        if getattr(a.effect, "side_by_side", False):
+            table = a.effect.input_sequence(table, model.nominal, a.channel, dt, a.p)
+            continue
+        z, done = a.effect.hidden(len(inputs), model.nominal, a.channel, dt, a.p), []
+        for u in table:
+            acting_now, z = a.effect.input_step(u, z, model.nominal, a.channel, dt, a.p)
+            done.append(acting_now)
+        table = np.stack(done)
+    return table.transpose(1, 0, 2)[np.arange(len(table)) < lengths[:, None]]
 
 
 def predicted(model: ComposedModel, steps: Steps, act: Acting) -> Array:

@@ -24,6 +24,9 @@ POINTS = 4000
 UNLIMITED = 1e5
 """Ends of intervals beyond it are bounds of the parameter, not findings."""
 
+LISTED = 8
+"""Faults that the account lists one by one."""
+
 LAGS = 40
 """Steps of the autocorrelation."""
 
@@ -244,7 +247,9 @@ def _left(tokens: tuple[str, ...], share: float, named: bool) -> str:
 
 
 def _fault_lines(faults: tuple[Fault, ...]) -> list[str]:
-    lines = [f"{f.kind} of {f.channel} from {f.from_s:.3f} s to {f.to_s:.3f} s, left out of the fit" for f in faults if f.kind != "dropout"]
+    loud = [f for f in faults if f.kind != "dropout"]
+    lines = [f"{f.kind} of {f.channel} from {f.from_s:.3f} s to {f.to_s:.3f} s, left out of the fit" for f in loud[:LISTED]]
+    lines += [f"and {len(loud) - LISTED} more faults of measurement"] if len(loud) > LISTED else []
     silent = [f for f in faults if f.kind == "dropout"]
     if silent:
         lines.append(f"{len(silent)} dropout{'s' if len(silent) > 1 else ''}, the longest {max(f.to_s - f.from_s for f in silent):.3g} s")

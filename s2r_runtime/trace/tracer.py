@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge, noise_floor
@@ -75,8 +76,8 @@ def trace(
     say: Progress = progress or (lambda done, total, detail: None)
     _belongs(dataset, model)
     say(0.0, 100.0, "looking for faults of measurement")
-    checked = check(model, dataset)
-    seen = fit_mask(checked.data, seed) if test is None else np.ones(sum(len(r.y) - 1 for r in checked.data.runs), dtype=bool)
+    checked = check(model, with_history(model, dataset))
+    seen = fit_mask(checked.data, seed, everything=test is not None)
     fit_part = part(checked.data, checked.left_out, seen, FIT_STEPS)
     judged_on = _held_out(checked, seen, test, model, horizon)
     ahead = max(1, min(round(horizon / dataset.dt), len(fit_part.steps) // 4))
@@ -154,7 +155,7 @@ def _held_out(checked: Checked, seen: Mask, test: Dataset | None, model: Compose
     """The transitions that the fit does not see."""
     if test is not None:
         _belongs(test, model)
-        other = check(model, test)
+        other = check(model, with_history(model, test))
         everything = np.ones(sum(len(run.y) - 1 for run in other.data.runs), dtype=bool)
         return held(other.data, steps_of(other.data, other.left_out), other.left_out, everything, horizon)
     steps = steps_of(checked.data, checked.left_out)

@@ -1,0 +1,66 @@
+"""Did a run begin at rest, or in the middle of a drive? Hidden states (a lag's, a delay's) depend on what came before its first row.
+
+A run whose first steps are foretold clearly better if its first input had been acting before was under way; that input is then taken to
+have been held before the run, long enough for hidden states to settle. Otherwise the robot stood, and everything before is zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.models.composed import AppliedEffect, ComposedModel
+from s2r_runtime.trace.dataset import Dataset, Run
+from s2r_runtime.trace.residual import sequence
+
+Array = NDArray[np.float64]
+
+FIRST = 2
+"""Steps from which it is told."""
+
+CLEARLY = 0.25
+"""Ratio of squared errors below which it counts as clear; where noise hides it, the robot stood."""
+
+HELD_S = 3.0
+"""For how long the first input is taken to have been held, s (30 to 300 steps)."""
+
+
+def with_history(model: ComposedModel, data: Dataset) -> Dataset:
+    """The dataset, its runs that began under way with what is taken to have been before: rows without a measurement."""
+    steps = int(np.clip(HELD_S / data.dt, 30, 300))
+    runs = tuple(_preceded(data, run, steps) if _under_way(model, data, run, steps) else run for run in data.runs)
+    return replace(data, runs=runs)
+
+
+def _under_way(model: ComposedModel, data: Dataset, run: Run, steps: int) -> bool:
+    """Whether the first steps are foretold clearly better with the first input held before them than from rest."""
+    first = FIRST * data.substeps
+    if len(run.y) < FIRST + 1 or not np.any(run.u[: data.substeps]) or np.isnan(run.y[: FIRST + 1]).any():
+        return False
+    held = np.concatenate([np.tile(run.u[:1], (steps * data.substeps, 1)), run.u[:first]])
+    part = data.dt / data.substeps
+    acting = [sequence(model, _chain(model), [u], part)[-first:].reshape(FIRST, data.substeps, -1) for u in (held, run.u[:first])]
+    if np.allclose(acting[0], acting[1]):  # nothing in the model remembers: what was before shows in the first step alone
+        acting[1] = np.where(np.arange(FIRST)[:, None, None] == 0, 0.0, acting[1])
+    errors = [_errors(model, run, u) for u in acting]
+    size = np.maximum(np.abs(errors[0] - errors[1]).max(axis=0), 1e-300)
+    driven, rested = (float(np.sum((e[:, size > 1e-12] / size[size > 1e-12]) ** 2)) for e in errors)
+    return driven < CLEARLY * rested
+
+
+def _chain(model: ComposedModel) -> list[AppliedEffect]:
+    return [a for a in model.effects if a.effect.stage == "input"]
+
+
+def _errors(model: ComposedModel, run: Run, u: Array) -> Array:
+    """(FIRST, nx) residuals of the first steps under an input as it acts, (FIRST, parts, nu)."""
+    foretold = model.advance(run.y[:FIRST], u.mean(axis=1), u[:, -1])
+    return model.difference(run.y[1 : FIRST + 1], foretold)
+
+
+def _preceded(data: Dataset, run: Run, steps: int) -> Run:
+    y = np.concatenate([np.full((steps, run.y.shape[1]), np.nan), run.y])
+    first = np.tile(run.u[:1], (steps * data.substeps, 1))
+    return Run(run.start_s - steps * data.dt, y, np.concatenate([first, run.u]))
