@@ -15,8 +15,9 @@ from s2r_runtime.hookspecs import Effect
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.fitting import Added, insert
+from s2r_runtime.trace.fitting import insert
 from s2r_runtime.trace.residual import sequence
+from s2r_runtime.trace.slots import Added
 
 Array = NDArray[np.float64]
 

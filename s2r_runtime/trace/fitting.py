@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.residual import Steps, acting, residual, state_jacobian
+from s2r_runtime.trace.residual import Steps, acting, predicted, residual, state_jacobian
 from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
+from s2r_runtime.trace.slots import Added, Free, bounds_of, free_of, inside, values_of, with_values
 
 Array = NDArray[np.float64]
-Free = tuple[tuple[int, str], ...]
 
 EXACT = 3e-4
 """Least standard deviation of noise, as a share of how far the state moves in a step: no model is meant more exactly than that, and data
@@ -48,7 +48,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Fit:
-    """A model on a problem. free: (index of the effect, parameter) of what was fitted; z: (n, nx); white, coloured: log likelihoods."""
+    """A model on a problem. free: what was fitted; z: (n, nx); white, coloured: log likelihoods."""
 
     model: ComposedModel
     free: Free
@@ -63,18 +63,13 @@ class Fit:
     @property
     def k(self) -> int:
         """Number of fitted parameters that these data feel at all (`idle` ones do not); an effect without any counts as one."""
-        named = {i for i, _ in self.free}
+        named = {slot.place for slot in self.free}
         return max(len(self.free) - self.idle, 0) + sum(1 for i in self.added if i not in named)
 
     @property
     def added(self) -> tuple[int, ...]:
         """Places of the effects that the data, not the user, put there."""
         return tuple(i for i, a in enumerate(self.model.effects) if isinstance(a, Added))
-
-
-@dataclass(frozen=True)
-class Added(AppliedEffect):
-    """An effect that the tracer added."""
 
 
 def problem(data: Dataset, steps: Steps) -> Problem:
@@ -98,57 +93,29 @@ def evaluate(given: Problem, model: ComposedModel, near: Noise | None = None) ->
     return Fit(model, free_of(model), level, colour, whiten, z, white, coloured)
 
 
-def free_of(model: ComposedModel) -> Free:
-    """Numeric parameters of the added effects."""
-    return tuple(
-        (i, p.name)
-        for i, a in enumerate(model.effects)
-        if isinstance(a, Added)
-        for p in a.effect.parameters
-        if isinstance(a.p.get(p.name), float)
-    )
-
-
-def values_of(model: ComposedModel, free: Free) -> Array:
-    """(k,) current values."""
-    return np.array([float(model.effects[i].p[name]) for i, name in free])
-
-
-def with_values(model: ComposedModel, free: Free, values: Array) -> ComposedModel | None:
-    """The model with these values, None if they are not allowed."""
-    effects = list(model.effects)
-    for (i, name), value in zip(free, values.tolist(), strict=True):
-        bounds = next(p for p in effects[i].effect.parameters if p.name == name)
-        if not bounds.low <= value <= bounds.high:
-            return None
-        effects[i] = replace(effects[i], p={**effects[i].p, name: value})
-    for i in {i for i, _ in free}:
-        if getattr(effects[i].effect, "wrong", lambda p: "")(effects[i].p):
-            return None
-    return replace(model, effects=tuple(effects))
-
-
 def objective(given: Problem, fit: Fit, model: ComposedModel) -> Array:
     """z (n, nx) of a model under the noise of a fit."""
     r = residual(model, given.steps, acting(model, given.data))
     return fit.colour(fit.whiten(r), given.steps.joined)
 
 
-def sensitivities(given: Problem, fit: Fit, model: ComposedModel, free: Free, z: Array) -> Array:
-    """dz/dp, (n nx, k), one-sided differences inside the bounds."""
+def sensitivities(given: Problem, fit: Fit, model: ComposedModel, free: Free) -> Array:
+    """dz/dp, (n nx, k), one-sided differences inside the bounds, under the noise of a fit."""
+    n, nx = given.steps.y0.shape
+    if not free:
+        return np.zeros((n * nx, 0))
+    here = predicted(model, given.steps, acting(model, given.data))
     now = values_of(model, free)
-    columns = []
+    moved = np.zeros((n, nx, len(free)))
     for j, h in enumerate(_differences(given, model, free)):
         for signed in (h, -h):
             there = now.copy()
             there[j] += signed
             other = with_values(model, free, there)
             if other is not None:
-                columns.append(((objective(given, fit, other) - z) / signed).ravel())
+                moved[:, :, j] = (predicted(other, given.steps, acting(other, given.data)) - here) / -signed
                 break
-        else:
-            columns.append(np.zeros(z.size))
-    return np.stack(columns, axis=1)
+    return fit.colour(fit.whiten(moved), given.steps.joined).reshape(n * nx, len(free))
 
 
 def widening(scores: Array, covariance: Array, nx: int, blocks: int) -> Array:
@@ -167,11 +134,10 @@ def widening(scores: Array, covariance: Array, nx: int, blocks: int) -> Array:
 def _differences(given: Problem, model: ComposedModel, free: Free) -> list[float]:
     """Wide enough that a kink is seen, small against the value."""
     steps = []
-    for i, name in free:
-        a = model.effects[i]
-        p = next(p for p in a.effect.parameters if p.name == name)
+    for slot, value in zip(free, values_of(model, free).tolist(), strict=True):
+        p = bounds_of(model, slot)
         usual = given.data.dt if p.unit == "s" else 1e-3
-        steps.append((1e-3 if p.kink else 1e-4) * max(abs(float(a.p[name]) - (p.neutral or 0.0)), usual))
+        steps.append((1e-3 if p.kink else 1e-4) * max(abs(value - (p.neutral or 0.0)), usual))
     return steps
 
 
@@ -184,13 +150,13 @@ def refine(given: Problem, fit: Fit, model: ComposedModel, free: Free | None = N
     best = float(np.sum(noises.log_density(z)))
     damping = 1e-4
     for _ in range(ITERATIONS):
-        j = sensitivities(given, fit, model, free, z)
+        j = sensitivities(given, fit, model, free)
         w = noises.weight(z).ravel()
         normal, slope = j.T @ (j * w[:, None]), j.T @ (w * z.ravel())
         before = best
         while damping < 1e6:
             damped = normal + np.diag(damping * np.diag(normal) + 1e-12 * np.max(np.diag(normal), initial=1e-300))
-            other = with_values(model, free, _inside(model, free, values_of(model, free) - np.linalg.solve(damped, slope)))
+            other = with_values(model, free, inside(model, free, values_of(model, free) - np.linalg.solve(damped, slope)))
             if other is not None:
                 z_other = objective(given, fit, other)
                 reached = float(np.sum(noises.log_density(z_other)))
@@ -202,11 +168,6 @@ def refine(given: Problem, fit: Fit, model: ComposedModel, free: Free | None = N
         if best - before < 0.02:
             break
     return model
-
-
-def _inside(model: ComposedModel, free: Free, values: Array) -> Array:
-    bounds = [next(p for p in model.effects[i].effect.parameters if p.name == name) for i, name in free]
-    return np.clip(values, [b.low for b in bounds], [b.high for b in bounds])
 
 
 def fitted(given: Problem, start: Fit, model: ComposedModel, rounds: int = ROUNDS) -> Fit:
@@ -222,8 +183,8 @@ def fitted(given: Problem, start: Fit, model: ComposedModel, rounds: int = ROUND
 
 def _idle(given: Problem, fit: Fit) -> int:
     """Parameters that change nothing here: a limit that is never reached."""
-    j = sensitivities(given, fit, fit.model, fit.free, objective(given, fit, fit.model)) if fit.free else np.zeros((1, 0))
-    sizes = np.maximum(np.abs(values_of(fit.model, fit.free)), 1e-9) if fit.free else np.zeros(0)
+    j = sensitivities(given, fit, fit.model, fit.free)
+    sizes = np.maximum(np.abs(values_of(fit.model, fit.free)), 1e-9)
     return int(np.count_nonzero(np.sqrt(np.sum(j * j, axis=0)) * sizes < 0.1))
 
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.fitting import Fit, Free, Problem, objective, sensitivities, values_of, widening, with_values
+from s2r_runtime.trace.fitting import Fit, Problem, objective, sensitivities, widening
+from s2r_runtime.trace.slots import Free, Slot, bounds_of, values_of, with_values
 
 Array = NDArray[np.float64]
 
@@ -20,26 +21,26 @@ NORMAL_95 = 1.96
 BLOCKS = 20
 
 
-def intervals(given: Problem, fit: Fit) -> dict[tuple[int, str], tuple[float, float]]:
-    """(low, high) by (place of the effect, parameter). Where the data say nothing of a parameter: its bounds."""
+def intervals(given: Problem, fit: Fit) -> dict[Slot, tuple[float, float]]:
+    """(low, high) of every number that was fitted. Where the data say nothing of a parameter: its bounds."""
     if not fit.free:
         return {}
     z = objective(given, fit, fit.model)
-    j = sensitivities(given, fit, fit.model, fit.free, z)
+    j = sensitivities(given, fit, fit.model, fit.free)
     w = noises.weight(z).ravel()
     normal = j.T @ (j * w[:, None])
     covariance = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     wider = widening(j * (w * z.ravel())[:, None], np.asarray(covariance), z.shape[1], BLOCKS)
     found = {}
-    for index, (place, name) in enumerate(fit.free):
-        bounds = next(p for p in fit.model.effects[place].effect.parameters if p.name == name)
-        value = float(fit.model.effects[place].p[name])
+    values = values_of(fit.model, fit.free)
+    for index, slot in enumerate(fit.free):
+        bounds, value = bounds_of(fit.model, slot), float(values[index])
         s = float(np.sqrt(max(covariance[index, index], 0.0))) * wider[index]
         known = normal[index, index] > 1e-12 * max(float(np.max(np.diag(normal))), 1e-300)
         if bounds.kink or not known:
-            found[place, name] = _profile(given, fit, index, value, s, wider[index], bounds.low, bounds.high)
+            found[slot] = _profile(given, fit, index, value, s, wider[index], bounds.low, bounds.high)
         else:
-            found[place, name] = float(max(value - NORMAL_95 * s, bounds.low)), float(min(value + NORMAL_95 * s, bounds.high))
+            found[slot] = float(max(value - NORMAL_95 * s, bounds.low)), float(min(value + NORMAL_95 * s, bounds.high))
     return found
 
 
@@ -89,7 +90,7 @@ def _reached(given: Problem, fit: Fit, index: int, value: float) -> float:
 
 
 def _step(given: Problem, fit: Fit, model: ComposedModel, free: Free, z: Array, reached: float) -> tuple[ComposedModel, Array, float]:
-    j = sensitivities(given, fit, model, free, z)
+    j = sensitivities(given, fit, model, free)
     w = noises.weight(z).ravel()
     step = np.linalg.lstsq(j.T @ (j * w[:, None]), j.T @ (w * z.ravel()), rcond=1e-10)[0]
     other = with_values(model, free, values_of(model, free) - step)

@@ -16,7 +16,9 @@ from s2r_runtime.trace.residual import acting, first_steps, rms
 from s2r_runtime.trace.verdict import Verdict
 
 Array = NDArray[np.float64]
-Value = tuple[Any, float | None, float | None, str]
+Limit = float | list[list[float | None]] | None
+Value = tuple[Any, Limit, Limit, str]
+"""Value, low and high end of its 95 % interval (in the shape of the value; None where there is none), unit."""
 
 POINTS = 4000
 """Points of a curve in `plots` at most."""
@@ -229,9 +231,9 @@ _SAID = {
 }
 
 
-def _range(low: float | None, high: float | None) -> str:
+def _range(low: Limit, high: Limit) -> str:
     """The interval in brackets; an end at a parameter's bound says that the data do not limit it there."""
-    if low is None or high is None:
+    if not isinstance(low, float) or not isinstance(high, float):
         return ""
     if abs(low) >= UNLIMITED or abs(high) >= UNLIMITED:
         ends = [f"at least {low:.4g}" if abs(low) < UNLIMITED else "", f"at most {high:.4g}" if abs(high) < UNLIMITED else ""]

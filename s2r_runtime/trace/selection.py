@@ -5,14 +5,13 @@
     significant   gain > log(tried / ALPHA) + k/2 log n               (k parameters; everything tried is paid for)
     relevant      some rollout's rms error falls by RELEVANT, on blocks that the parameters (all but those blocks) never saw
 
-Screening is linear in cost: every start of every candidate is one column, whitened together under the present model's noise; the best
-few are fitted as composed models. A candidate's score is its gain less its price.
+After a first look (`screening`), the best few candidates are fitted as composed models. A candidate's score is its gain less its price.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,22 +19,21 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.candidates import Candidate, candidates
+from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.fitting import (
     WIDEST,
-    Added,
     Fit,
     Problem,
     evaluate,
     fitted,
     objective,
     sensitivities,
-    values_of,
     widening,
-    with_values,
     without,
 )
-from s2r_runtime.trace.residual import acting, predicted, rms, rollout, rollout_starts
+from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
+from s2r_runtime.trace.screening import screen
+from s2r_runtime.trace.slots import Added, values_of, with_values
 
 Array = NDArray[np.float64]
 
@@ -126,54 +124,16 @@ def best_candidates(given: Problem, base: Fit, few: int = FEW) -> tuple[list[Sco
     found = candidates(base.model, given.data)
     screened, columns = screen(given, base, found)
     scored: dict[tuple[str, str], Scored] = {}
-    promising = [item for item in screened[:few] if item[0] > max(HOPELESS, HOPELESS_SHARE * screened[0][0])]
-    for _, candidate, start in promising:
-        fit = fitted(given, base, start, 2)
+    promising = [s for s in screened[:few] if s.value > max(HOPELESS, HOPELESS_SHARE * screened[0].value)]
+    for s in promising:
+        fit = fitted(given, base, s.start, 2)
         value = gain(fit, base) - price(fit.k - base.k, len(given.steps))
-        key = (candidate.name, candidate.channel)
+        key = (s.candidate.name, s.candidate.channel)
         if key not in scored or value > scored[key].score:
             scored[key] = Scored(*key, value, fit)
-    for guess, candidate, _ in screened[len(promising) :]:
-        scored.setdefault((candidate.name, candidate.channel), Scored(candidate.name, candidate.channel, min(guess, 0.0)))
+    for s in screened[len(promising) :]:
+        scored.setdefault((s.candidate.name, s.candidate.channel), Scored(s.candidate.name, s.candidate.channel, min(s.value, 0.0)))
     return sorted(scored.values(), key=lambda s: (s.fit is None, -s.score)), columns
-
-
-def screen(given: Problem, base: Fit, found: Sequence[Candidate]) -> tuple[list[tuple[float, Candidate, ComposedModel]], int]:
-    """(gain under the base's noise, candidate, its best start), best first."""
-    before = predicted(base.model, given.steps, acting(base.model, given.data))
-    starts = [(c, m) for c in found for m in c.models(base.model)]
-    level = float(np.sum(noises.log_density(base.z)))
-    best: dict[tuple[str, str, int], tuple[float, Candidate, ComposedModel]] = {}
-    for chunk in range(0, len(starts), 32):
-        part = starts[chunk : chunk + 32]
-        moved = np.stack([predicted(m, given.steps, acting(m, given.data)) - before for _, m in part], axis=2)
-        whitened = base.whiten(moved)
-        for (candidate, model), column in zip(part, np.moveaxis(whitened, 2, 0), strict=True):
-            value, start = _at_best_size(base, model, column)
-            key = (candidate.name, candidate.channel, candidate.place)
-            if key not in best or value - level > best[key][0]:
-                best[key] = (value - level, candidate, start)
-    ordered = sorted(best.values(), key=lambda item: -item[0])
-    return [item for item in ordered if item[0] > 0.0] + [item for item in ordered if item[0] <= 0.0], len(starts)
-
-
-def _at_best_size(base: Fit, model: ComposedModel, column: Array) -> tuple[float, ComposedModel]:
-    """Log density of what is left, at the start or, for one parameter with a neutral value, at its best multiple."""
-    left = float(np.sum(noises.log_density(base.z - column)))
-    size = float(np.sum(column * column))
-    place = next((i for i, a in enumerate(model.effects) if isinstance(a, Added) and not any(a is b for b in base.model.effects)), None)
-    if place is None or size <= 0.0:
-        return left, model
-    a = model.effects[place]
-    parameters = [p for p in a.effect.parameters if isinstance(a.p.get(p.name), float)]
-    if len(parameters) != 1 or parameters[0].neutral is None or parameters[0].kink:
-        return left, model
-    scale = float(np.sum(column * base.z)) / size
-    neutral = parameters[0].neutral
-    value = neutral + scale * (a.p[parameters[0].name] - neutral)
-    other = with_values(model, ((place, parameters[0].name),), np.array([value]))
-    scaled = float(np.sum(noises.log_density(base.z - scale * column)))
-    return (scaled, other) if other is not None and scaled > left else (left, model)
 
 
 def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int) -> bool:
@@ -188,9 +148,9 @@ def significant(given: Problem, fit: Fit, base: Fit, tried: int) -> bool:
     if reached <= needed or reached > WIDEST**2 * needed or not fit.free:
         return reached > needed
     there = names(base.model)
-    new = [i for i, (place, _) in enumerate(fit.free) if _name(fit.model.effects[place]) not in there]
+    new = [i for i, slot in enumerate(fit.free) if _name(fit.model.effects[slot.place]) not in there]
     z = objective(given, fit, fit.model)
-    j = sensitivities(given, fit, fit.model, fit.free, z)
+    j = sensitivities(given, fit, fit.model, fit.free)
     w = noises.weight(z).ravel()
     covariance = np.linalg.pinv(j.T @ (j * w[:, None]), rcond=1e-12, hermitian=True)
     wider = widening(j * (w * z.ravel())[:, None], np.asarray(covariance), z.shape[1], SCORE_BLOCKS)
@@ -228,7 +188,7 @@ def _less_each_block(given: Problem, fit: Fit, edges: Array) -> list[ComposedMod
     if not free:
         return [fit.model] * BLOCKS
     z = objective(given, fit, fit.model)
-    j = sensitivities(given, fit, fit.model, free, z)
+    j = sensitivities(given, fit, fit.model, free)
     w = noises.weight(z).ravel()
     block = np.repeat(np.clip(np.searchsorted(edges, given.steps.place, side="right") - 1, 0, BLOCKS - 1), z.shape[1])
     models = []

@@ -31,8 +31,9 @@ from s2r_runtime.trace.holdout import BLOCK, Part, fit_mask, part
 from s2r_runtime.trace.intervals import intervals
 from s2r_runtime.trace.lack_of_fit import Structure, lack_of_fit
 from s2r_runtime.trace.residual import Mask, first_steps, rms, steps_of
-from s2r_runtime.trace.result import Found, TraceResult
+from s2r_runtime.trace.result import Found, Limit, TraceResult
 from s2r_runtime.trace.selection import Selection, select
+from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.verdict import confirmed, final_fit, foretells, verdict_of
 
 __all__ = ["Dataset", "TraceResult", "load_dataset", "trace"]
@@ -195,14 +196,24 @@ def _new(fit: Fit, other: Fit) -> list[int]:
     return [i for i in fit.added if (fit.model.effects[i].effect.name, fit.model.effects[i].channel) not in there]
 
 
-def _found(model: ComposedModel, fit: Fit, place: int, ranges: dict[tuple[int, str], tuple[float, float]]) -> Found:
+def _found(model: ComposedModel, fit: Fit, place: int, ranges: dict[Slot, tuple[float, float]]) -> Found:
     a = fit.model.effects[place]
     values = {}
     for p in a.effect.parameters:
-        if p.name in a.p:
-            low, high = (None if end is None else float(end) for end in ranges.get((place, p.name), (None, None)))
-            values[p.name] = (a.p[p.name], low, high, a.effect.unit(model.nominal, a.channel, p.name))
+        value = a.p.get(p.name)
+        if value is None:
+            continue
+        low, high = _limits(value, lambda entry, name=p.name: ranges.get(Slot(place, name, entry)))
+        values[p.name] = (value, low, high, a.effect.unit(model.nominal, a.channel, p.name))
     return Found(a.effect.name, a.channel, values)
+
+
+def _limits(value: object, at: Callable[..., tuple[float, float] | None]) -> tuple[Limit, Limit]:
+    """Low and high in the shape of the value."""
+    if not isinstance(value, list):
+        return at(None) or (None, None)
+    pairs = [[at((i, j)) or (None, None) for j in range(len(row))] for i, row in enumerate(value)]
+    return [[low for low, _ in row] for row in pairs], [[high for _, high in row] for row in pairs]
 
 
 def _spec(model: ComposedModel, final: Fit, data: Dataset) -> ModelSpec:

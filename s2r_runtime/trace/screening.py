@@ -1,0 +1,132 @@
+"""A first look at every candidate, linear in cost: which are worth a fit?
+
+Every start of every candidate is one column c: what it changes in the prediction, whitened under the present model's noise. With J the
+sensitivities of what the present model's own parameters do (they may move aside for the newcomer),
+
+    value = max over delta of  sum log density(z - c - J delta)  -  sum log density(z)           least squares, the density's weights
+
+An effect that enters linearly needs no grid: its columns, one a number, are scaled by the same least squares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.candidates import Candidate
+from s2r_runtime.trace.fitting import Fit, Problem, sensitivities
+from s2r_runtime.trace.residual import acting, predicted
+from s2r_runtime.trace.slots import Free, bounds_of, inside, slots_of, values_of, with_values
+
+Array = NDArray[np.float64]
+
+CHUNK = 48
+"""Columns that are whitened together: few enough to stay in the cache of a small machine."""
+
+
+@dataclass(frozen=True)
+class Screened:
+    """A candidate's best start, with what it would gain in nats under the present noise."""
+
+    value: float
+    candidate: Candidate
+    start: ComposedModel
+
+
+@dataclass(frozen=True)
+class _Probe:
+    """models: one a column; free: the slots that the columns scale, none where the start is taken as it is."""
+
+    candidate: Candidate
+    start: ComposedModel
+    models: tuple[ComposedModel, ...]
+    free: Free
+
+
+def screen(given: Problem, base: Fit, found: Sequence[Candidate]) -> tuple[list[Screened], int]:
+    """Every candidate with its best start, best first; and how many starts were looked at."""
+    probes = [probe for c in found for probe in _probes(c, base.model)]
+    before = predicted(base.model, given.steps, acting(base.model, given.data))
+    white = replace(base, colour=noises.no_colour(base.z.shape[1]))  # what looks like colour may be what an effect explains
+    aside = _Aside(base.z.ravel(), sensitivities(given, white, base.model, base.free))
+    level = float(np.sum(noises.log_density(aside.z)))
+    best: dict[tuple[str, str, int], Screened] = {}
+    for chunk in _chunks(probes):
+        moved = [predicted(m, given.steps, acting(m, given.data)) - before for probe in chunk for m in probe.models]
+        columns = base.whiten(np.stack(moved, axis=2)).reshape(aside.z.size, -1)
+        at = 0
+        for probe in chunk:
+            c = columns[:, at : at + len(probe.models)]
+            at += len(probe.models)
+            value, start = aside.look(probe, c)
+            key = (probe.candidate.name, probe.candidate.channel, probe.candidate.place)
+            if np.isfinite(value) and (key not in best or value - level > best[key].value):
+                best[key] = Screened(value - level, probe.candidate, start)
+    return sorted(best.values(), key=lambda s: -s.value), len(probes)
+
+
+def _chunks(probes: Sequence[_Probe]) -> Iterator[list[_Probe]]:
+    chunk: list[_Probe] = []
+    for probe in probes:
+        chunk.append(probe)
+        if sum(len(p.models) for p in chunk) >= CHUNK:
+            yield chunk
+            chunk = []
+    if chunk:
+        yield chunk
+
+
+def _probes(candidate: Candidate, model: ComposedModel) -> Iterator[_Probe]:
+    for start in candidate.models(model):
+        place = candidate.place if candidate.replaced < 0 else candidate.replaced
+        slots = tuple(slots_of(start.effects[place], place))
+        neutral = [bounds_of(start, s).neutral for s in slots]
+        smooth = all(v is not None and not bounds_of(start, s).kink for s, v in zip(slots, neutral, strict=True))
+        if slots and smooth and (len(slots) == 1 or getattr(start.effects[place].effect, "additive", False)):
+            alone = [_alone(start, slots, i, neutral) for i in range(len(slots))]
+            if all(m is not None for m in alone):
+                yield _Probe(candidate, start, tuple(m for m in alone if m is not None), slots)
+                continue
+        yield _Probe(candidate, start, (start,), ())
+
+
+def _alone(start: ComposedModel, slots: Free, i: int, neutral: Sequence[float | None]) -> ComposedModel | None:
+    """One number as at the start, the others at their neutral values."""
+    values = values_of(start, slots)
+    return with_values(start, slots, np.array([values[j] if j == i else neutral[j] or 0.0 for j in range(len(slots))]))
+
+
+class _Aside:
+    """z of the present model, and how its own parameters move aside. z: (m,), j: (m, k)."""
+
+    def __init__(self, z: Array, j: Array) -> None:
+        self.z = z
+        self._j = j
+        self._w = noises.weight(self.z)
+
+    def look(self, probe: _Probe, c: Array) -> tuple[float, ComposedModel]:
+        """Log density of what the probe leaves, and the model that it means."""
+        best = self._left(self.z - c[:, 0], self._j) if not probe.free or len(probe.free) == 1 else (-np.inf, np.zeros(0))
+        value, start = best[0], probe.start
+        if probe.free:
+            scaled, beta = self._left(self.z, np.hstack([c, self._j]))
+            neutral = np.array([bounds_of(start, s).neutral or 0.0 for s in probe.free])
+            values = neutral + beta[: len(probe.free)] * (values_of(start, probe.free) - neutral)
+            other = with_values(start, probe.free, inside(start, probe.free, values))
+            if other is not None and scaled > value:
+                value, start = scaled, other
+        return value, start
+
+    def _left(self, z: Array, x: Array) -> tuple[float, Array]:
+        """Log density of z less its weighted least squares on x (m, k); the coefficients."""
+        if not x.shape[1]:
+            return float(np.sum(noises.log_density(z))), np.zeros(0)
+        xw = x * self._w[:, None]
+        product = xw.T @ x
+        beta = np.linalg.lstsq(product + 1e-10 * np.diag(np.diag(product)), xw.T @ z, rcond=1e-12)[0]
+        return float(np.sum(noises.log_density(z - x @ beta))), np.asarray(beta)
