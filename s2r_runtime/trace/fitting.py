@@ -72,6 +72,11 @@ class Fit:
         return tuple(i for i, a in enumerate(self.model.effects) if isinstance(a, Added))
 
 
+def gain(fit: Fit, base: Fit) -> float:
+    """Nats that `fit` explains beyond `base`, noise re-estimated under both, white and coloured: the smaller one."""
+    return min(fit.white - base.white, fit.coloured - base.coloured)
+
+
 def problem(data: Dataset, steps: Steps) -> Problem:
     """Of these transitions."""
     moved = np.std(steps.y1 - steps.y0, axis=0) + 1e-9 * np.std(steps.y0, axis=0) + 1e-12

@@ -1,11 +1,9 @@
 """Which effects does the residual call for? Forward selection, exchange, backward elimination.
 
-    gain(M)       = log likelihood of M, noise as it estimates it itself, less that of the model without the effect;
-                    the smaller of white and coloured: "just more noise" and "coloured noise" are rivals
-    significant   gain > log(tried / ALPHA) + k/2 log n               (k parameters; everything tried is paid for)
-    relevant      some rollout's rms error falls by RELEVANT, on blocks that the parameters (all but those blocks) never saw
-
-After a first look (`screening`), the best few candidates are fitted as composed models. A candidate's score is its gain less its price.
+gain          of a model over the one without the effect, the smaller of white and coloured (`scores`): "just more noise" and
+              "coloured noise" are rivals
+significant   gain > log(tried / ALPHA) + k/2 log n               (k parameters; everything tried is paid for)
+relevant      some rollout's rms error falls by RELEVANT, on blocks that the parameters (all but those blocks) never saw
 """
 
 from __future__ import annotations
@@ -17,23 +15,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.models.composed import AppliedEffect, ComposedModel
+from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.fitting import (
     WIDEST,
     Fit,
     Problem,
     evaluate,
     fitted,
+    gain,
     objective,
     sensitivities,
     widening,
     without,
 )
 from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
-from s2r_runtime.trace.screening import screen
-from s2r_runtime.trace.slots import Added, values_of, with_values
+from s2r_runtime.trace.rivals import CLOSE, rivals
+from s2r_runtime.trace.scores import Scored, best_candidates, name_of, names, price
+from s2r_runtime.trace.slots import values_of, with_values
 
 Array = NDArray[np.float64]
 
@@ -42,12 +41,6 @@ ALPHA = 1e-3
 
 RELEVANT = 0.05
 """An effect that lowers no rollout error by this share is left out: nobody would notice it."""
-
-FEW = 8
-"""Candidates that are fitted as composed models, after screening."""
-
-HOPELESS, HOPELESS_SHARE = 2.0, 0.05
-"""A candidate that screening gives fewer nats, or less than this share of the best one's, is not fitted."""
 
 MOST = 5
 """Effects that are looked for at most."""
@@ -58,21 +51,8 @@ SCORE_BLOCKS = 10
 BLOCKS = 5
 """Of the cross-validation."""
 
-CLOSE = 3.0
-"""Rivals whose score is within this (nats) of the best cannot be told from it: odds of 20 to 1."""
-
 STARTS = 1200
 """Rollouts that relevance is judged on at most."""
-
-
-@dataclass(frozen=True)
-class Scored:
-    """A candidate that was tried. score: its gain less its price, in nats."""
-
-    name: str
-    channel: str
-    score: float
-    fit: Fit | None = None
 
 
 @dataclass(frozen=True)
@@ -86,16 +66,6 @@ class Selection:
     tried: int
     ranking: tuple[Scored, ...]
     rivals: tuple[Scored, ...]
-
-
-def gain(fit: Fit, base: Fit) -> float:
-    """Nats that `fit` explains beyond `base`, noise re-estimated under both, white and coloured."""
-    return min(fit.white - base.white, fit.coloured - base.coloured)
-
-
-def price(k: int, n: int) -> float:
-    """Of k parameters on n transitions."""
-    return 0.5 * k * math.log(max(n, 2))
 
 
 def select(given: Problem, model: ComposedModel, horizon: int, progress: Callable[[float], None]) -> Selection:
@@ -119,23 +89,6 @@ def select(given: Problem, model: ComposedModel, horizon: int, progress: Callabl
     return Selection(nominal, fit, tried, tuple(ranking), tuple(rivals(given, fit)))
 
 
-def best_candidates(given: Problem, base: Fit, few: int = FEW) -> tuple[list[Scored], int]:
-    """The candidates for one more effect, fitted, best score first; and how many columns were tried."""
-    found = candidates(base.model, given.data)
-    screened, columns = screen(given, base, found)
-    scored: dict[tuple[str, str], Scored] = {}
-    promising = [s for s in screened[:few] if s.value > max(HOPELESS, HOPELESS_SHARE * screened[0].value)]
-    for s in promising:
-        fit = fitted(given, base, s.start, 2)
-        value = gain(fit, base) - price(fit.k - base.k, len(given.steps))
-        key = (s.candidate.name, s.candidate.channel)
-        if key not in scored or value > scored[key].score:
-            scored[key] = Scored(*key, value, fit)
-    for s in screened[len(promising) :]:
-        scored.setdefault((s.candidate.name, s.candidate.channel), Scored(s.candidate.name, s.candidate.channel, min(s.value, 0.0)))
-    return sorted(scored.values(), key=lambda s: (s.fit is None, -s.score)), columns
-
-
 def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int) -> bool:
     """Significant and relevant."""
     return significant(given, fit, base, tried) and relevant(given, fit, base, horizon)
@@ -148,7 +101,7 @@ def significant(given: Problem, fit: Fit, base: Fit, tried: int) -> bool:
     if reached <= needed or reached > WIDEST**2 * needed or not fit.free:
         return reached > needed
     there = names(base.model)
-    new = [i for i, slot in enumerate(fit.free) if _name(fit.model.effects[slot.place]) not in there]
+    new = [i for i, slot in enumerate(fit.free) if name_of(fit.model.effects[slot.place]) not in there]
     z = objective(given, fit, fit.model)
     j = sensitivities(given, fit, fit.model, fit.free)
     w = noises.weight(z).ravel()
@@ -223,28 +176,3 @@ def pruned(given: Problem, fit: Fit, tried: int, horizon: int) -> Fit:
                 fit, again = less, True
                 break
     return fit
-
-
-def rivals(given: Problem, fit: Fit) -> list[Scored]:
-    """Models with one effect replaced by another, of which the likelihood says the same."""
-    found = []
-    for place in fit.added:
-        mine = fit.model.effects[place]
-        base = fitted(given, fit, without(fit.model, place), 1)
-        scored, _ = best_candidates(given, base, 6)
-        here = gain(fit, base) - price(fit.k - base.k, len(given.steps))
-        found += [
-            Scored(s.name, s.channel, s.score, s.fit)
-            for s in scored
-            if s.fit is not None and (s.name, s.channel) != (mine.effect.name, mine.channel) and s.score >= here - CLOSE
-        ]
-    return found
-
-
-def names(model: ComposedModel) -> tuple[tuple[str, str], ...]:
-    """(effect, channel) of what was added, sorted."""
-    return tuple(sorted(_name(a) for a in model.effects if isinstance(a, Added)))
-
-
-def _name(a: AppliedEffect) -> tuple[str, str]:
-    return a.effect.name, a.channel

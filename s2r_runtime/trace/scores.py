@@ -1,0 +1,64 @@
+"""Candidates for one more effect, looked at, then fitted, then scored.
+
+gain    nats that a model explains beyond another one, noise re-estimated under both, white and coloured: the smaller one
+price   k/2 log n for k parameters on n transitions
+score   gain less price
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from s2r_runtime.models.composed import AppliedEffect, ComposedModel
+from s2r_runtime.trace.candidates import candidates
+from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain
+from s2r_runtime.trace.screening import screen
+from s2r_runtime.trace.slots import Added
+
+FEW = 10
+"""Candidates that are fitted as composed models, after screening."""
+
+HOPELESS, HOPELESS_SHARE = 2.0, 0.05
+"""A candidate that screening gives fewer nats, or less than this share of the best one's, is not fitted."""
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A candidate that was tried, with its score in nats."""
+
+    name: str
+    channel: str
+    score: float
+    fit: Fit | None = None
+
+
+def price(k: int, n: int) -> float:
+    """Of k parameters on n transitions (Schwarz)."""
+    return 0.5 * k * math.log(max(n, 2))
+
+
+def best_candidates(given: Problem, base: Fit, few: int = FEW) -> tuple[list[Scored], int]:
+    """The candidates for one more effect, fitted, best score first; and how many starts were looked at."""
+    screened, tried = screen(given, base, candidates(base.model, given.data))
+    scored: dict[tuple[str, str], Scored] = {}
+    promising = [s for s in screened[:few] if s.value > max(HOPELESS, HOPELESS_SHARE * screened[0].value)]
+    for s in promising:
+        fit = fitted(given, base, s.start, 2)
+        value = gain(fit, base) - price(fit.k - base.k, len(given.steps))
+        key = (s.candidate.name, s.candidate.channel)
+        if key not in scored or value > scored[key].score:
+            scored[key] = Scored(*key, value, fit)
+    for s in screened[len(promising) :]:
+        scored.setdefault((s.candidate.name, s.candidate.channel), Scored(s.candidate.name, s.candidate.channel, min(s.value, 0.0)))
+    return sorted(scored.values(), key=lambda s: (s.fit is None, -s.score)), tried
+
+
+def names(model: ComposedModel) -> tuple[tuple[str, str], ...]:
+    """(effect, channel) of what was added, sorted."""
+    return tuple(sorted(name_of(a) for a in model.effects if isinstance(a, Added)))
+
+
+def name_of(a: AppliedEffect) -> tuple[str, str]:
+    """(effect, channel)."""
+    return a.effect.name, a.channel
