@@ -134,8 +134,16 @@ class Effect(Protocol):
       place in the list only; `shift` = True: a pure delay, which commutes with all that has no clock of its own;
     - `side_by_side` = True: `input_sequence` also takes u (T, runs, nu), many short runs at once;
     - `within_step(dt, p) -> bool`: whether what acts changes within a step although the input is held over it;
+    - `reads(model, channel) -> tuple[str, ...]`: inputs besides the channel on which what acts there depends;
     - `starts(u, model, channel, dt) -> list[dict]`: parameter values from which the tracer begins, given the input that it would
-      get, u (T, nu). Without it the tracer begins from a grid over the parameters' bounds.
+      get, u (T, nu). Without it the tracer begins from a grid over the parameters' bounds;
+    - `timed` = True: it depends on the time since the recording's (or the rollout's) start, in s; times below 0 count as 0. Column 0 of
+      its hidden state is that time at the start of the step, which `input_step` advances by dt. `input_sequence(..., start=0.0)` gets
+      the time of the first row (float, or (runs,) with u (T, runs, nu)), `starts(..., t)` the times of the rows, (T,);
+    - `starts_from_residual(residual, t, pushes, model, channel, dt) -> list[dict]`: further values to begin from, for what the input
+      alone does not show (a frequency, the time of a change). residual (n, nx): measured less foretold, t (n,): the steps' times in s,
+      ascending, gaps allowed; pushes (n, nx): by how much a unit more of the channel's input moves the state over each step. With
+      `proportional` = True: by how much the input's own value more of it does. Both may be whitened, alike.
     """
 
     name: str

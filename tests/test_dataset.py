@@ -170,7 +170,7 @@ def test_short_runs_side_by_side_act_as_one_after_the_other():
     model, rng = _model(effects=effects), np.random.default_rng(4)
     runs = [(np.zeros((n + 1, 3)), rng.normal(size=(n, 2))) for n in rng.integers(3, 12, 20)]
     together = acting(model, from_arrays(model, runs)).mean
-    alone = np.concatenate([sequence(model, model.effects, [u], 0.1) for _, u in runs])
+    alone = np.concatenate([sequence(model, model.effects, [u], 0.1, [0.0]) for _, u in runs])
     assert np.allclose(together, alone, rtol=1e-12, atol=1e-14)
 
 

@@ -108,6 +108,8 @@ class ComposedModel:
                 given = acting
                 for _ in range(SETTLE_STEPS if np.any(given) and z.size else 1):
                     acting, after = a.effect.input_step(given, z, self.nominal, a.channel, dt, a.p)
+                    if getattr(a.effect, "timed", False):
+                        after[:, 0] = 0.0  # time has not begun yet
                     settled = np.allclose(after, z, rtol=1e-12, atol=1e-15)
                     z = after
                     if settled:

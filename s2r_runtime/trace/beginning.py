@@ -41,7 +41,10 @@ def _under_way(model: ComposedModel, data: Dataset, run: Run, steps: int) -> boo
         return False
     held = np.concatenate([np.tile(run.u[:1], (steps * data.substeps, 1)), run.u[:first]])
     part = data.dt / data.substeps
-    acting = [sequence(model, _chain(model), [u], part)[-first:].reshape(FIRST, data.substeps, -1) for u in (held, run.u[:first])]
+    acting = [
+        sequence(model, _chain(model), [u], part, [run.start_s + part * (first - len(u))])[-first:].reshape(FIRST, data.substeps, -1)
+        for u in (held, run.u[:first])
+    ]
     if np.allclose(acting[0], acting[1]):  # nothing in the model remembers: what was before shows in the first step alone
         acting[1] = np.where(np.arange(FIRST)[:, None, None] == 0, 0.0, acting[1])
     errors = [_errors(model, run, u) for u in acting]

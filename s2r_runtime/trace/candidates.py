@@ -16,7 +16,7 @@ from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.fitting import insert
-from s2r_runtime.trace.residual import sequence
+from s2r_runtime.trace.residual import sequence, times
 from s2r_runtime.trace.slots import Added
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ def candidates(model: ComposedModel, data: Dataset) -> list[Candidate]:
     """All that can be added to the model. What the tracer added already is not added again on the same channel."""
     found = []
     taken = {(a.effect.name, a.channel) for a in model.effects if isinstance(a, Added)}
-    inputs = [run.u for run in data.runs]
+    inputs, begun, t = [run.u for run in data.runs], [run.start_s for run in data.runs], times(data)
     part = data.dt / data.substeps
     given: dict[int, Array] = {}
     for name in registry().names("effects"):
@@ -59,8 +59,8 @@ def candidates(model: ComposedModel, data: Dataset) -> list[Candidate]:
                 continue
             for place in _places(model, effect, channel):
                 if place not in given:
-                    given[place] = sequence(model, _input_effects(model, place), inputs, part)
-                starts = _starts(effect, given[place], model, channel, data.dt)
+                    given[place] = sequence(model, _input_effects(model, place), inputs, part, begun)
+                starts = _starts(effect, given[place], model, channel, data.dt, t)
                 if starts:
                     found.append(Candidate(name, channel, place, tuple(AppliedEffect(effect, channel, p) for p in starts)))
     return found
@@ -75,19 +75,26 @@ def _places(model: ComposedModel, effect: Effect, channel: str) -> list[int]:
     end = len(model.effects)
     if effect.stage == "step":
         return [end]
-    return [end, *(i for i, a in enumerate(model.effects) if a.effect.stage == "input" and not commute(effect, channel, a))]
+    return [end, *(i for i, a in enumerate(model.effects) if a.effect.stage == "input" and not commute(effect, channel, a, model))]
 
 
-def commute(effect: Effect, channel: str, other: AppliedEffect) -> bool:
+def commute(effect: Effect, channel: str, other: AppliedEffect, model: ComposedModel) -> bool:
     """Whether their order makes no difference (but for what is averaged within a step)."""
-    if "*" not in {channel, other.channel} and channel != other.channel:
+    here, there = _concerned(effect, channel, model), _concerned(other.effect, other.channel, model)
+    if channel not in there and other.channel not in here and "*" not in {channel, other.channel}:
         return True
     if getattr(effect, "linear", False) and getattr(other.effect, "linear", False):
         return True
-    for one, on, two in ((effect, channel, other.channel), (other.effect, other.channel, channel)):
-        if getattr(one, "shift", False) and (on in {"*", two}):
+    for one, on, two in ((effect, channel, there), (other.effect, other.channel, here)):
+        if getattr(one, "shift", False) and (on == "*" or two == {on}):
             return True
     return False
+
+
+def _concerned(effect: Effect, channel: str, model: ComposedModel) -> set[str]:
+    """The channel, and the inputs that what acts there depends on."""
+    reads = getattr(effect, "reads", None)
+    return {channel, *(reads(model.nominal, channel) if reads else ())}
 
 
 def _instead(model: ComposedModel, effect: Effect, channel: str, place: int, dt: float) -> list[Candidate]:
@@ -101,8 +108,10 @@ def _instead(model: ComposedModel, effect: Effect, channel: str, place: int, dt:
     )
 
 
-def _starts(effect: Effect, u: Array, model: ComposedModel, channel: str, dt: float) -> list[dict[str, float | str]]:
-    """The effect's own, else a grid between the neutral value and the bounds."""
+def _starts(effect: Effect, u: Array, model: ComposedModel, channel: str, dt: float, t: Array) -> list[dict[str, float | str]]:
+    """The effect's own, else a grid between the neutral value and the bounds. t: of the rows of u, s."""
+    if hasattr(effect, "starts") and getattr(effect, "timed", False):
+        return list(effect.starts(u, model.nominal, channel, dt, t))
     if hasattr(effect, "starts"):
         return list(effect.starts(u, model.nominal, channel, dt))
     grids: list[dict[str, float | str]] = [{}]

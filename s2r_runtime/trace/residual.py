@@ -76,10 +76,15 @@ def steps_of(data: Dataset, left_out: Sequence[tuple[int, int]] = ()) -> Steps:
     return everything.take(np.flatnonzero(good))
 
 
+def times(data: Dataset) -> Array:
+    """When each row of the inputs of all runs, laid end to end, begins: (sum T_i,), s since the recording's first stamp."""
+    return np.concatenate([run.start_s + data.dt / data.substeps * np.arange(len(run.u)) for run in data.runs])
+
+
 def acting(model: ComposedModel, data: Dataset, effects: Sequence[AppliedEffect] | None = None) -> Acting:
     """The input as it acts after the effects of stage `input` (None: the model's)."""
     chain = [a for a in (model.effects if effects is None else effects) if a.effect.stage == "input"]
-    u = sequence(model, chain, [run.u for run in data.runs], data.dt / data.substeps)
+    u = sequence(model, chain, [run.u for run in data.runs], data.dt / data.substeps, [run.start_s for run in data.runs])
     if data.substeps == 1:
         return Acting(u, u)
     table = u.reshape(-1, data.substeps * u.shape[1])
@@ -87,30 +92,39 @@ def acting(model: ComposedModel, data: Dataset, effects: Sequence[AppliedEffect]
     return Acting(mean, table[:, -u.shape[1] :].copy())
 
 
-def sequence(model: ComposedModel, chain: Sequence[AppliedEffect], inputs: Sequence[Array], dt: float) -> Array:
-    """Inputs of each run, (T_i, nu), through a chain of effects from rest; laid end to end, (sum T_i, nu)."""
+def sequence(model: ComposedModel, chain: Sequence[AppliedEffect], inputs: Sequence[Array], dt: float, starts: Sequence[float]) -> Array:
+    """Inputs of each run, (T_i, nu), through a chain of effects from rest; laid end to end, (sum T_i, nu). starts: of the runs, s."""
     longest = max(len(u) for u in inputs)
     if chain and len(inputs) > 3 and len(inputs) * longest < 2 * sum(len(u) for u in inputs):
-        return _side_by_side(model, chain, inputs, dt)
+        return _side_by_side(model, chain, inputs, dt, np.array(starts, dtype=np.float64))
     done = []
-    for u in inputs:
+    for u, start in zip(inputs, starts, strict=True):
         for a in chain:
-            u = a.effect.input_sequence(u, model.nominal, a.channel, dt, a.p)
+            u = _over_time(a, u, model, dt, start)
         done.append(u)
     return np.concatenate(done)
 
 
-def _side_by_side(model: ComposedModel, chain: Sequence[AppliedEffect], inputs: Sequence[Array], dt: float) -> Array:
-    """Many short runs at once; an effect that cannot do that is taken step by step."""
+def _over_time(a: AppliedEffect, u: Array, model: ComposedModel, dt: float, start: float | Array) -> Array:
+    """`input_sequence`; an effect that depends on time is told when the first row is."""
+    if getattr(a.effect, "timed", False):
+        return a.effect.input_sequence(u, model.nominal, a.channel, dt, a.p, start=start)  # type: ignore[call-arg]
+    return a.effect.input_sequence(u, model.nominal, a.channel, dt, a.p)
+
+
+def _side_by_side(model: ComposedModel, chain: Sequence[AppliedEffect], inputs: Sequence[Array], dt: float, starts: Array) -> Array:
+    """Many short runs at once, starts (runs,); an effect that cannot do that is taken step by step."""
     lengths = np.array([len(u) for u in inputs])
     table = np.zeros((lengths.max(), len(inputs), inputs[0].shape[1]))
     for i, u in enumerate(inputs):
         table[: len(u), i] = u
     for a in chain:
         if getattr(a.effect, "side_by_side", False):
-            table = a.effect.input_sequence(table, model.nominal, a.channel, dt, a.p)
+            table = _over_time(a, table, model, dt, starts)
             continue
         z, done = a.effect.hidden(len(inputs), model.nominal, a.channel, dt, a.p), []
+        if getattr(a.effect, "timed", False):
+            z[:, 0] = starts
         for u in table:
             acting_now, z = a.effect.input_step(u, z, model.nominal, a.channel, dt, a.p)
             done.append(acting_now)
