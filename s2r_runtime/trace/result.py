@@ -12,6 +12,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.errors import Held, Judged
 from s2r_runtime.trace.faults import Fault
+from s2r_runtime.trace.power import Visible
 from s2r_runtime.trace.residual import acting, first_steps, rms
 from s2r_runtime.trace.verdict import Verdict
 
@@ -84,6 +85,7 @@ class TraceResult:
     n_rows: int
     source: str
     interpolated: bool
+    could_see: tuple[Visible, ...] = ()
 
     @property
     def horizon_s(self) -> float:
@@ -112,6 +114,9 @@ class TraceResult:
             "gap": {"before": self.gap[0], "after": self.gap[1], "independent": self.gap[2]},
             "faults": [{"from_s": f.from_s, "to_s": f.to_s, "channel": f.channel, "kind": f.kind} for f in self.faults],
             "outliers": self.outliers,
+            "could_see": [
+                {"name": v.name, "channel": v.channel, "parameter": v.parameter, "size": v.size, "unit": v.unit} for v in self.could_see
+            ],
             "n_fit": self.n_fit,
             "n_test": len(self.held.steps),
         }

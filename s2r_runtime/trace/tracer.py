@@ -11,6 +11,7 @@ Deterministic: the same recording, model and seed give the same result.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import msgspec
@@ -30,9 +31,10 @@ from s2r_runtime.trace.fitting import Fit, Problem, evaluate, problem
 from s2r_runtime.trace.holdout import BLOCK, Part, fit_mask, part
 from s2r_runtime.trace.intervals import intervals
 from s2r_runtime.trace.lack_of_fit import Structure, lack_of_fit
+from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.residual import Mask, first_steps, rms, steps_of
 from s2r_runtime.trace.result import Found, Limit, TraceResult
-from s2r_runtime.trace.selection import Selection, select
+from s2r_runtime.trace.selection import ALPHA, Selection, select
 from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.verdict import confirmed, final_fit, foretells, verdict_of
 
@@ -141,6 +143,7 @@ def _result(
         n_rows=dataset.rows,
         source=dataset.source,
         interpolated=dataset.interpolated,
+        could_see=visible(given, final, math.log(max(chosen.tried, 1) / ALPHA)),
     )
 
 
