@@ -25,6 +25,8 @@ _EFFECTS = {
     "input_delay": "an input acts later",
     "input_lag": "an input is followed with a first-order lag",
     "input_saturation": "an input is clipped",
+    "input_gain_drift": "an input's gain drifts with time",
+    "regime_change": "an input's gain changes at one time",
     "wheel_saturation": "both wheels of a unicycle are clipped, which couples v and w",
     "integration_scheme": "the pose moves along arcs, not along the step's first tangent",
 }

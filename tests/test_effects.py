@@ -16,6 +16,13 @@ EFFECTS = registry().names("effects")
 DT = 0.05
 
 
+def _starts(effect, u, model, channel):
+    """What the tracer would begin from; effects that depend on time are told when the rows are."""
+    if getattr(effect, "timed", False):
+        return effect.starts(u, model, channel, DT, DT * np.arange(len(u)))
+    return effect.starts(u, model, channel, DT)
+
+
 def _places():
     """(effect name, model name, channel): every place that an effect offers itself for."""
     found = []
@@ -28,7 +35,7 @@ def _places():
 def _values(effect, data, model, channel):
     """A draw of parameter values within bounds and within what a robot could have."""
     u = np.array([[2.0] * len(model.inputs), [-2.0] * len(model.inputs)])
-    start = data.draw(st.sampled_from(effect.starts(u, model, channel, DT)))
+    start = data.draw(st.sampled_from(_starts(effect, u, model, channel)))
     factor = data.draw(st.floats(0.3, 3.0))
     return {k: v * factor if isinstance(v, float) else v for k, v in start.items()}
 
@@ -53,7 +60,7 @@ def test_stepping_and_the_whole_sequence_at_once_agree(name, model_name, channel
 def test_a_batch_acts_as_its_rows_do_and_leaves_the_command_as_it_was(name, model_name, channel):
     effect, model = registry().get("effects", name), registry().get("models", model_name)
     u = np.random.default_rng(2).normal(size=(6, len(model.inputs)))
-    p = effect.starts(u, model, channel, DT)[0]
+    p = _starts(effect, u, model, channel)[0]
     kept = u.copy()
     z = effect.hidden(6, model, channel, DT, p)
     together, after = effect.input_step(u, z, model, channel, DT, p)

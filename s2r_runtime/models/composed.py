@@ -7,7 +7,7 @@ what a long time at zero input leaves (a campaign's full stop).
 
 u_act is the input's mean over the step. Where a nominal model says that a state is set to an input at once (`reached`: a wheel's
 speed, a car's speed), that state is the input as it acts at the end of the step. What an effect makes of a held input may change within
-the step (`within_step`: a lag, a delay by a part of a step). Where that meets such a state, or an effect that is not linear,
+the step (`within_step`: a lag, a delay by a part of a step). Where that meets such a state, or a later effect that is not linear,
 the effects are run in SUBSTEPS parts of the step, of which the last one stands for its end.
 """
 
@@ -92,9 +92,11 @@ class ComposedModel:
     def substeps(self) -> int:
         """Parts of a step in which the effects of stage `input` are run: 1 where that is exact."""
         chain = [a for a in self.effects if a.effect.stage == "input"]
-        moving = any(getattr(a.effect, "within_step", _never)(self.dt, a.p) for a in chain)
-        needed = getattr(self.nominal, "reached", None) or not all(getattr(a.effect, "linear", False) for a in chain)
-        return SUBSTEPS if moving and needed else 1
+        moving = [i for i, a in enumerate(chain) if getattr(a.effect, "within_step", _never)(self.dt, a.p)]
+        if not moving:
+            return 1
+        straight = all(getattr(a.effect, "linear", False) for a in chain[moving[0] + 1 :])
+        return SUBSTEPS if getattr(self.nominal, "reached", None) or not straight else 1
 
     @cached_property
     def _rest(self) -> Hidden:

@@ -1,0 +1,78 @@
+"""An input's gain changes at one time and stays so (a part breaks, a load is put on): u_act = u before `time`, gain u from then on.
+
+u is constant over each step; the mean over the step in which it happens has the part of the step that is left:
+
+    s = min(max((t + dt - time) / dt, 0), 1),   u_act = (1 + (gain - 1) s) u
+
+The tracer finds the time in one pass over the residual: with r the residual and c = what the input's own value more of it does to the
+state, a change at t_k by (gain - 1) = A_k / B_k explains A_k² / B_k of the sum of squares, where A_k = sum over j >= k of c_j . r_j,
+B_k = sum over j >= k of |c_j|².
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from s2r_runtime.effects.input_effect import Array, Values, columns
+from s2r_runtime.effects.timed_input import TimedInputEffect
+from s2r_runtime.hookspecs import NominalModel, Parameter
+
+COARSE = 6
+"""Times that the tracer begins from, so that between two of them the input does a sixth of what it does in all."""
+
+GAINS = (0.7, 1.3)
+
+BEST = 3
+"""Peaks of the explained sum of squares that are offered: the noise may put the highest one a few steps off."""
+
+EDGE = 0.02
+"""A change before or after which the input does less than this share of what it does in all is a constant gain, or none."""
+
+APART = 0.02
+"""Peaks nearer to each other than this share of the rows are one."""
+
+
+class RegimeChange(TimedInputEffect):
+    """time in s since the start, gain from then on (1 is none); on one input, or on all alike (`*`)."""
+
+    name = "regime_change"
+    parameters = (Parameter("time", "s", 0.0, 1e7, kink=True), Parameter("gain", "", 0.0, 100.0, neutral=1.0))
+    all_alike = True
+    proportional = True
+
+    def within_step(self, dt: float, p: Values) -> bool:
+        """It comes within a step, unless between two."""
+        place = p["time"] / dt
+        return bool(abs(place - round(place)) > 1e-9 * max(place, 1.0))
+
+    def act_at(self, u: Array, t: Array, dt: float, p: Values) -> Array:
+        """u, gain u after."""
+        time, gain = float(p["time"]), float(p["gain"])
+        left = np.clip((t + (dt - time)) / dt, 0.0, 1.0) if time > 0.0 else np.ones_like(t)
+        return u * (1.0 + (gain - 1.0) * left)
+
+    def starts(self, u: Array, model: NominalModel, channel: str, dt: float, t: Array) -> list[Values]:
+        """Times that cut what the input does into equal parts, a change down and up."""
+        done: Array = np.cumsum(np.sum(u[:, columns(model, channel)] ** 2, axis=1))
+        if not len(done) or done[-1] == 0.0:
+            return []
+        shares = (np.arange(COARSE) + 0.5) / COARSE
+        times = t[np.minimum(np.searchsorted(done, shares * done[-1]), len(t) - 1)]
+        return [{"time": max(float(when), 0.0), "gain": gain} for when in times for gain in GAINS]
+
+    def starts_from_residual(self, residual: Array, t: Array, pushes: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
+        """The best times, each with the gain that fits."""
+        a = np.cumsum(np.sum(pushes * residual, axis=1)[::-1])[::-1]
+        b = np.cumsum(np.sum(pushes * pushes, axis=1)[::-1])[::-1]
+        inside = (b > EDGE * b[:1]) & (b < (1.0 - EDGE) * b[:1])
+        explained = np.where(inside, a * a / np.maximum(b, 1e-300), 0.0)
+        found: list[Values] = []
+        apart = max(1, round(APART * len(t)))
+        while len(found) < BEST and explained.max(initial=0.0) > 0.0:
+            k = int(np.argmax(explained))
+            found.append({"time": max(float(t[k]), 0.0), "gain": float(np.clip(1.0 + a[k] / b[k], 0.0, 100.0))})
+            explained[max(0, k - apart) : k + apart + 1] = 0.0
+        return found
+
+
+EFFECT = RegimeChange()
