@@ -1,0 +1,1 @@
+"""MAVLink transport and recordings."""

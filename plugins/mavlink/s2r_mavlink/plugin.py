@@ -1,0 +1,3 @@
+"""What this package offers."""
+
+from __future__ import annotations
