@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace.dataset import Dataset, Run
-from s2r_runtime.trace.residual import sequence
+from s2r_runtime.trace.residual import acting, residual, sequence, steps_of
 
 Array = NDArray[np.float64]
 
@@ -30,26 +30,33 @@ HELD_S = 3.0
 def with_history(model: ComposedModel, data: Dataset) -> Dataset:
     """The dataset, its runs that began under way with what is taken to have been before: rows without a measurement."""
     steps = int(np.clip(HELD_S / data.dt, 30, 300))
-    runs = tuple(_preceded(data, run, steps) if _under_way(model, data, run, steps) else run for run in data.runs)
+    usual = _usual(model, data)
+    runs = tuple(_preceded(data, run, steps) if _under_way(model, data, run, steps, usual) else run for run in data.runs)
     return replace(data, runs=runs)
 
 
-def _under_way(model: ComposedModel, data: Dataset, run: Run, steps: int) -> bool:
+def _usual(model: ComposedModel, data: Dataset) -> Array:
+    """(nx,) usual size of a residual, which tells how much an error of the first steps weighs."""
+    act = acting(model, data)
+    steps = steps_of(data)
+    return np.median(np.abs(residual(model, steps, act)), axis=0) / 0.6745 + 1e-12 if len(steps) else np.ones(len(model.states))
+
+
+def _under_way(model: ComposedModel, data: Dataset, run: Run, steps: int, usual: Array) -> bool:
     """Whether the first steps are foretold clearly better with the first input held before them than from rest."""
     first = FIRST * data.substeps
     if len(run.y) < FIRST + 1 or not np.any(run.u[: data.substeps]) or np.isnan(run.y[: FIRST + 1]).any():
         return False
     held = np.concatenate([np.tile(run.u[:1], (steps * data.substeps, 1)), run.u[:first]])
     part = data.dt / data.substeps
-    acting = [
+    acted = [
         sequence(model, _chain(model), [u], part, [run.start_s + part * (first - len(u))])[-first:].reshape(FIRST, data.substeps, -1)
         for u in (held, run.u[:first])
     ]
-    if np.allclose(acting[0], acting[1]):  # nothing in the model remembers: what was before shows in the first step alone
-        acting[1] = np.where(np.arange(FIRST)[:, None, None] == 0, 0.0, acting[1])
-    errors = [_errors(model, run, u) for u in acting]
-    size = np.maximum(np.abs(errors[0] - errors[1]).max(axis=0), 1e-300)
-    driven, rested = (float(np.sum((e[:, size > 1e-12] / size[size > 1e-12]) ** 2)) for e in errors)
+    if np.allclose(acted[0], acted[1]):  # nothing in the model remembers: what was before shows in the first step alone
+        acted[1] = np.where(np.arange(FIRST)[:, None, None] == 0, 0.0, acted[1])
+    errors = [_errors(model, run, u) for u in acted]
+    driven, rested = (float(np.sum((e / usual) ** 2)) for e in errors)
     return driven < CLEARLY * rested
 
 
