@@ -1,0 +1,1 @@
+"""Seeded recordings of robots whose models lack something, for the tracer: own physics, own words (docs/tracing.md, How it is tested)."""

@@ -1,0 +1,222 @@
+"""From a draft (which robot, what is missing, how it is driven and seen) to a recording with its ratio.
+
+Layouts of stamps, in parts of a step:
+    grid      states and commands on the model's grid
+    jitter    both up to a third of a step off it, together
+    irregular rows 0.6 to 1.4 steps apart
+    other     states and commands together at a rate that is no multiple of the model's
+    async     states on the grid, commands on a clock of their own
+    late      commands a fixed part of a step after the states
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trace_sets import draws
+from trace_sets.excitation import Controller, open_loop, tracker
+from trace_sets.library import physics
+from trace_sets.noise import Noise
+from trace_sets.recording import Recording, Run, record
+from trace_sets.scale import Scale, log_uniform
+from trace_sets.world import Rollouts, Start, TruthEffect, World, rollout_errors
+
+Array = NDArray[np.float64]
+Whole = NDArray[np.int64]
+Rng = np.random.Generator
+
+HORIZON_S = 1.0
+"""Of rollouts, as `s2r trace` has it by default."""
+
+LAYOUTS = ("grid", "jitter", "irregular", "other", "async", "late")
+PAUSE_S = (1.0, 6.0)
+"""Between the runs of one recording."""
+
+
+@dataclass(frozen=True)
+class Missing:
+    """A library's effect that the model lacks."""
+
+    name: str
+    channel: str
+    p: dict[str, Any]
+
+    def told(self) -> dict[str, Any]:
+        """As plain data."""
+        return {"name": self.name, "channel": self.channel, "parameters": self.p}
+
+
+@dataclass
+class Draft:
+    """euler: whether the truth itself moves by Euler's rule; declared: what the model that the tracer gets has besides its nominal step."""
+
+    scale: Scale
+    noise: Noise
+    law: str
+    layout: str = "grid"
+    missing: tuple[Missing, ...] = ()
+    outside: tuple[TruthEffect, ...] = ()
+    euler: bool = False
+    runs: int = 1
+    declared: tuple[dict[str, Any], ...] = ()
+    commands: Controller | None = None
+    together: bool = True
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    def world(self) -> World:
+        """The robot."""
+        plant = self.scale.plant
+        named = [m for m in self.missing if m.name != "integration_scheme"]
+        first = [m for m in named if m.name == "input_delay"]
+        rest = [m for m in named if m.name != "input_delay"]
+        effects = (*(physics(plant, m.name, m.channel, m.p) for m in (*first, *rest)), *self.outside)
+        return World(plant, self.scale.dt, self.scale.parts, effects, self.euler)
+
+    def nominal(self) -> World:
+        """What the tracer's model does."""
+        scheme = any(m.name == "integration_scheme" for m in self.missing)
+        return self.world().without_effects(euler=self.euler or scheme)
+
+    def model(self) -> dict[str, Any]:
+        """As a model TOML has it."""
+        return {
+            "name": self.scale.plant.name,
+            "dt": self.scale.dt,
+            "parameters": dict(self.scale.plant.parameters),
+            "effects": [*self.declared],
+        }
+
+
+EXACT: dict[str, Any] = {"name": "integration_scheme", "channel": "*", "parameters": {"scheme": "exact"}}
+
+
+def draw_noise(rng: Rng, s: Scale, law: str, level: float | None = None) -> Noise:
+    """level: measurement noise over what moves in a second."""
+    level = level if level is not None else log_uniform(rng, 2e-4, 2e-2)
+    plant = s.plant
+    sigma = []
+    for name in plant.states:
+        own = level * log_uniform(rng, 0.5, 2.0)
+        if name == "theta":
+            sigma.append(own)
+        elif name.startswith("wheel"):
+            sigma.append(own * s.speed / plant.parameters["wheel_radius"])
+        else:
+            sigma.append(own * s.speed)
+    r = np.array(sigma)
+    kind: dict[str, Any] = {}
+    if law == "student":
+        kind = {"freedom": float(rng.uniform(2.5, 5.0))}
+    elif law == "outliers":
+        kind = {"outliers": float(rng.uniform(0.01, 0.05)), "far": log_uniform(rng, 5.0, 60.0)}
+    elif law == "quantised":
+        kind = {"quantum": r * log_uniform(rng, 1.0, 5.0)}
+    usual = (
+        np.array([s.speed, max(s.yaw, 0.3)]) if plant.pose else np.full(plant.axes, s.ranges[0].size / plant.parameters.get("mass", 1.0))
+    )
+    if law == "coloured":
+        strong = log_uniform(rng, 0.003, 0.08) * np.exp(rng.uniform(-0.7, 0.7, len(usual)))
+        kind |= {"push": strong * usual, "memory": log_uniform(rng, max(2.0 * s.dt, 0.02), max(0.5, 4.0 * s.dt))}
+    elif rng.random() < 0.5:
+        kind |= {"push": log_uniform(rng, 0.002, 0.05) * math.sqrt(0.033 / s.dt) * usual}
+    return Noise(law, r, **kind)
+
+
+def draw_law(rng: Rng, *, closed: float = 0.2) -> str:
+    """A law of excitation; `closed` is the share of closed loops."""
+    if rng.random() < closed:
+        return "closed"
+    return str(rng.choice(["holds", "sines", "ramps", "chirp", "human"], p=[0.4, 0.2, 0.12, 0.08, 0.2]))
+
+
+def draw_pose_rule(rng: Rng, s: Scale) -> dict[str, Any]:
+    """Whether the truth moves on arcs and the model says so (two thirds), or both move by Euler's rule."""
+    if not s.plant.pose:
+        return {}
+    return {"declared": (EXACT,)} if rng.random() < 0.67 else {"euler": True}
+
+
+def draw_layout(rng: Rng, *, euler: bool, plain: float = 0.6) -> str:
+    """Euler's rule is about the grid, so its states stay there."""
+    if rng.random() < plain:
+        return "grid"
+    return str(rng.choice(["async", "late"] if euler else list(LAYOUTS[1:])))
+
+
+def _stamps(rng: Rng, layout: str, s: Scale, n: int) -> tuple[Whole, Whole]:
+    """(rows, orders) in parts."""
+    parts = s.parts
+    grid = parts * np.arange(n + 1)
+    if layout == "jitter":
+        off = rng.integers(0, max(parts // 3, 1) + 1, n + 1)
+        off[0] = 0
+        return grid + off, grid + off
+    if layout == "irregular":
+        rows = np.concatenate([[0], np.cumsum(rng.integers(int(0.6 * parts), int(1.4 * parts) + 1, n))])
+        return rows, rows
+    if layout == "other":
+        period = int(rng.choice([k for k in range(max(parts // 3, 2), int(1.3 * parts)) if parts % k and k % parts]))
+        rows = period * np.arange(int(n * parts / period) + 1)
+        return rows, rows
+    if layout == "async":
+        period = int(rng.integers(max(parts // 2, 3), 2 * parts))
+        wobble = rng.integers(0, max(period // 4, 1) + 1, int(n * parts / period) + 1)
+        return grid, int(rng.integers(1, parts)) + period * np.arange(len(wobble)) + wobble
+    if layout == "late":
+        return grid, grid[:-1] + int(rng.integers(1, parts))
+    return grid, grid
+
+
+def realise(rng: Rng, draft: Draft) -> tuple[Recording, Rollouts | None]:
+    """Drives the draft's robot, and measures how far the nominal model goes wrong."""
+    s, world = draft.scale, draft.world()
+    plant = s.plant
+    origin, runs, starts = 0.0, [], []
+    for _ in range(draft.runs):
+        n = max(s.n // draft.runs, 10)
+        rows, orders = _stamps(rng, draft.layout, s, n)
+        if draft.law == "closed":
+            commands: Array | Controller = draft.commands or tracker(
+                rng, plant, s.ranges, max(s.pace, 8.0 * s.dt), s.speed, plant.parameters.get("mass", 1.0)
+            )
+        else:
+            commands = open_loop(rng, plant, draft.law, s.dt / s.parts * orders, s.ranges, s.pace, s.speed)
+        x0 = _begin(rng, s)
+        ahead = max(1, min(round(HORIZON_S / (world.h * float(np.median(np.diff(rows))))), n // 4))
+        run = record(world, rows, orders, commands, draft.noise, x0, rng, origin=origin, ahead=ahead, rollouts=max(30 // draft.runs, 6))
+        origin += round(s.dt * n + rng.uniform(*PAUSE_S), 3)
+        starts += run.starts
+        runs.append(run)
+    shift = float(rng.choice([0.0, round(rng.uniform(0.0, 9e4), 3), 1.7e9 + round(rng.uniform(0.0, 1e6), 3)], p=[0.6, 0.25, 0.15]))
+    shifted = [Run(run.t + shift, run.y, run.t_u + shift, run.u) for run in runs]
+    recording = Recording(
+        plant, shifted, digits=6, figures=int(rng.choice([7, 9])), together=draft.together, wrap=bool(rng.random() < 0.85)
+    )
+    return recording, _ratio(starts, draft.nominal())
+
+
+def _ratio(starts: list[Start], nominal: World) -> Rollouts | None:
+    return rollout_errors(starts, nominal) if starts else None
+
+
+def _begin(rng: Rng, s: Scale) -> list[float]:
+    plant = s.plant
+    if plant.pose:
+        return [
+            float(rng.uniform(-2.0, 2.0)),
+            float(rng.uniform(-2.0, 2.0)),
+            float(rng.uniform(-3.1, 3.1)),
+            *[0.0] * (len(plant.states) - 3),
+        ]
+    return [*(float(rng.uniform(-0.5, 0.5)) * s.speed for _ in range(plant.axes)), *[0.0] * plant.axes]
+
+
+def draw_missing(rng: Rng, s: Scale, name: str, size: float) -> Missing:
+    """An effect with values."""
+    channel, p = draws.draw(rng, name, s, size)
+    return Missing(name, channel, p)

@@ -1,0 +1,113 @@
+"""What an answer is worth, given the truth: one word a set.
+
+    clean      clean | alarm
+    one, pair  right | tie (ambiguous, the truth among what is named) | none | withheld (unexplained: no name was lent)
+               | fault (sensor_fault) | part (some of a pair, nothing false) | wrong (a false name among those given)
+    outside    flagged (unexplained) | named_flagged (a name, and depends_on says that more is left) | false_name | none | fault
+
+An answer is what `s2r trace --json` prints. A truth is what stands in NAME.truth.json. Both are plain data.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+Answer = dict[str, Any]
+Truth = dict[str, Any]
+Names = list[tuple[str, str]]
+
+INTERVAL_FREE = {"scheme", "from", "matrix"}
+"""Parameters whose intervals are not counted one by one."""
+
+
+def named(effects: list[dict[str, Any]]) -> Names:
+    """(name, channel) of each."""
+    return [(e["name"], e["channel"]) for e in effects]
+
+
+def is_one_of(found: tuple[str, str], names: list[list[str | None]]) -> bool:
+    """Whether a found name is among the accepted ones; no channel means any."""
+    return any(found[0] == name and channel in {None, found[1]} for name, channel in names)
+
+
+def outcome(truth: Truth, answer: Answer) -> str:
+    """One word."""
+    if truth["expect"] == "clean":
+        return _of_clean(truth, answer)
+    if truth["expect"] == "outside":
+        return _of_outside(answer)
+    return _of_named(truth, answer)
+
+
+def _of_clean(truth: Truth, answer: Answer) -> str:
+    """Coloured noise may be called so; spikes may be called faults where there are some."""
+    verdict = answer["verdict"]
+    if verdict == "none":
+        return "clean"
+    if verdict == "unexplained" and set(answer["depends_on"]) <= {"noise"} and truth["noise"] == "coloured":
+        return "clean"
+    heavy = truth["noise"] in {"outliers", "student"}
+    if verdict == "sensor_fault" and heavy and all(f["kind"] in {"spike", "dropout"} for f in answer["faults"]):
+        return "clean"
+    return "alarm"
+
+
+def _of_outside(answer: Answer) -> str:
+    verdict = answer["verdict"]
+    if verdict == "unexplained":
+        return "flagged"
+    if verdict in {"none", "sensor_fault"}:
+        return "none" if verdict == "none" else "fault"
+    return "named_flagged" if set(answer["depends_on"]) - {"noise"} else "false_name"
+
+
+def _of_named(truth: Truth, answer: Answer) -> str:
+    verdict, accepted = answer["verdict"], truth["accepted"]
+    if verdict in {"none", "unexplained", "sensor_fault"}:
+        return {"none": "none", "unexplained": "withheld", "sensor_fault": "fault"}[verdict]
+    found = named(answer["effects"])
+    matched = matching(found, accepted)
+    if verdict == "ambiguous":
+        among = found + named(answer["ambiguous_with"])
+        return "tie" if all(any(is_one_of(f, names) for f in among) for names in accepted) else "wrong"
+    if None in matched:
+        return "wrong"
+    return "right" if len(found) == len(accepted) else "part"
+
+
+def matching(found: Names, accepted: list[list[list[str | None]]]) -> list[int | None]:
+    """For each found effect, which missing one it is; each at most once."""
+    left = list(range(len(accepted)))
+    matched: list[int | None] = []
+    for f in found:
+        place = next((i for i in left if is_one_of(f, accepted[i])), None)
+        if place is not None:
+            left.remove(place)
+        matched.append(place)
+    return matched
+
+
+def depends_right(truth: Truth, answer: Answer) -> bool:
+    """Whether the first thing that the answer says it depends on is true."""
+    tokens = [t for t in answer["depends_on"] if t != "noise" or "noise" in truth["depends_on"]]
+    return bool(tokens) and tokens[0] in truth["depends_on"]
+
+
+def covered(truth: Truth, answer: Answer) -> list[tuple[str, bool]]:
+    """For each parameter with a 95 % interval that goes by the truth's own name: whether the truth lies in it."""
+    if answer["verdict"] not in {"traced", "ambiguous"}:
+        return []
+    told = []
+    pairs = zip(answer["effects"], matching(named(answer["effects"]), truth["accepted"]), strict=True)
+    for effect, place in pairs:
+        if place is None or truth["effects"][place]["name"] != effect["name"]:
+            continue
+        true = truth["effects"][place]["parameters"]
+        for name, value in effect["parameters"].items():
+            low, high = value["low"], value["high"]
+            if name in INTERVAL_FREE or name not in true or not isinstance(low, float | int) or not isinstance(high, float | int):
+                continue
+            if name in {"low", "high"} and abs(true[name]) > truth["unreached"].get(effect["channel"], float("inf")):
+                continue
+            told.append((f"{effect['name']}.{name}", bool(low <= true[name] <= high)))
+    return told
