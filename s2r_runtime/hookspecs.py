@@ -34,11 +34,16 @@ hookimpl = pluggy.HookimplMarker(GROUP)
 
 
 class Offer(NamedTuple):
-    """`target`: `module:attribute`, imported when first used. The attribute is the class or object the hook asks for."""
+    """`target`: `module:attribute`, imported when first used. The attribute is the class or object the hook asks for.
+
+    `files`: of a transport, the options that name a file (relative to the profile) whose content says what frames mean. Where a profile
+    is read, such an option becomes `{"file": as written, "text": content}`: bound into the profile's digest, and attached to the log.
+    """
 
     name: str
     target: str
     summary: str = ""
+    files: tuple[str, ...] = ()
 
 
 # ---------------------------------------------------------------- transports

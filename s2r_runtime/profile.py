@@ -9,6 +9,7 @@ import difflib
 import math
 import re
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -170,6 +171,12 @@ class Profile(_Table, frozen=True):
     repair: Repair = Repair()
     clock: Literal["realtime", "lockstep"] = "realtime"
 
+    @property
+    def files(self) -> dict[str, str]:
+        """Name as written in the profile -> text, of the files that its transport names (`Offer.files`)."""
+        named = [value for value in self.transport.values() if isinstance(value, dict) and set(value) == {"file", "text"}]
+        return {value["file"]: value["text"] for value in named}
+
     def digest(self) -> str:
         """Digest of everything but the model (it has a digest of its own) and where logs go."""
         plain = msgspec.to_builtins(self)
@@ -194,8 +201,8 @@ def load_profile(path: Path) -> Profile:
     return parse_profile(text, str(path), path.parent)
 
 
-def parse_profile(text: str, where: str, base: Path) -> Profile:
-    """As `load_profile`, from text; relative model files are looked up from `base`."""
+def parse_profile(text: str, where: str, base: Path, files: Mapping[str, str] | None = None) -> Profile:
+    """As `load_profile`, from text; relative files are looked up from `base`. files: the transport's, by name, instead of the disk's."""
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -206,7 +213,36 @@ def parse_profile(text: str, where: str, base: Path) -> Profile:
         raise ConfigError(f"{where}: {_explain(str(error), table)}") from None
     for field, value, must in _checks(profile):
         raise ConfigError(f"{where}: {field} is {value}, must be {must}")
-    return msgspec.structs.replace(profile, model=_resolved(profile.model, where, base))
+    transport = _with_files(profile.transport, where, base, files)
+    return msgspec.structs.replace(profile, model=_resolved(profile.model, where, base), transport=transport)
+
+
+def _with_files(transport: dict[str, Any], where: str, base: Path, given: Mapping[str, str] | None) -> dict[str, Any]:
+    """The transport's options, with the content of the files that they name (`Offer.files`). A transport that isn't known has none."""
+    from s2r_runtime.plugins import registry
+
+    found = registry()
+    if transport["name"] not in found.names("transports"):
+        return transport
+    options = dict(transport)
+    for option in found.offered("transports", transport["name"]).offer.files:
+        name = options.get(option)
+        if not isinstance(name, str) or not name:
+            continue  # the transport says what is wrong with it
+        if given is not None:
+            if name not in given:
+                raise ConfigError(f"{where}: transport.{option}: {name} is not attached")
+            options[option] = {"file": name, "text": given[name]}
+            continue
+        try:
+            data = (base / name).read_bytes()
+        except OSError as error:
+            raise ConfigError(f"{where}: transport.{option}: {base / name}: cannot be read: {error.strerror}") from None
+        try:
+            options[option] = {"file": name, "text": data.decode("utf-8-sig")}
+        except UnicodeDecodeError:  # older tools on Windows
+            options[option] = {"file": name, "text": data.decode("cp1252", "replace")}
+    return options
 
 
 def _resolved(spec: ModelSpec, where: str, base: Path) -> ModelSpec:

@@ -173,7 +173,8 @@ class RunAudit:
         for name in ("profile.toml", "model.toml"):
             if name not in attached:
                 raise ConfigError(f"{self._where()}: {name} is not attached, so nothing can be recomputed")
-        profile = parse_profile(attached["profile.toml"].data.decode(), f"{self._where()}: profile.toml", Path())
+        files = {name.removeprefix("profile/"): one.data.decode() for name, one in attached.items() if name.startswith("profile/")}
+        profile = parse_profile(attached["profile.toml"].data.decode(), f"{self._where()}: profile.toml", Path(), files)
         self._profile = self._with_model(profile, event.settings.model_digest)
         settings = event.settings
         facts = ModelFacts(settings.states, settings.inputs, settings.angles)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -39,10 +40,15 @@ class Logbook:
         self._earlier: list[Path] = []
         self._attached: dict[str, Attachment] = {}
 
-    def begin(self, profile: Path, model: ModelSpec) -> None:
-        """The first log, with the profile's file and the model in force attached. Raises RecordingError or ConfigError if it can't."""
+    def begin(self, profile: Path, model: ModelSpec, files: Mapping[str, str] | None = None) -> None:
+        """The first log, with the profile's file and the model in force attached. files: those that the profile's transport names.
+
+        Raises RecordingError or ConfigError if it can't.
+        """
         for name, data in (("profile.toml", profile.read_bytes()), ("model.toml", dump_model(model).encode())):
             self._attached[name] = (name, "application/toml", data)
+        for name, text in (files or {}).items():
+            self._attached[f"profile/{name}"] = (f"profile/{name}", "text/plain", text.encode())
         self._use(self._new())
 
     def prepare(self) -> bool:

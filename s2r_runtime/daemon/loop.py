@@ -160,7 +160,7 @@ class Daemon:
         self.facts: ModelFacts = self.watcher.facts()
         self.settings = settings_of(profile, profile.model, self.facts, self.seed)
         self.link = link_of(self.profile, self.facts, self._record_frame)
-        self.logbook.begin(self._profile_path, self.profile.model)
+        self.logbook.begin(self._profile_path, self.profile.model, self.profile.files)
         stack.callback(self._close_log)
         stack.callback(self._close_link)
         self.keeper = Keeper(self.folder, self.say)
