@@ -1,0 +1,218 @@
+"""The account that a person reads in twenty seconds: what was left over and what it follows, what explains it, before and after,
+what is still there, what is wrong with the measurements, what was done to the data. 100 columns.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+from s2r_runtime.trace.found import Found
+from s2r_runtime.trace.plain_words import degrees
+from s2r_runtime.trace.residual import rms
+from s2r_runtime.trace.shape import Shape, components, derived, strongest, variables
+
+if TYPE_CHECKING:
+    from s2r_runtime.trace.result import TraceResult
+
+WIDTH = 100
+
+LABEL = 12
+"""Columns of the words on the left."""
+
+LISTED = 6
+"""Faults, and effects that could not have been seen, that are listed one by one."""
+
+TOLD, FOLLOWED = 1.05, 0.3
+"""A part of the residual is spoken of from this many times the noise on; what it follows, from this share on."""
+
+HEADLINES = {
+    "none": "nothing is left beyond noise: the model explains these data",
+    "unexplained": "structure is left that no effect in the library accounts for, so it gets no name",
+    "sensor_fault": "the measurements, not the motion, are wrong in places",
+}
+
+ARROW = "->"
+
+
+def account(r: TraceResult) -> str:
+    """The lines."""
+    lines = [f"{r.verdict}: {headline(r)}", *_explained(r)]
+    lines += ["", *_labelled("left over", _left_over(r))]
+    lines += ["", *_table(r), ""]
+    lines += _labelled("gap", _gap(r))
+    lines += _labelled("still there", _still_there(r))
+    lines += _labelled("faults", list(_faults(r)))
+    lines += _labelled("not shown", _unseen(r))
+    lines += _labelled("data", _data(r))
+    return "\n".join(lines)
+
+
+def headline(r: TraceResult) -> str:
+    """What the verdict says, in a clause."""
+    if r.verdict == "ambiguous":
+        return f"these data cannot decide between {1 + len(r.rivals)} explanations; the best is"
+    if r.verdict == "traced":
+        count = len(r.effects)
+        return f"the model lacks {'one effect' if count == 1 else f'{count} effects'}" + (
+            ", which explains what was left over" if count == 1 else ", which explain what was left over"
+        )
+    return HEADLINES[r.verdict]
+
+
+def _explained(r: TraceResult) -> list[str]:
+    lines = [line for e in r.effects for line in _effect(e, r.nominal.dt)]
+    lines += [f"  {'':<4}the same thing on this model: {e.text()}" for e in r.same]
+    if r.rivals:
+        lines += ["cannot be told from:", *(line for e in r.rivals for line in _effect(e, r.nominal.dt))]
+        lines += _labelled("try next", [*_wrapped(r.suggested_excitation or ""), "(--suggest FILE.csv writes such a drive)"])
+    if r.partial:
+        lines += ["explains a part only, so no name is lent to it:", *(line for e in r.partial for line in _effect(e, r.nominal.dt))]
+    return lines
+
+
+def _effect(e: Found, dt: float) -> list[str]:
+    lines, text = [], ""
+    for piece in e.text().split(", "):
+        if text and len(text) + len(piece) + 4 > WIDTH:
+            lines.append(f"{text},")
+            text = f"      {piece}"
+        else:
+            text = f"{text}, {piece}" if text else f"  {piece}"
+    words = e.words(dt)
+    return [*lines, text, *([f"      {words}"] if words else [])]
+
+
+def _left_over(r: TraceResult) -> list[str]:
+    """Of the model as it was given."""
+    parts = components(r.nominal, r.held, r.before.one_step, r.after.one_step, r.floor[0])
+    loud = [p for p in parts if float(rms(p.before)) > TOLD * p.floor]
+    if not loud:
+        quiet = "nothing beyond noise in one step"
+        return [quiet if not _over_rollouts(r) else f"{quiet}; {_over_rollouts(r)}"]
+    over = variables(r.nominal, r.held)
+    inputs = over[: len(r.nominal.inputs)]
+    over += derived(r.nominal, r.held)
+    told = [v for v in over if r.verdict == "unexplained" and v.token in r.depends_on]
+    shapes = strongest(loud, told or over, inputs)
+    return [*(_told(s) for s in shapes[:3]), *([_over_rollouts(r)] if _over_rollouts(r) else [])]
+
+
+def _told(shape: Shape) -> str:
+    """One line about a part of the residual and what it follows."""
+    part = shape.component
+    ratio = float(rms(part.before)) / max(part.floor, 1e-300)
+    follows = f"{100.0 * shape.share:.0f} % of that {shape.said}" if shape.share > FOLLOWED else "follows no single variable"
+    return f"{part.said}: {ratio:.3g} x the noise in one step; {follows}"
+
+
+def _over_rollouts(r: TraceResult) -> str:
+    """The state that is farthest beyond its noise at the end of the rollouts."""
+    if not len(r.before.ends):
+        return ""
+    ratio = rms(r.before.ends) / r.floor[1].clip(1e-300)
+    worst = int(ratio.argmax())
+    return (
+        f"{r.nominal.states[worst]} ends {float(ratio[worst]):.3g} x the noise away after {r.horizon_s:g} s" if ratio[worst] > TOLD else ""
+    )
+
+
+def _table(r: TraceResult) -> list[str]:
+    """One row a state, and one in degrees for an angle. Before and after are one column where nothing was added."""
+    units: dict[str, str] = getattr(r.nominal.nominal, "units", {})
+    pairs = [(rms(r.before.one_step), rms(r.after.one_step), r.floor[0])]
+    if len(r.before.ends):
+        pairs.append((rms(r.before.ends), rms(r.after.ends), r.floor[1]))
+    changed = r.model.effects != r.nominal.effects
+    what = f"before {ARROW} after" if changed else "error"
+    over = [f"one step ({r.nominal.dt:g} s)", f"over {r.horizon_s:g} s"][: len(pairs)]
+    head = [f"{'error, rms':<18}" + "".join(f"{text:^38}" for text in over).rstrip(), f"{'':<18}" + f"{what:>24}{'noise':>14}" * len(pairs)]
+    rows = []
+    for i, state in enumerate(r.nominal.states):
+        unit = units.get(state, "")
+        for name, factor in [(unit, 1.0)] + ([(degrees(unit), math.degrees(1.0))] if degrees(unit) else []):
+            row = f"{(f'{state} ({name})' if name else state):<18}"
+            for before, after, floor in pairs:
+                now = f"{_short(factor * before[i])} {ARROW} {_short(factor * after[i])}" if changed else _short(factor * before[i])
+                row += f"{now:>24}{_short(factor * floor[i]):>14}"
+            rows.append(row)
+    return [*head, *rows]
+
+
+def _short(value: float) -> str:
+    return f"{value:.3g}"
+
+
+def _gap(r: TraceResult) -> list[str]:
+    before, after, independent = r.gap
+    kind = "independent samples" if independent else "transitions of the drive, which bound no other (no statement)"
+    now = f"{before['radius']:.4g} {ARROW} {after['radius']:.4g}" if r.effects else f"{before['radius']:.4g}"
+    lines = [f"{now}, the largest of {before['n']} {kind}"]
+    if "hold_radius" in before:
+        now = f"{before['hold_radius']:.4g} {ARROW} {after['hold_radius']:.4g}" if r.effects else f"{before['hold_radius']:.4g}"
+        lines.append(f"{now} after {before['hold_periods']} held periods")
+    return lines
+
+
+def _still_there(r: TraceResult) -> list[str]:
+    if not r.depends_on:
+        return ["nothing beyond noise"] if r.verdict != "unexplained" else ["structure; what it depends on cannot be told"]
+    if r.depends_on == ("noise",):
+        return ["coloured noise: correlated in time, whatever the inputs do"]
+    much = f" ({100.0 * r.share_left:.0f} % of what the model lacked)" if r.effects else ""
+    lines = [f"structure{much} that depends on {', '.join(r.depends_on)}"]
+    return [*lines, "its shape is on the page that --report FILE.html writes"] if r.verdict == "unexplained" else lines
+
+
+def _faults(r: TraceResult) -> Iterator[str]:
+    """What stands at one time on several channels is one line."""
+    loud = sorted((f for f in r.faults if f.kind != "dropout"), key=lambda f: (f.from_s, f.to_s, f.kind))
+    grouped = [(key, [f.channel for f in found]) for key, found in groupby(loud, key=lambda f: (f.from_s, f.to_s, f.kind))]
+    for (begin, end, kind), channels in grouped[:LISTED]:
+        where = ", ".join("all" if c == "*" else c for c in channels)
+        yield f"{kind} of {where} at {begin:.3f} s" if end == begin else f"{kind} of {where} from {begin:.3f} to {end:.3f} s"
+    if len(grouped) > LISTED:
+        yield f"and {len(grouped) - LISTED} more (all of them: --json)"
+    silent = [f for f in r.faults if f.kind == "dropout"]
+    if silent:
+        yield f"{len(silent)} dropout{'s' if len(silent) > 1 else ''}, the longest {max(f.to_s - f.from_s for f in silent):.3g} s"
+    if r.faults:
+        yield "all left out of the fit"
+
+
+def _unseen(r: TraceResult) -> list[str]:
+    """Effects of which `none` on these data says nothing."""
+    blind = [f"{v.name}({v.channel})" for v in r.could_see if v.size is None]
+    if not blind or r.verdict not in {"none", "traced"}:
+        return []
+    more = f" and {len(blind) - LISTED} more" if len(blind) > LISTED else ""
+    return _wrapped(f"{', '.join(blind[:LISTED])}{more}: these inputs could not have shown them (--suggest FILE.csv writes some that do)")
+
+
+def _data(r: TraceResult) -> list[str]:
+    runs = len({int(run) for run in r.held.steps.run}) if r.held.data.source != r.source else len(r.held.data.runs)
+    grid = "interpolated to the model's step, they were not recorded on it" if r.interpolated else "on the model's step as recorded"
+    lines = [f"{r.n_rows} rows in {runs} run{'s' if runs > 1 else ''}, {grid}"]
+    lines += list(r.done_to_data)
+    if r.outliers:
+        lines.append(f"{r.outliers} outlying rows count for next to nothing")
+    lines.append(f"fitted on {r.n_fit} transitions, judged on {len(r.held.steps)} that the fit never saw")
+    return lines
+
+
+def _labelled(label: str, lines: Sequence[str]) -> list[str]:
+    return [f"{label if i == 0 else '':<{LABEL}}{line}" for i, line in enumerate(lines)]
+
+
+def _wrapped(text: str) -> list[str]:
+    """At words, to fit behind a label."""
+    lines, line = [], ""
+    for word in text.split():
+        if line and len(line) + 1 + len(word) > WIDTH - LABEL:
+            lines.append(line)
+            line = word
+        else:
+            line = f"{line} {word}" if line else word
+    return [*lines, line] if line else lines

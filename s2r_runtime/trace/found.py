@@ -1,0 +1,85 @@
+"""An effect that was found: its name, channel, and parameters with their 95 % intervals and units."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from s2r_runtime.trace.plain_words import degrees, in_words
+
+Limit = float | list[list[float | None]] | None
+Value = tuple[Any, Limit, Limit, str]
+"""Value, low and high end of its 95 % interval (in the shape of the value; None where there is none), unit."""
+
+UNLIMITED = 1e5
+"""Ends of intervals beyond it are bounds of the parameter, not findings."""
+
+DIGITS = 1
+"""Of an interval's half width that are written: more are noise."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """An effect. parameters: name -> (value, low, high, unit); low and high: 95 % interval, None where there is none."""
+
+    name: str
+    channel: str
+    parameters: dict[str, Value]
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Parameter -> value."""
+        return {name: value[0] for name, value in self.parameters.items()}
+
+    def to_json(self) -> dict[str, Any]:
+        """The form of docs/json.md."""
+        values = {n: {"value": v, "low": low, "high": high, "unit": unit} for n, (v, low, high, unit) in self.parameters.items()}
+        return {"name": self.name, "channel": self.channel, "parameters": values}
+
+    def text(self) -> str:
+        """One line: what, where, and the numbers."""
+        told = ", ".join(f"{name} = {text}" for name, text in self.told())
+        return f"{self.name} on {self.channel}{': ' if told else ''}{told}"
+
+    def told(self) -> Iterator[tuple[str, str]]:
+        """(parameter, value with its unit and interval)."""
+        for name, (value, low, high, unit) in self.parameters.items():
+            if isinstance(value, float):
+                yield name, interval_text(value, low, high, unit)
+            elif isinstance(value, list):
+                yield name, "[" + ", ".join("[" + ", ".join(f"{v:.4g}" for v in row) + "]" for row in value) + f"] {unit}".rstrip()
+            else:
+                yield name, str(value)
+
+    def words(self, dt: float) -> str:
+        """What it means for the robot, in a clause."""
+        return in_words(self.name, self.channel, self.values, dt)
+
+
+def interval_text(value: float, low: Limit, high: Limit, unit: str) -> str:
+    """`0.1000 rad/s (5.730 deg/s) (95 %: 0.0980 to 0.1020)`; an end at a parameter's bound says that the data do not limit it there."""
+    plain = "" if unit == "-" else unit
+    ends = (low, high) if isinstance(low, float) and isinstance(high, float) else None
+    within = ends is not None and abs(ends[0]) < UNLIMITED and abs(ends[1]) < UNLIMITED
+    width = 0.5 * (ends[1] - ends[0]) if ends is not None and within else 0.0
+    turned = degrees(plain)
+    text = _rounded(value, width) + (f" {plain}" if plain else "")
+    text += f" ({_rounded(math.degrees(value), math.degrees(width))} {turned})" if turned else ""
+    if ends is None:
+        return text
+    if within:
+        return f"{text} (95 %: {_rounded(ends[0], width)} to {_rounded(ends[1], width)})"
+    said = [f"at least {ends[0]:.4g}" if abs(ends[0]) < UNLIMITED else "", f"at most {ends[1]:.4g}" if abs(ends[1]) < UNLIMITED else ""]
+    return f"{text} ({', '.join(s for s in said if s) or 'not limited by these data'})"
+
+
+def _rounded(value: float, width: float) -> str:
+    """To DIGITS digits of the half width; to four without one."""
+    if not 0.0 < width < math.inf or not math.isfinite(value):
+        return f"{value:.4g}"
+    decimals = DIGITS - 1 - math.floor(math.log10(width))
+    if not 0 <= decimals <= 9:
+        return f"{value:.4g}"
+    return f"{value:.{decimals}f}"
