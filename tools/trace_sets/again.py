@@ -9,7 +9,6 @@ three it is the share of what was achievable there. Models are the project's own
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from trace_sets.excitation import open_loop
-from trace_sets.making import HORIZON_S, Draft
+from trace_sets.making import HORIZON_S, TIMED, Draft
 from trace_sets.noise import Noise
 from trace_sets.recording import record
 
@@ -25,8 +24,6 @@ Array = NDArray[np.float64]
 
 STEPS = 600
 """Of the new drive, where time itself does not matter."""
-
-TIMED = {"input_gain_drift", "regime_change", "periodic_disturbance"}
 
 
 def errors_again(draft: Draft, seed: int, nominal: ComposedModel, repaired: ComposedModel, oracle: list[float] | None) -> dict[str, Any]:
@@ -36,11 +33,11 @@ def errors_again(draft: Draft, seed: int, nominal: ComposedModel, repaired: Comp
     steps = s.n if any(m.name in TIMED for m in draft.missing) else min(STEPS, s.n)
     steps = min(steps, 5000)
     grid = s.parts * np.arange(steps + 1)
-    law = "sines" if draft.law in {"closed", "chirp"} else draft.law
+    law = draft.law if draft.law in {"holds", "sines", "ramps", "human"} else "holds"
     commands = open_loop(rng, s.plant, law, s.dt * np.arange(steps + 1), s.ranges, s.pace, s.speed)
     quiet = Noise("none", np.zeros(len(s.plant.states)))
     x0 = [0.0] * len(s.plant.states)
-    run = record(replace(draft.world()), grid, grid, commands, quiet, x0, rng)
+    run = record(draft.world(), grid, grid, commands, quiet, x0, rng)
     ahead = max(1, min(round(HORIZON_S / s.dt), steps // 4))
     starts = np.unique(np.linspace(0, steps - ahead, 60).astype(int))
     way = np.sqrt(np.mean((run.y[starts + ahead] - run.y[starts]) ** 2, axis=0))

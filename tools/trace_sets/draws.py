@@ -183,8 +183,8 @@ def lever(rng: Rng, s: Scale, channel: str, size: float) -> Values:
 
 
 def field(rng: Rng, s: Scale, channel: str, size: float) -> Values:
-    wide = max(s.speed * min(3.0 * s.pace, s.duration / 4.0), 1.0)
-    m = size * 0.3 * s.speed / wide * rng.uniform(-1.0, 1.0, (2, 2))
+    """Weak enough that a robot is not carried away over the whole recording."""
+    m = min(size, 1.5) * 2.0 / max(s.duration, 4.0) * rng.uniform(-1.0, 1.0, (2, 2))
     return {"matrix": m.tolist()}
 
 

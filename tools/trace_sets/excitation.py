@@ -1,7 +1,8 @@
 """What is asked of the robot: open-loop laws of commands, and controllers that see the measured, noisy state.
 
-An open-loop law gives s(t) in [-1, 1] at the stamps of commands; it is scaled to the input's range. Force plants get accelerations that
-keep the nominal speed near a wandering goal, or they would be a kilometre away after a minute. A controller is called with (t, y) and answers u.
+An open-loop law gives s(t) in [-1, 1] at the stamps of commands; it is scaled to the input's range. Force plants get accelerations
+that keep the nominal speed near a wandering goal, or they would be a kilometre away after a minute. A controller is called with (t, y)
+and answers u.
 """
 
 from __future__ import annotations

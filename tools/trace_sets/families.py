@@ -3,25 +3,47 @@
 TUNING    seeds that the tracer's authors may look at and tune on
 UNTOUCHED seeds that nobody looks at set by set; a bench on them is what the docs state
 
-clean, clean_closed, clean_coloured, clean_outliers, clean_jittered, clean_student, clean_quantised
-one      one effect of the library that matters (ratio >= 1.5)         weak     one that hardly does (1.1 to 1.5)
-outside  an effect that the library does not have
+clean...        nothing is missing: white noise, closed loop, poor excitation; coloured, heavy-tailed, quantised noise; odd stamps
+one, weak       one effect of the library that matters (ratio >= 1.5), or hardly does (1.1 to 1.5)
+pair            two effects, each of which matters beside the other
+outside         an effect that the library does not have
+tie             not separable, by how the robot was driven
+fault, bad      measurements that are wrong in places; input from which nothing can be traced
+tiny, long      20 to 120 steps; 50 000 to 100 000 steps
 """
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from trace_sets import draws, outside
-from trace_sets.making import EXACT, Draft, Missing, draw_law, draw_layout, draw_missing, draw_noise, draw_pose_rule, realise
+from trace_sets.bad_inputs import bad
+from trace_sets.confounded import confounded
+from trace_sets.excitation import LAWS
+from trace_sets.faulty import faulty
+from trace_sets.layouts import OFF_GRID, draw_layout, odd_layout
+from trace_sets.making import (
+    EXACT,
+    Draft,
+    Missing,
+    common,
+    draw_law,
+    draw_missing,
+    draw_noise,
+    draw_pose_rule,
+    drive,
+    realise,
+    recording_of,
+)
 from trace_sets.recording import TraceSet
-from trace_sets.same import accepted
-from trace_sets.scale import PLANTS, Scale, draw_scale
-from trace_sets.world import Rollouts
+from trace_sets.same import accepted, alternatives, share_a_name
+from trace_sets.scale import PLANTS, Scale, draw_scale, log_uniform
+from trace_sets.world import rollout_errors
 
 Rng = np.random.Generator
 
@@ -31,6 +53,12 @@ UNTOUCHED = range(1_000_000, 2_000_000)
 STRONG = 1.5
 WEAK = 1.1
 """Ratios of the nominal model's error over the oracle's from which an effect matters, and from which it is there at all."""
+
+BESIDE = 1.3
+"""Ratio by which an effect of a pair shows beside the other."""
+
+LARGE = 5000
+"""Steps from which on a set is not drawn many times over."""
 
 TRIES = 14
 
@@ -42,70 +70,108 @@ def make(family: str, seed: int) -> TraceSet:
     return FAMILIES[family](family, seed, np.random.default_rng([seed, zlib.crc32(family.encode())]))
 
 
-def _common(draft: Draft, errors: Rollouts | None) -> dict[str, Any]:
-    s = draft.scale
-    return {
-        "robot": s.plant.name,
-        "rate": round(1.0 / s.dt, 3),
-        "n": s.n,
-        "law": draft.law,
-        "layout": draft.layout,
-        "noise": draft.noise.law,
-        "runs": draft.runs,
-        "euler": draft.euler,
-        "ratio": round(errors.ratio, 4) if errors else None,
-        "oracle": errors.oracle.tolist() if errors else None,
-        "effects": [m.told() for m in draft.missing],
-        **draft.extra,
-    }
-
-
 def _runs(rng: Rng, n: int) -> int:
     return int(rng.choice([1, 2, 3, 6], p=[0.8, 0.08, 0.06, 0.06])) if n >= 600 else 1
 
 
-def _clean(law: str, *, closed: float = 0.15, layout: str | None = None) -> Family:
+def _clean(law: str, *, closed: float = 0.15, odd: bool = False, poor: bool = False, least: int = 20, most: int | None = None) -> Family:
     def family(name: str, seed: int, rng: Rng) -> TraceSet:
-        s = draw_scale(rng)
-        rule = draw_pose_rule(rng, s) if layout not in {"jitter", "irregular", "other"} or not s.plant.pose else {"declared": (EXACT,)}
-        shape = layout or draw_layout(rng, euler=bool(rule.get("euler")), plain=0.8)
-        draft = Draft(s, draw_noise(rng, s, law), draw_law(rng, closed=closed), shape, runs=_runs(rng, s.n), **rule)
+        s = draw_scale(rng, n=int(log_uniform(rng, least, most)) if most else None)
+        layout = odd_layout(rng, s.plant) if odd else ""
+        rule = _arcs(s) if layout in OFF_GRID else draw_pose_rule(rng, s)
+        layout = layout or draw_layout(rng, s.plant, euler=bool(rule.get("euler")), plain=0.8)
+        asked = _poorly(rng, s) if poor else None
+        shown = "poor" if poor else draw_law(rng, closed=closed)
+        draft = Draft(s, draw_noise(rng, s, law), shown, layout, runs=_runs(rng, s.n), asked=asked, **rule)
         recording, errors = realise(rng, draft)
-        return TraceSet(name, seed, recording, draft.model(), {"expect": "clean", **_common(draft, errors)}, draft=draft)
+        return TraceSet(name, seed, recording, draft.model(), {"expect": "clean", **common(draft, errors)}, draft=draft)
 
     return family
 
 
-def _jittered(name: str, seed: int, rng: Rng) -> TraceSet:
-    return _clean("white", layout=str(rng.choice(["jitter", "irregular", "other", "async", "late"])))(name, seed, rng)
+def _arcs(s: Scale) -> dict[str, Any]:
+    return {"declared": (EXACT,)} if s.plant.pose else {}
 
 
-def _one(low: float, high: float, effect: str | None = None) -> Family:
-    """One effect whose ratio lies in [low, high): drawn again, larger or smaller, until it does."""
+def _poorly(rng: Rng, s: Scale) -> Callable[[Rng, Any], Any]:
+    """Each input constant, or between two values, or at rest for most of the time."""
+    kinds = rng.choice(["constant", "two", "rare"], len(s.ranges)) if s.plant.pose else ["rare"] * len(s.ranges)
+    values = [r.size * float(rng.uniform(0.3, 1.0)) for r in s.ranges]
+
+    def asked(rng: Rng, t: Any) -> Any:
+        columns = []
+        for r, kind, value in zip(s.ranges, kinds, values, strict=True):
+            holds = LAWS["holds"](rng, t, 2.0 * s.pace)
+            two = np.where(holds > 0.0, value, r.low if r.low >= 0.0 else -value)
+            columns.append(
+                np.full(len(t), value) if kind == "constant" else two if kind == "two" else value * holds * (np.abs(holds) > 0.85)
+            )
+        return np.column_stack(columns)
+
+    return asked
+
+
+def _one(low: float, high: float, *, least: int | None = None, most: int | None = None) -> Family:
+    """One effect whose ratio lies in [low, high): drawn again, larger or smaller, until it does. least, most: steps."""
 
     def family(name: str, seed: int, rng: Rng) -> TraceSet:
         size = float(np.exp(rng.uniform(-1.0, 0.7))) if low >= STRONG else 0.3
-        for attempt in range(TRIES):
+        steps = int(log_uniform(rng, least, most)) if least and most else None
+        tries = TRIES if not steps or steps < LARGE else 3
+        for attempt in range(tries):
             if attempt in {0, 5, 10}:
-                s, chosen = _robot_for(rng, effect)
+                s, chosen = _robot_for(rng, steps)
             draft = _draft_with(rng, s, (draw_missing(rng, s, chosen, size),))
             recording, errors = realise(rng, draft)
             ratio = errors.ratio if errors else 1.0
             if low <= ratio < high:
                 break
             size = min(max(size * (2.0 if ratio < low else 0.45), 0.003), 4.0)
-        truth = {"expect": "one", **_common(draft, errors), "accepted": accepted(draft)}
+        truth = {"expect": "one", **common(draft, errors), "accepted": accepted(draft), "alternatives": alternatives(draft)}
         return TraceSet(name, seed, recording, draft.model(), truth, draft=draft)
 
     return family
 
 
-def _robot_for(rng: Rng, effect: str | None) -> tuple[Scale, str]:
+def _pair(name: str, seed: int, rng: Rng) -> TraceSet:
+    """Two effects: the nominal model is off by 1.5 at least, and so it is by 1.3 if only one of them is missing."""
+    sizes = [float(np.exp(rng.uniform(-0.7, 0.5))) for _ in range(2)]
+    for attempt in range(TRIES):
+        if attempt % 4 == 0:
+            s, first = _robot_for(rng)
+            second = first
+            while second == first:
+                second = str(rng.choice([n for n in draws.names(s.plant) if n != "integration_scheme"]))
+        missing = tuple(draw_missing(rng, s, n, size) for n, size in zip((first, second), sizes, strict=True))
+        draft = _draft_with(rng, s, missing)
+        if share_a_name(draft):
+            continue
+        runs, starts = drive(rng, draft)
+        if not starts:
+            continue
+        alone = [rollout_errors(starts, replace(draft, missing=(m,)).world()).ratio for m in reversed(missing)]
+        errors = rollout_errors(starts, draft.nominal())
+        recording = recording_of(rng, draft, runs)
+        if min(alone) >= BESIDE and errors.ratio >= STRONG:
+            break
+        sizes = [min(size * (1.8 if r < BESIDE else 1.0), 4.0) for size, r in zip(sizes, alone, strict=True)]
+    told = common(draft, errors) | {"alone": alone}
+    return TraceSet(
+        name,
+        seed,
+        recording,
+        draft.model(),
+        {"expect": "pair", **told, "accepted": accepted(draft), "alternatives": alternatives(draft)},
+        draft=draft,
+    )
+
+
+def _robot_for(rng: Rng, steps: int | None = None) -> tuple[Scale, str]:
     """A robot, and an effect for it: effects alike often, whatever robots have them."""
     everything = sorted({n for p in PLANTS for n in draws.names(_plant(p))})
-    chosen = effect or str(rng.choice(everything))
+    chosen = str(rng.choice(everything))
     while True:
-        s = draw_scale(rng)
+        s = draw_scale(rng, n=steps)
         if chosen not in draws.names(s.plant):
             continue
         if chosen == "input_gain_asymmetry" and all(r.low >= 0.0 for r in s.ranges):
@@ -123,8 +189,17 @@ def _draft_with(rng: Rng, s: Scale, missing: tuple[Missing, ...], **more: Any) -
     scheme = any(m.name == "integration_scheme" for m in missing)
     rule = {} if scheme else draw_pose_rule(rng, s)
     law = str(rng.choice(["white", "white", "white", "white", "coloured", "student", "outliers", "quantised"]))
-    shape = "grid" if scheme else draw_layout(rng, euler=bool(rule.get("euler")), plain=0.7)
-    return Draft(s, draw_noise(rng, s, law), draw_law(rng), shape, missing, runs=_runs(rng, s.n), **rule, **more)
+    shape = "grid" if scheme else draw_layout(rng, s.plant, euler=bool(rule.get("euler")), plain=0.7)
+    return Draft(
+        s,
+        draw_noise(rng, s, law),
+        draw_law(rng, closed=0.2 if s.plant.pose else 0.45),
+        shape,
+        missing,
+        runs=_runs(rng, s.n),
+        **rule,
+        **more,
+    )
 
 
 def _outside(name: str, seed: int, rng: Rng) -> TraceSet:
@@ -140,7 +215,7 @@ def _outside(name: str, seed: int, rng: Rng) -> TraceSet:
         if ratio >= STRONG:
             break
         size = min(size * 1.8, 5.0)
-    truth = {"expect": "outside", **_common(draft, errors), "depends_on": sorted(tokens)}
+    truth = {"expect": "outside", **common(draft, errors), "depends_on": sorted(tokens)}
     return TraceSet(name, seed, recording, draft.model(), truth, draft=draft)
 
 
@@ -151,8 +226,17 @@ FAMILIES: dict[str, Family] = {
     "clean_outliers": _clean("outliers"),
     "clean_student": _clean("student"),
     "clean_quantised": _clean("quantised"),
-    "clean_jittered": _jittered,
+    "clean_jittered": _clean("white", odd=True),
+    "clean_poor": _clean("white", poor=True),
     "one": _one(STRONG, 1e9),
     "weak": _one(WEAK, STRONG),
+    "pair": _pair,
     "outside": _outside,
+    "tie": confounded,
+    "fault": faulty,
+    "bad": bad,
+    "tiny": _one(STRONG, 1e9, least=20, most=120),
+    "tiny_clean": _clean("white", most=120),
+    "long": _one(STRONG, 1e9, least=50_000, most=100_000),
+    "long_clean": _clean("white", closed=0.0, least=50_000, most=100_000),
 }

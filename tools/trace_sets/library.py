@@ -255,12 +255,12 @@ class Offset(OnPlant):
         self.state = plant.states.index(channel)
         self.off = p["angle"] if "angle" in p else p["offset"]
 
-    def to_measured(self, x: Numbers) -> Numbers:
+    def to_measured(self, x: Numbers, t: float) -> Numbers:
         y = list(x)
         y[self.state] += self.off
         return y
 
-    def to_true(self, x: Numbers) -> Numbers:
+    def to_true(self, x: Numbers, t: float) -> Numbers:
         y = list(x)
         y[self.state] -= self.off
         return y
@@ -273,10 +273,10 @@ class LeverArm(OnPlant):
         c, s = math.cos(x[2]), math.sin(x[2])
         return [x[0] + sign * (self.p["x"] * c - self.p["y"] * s), x[1] + sign * (self.p["x"] * s + self.p["y"] * c), *x[2:]]
 
-    def to_measured(self, x: Numbers) -> Numbers:
+    def to_measured(self, x: Numbers, t: float) -> Numbers:
         return self._shifted(x, 1.0)
 
-    def to_true(self, x: Numbers) -> Numbers:
+    def to_true(self, x: Numbers, t: float) -> Numbers:
         return self._shifted(x, -1.0)
 
 

@@ -1,17 +1,9 @@
-"""From a draft (which robot, what is missing, how it is driven and seen) to a recording with its ratio.
-
-Layouts of stamps, in parts of a step:
-    grid      states and commands on the model's grid
-    jitter    both up to a third of a step off it, together
-    irregular rows 0.6 to 1.4 steps apart
-    other     states and commands together at a rate that is no multiple of the model's
-    async     states on the grid, commands on a clock of their own
-    late      commands a fixed part of a step after the states
-"""
+"""From a draft (which robot, what is missing, how it is driven and seen) to a recording with its ratio."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,6 +12,7 @@ from numpy.typing import NDArray
 
 from trace_sets import draws
 from trace_sets.excitation import Controller, open_loop, tracker
+from trace_sets.layouts import as_seen, lost, stamps, under_way
 from trace_sets.library import physics
 from trace_sets.noise import Noise
 from trace_sets.recording import Recording, Run, record
@@ -27,13 +20,14 @@ from trace_sets.scale import Scale, log_uniform
 from trace_sets.world import Rollouts, Start, TruthEffect, World, rollout_errors
 
 Array = NDArray[np.float64]
-Whole = NDArray[np.int64]
 Rng = np.random.Generator
+
+TIMED = {"input_gain_drift", "regime_change", "periodic_disturbance"}
+"""Effects whose time counts from the recording's first stamp: that one must be there."""
 
 HORIZON_S = 1.0
 """Of rollouts, as `s2r trace` has it by default."""
 
-LAYOUTS = ("grid", "jitter", "irregular", "other", "async", "late")
 PAUSE_S = (1.0, 6.0)
 """Between the runs of one recording."""
 
@@ -53,7 +47,9 @@ class Missing:
 
 @dataclass
 class Draft:
-    """euler: whether the truth itself moves by Euler's rule; declared: what the model that the tracer gets has besides its nominal step."""
+    """euler: whether the truth itself moves by Euler's rule; declared: what the tracer's model has besides its nominal step;
+    asked: a law of commands of its own; whole: nothing is lost on the way into the file; extra: goes into the truth.
+    """
 
     scale: Scale
     noise: Noise
@@ -64,8 +60,9 @@ class Draft:
     euler: bool = False
     runs: int = 1
     declared: tuple[dict[str, Any], ...] = ()
-    commands: Controller | None = None
+    asked: Callable[[Rng, Array], Array] | None = None
     together: bool = True
+    whole: bool = False
     extra: dict[str, Any] = field(default_factory=dict)
 
     def world(self) -> World:
@@ -141,67 +138,53 @@ def draw_pose_rule(rng: Rng, s: Scale) -> dict[str, Any]:
     return {"declared": (EXACT,)} if rng.random() < 0.67 else {"euler": True}
 
 
-def draw_layout(rng: Rng, *, euler: bool, plain: float = 0.6) -> str:
-    """Euler's rule is about the grid, so its states stay there."""
-    if rng.random() < plain:
-        return "grid"
-    return str(rng.choice(["async", "late"] if euler else list(LAYOUTS[1:])))
-
-
-def _stamps(rng: Rng, layout: str, s: Scale, n: int) -> tuple[Whole, Whole]:
-    """(rows, orders) in parts."""
-    parts = s.parts
-    grid = parts * np.arange(n + 1)
-    if layout == "jitter":
-        off = rng.integers(0, max(parts // 3, 1) + 1, n + 1)
-        off[0] = 0
-        return grid + off, grid + off
-    if layout == "irregular":
-        rows = np.concatenate([[0], np.cumsum(rng.integers(int(0.6 * parts), int(1.4 * parts) + 1, n))])
-        return rows, rows
-    if layout == "other":
-        period = int(rng.choice([k for k in range(max(parts // 3, 2), int(1.3 * parts)) if parts % k and k % parts]))
-        rows = period * np.arange(int(n * parts / period) + 1)
-        return rows, rows
-    if layout == "async":
-        period = int(rng.integers(max(parts // 2, 3), 2 * parts))
-        wobble = rng.integers(0, max(period // 4, 1) + 1, int(n * parts / period) + 1)
-        return grid, int(rng.integers(1, parts)) + period * np.arange(len(wobble)) + wobble
-    if layout == "late":
-        return grid, grid[:-1] + int(rng.integers(1, parts))
-    return grid, grid
-
-
 def realise(rng: Rng, draft: Draft) -> tuple[Recording, Rollouts | None]:
     """Drives the draft's robot, and measures how far the nominal model goes wrong."""
+    runs, starts = drive(rng, draft)
+    return recording_of(rng, draft, runs), rollout_errors(starts, draft.nominal()) if starts else None
+
+
+def drive(rng: Rng, draft: Draft) -> tuple[list[Run], list[Start]]:
+    """Runs as measured, and begins of rollouts."""
     s, world = draft.scale, draft.world()
-    plant = s.plant
     origin, runs, starts = 0.0, [], []
     for _ in range(draft.runs):
         n = max(s.n // draft.runs, 10)
-        rows, orders = _stamps(rng, draft.layout, s, n)
-        if draft.law == "closed":
-            commands: Array | Controller = draft.commands or tracker(
-                rng, plant, s.ranges, max(s.pace, 8.0 * s.dt), s.speed, plant.parameters.get("mass", 1.0)
-            )
-        else:
-            commands = open_loop(rng, plant, draft.law, s.dt / s.parts * orders, s.ranges, s.pace, s.speed)
+        rows, orders = stamps(rng, draft.layout, s, n)
+        commands = draft.asked(rng, s.dt / s.parts * orders) if draft.asked else asked(rng, draft, s.dt / s.parts * orders)
         x0 = _begin(rng, s)
         ahead = max(1, min(round(HORIZON_S / (world.h * float(np.median(np.diff(rows))))), n // 4))
         run = record(world, rows, orders, commands, draft.noise, x0, rng, origin=origin, ahead=ahead, rollouts=max(30 // draft.runs, 6))
         origin += round(s.dt * n + rng.uniform(*PAUSE_S), 3)
         starts += run.starts
         runs.append(run)
+    return runs, starts
+
+
+def asked(rng: Rng, draft: Draft, t: Array) -> Array | Controller:
+    """Commands of the draft's law at these stamps, or its controller."""
+    s = draft.scale
+    if draft.law == "closed":
+        return tracker(rng, s.plant, s.ranges, max(s.pace, 8.0 * s.dt), s.speed, s.plant.parameters.get("mass", 1.0))
+    return open_loop(rng, s.plant, draft.law, t, s.ranges, s.pace, s.speed)
+
+
+def recording_of(rng: Rng, draft: Draft, runs: list[Run]) -> Recording:
+    """What the file says: on some clock, with so many digits."""
+    s = draft.scale
+    timed = any(m.name in TIMED for m in draft.missing)
+    seen = [as_seen(rng, draft.layout, s, run) for run in runs]
+    plain = draft.layout in {"grid", "async", "late"}
+    if plain and len(runs) == 1 and s.n >= 200 and not timed and not draft.whole:
+        chance = rng.random()
+        seen = [lost(rng, s, seen[0])] if chance < 0.08 else [under_way(rng, seen[0])] if chance < 0.16 else seen
+        draft.extra |= {"seen": "lost" if chance < 0.08 else "under_way"} if chance < 0.16 else {}
     shift = float(rng.choice([0.0, round(rng.uniform(0.0, 9e4), 3), 1.7e9 + round(rng.uniform(0.0, 1e6), 3)], p=[0.6, 0.25, 0.15]))
-    shifted = [Run(run.t + shift, run.y, run.t_u + shift, run.u) for run in runs]
-    recording = Recording(
-        plant, shifted, digits=6, figures=int(rng.choice([7, 9])), together=draft.together, wrap=bool(rng.random() < 0.85)
+    digits = int(rng.choice([4, 5])) if s.dt >= 0.02 and rng.random() < 0.2 else 6
+    shifted = [Run(run.t + shift, run.y, run.t_u + shift, run.u) for run in seen]
+    return Recording(
+        s.plant, shifted, digits=digits, figures=int(rng.choice([7, 9])), together=draft.together, wrap=bool(rng.random() < 0.85)
     )
-    return recording, _ratio(starts, draft.nominal())
-
-
-def _ratio(starts: list[Start], nominal: World) -> Rollouts | None:
-    return rollout_errors(starts, nominal) if starts else None
 
 
 def _begin(rng: Rng, s: Scale) -> list[float]:
@@ -220,3 +203,22 @@ def draw_missing(rng: Rng, s: Scale, name: str, size: float) -> Missing:
     """An effect with values."""
     channel, p = draws.draw(rng, name, s, size)
     return Missing(name, channel, p)
+
+
+def common(draft: Draft, errors: Rollouts | None) -> dict[str, Any]:
+    """What every truth tells."""
+    s = draft.scale
+    return {
+        "robot": s.plant.name,
+        "rate": round(1.0 / s.dt, 3),
+        "n": s.n,
+        "law": draft.law,
+        "layout": draft.layout,
+        "noise": draft.noise.law,
+        "runs": draft.runs,
+        "euler": draft.euler,
+        "ratio": round(errors.ratio, 4) if errors else None,
+        "oracle": errors.oracle.tolist() if errors else None,
+        "effects": [m.told() for m in draft.missing],
+        **draft.extra,
+    }

@@ -1,6 +1,6 @@
 """Laws of noise: on what is measured, and on what the robot does.
 
-measured   y = x + e,   e white Gaussian, Student-t, or Gaussian with outliers on a share of the rows; y rounded to a quantum, if there is one
+measured   y = x + e,   e white Gaussian, Student-t, or Gaussian with outliers on a share of the rows; y may be rounded
 motion     a push a step of dt on the speeds (pose plants) or accelerations (force plants), white or AR(1) with a time constant
 """
 

@@ -113,7 +113,7 @@ class Recording:
         nx, nu = len(self.plant.states), len(self.plant.inputs)
         rows: dict[tuple[float, int], list[str]] = {}
         for stamp, y in zip(run.t.tolist(), run.y.tolist(), strict=True):
-            values = [wrapped(v) if self.wrap and name in {"theta"} else v for name, v in zip(self.plant.states, y, strict=True)]
+            values = [wrapped(v) if self.wrap and name == "theta" else v for name, v in zip(self.plant.states, y, strict=True)]
             rows[stamp, 0] = [*("" if np.isnan(v) else f"{v:.{self.figures}g}" for v in values), *[""] * nu]
         for stamp, u in zip(run.t_u.tolist(), run.u.tolist(), strict=True):
             cells = [f"{v:.{self.figures}g}" for v in u]

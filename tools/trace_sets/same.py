@@ -60,3 +60,43 @@ def groups(plant: Plant) -> list[list[Name]]:
             [("mass_change", None), ("input_gain", "force")],
         ]
     return []
+
+
+def share_a_name(draft: Draft) -> bool:
+    """Whether two of its effects cannot be told apart, or are kinds of one thing on one channel."""
+    lists = [names(draft.scale.plant, m, draft) for m in draft.missing]
+    for i, first in enumerate(lists):
+        for second in lists[i + 1 :]:
+            if set(first) & set(second):
+                return True
+    dry = [m for m in draft.missing if m.name in {"coulomb_friction", "stribeck_friction"}]
+    gains = [
+        m for m in draft.missing if m.name in {"input_gain", "input_gain_asymmetry", "mass_change", "longitudinal_slip", "track_scale"}
+    ]
+    pushes = [m for m in draft.missing if m.name in {"input_bias", "constant_disturbance"}]
+    noses = [m for m in draft.missing if m.name in {"understeer", "track_scale"}]
+    return any(len(group) > 1 for group in (dry, gains, pushes, noses))
+
+
+def alternatives(draft: Draft) -> list[list[list[list[str | None]]]]:
+    """Other sets of effects that are the same thing: each a list as `accepted` gives it."""
+    plant = draft.scale.plant
+    found = []
+    for i, m in enumerate(draft.missing):
+        for other in _as_two(plant, m):
+            rest = [list(map(list, names(plant, n, draft))) for k, n in enumerate(draft.missing) if k != i]
+            found.append([*rest, *([list(name) for name in group] for group in other)])
+    return found
+
+
+def _as_two(plant: Plant, m: Missing) -> list[list[list[Name]]]:
+    """Ways in which one effect is two others."""
+    if m.channel == "*" and m.name in {"input_delay", "input_gain_drift", "regime_change"} and len(plant.inputs) == 2:
+        return [[[(m.name, channel)] for channel in plant.inputs]]
+    if m.name == "constant_disturbance" and plant.name == "double_integrator":
+        return [[[("input_bias", "ax")], [("input_bias", "ay")]]]
+    if m.name == "coulomb_friction" and "force_positive" in m.p:
+        axis = plant.velocity.index(plant.states.index(m.channel))
+        push: list[Name] = [("input_bias", plant.inputs[axis]), ("constant_disturbance", "world")]
+        return [[[("coulomb_friction", m.channel)], push]]
+    return []

@@ -4,6 +4,9 @@
     one, pair  right | tie (ambiguous, the truth among what is named) | none | withheld (unexplained: no name was lent)
                | fault (sensor_fault) | part (some of a pair, nothing false) | wrong (a false name among those given)
     outside    flagged (unexplained) | named_flagged (a name, and depends_on says that more is left) | false_name | none | fault
+    tie        tie | overclaimed (one of several, as if it were sure) | wrong | none | withheld | fault
+    fault      found (sensor_fault, and where) | located (where, under another verdict) | missed | wrong (a name)
+    bad        honest (refused in one line, or no name) | named | accepted (a file that is none) | crash
 
 An answer is what `s2r trace --json` prints. A truth is what stands in NAME.truth.json. Both are plain data.
 """
@@ -36,7 +39,12 @@ def outcome(truth: Truth, answer: Answer) -> str:
         return _of_clean(truth, answer)
     if truth["expect"] == "outside":
         return _of_outside(answer)
-    return _of_named(truth, answer)
+    if truth["expect"] == "fault":
+        return _of_fault(truth, answer)
+    if truth["expect"] == "bad":
+        return "accepted" if truth["must_refuse"] else "named" if answer["verdict"] in {"traced", "ambiguous"} else "honest"
+    word = _of_named(truth, answer)
+    return "overclaimed" if truth["expect"] == "tie" and word in {"right", "part"} else word
 
 
 def _of_clean(truth: Truth, answer: Answer) -> str:
@@ -65,14 +73,44 @@ def _of_named(truth: Truth, answer: Answer) -> str:
     verdict, accepted = answer["verdict"], truth["accepted"]
     if verdict in {"none", "unexplained", "sensor_fault"}:
         return {"none": "none", "unexplained": "withheld", "sensor_fault": "fault"}[verdict]
+    words = [_against(names, answer) for names in (accepted, *truth.get("alternatives", []))]
+    return next((word for word in ("right", "tie", "part") if word in words), "wrong")
+
+
+def _against(accepted: list[list[list[str | None]]], answer: Answer) -> str:
     found = named(answer["effects"])
-    matched = matching(found, accepted)
-    if verdict == "ambiguous":
+    if answer["verdict"] == "ambiguous":
         among = found + named(answer["ambiguous_with"])
         return "tie" if all(any(is_one_of(f, names) for f in among) for names in accepted) else "wrong"
-    if None in matched:
+    if None in matching(found, accepted):
         return "wrong"
     return "right" if len(found) == len(accepted) else "part"
+
+
+def _of_fault(truth: Truth, answer: Answer) -> str:
+    verdict = answer["verdict"]
+    if verdict in {"traced", "ambiguous"}:
+        return "wrong"
+    if not located(truth, answer):
+        return "missed"
+    only_gaps = all(f["kinds"] == ["dropout"] for f in truth["true_faults"])
+    return "found" if verdict == "sensor_fault" or (only_gaps and verdict == "none") else "located"
+
+
+def located(truth: Truth, answer: Answer) -> bool:
+    """Whether at least four of five true faults are told, under a name that fits, on that channel, about there and then."""
+    step = 1.0 / truth["rate"]
+    there = [any(_meets(true, told, step) for told in answer["faults"]) for true in truth["true_faults"]]
+    return sum(there) >= 0.8 * len(there)
+
+
+def _meets(true: dict[str, Any], told: dict[str, Any], step: float) -> bool:
+    if told["kind"] not in true["kinds"] or (true["channel"] not in {"*", told["channel"]} and told["channel"] != "*"):
+        return False
+    slack = 3.0 * step
+    both = min(true["to_s"], told["to_s"]) - max(true["from_s"], told["from_s"])
+    either = max(true["to_s"], told["to_s"]) - min(true["from_s"], told["from_s"])
+    return bool(both + slack >= 0.5 * (either - 2.0 * slack) and both >= -slack)
 
 
 def matching(found: Names, accepted: list[list[list[str | None]]]) -> list[int | None]:
@@ -98,9 +136,9 @@ def covered(truth: Truth, answer: Answer) -> list[tuple[str, bool]]:
     if answer["verdict"] not in {"traced", "ambiguous"}:
         return []
     told = []
-    pairs = zip(answer["effects"], matching(named(answer["effects"]), truth["accepted"]), strict=True)
+    pairs = zip(answer["effects"], matching(named(answer["effects"]), truth.get("accepted", [])), strict=True)
     for effect, place in pairs:
-        if place is None or truth["effects"][place]["name"] != effect["name"]:
+        if place is None or place >= len(truth["effects"]) or truth["effects"][place]["name"] != effect["name"]:
             continue
         true = truth["effects"][place]["parameters"]
         for name, value in effect["parameters"].items():

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import copy
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,11 +47,11 @@ class TruthEffect:
         """Force plants: greatest deceleration by dry friction on this axis."""
         return 0.0
 
-    def to_measured(self, x: Numbers) -> Numbers:
-        """Sensors: true -> measured."""
+    def to_measured(self, x: Numbers, t: float) -> Numbers:
+        """Sensors: true -> measured, t seconds after the recording's first stamp."""
         return x
 
-    def to_true(self, x: Numbers) -> Numbers:
+    def to_true(self, x: Numbers, t: float) -> Numbers:
         """Sensors: measured -> true."""
         return x
 
@@ -88,16 +88,16 @@ class World:
         """The nominal robot."""
         return World(self.plant, self.dt, self.parts, (), self.euler if euler is None else euler)
 
-    def measured(self, x: Numbers) -> Numbers:
+    def measured(self, x: Numbers, t: float) -> Numbers:
         """Through the sensors, without noise."""
         for e in self.sensing:
-            x = e.to_measured(x)
+            x = e.to_measured(x, t)
         return x
 
-    def true(self, y: Numbers) -> Numbers:
+    def true(self, y: Numbers, t: float) -> Numbers:
         """Back from the sensors."""
         for e in reversed(self.sensing):
-            y = e.to_true(y)
+            y = e.to_true(y, t)
         return y
 
 
@@ -176,7 +176,7 @@ class Moment:
             self.i, self.h, self.instant, self.memories = self.i + 1, self.world.h, False, kept
             for state, channel in plant.reached.items():
                 x[state] = a[channel]
-        return self.world.measured(x)
+        return self.world.measured(x, self.t)
 
 
 def wrapped(angle: float) -> float:
@@ -223,15 +223,10 @@ def rollout_errors(starts: list[Start], nominal: World) -> Rollouts:
     for start in starts:
         moments = [start.moment.copy(), Moment(nominal, start.moment.u, list(start.y), start.moment.i)]
         moments[1].origin = start.moment.origin
-        moments[0].x = moments[0].world.true(list(start.y))
+        moments[0].x = moments[0].world.true(list(start.y), start.moment.t)
         for place, moment in enumerate(moments):
             while moment.i < start.until:
                 moment.part()
             errors[place].append(difference(plant, np.array(moment.read()), np.array(start.y_end)))
     oracle, plain = (np.sqrt(np.mean(np.array(e) ** 2, axis=0)) for e in errors)
     return Rollouts(oracle, plain)
-
-
-def reseeded(world: World, effects: tuple[TruthEffect, ...]) -> World:
-    """The same robot with other effects."""
-    return replace(world, effects=effects)
