@@ -8,4 +8,4 @@ from s2r_runtime.hookspecs import Offer, hookimpl
 @hookimpl
 def s2r_transports() -> list[Offer]:
     """The CAN transport."""
-    return []
+    return [Offer("can", "s2r_can.transport:CanTransport", "robots on a CAN bus, described by its DBC", files=("dbc",))]
