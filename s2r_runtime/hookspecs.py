@@ -21,6 +21,8 @@ import pluggy
 from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import numpy as np
     from numpy.typing import NDArray
 
@@ -94,12 +96,20 @@ class Transport(Protocol):
 # ---------------------------------------------------------------- models and effects
 
 
+class Follows(NamedTuple):
+    """How a state follows from measured ones: formula(x, rates, parameters) -> (n,); x and rates (per s): name -> (n,)."""
+
+    of: tuple[str, ...]
+    formula: Callable[[dict[str, Array], dict[str, Array], dict[str, float]], Array]
+
+
 class NominalModel(Protocol):
     """One step of `dt`, batched. x: (n, nx), u: (n, nu); all states and inputs in SI units, angles in rad.
 
     It may also have: `units` (name of a state or input -> SI unit, for reports); `integration` = "euler" if it has a planar pose (x, y,
     theta) that is moved along the heading at the start of the step; `reached` (state -> the input that it is set to at once: such
-    a state is compared with the input as it acts at the *end* of the step, the others with its mean over the step).
+    a state is compared with the input as it acts at the *end* of the step, the others with its mean over the step); `follows` (state that
+    a recording may lack -> the states that it follows from, and how: `Follows`).
     """
 
     name: str
@@ -133,10 +143,12 @@ class Effect(Protocol):
     long recordings, the same thing over time at once, `input_sequence`; the kit checks that the two agree.
 
     It may also have
-    - `optional`: names of parameters that may be left out; `choices`: parameter -> its words, for one that is not a number;
-      `wrong(p) -> str`: what is wrong with values that are each within bounds, or an empty text;
+    - `optional`: names of parameters that may be left out; `choices`: parameter -> its words, for one that is not a number; `named`:
+      parameters that say the name of another input; `wrong(p) -> str`: what is wrong with values that are each within bounds, or an
+      empty text;
     - `once` = True: a model has at most one of it; `linear` = True: it commutes with other linear effects, so the tracer tries one
-      place in the list only; `shift` = True: a pure delay, which commutes with all that has no clock of its own;
+      place in the list only; `shift` = True: a pure delay, which commutes with all that has no clock of its own; `additive` = True: what
+      it does is a sum over its parameters, in proportion to each one's distance from neutral;
     - `side_by_side` = True: `input_sequence` also takes u (T, runs, nu), many short runs at once;
     - `within_step(dt, p) -> bool`: whether what acts changes within a step although the input is held over it;
     - `reads(model, channel) -> tuple[str, ...]`: inputs besides the channel on which what acts there depends;

@@ -51,8 +51,11 @@ class Table:
         return digest(np.ascontiguousarray(numbers, dtype="<f8").tobytes())
 
 
-def read_csv(path: Path | str, wanted: Sequence[str] | None = None) -> Table:
-    """Reads the columns `wanted` (None: all). Raises RecordingError, one line: file, line, column, value, what would be right."""
+def read_csv(path: Path | str, wanted: Sequence[str] | None = None, optional: Sequence[str] = ()) -> Table:
+    """Reads the columns `wanted` (None: all), and those of `optional` that are there.
+
+    Raises RecordingError, one line: file, line, column, value, what would be right.
+    """
     path = Path(path)
     rows = csv.reader(io.StringIO(_text(path), newline=""), strict=True)
     try:
@@ -62,6 +65,7 @@ def read_csv(path: Path | str, wanted: Sequence[str] | None = None) -> Table:
     except csv.Error as error:
         raise RecordingError(f"{path}: line 1: not CSV: {error}") from None
     names = _checked_names(path, header, wanted)
+    names += [name for name in dict.fromkeys(optional) if name in header and name not in {TIME, SEGMENT, *names}]
     cells, lines = _cells(path, rows, len(header))
     numbers = {name: _numbers(path, name, cells[header.index(name)], lines) for name in (TIME, *names)}
     t = numbers.pop(TIME)

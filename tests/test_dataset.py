@@ -45,17 +45,33 @@ def test_rows_a_fraction_of_a_step_apart_are_picked_and_inputs_averaged():
     assert np.allclose(mean, inputs.values[:40].reshape(10, 4, 2).mean(axis=1))
 
 
-def test_irregular_rows_are_interpolated_and_far_neighbours_are_not():
+def test_irregular_rows_are_taken_as_they_are_and_a_gap_is_a_gap():
     t = np.concatenate([np.arange(0.0, 5.0, 0.013), np.arange(6.0, 9.0, 0.013)])
+    u = np.stack([np.sin(t), np.cos(t)], axis=1)
+    states = Stream(t, np.stack([2.0 * t, -t, 0.5 * t], axis=1))
+    data = from_streams(_model(), [(states, Stream(t, u))], "here")
+    run = data.runs[0]
+    at = np.concatenate([[0.0], np.cumsum(run.lasts)])
+    good = ~np.isnan(run.y[:, 0])
+    assert not data.interpolated
+    assert np.isin(np.round(run.y[good, 0], 9), np.round(2.0 * t, 9)).all()
+    assert np.allclose(run.y[good, 0], 2.0 * at[good])
+    assert np.all(np.abs(at - 0.1 * np.arange(len(at))) <= 0.05 + 1e-9)
+    assert not good[(at > 5.03) & (at < 5.97)].any()
+    assert good[(at < 4.9) | (at > 6.1)].all()
+    step = slice(20 * data.substeps, 21 * data.substeps)
+    inside = np.linspace(at[20], at[21], 20001)
+    held = u[np.searchsorted(t, inside, side="right") - 1]
+    assert np.allclose(run.u[step].mean(axis=0), held.mean(axis=0), atol=1e-3)
+
+
+def test_rows_rarer_than_the_step_are_interpolated():
+    t = np.arange(0.0, 9.0, 0.13)
     states = Stream(t, np.stack([2.0 * t, -t, 0.5 * t], axis=1))
     data = from_streams(_model(), [(states, Stream(t, np.zeros((len(t), 2))))], "here")
     y = data.runs[0].y
-    grid = 0.1 * np.arange(len(y))
-    good = ~np.isnan(y[:, 0])
     assert data.interpolated
-    assert np.allclose(y[good, 0], 2.0 * grid[good])
-    assert not good[(grid > 5.03) & (grid < 5.97)].any()
-    assert good[(grid < 4.9) | (grid > 6.1)].all()
+    assert np.allclose(y[:, 0], 0.2 * np.arange(len(y)))
 
 
 def test_angles_are_unwrapped_over_the_turn():

@@ -23,6 +23,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     )
     verb.add_argument("--horizon", type=positive, default=1.0, metavar="S", help="length of the rollouts in s (default 1)")
     verb.add_argument("--seed", type=count, default=0, help="seed of everything random in it (default 0)")
+    verb.add_argument(
+        "--bandwidth",
+        type=positive,
+        metavar="HZ",
+        help="within which states that the recording lacks are reconstructed from those that it has (default: what the data bear)",
+    )
     verb.add_argument("-o", "--output", type=Path, metavar="MODEL.toml", help="write the repaired model")
     verb.add_argument("--report", type=Path, metavar="FILE.html", help="write a self-contained page with plots")
     verb.add_argument("--json", action="store_true", help="print one JSON object")
@@ -38,8 +44,9 @@ def run(args: argparse.Namespace) -> int:
     writable(args.report)
     model, profile = chosen_model(args)
     columns = dict(profile.columns) if profile else {}
-    data = load_dataset(args.recording, model, columns)
-    test = load_dataset(args.test, model, columns) if args.test else None
+    data = load_dataset(args.recording, model, columns, bandwidth=args.bandwidth)
+    used = data.reconstruction.bandwidth if data.reconstruction else args.bandwidth
+    test = load_dataset(args.test, model, columns, bandwidth=used) if args.test else None
     if test and set(test.digests) & set(data.digests):
         raise UsageError(f"--test {args.test}: is the recording that the fit is made on; take one that the fit never sees")
     bar = output.Progress("tracing")
@@ -59,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     if args.output:
         args.output.write_text(dump_model(result.spec, result.comments()), encoding="utf-8")
     if args.report:
-        from s2r_runtime.report.trace_section import trace_page
+        from s2r_runtime.report.trace_page import trace_page
 
         args.report.write_text(trace_page(result), encoding="utf-8")
     if args.json:

@@ -8,7 +8,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.hookspecs import Follows
+
 Array = NDArray[np.float64]
+
+
+def _speed(x: dict[str, Array], rates: dict[str, Array], parameters: dict[str, float]) -> Array:
+    """Of the rear axle along the heading, (n,): what it does not say is how fast it slides."""
+    return np.asarray(np.cos(x["theta"]) * rates["x"] + np.sin(x["theta"]) * rates["y"])
 
 
 class Bicycle:
@@ -19,6 +26,7 @@ class Bicycle:
     inputs = ("steer_cmd", "speed_cmd")
     angles = ("theta",)
     parameters: dict[str, float] = {"wheel_base": 0.33}
+    follows = {"speed": Follows(("x", "y", "theta"), _speed)}
     units = {"x": "m", "y": "m", "theta": "rad", "speed": "m/s", "steer_cmd": "rad", "speed_cmd": "m/s"}
     integration = "euler"
     reached = {"speed": "speed_cmd"}

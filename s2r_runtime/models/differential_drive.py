@@ -6,10 +6,20 @@ x+ = x + dt v cos(theta),  y+ = y + dt v sin(theta),  theta+ = theta + dt w
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.hookspecs import Follows
+
 Array = NDArray[np.float64]
+
+
+def _wheel(side: float, x: dict[str, Array], rates: dict[str, Array], parameters: dict[str, float]) -> Array:
+    """Speed of a wheel that does not slip, (n,) rad/s; side: its place across the robot over the track."""
+    forward = np.cos(x["theta"]) * rates["x"] + np.sin(x["theta"]) * rates["y"]
+    return np.asarray((forward + side * parameters["track"] * rates["theta"]) / parameters["wheel_radius"])
 
 
 class DifferentialDrive:
@@ -23,6 +33,10 @@ class DifferentialDrive:
     inputs = ("cmd_left", "cmd_right")
     angles = ("theta",)
     parameters: dict[str, float] = {"wheel_radius": 0.1, "track": 0.5}
+    follows = {
+        "wheel_left": Follows(("x", "y", "theta"), partial(_wheel, -0.5)),
+        "wheel_right": Follows(("x", "y", "theta"), partial(_wheel, 0.5)),
+    }
     units = {"x": "m", "y": "m", "theta": "rad", "wheel_left": "rad/s", "wheel_right": "rad/s", "cmd_left": "rad/s", "cmd_right": "rad/s"}
     integration = "euler"
     reached = {"wheel_left": "cmd_left", "wheel_right": "cmd_right"}

@@ -8,6 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.hookspecs import Follows
+
 Array = NDArray[np.float64]
 
 
@@ -19,6 +21,10 @@ class DoubleIntegrator:
     inputs = ("ax", "ay")
     angles = ()
     parameters: dict[str, float] = {}
+    follows = {
+        "vx": Follows(("x",), lambda x, rates, parameters: rates["x"]),
+        "vy": Follows(("y",), lambda x, rates, parameters: rates["y"]),
+    }
     units = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "ax": "m/s²", "ay": "m/s²"}
 
     def step(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:

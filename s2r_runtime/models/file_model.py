@@ -10,7 +10,8 @@ import importlib.util
 import sys
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.canonical import digest
 from s2r_runtime.errors import ConfigError, one_line
-from s2r_runtime.hookspecs import NominalModel
+from s2r_runtime.hookspecs import Follows, NominalModel
 from s2r_runtime.modelspec import ModelSpec
 
 Array = NDArray[np.float64]
@@ -36,6 +37,7 @@ class FileModel:
     angles: tuple[str, ...]
     parameters: dict[str, float]
     function: Callable[..., Any]
+    follows: dict[str, Follows] = field(default_factory=dict)
 
     def step(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
         """Calls the file's `step`: x (n, nx), u (n, nu) -> (n, nx).
@@ -81,7 +83,7 @@ def load_file_model(spec: ModelSpec, where: str) -> NominalModel:
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{path}: PARAMS must be a dict of numbers: {error}") from None
     states, inputs, angles = (_names(path, module, name) for name in ("STATES", "INPUTS", "ANGLES"))
-    return FileModel(str(path), states, inputs, angles, parameters, module.step)
+    return FileModel(str(path), states, inputs, angles, parameters, module.step, _follows(path, module, states))
 
 
 def _run(path: Path) -> ModuleType:
@@ -103,6 +105,18 @@ def _names(path: Path, module: ModuleType, name: str) -> tuple[str, ...]:
     if not isinstance(given, tuple | list) or not all(isinstance(one, str) for one in given):
         raise ConfigError(f"{path}: {name} is {given!r}, must be a tuple of names")
     return tuple(given)
+
+
+def _follows(path: Path, module: ModuleType, states: tuple[str, ...]) -> dict[str, Follows]:
+    """RATES = {"vx": "x"}: states that are rates of others, and so need not be measured."""
+    given = getattr(module, "RATES", {})
+    if not isinstance(given, dict) or not {*given, *given.values()} <= {*states} or {*given} & {*given.values()}:
+        raise ConfigError(f"{path}: RATES is {given!r}, must be a dict of states and the states whose rates they are")
+    return {name: Follows((of,), partial(_rate, of)) for name, of in given.items()}
+
+
+def _rate(of: str, x: dict[str, Array], rates: dict[str, Array], parameters: dict[str, float]) -> Array:
+    return rates[of]
 
 
 def _failed(path: str, doing: str, error: BaseException) -> ConfigError:

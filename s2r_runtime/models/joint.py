@@ -8,6 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.hookspecs import Follows
+
 Array = NDArray[np.float64]
 
 
@@ -19,6 +21,7 @@ class Joint:
     inputs = ("force",)
     angles = ()
     parameters: dict[str, float] = {"mass": 1.0}
+    follows = {"qd": Follows(("q",), lambda x, rates, parameters: rates["q"])}
     units = {"q": "m", "qd": "m/s", "force": "N"}
 
     def step(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:

@@ -73,4 +73,5 @@ def _errors(model: ComposedModel, run: Run, u: Array) -> Array:
 def _preceded(data: Dataset, run: Run, steps: int) -> Run:
     y = np.concatenate([np.full((steps, run.y.shape[1]), np.nan), run.y])
     first = np.tile(run.u[:1], (steps * data.substeps, 1))
-    return Run(run.start_s - steps * data.dt, y, np.concatenate([first, run.u]))
+    lasts = None if run.lasts is None else np.concatenate([np.full(steps, data.dt), run.lasts])
+    return Run(run.start_s - steps * data.dt, y, np.concatenate([first, run.u]), lasts)

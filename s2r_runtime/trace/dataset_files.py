@@ -16,6 +16,7 @@ from s2r_runtime.errors import RecordingError
 from s2r_runtime.messages import CampaignFinished, Observed, Send, StartCampaign, Started
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Array, Dataset, Stream, columns_of, from_streams
+from s2r_runtime.trace.reconstruct import reconstruct
 
 MCAP_MAGIC = b"\x89MCAP"
 
@@ -23,20 +24,29 @@ Row = tuple[float, ...]
 
 
 def load_dataset(
-    path: Path | str | Sequence[Path | str], model: ComposedModel, columns: Mapping[str, str] | None = None, *, epoch: int | None = None
+    path: Path | str | Sequence[Path | str],
+    model: ComposedModel,
+    columns: Mapping[str, str] | None = None,
+    *,
+    epoch: int | None = None,
+    bandwidth: float | None = None,
 ) -> Dataset:
     """Reads a recording on the model's grid. columns: name in the model -> column of the table. Several paths: parts of one log.
-    epoch: of a log, only what was recorded while that campaign was under way.
+    epoch: of a log, only what was recorded while that campaign was under way. bandwidth: Hz within which states that the table does not
+    have are reconstructed from those that it has (None: what the data bear).
 
-    Raises RecordingError (unreadable, lacks a column, too slow for the model's dt).
+    Raises RecordingError (unreadable, lacks a column that does not follow from others, too slow for the model's dt).
     """
     paths = tuple(Path(p) for p in ([path] if isinstance(path, str | Path) else path))
     digests = tuple(_digest(p) for p in paths)
     source = ", ".join(str(p) for p in paths)
     if _is_log(paths[0]):
         return from_streams(model, _log_segments(paths, model, epoch), source, digests, paths)
-    segments, content = _table_segments(paths[0], model, columns or {})
-    return from_streams(model, segments, source, (*digests, content), paths)
+    segments, missing, content = _table_segments(paths[0], model, columns or {})
+    if not missing:
+        return from_streams(model, segments, source, (*digests, content), paths)
+    segments, done = reconstruct(model, segments, missing, source, bandwidth)
+    return from_streams(model, segments, source, (*digests, content), paths, done)
 
 
 def _digest(path: Path) -> str:
@@ -53,13 +63,20 @@ def _is_log(path: Path) -> bool:
         return file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
 
 
-def _table_segments(path: Path, model: ComposedModel, columns: Mapping[str, str]) -> tuple[list[tuple[Stream, Stream]], str]:
-    """The segments, and the digest of what the table says, however it is written."""
+def _table_segments(
+    path: Path, model: ComposedModel, columns: Mapping[str, str]
+) -> tuple[list[tuple[Stream, Stream]], tuple[str, ...], str]:
+    """The segments, the states that the table does not have although they may be left out, and the digest of what it says, however it is
+    written. A column that the caller named must be there.
+    """
     from s2r_runtime.tables import read_csv
 
     names = columns_of(model, columns)
-    table = read_csv(path, list(names.values()))
-    states = np.column_stack([table.columns[names[s]] for s in model.states])
+    free = {name for name in getattr(model.nominal, "follows", {}) if name not in columns}
+    table = read_csv(path, [names[n] for n in names if n not in free], optional=[names[n] for n in names if n in free])
+    missing = tuple(s for s in free if s not in table.columns or np.isnan(table.columns[s]).all())
+    missing = tuple(s for s in model.states if s in missing)
+    states = np.column_stack([table.columns[names[s]] for s in model.states if s not in missing])
     inputs = np.column_stack([table.columns[names[i]] for i in model.inputs])
     where = np.zeros(len(table.t), dtype=np.int64) if table.segment is None else table.segment
     given = []
@@ -68,7 +85,7 @@ def _table_segments(path: Path, model: ComposedModel, columns: Mapping[str, str]
         t, y, u = table.t[rows], states[rows], inputs[rows]
         measured, commanded = ~np.isnan(y).all(axis=1), ~np.isnan(u).all(axis=1)
         given.append((Stream(t[measured], y[measured]), Stream(t[commanded], u[commanded])))
-    return given, table.content_digest(list(names.values()))
+    return given, missing, table.content_digest([names[n] for n in names if n not in missing])
 
 
 def _log_segments(paths: tuple[Path, ...], model: ComposedModel, epoch: int | None) -> list[tuple[Stream, Stream]]:

@@ -18,7 +18,8 @@ from s2r_runtime.gap import Transitions, discrepancy, hold_residuals, residuals
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.holdout import FEWEST_RUNS
-from s2r_runtime.trace.residual import Steps, acting, residual, rms, rollout, rollout_starts, state_jacobian
+from s2r_runtime.trace.inverse import Inverse, input_relative, inverse
+from s2r_runtime.trace.residual import Steps, acting, advanced, residual, rms, rollout, rollout_starts, state_jacobian
 from s2r_runtime.trace.residual_noise import Noise
 
 Array = NDArray[np.float64]
@@ -37,44 +38,50 @@ MANY = 20_000_000
 
 @dataclass(frozen=True)
 class Held:
-    """What is held out. steps: its transitions; within: (M,) steps a rollout may touch; horizon in steps."""
+    """What is held out. steps: its transitions; within: (M,) steps a rollout may touch; horizon in steps; inverse: for inputs that are
+    forces.
+    """
 
     data: Dataset
     steps: Steps
     left_out: tuple[tuple[int, int], ...]
     within: Mask
     horizon: int
+    inverse: Inverse | None = None
 
 
 @dataclass(frozen=True)
 class Judged:
-    """Of one model. one_step: (n, nx) residuals; ends: (m, nx) errors at the ends of rollouts."""
+    """Of one model. one_step: (n, nx) residuals; ends: (m, nx) errors at the ends of rollouts; input_relative: of the inverse model."""
 
     one_step: Array
     ends: Array
+    input_relative: float | None = None
 
     def error(self, states: tuple[str, ...], horizon_s: float) -> dict[str, Any]:
         """docs/json.md's `before` and `after`."""
-        return {
+        inverted = {} if self.input_relative is None else {"input_relative": self.input_relative}
+        return inverted | {
             "one_step_rms": dict(zip(states, rms(self.one_step).tolist(), strict=True)),
             "rollout_rms": dict(zip(states, (rms(self.ends) if len(self.ends) else rms(self.one_step)).tolist(), strict=True)),
             "rollout_horizon_s": horizon_s,
         }
 
 
-def held(data: Dataset, steps: Steps, left_out: tuple[tuple[int, int], ...], within: Mask, horizon_s: float) -> Held:
+def held(model: ComposedModel, data: Dataset, steps: Steps, left_out: tuple[tuple[int, int], ...], within: Mask, horizon_s: float) -> Held:
     """With the longest horizon up to the one asked for that some row has ahead of it."""
     ahead = max(1, round(horizon_s / data.dt))
     while ahead > 1 and not len(rollout_starts(data, ahead, left_out, within)):
         ahead = max(1, ahead // 2)
-    return Held(data, steps, left_out, within, ahead)
+    return Held(data, steps, left_out, within, ahead, inverse(model, data, steps))
 
 
 def judge(model: ComposedModel, given: Held) -> Judged:
     """The model's errors on what is held out."""
     act = acting(model, given.data)
     starts = _starts(given)
-    return Judged(residual(model, given.steps, act), rollout(model, given.data, act, starts, given.horizon).error)
+    inverted = None if given.inverse is None else input_relative(model, given.inverse)
+    return Judged(residual(model, given.steps, act), rollout(model, given.data, act, starts, given.horizon).error, inverted)
 
 
 def better(given: Held, model: ComposedModel, other: ComposedModel, share: float) -> bool:
@@ -117,9 +124,8 @@ def noise_floor(model: ComposedModel, noise: Noise, given: Held, seed: int) -> t
     clean = np.concatenate([run.y for run in given.data.runs])[rows]
     noisy = clean + rng.normal(size=clean.shape) * np.sqrt(noise.r)
     for h in range(given.horizon):
-        mean, end = act.mean[starts + h], act.end[starts + h]
-        clean = model.advance(clean, mean, end)
-        noisy = model.advance(noisy, mean, end) + rng.normal(size=clean.shape) * np.sqrt(noise.q)
+        clean = advanced(model, clean, act, starts + h)
+        noisy = advanced(model, noisy, act, starts + h) + rng.normal(size=clean.shape) * np.sqrt(noise.q)
     return one, rms(model.difference(clean, noisy) + rng.normal(size=clean.shape) * np.sqrt(noise.r))
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset, Pause
-from s2r_runtime.trace.residual import Acting, acting, first_steps
+from s2r_runtime.trace.residual import Acting, acting, advanced, first_steps
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -131,7 +131,7 @@ def _predicted(model: ComposedModel, data: Dataset, act: Acting, run: int) -> Ar
     begin = first_steps(data)[run]
     y = data.runs[run].y[:-1]
     here = slice(begin, begin + len(y))
-    return model.advance(y, act.mean[here], act.end[here])
+    return advanced(model, y, act, here)
 
 
 def _of_pause(model: ComposedModel, data: Dataset, pause: Pause, reach: _Reach) -> Fault | None:

@@ -10,9 +10,10 @@ Effects of stage `input` filter the command, which is known without noise: their
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
@@ -51,10 +52,13 @@ class Steps:
 
 @dataclass(frozen=True)
 class Acting:
-    """The input as it acts over every step of all runs laid end to end: mean over the step, and at its end, (M, nu)."""
+    """The input as it acts over every step of all runs laid end to end: mean over the step, and at its end, (M, nu). lasts: (M,) s, of each
+    step, None where all last dt.
+    """
 
     mean: Array
     end: Array
+    lasts: Array | None = None
 
 
 def first_steps(data: Dataset) -> Index:
@@ -85,11 +89,14 @@ def acting(model: ComposedModel, data: Dataset, effects: Sequence[AppliedEffect]
     """The input as it acts after the effects of stage `input` (None: the model's)."""
     chain = [a for a in (model.effects if effects is None else effects) if a.effect.stage == "input"]
     u = sequence(model, chain, [run.u for run in data.runs], data.dt / data.substeps, [run.start_s for run in data.runs])
+    lasts = None
+    if any(run.lasts is not None for run in data.runs):
+        lasts = np.concatenate([np.full(len(run.y) - 1, data.dt) if run.lasts is None else run.lasts for run in data.runs])
     if data.substeps == 1:
-        return Acting(u, u)
+        return Acting(u, u, lasts)
     table = u.reshape(-1, data.substeps * u.shape[1])
     mean = table @ np.tile(np.eye(u.shape[1]) / data.substeps, (data.substeps, 1))
-    return Acting(mean, table[:, -u.shape[1] :].copy())
+    return Acting(mean, table[:, -u.shape[1] :].copy(), lasts)
 
 
 def sequence(model: ComposedModel, chain: Sequence[AppliedEffect], inputs: Sequence[Array], dt: float, starts: Sequence[float]) -> Array:
@@ -132,9 +139,25 @@ def _side_by_side(model: ComposedModel, chain: Sequence[AppliedEffect], inputs: 
     return table.transpose(1, 0, 2)[np.arange(len(table)) < lengths[:, None]]
 
 
+def advanced(model: ComposedModel, x: Array, act: Acting, place: Index | slice) -> Array:
+    """x (n, nx) one step later, angles not wrapped; place: which of the steps.
+
+    A model has one dt. Steps that last h are interpolated between the model's at dt (1 - s), dt and dt (1 + s), a quadratic in h: exact for
+    poses by Euler and for constant accelerations.
+    """
+    mean, end = act.mean[place], act.end[place]
+    if act.lasts is None:
+        return model.advance(x, mean, end)
+    h = (act.lasts[place] / model.dt - 1.0)[:, None]
+    s = float(np.clip(np.max(np.abs(h), initial=0.0), 0.05, 0.9))
+    short, long = (replace(model, spec=structs.replace(model.spec, dt=model.dt * (1.0 + r))).advance(x, mean, end) for r in (-s, s))
+    usual = model.advance(x, mean, end)
+    return np.asarray(usual + h / (2.0 * s) * (long - short) + (h / s) ** 2 / 2.0 * (long - 2.0 * usual + short))
+
+
 def predicted(model: ComposedModel, steps: Steps, act: Acting) -> Array:
     """f(y0, a), (n, nx), angles not wrapped."""
-    return model.advance(steps.y0, act.mean[steps.place], act.end[steps.place])
+    return advanced(model, steps.y0, act, steps.place)
 
 
 def residual(model: ComposedModel, steps: Steps, act: Acting) -> Array:
@@ -146,13 +169,12 @@ def state_jacobian(model: ComposedModel, steps: Steps, act: Acting) -> Array:
     """F, (n, nx, nx), by central differences of a millionth of the state's size."""
     nx = steps.y0.shape[1]
     f = np.empty((len(steps), nx, nx))
-    mean, end = act.mean[steps.place], act.end[steps.place]
     for j in range(nx):
         h = 1e-6 * max(1.0, float(np.max(np.abs(steps.y0[:, j]), initial=0.0)))
         up, down = steps.y0.copy(), steps.y0.copy()
         up[:, j] += h
         down[:, j] -= h
-        f[:, :, j] = (model.advance(up, mean, end) - model.advance(down, mean, end)) / (2.0 * h)
+        f[:, :, j] = (advanced(model, up, act, steps.place) - advanced(model, down, act, steps.place)) / (2.0 * h)
     return f
 
 
@@ -194,7 +216,7 @@ def rollout(model: ComposedModel, data: Dataset, act: Acting, starts: Index, hor
     x = y[rows]
     for h in range(horizon):
         place = starts + h
-        x = model.advance(x, act.mean[place], act.end[place])
+        x = advanced(model, x, act, place)
         if extra is not None:
             x = x + extra[place]
     return Rollouts(horizon, starts, model.difference(y[rows + horizon], x))

@@ -15,6 +15,7 @@ from s2r_runtime.trace.errors import Held, Judged
 from s2r_runtime.trace.faults import Fault
 from s2r_runtime.trace.found import Found, Limit
 from s2r_runtime.trace.power import Visible
+from s2r_runtime.trace.reconstruct import Reconstruction
 from s2r_runtime.trace.verdict import Verdict
 from s2r_runtime.trace.views import views
 
@@ -51,6 +52,7 @@ class TraceResult:
     n_rows: int
     source: str
     interpolated: bool
+    reconstruction: Reconstruction | None = None
     could_see: tuple[Visible, ...] = ()
 
     @property
@@ -66,7 +68,11 @@ class TraceResult:
     @property
     def done_to_data(self) -> tuple[str, ...]:
         """What stands between the measurements and what was fitted, one line each."""
-        return ()
+        lines = [] if self.reconstruction is None else self.reconstruction.text()
+        if self.nominal.dt != self.spec.dt:
+            longer = f"fitted and judged on steps of {self.nominal.dt:g} s, the shortest that are independent"
+            lines.append(f"{longer}; the model's are {self.spec.dt:g} s")
+        return tuple(lines)
 
     @property
     def horizon_s(self) -> float:
@@ -98,6 +104,8 @@ class TraceResult:
             "could_see": [
                 {"name": v.name, "channel": v.channel, "parameter": v.parameter, "size": v.size, "unit": v.unit} for v in self.could_see
             ],
+            "reconstructed": None if self.reconstruction is None else self.reconstruction.to_json(),
+            "step_s": self.nominal.dt,
             "n_fit": self.n_fit,
             "n_test": len(self.held.steps),
         }

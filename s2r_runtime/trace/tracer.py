@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -22,7 +23,7 @@ from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.beginning import with_history
-from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.dataset import Dataset, thinned
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge, noise_floor
 from s2r_runtime.trace.excitation import advice
@@ -78,6 +79,10 @@ def trace(
     """
     say: Progress = progress or (lambda done, total, detail: None)
     _belongs(dataset, model)
+    asked = model
+    if test is not None:
+        _belongs(test, model)
+    model, dataset, test = thinned(model, dataset, test)
     say(0.0, 100.0, "looking for faults of measurement")
     checked = check(model, with_history(model, dataset))
     seen = fit_mask(checked.data, seed, everything=test is not None)
@@ -94,6 +99,7 @@ def trace(
     say(90.0, 100.0, "judging on held-out data")
     w = np.ones(len(model.states)) if weights is None else np.asarray(weights, dtype=np.float64)
     result = _result(dataset, checked, given, chosen, structure, judged_on, seed, w, kind)
+    result = replace(result, spec=msgspec.structs.replace(result.spec, dt=asked.dt))
     say(100.0, 100.0, result.verdict)
     return result
 
@@ -143,6 +149,7 @@ def _result(
         n_rows=dataset.rows,
         source=dataset.source,
         interpolated=dataset.interpolated,
+        reconstruction=dataset.reconstruction,
         could_see=visible(given, final, math.log(max(chosen.tried, 1) / ALPHA)),
     )
 
@@ -158,12 +165,11 @@ def _belongs(data: Dataset, model: ComposedModel) -> None:
 def _held_out(checked: Checked, seen: Mask, test: Dataset | None, model: ComposedModel, horizon: float) -> Held:
     """The transitions that the fit does not see."""
     if test is not None:
-        _belongs(test, model)
         other = check(model, with_history(model, test))
         everything = np.ones(sum(len(run.y) - 1 for run in other.data.runs), dtype=bool)
-        return held(other.data, steps_of(other.data, other.left_out), other.left_out, everything, horizon)
+        return held(model, other.data, steps_of(other.data, other.left_out), other.left_out, everything, horizon)
     steps = steps_of(checked.data, checked.left_out)
-    return held(checked.data, steps.take(np.flatnonzero(~seen[steps.place])), checked.left_out, ~seen, horizon)
+    return held(model, checked.data, steps.take(np.flatnonzero(~seen[steps.place])), checked.left_out, ~seen, horizon)
 
 
 def _enough(data: Dataset, model: ComposedModel, fit_part: Part, judged_on: Held, ahead: int) -> None:

@@ -1,0 +1,124 @@
+"""Where a force, a torque or an acceleration is the input: the input that the measured motion takes, against the one that acted.
+
+    u*_k: f(y_k, u*_k) = y_{k+1} in the least-squares sense, of all such inputs the one nearest to what acted, a_k
+    input_relative = |h * (a - u*)| / |h * u|         over what is held out, every input over its own norm, root mean square of the inputs
+
+(y, a) at the recording's own rate, since friction is not the same over a long step; u: what was commanded; h: the low-pass of
+differentiation.py, zero-phase, by which noise that differences of measurements blow up is left out of both. This is the relative
+error of inverse dynamic identification (A. Janot, M. Gautier, M. Brunot, Data set and reference models of EMPS, 2019).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace import differentiation
+from s2r_runtime.trace.dataset import Dataset, regridded
+from s2r_runtime.trace.reconstruct import at_step
+from s2r_runtime.trace.residual import Steps, acting, steps_of
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+FORCES = {"N", "N m", "Nm", "m/s²", "rad/s²"}
+"""Units of inputs for which the inverse model is a usual thing to ask for."""
+
+ROUNDS = 40
+"""Of the iteration; it ends at once where the model is linear, and where friction holds it creeps out of the range that does nothing."""
+
+CLOSE = 1e-7
+"""Change, over the input's size, at which the iteration ends."""
+
+ROWS = 200_000
+"""At most; of a longer recording a part of that length at the beginning."""
+
+
+@dataclass(frozen=True)
+class Inverse:
+    """What is judged. data: at the recording's rate; steps of it; stretches: [a, b) of steps that follow one another; bandwidth: Hz."""
+
+    data: Dataset
+    steps: Steps
+    stretches: tuple[tuple[int, int], ...]
+    bandwidth: float
+
+
+def inverse(model: ComposedModel, data: Dataset, held_out: Steps) -> Inverse | None:
+    """None where the inputs are no forces, or where what is held out has no stretch long enough to filter."""
+    units: dict[str, str] = getattr(model.nominal, "units", {})
+    if not all(units.get(name) in FORCES for name in model.inputs) or not len(held_out):
+        return None
+    fine = data
+    if data.segments and data.interval < 0.75 * data.dt:
+        fine = regridded(data, at_step(model, data.interval))
+    steps = steps_of(fine)
+    steps = steps.take(_within(steps, fine.dt, held_out, data.dt))
+    steps = steps.take(np.arange(min(len(steps), ROWS)))
+    if not len(steps):
+        return None
+    edges = [0, *(np.flatnonzero(~steps.joined[1:]) + 1).tolist(), len(steps)]
+    band = data.reconstruction.bandwidth if data.reconstruction else _bandwidth(model, steps, edges, fine.dt)
+    least = 2 * differentiation.reach(fine.dt, band)
+    stretches = tuple((a, b) for a, b in pairwise(edges) if b - a > least)
+    return Inverse(fine, steps, stretches, band) if stretches else None
+
+
+def input_relative(model: ComposedModel, given: Inverse) -> float:
+    """See above."""
+    model = model if model.dt == given.data.dt else at_step(model, given.data.dt)
+    act = acting(model, given.data)
+    mean, end = act.mean[given.steps.place], act.end[given.steps.place]
+    commanded = acting(model, given.data, ()).mean[given.steps.place]
+    error = mean - _needed(model, given.steps, mean, end)
+    lost, whole = np.zeros(error.shape[1]), np.zeros(error.shape[1])
+    for a, b in given.stretches:
+        lost += np.sum(differentiation.low_pass(error[a:b], given.data.dt, given.bandwidth) ** 2, axis=0)
+        whole += np.sum(differentiation.low_pass(commanded[a:b], given.data.dt, given.bandwidth) ** 2, axis=0)
+    used = whole > 0.0
+    return float(np.sqrt(np.mean(lost[used] / whole[used]))) if used.any() else float("nan")
+
+
+def _needed(model: ComposedModel, steps: Steps, mean: Array, end: Array) -> Array:
+    """u*, (n, nu)."""
+    size = np.maximum(np.sqrt(np.mean(mean**2, axis=0)), 1e-12)
+    answer = np.stack([_slope(model, steps, mean, end, j, 0.1 * float(size[j])) for j in range(mean.shape[1])], axis=1)
+    back = np.linalg.pinv(answer)  # (nu, nx)
+    shift = np.zeros_like(mean)
+    for _ in range(ROUNDS):
+        e = model.difference(steps.y1, model.advance(steps.y0, mean + shift, end + shift))
+        step = e @ back.T
+        shift = shift + step
+        if np.all(np.abs(step) < CLOSE * size):
+            break
+    return np.asarray(mean + shift)
+
+
+def _slope(model: ComposedModel, steps: Steps, mean: Array, end: Array, j: int, h: float) -> Array:
+    """(nx,) what a unit more of input j does to the state, at the middle of all rows: where friction holds, it does nothing."""
+    up = np.zeros(mean.shape[1])
+    up[j] = h
+    change = model.advance(steps.y0, mean + up, end + up) - model.advance(steps.y0, mean - up, end - up)
+    return np.asarray(np.median(change, axis=0) / (2.0 * h))
+
+
+def _within(steps: Steps, dt: float, held_out: Steps, longer: float) -> Mask:
+    """Which of the steps lie in one that is held out."""
+    middle = steps.t + 0.5 * dt
+    last = np.searchsorted(held_out.t, middle, side="right") - 1
+    inside: Mask = (last >= 0) & (middle < held_out.t[np.maximum(last, 0)] + longer)
+    return inside
+
+
+def _bandwidth(model: ComposedModel, steps: Steps, edges: list[int], dt: float) -> float:
+    """What the measured rates (the states that an input moves most) bear, Hz."""
+    at = np.zeros((1, len(model.inputs)))
+    pushed = [model.nominal.step(steps.y0[:1], at + one, model.dt, model.parameters) for one in np.eye(len(model.inputs))]
+    resting = model.nominal.step(steps.y0[:1], at, model.dt, model.parameters)
+    moved = np.max([np.abs(p - resting)[0] for p in pushed], axis=0)
+    fast = np.flatnonzero(moved > 0.5 * moved.max())
+    return differentiation.bandwidth([steps.y0[a:b][:, fast] for a, b in pairwise(edges)], dt, 1)

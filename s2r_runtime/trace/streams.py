@@ -1,0 +1,237 @@
+"""Streams of measured states and of inputs, as received: on stamps of their own, with blanks, repeats and gaps.
+
+An input holds until the next one and is zero before the first. A value that is said again because no new one came is not a measurement
+(`fresh`). States on different stamps are brought to those of the slowest one (`complete`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+ALIGNED = 0.02
+"""A stamp this part of dt away from the grid counts as on it: stamps are printed with a few digits."""
+
+TOGETHER = 0.8
+"""If this part of the rows with the rarest state has all states, they come on the same stamps, and the rest is left."""
+
+REACH = 2.6
+"""Usual intervals between two values of a state from which on nothing is interpolated between them."""
+
+REPEATED = 0.15
+"""Share of the rows in motion that must repeat the row before for repeats to be the recorder's, not the robot's."""
+
+BRIEF = 6
+"""Rows that a recorder repeats at most while the robot moves; longer ones are a matter for the search for faults."""
+
+COARSE = 50
+"""A change of this many quanta or more, at the median, means that a sensor's resolution cannot make it repeat."""
+
+
+@dataclass(frozen=True)
+class Stream:
+    """t: (N,) s, ascending; values: (N, c). NaN where a column was not received."""
+
+    t: Array
+    values: Array
+
+
+def complete(states: Stream) -> Stream:
+    """Rows on which every state is known, one a stamp (the last)."""
+    there = ~np.isnan(states.values)
+    whole = there.all(axis=1)
+    counts = there.sum(axis=0)
+    if not counts.min(initial=len(states.t)) or np.count_nonzero(whole) >= TOGETHER * counts.min():
+        return last_of_each(Stream(states.t[whole], states.values[whole]))
+    slow = there[:, int(np.argmin(counts))]
+    t = states.t[slow]
+    values = np.column_stack([_between(t, states.t[m], states.values[m, j]) for j, m in enumerate(there.T)])
+    whole = ~np.isnan(values).any(axis=1)
+    return last_of_each(Stream(t[whole], values[whole]))
+
+
+def _between(at: Array, t: Array, values: Array) -> Array:
+    """Linear between neighbours that are not far apart; NaN elsewhere."""
+    right = np.clip(np.searchsorted(t, at), 1, max(len(t) - 1, 1))
+    if len(t) < 2:
+        return np.where(np.isin(at, t), values[0] if len(values) else np.nan, np.nan)
+    apart = t[right] - t[right - 1]
+    usual = float(np.median(np.diff(t)))
+    far = (apart > REACH * usual) & ~np.isin(at, t)
+    return np.where(far | (at < t[0]) | (at > t[-1]), np.nan, np.interp(at, t, values))
+
+
+def last_of_each(stream: Stream) -> Stream:
+    """One row a stamp: of equal stamps the last."""
+    keep = np.append(np.diff(stream.t) > 0.0, True) if len(stream.t) else np.zeros(0, dtype=bool)
+    return Stream(stream.t[keep], stream.values[keep])
+
+
+def fresh(states: Stream) -> Stream:
+    """The same with NaN where columns, in the groups in which they come (a pose, the wheels), repeat the row before because nothing
+    new had come: on a good part of the rows, briefly, in motion, and not for want of resolution.
+    """
+    values = states.values.copy()
+    for group in _groups(states.values):
+        column = states.values[:, group]
+        rows = np.flatnonzero(~np.isnan(column).any(axis=1))
+        if len(rows) < 20:
+            continue
+        change = np.diff(column[rows], axis=0)
+        same = np.append(False, ~np.any(change, axis=1))
+        stale = same & (_length(same) <= BRIEF)
+        moving = ~(same & ~stale)
+        if np.count_nonzero(stale) > REPEATED * np.count_nonzero(moving) and not _coarse(change):
+            values[rows[stale][:, None], group] = np.nan
+    return Stream(states.t, values)
+
+
+def _groups(values: Array) -> list[list[int]]:
+    """Columns that are received and repeated on the same rows."""
+    same = np.diff(values, axis=0) == 0.0
+    groups: list[list[int]] = []
+    for j in range(values.shape[1]):
+        for group in groups:
+            first = same[:, group[0]]
+            either = np.count_nonzero(first | same[:, j])
+            if either and np.count_nonzero(first & same[:, j]) > 0.9 * either:
+                group.append(j)
+                break
+        else:
+            groups.append([j])
+    return groups
+
+
+def _length(yes: Mask) -> NDArray[np.int64]:
+    """Of the run of True that each row is in, (N,); 0 elsewhere."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], yes.astype(np.int8), [0]])))
+    length = np.zeros(len(yes), dtype=np.int64)
+    for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        length[a:b] = b - a
+    return length
+
+
+def _coarse(change: Array) -> bool:
+    """Whether some column moves by a few quanta at a time: then it repeats by itself."""
+    for column in np.abs(change).T:
+        moved = np.sort(column[column > 0.0])
+        if len(moved) < 10:
+            return True
+        quantum = float(moved[len(moved) // 100])
+        if np.median(moved) < COARSE * quantum and np.mean(np.abs(moved / quantum - np.rint(moved / quantum)) < 0.02) > 0.9:
+            return True
+    return False
+
+
+def held(values: Array) -> Array:
+    """Each column's last received value, zero before the first; (N, c)."""
+    out = values.copy()
+    for column in out.T:
+        there = ~np.isnan(column)
+        last = np.maximum.accumulate(np.where(there, np.arange(len(column)), -1))
+        column[:] = np.where(last >= 0, column[np.maximum(last, 0)], 0.0)
+    return out
+
+
+def changes(inputs: Stream) -> Array:
+    """Stamps at which the held input changes, (M,)."""
+    values = held(inputs.values)
+    moved = np.any(values[1:] != values[:-1], axis=1) if len(values) else np.zeros(0, dtype=bool)
+    return inputs.t[1:][moved]
+
+
+def held_means(inputs: Stream, t0: float, steps: int, dt: float, parts: int) -> Array:
+    """(steps * parts, nu) from t0 on: what is held at the start of a part where inputs change on the grid of steps only; else the mean over
+    each part, from the running integral.
+    """
+    values = held(inputs.values)
+    width = values.shape[1]
+    if not len(values):
+        return np.zeros((steps * parts, width))
+    nearest = t0 + dt * np.rint((inputs.t - t0) / dt)
+    on = np.abs(inputs.t - nearest) <= ALIGNED * dt
+    t = np.where(on, nearest, inputs.t)
+    edges = t0 + dt / parts * np.arange(steps * parts + 1)
+    if bool(on.all()):
+        last = np.searchsorted(t, edges[:-1] + ALIGNED * dt / parts, side="right") - 1
+        return np.asarray(np.where(last[:, None] >= 0, values[np.maximum(last, 0)], 0.0))
+    total = np.concatenate([np.zeros((1, width)), np.cumsum(values[:-1] * np.diff(t)[:, None], axis=0)])
+    last = np.searchsorted(t, edges, side="right") - 1
+    i = np.maximum(last, 0)
+    area = np.where(last[:, None] >= 0, total[i] + values[i] * (edges - t[i])[:, None], 0.0)
+    mean: Array = np.diff(area, axis=0) * (parts / dt)
+    return mean
+
+
+def on_grid(t: Array, dt: float) -> bool:
+    """Whether nearly every grid point that has a row in reach has one on it."""
+    place = (t - t[0]) / dt
+    nearest = np.rint(place)
+    on = np.abs(place - nearest) <= ALIGNED
+    return len(np.unique(nearest[on])) >= 0.97 * len(np.unique(nearest))
+
+
+def at_grid(states: Stream, dt: float, angles: list[int]) -> Array:
+    """(K + 1, nx): the rows that are on the grid from the first stamp on, NaN where there is none."""
+    place = (states.t - states.t[0]) / dt
+    nearest = np.rint(place)
+    on = np.abs(place - nearest) <= ALIGNED
+    y = np.full((int(nearest[on].max()) + 1, states.values.shape[1]), np.nan)
+    y[nearest[on].astype(int)] = states.values[on]
+    return unwrapped(y, angles)
+
+
+def nearest(states: Stream, dt: float, angles: list[int]) -> tuple[Array, Array]:
+    """(K + 1, nx) the row nearest to each point of the grid, and (K + 1,) its stamp (of a point without a row: where the grid has it)."""
+    place = (states.t - states.t[0]) / dt
+    point = np.rint(place).astype(np.int64)
+    order = np.argsort(-np.abs(place - point), kind="stable")  # the nearest one is written last
+    y = np.full((int(point.max()) + 1, states.values.shape[1]), np.nan)
+    at = states.t[0] + dt * np.arange(len(y))
+    y[point[order]] = states.values[order]
+    at[point[order]] = states.t[order]
+    return unwrapped(y, angles), at
+
+
+def held_between(inputs: Stream, at: Array, parts: int) -> Array:
+    """(K * parts, nu) means of what is held, over equal parts of the intervals between the stamps at (K + 1,)."""
+    values = held(inputs.values)
+    if not len(values):
+        return np.zeros(((len(at) - 1) * parts, values.shape[1]))
+    edges = np.interp(np.arange((len(at) - 1) * parts + 1) / parts, np.arange(len(at)), at)
+    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values[:-1] * np.diff(inputs.t)[:, None], axis=0)])
+    last = np.searchsorted(inputs.t, edges, side="right") - 1
+    i = np.maximum(last, 0)
+    area = np.where(last[:, None] >= 0, total[i] + values[i] * (edges - inputs.t[i])[:, None], 0.0)
+    return np.asarray(np.diff(area, axis=0) / np.diff(edges)[:, None])
+
+
+def interpolated(states: Stream, dt: float, angles: list[int], spacing: float) -> Array:
+    """(K + 1, nx) on the grid from the first stamp on: linear between neighbours at most a few usual spacings apart."""
+    values = unwrapped(states.values, angles)
+    near = max(1.6 * spacing, min(3.0 * spacing, dt))
+    grid = states.t[0] + dt * np.arange(math.floor((states.t[-1] - states.t[0]) / dt + ALIGNED) + 1)
+    right = np.clip(np.searchsorted(states.t, grid), 1, len(states.t) - 1)
+    share = ((grid - states.t[right - 1]) / (states.t[right] - states.t[right - 1]))[:, None]
+    y = (1.0 - share) * values[right - 1] + share * values[right]
+    far = states.t[right] - states.t[right - 1] > near
+    on_left, on_right = np.abs(grid - states.t[right - 1]) < ALIGNED * dt, np.abs(states.t[right] - grid) < ALIGNED * dt
+    y[far] = np.nan
+    y[far & on_left] = values[right - 1][far & on_left]
+    y[far & on_right] = values[right][far & on_right]
+    return np.asarray(y)
+
+
+def unwrapped(y: Array, angles: list[int]) -> Array:
+    """Angle columns without jumps of a turn; NaN rows are stepped over."""
+    y = y.copy()
+    for column in angles:
+        there = ~np.isnan(y[:, column])
+        y[there, column] = np.unwrap(y[there, column])
+    return y
