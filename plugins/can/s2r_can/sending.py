@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 Constants = dict[tuple[str, str], float]
 
+ZERO = 1e-6
+"""Of a signal's step and offset: what rounding leaves of zero."""
+
 
 def outbound(options: Options, database: Database, inputs: tuple[str, ...]) -> list[Outbound]:
     """A frame a message, or a branch of a multiplexed one. Raises ConfigError."""
@@ -30,10 +33,7 @@ def outbound(options: Options, database: Database, inputs: tuple[str, ...]) -> l
         where = f"transport.inputs.{name}"
         named = database.signal(options.inputs[name].signal, where)
         signal = scaled(named, options.inputs[name], where)
-        try:
-            signal.raw_of(0.0)
-        except ValueError as error:
-            raise ConfigError(f"{where}: zero input, which stops the robot, cannot be sent: {error}") from None
+        _stops(signal, where)
         key = key_of(named.message.frame_id, extended=named.message.is_extended_frame)
         messages[key] = named.message
         frames.setdefault((key, selectors_of(named.message, named.signal, where)), []).append((index, named, signal))
@@ -48,6 +48,19 @@ def outbound(options: Options, database: Database, inputs: tuple[str, ...]) -> l
             inputs_held = [(index, signal) for index, _, signal in held]
             found.append(Outbound(message.name, key, message.length, fd, selectors, inputs_held, base))
     return found
+
+
+def _stops(signal: Scaled, where: str) -> None:
+    """Zero input stops the robot; a signal that cannot say zero would let it creep. Raises ConfigError."""
+    what = f"{where}: zero input, which stops the robot, cannot be sent"
+    try:
+        raw = signal.raw_of(0.0)
+        signal.bits.placed(raw)
+    except ValueError as error:
+        raise ConfigError(f"{what}: {error}") from None
+    said = (raw * signal.scale + signal.offset) * signal.factor + signal.shift_si
+    if abs(said) > ZERO * abs(signal.factor) * (abs(signal.scale) + abs(signal.offset)):
+        raise ConfigError(f"{what}: the nearest that {signal.bits.name} can say is {said:g}")
 
 
 def _constants(options: Options, database: Database, commands: set[str]) -> Constants:
