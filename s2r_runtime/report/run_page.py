@@ -20,8 +20,8 @@ from s2r_runtime.report.trace_section import add_trace
 from s2r_runtime.verify import not_shown
 
 COLOURS = {"good": plots.GREEN, "bad": plots.RED, "plain": plots.SOFT}
-SOURCES = {"sampler": (plots.BLUE, "sampler"), "controller": (plots.GREEN, "certified controller"), "recovery": ("#d4d9e0", "recovery")}
-GATE = {"open": (plots.GREEN, "open"), "closed": ("#d4d9e0", "closed")}
+SOURCES = {"sampler": (plots.BLUE, "sampler"), "controller": (plots.GREEN, "certified controller"), "recovery": (plots.QUIET, "recovery")}
+GATE = {"open": (plots.GREEN, "open"), "closed": (plots.QUIET, "closed")}
 
 
 def log_page(paths: Sequence[Path]) -> str:

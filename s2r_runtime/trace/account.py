@@ -63,17 +63,17 @@ def headline(r: TraceResult) -> str:
 
 
 def _explained(r: TraceResult) -> list[str]:
-    lines = [line for e in r.effects for line in _effect(e, r.nominal.dt)]
+    lines = [line for e in r.effects for line in _effect(e)]
     lines += [f"  {'':<4}the same thing on this model: {e.text()}" for e in r.same]
     if r.rivals:
-        lines += ["cannot be told from:", *(line for e in r.rivals for line in _effect(e, r.nominal.dt))]
-        lines += _labelled("try next", [*_wrapped(r.suggested_excitation or ""), "(--suggest FILE.csv writes such a drive)"])
+        lines += ["cannot be told from:", *(line for e in r.rivals for line in _effect(e))]
+        lines += _labelled("try next", [r.suggested_excitation or "", "(--suggest FILE.csv writes such a drive)"])
     if r.partial:
-        lines += ["explains a part only, so no name is lent to it:", *(line for e in r.partial for line in _effect(e, r.nominal.dt))]
+        lines += ["explains a part only, so no name is lent to it:", *(line for e in r.partial for line in _effect(e))]
     return lines
 
 
-def _effect(e: Found, dt: float) -> list[str]:
+def _effect(e: Found) -> list[str]:
     lines, text = [], ""
     for piece in e.text().split(", "):
         if text and len(text) + len(piece) + 4 > WIDTH:
@@ -81,7 +81,7 @@ def _effect(e: Found, dt: float) -> list[str]:
             text = f"      {piece}"
         else:
             text = f"{text}, {piece}" if text else f"  {piece}"
-    words = e.words(dt)
+    words = e.words()
     return [*lines, text, *([f"      {words}"] if words else [])]
 
 
@@ -97,14 +97,17 @@ def _left_over(r: TraceResult) -> list[str]:
     over += derived(r.nominal, r.held)
     told = [v for v in over if r.verdict == "unexplained" and v.token in r.depends_on]
     shapes = strongest(loud, told or over, inputs)
-    return [*(_told(s) for s in shapes[:3]), *([_over_rollouts(r)] if _over_rollouts(r) else [])]
+    return [*(_told(s, bool(told)) for s in shapes[:3]), *([_over_rollouts(r)] if _over_rollouts(r) else [])]
 
 
-def _told(shape: Shape) -> str:
-    """One line about a part of the residual and what it follows."""
+def _told(shape: Shape, swallowed: bool) -> str:
+    """One line about a part of the residual and what it follows. swallowed: the noise was estimated with the structure in it, so a share
+    of what is not noise says nothing.
+    """
     part = shape.component
     ratio = float(rms(part.before)) / max(part.floor, 1e-300)
-    follows = f"{100.0 * shape.share:.0f} % of that {shape.said}" if shape.share > FOLLOWED else "follows no single variable"
+    much = "it" if swallowed else f"{100.0 * shape.share:.0f} % of that"
+    follows = f"{much} {shape.said}" if shape.share > FOLLOWED else "it follows no single variable"
     return f"{part.said}: {ratio:.3g} x the noise in one step; {follows}"
 
 
@@ -138,6 +141,9 @@ def _table(r: TraceResult) -> list[str]:
                 now = f"{_short(factor * before[i])} {ARROW} {_short(factor * after[i])}" if changed else _short(factor * before[i])
                 row += f"{now:>24}{_short(factor * floor[i]):>14}"
             rows.append(row)
+    if r.before.input_relative is not None and r.after.input_relative is not None:
+        now = f"{100.0 * r.before.input_relative:.3g} %" + (f" {ARROW} {100.0 * r.after.input_relative:.3g} %" if changed else "")
+        rows.append(f"{'input':<18}{now:>24}   of the input's norm, by the inverse model")
     return [*head, *rows]
 
 
@@ -188,7 +194,7 @@ def _unseen(r: TraceResult) -> list[str]:
     if not blind or r.verdict not in {"none", "traced"}:
         return []
     more = f" and {len(blind) - LISTED} more" if len(blind) > LISTED else ""
-    return _wrapped(f"{', '.join(blind[:LISTED])}{more}: these inputs could not have shown them (--suggest FILE.csv writes some that do)")
+    return [f"{', '.join(blind[:LISTED])}{more}: these inputs could not have shown them (--suggest FILE.csv writes some that do)"]
 
 
 def _data(r: TraceResult) -> list[str]:
@@ -203,7 +209,8 @@ def _data(r: TraceResult) -> list[str]:
 
 
 def _labelled(label: str, lines: Sequence[str]) -> list[str]:
-    return [f"{label if i == 0 else '':<{LABEL}}{line}" for i, line in enumerate(lines)]
+    fitting = [piece for line in lines for piece in _wrapped(line)]
+    return [f"{label if i == 0 else '':<{LABEL}}{line}" for i, line in enumerate(fitting)]
 
 
 def _wrapped(text: str) -> list[str]:

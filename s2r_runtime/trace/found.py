@@ -53,9 +53,9 @@ class Found:
             else:
                 yield name, str(value)
 
-    def words(self, dt: float) -> str:
+    def words(self) -> str:
         """What it means for the robot, in a clause."""
-        return in_words(self.name, self.channel, self.values, dt)
+        return in_words(self.name, self.channel, self.values)
 
 
 def interval_text(value: float, low: Limit, high: Limit, unit: str) -> str:

@@ -17,24 +17,16 @@ Values = Mapping[str, Any]
 RIGHT_ANGLE = math.pi / 2.0
 
 
-def in_words(name: str, channel: str, p: Values, dt: float) -> str:
-    """One clause without a full stop. p: parameter values; dt: the model's step, s."""
+def in_words(name: str, channel: str, p: Values) -> str:
+    """One clause without a full stop. p: parameter values."""
     what = "every input" if channel == "*" else channel
     told = _WORDS.get(name)
     if told is None:
         return _offered(name)
     try:
-        return told(what, p, dt)
+        return told(what, p)
     except (KeyError, TypeError, ValueError):  # an effect with the name but not the parameters: a later version's, or half of a pair
         return _offered(name)
-
-
-def number(value: float, unit: str = "") -> str:
-    """With its unit, and in degrees beside radians: `0.1 rad/s (5.73 deg/s)`."""
-    plain = "" if unit == "-" else unit
-    text = f"{value:.4g}{' ' + plain if plain else ''}"
-    turned = degrees(plain)
-    return f"{text} ({math.degrees(value):.3g} {turned})" if turned and math.isfinite(value) else text
 
 
 def degrees(unit: str) -> str:
@@ -57,46 +49,46 @@ def _way(value: float) -> str:
     return "more" if value > 0.0 else "less"
 
 
-def _delay(what: str, p: Values, dt: float) -> str:
-    return f"{what} acts {p['delay']:.3g} s late ({p['delay'] / dt:.2g} steps)"
+def _delay(what: str, p: Values) -> str:
+    return f"{what} acts {p['delay']:.3g} s late"
 
 
-def _saturation(what: str, p: Values, dt: float) -> str:
+def _saturation(what: str, p: Values) -> str:
     ends = [f"{side} {p[key]:.3g}" for key, side in (("low", "below"), ("high", "above")) if key in p]
     return f"{what} is cut off {' and '.join(ends)}"
 
 
-def _friction(kind: str) -> Callable[[str, Values, float], str]:
-    return lambda what, p, dt: f"{kind} brakes {what}" + (", not alike in both directions" if len(p) == 2 else "")
+def _friction(kind: str) -> Callable[[str, Values], str]:
+    return lambda what, p: f"{kind} brakes {what}" + (", not alike in both directions" if len(p) == 2 else "")
 
 
-def _mass(what: str, p: Values, dt: float) -> str:
+def _mass(what: str, p: Values) -> str:
     return f"the mass is {p['mass']:.4g} kg" if "mass" in p else f"the mass is {_percent(p['ratio'])} of the model's"
 
 
-def _disturbance(what: str, p: Values, dt: float) -> str:
+def _disturbance(what: str, p: Values) -> str:
     frame = {"world": "in a fixed direction of the world (wind, current)", "body": "in a fixed direction of the robot"}
     return f"something pushes steadily {frame.get(what, '')}".rstrip()
 
 
-_WORDS: dict[str, Callable[[str, Values, float], str]] = {
-    "input_gain": lambda what, p, dt: f"{what} does {_percent(p['gain'])} of what is commanded",
-    "input_gain_asymmetry": lambda what, p, dt: (
+_WORDS: dict[str, Callable[[str, Values], str]] = {
+    "input_gain": lambda what, p: f"{what} does {_percent(p['gain'])} of what is commanded",
+    "input_gain_asymmetry": lambda what, p: (
         f"{what} does {_percent(p['gain_positive'])} of a positive command, {_percent(p['gain_negative'])} of a negative one"
     ),
-    "input_bias": lambda what, p, dt: f"{what} is always {abs(p['bias']):.3g} {_way(p['bias'])} than commanded",
+    "input_bias": lambda what, p: f"{what} is always {abs(p['bias']):.3g} {_way(p['bias'])} than commanded",
     "input_delay": _delay,
-    "input_lag": lambda what, p, dt: f"{what} follows its command slowly: 63 % of a step after {p['time_constant']:.3g} s",
-    "input_rate_limit": lambda what, p, dt: f"{what} changes by {p['rate']:.3g} a second at most",
+    "input_lag": lambda what, p: f"{what} follows its command slowly: 63 % of a step after {p['time_constant']:.3g} s",
+    "input_rate_limit": lambda what, p: f"{what} changes by {p['rate']:.3g} a second at most",
     "input_saturation": _saturation,
-    "wheel_saturation": lambda what, p, dt: f"no wheel runs faster than {p['speed']:.3g} m/s, which couples v and w",
-    "input_deadband": lambda what, p, dt: f"nothing happens below {p['width']:.3g} of {what}, and that much is lost above",
-    "input_backlash": lambda what, p, dt: f"{what} has a play of {p['width']:.3g} when it turns round",
-    "input_coupling": lambda what, p, dt: f"{what} also gets {_percent(p['coefficient'])} of {p['from']}",
-    "input_gain_drift": lambda what, p, dt: f"the gain of {what} changes by {_percent(60.0 * p['rate'])} a minute",
-    "regime_change": lambda what, p, dt: f"from {p['time']:.4g} s on {what} does {_percent(p['gain'])} of what is commanded",
-    "periodic_disturbance": lambda what, p, dt: f"{what} swings by {p['amplitude']:.3g}, once in {1.0 / p['frequency']:.3g} s",
-    "integration_scheme": lambda what, p, dt: {
+    "wheel_saturation": lambda what, p: f"no wheel runs faster than {p['speed']:.3g} m/s, which couples v and w",
+    "input_deadband": lambda what, p: f"nothing happens below {p['width']:.3g} of {what}, and that much is lost above",
+    "input_backlash": lambda what, p: f"{what} has a play of {p['width']:.3g} when it turns round",
+    "input_coupling": lambda what, p: f"{what} also gets {_percent(p['coefficient'])} of {p['from']}",
+    "input_gain_drift": lambda what, p: f"the gain of {what} changes by {_percent(60.0 * p['rate'])} a minute",
+    "regime_change": lambda what, p: f"from {p['time']:.4g} s on {what} does {_percent(p['gain'])} of what is commanded",
+    "periodic_disturbance": lambda what, p: f"{what} swings by {p['amplitude']:.3g}, once in {1.0 / p['frequency']:.3g} s",
+    "integration_scheme": lambda what, p: {
         "exact": "the robot moves on arcs, the model in straight pieces",
         "rk4": "the model's integration is coarser than the motion",
         "euler": "the robot moves in straight pieces, as under an Euler step",
@@ -104,21 +96,19 @@ _WORDS: dict[str, Callable[[str, Values, float], str]] = {
     "viscous_friction": _friction("friction that grows with speed"),
     "coulomb_friction": _friction("dry friction of a constant size"),
     "stribeck_friction": _friction("dry friction that is larger at standstill"),
-    "quadratic_drag": lambda what, p, dt: f"drag that grows with the square of {what}",
-    "cubic_stiffness": lambda what, p, dt: f"a spring on {what} that stiffens with the cube",
+    "quadratic_drag": lambda what, p: f"drag that grows with the square of {what}",
+    "cubic_stiffness": lambda what, p: f"a spring on {what} that stiffens with the cube",
     "constant_disturbance": _disturbance,
-    "gravity_slope": lambda what, p, dt: "the ground slopes: what it does turns with the heading",
-    "lateral_slip": lambda what, p, dt: "the robot slides sideways in curves",
-    "longitudinal_slip": lambda what, p, dt: f"the wheels slip: {_percent(p['ratio'])} of the way is lost",
-    "track_scale": lambda what, p, dt: f"it turns at {_percent(p['gain'])} of the ideal rate",
-    "understeer": lambda what, p, dt: (
-        f"it turns {'less' if p['coefficient'] > 0.0 else 'more'} than its steering says, with the speed squared"
-    ),
-    "heading_offset": lambda what, p, dt: f"the measured heading is off by {math.degrees(p['angle']):.3g} deg",
-    "sensor_offset": lambda what, p, dt: f"{what} is measured {abs(p['offset']):.3g} too {'high' if p['offset'] > 0.0 else 'low'}",
-    "sensor_lever_arm": lambda what, p, dt: (
+    "gravity_slope": lambda what, p: "the ground slopes: what it does turns with the heading",
+    "lateral_slip": lambda what, p: "the robot slides sideways in curves",
+    "longitudinal_slip": lambda what, p: f"the wheels slip: {_percent(p['ratio'])} of the way is lost",
+    "track_scale": lambda what, p: f"it turns at {_percent(p['gain'])} of the ideal rate",
+    "understeer": lambda what, p: f"it turns {'less' if p['coefficient'] > 0.0 else 'more'} than its steering says, with the speed squared",
+    "heading_offset": lambda what, p: f"the measured heading is off by {math.degrees(p['angle']):.3g} deg",
+    "sensor_offset": lambda what, p: f"{what} is measured {abs(p['offset']):.3g} too {'high' if p['offset'] > 0.0 else 'low'}",
+    "sensor_lever_arm": lambda what, p: (
         f"the measured point lies {1000.0 * math.hypot(p['x'], p['y']):.3g} mm from the point that the model moves"
     ),
-    "position_field": lambda what, p, dt: "something pushes that depends on where the robot is",
+    "position_field": lambda what, p: "something pushes that depends on where the robot is",
     "mass_change": _mass,
 }

@@ -36,7 +36,7 @@ BETTER = 0.1
 SPEEDS = ("speed", "vx", "vy", "qd", "wheel_left", "wheel_right")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Component:
     """A part of the residual, (n,). floor: its rms by noise alone. turn: an angle, or a rate of one."""
 
@@ -48,7 +48,7 @@ class Component:
     floor: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Variable:
     """What a residual may depend on, (n,). token: of `depends_on`; said: as a person says it."""
 
