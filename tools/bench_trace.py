@@ -22,10 +22,11 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+from trace_sets import sindy
 from trace_sets.families import FAMILIES, make
 from trace_sets.recording import TraceSet
 from trace_sets.scoring import covered, depends_right, located, outcome
-from trace_sets.targets import Record, by, reached, rows
+from trace_sets.targets import Record, beside, by, reached, rows
 
 KEPT = ("expect", "robot", "rate", "n", "law", "layout", "noise", "runs", "euler", "ratio", "kind", "values", "accepted", "depends_on")
 GOOD = {"right", "clean", "tie", "found", "honest"}
@@ -59,7 +60,8 @@ def _answer(given: TraceSet, path: Path) -> Record:
     nominal = compose(spec)
     begin = time.process_time()
     try:
-        result = trace(load_dataset(path, nominal), nominal)
+        data = load_dataset(path, nominal)
+        result = trace(data, nominal)
     except S2RError as error:
         text = str(error).replace(f"{path.parent}/", "")
         word = "refused" if given.truth["expect"] != "bad" else "honest" if "\n" not in text else "long_error"
@@ -73,11 +75,22 @@ def _answer(given: TraceSet, path: Path) -> Record:
     told |= {"partial": answer.get("partial", []), "cpu_s": cpu_s, "outcome": outcome(truth, answer), "covered": covered(truth, answer)}
     told["located"] = "true_faults" in truth and located(truth, answer)
     told["depends_right"] = "depends_on" in truth and depends_right(truth, answer)
+    if sindy.available() and truth["expect"] in {"one", "outside", "clean"}:
+        told["sindy"] = sindy.answer(data, nominal)
+        told["sindy"]["right"] = told["sindy"]["top"] in _sindy_right(given)
     if given.draft is not None and truth["expect"] in {"one", "pair", "outside", "clean"}:
         from trace_sets.again import errors_again
 
         told["again"] = errors_again(given.draft, given.seed, nominal, result.model, truth["oracle"])
     return told
+
+
+def _sindy_right(given: TraceSet) -> set[str]:
+    plant = given.draft.scale.plant
+    if "depends_on" in given.truth:
+        return set(given.truth["depends_on"])
+    follows = {plant.inputs[j]: plant.states[i] for i, j in plant.reached.items()}
+    return sindy.right_tokens(given.truth["effects"], plant.inputs, follows)
 
 
 def _unreached(given: TraceSet) -> dict[str, float]:
@@ -175,6 +188,10 @@ def main() -> int:
         print(line)
     print()
     for row in rows(records):
+        print(row.text())
+    if not sindy.available():
+        print("\nPySINDy beside it: skipped, it is not installed (pip install '.[bench]')")
+    for row in beside(records):
         print(row.text())
     return 0
 

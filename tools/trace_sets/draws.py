@@ -31,8 +31,8 @@ def _late(rng: Rng, s: Scale, size: float) -> float:
     """Seconds: some steps, or what actuators have; never more than the recording shows."""
     steps = s.dt * log_uniform(rng, 0.4, 8.0)
     usual = log_uniform(rng, 0.02, 0.4)
-    most = min(s.duration / 20.0, 0.9 * s.pace + 4.0 * s.dt)
-    return float(min(max((steps if rng.random() < 0.5 else usual) * size, 0.3 * s.dt), most))
+    most = min(s.duration / 20.0, 0.9 * s.pace + 4.0 * s.dt, 0.8)
+    return float(min(max((steps if rng.random() < 0.5 else usual) * size, 0.02 * s.dt), most))
 
 
 def gain(rng: Rng, s: Scale, channel: str, size: float) -> Values:
@@ -58,7 +58,7 @@ def lag(rng: Rng, s: Scale, channel: str, size: float) -> Values:
 
 
 def rate_limit(rng: Rng, s: Scale, channel: str, size: float) -> Values:
-    rate = s.amplitude(channel) / max(_late(rng, s, 2.0 * size), 1.5 * s.dt)
+    rate = s.amplitude(channel) / max(_late(rng, s, 2.0 * size), 0.2 * s.dt)
     return {"rate": rate} if rng.random() < 0.7 else {"rate": rate, "rate_down": rate * log_uniform(rng, 0.4, 2.5)}
 
 

@@ -7,11 +7,13 @@ interval says how sure that is.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy.special import betaincinv
+
+from trace_sets.sizing import STRONG, WEAK
 
 Record = dict[str, Any]
 
@@ -20,8 +22,6 @@ LARGE = 50_000
 """Steps of a long set."""
 WHITE = {"clean", "clean_closed", "clean_quantised", "clean_poor", "long_clean"}
 ROUGH = {"clean_coloured", "clean_outliers", "clean_student", "clean_jittered"}
-STRONG, WEAK = 1.5, 1.1
-"""Ratios of nominal over oracle error from which an effect matters, and from which it is there at all."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +123,29 @@ def rows(records: list[Record]) -> list[Row]:
         _share("bad input: refused in a line, or no name", words([r for r in records if r["family"] == "bad"], "honest"), 0.95),
         _share("crashed, or refused 120 steps or more", lost, 0.0, at_most=True),
     ]
+
+
+def beside(records: list[Record]) -> list[Row]:
+    """What PySINDy's STLSQ makes of the same sets; no targets. A term of the right kind is all that is asked of it."""
+    told = [r for r in records if r.get("sindy")]
+
+    def share(what: str, yes: Iterable[bool]) -> Row:
+        return replace(_share(what, yes, 0.0), target="", met=None)
+
+    one = [r for r in told if r["family"] in {"one", "weak"}]
+    rows_of = [
+        share("STLSQ: keeps a term on clean data, white noise", [r["sindy"]["terms"] > 0 for r in told if r["family"] in WHITE]),
+        share("STLSQ:   in closed loop", [r["sindy"]["terms"] > 0 for r in told if r["family"] == "clean_closed"]),
+        share("STLSQ:   coloured, heavy-tailed, jittered", [r["sindy"]["terms"] > 0 for r in told if r["family"] in ROUGH]),
+        share(
+            "STLSQ: one effect that matters: top term of the right kind", [r["sindy"]["right"] for r in one if (r["ratio"] or 0) >= STRONG]
+        ),
+        share(
+            "STLSQ: one weak effect: top term of the right kind", [r["sindy"]["right"] for r in one if WEAK <= (r["ratio"] or 0) < STRONG]
+        ),
+        share("STLSQ: outside the library: top term is one it depends on", [r["sindy"]["right"] for r in told if r["family"] == "outside"]),
+    ]
+    return [row for row in rows_of if row.n]
 
 
 def by(records: list[Record], key: str) -> list[str]:
