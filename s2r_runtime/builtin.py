@@ -21,12 +21,18 @@ def s2r_models() -> list[Offer]:
 
 _EFFECTS = {
     "input_gain": "an input acts by a constant factor",
+    "input_gain_asymmetry": "an input acts by a factor that depends on its sign",
     "input_bias": "a constant is added to an input",
     "input_delay": "an input acts later",
     "input_lag": "an input is followed with a first-order lag",
+    "input_rate_limit": "an input is followed at a limited rate",
     "input_saturation": "an input is clipped",
     "input_gain_drift": "an input's gain drifts with time",
     "regime_change": "an input's gain changes at one time",
+    "periodic_disturbance": "a sine is added to an input",
+    "input_deadband": "small inputs do nothing",
+    "input_backlash": "an input acts through a play",
+    "input_coupling": "an input acts on another one too",
     "wheel_saturation": "both wheels of a unicycle are clipped, which couples v and w",
     "integration_scheme": "the pose moves along arcs, not along the step's first tangent",
 }

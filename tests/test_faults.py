@@ -70,7 +70,7 @@ def test_a_frozen_heading_is_reported_and_taken_out():
         [("input_lag", "w", {"time_constant": 0.3}), ("input_lag", "v", {"time_constant": 0.3})],
         [("input_delay", "*", {"delay": 0.3})],
         [("input_saturation", "w", {"low": -0.5, "high": 0.5})],
-        [("play", "v", {"width": 0.1})],
+        [("deadband", "v", {"width": 0.1})],
     ],
 )
 def test_what_an_effect_does_is_no_fault(effects):

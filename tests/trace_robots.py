@@ -91,7 +91,8 @@ _ACTS = {
     "input_delay": lambda x, p, part: _late(x, p["delay"], part),
     "input_lag": lambda x, p, part: _lagged(x, p["time_constant"], part),
     "input_saturation": lambda x, p, part: np.clip(x, p["low"], p["high"]),
-    "play": lambda x, p, part: np.sign(x) * np.maximum(np.abs(x) - p["width"], 0.0),
+    "deadband": lambda x, p, part: np.sign(x) * np.maximum(np.abs(x) - p["width"], 0.0),
+    "wavy": lambda x, p, part: x + p["height"] * np.sin(3.0 * x),
 }
 
 

@@ -1,9 +1,10 @@
 """A model as it is used: nominal step, parameter values, effects in order, hidden state where an effect has one.
 
-    x, z -> x', z':   u_act, z' = effects of stage `input` (u, z);   x' = effects of stage `step` (nominal(x, u_act))
+    x, z -> x', z':   u_act, z' = effects of stage `input` (u, z);   x' = h(effects of stage `step` (nominal(h^-1(x), u_act)))
 
-x: (n, nx), u: (n, nu), angles wrapped to (-pi, pi]. The hidden state is a tuple of one array an effect, (n, nh); at rest it is
-what a long time at zero input leaves (a campaign's full stop).
+x: (n, nx), u: (n, nu), angles wrapped to (-pi, pi]. h: effects of stage `sensor`, true -> measured, in their order; x is the measured
+state on both sides. The hidden state is a tuple of one array an effect, (n, nh); at rest it is what a long time at zero input
+leaves (a campaign's full stop).
 
 u_act is the input's mean over the step. Where a nominal model says that a state is set to an input at once (`reached`: a wheel's
 speed, a car's speed), that state is the input as it acts at the end of the step. What an effect makes of a held input may change within
@@ -26,8 +27,9 @@ from numpy.typing import NDArray
 from s2r_runtime.canonical import digest
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import Effect, NominalModel
+from s2r_runtime.models.bound import BoundModel, bind
 from s2r_runtime.models.file_model import load_file_model
-from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 
 Array = NDArray[np.float64]
@@ -64,9 +66,13 @@ class ComposedModel:
     """A nominal model with effects. Batched: x (n, nx), u (n, nu)."""
 
     spec: ModelSpec
-    nominal: NominalModel
-    parameters: dict[str, float]
+    nominal: BoundModel
     effects: tuple[AppliedEffect, ...]
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values of the nominal model's parameters."""
+        return self.nominal.parameters
 
     @property
     def dt(self) -> float:
@@ -108,11 +114,11 @@ class ComposedModel:
             z = a.effect.hidden(1, self.nominal, a.channel, dt, a.p)
             if a.effect.stage == "input":
                 given = acting
+                clock = 1 if getattr(a.effect, "timed", False) else 0  # its first column is the time
                 for _ in range(SETTLE_STEPS if np.any(given) and z.size else 1):
+                    z[:, :clock] = -dt  # the last step before the start
                     acting, after = a.effect.input_step(given, z, self.nominal, a.channel, dt, a.p)
-                    if getattr(a.effect, "timed", False):
-                        after[:, 0] = 0.0  # time has not begun yet
-                    settled = np.allclose(after, z, rtol=1e-12, atol=1e-15)
+                    settled = np.allclose(after[:, clock:], z[:, clock:], rtol=1e-12, atol=1e-15)
                     z = after
                     if settled:
                         break
@@ -139,6 +145,8 @@ class ComposedModel:
 
     def advance(self, x: Array, mean: Array, end: Array) -> Array:
         """x one step later under an input that acts as `act` says; angles are not wrapped."""
+        for a in reversed(self._sensors):
+            x = a.effect.to_true(x, self.nominal, a.channel, a.p)
         x_next = self.nominal.step(x, mean, self.dt, self.parameters)
         if end is not mean:
             for state, name in getattr(self.nominal, "reached", {}).items():
@@ -146,7 +154,13 @@ class ComposedModel:
         for a in self.effects:
             if a.effect.stage == "step":
                 x_next = a.effect.after_step(x, mean, x_next, self.nominal, a.channel, self.dt, a.p)
+        for a in self._sensors:
+            x_next = a.effect.to_measured(x_next, self.nominal, a.channel, a.p)
         return x_next
+
+    @cached_property
+    def _sensors(self) -> tuple[AppliedEffect, ...]:
+        return tuple(a for a in self.effects if a.effect.stage == "sensor")
 
     def step(self, x: Array, u: Array, hidden: Hidden) -> tuple[Array, Hidden]:
         """One step: (x', hidden')."""
@@ -173,11 +187,12 @@ class ComposedModel:
 
 def compose(spec: ModelSpec, where: str = "model") -> ComposedModel:
     """The model that a spec describes. Raises ConfigError (unknown names with the nearest known one, bad parameters)."""
-    nominal = load_file_model(spec, where) if spec.name.endswith(".py") else _registered(spec, where)
+    shared = load_file_model(spec, where) if spec.name.endswith(".py") else _registered(spec, where)
     for name in spec.parameters:
-        if name not in nominal.parameters:
-            known = ", ".join(nominal.parameters) or "none"
+        if name not in shared.parameters:
+            known = ", ".join(shared.parameters) or "none"
             raise ConfigError(f"{where}.parameters.{name}: model {spec.name!r} has no such parameter; it has: {known}")
+    nominal = bind(shared, spec.parameters)
     applied: list[AppliedEffect] = []
     for index, entry in enumerate(spec.effects):
         effect = registry().get("effects", entry.name)
@@ -187,8 +202,8 @@ def compose(spec: ModelSpec, where: str = "model") -> ComposedModel:
             raise ConfigError(f"{place}: channel is {entry.channel!r}, must be one of: {', '.join(channels) or 'none on this model'}")
         if getattr(effect, "once", False) and any(a.effect is effect for a in applied):
             raise ConfigError(f"{place}: is there twice, must be there once")
-        applied.append(AppliedEffect(effect, entry.channel, _effect_parameters(effect, entry.parameters, place)))
-    return ComposedModel(spec, nominal, {**nominal.parameters, **spec.parameters}, tuple(applied))
+        applied.append(AppliedEffect(effect, entry.channel, _effect_parameters(effect, entry, nominal, place)))
+    return ComposedModel(spec, nominal, tuple(applied))
 
 
 def _registered(spec: ModelSpec, where: str) -> NominalModel:
@@ -199,13 +214,22 @@ def _registered(spec: ModelSpec, where: str) -> NominalModel:
     return model
 
 
-def _effect_parameters(effect: Effect, given: dict[str, Any], where: str) -> dict[str, Any]:
+def _words(effect: Effect, channel: str, nominal: NominalModel, parameter: str) -> tuple[str, ...] | None:
+    """What a parameter may say that is no number; None for one that is."""
+    if parameter in getattr(effect, "named", ()):
+        return tuple(name for name in nominal.inputs if name != channel)
+    words: tuple[str, ...] | None = getattr(effect, "choices", {}).get(parameter)
+    return words
+
+
+def _effect_parameters(effect: Effect, entry: EffectSpec, nominal: NominalModel, where: str) -> dict[str, Any]:
+    given: dict[str, Any] = entry.parameters
     known = {p.name: p for p in effect.parameters}
     for name, value in given.items():
         if name not in known:
             raise ConfigError(f"{where}: has no parameter {name!r}; it has: {', '.join(known)}")
         bounds = known[name]
-        allowed = getattr(effect, "choices", {}).get(name)
+        allowed = _words(effect, entry.channel, nominal, name)
         if allowed is not None and value not in allowed:
             raise ConfigError(f"{where}: {name} is {value!r}, must be one of: {', '.join(allowed)}")
         if allowed is None and isinstance(value, str):

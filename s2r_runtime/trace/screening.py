@@ -40,12 +40,15 @@ class Screened:
 
 @dataclass(frozen=True)
 class _Probe:
-    """models: one a column; free: the slots that the columns scale, none where the start is taken as it is."""
+    """models: one a column; free: the slots that the columns scale, none where the start is taken as it is; values: names of the
+    effect's parameters that the start holds.
+    """
 
     candidate: Candidate
     start: ComposedModel
     models: tuple[ComposedModel, ...]
     free: Free
+    values: tuple[str, ...]
 
 
 def screen(given: Problem, base: Fit, found: Sequence[Candidate]) -> tuple[list[Screened], int]:
@@ -55,7 +58,7 @@ def screen(given: Problem, base: Fit, found: Sequence[Candidate]) -> tuple[list[
     white = replace(base, colour=noises.no_colour(base.z.shape[1]))  # what looks like colour may be what an effect explains
     aside = _Aside(base.z.ravel(), sensitivities(given, white, base.model, base.free))
     level = float(np.sum(noises.log_density(aside.z)))
-    best: dict[tuple[str, str, int], Screened] = {}
+    best: dict[tuple[str | int, ...], Screened] = {}  # one for each set of parameters: more of them may do no better at the start
     for chunk in _chunks(probes):
         moved = [predicted(m, given.steps, acting(m, given.data)) - before for probe in chunk for m in probe.models]
         columns = base.whiten(np.stack(moved, axis=2)).reshape(aside.z.size, -1)
@@ -64,7 +67,7 @@ def screen(given: Problem, base: Fit, found: Sequence[Candidate]) -> tuple[list[
             c = columns[:, at : at + len(probe.models)]
             at += len(probe.models)
             value, start = aside.look(probe, c)
-            key = (probe.candidate.name, probe.candidate.channel, probe.candidate.place)
+            key = (probe.candidate.name, probe.candidate.channel, probe.candidate.place, *sorted(probe.values))
             if np.isfinite(value) and (key not in best or value - level > best[key].value):
                 best[key] = Screened(value - level, probe.candidate, start)
     return sorted(best.values(), key=lambda s: -s.value), len(probes)
@@ -85,14 +88,15 @@ def _probes(candidate: Candidate, model: ComposedModel) -> Iterator[_Probe]:
     for start in candidate.models(model):
         place = candidate.place if candidate.replaced < 0 else candidate.replaced
         slots = tuple(slots_of(start.effects[place], place))
+        held = tuple(start.effects[place].p)
         neutral = [bounds_of(start, s).neutral for s in slots]
         smooth = all(v is not None and not bounds_of(start, s).kink for s, v in zip(slots, neutral, strict=True))
         if slots and smooth and (len(slots) == 1 or getattr(start.effects[place].effect, "additive", False)):
             alone = [_alone(start, slots, i, neutral) for i in range(len(slots))]
             if all(m is not None for m in alone):
-                yield _Probe(candidate, start, tuple(m for m in alone if m is not None), slots)
+                yield _Probe(candidate, start, tuple(m for m in alone if m is not None), slots, held)
                 continue
-        yield _Probe(candidate, start, (start,), ())
+        yield _Probe(candidate, start, (start,), (), held)
 
 
 def _alone(start: ComposedModel, slots: Free, i: int, neutral: Sequence[float | None]) -> ComposedModel | None:

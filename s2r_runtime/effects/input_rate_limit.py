@@ -1,0 +1,80 @@
+"""An input is followed at a limited rate: y' = rate where y < u, -rate_down where y > u, until y = u.
+
+Over a step of dt with u constant and d = u - y, r the limit in d's direction:
+
+    |d| <= r dt   reached within the step:   y+ = u,                  mean = u - d |d| / (2 r dt)
+    else          a ramp over all of it:     y+ = y + sign(d) r dt,   mean = y + sign(d) r dt / 2
+
+After j steps of the same u:  y + min(max(d, -rate_down j dt), rate j dt).   Hidden state: y, zero at rest.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from s2r_runtime.effects.follower import Follower
+from s2r_runtime.effects.input_effect import Array, Values, columns
+from s2r_runtime.hookspecs import NominalModel, Parameter
+
+CATCHING_UP = (0.8, 1.7, 3.5, 8.0, 20.0)
+"""Steps that a large change of the input takes at the rates from which the tracer begins."""
+
+UNLIKE = ((2.0, 5.0), (5.0, 2.0))
+"""The same, up and down, for a limit that depends on the direction."""
+
+
+class InputRateLimit(Follower):
+    """rate in the input's unit a second, for growing values; rate_down for falling ones (left out: the same)."""
+
+    name = "input_rate_limit"
+    parameters = (Parameter("rate", "input/s", 1e-6, 1e9, kink=True), Parameter("rate_down", "input/s", 1e-6, 1e9, kink=True))
+    optional = ("rate_down",)
+
+    def within_step(self, dt: float, p: Values) -> bool:
+        """A ramp goes on over the step."""
+        return True
+
+    def after(self, y: Array, u: Array, steps: Array | int, dt: float, p: Values) -> Array:
+        """y moved toward u."""
+        up, down = _limits(p, dt)
+        return np.asarray(y + np.minimum(np.maximum(u - y, -down * steps), up * steps))
+
+    def mean(self, y: Array, u: Array, dt: float, p: Values) -> Array:
+        """Of the ramp, and of u where the ramp has reached it."""
+        up, down = _limits(p, dt)
+        d = u - y
+        reach = np.where(d > 0.0, up, down)
+        moved = np.minimum(np.abs(d), reach)
+        # a ramp of `moved` takes moved / reach of the step; what it covers it stands at for the rest
+        return np.asarray(y + np.sign(d) * moved * (1.0 - moved / (2.0 * reach)))
+
+    def begins(self, held: list[float], steps: list[int], dt: float, p: Values) -> list[float]:
+        """One ramp a stretch."""
+        up, down = _limits(p, dt)
+        y, found = 0.0, []
+        for u, n in zip(held, steps, strict=True):
+            found.append(y)
+            if u > y + up * n:
+                y += up * n
+            elif u < y - down * n:
+                y -= down * n
+            else:
+                y = u
+        return found
+
+    def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
+        """From a limit that a large change meets within a step to one that takes it twenty."""
+        change = np.abs(np.diff(u[:, columns(model, channel)], axis=0))
+        if not np.any(change):
+            return []
+        rate = float(np.quantile(change[change > 0.0], 0.9)) / dt
+        alike: list[Values] = [{"rate": rate / n} for n in CATCHING_UP]
+        return [*alike, *({"rate": rate / up, "rate_down": rate / down} for up, down in UNLIKE)]
+
+
+def _limits(p: Values, dt: float) -> tuple[float, float]:
+    """How far it gets in a step, up and down."""
+    return float(p["rate"]) * dt, float(p["rate_down"] if "rate_down" in p else p["rate"]) * dt
+
+
+EFFECT = InputRateLimit()
