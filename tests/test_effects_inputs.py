@@ -102,7 +102,8 @@ def test_a_limit_that_is_left_out_is_not_there(p, expected):
 
 
 @pytest.mark.parametrize(
-    ("p", "wrong"), [({}, "has neither low nor high, must have at least one"), ({"low": 1.0, "high": 0.5}, "low is 1.0, must be below high")]
+    ("p", "wrong"),
+    [({}, "has neither low nor high, must have at least one"), ({"low": 1.0, "high": 0.5}, "low is 1.0, must be below high")],
 )
 def test_limits_that_make_no_sense_are_refused(p, wrong):
     with pytest.raises(ConfigError, match=wrong):

@@ -67,7 +67,7 @@ def screen(given: Problem, base: Fit, found: Sequence[Candidate]) -> tuple[list[
             c = columns[:, at : at + len(probe.models)]
             at += len(probe.models)
             value, start = aside.look(probe, c)
-            key = (probe.candidate.name, probe.candidate.channel, probe.candidate.place, *sorted(probe.values))
+            key: tuple[str | int, ...] = (probe.candidate.name, probe.candidate.channel, probe.candidate.place, *sorted(probe.values))
             if np.isfinite(value) and (key not in best or value - level > best[key].value):
                 best[key] = Screened(value - level, probe.candidate, start)
     return sorted(best.values(), key=lambda s: -s.value), len(probes)
