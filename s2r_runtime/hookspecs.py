@@ -117,7 +117,7 @@ class NominalModel(Protocol):
     inputs: tuple[str, ...]
     angles: tuple[str, ...]
     parameters: dict[str, float]
-    """Defaults."""
+    """Defaults. The model that effects are given has the values actually used here (`models.bound`)."""
 
     def step(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
         """x one step later, (n, nx); angles need not be wrapped."""
@@ -139,8 +139,9 @@ class Effect(Protocol):
     """A phenomenon that can be composed into a model's step. Effects apply in the order in which a model lists them.
 
     Stage `input`: changes the commanded input (n, nu) before the nominal step, with hidden state where it has one.
-    Stage `step`: changes the result of the nominal step. An effect of stage `input` is defined by `input_step` and, for
-    long recordings, the same thing over time at once, `input_sequence`; the kit checks that the two agree.
+    Stage `step`: changes the result of the nominal step. Stage `sensor`: what is measured is not the true state; `to_true` and
+    `to_measured` are exact inverses, and a model's x is the measured state on both sides of a step. An effect of stage `input` is
+    defined by `input_step` and, for long recordings, the same thing over time at once, `input_sequence`; the kit checks that the two agree.
 
     It may also have
     - `optional`: names of parameters that may be left out; `choices`: parameter -> its words, for one that is not a number; `named`:
@@ -165,6 +166,7 @@ class Effect(Protocol):
 
     name: str
     stage: str
+    """`input`, `step` or `sensor`."""
     parameters: tuple[Parameter, ...]
 
     def channels(self, model: NominalModel) -> tuple[str, ...]:
@@ -183,7 +185,13 @@ class Effect(Protocol):
         """u (T, nu), one row a step of dt from rest -> what acts, (T, nu). Same as `input_step` T times."""
 
     def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: dict[str, Any]) -> Array:
-        """Stage `step`: the nominal result x_next (n, nx) -> the result with the effect. u is what acted."""
+        """Stage `step`: the nominal result x_next (n, nx) -> the result with the effect. x: the true state, u: what acted."""
+
+    def to_true(self, x: Array, model: NominalModel, channel: str, p: dict[str, Any]) -> Array:
+        """Stage `sensor`: measured states (n, nx) -> true ones. Angles are not wrapped, here and in `to_measured`."""
+
+    def to_measured(self, x: Array, model: NominalModel, channel: str, p: dict[str, Any]) -> Array:
+        """Stage `sensor`: true states (n, nx) -> measured ones. Measured less true is the sensor's offset."""
 
 
 # ---------------------------------------------------------------- tasks
@@ -261,6 +269,21 @@ def s2r_effects() -> list[Offer]:
 @hookspec
 def s2r_tasks() -> list[Offer]:
     """Classes with the interface of `Task`."""
+    return []
+
+
+@hookspec
+def s2r_recordings() -> list[Offer]:
+    """Readers of recordings in robots' own formats. An offer's name is `TRANSPORT.SUFFIX` (`can.blf`): the transport whose options
+    the reader understands, and the files that it reads (`.gz` behind the suffix is the reader's to unpack). The attribute is a function
+
+        read(path, states, inputs, options) -> [((t_states, x), (t_inputs, u)), ...]
+
+    states, inputs: the model's names. options: the profile's `[transport]` table without `name`, as a transport gets it; empty where the
+    profile is of another transport. A list of contiguous stretches; t (N,) s, ascending, of one clock; x (N, nx), u (M, nu) in SI units,
+    NaN where a column was not received at that stamp. Raises ConfigError for bad or missing options, RecordingError for a file that
+    can't be read.
+    """
     return []
 
 

@@ -73,7 +73,7 @@ def _input_effects(model: ComposedModel, place: int) -> list[AppliedEffect]:
 def _places(model: ComposedModel, effect: Effect, channel: str) -> list[int]:
     """The end, and before each effect that it does not commute with."""
     end = len(model.effects)
-    if effect.stage == "step":
+    if effect.stage != "input":
         return [end]
     return [end, *(i for i, a in enumerate(model.effects) if a.effect.stage == "input" and not commute(effect, channel, a, model))]
 
