@@ -18,7 +18,7 @@ from s2r_runtime import hookspecs
 from s2r_runtime.errors import PluginError
 from s2r_runtime.hookspecs import API_VERSION, GROUP, Offer
 
-KINDS = ("transports", "models", "effects", "tasks", "robots")
+KINDS = ("transports", "models", "effects", "tasks", "recordings", "robots")
 
 INSTALL = {"zenoh": "s2r-zenoh", "mavlink": "s2r-mavlink", "can": "s2r-can", "robotarium": "s2r-standins"}
 """Names that a package of this project offers, for the hint when it is not installed."""

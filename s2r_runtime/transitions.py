@@ -10,7 +10,7 @@ beyond the order of the samples (`whiteness`). Left out, and counted by reason: 
 `too_short`; `not_received`, where rows reach t0 + dt and a state in them does not; `duplicate_stamp`, all rows on one stamp; `too_coarse`,
 the rows around t0 + dt more than 1.5 dt apart, so that x1 would be made up.
 
-CSV without segments: ordinary driving (`driving`).
+CSV without segments, and a log in a robot's own format (`robot_logs`): ordinary driving (`driving`).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ from s2r_runtime.errors import RecordingError, UsageError
 from s2r_runtime.gap import Transitions
 from s2r_runtime.messages import CampaignFinished, Observed, SampleTaken, Send, Started
 from s2r_runtime.models.composed import ComposedModel, wrap
+from s2r_runtime.robot_logs import content_digest, is_robot_log, merged_rows, read_robot_log
 from s2r_runtime.sensor_noise import FEWEST, NORMAL_MAD
 from s2r_runtime.tables import read_csv
 
@@ -38,9 +40,15 @@ CHANNELS = ("event/started", "event/observed", "event/sample_taken", "event/camp
 
 
 def load_transitions(
-    path: Path | str, model: ComposedModel, columns: Mapping[str, str] | None = None, *, epoch: int | None = None
+    path: Path | str,
+    model: ComposedModel,
+    columns: Mapping[str, str] | None = None,
+    *,
+    epoch: int | None = None,
+    transport: Mapping[str, Any] | None = None,
 ) -> Transitions:
-    """The transitions of a recording, whichever form it has. columns: model name -> column name, where they differ.
+    """The transitions of a recording, whichever form it has. columns: model name -> column name, where they differ. transport: the
+    profile's, for a log in a robot's own format.
 
     Raises RecordingError (not readable, columns missing, of another robot).
     """
@@ -53,7 +61,9 @@ def load_transitions(
     if log or path.suffix == ".mcap":
         return from_mcap(path, model, epoch=epoch)
     if epoch is not None:
-        raise UsageError(f"{path}: a CSV has no epochs")
+        raise UsageError(f"{path}: a CSV has no epochs, nor has a log that is not of the daemon")
+    if is_robot_log(path):
+        return from_robot_log(path, model, transport)
     return from_csv(path, model, columns or {}, model.dt)
 
 
@@ -182,6 +192,13 @@ def _states_at(model: ComposedModel, s: Streams, periods: int) -> tuple[Array, b
 
 def _rows(rows: Sequence[Array], width: int) -> Array:
     return np.array(rows) if rows else np.empty((0, width))
+
+
+def from_robot_log(path: Path, model: ComposedModel, transport: Mapping[str, Any] | None) -> Transitions:
+    """Transitions of ordinary driving from a log in a robot's own format."""
+    stretches, nx = read_robot_log(path, model, transport), len(model.states)
+    drives = [Streams(t, values[:, :nx], values[:, nx:]) for t, values in map(merged_rows, stretches)]
+    return replace(drive_transitions(model, drives, digest(path.read_bytes()), str(path)), content_digest=content_digest(stretches, model))
 
 
 # ---------------------------------------------------------------- MCAP

@@ -26,7 +26,9 @@ LAWS = ("uniform", "persistent", "adversarial")
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verbs of this module."""
     gap = verbs.add_parser("gap", help="the sim2real gap that a recording shows, and its statement")
-    gap.add_argument("recording", type=Path, metavar="RECORDING", help="a campaign's MCAP, or CSV (.gz)")
+    gap.add_argument(
+        "recording", type=Path, metavar="RECORDING", help="a campaign's MCAP, CSV (.gz), or a robot's own log that a plug-in reads"
+    )
     add_model_options(gap)
     gap.add_argument("--epsilon", type=probability, metavar="E", help="violation probability (default: the profile's, else 0.01)")
     gap.add_argument("--beta", type=probability, metavar="B", help="one minus the confidence (default 0.05)")
@@ -76,7 +78,9 @@ def run_gap(args: argparse.Namespace) -> int:
     from s2r_runtime.transitions import load_transitions
 
     model, profile = chosen_model(args)
-    found = load_transitions(args.recording, model, dict(profile.columns) if profile else {})
+    found = load_transitions(
+        args.recording, model, dict(profile.columns) if profile else {}, transport=profile.transport if profile else None
+    )
     if args.blocking:
         found = gaps.blocked(found, args.blocking, model.dt)
     result = gaps.estimate_gap(
@@ -173,7 +177,7 @@ def gap_of(recording: Path, model: ComposedModel, profile: Profile, *, beta: flo
     from s2r_runtime import gap as gaps
     from s2r_runtime.transitions import load_transitions
 
-    found = load_transitions(recording, model, dict(profile.columns))
+    found = load_transitions(recording, model, dict(profile.columns), transport=profile.transport)
     if not found.independent:
         raise NotEnoughEvidence(
             f"{recording}: is ordinary driving, not a campaign; its transitions are not independent, so its gap carries no statement"

@@ -13,7 +13,9 @@ from s2r_runtime.errors import UsageError
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verb."""
     verb = verbs.add_parser("trace", help="find the effect that the model lacks, add it, and report the error before and after")
-    verb.add_argument("recording", type=Path, metavar="RECORDING", help="a log's MCAP, or CSV (.gz)")
+    verb.add_argument(
+        "recording", type=Path, metavar="RECORDING", help="a log's MCAP, CSV (.gz), or a robot's own log that a plug-in reads"
+    )
     add_model_options(verb)
     verb.add_argument(
         "--test",
@@ -43,10 +45,10 @@ def run(args: argparse.Namespace) -> int:
     writable(args.output)
     writable(args.report)
     model, profile = chosen_model(args)
-    columns = dict(profile.columns) if profile else {}
-    data = load_dataset(args.recording, model, columns, bandwidth=args.bandwidth)
+    columns, transport = (dict(profile.columns), profile.transport) if profile else ({}, None)
+    data = load_dataset(args.recording, model, columns, bandwidth=args.bandwidth, transport=transport)
     used = data.reconstruction.bandwidth if data.reconstruction else args.bandwidth
-    test = load_dataset(args.test, model, columns, bandwidth=used) if args.test else None
+    test = load_dataset(args.test, model, columns, bandwidth=used, transport=transport) if args.test else None
     if test and set(test.digests) & set(data.digests):
         raise UsageError(f"--test {args.test}: is the recording that the fit is made on; take one that the fit never sees")
     bar = output.Progress("tracing")

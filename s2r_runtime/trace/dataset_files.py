@@ -1,4 +1,4 @@
-"""Datasets from files: a table (CSV, CSV.gz) or a log of the daemon (MCAP, one part or several).
+"""Datasets from files: a table (CSV, CSV.gz), a log in a robot's own format, or one of the daemon (MCAP, one part or several).
 
 In a log the states are the observations that carry no fault, on the robot's clock. A command acts from the stamp of the observation
 that it answers, plus what the daemon took to answer (`obs_seq` ties the two clocks together); in lockstep that is nothing.
@@ -9,12 +9,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.messages import CampaignFinished, Observed, Send, StartCampaign, Started
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.robot_logs import content_digest, is_robot_log, read_robot_log
 from s2r_runtime.trace.dataset import Array, Dataset, Stream, columns_of, from_streams
 from s2r_runtime.trace.reconstruct import reconstruct
 
@@ -30,10 +32,11 @@ def load_dataset(
     *,
     epoch: int | None = None,
     bandwidth: float | None = None,
+    transport: Mapping[str, Any] | None = None,
 ) -> Dataset:
     """Reads a recording on the model's grid. columns: name in the model -> column of the table. Several paths: parts of one log.
     epoch: of a log, only what was recorded while that campaign was under way. bandwidth: Hz within which states that the table does not
-    have are reconstructed from those that it has (None: what the data bear).
+    have are reconstructed from those that it has (None: what the data bear). transport: the profile's, for a log in a robot's own format.
 
     Raises RecordingError (unreadable, lacks a column that does not follow from others, too slow for the model's dt).
     """
@@ -42,7 +45,10 @@ def load_dataset(
     source = ", ".join(str(p) for p in paths)
     if _is_log(paths[0]):
         return from_streams(model, _log_segments(paths, model, epoch), source, digests, paths)
-    segments, missing, content = _table_segments(paths[0], model, columns or {})
+    if is_robot_log(paths[0]):
+        segments, missing, content = _robot_segments(paths[0], model, transport)
+    else:
+        segments, missing, content = _table_segments(paths[0], model, columns or {})
     if not missing:
         return from_streams(model, segments, source, (*digests, content), paths)
     segments, done = reconstruct(model, segments, missing, source, bandwidth)
@@ -86,6 +92,19 @@ def _table_segments(
         measured, commanded = ~np.isnan(y).all(axis=1), ~np.isnan(u).all(axis=1)
         given.append((Stream(t[measured], y[measured]), Stream(t[commanded], u[commanded])))
     return given, missing, table.content_digest([names[n] for n in names if n not in missing])
+
+
+def _robot_segments(
+    path: Path, model: ComposedModel, transport: Mapping[str, Any] | None
+) -> tuple[list[tuple[Stream, Stream]], tuple[str, ...], str]:
+    """As `_table_segments`, from a log in a robot's own format."""
+    stretches = read_robot_log(path, model, transport)
+    seen = ~np.isnan(np.concatenate([stretch.states.values for stretch in stretches])).all(axis=0)
+    free = getattr(model.nominal, "follows", {})
+    missing = tuple(name for name, there in zip(model.states, seen, strict=True) if not there and name in free)
+    kept = [i for i, name in enumerate(model.states) if name not in missing]
+    given = [(Stream(s.states.t, s.states.values[:, kept]), Stream(*s.inputs)) for s in stretches]
+    return given, missing, content_digest(stretches, model)
 
 
 def _log_segments(paths: tuple[Path, ...], model: ComposedModel, epoch: int | None) -> list[tuple[Stream, Stream]]:

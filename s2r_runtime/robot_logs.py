@@ -1,0 +1,100 @@
+"""Recordings in robots' own formats (candump, tlog, ...), read by plug-ins: the hook `s2r_recordings`.
+
+Which reader: the one that the profile's transport offers for the file's suffix, else the only one that there is for it (it then gets no
+options). A log in one of them is ordinary driving: rows of states and rows of inputs, each on stamps of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.errors import ConfigError, RecordingError, UsageError
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.plugins import registry
+from s2r_runtime.tables import Table
+
+Array = NDArray[np.float64]
+
+
+class Rows(NamedTuple):
+    """t: (N,) s, ascending; values: (N, c), NaN where a column was not received."""
+
+    t: Array
+    values: Array
+
+
+class Stretch(NamedTuple):
+    """Contiguous driving: states (N, nx) and inputs (M, nu), each on its own stamps of one clock."""
+
+    states: Rows
+    inputs: Rows
+
+
+def suffix_of(path: Path) -> str:
+    """`.log` of `a.log` and of `a.log.gz`, in small letters."""
+    name = path.name.lower()
+    return Path(name.removesuffix(".gz")).suffix
+
+
+def is_robot_log(path: Path) -> bool:
+    """Whether an installed plug-in reads files with this suffix."""
+    suffix = suffix_of(path)
+    return bool(suffix) and any(name.partition(".")[2] == suffix[1:] for name in registry().names("recordings"))
+
+
+def read_robot_log(path: Path, model: ComposedModel, transport: Mapping[str, Any] | None) -> list[Stretch]:
+    """Its stretches of driving. transport: the profile's table, or None. Raises RecordingError, ConfigError, UsageError."""
+    suffix = suffix_of(path)
+    offered = [name for name in registry().names("recordings") if name.partition(".")[2] == suffix[1:]]
+    own = f"{(transport or {}).get('name', '')}{suffix}"
+    if own in offered:
+        options = {name: value for name, value in (transport or {}).items() if name != "name"}
+    elif len(offered) == 1:
+        own, options = offered[0], {}
+    else:
+        raise UsageError(f"{path}: could be of {' or '.join(offered)}; a profile says whose it is: --profile P")
+    read = registry().get("recordings", own)
+    try:
+        found = read(path, model.states, model.inputs, options)
+    except ConfigError as error:
+        if options:
+            raise
+        raise UsageError(f"{path}: is read with a profile that says what is in it (--profile P): {error}") from None
+    stretches = [Stretch(_rows(x, len(model.states), path, own), _rows(u, len(model.inputs), path, own)) for x, u in found]
+    if not any(len(stretch.states.t) for stretch in stretches):
+        raise RecordingError(f"{path}: holds no state of this model")
+    return stretches
+
+
+def _rows(given: tuple[Any, Any], width: int, path: Path, reader: str) -> Rows:
+    """Checked: what a plug-in gives is taken at its word nowhere else."""
+    t, values = np.asarray(given[0], dtype=np.float64), np.asarray(given[1], dtype=np.float64).reshape(-1, width)
+    if t.shape != values.shape[:1] or not np.all(np.isfinite(t)) or np.any(np.diff(t) < 0.0) or np.any(np.isinf(values)):
+        raise RecordingError(f"{path}: the reader {reader!r} gave rows that are not in order, or not finite")
+    kept = ~np.isnan(values).all(axis=1)
+    return Rows(t[kept], values[kept])
+
+
+def content_digest(stretches: list[Stretch], model: ComposedModel) -> str:
+    """Of what the log says, whatever file says it (guarantee G6)."""
+    names = (*model.states, *model.inputs)
+    merged = [merged_rows(stretch) for stretch in stretches]
+    t = np.concatenate([rows.t for rows in merged])
+    values = np.concatenate([rows.values for rows in merged])
+    return Table(t, {name: values[:, i] for i, name in enumerate(names)}, None).content_digest(names)
+
+
+def merged_rows(stretch: Stretch) -> Rows:
+    """Rows of states and inputs in one table, (N + M, nx + nu), by stamp; what was not received is NaN."""
+    (t_x, x), (t_u, u) = stretch
+    t = np.concatenate([t_x, t_u])
+    values = np.full((len(t), x.shape[1] + u.shape[1]), np.nan)
+    values[: len(t_x), : x.shape[1]] = x
+    values[len(t_x) :, x.shape[1] :] = u
+    order = np.argsort(t, kind="stable")
+    return Rows(t[order], values[order])
