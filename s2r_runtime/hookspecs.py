@@ -55,6 +55,11 @@ class Transport(Protocol):
     """Turns a robot's protocol into observations and commands. Constructed as `T(options, states, inputs)`; options is the
     profile's `[transport]` table without `name`. Raises ConfigError for a bad option. Construction opens nothing: an audit
     constructs one just to `decode`.
+
+    It may also have
+    - `inform(record)`: takes every change of the gate (`GateChanged`) and every refused command (`Decided`), for people who watch on the
+      robot's side. Nothing that an audit repeats may depend on it;
+    - `lines() -> list[str]`: since the last call, for the daemon's journal: what a person should know of the robot.
     """
 
     OPTIONS: ClassVar[dict[str, str]]

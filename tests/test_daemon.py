@@ -84,7 +84,7 @@ def test_second_daemon_of_a_robot_is_refused(rig: Rig) -> None:
     [
         ('name = "unicycle"', 'name = "unicicle"', "did you mean 'unicycle'?"),
         ('name = "grid_world"', 'name = "grid_wold"', "did you mean 'grid_world'?"),
-        ('name = "loop"', 'name = "mavlink"', "install the package s2r-mavlink"),
+        ('name = "loop"', 'name = "robotarium"', "install the package s2r-standins"),
         ("x = [-1.6, 1.6]", "z = [-1.6, 1.6]", "region.z"),
     ],
 )

@@ -92,6 +92,9 @@ class Actions:
             waiting = waiting or must_be_durable(output)
         if waiting and not self._d.logbook.durable():
             self._d.log_changed(False, self._d.logbook.health().detail or "the disk does not take the log")
+        for output in outputs:
+            if isinstance(output, m.GateChanged) or (isinstance(output, m.Decided) and not output.allow):
+                self._d.link.inform(output)
 
     def tick(self, now_ns: int) -> None:
         """Tries again to save a memory that the disk did not take. now_ns: the host's clock."""

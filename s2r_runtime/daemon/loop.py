@@ -212,6 +212,8 @@ class Daemon:
         self._next_tick_ns = now_ns + TICK_NS
         for change in self.link.poll(now_ns):
             self.feed(change)
+        for line in self.link.lines():
+            self.say(line)
         self.driver.poll(now_ns)
         self.watcher.tick(now_ns)
         if now_ns >= self._next_round_ns:

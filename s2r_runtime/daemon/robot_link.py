@@ -5,12 +5,14 @@ Also the daemon's clock: the host's monotonic one in real time; in lockstep the 
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator
 
 from s2r_runtime.daemon.settings import ModelFacts
+from s2r_runtime.errors import one_line
 from s2r_runtime.hookspecs import Transport
-from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged, Send
+from s2r_runtime.messages import Command, Decided, Frame, GateChanged, LinkChanged, Observation, OverrideChanged, Send
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import Profile
 
@@ -96,6 +98,19 @@ class RobotLink:
             yield from self._failed("send", error)
             return
         self._record(frame)
+
+    def inform(self, record: GateChanged | Decided) -> None:
+        """For people on the robot's side, if the transport tells them anything."""
+        with contextlib.suppress(Exception):  # nobody's safety hangs on it
+            if (inform := getattr(self.transport, "inform", None)) is not None:
+                inform(record)
+
+    def lines(self) -> list[str]:
+        """For the journal, if the transport has anything to say."""
+        with contextlib.suppress(Exception):  # as above
+            if (lines := getattr(self.transport, "lines", None)) is not None:
+                return [one_line(str(line)) for line in lines()]
+        return []
 
     def counters(self) -> dict[str, int]:
         """The transport's counters."""

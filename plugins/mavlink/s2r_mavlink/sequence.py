@@ -1,0 +1,72 @@
+"""Whose turn it is: a sender's numbers, modulo 256, tell what was lost, what came late, and that a second sender uses the same ids.
+
+d = (number - newest) mod 256.  0: again.  1 to `AHEAD`: next, d - 1 were lost.  Above 256 - `BEHIND`: late.  Else: off the track.
+Off the track, another track is tried: it takes over after `PROOF` frames in a row without one of the old track between them, or at once
+if the old one was silent for `SILENT_NS` (a robot started anew, a long loss). Both in turns are a conflict: two senders, or a replay.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Literal
+
+Place = Literal["next", "late", "again", "off"]
+
+AHEAD, BEHIND = 32, 16
+AHEAD_UNCHECKED = 8
+"""For a frame whose checksum nobody here can check: its number may be noise."""
+PROOF = 4
+SILENT_NS = 500_000_000
+CONFLICTS, WITHIN_NS = 8, 10_000_000_000
+"""So many conflicts in so long are two senders. A few replayed frames are none."""
+
+
+class Sequence:
+    """Of one sender. lost: frames that were missing when a newer one came; off, again: frames off the track, and repeated ones."""
+
+    def __init__(self) -> None:
+        self._newest = -1
+        self._heard_ns = 0
+        self._other = -1
+        self._proof = 0
+        self._strange = False
+        self._conflicts: deque[int] = deque(maxlen=CONFLICTS)
+        self.lost = self.off = self.again = 0
+
+    def place(self, number: int, now_ns: int, *, checked: bool = True) -> Place:
+        """Where this frame stands. Only `next` and `late` may be acted on."""
+        d = (number - self._newest) & 0xFF
+        if self._newest < 0 or (d > AHEAD and now_ns - self._heard_ns > SILENT_NS and checked):
+            return self._next(number, now_ns, 0)
+        if 0 < d <= (AHEAD if checked else AHEAD_UNCHECKED):
+            if self._proof or self._strange:
+                self._conflicts.append(now_ns)
+            return self._next(number, now_ns, d - 1)
+        if d == 0:
+            self.again += 1
+            return "again"
+        if d > 256 - BEHIND:
+            return "late"
+        return self._try(number, now_ns) if checked else "off"
+
+    def _next(self, number: int, now_ns: int, lost: int) -> Place:
+        self._newest, self._heard_ns, self._proof, self._strange = number, now_ns, 0, False
+        self.lost += lost
+        return "next"
+
+    def _try(self, number: int, now_ns: int) -> Place:
+        """Off the track: another one?"""
+        self._proof = self._proof + 1 if self._proof and 0 < (number - self._other) & 0xFF <= AHEAD else 1
+        self._other = number
+        if self._proof >= PROOF:
+            return self._next(number, now_ns, (number - self._newest - 1) & 0xFF)
+        self.off += 1
+        return "off"
+
+    def stranger(self) -> None:
+        """Somebody else used these ids. It is a conflict once the one who has them goes on."""
+        self._strange = True
+
+    def shared(self, now_ns: int) -> bool:
+        """Whether two senders use these ids."""
+        return len(self._conflicts) == CONFLICTS and now_ns - self._conflicts[0] <= WITHIN_NS
