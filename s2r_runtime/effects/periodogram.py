@@ -32,7 +32,7 @@ SLOWEST = 1.5
 BANDS = 40
 """Of frequency, in each of which the median is the usual level."""
 
-ZOOM = (21, 3)
+ZOOM = (11, 3)
 """Frequencies looked at around a peak, and how often the range is narrowed to their spacing."""
 
 
