@@ -2,12 +2,13 @@
 # make test   sets everything up and runs the tests
 # make check  format, lint, types, import walls, docs
 # make bench  the figures that the docs state, as ratios in one run
+# make bench-trace  the tracer on seeded recordings that it has never seen, in some 15 minutes; SETS="--seeds 0:5 --failures" for others
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: run test check bench format clean wheels setup
+.PHONY: run test check bench bench-trace format clean wheels setup
 
 run: $(STAMP)
 	$(BIN)/s2r demo
@@ -24,6 +25,12 @@ check: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/python tools/bench.py
+
+SETS ?= --seeds 1000000:1000020 --jobs 2
+
+bench-trace: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
+	$(BIN)/python tools/bench_trace.py $(SETS)
 
 format: $(STAMP)
 	$(BIN)/ruff format .

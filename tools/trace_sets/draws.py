@@ -28,11 +28,11 @@ def _factor(rng: Rng, size: float) -> float:
 
 
 def _late(rng: Rng, s: Scale, size: float) -> float:
-    """Seconds: some steps, or what actuators have; never more than the recording shows."""
+    """Seconds: some steps, or what actuators have; never more than the recording shows, nor what no data could tell apart."""
     steps = s.dt * log_uniform(rng, 0.4, 8.0)
     usual = log_uniform(rng, 0.02, 0.4)
     most = min(s.duration / 20.0, 0.9 * s.pace + 4.0 * s.dt, 0.8)
-    return float(min(max((steps if rng.random() < 0.5 else usual) * size, 0.02 * s.dt), most))
+    return float(min(max((steps if rng.random() < 0.5 else usual) * size, 0.1 * s.dt), most))
 
 
 def gain(rng: Rng, s: Scale, channel: str, size: float) -> Values:

@@ -118,9 +118,9 @@ def _one(band: Band, *, least: int | None = None, most: int | None = None) -> Fa
         steps = int(log_uniform(rng, least, most)) if least and most else None
         chosen = [_effect(rng)] * 2 + [_effect(rng), _effect(rng)]
 
-        def draw(number: int, rng: Rng, size: float) -> Draft:
+        def draw(number: int, rng: Rng, size: float, loud: float) -> Draft:
             s = _robot_for(rng, chosen[number], steps)
-            return _draft_with(rng, s, (draw_missing(rng, s, chosen[number], size),))
+            return _draft_with(rng, s, (draw_missing(rng, s, chosen[number], size),), loud=loud)
 
         long = steps is not None and steps > LARGE
         draft, recording, errors = sized(rng, draw, band, **({"steps": 2, "robots": 1} if long else {}))
@@ -183,7 +183,7 @@ def _plant(name: str) -> Any:
     return draw_scale(np.random.default_rng(0), (name,)).plant
 
 
-def _draft_with(rng: Rng, s: Scale, missing: tuple[Missing, ...], **more: Any) -> Draft:
+def _draft_with(rng: Rng, s: Scale, missing: tuple[Missing, ...], loud: float = 1.0, **more: Any) -> Draft:
     scheme = any(m.name == "integration_scheme" for m in missing)
     rule = {} if scheme else draw_pose_rule(rng, s)
     law = str(rng.choice(["white", "white", "white", "white", "coloured", "student", "outliers", "quantised"]))
@@ -191,7 +191,7 @@ def _draft_with(rng: Rng, s: Scale, missing: tuple[Missing, ...], **more: Any) -
     pushed = not s.plant.pose and any(m.name in PUSHES for m in missing)
     return Draft(
         s,
-        draw_noise(rng, s, law),
+        draw_noise(rng, s, law, loud=loud),
         draw_law(rng, closed=0.9 if pushed else 0.2 if s.plant.pose else 0.45),
         shape,
         missing,
@@ -204,10 +204,10 @@ def _draft_with(rng: Rng, s: Scale, missing: tuple[Missing, ...], **more: Any) -
 def _outside(name: str, seed: int, rng: Rng) -> TraceSet:
     kind = str(rng.choice(list(outside.KINDS)))
 
-    def draw(number: int, rng: Rng, size: float) -> Draft:
+    def draw(number: int, rng: Rng, size: float, loud: float) -> Draft:
         s = draw_scale(rng, outside.KINDS[kind].plants)
         effect, true, told = outside.KINDS[kind].draw(rng, s, size)
-        return _draft_with(rng, s, (), outside=(effect,), extra={"kind": kind, "values": told, "depends_on": sorted(true)})
+        return _draft_with(rng, s, (), loud=loud, outside=(effect,), extra={"kind": kind, "values": told, "depends_on": sorted(true)})
 
     draft, recording, errors = sized(rng, draw, MATTERS)
     return TraceSet(name, seed, recording, draft.model(), {"expect": "outside", **common(draft, errors)}, draft=draft)

@@ -92,8 +92,8 @@ class Draft:
 EXACT: dict[str, Any] = {"name": "integration_scheme", "channel": "*", "parameters": {"scheme": "exact"}}
 
 
-def draw_noise(rng: Rng, s: Scale, law: str, level: float | None = None) -> Noise:
-    """level: measurement noise over what moves in a second."""
+def draw_noise(rng: Rng, s: Scale, law: str, level: float | None = None, loud: float = 1.0) -> Noise:
+    """level: measurement noise over what moves in a second; loud: times all of the noise."""
     level = level if level is not None else log_uniform(rng, 2e-4, 2e-2)
     plant = s.plant
     sigma = []
@@ -105,7 +105,7 @@ def draw_noise(rng: Rng, s: Scale, law: str, level: float | None = None) -> Nois
             sigma.append(own * s.speed / plant.parameters["wheel_radius"])
         else:
             sigma.append(own * s.speed)
-    r = np.array(sigma)
+    r = loud * np.array(sigma)
     kind: dict[str, Any] = {}
     if law == "student":
         kind = {"freedom": float(rng.uniform(2.5, 5.0))}
@@ -113,9 +113,8 @@ def draw_noise(rng: Rng, s: Scale, law: str, level: float | None = None) -> Nois
         kind = {"outliers": float(rng.uniform(0.01, 0.05)), "far": log_uniform(rng, 5.0, 60.0)}
     elif law == "quantised":
         kind = {"quantum": r * log_uniform(rng, 1.0, 5.0)}
-    usual = (
-        np.array([s.speed, max(s.yaw, 0.3)]) if plant.pose else np.full(plant.axes, s.ranges[0].size / plant.parameters.get("mass", 1.0))
-    )
+    push = s.ranges[0].size / plant.parameters.get("mass", 1.0)
+    usual = loud * (np.array([s.speed, max(s.yaw, 0.3)]) if plant.pose else np.full(plant.axes, push))
     if law == "coloured":
         strong = log_uniform(rng, 0.003, 0.08) * np.exp(rng.uniform(-0.7, 0.7, len(usual)))
         kind |= {"push": strong * usual, "memory": log_uniform(rng, max(2.0 * s.dt, 0.02), max(0.5, 4.0 * s.dt))}

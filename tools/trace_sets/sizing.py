@@ -29,7 +29,9 @@ STEPS, ROBOTS = 5, 4
 NEAR = 0.35
 """Of the aim's logarithm: near enough."""
 
-SIZES = (1e-4, 5.0)
+SIZES, LOUD = (1e-4, 5.0), (1e-3, 100.0)
+FIRST = 3
+"""Steps in which the effect's size is tried, before the noise is turned."""
 
 
 @dataclass(frozen=True)
@@ -46,17 +48,20 @@ MATTERS = Band(STRONG, 1e9, 1.6, LARGEST_AIM)
 HARDLY = Band(WEAK, STRONG, 1.13, 1.45)
 
 Found = tuple[Draft, Recording, Rollouts | None]
+Draw = Callable[[int, Rng, float, float], Draft]
+"""(robot's number, rng, size of the effect, loudness of the noise) -> draft."""
 
 
-def sized(rng: Rng, draw: Callable[[int, Rng, float], Draft], band: Band, *, steps: int = STEPS, robots: int = ROBOTS) -> Found:
-    """draw(robot's number, rng, size). The first robot on which the band is reached, at the size nearest to an aim; else the last one."""
+def sized(rng: Rng, draw: Draw, band: Band, *, steps: int = STEPS, robots: int = ROBOTS) -> Found:
+    """The first robot on which the band is reached, as near to an aim as it gets; else the last one."""
     aim = log_uniform(rng, band.first, band.last)
+    by_noise = rng.random() < 0.5
     found: Found | None = None
     for number in range(robots):
-        sub, size, best = int(rng.integers(2**62)), 1.0, math.inf
-        for _ in range(steps):
+        sub, size, loud, best = int(rng.integers(2**62)), 1.0, 1.0, math.inf
+        for step in range(steps):
             again = np.random.default_rng(sub)
-            draft = draw(number, again, size)
+            draft = draw(number, again, size, loud)
             recording, errors = realise(again, draft)
             ratio = errors.ratio if errors else 1.0
             off = abs(math.log(ratio / aim))
@@ -65,11 +70,11 @@ def sized(rng: Rng, draw: Callable[[int, Rng, float], Draft], band: Band, *, ste
                 best = off if band.low <= ratio < band.high else math.inf
             if best < NEAR:
                 break
-            wanted = math.sqrt((aim**2 - 1.0) / max(ratio**2 - 1.0, 1e-4))
-            smaller = min(max(size * min(max(wanted, 0.02), 20.0), SIZES[0]), SIZES[1])
-            if smaller == size:
-                break
-            size = smaller
+            wanted = min(max(math.sqrt((aim**2 - 1.0) / max(ratio**2 - 1.0, 1e-4)), 0.02), 20.0)
+            if by_noise or step >= FIRST:
+                loud = min(max(loud / wanted, LOUD[0]), LOUD[1])
+            else:
+                size = min(max(size * wanted, SIZES[0]), SIZES[1])
         if best < math.inf:
             break
     assert found is not None
