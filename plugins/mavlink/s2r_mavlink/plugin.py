@@ -9,3 +9,9 @@ from s2r_runtime.hookspecs import Offer, hookimpl
 def s2r_transports() -> list[Offer]:
     """The MAVLink transport."""
     return [Offer("mavlink", "s2r_mavlink.transport:MavlinkTransport", "autopilots that speak MAVLink: UDP, TCP, serial")]
+
+
+@hookimpl
+def s2r_recordings() -> list[Offer]:
+    """Telemetry logs."""
+    return [Offer("mavlink.tlog", "s2r_mavlink.tlog:read", "telemetry logs of MAVLink ground stations (.tlog, .tlog.gz)")]
