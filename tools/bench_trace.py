@@ -84,7 +84,8 @@ def _answer(given: TraceSet, path: Path) -> Record:
     if given.draft is not None and truth["expect"] in {"one", "pair", "outside", "clean"}:
         from trace_sets.again import errors_again
 
-        told["again"] = errors_again(given.draft, given.seed, nominal, result.model, truth["oracle"])
+        repaired = compose(ModelSpec(spec.name, spec.dt, result.spec.parameters, result.spec.effects))  # at the step of the truth
+        told["again"] = errors_again(given.draft, given.seed, nominal, repaired, truth["oracle"])
     return told
 
 

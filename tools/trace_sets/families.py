@@ -7,6 +7,7 @@ clean...        nothing is missing: white noise, closed loop, poor excitation; c
 one, weak       one effect of the library that matters (ratio >= 1.5), or hardly does (1.1 to 1.5)
 pair            two effects, each of which matters beside the other
 outside         an effect that the library does not have
+unmeasured      one effect that matters, and no speed is measured
 tie             not separable, by how the robot was driven
 fault, bad      measurements that are wrong in places; input from which nothing can be traced
 tiny, long      20 to 120 steps; 50 000 to 100 000 steps
@@ -79,7 +80,7 @@ def _clean(law: str, *, closed: float = 0.15, odd: bool = False, poor: bool = Fa
         s = draw_scale(rng, n=int(log_uniform(rng, least, most)) if most else None)
         layout = odd_layout(rng, s.plant) if odd else ""
         rule = _arcs(s) if layout in OFF_GRID else draw_pose_rule(rng, s)
-        layout = layout or str(rng.choice(["grid", *ON_GRID], p=[0.84, 0.08, 0.08]))
+        layout = layout or str(rng.choice(["grid", *ON_GRID], p=[0.82, 0.06, 0.06, 0.06]))
         asked = _poorly(rng, s) if poor else None
         shown = "poor" if poor else draw_law(rng, closed=closed)
         draft = Draft(s, draw_noise(rng, s, law), shown, layout, runs=_runs(rng, s.n), asked=asked, **rule)
@@ -128,6 +129,21 @@ def _one(band: Band, *, least: int | None = None, most: int | None = None) -> Fa
         return TraceSet(name, seed, recording, draft.model(), truth, draft=draft)
 
     return family
+
+
+def _unmeasured(name: str, seed: int, rng: Rng) -> TraceSet:
+    """Speeds (of masses, wheels, a car) have no column, and an effect matters; the ratio is that of a robot that measures them, too."""
+
+    def draw(number: int, rng: Rng, size: float, loud: float) -> Draft:
+        s = draw_scale(rng, ("joint", "double_integrator", "joint", "differential_drive", "bicycle"))
+        known = [n for n in draws.names(s.plant) if n not in {"sensor_offset", "integration_scheme"}]
+        return _draft_with(rng, s, (draw_missing(rng, s, str(rng.choice(known)), size),), loud=0.3 * loud)
+
+    draft, recording, errors = sized(rng, draw, MATTERS)
+    plant = draft.scale.plant
+    recording.unseen = plant.states[3:] if plant.pose else plant.states[plant.axes :]
+    truth = {"expect": "one", **common(draft, errors), "accepted": accepted(draft), "alternatives": alternatives(draft)}
+    return TraceSet(name, seed, recording, draft.model(), truth, draft=draft)
 
 
 def _pair(name: str, seed: int, rng: Rng) -> TraceSet:
@@ -226,6 +242,7 @@ FAMILIES: dict[str, Family] = {
     "weak": _one(HARDLY),
     "pair": _pair,
     "outside": _outside,
+    "unmeasured": _unmeasured,
     "tie": confounded,
     "fault": faulty,
     "bad": bad,

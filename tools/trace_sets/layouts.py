@@ -7,6 +7,7 @@ In parts of a step:
     other      states and commands together at a rate that is no multiple of the model's
     async      states on the grid, commands on a clock of their own
     late       commands a fixed part of a step after the states
+    finer      states and commands some times a step
     split      position and heading on rows of their own, half a step apart
     stamped    on the grid, but each stamp is wrong by up to some per cent of a step
 """
@@ -27,7 +28,7 @@ Rng = np.random.Generator
 OFF_GRID = ("jitter", "irregular", "other", "split", "stamped")
 """Layouts for which the truth must not depend on the grid: not for robots that move by Euler's rule."""
 
-ON_GRID = ("async", "late")
+ON_GRID = ("async", "late", "finer")
 
 
 def draw_layout(rng: Rng, plant: Plant, *, euler: bool, plain: float = 0.6) -> str:
@@ -64,6 +65,10 @@ def stamps(rng: Rng, layout: str, s: Scale, n: int) -> tuple[Whole, Whole]:
         return grid, int(rng.integers(1, parts)) + period * np.arange(len(wobble)) + wobble
     if layout == "late":
         return grid, grid[:-1] + int(rng.integers(1, parts))
+    if layout == "finer":
+        rows = parts // int(rng.choice([k for k in (2, 3, 4, 5) if parts % k == 0])) * np.arange(10**6)
+        rows = rows[rows <= n * parts]
+        return rows, rows
     if layout == "split":
         half = parts // 2
         return np.sort(np.concatenate([grid, grid[:-1] + half])), grid

@@ -87,7 +87,7 @@ def record(
 
 @dataclass
 class Recording:
-    """What is written. together: whether state and command stand on one row where their stamps agree."""
+    """What is written. together: state and command stand on one row where their stamps agree; unseen: states without a column."""
 
     plant: Plant
     runs: list[Run]
@@ -95,26 +95,27 @@ class Recording:
     figures: int = 8
     together: bool = True
     wrap: bool = True
-    columns: dict[str, str] = field(default_factory=dict)
+    unseen: tuple[str, ...] = ()
 
     def text(self) -> str:
         """The CSV."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
-        names = [*self.plant.states, *self.plant.inputs]
+        names = [*(n for n in self.plant.states if n not in self.unseen), *self.plant.inputs]
         many = len(self.runs) > 1
-        writer.writerow([*(["segment"] if many else []), "t", *(self.columns.get(n, n) for n in names)])
+        writer.writerow([*(["segment"] if many else []), "t", *names])
         for number, run in enumerate(self.runs):
             for stamp, cells in self._rows(run):
                 writer.writerow([*([f"r{number}"] if many else []), f"{stamp:.{self.digits}f}", *cells])
         return out.getvalue()
 
     def _rows(self, run: Run) -> list[tuple[float, list[str]]]:
-        nx, nu = len(self.plant.states), len(self.plant.inputs)
+        seen = [i for i, name in enumerate(self.plant.states) if name not in self.unseen]
+        nx, nu = len(seen), len(self.plant.inputs)
         rows: dict[tuple[float, int], list[str]] = {}
         for stamp, y in zip(run.t.tolist(), run.y.tolist(), strict=True):
             values = [wrapped(v) if self.wrap and name == "theta" else v for name, v in zip(self.plant.states, y, strict=True)]
-            rows[stamp, 0] = [*("" if np.isnan(v) else f"{v:.{self.figures}g}" for v in values), *[""] * nu]
+            rows[stamp, 0] = [*("" if np.isnan(values[i]) else f"{values[i]:.{self.figures}g}" for i in seen), *[""] * nu]
         for stamp, u in zip(run.t_u.tolist(), run.u.tolist(), strict=True):
             cells = [f"{v:.{self.figures}g}" for v in u]
             here = rows.get((stamp, 0)) if self.together else None

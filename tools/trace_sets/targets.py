@@ -119,6 +119,7 @@ def rows(records: list[Record]) -> list[Row]:
         _figure("CPU s, 50 000 to 100 000 steps, most", [r["cpu_s"] for r in done if r["n"] >= LARGE], max, 60.0, at_most=True, form=".1f"),
         _share("sensor faults: found and placed, no name lent", words([r for r in of("fault") if not r["truth"]], "found"), 0.80),
         _share("  with an effect beside: its right name", words([r for r in of("fault") if r["truth"]], "right"), 0.80),
+        _share("speeds not measured: right name", words(of("unmeasured"), "right"), 0.70),
         _share("20 to 120 steps: false alarm or wrong name", words(tiny, "alarm", "wrong"), 0.05, at_most=True),
         _share("bad input: refused in a line, or no name", words([r for r in records if r["family"] == "bad"], "honest"), 0.95),
         _share("crashed, or refused 120 steps or more", lost, 0.0, at_most=True),
