@@ -19,6 +19,8 @@ from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, Overr
 
 PATIENCE_S = 10.0
 """How long anything may take that takes milliseconds on an idle machine."""
+PERIOD_NS = 10_000_000
+"""Between two observations of the kit's robot, by its own clock."""
 COUNTERS = ("received", "sent", "dropped_in", "dropped_out", "malformed", "lost")
 
 
@@ -53,8 +55,10 @@ class Rig(Protocol):
 class Line:
     """An open transport with what came over it."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, *, numbered: bool = True) -> None:
+        """numbered: as in TransportKit."""
         self.transport, self.robot = rig.transport, rig.robot
+        self._numbered = numbered
         self.frames: list[Frame] = []
         self.messages: list[Observation | Command | LinkChanged | OverrideChanged] = []
         self._seq = 100
@@ -69,9 +73,15 @@ class Line:
         """Link changes so far: up or not."""
         return [m.up for m in self.messages if isinstance(m, LinkChanged)]
 
+    @property
+    def last(self) -> int:
+        """The number that the robot gave to the newest of them."""
+        newest = self.good[-1]
+        return newest.seq if self._numbered else newest.stamp_ns // PERIOD_NS
+
     def reached(self, seq: int) -> bool:
         """Whether that observation is here."""
-        return bool(self.good) and self.good[-1].seq >= seq
+        return bool(self.good) and self.last >= seq
 
     def turn(self) -> None:
         """One turn of a loop like the daemon's."""
@@ -97,7 +107,7 @@ class Line:
         while len(self.good) == before:
             assert time.monotonic() < end, "no observation got through"
             self._seq += 1
-            self.robot.publish(self._seq, self._seq * 10_000_000, x)
+            self.robot.publish(self._seq, self._seq * PERIOD_NS, x)
             self.turn()
         for _ in range(5):
             self.turn()
@@ -121,12 +131,15 @@ def _descriptors() -> int:
 
 class TransportKit:
     """Subclass with `rig`. carries: fields of a command, beside u, that the protocol conveys. tolerance: of numbers, relative (a
-    protocol with single precision: 1e-6).
+    protocol with single precision: 1e-6). numbered: whether it conveys the robot's own count of observations; if not, theirs is the
+    transport's. resolution_ns: of its stamps.
     """
 
     rig: ClassVar[Callable[[], Rig]]
     carries: ClassVar[tuple[str, ...]] = ("seq", "obs_seq", "ttl_ns")
     tolerance: ClassVar[float] = 0.0
+    numbered: ClassVar[bool] = True
+    resolution_ns: ClassVar[int] = 1
 
     @pytest.fixture
     def bench(self) -> Any:
@@ -139,7 +152,7 @@ class TransportKit:
     def line(self, bench: Rig) -> Line:
         """The transport open and linked."""
         bench.transport.open()
-        line = Line(bench)
+        line = Line(bench, numbered=self.numbered)
         line.link((0.0,) * len(bench.states))
         return line
 
@@ -152,14 +165,15 @@ class TransportKit:
 
     def test_every_field_of_an_observation_arrives(self, bench: Rig, line: Line) -> None:
         draw = random.Random(1)
-        last = line.good[-1].seq
+        last = line.last
         for k in range(1, 6):
             x = tuple(draw.uniform(-3.0, 3.0) for _ in bench.states)
-            line.robot.publish(last + k, (last + k) * 10_000_000 + 12_345_000, x)
+            stamp_ns = (last + k) * PERIOD_NS + 2_345_000
+            line.robot.publish(last + k, stamp_ns, x)
             assert line.until(partial(line.reached, last + k)), "an observation was lost on an idle link"
             got = line.good[-1]
-            assert got.seq == last + k
-            assert got.stamp_ns == (last + k) * 10_000_000 + 12_345_000
+            assert line.last == last + k
+            assert got.stamp_ns == stamp_ns - stamp_ns % self.resolution_ns
             assert self._same(got.x, x)
 
     def test_every_field_of_a_command_arrives(self, bench: Rig, line: Line) -> None:
@@ -216,13 +230,13 @@ class TransportKit:
         line.link((0.0,) * len(bench.states))
 
     def test_numbers_that_are_not_finite_never_come_through(self, bench: Rig, line: Line) -> None:
-        before = line.good[-1].seq
+        before = line.last
         for k, value in enumerate((math.nan, math.inf, -math.inf), start=1):
-            line.robot.publish(before + k, (before + k) * 10_000_000, (value,) * len(bench.states))
+            line.robot.publish(before + k, (before + k) * PERIOD_NS, (value,) * len(bench.states))
         for _ in range(20):
             line.turn()
         assert all(math.isfinite(value) for m in line.messages if isinstance(m, Observation) for value in m.x)
-        assert line.good[-1].seq == before
+        assert line.last == before
 
     def test_unknown_option_is_refused(self, bench: Rig) -> None:
         make: Any = type(bench.transport)
@@ -236,22 +250,22 @@ class TransportKit:
     # ------------------------------------------------------------------ time and order
 
     def test_stamps_only_rise_whatever_order_observations_come_in(self, bench: Rig, line: Line) -> None:
-        base = line.good[-1].seq
+        base = line.last
         x = (0.0,) * len(bench.states)
         for k in (5, 3, 5, 4, 6, 1, 6, 7):
-            line.robot.publish(base + k, (base + k) * 10_000_000, x)
-        assert line.until(lambda: line.good[-1].seq >= base + 7)
+            line.robot.publish(base + k, (base + k) * PERIOD_NS, x)
+        assert line.until(lambda: line.last >= base + 7)
         stamps = [o.stamp_ns for o in line.good]
         assert stamps == sorted(set(stamps))
         assert line.transport.counters()["lost"] >= 4
 
     def test_decoding_depends_on_frames_only(self, bench: Rig, line: Line) -> None:
         """An audit decodes the logged frames again, without a link and long after."""
-        base = line.good[-1].seq
+        base = line.last
         for k in range(1, 6):
-            line.robot.publish(base + k, (base + k) * 10_000_000, (0.1 * k,) * len(bench.states))
+            line.robot.publish(base + k, (base + k) * PERIOD_NS, (0.1 * k,) * len(bench.states))
         line.robot.publish_raw(b"garbage")
-        assert line.until(lambda: line.good[-1].seq == base + 5)
+        assert line.until(lambda: line.last == base + 5)
         line.turn()
         make: Any = type(bench.transport)
         again = make(bench.options, bench.states, bench.inputs)
@@ -276,8 +290,8 @@ class TransportKit:
     def test_receive_never_blocks_and_says_by_its_descriptor_when_to_come(self, bench: Rig, line: Line) -> None:
         assert line.transport.receive() == []
         assert select.select([line.transport.fileno()], [], [], 0.0)[0] == []
-        base = line.good[-1].seq
-        line.robot.publish(base + 1, (base + 1) * 10_000_000, (0.0,) * len(bench.states))
+        base = line.last
+        line.robot.publish(base + 1, (base + 1) * PERIOD_NS, (0.0,) * len(bench.states))
         assert select.select([line.transport.fileno()], [], [], PATIENCE_S)[0]
         assert line.transport.receive()
 
@@ -291,22 +305,22 @@ class TransportKit:
         assert counters["sent"] + counters["dropped_out"] == 200
 
     def test_queue_is_bounded_and_what_it_drops_is_counted(self, bench: Rig, line: Line) -> None:
-        base, count, x = line.good[-1].seq, 5000, (0.0,) * len(bench.states)
+        base, count, x = line.last, 5000, (0.0,) * len(bench.states)
         before, frames = line.transport.counters(), len(line.frames)
         for k in range(1, count + 1):
-            line.robot.publish(base + k, (base + k) * 10_000_000, x)
+            line.robot.publish(base + k, (base + k) * PERIOD_NS, x)
             if k % 200 == 0:
                 time.sleep(0.005)  # the link's own buffers must drain, or it drops what nobody can count
         end = time.monotonic() + PATIENCE_S
         waiting: list[Frame] = []
-        while time.monotonic() < end and not (waiting and line.good[-1].seq == base + count):
-            line.robot.publish(base + count, (base + count) * 10_000_000, x)
+        while time.monotonic() < end and not (waiting and line.last == base + count):
+            line.robot.publish(base + count, (base + count) * PERIOD_NS, x)
             time.sleep(0.05)
             waiting = line.transport.receive()
             line.frames += waiting
             line.messages += [m for frame in waiting for m in line.transport.decode(frame)]
         after = line.transport.counters()
-        assert line.good[-1].seq == base + count, "the newest must survive"
+        assert line.last == base + count, "the newest must survive"
         assert len(line.frames) - frames < count, "nothing was dropped: the queue has no bound"
         assert after["dropped_in"] > before["dropped_in"]
 
