@@ -289,10 +289,10 @@ def run(test: str, rig: LoopRig) -> None:
 # ---------------------------------------------------------------- effects
 
 
-class Smoothed:
-    """An input acts as the mean of this period's and the last one's."""
+class WornOut:
+    """An input acts the less, the larger it has ever been: something wears out."""
 
-    name, stage = "smoothed", "input"
+    name, stage = "worn_out", "input"
     parameters = (Parameter("share", "-", 0.0, 1.0, neutral=0.0),)
 
     def channels(self, model: Any) -> tuple[str, ...]:
@@ -306,41 +306,42 @@ class Smoothed:
 
     def input_step(self, u: Any, z: Any, model: Any, channel: str, dt: float, p: dict[str, Any]) -> Any:
         column, acting = model.inputs.index(channel), u.copy()
-        acting[:, column] = (1.0 - p["share"]) * u[:, column] + p["share"] * z[:, 0]
-        return acting, u[:, [column]]
+        largest = np.maximum(z, np.abs(u[:, [column]]))
+        acting[:, column] *= 1.0 - p["share"] * largest[:, 0]
+        return acting, largest
 
     def input_sequence(self, u: Any, model: Any, channel: str, dt: float, p: dict[str, Any]) -> Any:
         column, acting = model.inputs.index(channel), u.copy()
-        acting[:, column] = (1.0 - p["share"]) * u[:, column] + p["share"] * np.concatenate([[0.0], u[:-1, column]])
+        acting[:, column] *= 1.0 - p["share"] * np.maximum.accumulate(np.abs(u[:, column]))
         return acting
 
     def after_step(self, x: Any, u: Any, x_next: Any, model: Any, channel: str, dt: float, p: dict[str, Any]) -> Any:
         return x_next
 
 
-class TestSmoothed(EffectKit):
-    effect, parameters = Smoothed(), {"share": 0.3}
+class TestWornOut(EffectKit):
+    effect, parameters = WornOut(), {"share": 0.3}
 
 
-class StartsElsewhere(Smoothed):
+class StartsElsewhere(WornOut):
     def input_sequence(self, u: Any, model: Any, channel: str, dt: float, p: dict[str, Any]) -> Any:
         later = super().input_sequence(u, model, channel, dt, p)
         later[0] = u[0]
         return later
 
 
-class Scribbles(Smoothed):
+class Scribbles(WornOut):
     def input_step(self, u: Any, z: Any, model: Any, channel: str, dt: float, p: dict[str, Any]) -> Any:
         u *= 1.0 - p["share"]
         return u, z
 
 
-class MixesRows(Smoothed):
+class MixesRows(WornOut):
     def input_step(self, u: Any, z: Any, model: Any, channel: str, dt: float, p: dict[str, Any]) -> Any:
         return u - p["share"] * u.mean(axis=0), z
 
 
-class NotNeutral(Smoothed):
+class NotNeutral(WornOut):
     parameters = (Parameter("share", "-", 0.0, 1.0, neutral=0.5),)
 
 
@@ -353,7 +354,7 @@ class NotNeutral(Smoothed):
         (NotNeutral, "test_neutral_parameters_are_no_effect"),
     ],
 )
-def test_effect_kit_fails_an_effect_that_breaks_the_contract(broken: type[Smoothed], test: str) -> None:
+def test_effect_kit_fails_an_effect_that_breaks_the_contract(broken: type[WornOut], test: str) -> None:
     from s2r_runtime.plugins import registry
 
     kit = EffectKit()

@@ -1,0 +1,108 @@
+"""Every built-in effect on inputs passes the kit that authors of effects get, at several sets of values."""
+
+import numpy as np
+import pytest
+
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.plugins import registry
+from s2r_runtime.testing import EffectKit
+
+VALUES = {
+    "input_gain": ({"gain": 0.8}, {"gain": -2.0}),
+    "input_gain_asymmetry": ({"gain_positive": 0.8, "gain_negative": 1.3},),
+    "input_bias": ({"bias": 0.2},),
+    "input_delay": ({"delay": 0.066}, {"delay": 0.01}, {"delay": 0.15}),
+    "input_lag": ({"time_constant": 0.1}, {"time_constant": 0.005}, {"time_constant": 0.0}),
+    "input_rate_limit": ({"rate": 2.0}, {"rate": 1e4}, {"rate": 1.0, "rate_down": 9.0}),
+    "input_saturation": ({"low": -0.4, "high": 0.5}, {"low": -0.4}, {"high": 0.5}, {"low": 0.1, "high": 0.2}),
+    "input_deadband": ({"width": 0.2}, {"width": 3.0}),
+    "input_backlash": ({"width": 0.3}, {"width": 3.0}),
+    "input_coupling": ({"from": "", "coefficient": 0.3},),
+    "input_gain_drift": ({"rate": 0.2}, {"rate": -0.05}),
+    "regime_change": ({"time": 1.0, "gain": 0.6}, {"time": 0.0, "gain": 0.6}, {"time": 33 * 0.033, "gain": 2.0}),
+    "periodic_disturbance": (
+        {"frequency": 0.7, "amplitude": 0.2, "phase": 1.1},
+        {"frequency": 20.0, "amplitude": 0.2, "phase": -3.0},
+        {"frequency": 0.7, "amplitude": 0.0, "phase": 0.0},
+    ),
+    "wheel_saturation": ({"speed": 0.5, "track": 0.7},),
+}
+
+for _name, (_first, *_others) in VALUES.items():
+    _class = f"Test_{_name}"
+    globals()[_class] = type(
+        _class, (EffectKit,), {"effect": registry().get("effects", _name), "parameters": _first, "others": tuple(_others)}
+    )
+
+
+def test_no_effect_on_inputs_is_left_out():
+    offered = {name for name in registry().names("effects") if registry().get("effects", name).stage == "input"}
+    assert offered == set(VALUES)
+
+
+class _Wrong:
+    """An input gain that claims what is not so."""
+
+    def __init__(self, name, **claims):
+        given = registry().get("effects", name)
+        for attribute in dir(given):
+            if not attribute.startswith("__"):
+                setattr(self, attribute, getattr(given, attribute))
+        for claim, value in claims.items():
+            setattr(self, claim, value)
+
+
+@pytest.mark.parametrize(
+    ("effect", "p", "test", "says"),
+    [
+        (_Wrong("input_saturation", linear=True), {"high": 0.5}, "test_what_it_claims_of_itself_is_true", "not linear"),
+        (_Wrong("input_gain_drift", linear=True), {"rate": 0.2}, "test_what_it_claims_of_itself_is_true", "not linear"),
+        (_Wrong("input_lag", shift=True), {"time_constant": 0.1}, "test_what_it_claims_of_itself_is_true", "not a shift"),
+        (
+            _Wrong("input_delay", shift=False, linear=False, additive=True),
+            {"delay": 0.1},
+            "test_what_it_claims_of_itself_is_true",
+            "not the sum",
+        ),
+        (
+            _Wrong("input_rate_limit", within_step=lambda dt, p: False),
+            {"rate": 2.0},
+            "test_a_step_is_the_mean_of_its_parts",
+            "nothing changes",
+        ),
+        (
+            _Wrong("input_coupling", reads=lambda model, channel: ()),
+            {"from": "", "coefficient": 0.3},
+            "test_only_the_channel_changes_and_only_by_what_it_reads",
+            "assert",
+        ),
+        (
+            _Wrong("input_gain_drift", input_step=registry().get("effects", "input_gain").input_step),
+            {"rate": 0.2, "gain": 1.0},
+            "test_a_run_that_begins_later_knows_its_time",
+            "Not equal",
+        ),
+    ],
+)
+def test_a_claim_that_is_not_true_fails(effect, p, test, says):
+    kit = EffectKit()
+    kit.effect, kit.parameters = effect, p
+    with pytest.raises(AssertionError, match=says):
+        getattr(kit, test)([(registry().get("models", "unicycle"), "w")])
+
+
+@pytest.mark.parametrize("name", [name for name in VALUES if name != "wheel_saturation"])
+def test_a_user_s_own_model_gets_every_effect_on_its_inputs(name, tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text("STATES, INPUTS, PARAMS = ('a', 'b'), ('p', 'q'), {}\ndef step(x, u, dt, params):\n    return x + dt * u\n")
+    for given in VALUES[name]:
+        p = {**given, "from": "q"} if "from" in given else given
+        model = compose(ModelSpec(str(path), 0.1, {}, (EffectSpec(name, "p", p),)))
+        x, hidden = np.zeros((2, 2)), model.at_rest(2)
+        u = np.random.default_rng(0).uniform(-1.0, 1.0, (30, 2))
+        for row in u:
+            x, hidden = model.step(x, np.tile(row, (2, 1)), hidden)
+        acting = model.effects[0].effect.input_sequence(u, model.nominal, "p", 0.1, p)
+        assert x == pytest.approx(np.tile(0.1 * acting.sum(axis=0), (2, 1)))
+        assert model.effects[0].effect.unit(model.nominal, "p", next(iter(p))) is not None
