@@ -184,7 +184,9 @@ class Effect(Protocol):
         """Hidden state after a long time at zero input, (n, nh); nh may be 0."""
 
     def input_step(self, u: Array, z: Array, model: NominalModel, channel: str, dt: float, p: dict[str, Any]) -> tuple[Array, Array]:
-        """u as commanded over this step -> u as it acts, averaged over the step; and the next hidden state."""
+        """u as commanded over this step -> u as it acts, averaged over the step; and the next hidden state. A step may be taken in parts:
+        it is their mean.
+        """
 
     def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float, p: dict[str, Any]) -> Array:
         """u (T, nu), one row a step of dt from rest -> what acts, (T, nu). Same as `input_step` T times."""
