@@ -69,13 +69,13 @@ def _odd(rng: Rng, kind: str, s: Scale, run: Run) -> Run:
 def _broken(kind: str, recording: Recording) -> str:
     """A text that is no recording."""
     lines = recording.text().splitlines()
-    last = recording.plant.states[-1]
+    needed = recording.plant.inputs[0]
     if kind == "empty":
         lines = []
     elif kind == "no_rows":
         lines = lines[:1]
     elif kind == "missing_column":
-        place = lines[0].split(",").index(last)
+        place = lines[0].split(",").index(needed)
         lines = [",".join(c for i, c in enumerate(line.split(",")) if i != place) for line in lines]
     elif kind == "words":
         lines[len(lines) // 2] = lines[len(lines) // 2].rpartition(",")[0] + ",fast"

@@ -189,12 +189,9 @@ def recording_of(rng: Rng, draft: Draft, runs: list[Run]) -> Recording:
 def _begin(rng: Rng, s: Scale) -> list[float]:
     plant = s.plant
     if plant.pose:
-        return [
-            float(rng.uniform(-2.0, 2.0)),
-            float(rng.uniform(-2.0, 2.0)),
-            float(rng.uniform(-3.1, 3.1)),
-            *[0.0] * (len(plant.states) - 3),
-        ]
+        wide = min(2.0, s.speed * min(2.0 * s.pace, 0.25 * s.duration))
+        place = [float(rng.uniform(-wide, wide)), float(rng.uniform(-wide, wide)), float(rng.uniform(-3.1, 3.1))]
+        return [*place, *[0.0] * (len(plant.states) - 3)]
     return [*(float(rng.uniform(-0.5, 0.5)) * s.speed for _ in range(plant.axes)), *[0.0] * plant.axes]
 
 

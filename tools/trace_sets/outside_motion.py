@@ -10,16 +10,17 @@ from trace_sets.scale import Scale, log_uniform
 from trace_sets.world import Moment, TruthEffect
 
 
-def slip_patch(rng: Rng, s: Scale, size: float) -> Drawn:
-    """Wheels slip on a part of the floor."""
+def slip_patches(rng: Rng, s: Scale, size: float) -> Drawn:
+    """Wheels slip on parts of the floor: stripes, so that every drive crosses some."""
     angle, loss = float(rng.uniform(-math.pi, math.pi)), min(0.4 * size, 0.8)
-    ax, ay, off = math.cos(angle), math.sin(angle), float(rng.uniform(-0.3, 0.3)) * usual_way(s)
+    wide = usual_way(s) * float(rng.uniform(0.4, 0.9))
+    ax, ay, phase = math.tau * math.cos(angle) / wide, math.tau * math.sin(angle) / wide, float(rng.uniform(-3.0, 3.0))
 
     def f(m: Moment, x: Numbers, q: Numbers) -> None:
-        if ax * x[0] + ay * x[1] > off:
+        if math.sin(ax * x[0] + ay * x[1] + phase) > 0.2:
             q[0] *= 1.0 - loss
 
-    return Turning(f), {"position", "x", "y"}, {"loss": loss, "angle": angle, "offset": off}
+    return Turning(f), {"position", "x", "y"}, {"loss": loss, "angle": angle, "wide": wide}
 
 
 def heading_drag(rng: Rng, s: Scale, size: float) -> Drawn:
@@ -42,14 +43,14 @@ def magnetic_floor(rng: Rng, s: Scale, size: float) -> Drawn:
     return Turning(f), {"heading", "theta"}, {"pull": pull, "direction": direction}
 
 
-def gradient(rng: Rng, s: Scale, size: float) -> Drawn:
-    """The floor gets more slippery the farther one goes."""
-    wide, share = usual_way(s), min(0.5 * size, 0.9)
+def rolling_floor(rng: Rng, s: Scale, size: float) -> Drawn:
+    """How well it turns changes smoothly over the floor."""
+    wide, share = usual_way(s) * float(rng.uniform(0.6, 1.5)), min(0.5 * size, 0.9)
 
     def f(m: Moment, x: Numbers, q: Numbers) -> None:
-        q[1] *= 1.0 - share * 0.5 * (1.0 + math.tanh(x[1] / wide))
+        q[1] *= 1.0 - share * math.sin(math.tau * x[0] / wide) * math.cos(math.tau * x[1] / wide)
 
-    return Turning(f), {"position", "x", "y"}, {"share": share}
+    return Turning(f), {"position", "x", "y"}, {"share": share, "wide": wide}
 
 
 def spin_drift(rng: Rng, s: Scale, size: float) -> Drawn:
@@ -212,6 +213,6 @@ class Lens(TruthEffect):
 
 def lens(rng: Rng, s: Scale, size: float) -> Drawn:
     """A lens that stretches what is far from its middle."""
-    wide = max(2.0 * usual_way(s), 2.0)
+    wide = 2.0 * usual_way(s)
     k = min(0.3 * size, 3.0) / wide**2
     return Lens(k), {"position", "x", "y"}, {"k": k}

@@ -99,7 +99,11 @@ def rows(records: list[Record]) -> list[Row]:
     worse = [r["again"]["noisy"][1] > 1.02 * r["again"]["noisy"][0] for r in changed]
     short = [r["cpu_s"] for r in done if 1000 <= r["n"] <= 1500]
     tiny = [r for r in records if r["family"] in {"tiny", "tiny_clean"} and r["outcome"] not in {"refused", "crash"}]
-    lost = [r["outcome"] == "crash" or (r["outcome"] == "refused" and r["n"] >= 120) for r in records if r["family"] != "bad"]
+    lost = [
+        r["outcome"] == "crash" or (r["outcome"] == "refused" and r["n"] >= 120)
+        for r in records
+        if r["family"] not in {"bad", "clean_poor", "unmeasured"}
+    ]
     return [
         _share("false alarms, clean, white noise", words(of(*WHITE), "alarm"), 0.01, at_most=True),
         _share("  of these in closed loop", words(of("clean_closed"), "alarm"), 0.01, at_most=True),
