@@ -46,7 +46,7 @@ def test_both_variances_are_found_again(q, r):
     """Their sum's standard error is about 2 % of it at this n; eight times that is never reached by chance."""
     rng, n = np.random.default_rng(3), 5000
     residual, f = _residuals(rng, n, np.array(q), np.array(r), 0.2)
-    found = estimate(residual, f, np.append(False, np.ones(n - 1, dtype=bool)), np.full(2, 1e-12))
+    found = estimate(residual, f, np.append(False, np.ones(n - 1, dtype=bool)), Noise(np.full(2, 1e-12), np.full(2, 1e-12)))
     total = np.array(q) + np.array(r)
     assert np.allclose(found.q, q, atol=0.16 * total.max())
     assert np.allclose(found.r, r, atol=0.16 * total.max())
@@ -56,9 +56,9 @@ def test_a_few_wild_rows_do_not_change_the_noise():
     rng, n = np.random.default_rng(4), 3000
     residual, f = _residuals(rng, n, np.array([0.01, 0.01]), np.array([1.0, 1.0]), 0.0)
     joined = np.append(False, np.ones(n - 1, dtype=bool))
-    clean = estimate(residual, f, joined, np.full(2, 1e-12))
+    clean = estimate(residual, f, joined, Noise(np.full(2, 1e-12), np.full(2, 1e-12)))
     residual[rng.choice(n, 60, replace=False)] += rng.normal(size=(60, 2)) * 40.0
-    wild = estimate(residual, f, joined, np.full(2, 1e-12))
+    wild = estimate(residual, f, joined, Noise(np.full(2, 1e-12), np.full(2, 1e-12)))
     assert np.allclose(wild.q + wild.r, clean.q + clean.r, rtol=0.2)
 
 

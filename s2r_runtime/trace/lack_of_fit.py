@@ -3,12 +3,13 @@
 A group is a set of dictionaries of terms (see `lack_of_fit_terms`), all of which depend on the same thing. A dictionary is judged like a
 rival model: its terms are added to the step,
 
-    r = sum_j beta_j X_j + noise,        beta by ridge on all blocks of time but the one that is judged
+    r = sum_j beta_j X_j + noise,        beta by ridge, its strength by the evidence (`evidence`); without the block of time that is judged
 
-and its gain is the log likelihood of what is left, with noise and colour re-estimated for it, less that of the model without
-it. The best group is named, then those that add to it. A group counts only if it is significant after correction for
-everything tried and if the rollouts' errors fall with it: structure that nobody would notice is none. A residual that is
-only correlated in time, whatever the inputs do, is `noise`.
+and its gain is the log likelihood of what is left, with noise and colour re-estimated for it, less that of the model without it. The
+best group is named, then those that add to it. A group counts only if it is beyond chance, and if the rollouts' errors fall
+with it: structure that nobody would notice is none. Beyond chance: its gain is, the scatter of its scores over blocks of time
+allowed for; or its evidence is out of reach of the same residual slid along the recording. A residual that is only
+correlated in time, whatever the inputs do, is `noise`.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.evidence import beyond_chance, evidence
 from s2r_runtime.trace.fitting import Fit, Problem
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
 from s2r_runtime.trace.residual import acting, residual, rms, rollout, rollout_starts, state_jacobian
@@ -38,14 +40,17 @@ BLOCKS = 8
 FEW = 8
 """Dictionaries that are judged with their own noise, after a first look under the model's."""
 
-EACH = 0.5
-"""Nats a column that one dictionary must gain beyond another one: the smaller of two that hold the truth is named."""
+ALIKE = 3.0
+"""Nats within which dictionaries say the same: the smallest one is named."""
 
 ADDS = 0.1
 """A further group is named if it adds this share of what is explained already."""
 
 MATTERS = 0.05
 """Structure counts if taking it up lowers some rollout error by this share."""
+
+SLIDING = ("constant", "time")
+"""What slides along with the residual, so that sliding tells nothing."""
 
 COLOURED = 0.2
 """Autoregression coefficient from which noise is called coloured."""
@@ -55,9 +60,6 @@ MOST_SCATTER = 5.0
 
 PASSES = 3
 """Of terms and noise in turn."""
-
-RIDGE = 1e-4
-"""Of the columns' own size; terms of a dictionary are nearly collinear."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,7 @@ def _columns(terms: Sequence[Array]) -> Array:
 def _forward(left: _Left, found: Sequence[tuple[str, Array]]) -> tuple[list[_Judged], dict[str, float]]:
     """The best group, then those that add to it; the last one holds the columns of all."""
     threshold = math.log(len(found) / ALPHA)
-    looked = sorted(((_first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True)
+    looked = _best_of_each(sorted(((_first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True), found)
     gains = {token: 0.0 for token, _ in found}
     chosen: list[_Judged] = []
     rest = [found[i] for _, i in looked[:FEW]]
@@ -133,22 +135,42 @@ def _forward(left: _Left, found: Sequence[tuple[str, Array]]) -> tuple[list[_Jud
             for j in judged:
                 gains[j.token] = max(gains[j.token], j.gain)
             rest = [(token, x) for token, x in rest if gains[token] > threshold]
-        best = max(judged, key=lambda j: j.gain - EACH * j.x.shape[2])
+        most = max(j.gain for j in judged)
+        best = min((j for j in judged if j.gain >= most - ALIKE), key=lambda j: (j.x.shape[2], -j.gain))
         reached = before.gain if before else 0.0
-        if best.gain - reached < max(threshold * best.scatter, ADDS * reached):
+        if best.gain - reached < max(threshold, ADDS * reached) or not _beyond_chance(left, best, before, threshold):
             break
         chosen.append(best)
         rest = [(token, x) for token, x in rest if token != best.token]
     return chosen, gains
 
 
+def _best_of_each(looked: list[tuple[float, int]], found: Sequence[tuple[str, Array]]) -> list[tuple[float, int]]:
+    """The two best dictionaries of the first group, and the best one of each other group: many of one would leave no place for others."""
+    seen: list[str] = []
+    kept = []
+    for look, i in looked:
+        token = found[i][0]
+        if token not in seen or (token == seen[0] and seen.count(token) < 2):
+            kept.append((look, i))
+        seen.append(token)
+    return kept
+
+
 def _first_look(left: _Left, x: Array) -> float:
-    """Nats that the dictionary explains under the model's own noise, less one a column."""
+    """Log evidence of the dictionary under the model's own noise."""
     white = left.fit.whiten(x).reshape(-1, x.shape[2])
     z = left.fit.z.ravel()
     weighted = white * noises.weight(z)[:, None]
-    slope = weighted.T @ z
-    return 0.5 * float(slope @ _solve(white.T @ weighted, slope)) - float(x.shape[2])
+    return evidence(white.T @ weighted, weighted.T @ z).log
+
+
+def _beyond_chance(left: _Left, best: _Judged, before: _Judged | None, threshold: float) -> bool:
+    if best.gain - (before.gain if before else 0.0) > threshold * best.scatter:
+        return True
+    if before is not None or best.token in SLIDING:
+        return False
+    return beyond_chance(left.fit.whiten(best.x), left.fit.z, noises.weight(left.fit.z))
 
 
 def _judge(left: _Left, token: str, x: Array) -> _Judged:
@@ -162,7 +184,7 @@ def _judge(left: _Left, token: str, x: Array) -> _Judged:
     for _ in range(PASSES):
         betas_now = _betas(left, x, whiten, colour)
         rest = left.r - np.einsum("kim,km->ki", x, betas_now[left.block])
-        level = noises.estimate(rest, left.f, joined, left.given.floor, left.fit.noise)
+        level = noises.estimate(rest, left.f, joined, left.given.floor)
         whiten = Whitener(level, left.f, joined)
         z = whiten(rest)
         colour = noises.colour(z, joined)
@@ -195,13 +217,9 @@ def _betas(left: _Left, x: Array, whiten: Whitener, colour: Colour | None) -> Ar
     products, slopes = np.zeros((BLOCKS, m, m)), np.zeros((BLOCKS, m))
     for b, here in enumerate(slice(p, q) for p, q in pairwise(edges.tolist())):
         products[b], slopes[b] = white[here].T @ weighted[here], weighted[here].T @ z[here]
-    return np.stack([_solve(products.sum(axis=0) - products[b], slopes.sum(axis=0) - slopes[b]) for b in range(BLOCKS)])
-
-
-def _solve(product: Array, slope: Array) -> Array:
-    m = len(slope)
-    ridge = np.diag(RIDGE * np.diag(product) + 1e-12 * float(np.trace(product)) / m + 1e-300)
-    return np.asarray(np.linalg.solve(product + ridge, slope))
+    product, slope = products.sum(axis=0), slopes.sum(axis=0)
+    ridge = evidence(product, slope).ridge * np.eye(m)
+    return np.stack([np.linalg.solve(product - products[b] + ridge, slope - slopes[b]) for b in range(BLOCKS)])
 
 
 def _weight_of(left: _Left, nominal: Fit, judged: _Judged, horizon: int) -> tuple[bool, float]:

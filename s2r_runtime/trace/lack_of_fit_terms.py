@@ -22,6 +22,12 @@ Terms = list[Array]
 HARMONICS = 6
 """Of the heading: grooves, cables and slopes have few."""
 
+WAVES = 24
+"""Waves of a position over the way that was gone: cogging has many."""
+
+LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)
+"""Steps back at which an input may still act."""
+
 PATCHES = 5
 """Along each axis of the region: what lies on a part of the floor is then seen if the part is a fifth of it."""
 
@@ -42,6 +48,8 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting) -> Iterator[
         yield from ((name, _push(terms, body)) for terms in _static(u[:, j]))
         yield from ((f"memory({name})", _push(terms, body)) for terms in _memory(act.mean[:, j] / size[j], steps.place))
         yield f"time*{name}", _push([t * u[:, j]], body)
+        slow = [f(np.pi * k * t) * u[:, j] for k in range(1, 7) for f in (np.sin, np.cos)]
+        yield f"time*{name}", _push([t * u[:, j], *slow], body)
         yield f"time*{name}", _push([np.where(t > s, u[:, j], 0.0) for s in np.linspace(0.1, 0.9, 9)], body)
         for i in range(j):
             pair = [u[:, i] * u[:, j], np.abs(u[:, i]) * u[:, j], u[:, i] * np.abs(u[:, j]), np.abs(u[:, i] * u[:, j])]
@@ -59,18 +67,24 @@ def _static(u: Array) -> Iterator[Terms]:
     a = np.abs(u)
     yield [u, u * a, np.sign(u) * (a > 0.02)]
     yield [u, a, u * a, u * u, np.sign(u) * (a > 0.02), *(np.sign(u) * np.maximum(a - s, 0.0) for s in (0.1, 0.25, 0.5, 0.75))]
+    yield [u, *(f(0.5 * np.pi * k * u) for k in range(1, 13) for f in (np.sin, np.cos))]
 
 
 def _memory(u: Array, place: NDArray[np.int64]) -> Iterator[Terms]:
     """Earlier values of one input, and its slow means, less its present one. The first steps of a run see the run before: few, and
     harmless."""
     yield [u[np.maximum(place - lag, 0)] - u[place] for lag in (1, 2)]
-    terms = [u[np.maximum(place - lag, 0)] - u[place] for lag in (1, 2, 3, 5, 8)]
+    terms = [u[np.maximum(place - lag, 0)] - u[place] for lag in LAGS]
+    means = [_mean_before(u, place, width) - u[place] for width in (12, 30, 80)]
+    yield [*terms, *means]
+    heat = [_mean_before(u * u, place, width) for width in (30, 100, 300, 1000)]
+    yield [*(h * u[place] for h in heat), *(h * u[place] ** 3 for h in heat[:1])]
+
+
+def _mean_before(u: Array, place: NDArray[np.int64], width: int) -> Array:
     total = np.concatenate([[0.0], np.cumsum(u)])
-    for width in (12, 30, 80):
-        begin = np.maximum(place - width, 0)
-        terms.append((total[place] - total[begin]) / np.maximum(place - begin, 1) - u[place])
-    yield terms
+    begin = np.maximum(place - width, 0)
+    return np.asarray((total[place] - total[begin]) / np.maximum(place - begin, 1))
 
 
 def _of_states(
@@ -101,6 +115,11 @@ def _of_states(
         yield "position", [a * v for a in position for v in inputs], body
         yield "position", [c[:, None] * p for c in _patches(position) for p in pushes], None
         yield "position", [one, *position, *squares, *(a**3 for a in position)], [*body, *world]
+        for a in position:
+            yield "position", [f(np.pi * k * a) for k in range(1, WAVES + 1) for f in (np.sin, np.cos)], world or body
+        moving = [f for i, name in enumerate(model.states) if name in VELOCITIES for f in _dry(y[:, i])]
+        if moving:
+            yield "position", [c * f for c in _patches(position) for f in moving], body
     speed = [_scaled(y[:, i], centred=False) for i, name in enumerate(model.states) if name in VELOCITIES]
     if speed:
         known |= set(VELOCITIES)
@@ -110,6 +129,12 @@ def _of_states(
         if name not in known:
             v = _scaled(y[:, i])
             yield name, [v, v * v, v**3, np.sign(v), *(v * w for w in inputs)], [*body, *world]
+
+
+def _dry(v: Array) -> tuple[Array, Array]:
+    """Which way it moves, and how fast."""
+    v = _scaled(v, centred=False)
+    return np.tanh(v / 0.05), v
 
 
 def _patches(position: Sequence[Array]) -> Terms:

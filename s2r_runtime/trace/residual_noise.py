@@ -96,15 +96,15 @@ def weight(z: Array) -> Array:
     return np.asarray(1.0 - wild * (1.0 - WIDE**-2))
 
 
-def estimate(r: Array, f: Array, joined: Mask, floor: Array, near: Noise | None = None) -> Noise:
-    """Q and R of the residual r (n, nx). floor: (nx,) least variance. near: where to look first.
+def estimate(r: Array, f: Array, joined: Mask, floor: Noise, near: Noise | None = None) -> Noise:
+    """Q and R of the residual r (n, nx). floor: least variances. near: where to look first.
 
     Outlying steps, if they are few, are given a variance of their own, so that they do not count for the others.
     """
     rows = _middle(joined, ENOUGH)
     r, f, joined = r[rows], f[rows], joined[rows].copy()
     joined[0] = False
-    robust = np.maximum((np.median(np.abs(r), axis=0) / 0.6745) ** 2, floor)
+    robust = np.maximum((np.median(np.abs(r), axis=0) / 0.6745) ** 2, floor.q + 2.0 * floor.r)
     rough = np.maximum(np.abs(r) / np.sqrt(robust) / OUTLIER, 1.0) ** 2 - 1.0
     few = np.mean(rough > 0.0, axis=0) < 0.1  # more than that is no tail but the bulk of what is missing
     extra = np.where(few, rough * robust, 0.0)
@@ -127,7 +127,7 @@ def _middle(joined: Mask, most: int) -> slice:
     return slice(begin, min(n, begin + most))
 
 
-def _by_state(r: Array, f: Array, joined: Mask, extra: Array, near: Noise | None, floor: Array) -> Noise:
+def _by_state(r: Array, f: Array, joined: Mask, extra: Array, near: Noise | None, floor: Noise) -> Noise:
     """State by state; twice, if one state's measurement noise is a good part of another's residual."""
     nx = r.shape[1]
     q, s = (np.zeros(nx), np.zeros(nx)) if near is None else (near.q.copy(), near.r.copy())
@@ -137,7 +137,7 @@ def _by_state(r: Array, f: Array, joined: Mask, extra: Array, near: Noise | None
         for i in range(nx):
             others = square[:, i] @ s - square[:, i, i] * s[i]
             start = None if near is None else (q[i], s[i])
-            q[i], s[i] = _one_state(r[:, i], f[:, i, i], joined, extra[:, i] + others, float(floor[i]), start)
+            q[i], s[i] = _one_state(r[:, i], f[:, i, i], joined, extra[:, i] + others, (float(floor.q[i]), float(floor.r[i])), start)
         for i in range(nx):
             foreign[i] = np.mean(square[:, i] @ s - square[:, i, i] * s[i]) / (q[i] + s[i])
         near = Noise(q, s)
@@ -146,8 +146,10 @@ def _by_state(r: Array, f: Array, joined: Mask, extra: Array, near: Noise | None
     return Noise(q, s)
 
 
-def _one_state(r: Array, f: Array, joined: Mask, other: Array, floor: float, near: tuple[float, float] | None) -> tuple[float, float]:
-    """(q, r) of one state by maximum likelihood; pattern search over their logarithms."""
+def _one_state(
+    r: Array, f: Array, joined: Mask, other: Array, floor: tuple[float, float], near: tuple[float, float] | None
+) -> tuple[float, float]:
+    """(q, r) of one state by maximum likelihood; pattern search over their logarithms. floor: least q and r."""
     from scipy.linalg import lapack
 
     link = np.where(joined[1:], -f[1:], 0.0)
@@ -161,18 +163,19 @@ def _one_state(r: Array, f: Array, joined: Mask, other: Array, floor: float, nea
         x, _ = lapack.dpttrs(d, e, r)
         return 0.5 * float(r @ x) + 0.5 * float(np.log(d).sum())
 
-    total = max(float(np.mean(np.minimum(r * r, 9.0 * max(float(np.median(r * r)), floor)))), floor)
-    low, high = math.log(max(floor, LEAST * total)), math.log(16.0 * total)
+    least = floor[0] + 2.0 * floor[1]
+    total = max(float(np.mean(np.minimum(r * r, 9.0 * max(float(np.median(r * r)), least)))), least)
+    low_q, low_r, high = math.log(max(floor[0], LEAST * total)), math.log(max(floor[1], LEAST * total)), math.log(16.0 * total)
     if near is None:
         seeds = [(share, (1.0 - share) / 2.0) for share in (1e-3, 0.05, 0.3, 0.7, 0.99)]
-        starts = [(math.log(max(total * a, floor)), math.log(max(total * b, floor))) for a, b in seeds]
+        starts = [(max(math.log(total * a), low_q), max(math.log(total * b), low_r)) for a, b in seeds]
     else:
-        starts = [(min(max(math.log(near[0]), low), high), min(max(math.log(near[1]), low), high))]
+        starts = [(min(max(math.log(near[0]), low_q), high), min(max(math.log(near[1]), low_r), high))]
     best, (a, b) = min((cost(*start), start) for start in starts)
     step, moves = 1.0 if near is None else 0.5, [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]
     while step > 0.04:
         for move in list(moves):
-            there = min(max(a + move[0] * step, low), high), min(max(b + move[1] * step, low), high)
+            there = min(max(a + move[0] * step, low_q), high), min(max(b + move[1] * step, low_r), high)
             found = cost(*there) if there != (a, b) else math.inf
             if found < best - 1e-6:
                 best, (a, b) = found, there

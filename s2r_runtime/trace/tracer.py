@@ -29,7 +29,7 @@ from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge
 from s2r_runtime.trace.excitation import advice
 from s2r_runtime.trace.faults import Checked, check
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, problem
-from s2r_runtime.trace.holdout import BLOCK, Part, fit_mask, part
+from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.intervals import intervals
 from s2r_runtime.trace.lack_of_fit import Structure, lack_of_fit
 from s2r_runtime.trace.power import visible
@@ -50,7 +50,7 @@ FEWEST = 60
 FIT_STEPS = 4000
 """Transitions that a fit uses at most; a parameter that matters is then known to about a per cent."""
 
-STRUCTURE_STEPS = 2500
+STRUCTURE_STEPS = 4000
 """Transitions that the lack of fit is tested on at most."""
 
 MOVED, ASKED = 1.5, 5.0
@@ -95,7 +95,7 @@ def trace(
     chosen = select(given, model, ahead, lambda share: say(5.0 + 75.0 * share, 100.0, "looking for effects"))
     chosen = confirmed(given, chosen, judged_on)
     say(80.0, 100.0, "testing what is left")
-    structure = _structure(given, chosen, ahead)
+    structure = _structure(checked, chosen, ahead)
     say(90.0, 100.0, "judging on held-out data")
     w = np.ones(len(model.states)) if weights is None else np.asarray(weights, dtype=np.float64)
     result = _result(dataset, checked, given, chosen, structure, judged_on, seed, w, kind)
@@ -190,13 +190,11 @@ def _enough(data: Dataset, model: ComposedModel, fit_part: Part, judged_on: Held
         raise NotEnoughEvidence(f"{data.source}: the robot stood still although it was asked to move; nothing can be traced until it moves")
 
 
-def _structure(given: Problem, chosen: Selection, horizon: int) -> Structure:
-    """Of what the chosen model leaves; on a part of a long recording."""
-    if len(given.steps) <= STRUCTURE_STEPS:
-        return lack_of_fit(given, chosen.fit, chosen.nominal, horizon)
-    block = len(given.steps) * BLOCK // STRUCTURE_STEPS
-    few = Problem(given.data, given.steps.take(np.flatnonzero(np.arange(len(given.steps)) % block < BLOCK)), given.floor)
-    return lack_of_fit(few, evaluate(few, chosen.fit.model), evaluate(few, chosen.nominal.model), horizon)
+def _structure(checked: Checked, chosen: Selection, horizon: int) -> Structure:
+    """Of what the chosen model leaves, over all of the recording: a test needs no data that the fit never saw."""
+    everything = part(checked.data, checked.left_out, np.ones(first_steps(checked.data)[-1], dtype=bool), STRUCTURE_STEPS)
+    given = problem(everything.data, everything.steps)
+    return lack_of_fit(given, evaluate(given, chosen.fit.model), evaluate(given, chosen.nominal.model), horizon)
 
 
 def _new(fit: Fit, other: Fit) -> list[int]:
