@@ -129,7 +129,10 @@ class NominalModel(Protocol):
 
 
 class Parameter(NamedTuple):
-    """A parameter of an effect. `neutral`: the value at which the effect is none (None if there is no such value)."""
+    """A parameter of an effect. `neutral`: the value at which the effect is none (None if there is no such value).
+
+    `shape`: rows and columns of a matrix ([[a, b], [c, d]]; low, high, neutral are those of its entries); empty: a number or a word.
+    """
 
     name: str
     unit: str
@@ -138,6 +141,7 @@ class Parameter(NamedTuple):
     neutral: float | None = None
     kink: bool = False
     """Enters with a kink (delay, deadband, limits): its interval comes from the profile likelihood."""
+    shape: tuple[int, ...] = ()
 
 
 class Effect(Protocol):
@@ -155,6 +159,12 @@ class Effect(Protocol):
     - `once` = True: a model has at most one of it; `linear` = True: it commutes with other linear effects, so the tracer tries one
       place in the list only; `shift` = True: a pure delay, which commutes with all that has no clock of its own; `additive` = True: what
       it does is a sum over its parameters, in proportion to each one's distance from neutral;
+    - `takes(model, channel) -> tuple[str, ...]`: names of the parameters that it has there (default: all);
+    - `frame(model, channel) -> str` (stage `step`): "body" if it changes the motion of the body (it then applies before a pose is
+      integrated along it), "world" if it adds to the motion along the world's axes (it then applies after that);
+    - `integrates(p) -> str`: it is the scheme by which a pose is integrated; effects see it as the `integration` of their model;
+    - `pushes(model, channel) -> bool`, `push(x, axis, model, channel, p) -> Push | None` and `varies`: it is a force on an axis
+      (`models.forces`). A model solves for all its forces together, and does not call `after_step`;
     - `side_by_side` = True: `input_sequence` also takes u (T, runs, nu), many short runs at once;
     - `within_step(dt, p) -> bool`: whether what acts changes within a step although the input is held over it;
     - `reads(model, channel) -> tuple[str, ...]`: inputs besides the channel on which what acts there depends;

@@ -29,6 +29,10 @@ class IntegrationScheme:
         """Models that say that they move a pose by Euler."""
         return ("*",) if getattr(model, "integration", "") == "euler" else ()
 
+    def integrates(self, p: Values) -> str:
+        """The scheme."""
+        return str(p["scheme"])
+
     def unit(self, model: NominalModel, channel: str, parameter: str) -> str:
         """None."""
         return ""

@@ -6,6 +6,10 @@ x: (n, nx), u: (n, nu), angles wrapped to (-pi, pi]. h: effects of stage `sensor
 state on both sides. The hidden state is a tuple of one array an effect, (n, nh); at rest it is what a long time at zero input
 leaves (a campaign's full stop).
 
+Effects of stage `step` apply in this order, and within it as listed: what changes the motion of the body (`frame` says so); all others (the
+scheme by which a pose is integrated among them); what adds to the motion along the world's axes; and last, all together, the forces on axes
+(`push`): dry friction holds against the sum of all that pulls.
+
 u_act is the input's mean over the step. Where a nominal model says that a state is set to an input at once (`reached`: a wheel's
 speed, a car's speed), that state is the input as it acts at the end of the step. What an effect makes of a held input may change within
 the step (`within_step`: a lag, a delay by a part of a step). Where that meets such a state, or a later effect that is not linear,
@@ -15,7 +19,7 @@ the effects are run in SUBSTEPS parts of the step, of which the last one stands 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -26,9 +30,10 @@ from numpy.typing import NDArray
 
 from s2r_runtime.canonical import digest
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.hookspecs import Effect, NominalModel
+from s2r_runtime.hookspecs import Effect, NominalModel, Parameter
 from s2r_runtime.models.bound import BoundModel, bind
 from s2r_runtime.models.file_model import load_file_model
+from s2r_runtime.models.forces import Pushing, pushed
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 
@@ -37,6 +42,9 @@ Hidden = tuple[Array, ...]
 
 SUBSTEPS = 5
 """Parts of a step where one is not enough: its end is then known to a tenth of a step."""
+
+FRAMES = ("body", "", "world")
+"""Where an effect on the step acts, in the order in which they apply."""
 
 SETTLE_STEPS = 20_000
 """Steps after which an effect that is fed a constant counts as settled, whatever it does."""
@@ -97,7 +105,7 @@ class ComposedModel:
     @cached_property
     def substeps(self) -> int:
         """Parts of a step in which the effects of stage `input` are run: 1 where that is exact."""
-        chain = [a for a in self.effects if a.effect.stage == "input"]
+        chain = [a for a in self.effects if a.effect.stage == "input" and not self._pushes(a)]
         moving = [i for i, a in enumerate(chain) if getattr(a.effect, "within_step", _never)(self.dt, a.p)]
         if not moving:
             return 1
@@ -145,18 +153,42 @@ class ComposedModel:
 
     def advance(self, x: Array, mean: Array, end: Array) -> Array:
         """x one step later under an input that acts as `act` says; angles are not wrapped."""
+        given = self._given
         for a in reversed(self._sensors):
-            x = a.effect.to_true(x, self.nominal, a.channel, a.p)
+            x = a.effect.to_true(x, given, a.channel, a.p)
         x_next = self.nominal.step(x, mean, self.dt, self.parameters)
         if end is not mean:
             for state, name in getattr(self.nominal, "reached", {}).items():
                 x_next[:, self.states.index(state)] = end[:, self.inputs.index(name)]
-        for a in self.effects:
-            if a.effect.stage == "step":
-                x_next = a.effect.after_step(x, mean, x_next, self.nominal, a.channel, self.dt, a.p)
+        for a in self._after:
+            x_next = a.effect.after_step(x, mean, x_next, given, a.channel, self.dt, a.p)
+        if self._forces:
+            x_next = pushed(x, x_next, given, self._forces, self.dt)
         for a in self._sensors:
-            x_next = a.effect.to_measured(x_next, self.nominal, a.channel, a.p)
+            x_next = a.effect.to_measured(x_next, given, a.channel, a.p)
         return x_next
+
+    @cached_property
+    def _given(self) -> BoundModel:
+        """What effects on the step are given: they see the scheme by which the pose is integrated."""
+        schemes = [a.effect.integrates(a.p) for a in self.effects if hasattr(a.effect, "integrates")]
+        return replace(self.nominal, integration=schemes[-1]) if schemes else self.nominal
+
+    def _pushes(self, a: AppliedEffect) -> bool:
+        pushes = getattr(a.effect, "pushes", None)
+        return pushes is not None and bool(pushes(self.nominal, a.channel))
+
+    @cached_property
+    def _forces(self) -> tuple[Pushing, ...]:
+        return tuple((a.effect, a.channel, a.p) for a in self.effects if self._pushes(a))
+
+    @cached_property
+    def _after(self) -> tuple[AppliedEffect, ...]:
+        """Effects of stage `step` that are no forces, in the order in which they apply."""
+        those = [a for a in self.effects if a.effect.stage == "step" and not self._pushes(a)]
+        return tuple(
+            sorted(those, key=lambda a: FRAMES.index(a.effect.frame(self.nominal, a.channel) if hasattr(a.effect, "frame") else ""))
+        )
 
     @cached_property
     def _sensors(self) -> tuple[AppliedEffect, ...]:
@@ -224,11 +256,15 @@ def _words(effect: Effect, channel: str, nominal: NominalModel, parameter: str) 
 
 def _effect_parameters(effect: Effect, entry: EffectSpec, nominal: NominalModel, where: str) -> dict[str, Any]:
     given: dict[str, Any] = entry.parameters
-    known = {p.name: p for p in effect.parameters}
+    takes = effect.takes(nominal, entry.channel) if hasattr(effect, "takes") else [p.name for p in effect.parameters]
+    known = {p.name: p for p in effect.parameters if p.name in takes}
     for name, value in given.items():
         if name not in known:
             raise ConfigError(f"{where}: has no parameter {name!r}; it has: {', '.join(known)}")
         bounds = known[name]
+        if bounds.shape or isinstance(value, list):
+            _check_matrix(value, bounds, where)
+            continue
         allowed = _words(effect, entry.channel, nominal, name)
         if allowed is not None and value not in allowed:
             raise ConfigError(f"{where}: {name} is {value!r}, must be one of: {', '.join(allowed)}")
@@ -242,6 +278,17 @@ def _effect_parameters(effect: Effect, entry: EffectSpec, nominal: NominalModel,
     if wrong := getattr(effect, "wrong", lambda p: "")(given):
         raise ConfigError(f"{where}: {wrong}")
     return dict(given)
+
+
+def _check_matrix(value: object, bounds: Parameter, where: str) -> None:
+    """Raises ConfigError unless the value has the parameter's shape, and its entries are within bounds."""
+    rows, columns = bounds.shape or (0, 0)
+    if not rows:
+        raise ConfigError(f"{where}: {bounds.name} is {value!r}, must be a number")
+    if not isinstance(value, list) or len(value) != rows or any(len(row) != columns for row in value):
+        raise ConfigError(f"{where}: {bounds.name} is {value!r}, must be {rows} rows of {columns} numbers")
+    if outside := [v for row in value for v in row if not bounds.low <= v <= bounds.high]:
+        raise ConfigError(f"{where}: {bounds.name} has {outside[0]}, must be in [{bounds.low}, {bounds.high}] {bounds.unit}")
 
 
 def resolve_source(spec: ModelSpec, base: Path) -> ModelSpec:

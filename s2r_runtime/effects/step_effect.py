@@ -1,0 +1,119 @@
+"""What effects of stage `step` and `sensor` have in common.
+
+`StepEffect` changes the result of the nominal step: override `after_step`. `ForceEffect` acts on an axis (a position and its rate), with
+all other forces of the model (`s2r_runtime.models.forces`): override `push`. `SensorEffect` stands between the true and the measured
+state: override `to_true` and `to_measured`. Third parties may build on these or on nothing at all: the interface is
+`s2r_runtime.hookspecs.Effect`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.hookspecs import NominalModel, Parameter
+from s2r_runtime.models.forces import Axis, Push, axes, mass_name, pushed
+
+Array = NDArray[np.float64]
+Values = dict[str, Any]
+
+POSE = {"x", "y", "theta"}
+
+
+class StepEffect:
+    """No hidden state; inputs pass."""
+
+    name = ""
+    stage = "step"
+    parameters: tuple[Parameter, ...] = ()
+
+    def channels(self, model: NominalModel) -> tuple[str, ...]:
+        """`*` on planar poses."""
+        return ("*",) if has_pose(model) else ()
+
+    def unit(self, model: NominalModel, channel: str, parameter: str) -> str:
+        """SI unit as declared."""
+        return next(p.unit for p in self.parameters if p.name == parameter)
+
+    def hidden(self, n: int, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+        """None: (n, 0)."""
+        return np.zeros((n, 0))
+
+    def input_step(self, u: Array, z: Array, model: NominalModel, channel: str, dt: float, p: Values) -> tuple[Array, Array]:
+        """Not of stage `input`."""
+        return u, z
+
+    def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+        """Not of stage `input`."""
+        return u
+
+    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+        """Nothing changes."""
+        return x_next
+
+
+class ForceEffect(StepEffect):
+    """Acts on axes by a `push`. varies: whether the push depends on the state."""
+
+    varies = False
+
+    def channels(self, model: NominalModel) -> tuple[str, ...]:
+        """The velocities of all axes."""
+        return tuple(model.states[axis.velocity] for axis in axes(model))
+
+    def pushes(self, model: NominalModel, channel: str) -> bool:
+        """Whether it acts by `push` there."""
+        return bool(axes(model))
+
+    def push(self, x: Array, axis: Axis, model: NominalModel, channel: str, p: Values) -> Push | None:
+        """What it adds on this axis at x (n, nx), accelerations; None where it does not act."""
+        return None
+
+    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+        """The step with this force alone."""
+        return pushed(x, x_next, model, [(self, channel, p)], dt) if self.pushes(model, channel) else x_next
+
+
+class SensorEffect(StepEffect):
+    """measured = true + offset(true)."""
+
+    stage = "sensor"
+
+    def to_true(self, x: Array, model: NominalModel, channel: str, p: Values) -> Array:
+        """Measured (n, nx) -> true."""
+        return x
+
+    def to_measured(self, x: Array, model: NominalModel, channel: str, p: Values) -> Array:
+        """True (n, nx) -> measured."""
+        return x
+
+
+def has_pose(model: NominalModel) -> bool:
+    """Whether it has a position in the plane and a heading."""
+    return {*model.states} >= POSE
+
+
+def force_unit(model: NominalModel) -> str:
+    """Of what acts on an axis: the input's where it is divided by a mass, an acceleration otherwise."""
+    units: dict[str, str] = getattr(model, "units", {})
+    if not mass_name(model):
+        return "m/s²"
+    return units.get(model.inputs[0], "N m" if mass_name(model) == "inertia" else "N")
+
+
+def length_unit(model: NominalModel, axis: Axis) -> str:
+    """Of an axis' position."""
+    units: dict[str, str] = getattr(model, "units", {})
+    return units.get(model.states[axis.position], "rad" if mass_name(model) == "inertia" else "m")
+
+
+def axis_of(model: NominalModel, channel: str) -> Axis | None:
+    """The axis whose position or velocity the channel is."""
+    return next((axis for axis in axes(model) if channel in {model.states[axis.velocity], model.states[axis.position]}), None)
+
+
+def size_of(u: Array) -> float:
+    """Root mean square of the inputs, (T, nu); 1 if they are zero."""
+    return float(np.sqrt(np.mean(u * u))) if np.any(u) else 1.0
