@@ -126,6 +126,12 @@ class Child:
             return "no longer answers"
         return f"killed by signal {-code}" if code < 0 else f"exit code {code}"
 
+    def signal(self, number: signal.Signals) -> None:
+        """To the process and all that it started; one that is gone doesn't mind."""
+        if self._process.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self._process.pid, number)
+
     def stop(self) -> None:
         """Kills it if it still runs, and frees everything; may be called twice."""
         self._ended = True

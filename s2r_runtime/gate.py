@@ -136,7 +136,7 @@ def decide(settings: Settings, situation: Situation, command: Command, now_ns: i
             return _refuse("settling", (now_ns - situation.clear_since_ns - settings.hysteresis_ns) * 1e-9)
     bounds = settings.region if command.source == "controller" else settings.geofence
     x = situation.observation.x if situation.observation is not None else ()
-    return Verdict(allow=True, reason=ALLOWED, margin=_inside(settings, x, bounds))
+    return Verdict(allow=True, reason=ALLOWED, margin=inside(settings, x, bounds))
 
 
 def standing(settings: Settings, situation: Situation, source: Source, now_ns: int) -> Verdict | None:
@@ -233,7 +233,7 @@ def _about_observation(settings: Settings, s: Situation, source: Source, now_ns:
     if not 0 <= age_ns <= settings.observation_timeout_ns:
         return _refuse("observation_stale", (settings.observation_timeout_ns - age_ns) * 1e-9 if age_ns > 0 else age_ns * 1e-9)
     bounds, reason = (settings.region, "outside_region") if source == "controller" else (settings.geofence, "outside_geofence")
-    margin = _inside(settings, observation.x, bounds)
+    margin = inside(settings, observation.x, bounds)
     return None if margin >= 0.0 else _refuse(reason, margin)
 
 
@@ -253,7 +253,7 @@ def _about_command(settings: Settings, s: Situation, command: Command, now_ns: i
     return None
 
 
-def _inside(settings: Settings, x: tuple[float, ...], bounds: tuple[tuple[float, float], ...]) -> float:
+def inside(settings: Settings, x: tuple[float, ...], bounds: tuple[tuple[float, float], ...]) -> float:
     """Least distance of a state from its bounds, negative outside. An angle is measured from the middle of its bounds, wrapped;
     bounds a circle apart are none.
     """

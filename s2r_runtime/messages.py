@@ -14,6 +14,8 @@ from typing import Literal
 import msgspec
 
 Source = Literal["controller", "sampler", "recovery", "external"]
+Stretch = Literal["campaign", "drive", "inputs"]
+"""What a trace is made on: the newest campaign; what controllers drove since its gap came into force; the newest drive of given inputs."""
 
 
 class Struct(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -173,6 +175,14 @@ class Settings(Struct, frozen=True):
     seed: int
     campaign_timeout_s: float = 0.0
     trace_after_campaign: bool = False
+    trace_after_inputs: bool = False
+    trace_on_growth: bool = False
+    trace_delay_ns: int = 10_000_000_000
+    """How long is driven on, after the gap grew, before that is traced."""
+    trace_rows: int = 40_000
+    """Observations that a trace is made on at most, the newest."""
+    adopt: Literal["ask", "always"] = "ask"
+    """Whose decision it is to use a proposed model: a person's, or the profile's."""
     required_laws: tuple[str, ...] = ()
     """Disturbance laws that must pass (guarantee G8); empty: not said, the verification's own word counts."""
     campaign_digest: str = ""
@@ -181,6 +191,19 @@ class Settings(Struct, frozen=True):
 
 MEMORY_SCHEMA = 1
 """Of `Memory`: a memory of another schema is refused."""
+
+
+class Proposal(Struct, frozen=True):
+    """A repaired model that tracing proposes. `digest`: its; `base`: of the model in whose residual the effects were found.
+
+    `stretch`, `epoch`: what it was traced on; `effects`: in words.
+    """
+
+    digest: str
+    base: str
+    stretch: Stretch
+    epoch: int
+    effects: tuple[str, ...] = ()
 
 
 class Memory(Struct, frozen=True):
@@ -210,6 +233,8 @@ class Memory(Struct, frozen=True):
     """Where the watch of this epoch stood when the memory was last written, so that a restart forgives nothing."""
     traced: bool = False
     """An effect was traced in the residual and no model that has it was adopted since (guarantee G8)."""
+    proposal: Proposal | None = None
+    """The newest repaired model that waits to be adopted."""
 
 
 # ---------------------------------------------------------------- events: into the core
@@ -354,8 +379,18 @@ class CampaignFinished(Struct, frozen=True, tag="campaign_finished"):
     detail: str = ""
 
 
+class InputsFinished(Struct, frozen=True, tag="inputs_finished"):
+    """Given inputs were driven, `n` rows of them; `complete` iff that is all. They were chosen, so they found no gap."""
+
+    t_ns: int
+    digest: str
+    n: int
+    complete: bool
+    detail: str = ""
+
+
 class JobFinished(Struct, frozen=True, tag="job_finished"):
-    """A worker's result: exactly one of gap, verification, trace is there unless `error` is not empty."""
+    """A worker's result: exactly one of gap, verification, trace is there unless `error` is not empty. trace: docs/log-format.md."""
 
     t_ns: int
     job_id: int
@@ -403,12 +438,13 @@ class Requested(Struct, frozen=True, tag="requested"):
     """An operator's decision, from the control socket. `by`: user id of the peer. Unused fields are at their defaults.
 
     deploy: `digest` of the controller that was loaded for it. adopt: `digest` of the model. revoke: `text` a certificate
-    id, or empty for all. clear: `text` the reason. permit: `duration_s`. sample: `count` (0: the profile's).
+    id, or empty for all. clear: `text` the reason. permit: `duration_s`. sample: `count` (0: the profile's). excite: `digest` of the
+    inputs, `count` their rows. trace: `text` a stretch (empty: campaign).
     """
 
     t_ns: int
     request_id: int
-    verb: Literal["deploy", "undeploy", "revoke", "adopt", "clear", "stop", "permit", "sample", "cancel", "trace", "verify"]
+    verb: Literal["deploy", "undeploy", "revoke", "adopt", "clear", "stop", "permit", "sample", "cancel", "trace", "verify", "excite"]
     by: int
     digest: str = ""
     text: str = ""
@@ -418,8 +454,8 @@ class Requested(Struct, frozen=True, tag="requested"):
 
 Event = (
     Started | Observed | Proposed | Ticked | WallClockRead | LinkChanged | RecorderChanged | AnalyticsChanged | OverrideChanged | Measured
-    | EpisodeEnded | SourceStarted | SourceStopped | SampleTaken | CampaignFinished | JobFinished | CertificateStored | CertificateFailed
-    | Requested | Stopping
+    | EpisodeEnded | SourceStarted | SourceStopped | SampleTaken | CampaignFinished | InputsFinished | JobFinished | CertificateStored
+    | CertificateFailed | Requested | Stopping
 )  # fmt: skip
 
 
@@ -454,7 +490,17 @@ class StartCampaign(Struct, frozen=True, tag="start_campaign"):
     resume: bool
 
 
+class StartInputs(Struct, frozen=True, tag="start_inputs"):
+    """The sampler is to drive the inputs of this digest, `n` rows, one a control instant. They are attached to the log."""
+
+    t_ns: int
+    digest: str
+    n: int
+
+
 class StopCampaign(Struct, frozen=True, tag="stop_campaign"):
+    """The sampler is to stop: a campaign, or given inputs."""
+
     t_ns: int
     reason: str
 
@@ -474,7 +520,8 @@ class StartJob(Struct, frozen=True, tag="start_job"):
     """What the worker is to do.
 
     gap: of campaign `epoch` at `beta`. verify: controller `digest` at `radius`, `hold_radius`, attempt, seed, `beta`.
-    trace: of `epoch`.
+    trace: the residual of the model `digest` in the newest `rows` observations of `stretch` before this record; `epoch`: of the gap then
+    in force (0: none).
     """
 
     t_ns: int
@@ -487,6 +534,8 @@ class StartJob(Struct, frozen=True, tag="start_job"):
     attempt: int = 0
     seed: int = 0
     beta: float = 0.0
+    stretch: Literal["", "campaign", "drive", "inputs"] = ""
+    rows: int = 0
 
 
 class IssueCertificate(Struct, frozen=True, tag="issue_certificate"):
@@ -591,17 +640,36 @@ class Revoked(Struct, frozen=True, tag="revoked"):
     reason: str
 
 
+class TraceEnded(Struct, frozen=True, tag="trace_ended"):
+    """A trace is over: its verdict, or the reason why there is none. `proposal`: digest of the model that is proposed, or empty."""
+
+    t_ns: int
+    job_id: int
+    stretch: Stretch
+    epoch: int
+    verdict: str
+    reason: str = ""
+    proposal: str = ""
+
+
 class ModelAdopted(Struct, frozen=True, tag="model_adopted"):
+    """This model is in force, without a gap until a fresh campaign. `by`: the user who decided it; -1: the profile (`repair.adopt`).
+
+    `proposed`: it is the model that tracing proposed.
+    """
+
     t_ns: int
     digest: str
     by: int
+    proposed: bool = False
 
 
 Action = (
-    Ask | Send | StartCampaign | StopCampaign | StartController | StopController | StartJob | IssueCertificate | Persist | Answer
+    Ask | Send | StartCampaign | StartInputs | StopCampaign | StartController | StopController | StartJob | IssueCertificate | Persist
+    | Answer
 )  # fmt: skip
 Record = (
     Decided | GateChanged | EpochChanged | AttemptSpent | AttemptEnded | RadiusGrew | AlarmRaised | CertificateInstalled | Revoked
-    | ModelAdopted
+    | TraceEnded | ModelAdopted
 )  # fmt: skip
 Output = Action | Record

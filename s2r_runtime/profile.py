@@ -143,9 +143,19 @@ class Recording(_Table, frozen=True):
 
 
 class Repair(_Table, frozen=True):
-    """`after_campaign`: trace the residual when a campaign ends. Adopting a repaired model is always a person's decision."""
+    """When the residual is traced without being asked for: after a campaign, after given inputs, or `delay` s after the gap grew while a
+    controller drives. `rows`: observations at most, the newest. `timeout` in s.
+
+    `adopt`: a repaired model is used when a person says so (`ask`), or as soon as nothing drives (`always`).
+    """
 
     after_campaign: bool = False
+    after_inputs: bool = False
+    on_growth: bool = False
+    delay: float = 10.0
+    rows: int = 40_000
+    timeout: float = 600.0
+    adopt: Literal["ask", "always"] = "ask"
 
 
 class Profile(_Table, frozen=True):
@@ -388,6 +398,9 @@ def _checks(p: Profile) -> list[tuple[str, object, str]]:
             reason in REASONS, "gate.latching", repr(reason), "one of the gate's reasons" + (f"; did you mean {near[0]!r}?" if near else "")
         )
     need(p.certificate.lifetime >= 1.0, "certificate.lifetime", p.certificate.lifetime, ">= 1 s")
+    need(0.0 <= p.repair.delay < math.inf, "repair.delay", p.repair.delay, ">= 0 s")
+    need(p.repair.rows >= 100, "repair.rows", p.repair.rows, ">= 100 (a trace needs some dozens of transitions)")
+    need(0.0 < p.repair.timeout < math.inf, "repair.timeout", p.repair.timeout, "> 0 s")
     need(p.task.episodes >= 0, "task.episodes", p.task.episodes, ">= 0 (0: no end)")
     need(p.watch.fault_jump >= 0.0, "watch.fault_jump", p.watch.fault_jump, ">= 0 (0: no such rule)")
     need(isinstance(p.transport.get("name"), str), "transport.name", p.transport.get("name"), "the name of a transport")

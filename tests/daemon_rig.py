@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +20,7 @@ from s2r_runtime import certificate, keys
 from s2r_runtime.controllers.file import load
 from s2r_runtime.core.ledger import campaign_size, sample_size, share
 from s2r_runtime.daemon import control
+from s2r_runtime.errors import S2RError
 from s2r_runtime.messages import Gap, LawResult, Struct, Verification
 from s2r_runtime.profile import load_profile
 from s2r_runtime.recording.reading import read
@@ -150,6 +153,34 @@ class Rig:
 
     def ask(self, verb: str, heard: list[dict[str, Any]] | None = None, **fields: Any) -> dict[str, Any]:
         return control.call(self.socket, {"verb": verb, **fields}, heard.append if heard is not None else None)
+
+    def background(self, verb: str, **fields: Any) -> Callable[[], dict[str, Any]]:
+        """A request whose answer is waited for later, by calling what this gives."""
+        kept: list[dict[str, Any]] = []
+        thread = threading.Thread(target=lambda: kept.append(self._quietly(verb, fields)), daemon=True)
+        thread.start()
+
+        def answer() -> dict[str, Any]:
+            thread.join(WITHIN_S)
+            return kept[0]
+
+        return answer
+
+    def _quietly(self, verb: str, fields: dict[str, Any]) -> dict[str, Any]:
+        try:
+            return self.ask(verb, **fields)
+        except S2RError as error:  # the daemon ended first
+            return {"exit_code": error.exit_code, "text": str(error)}
+
+    def children(self, module: str) -> list[int]:
+        """Processes of the daemon that run this module."""
+        assert self.daemon is not None
+        found = []
+        for pid in Path(f"/proc/{self.daemon.pid}/task/{self.daemon.pid}/children").read_text().split():
+            with contextlib.suppress(OSError):
+                if module.encode() in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"):
+                    found.append(int(pid))
+        return found
 
     def status(self) -> dict[str, Any]:
         return dict(self.ask("status")["data"])

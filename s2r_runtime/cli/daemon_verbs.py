@@ -37,7 +37,13 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         metavar="S",
         help="without a daemon: for how many seconds the robot may be driven (default 3600). Running this verb is the permit",
     )
-    sample.add_argument("--cancel", action="store_true", help="stop the running daemon's campaign")
+    sample.add_argument("--cancel", action="store_true", help="stop the running daemon's campaign, or the given inputs that it drives")
+    sample.add_argument(
+        "--inputs",
+        type=Path,
+        metavar="FILE.csv",
+        help="drive these inputs instead, through the running daemon: for s2r trace --live inputs; no campaign, so no gap",
+    )
     _common(sample)
     sample.set_defaults(run=run_sample)
 
@@ -55,7 +61,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     revoke.set_defaults(run=lambda a: _say(a, {"verb": "revoke", "text": a.certificate}))
 
     adopt = _talker(verbs, "adopt", "use this model from now on; voids the gap, so a fresh campaign comes next")
-    adopt.add_argument("model", type=Path, metavar="MODEL.toml")
+    adopt.add_argument("model", type=Path, nargs="?", metavar="MODEL.toml", help="default: the model that tracing proposes (s2r status)")
     adopt.set_defaults(run=run_adopt)
 
     clear = _talker(verbs, "clear", "clear a latched reason, after looking into it")
@@ -79,9 +85,14 @@ def _talker(verbs: argparse._SubParsersAction[argparse.ArgumentParser], name: st
     return verb
 
 
-def _common(verb: argparse.ArgumentParser) -> None:
+def add_daemon_options(verb: argparse.ArgumentParser) -> None:
+    """Which daemon is meant."""
     verb.add_argument("--robot", metavar="NAME", help="which robot, if several daemons run here")
     verb.add_argument("--socket", type=Path, metavar="PATH", help="the daemon's control socket, if it is not in the usual place")
+
+
+def _common(verb: argparse.ArgumentParser) -> None:
+    add_daemon_options(verb)
     verb.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -107,7 +118,7 @@ def run_daemon(args: argparse.Namespace) -> int:
 
 
 def run_sample(args: argparse.Namespace) -> int:
-    """Exit 0 if the campaign is complete."""
+    """Exit 0 if the campaign is complete, or all of the given inputs were driven."""
     from s2r_runtime.daemon import control
     from s2r_runtime.profile import load_profile
 
@@ -118,7 +129,14 @@ def run_sample(args: argparse.Namespace) -> int:
             raise UsageError(
                 f"-o: robot {profile.robot.name!r} has a running daemon, which records the campaign in its own log; leave -o out"
             )
-        return _say(args, {"verb": "cancel"} if args.cancel else {"verb": "sample", "count": args.n}, socket)
+        if args.inputs and (args.cancel or args.n):
+            raise UsageError("--inputs: drives what is in the file; leave -n and --cancel out")
+        if args.inputs and not args.inputs.is_file():
+            raise UsageError(f"--inputs {args.inputs}: no such file; s2r trace --suggest writes one")
+        request = {"verb": "excite", "path": str(args.inputs.resolve())} if args.inputs else {"verb": "sample", "count": args.n}
+        return _say(args, {"verb": "cancel"} if args.cancel else request, socket)
+    if args.inputs:
+        raise UsageError(f"--inputs: no daemon of robot {profile.robot.name!r} is running; start one: s2r run {args.profile}")
     if args.cancel:
         raise UsageError(f"--cancel: no daemon of robot {profile.robot.name!r} is running")
     from s2r_runtime.daemon.campaign_run import run_campaign
@@ -155,8 +173,23 @@ def run_adopt(args: argparse.Namespace) -> int:
     """Exit 0 if the model is in force."""
     from s2r_runtime.modelspec import load_model
 
+    if args.model is None:
+        return _say(args, {"verb": "adopt"})
     load_model(args.model)
     return _say(args, {"verb": "adopt", "text": args.model.read_text(encoding="utf-8"), "base": str(args.model.resolve().parent)})
+
+
+def run_live_trace(args: argparse.Namespace) -> int:
+    """Exit 0 with any verdict, 1 if there is none, 3 if there is nothing to trace."""
+    answer = _call(args, {"verb": "trace", "text": args.live})
+    found = answer.get("data")
+    if args.json:
+        output.result_json(answer if answer["exit_code"] or not found else found)
+    elif answer["exit_code"]:
+        output.err(f"s2r: {answer['text']}")
+    else:
+        output.out(f"{answer['text']}\n{(found or {}).get('text', '')}")
+    return int(answer["exit_code"])
 
 
 def run_status(args: argparse.Namespace) -> int:

@@ -62,7 +62,7 @@ def begin_campaign(turn: Turn, count: int, request_id: int) -> None:
 def campaign_finished(turn: Turn, event: CampaignFinished) -> None:
     """All samples are there: the gap is computed. Or they are not: the epoch stays begun, and a person may go on with it."""
     campaign, asked = turn.state.campaign, turn.state.asked
-    if campaign is None or event.epoch != campaign.epoch:
+    if campaign is None or campaign.inputs or event.epoch != campaign.epoch:
         return
     turn.set(campaign=None)
     if asked is not None and asked.source == "sampler":
@@ -78,25 +78,6 @@ def campaign_finished(turn: Turn, event: CampaignFinished) -> None:
     turn.answer(one.request_id, 0, f"{campaign.n} samples taken; computing the gap", final=False)
 
 
-def begin_trace(turn: Turn, gap: Gap, request_id: int) -> None:
-    """Traces the residual of the campaign behind this gap."""
-    one = Job(turn.state.next_job, "trace", request_id, gap.epoch)
-    turn.add_job(one)
-    turn.emit(StartJob(turn.now, one.id, "trace", epoch=one.epoch))
-
-
-def trace_finished(turn: Turn, done: Job, event: JobFinished) -> None:
-    """What the tracer says is a finding for a person to act on; here it only counts that an effect is known and not adopted."""
-    verdict = event.trace.get("verdict") if event.trace is not None else None
-    if event.error or not isinstance(verdict, str):
-        turn.answer(done.request_id, 1, f"no trace: {event.error or 'the worker returned none'}")
-        return
-    gap = turn.memory.gap
-    if verdict in ("traced", "ambiguous") and gap is not None and gap.epoch == done.epoch and not turn.memory.traced:
-        turn.remember(traced=True)
-    turn.answer(done.request_id, 0, f"residual of epoch {done.epoch} traced: {verdict}")
-
-
 # ---------------------------------------------------------------- the gap in force
 
 
@@ -110,8 +91,6 @@ def gap_finished(turn: Turn, done: Job, event: JobFinished) -> None:
     turn.remember(campaign_epoch=0, campaign_n=0, traced=False)
     _enforce(turn, gap)
     turn.answer(done.request_id, 0, f"gap of epoch {gap.epoch}: {gap.radius:.6g} at epsilon {gap.epsilon:g}, from {gap.n} samples")
-    if turn.settings.trace_after_campaign and job(turn.state, "trace") is None:
-        begin_trace(turn, gap, 0)
 
 
 def _gap_problem(turn: Turn, gap: Gap, epoch: int) -> str:

@@ -11,16 +11,16 @@ before they matter, while closing acts first and is logged next. Every `Ask` is 
 `SourceStopped` of that source. A `Send` of the recovery command while a campaign runs means that another input than the
 campaign's acted: the campaign must be told. Everything that happens comes as an event, in the order in which it is logged.
 
-The parts: `core_state` (the state), `core_drive` (instants, sends, the gate opening and closing), `core_sources` (who may command),
-`core_gaps` (campaigns, gap, watch), `core_certificates` (attempts, certificates), `core_requests` (what a person asks for), `gate` (the
-verdict on a command), `ledger` (what is spent).
+The parts: `state`, `drive` (instants, sends, the gate opening and closing), `sources` (who may command), `gaps` (campaigns, gap, watch),
+`excitation` (given inputs), `repair` (traces, proposed models), `certificates` (attempts, certificates), `requests` (what a person asks
+for), `gate` (the verdict on a command), `ledger` (what is spent).
 """
 
 from __future__ import annotations
 
 import msgspec
 
-from s2r_runtime.core import certificates, drive, gaps, ledger, sources
+from s2r_runtime.core import certificates, drive, excitation, gaps, ledger, repair, sources
 from s2r_runtime.core.requests import requested
 from s2r_runtime.core.state import NANO, State, Turn, certificate, unix_now
 from s2r_runtime.messages import (
@@ -32,6 +32,7 @@ from s2r_runtime.messages import (
     CertificateStored,
     EpisodeEnded,
     Event,
+    InputsFinished,
     JobFinished,
     LinkChanged,
     Measured,
@@ -68,6 +69,8 @@ def handle(state: State, event: Event) -> tuple[State, tuple[Output, ...]]:
     turn.set(now_ns=event.t_ns)
     _dispatch(turn, event)
     sources.check_campaign(turn)
+    excitation.follow_inputs(turn, event)
+    repair.follow(turn, event)
     drive.wake(turn)
     turn.persist()
     return turn.state, tuple(turn.outputs)
@@ -97,7 +100,7 @@ def _started(state: State, event: Started) -> tuple[State, tuple[Output, ...]]:
         if memory.model_digest != settings.model_digest:
             if memory.model_digest:
                 gaps.void_gap(turn, "model_changed")
-            turn.remember(model_digest=settings.model_digest)
+            turn.remember(model_digest=settings.model_digest, proposal=None)
         if memory.campaign_digest != settings.campaign_digest:
             if memory.campaign_digest:
                 gaps.void_gap(turn, "profile_changed")
@@ -144,12 +147,14 @@ def _noted(turn: Turn, event: Event) -> None:
             turn.set(analytics_up=event.up)
         case SampleTaken():
             campaign = turn.state.campaign
-            if campaign is not None and campaign.epoch == event.epoch:
+            if campaign is not None and not campaign.inputs and campaign.epoch == event.epoch:
                 turn.set(campaign=msgspec.structs.replace(campaign, taken=event.index + 1))
         case EpisodeEnded():
             turn.set(episodes=turn.state.episodes + 1)
         case CampaignFinished():
             gaps.campaign_finished(turn, event)
+        case InputsFinished():
+            excitation.inputs_finished(turn, event)
         case JobFinished():
             _job_finished(turn, event)
         case CertificateStored(gap=None):
@@ -193,7 +198,7 @@ def _job_finished(turn: Turn, event: JobFinished) -> None:
     if done.purpose == "gap":
         gaps.gap_finished(turn, done, event)
     elif done.purpose == "trace":
-        gaps.trace_finished(turn, done, event)
+        repair.trace_finished(turn, done, event)
     else:
         certificates.verification_finished(turn, done, event)
 
@@ -226,13 +231,20 @@ def status(state: State) -> dict[str, object]:
         "latched": list(memory.latched),
         "driving": None if state.sent is None else state.sent.source,
         "campaign": None
-        if campaign is None
+        if campaign is None or campaign.inputs
         else {"epoch": campaign.epoch, "taken": campaign.taken, "n": campaign.n, "running": campaign.running},
+        "inputs": None
+        if campaign is None or not campaign.inputs
+        else {"digest": campaign.inputs, "driven": campaign.taken, "n": campaign.n, "running": campaign.running},
         "unfinished_epoch": memory.campaign_epoch or None,
         "permit_left_s": left_ns / NANO,
         "jobs": [one.purpose for one in state.jobs],
         "measurement_faults": state.faults,
         "episodes": state.episodes,
         "model": memory.model_digest,
+        "proposal": None
+        if memory.proposal is None
+        else {**msgspec.structs.asdict(memory.proposal), "adopt": None if settings is None else settings.adopt},
+        "traced": memory.traced,
         "link": state.link_up,
     }

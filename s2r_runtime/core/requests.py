@@ -13,10 +13,12 @@ import msgspec
 from s2r_runtime import gate
 from s2r_runtime.core.certificates import begin_verification, refusal_to_verify, revoke, start_controller, valid_certificate
 from s2r_runtime.core.drive import recover_now, regate
-from s2r_runtime.core.gaps import begin_campaign, begin_trace, void_gap
-from s2r_runtime.core.sources import check_campaign, end_deployment, stop
-from s2r_runtime.core.state import NANO, VERIFYING, Deployment, Turn, job, situation
-from s2r_runtime.messages import ModelAdopted, Requested, StopCampaign
+from s2r_runtime.core.excitation import begin_inputs
+from s2r_runtime.core.gaps import begin_campaign
+from s2r_runtime.core.repair import requested_adoption, requested_trace
+from s2r_runtime.core.sources import check_campaign, end_deployment, interrupt_campaign, stop
+from s2r_runtime.core.state import NANO, Deployment, Turn, job, situation
+from s2r_runtime.messages import Requested, StopCampaign
 
 LONGEST_PERMIT_S = 86_400.0
 """A permit is a person's presence, given for a limited time; nobody watches a robot for longer than a day."""
@@ -46,7 +48,7 @@ def requested(turn: Turn, request: Requested) -> None:
         case "revoke":
             _revoke(turn, request)
         case "adopt":
-            _adopt(turn, request)
+            requested_adoption(turn, request)
         case "clear":
             _clear(turn, request)
         case "stop":
@@ -57,10 +59,12 @@ def requested(turn: Turn, request: Requested) -> None:
             _permit(turn, request)
         case "sample":
             _sample(turn, request)
+        case "excite":
+            _excite(turn, request)
         case "cancel":
             _cancel(turn, request)
         case "trace":
-            _trace(turn, request)
+            requested_trace(turn, request)
 
 
 def _deploy(turn: Turn, request: Requested) -> None:
@@ -116,25 +120,6 @@ def _revoke(turn: Turn, request: Requested) -> None:
         turn.answer(request.request_id, 2, f"no certificate {request.text}; in force: {', '.join(known) or 'none'}")
 
 
-def _adopt(turn: Turn, request: Requested) -> None:
-    state = turn.state
-    if not request.digest:
-        turn.answer(request.request_id, 2, "adopt needs a model")
-    elif request.digest == turn.memory.model_digest:
-        turn.answer(request.request_id, 0, "this model is in force already")
-    elif state.deployment is not None or state.campaign is not None:
-        turn.answer(request.request_id, 1, "refused: a model is adopted only while nothing drives; undeploy or cancel first")
-    elif job(state, "gap", "trace", *VERIFYING) is not None:
-        turn.answer(request.request_id, 1, "refused: the worker still works with the model in force")
-    else:
-        void_gap(turn, "model_changed")
-        turn.remember(model_digest=request.digest)
-        turn.persist()
-        turn.emit(ModelAdopted(turn.now, request.digest, request.by))
-        regate(turn)
-        turn.answer(request.request_id, 0, "model adopted; its gap is not known yet: s2r sample")
-
-
 def _clear(turn: Turn, request: Requested) -> None:
     reason, latched = request.text.removeprefix("latched:"), turn.memory.latched
     if reason not in latched:
@@ -163,24 +148,43 @@ def _permit(turn: Turn, request: Requested) -> None:
 
 
 def _sample(turn: Turn, request: Requested) -> None:
+    if request.count < 0:
+        turn.answer(request.request_id, 2, f"{request.count} samples make no campaign")
+    elif _sampler_may_drive(turn, request):
+        begin_campaign(turn, request.count, request.request_id)
+
+
+def _excite(turn: Turn, request: Requested) -> None:
+    if not request.digest or request.count < 1:
+        turn.answer(request.request_id, 2, "there are no inputs to drive")
+    elif _sampler_may_drive(turn, request):
+        begin_inputs(turn, request.digest, request.count, request.request_id)
+
+
+def _sampler_may_drive(turn: Turn, request: Requested) -> bool:
+    """Whether nothing stands against the sampler; if something does, that is the answer."""
     state = turn.state
     ready = msgspec.structs.replace(situation(state), campaign_running=True)
     refusal = gate.standing(turn.settings, ready, "sampler", turn.now)
     if state.campaign is not None or job(state, "gap") is not None:
-        turn.answer(request.request_id, 2, "a campaign is under way already")
+        what = "inputs are being driven" if state.campaign is not None and state.campaign.inputs else "a campaign is under way"
+        turn.answer(request.request_id, 2, f"{what} already")
     elif state.deployment is not None:
         turn.answer(request.request_id, 1, "refused: a controller is deployed; undeploy it first")
-    elif request.count < 0:
-        turn.answer(request.request_id, 2, f"{request.count} samples make no campaign")
     elif refusal is not None:
         hint = HINTS.get(refusal.reason.removeprefix("latched:"), "")
         turn.answer(request.request_id, 1, f"refused: {refusal.reason}" + (f": {hint}" if hint else ""))
     else:
-        begin_campaign(turn, request.count, request.request_id)
+        return True
+    return False
 
 
 def _cancel(turn: Turn, request: Requested) -> None:
     campaign, asked, epoch = turn.state.campaign, turn.state.asked, turn.memory.campaign_epoch
+    if campaign is not None and campaign.inputs:
+        interrupt_campaign(turn, "cancelled")
+        turn.answer(request.request_id, 0, f"inputs cancelled after {campaign.taken} of {campaign.n} rows")
+        return
     if job(turn.state, "gap") is not None or not epoch:
         turn.answer(request.request_id, 2, "there is no campaign to cancel")
         return
@@ -193,13 +197,3 @@ def _cancel(turn: Turn, request: Requested) -> None:
     turn.remember(campaign_epoch=0, campaign_n=0)
     turn.persist()
     turn.answer(request.request_id, 0, f"campaign of epoch {epoch} cancelled; its share of beta is spent")
-
-
-def _trace(turn: Turn, request: Requested) -> None:
-    gap = turn.memory.gap
-    if gap is None:
-        turn.answer(request.request_id, 3, "there is no finished campaign to trace; sample first: s2r sample")
-    elif job(turn.state, "trace") is not None:
-        turn.answer(request.request_id, 2, "the residual is being traced already")
-    else:
-        begin_trace(turn, gap, request.request_id)

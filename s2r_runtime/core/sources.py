@@ -57,7 +57,7 @@ def fail_controller(turn: Turn, reason: str, detail: str, *, tell: bool) -> None
 
 
 def interrupt_campaign(turn: Turn, reason: str, *, tell: bool = True, exit_code: int = 1) -> None:
-    """The campaign stops sampling; its epoch stays begun, so that it can go on at no cost."""
+    """The campaign stops sampling; its epoch stays begun, so that it can go on at no cost. Given inputs stop for good."""
     campaign = turn.state.campaign
     if campaign is None:
         return
@@ -67,8 +67,12 @@ def interrupt_campaign(turn: Turn, reason: str, *, tell: bool = True, exit_code:
         recover_now(turn)
     if tell:
         turn.emit(StopCampaign(turn.now, reason))
-    done = f"after {campaign.taken} of {campaign.n} samples"
-    turn.answer(campaign.request_id, exit_code, f"campaign of epoch {campaign.epoch} stopped {done}: {reason}; s2r sample goes on with it")
+    text = (
+        f"campaign of epoch {campaign.epoch} stopped after {campaign.taken} of {campaign.n} samples: {reason}; s2r sample goes on with it"
+    )
+    if campaign.inputs:
+        text = f"inputs stopped after {campaign.taken} of {campaign.n} rows: {reason}"
+    turn.answer(campaign.request_id, exit_code, text)
 
 
 def check_campaign(turn: Turn) -> None:
@@ -105,7 +109,7 @@ def source_started(turn: Turn, event: SourceStarted) -> None:
         end_deployment(turn, "digest_mismatch", f"refused: digest_mismatch: what started is {event.digest}, not {deployment.digest}")
         return
     running = msgspec.structs.replace(deployment, stage="running", running=event.digest, request_id=0)
-    turn.set(deployment=running, controller_seq=-1, faults=0)
+    turn.set(deployment=running, controller_seq=-1, faults=0, driven=True)
     regate(turn)
     latched = ", ".join(turn.memory.latched)
     stays = f"; the gate stays closed until these are cleared: {latched}" if latched else ""

@@ -12,7 +12,20 @@ from typing import Any, Literal
 import msgspec
 
 from s2r_runtime.gate import Situation
-from s2r_runtime.messages import Answer, CertificateFacts, Gap, Memory, Observation, Output, Persist, Send, Settings, Source, Struct
+from s2r_runtime.messages import (
+    Answer,
+    CertificateFacts,
+    Gap,
+    Memory,
+    Observation,
+    Output,
+    Persist,
+    Send,
+    Settings,
+    Source,
+    Stretch,
+    Struct,
+)
 
 NANO = 1_000_000_000
 
@@ -26,13 +39,16 @@ class Asked(Struct, frozen=True):
 
 
 class Campaign(Struct, frozen=True):
-    """A campaign that samples. `running`: its source has started."""
+    """A campaign that samples, or given inputs that are driven. `running`: its source has started. `inputs`: their digest; then epoch is 0,
+    and n, taken count rows.
+    """
 
     epoch: int
     n: int
     request_id: int
     running: bool = False
     taken: int = 0
+    inputs: str = ""
 
 
 class Deployment(Struct, frozen=True):
@@ -51,7 +67,8 @@ class Deployment(Struct, frozen=True):
 class Job(Struct, frozen=True):
     """What the worker does. `again`: the radius outgrew a verification of the same request before.
 
-    reverify: of the driving controller, whose certificate `certificate_id` the radius has outgrown.
+    reverify: of the driving controller, whose certificate `certificate_id` the radius has outgrown. trace: of the model `digest`
+    in `stretch`.
     """
 
     id: int
@@ -64,6 +81,7 @@ class Job(Struct, frozen=True):
     hold_radius: float = 0.0
     certificate_id: str = ""
     again: bool = False
+    stretch: Stretch = "campaign"
 
 
 VERIFYING = ("deploy", "verify", "reverify")
@@ -77,7 +95,9 @@ class State(Struct, frozen=True):
     control_stamp_ns: of the newest control instant; `answered`: whether it has its Send. `idle`: recovery instants since a source
     was asked. `repeats`: of an observation whose command was sent. `issuing`: the job whose certificate is being signed.
     gate_said: the reason last recorded; `ended`: why the last deployment ended. clear_since_ns: since when all standing
-    conditions of the gate hold.
+    conditions of the gate hold. driven: a controller has, since the gap came into force; excited: given inputs were. trace_due_ns: when a
+    growth of the gap is to be traced; traced_radius: the radius when one was traced last. unsaved: the memory holds what was not
+    persisted yet.
     """
 
     settings: Settings | None = None
@@ -118,6 +138,11 @@ class State(Struct, frozen=True):
     clear_since_ns: int | None = None
     faults: int = 0
     episodes: int = 0
+    driven: bool = False
+    excited: bool = False
+    trace_due_ns: int | None = None
+    traced_radius: float = 0.0
+    unsaved: bool = False
 
     @property
     def e_value(self) -> float:
@@ -212,10 +237,17 @@ class Turn:
         self.set(memory=msgspec.structs.replace(self.state.memory, **changes))
         self._unsaved = True
 
+    def remember_later(self, **changes: Any) -> None:
+        """As `remember`, but nothing that moves the robot has to wait for the disk: persisted once nothing drives, or with what is next."""
+        self.set(memory=msgspec.structs.replace(self.state.memory, **changes), unsaved=True)
+
     def persist(self) -> None:
         """What was remembered is durable before what is emitted after this."""
+        if self.state.unsaved and not self.state.gate_open and self.state.campaign is None:
+            self._unsaved = True
         if self._unsaved:
             self._unsaved = False
+            self.set(unsaved=False)
             self.outputs.append(Persist(self.now, self.state.memory))
 
     def emit(self, *outputs: Output) -> None:

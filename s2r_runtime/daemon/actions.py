@@ -27,7 +27,6 @@ KEPT_CONTROLLERS = 8
 """Loaded controllers that are remembered; a deployment that comes later loads its own again."""
 KEPT_EPISODES = 1000
 SAVE_AGAIN_NS = 1_000_000_000
-TRACE_TIMEOUT_S = 600.0
 GAP_TIMEOUT_S = 300.0
 
 
@@ -47,6 +46,7 @@ class Actions:
         self.last_sent = 0
         self._reason = ""
         self.results: dict[str, Any] = {}
+        self.last_trace: m.TraceEnded | None = None
         self.episodes: deque[m.EpisodeEnded] = deque(maxlen=KEPT_EPISODES)
         self._memory: m.Memory | None = None
         self._save_again_ns = 0
@@ -55,6 +55,7 @@ class Actions:
             m.Ask: self._ask,
             m.Send: self._send,
             m.StartCampaign: self._start_campaign,
+            m.StartInputs: self._start_inputs,
             m.StopCampaign: self._stop_campaign,
             m.StartController: self._start_controller,
             m.StopController: self._stop_controller,
@@ -64,6 +65,7 @@ class Actions:
             m.Decided: self._decided,
             m.Answer: self._answer,
             m.ModelAdopted: self._model_adopted,
+            m.TraceEnded: self._trace_ended,
         }
 
     def carry_out(self, outputs: Sequence[m.Output]) -> None:
@@ -120,7 +122,9 @@ class Actions:
         observation = self._d.observation
         if observation is None or observation.seq != ask.obs_seq:
             return  # it was overtaken; the newer one has its own question
-        if ask.source == "sampler":
+        if ask.source == "sampler" and self._d.excitation.running:
+            self._d.feed(*self._d.excitation.ask(ask.t_ns, observation, self._d.next_seq()))
+        elif ask.source == "sampler":
             self._d.feed(*self._d.sampler.ask(ask.t_ns, observation))
         else:
             self._d.driver.ask(observation)
@@ -141,8 +145,11 @@ class Actions:
     def _start_campaign(self, order: m.StartCampaign) -> None:
         self._d.feed(*self._d.sampler.start(order, self._d.settings))
 
+    def _start_inputs(self, order: m.StartInputs) -> None:
+        self._d.feed(*self._d.excitation.start(order, self._d.settings))
+
     def _stop_campaign(self, order: m.StopCampaign) -> None:
-        self._d.feed(*self._d.sampler.stop(order.t_ns, order.reason))
+        self._d.feed(*self._d.sampler.stop(order.t_ns, order.reason), *self._d.excitation.stop(order.t_ns, order.reason))
 
     def _start_controller(self, order: m.StartController) -> None:
         file = self._controllers.get(order.digest)
@@ -168,12 +175,15 @@ class Actions:
         if isinstance(job, str):
             self._d.feed(m.JobFinished(order.t_ns, order.job_id, order.kind, error=job))
             return
-        timeout_s = {"gap": GAP_TIMEOUT_S, "trace": TRACE_TIMEOUT_S, "verify": self._d.profile.verification.timeout}[order.kind]
+        profile = self._d.profile
+        timeout_s = {"gap": GAP_TIMEOUT_S, "trace": profile.repair.timeout, "verify": profile.verification.timeout}[order.kind]
         self._d.workshop.start(job, timeout_s, lambda result: self._job_done(order, result), self._job_progress)
 
     def _job(self, order: m.StartJob) -> GapJob | VerifyJob | TraceJob | str:
         """The worker's job; or why there is none."""
         d, memory = self._d, self._d.state.memory
+        if order.kind == "trace":
+            return self._trace_job(order)
         samples = tuple(d.sampler.samples)
         if order.kind == "verify":
             file = self._controllers.get(order.digest)
@@ -182,16 +192,39 @@ class Actions:
             return VerifyJob(d.profile, file, memory.gap, order.radius, order.hold_radius, order.attempt, order.seed, order.beta)
         if d.sampler.epoch != order.epoch or not samples:
             return f"the samples of epoch {order.epoch} are not here any more"
-        if order.kind == "gap":
-            return GapJob(d.profile, samples, d.sampler.rejected, order.epoch, order.beta)
-        d.logbook.durable()  # the worker reads the log
-        out = d.models.proposal(f"epoch-{order.epoch}")
-        return TraceJob(d.profile, d.sampler.logs(), samples, d.sampler.rejected, order.epoch, order.seed, str(out))
+        return GapJob(d.profile, samples, d.sampler.rejected, order.epoch, order.beta)
+
+    def _trace_job(self, order: m.StartJob) -> TraceJob | str:
+        """On the log that is being written, and for a campaign those before it: the worker waits until the order stands in it."""
+        d = self._d
+        if not order.stretch:
+            return "it says not what to trace"
+        logs = tuple(map(str, d.logbook.parts))
+        if order.stretch == "campaign":
+            if d.sampler.epoch != order.epoch:
+                return f"the samples of epoch {order.epoch} are not here any more"
+            logs = d.sampler.logs()
+        return TraceJob(
+            d.profile,
+            order.stretch,
+            order.epoch,
+            order.rows,
+            order.seed,
+            logs=logs,
+            run=d.logbook.run,
+            job_id=order.job_id,
+            out=str(d.models.folder),
+            base=d.models.base,
+        )
 
     def _job_done(self, order: m.StartJob, result: Result | Failed) -> None:
         if isinstance(result, Failed):
             self._d.feed(m.JobFinished(0, order.job_id, order.kind, error=result.text))
             return
+        if result.trace is not None and result.trace["model_path"]:  # before the result, so that a reader of the log has the model by then
+            self._d.logbook.attach(
+                f"model/{result.trace['proposal']['digest']}", "application/toml", str(result.trace["model_toml"]).encode()
+            )
         self.results[order.kind] = result.trace if order.kind == "trace" else result.gap or result.verification
         self._d.feed(
             m.JobFinished(
@@ -222,6 +255,9 @@ class Actions:
 
         self._d.feed(issue(self._d, order))
 
+    def _trace_ended(self, ended: m.TraceEnded) -> None:
+        self.last_trace = ended
+
     def _model_adopted(self, adopted: m.ModelAdopted) -> None:
         self._d.use_model(adopted.digest)
 
@@ -243,7 +279,7 @@ class Actions:
                     self._do[type(output)](output)
                 case m.StartController():
                     self._d.feed(m.SourceStopped(0, "controller", "start_failed", why))
-                case m.StartCampaign():
+                case m.StartCampaign() | m.StartInputs():
                     self._d.feed(m.SourceStopped(0, "sampler", "start_failed", why))
                 case m.StartJob():
                     self._d.feed(m.JobFinished(0, output.job_id, output.kind, error=why))

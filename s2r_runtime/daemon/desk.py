@@ -18,26 +18,30 @@ from s2r_runtime.daemon.control import Connection, ControlServer
 from s2r_runtime.daemon.model_store import parse_model
 from s2r_runtime.daemon.settings import ModelFacts
 from s2r_runtime.daemon.status import status
-from s2r_runtime.daemon.worker import Failed, LoadJob, Result
-from s2r_runtime.errors import ConfigError, S2RError
+from s2r_runtime.daemon.worker import Failed, InputsJob, LoadJob, Result
+from s2r_runtime.errors import ConfigError, S2RError, UsageError
 from s2r_runtime.messages import Answer, Requested
-from s2r_runtime.modelspec import dump_model
+from s2r_runtime.modelspec import ModelSpec, dump_model
 
 if TYPE_CHECKING:
     from s2r_runtime.daemon.loop import Daemon
 
 PLAIN = ("undeploy", "revoke", "clear", "stop", "permit", "sample", "cancel", "trace", "verify")
 """Verbs that the core can have as they are."""
-MOVING = ("sample", "deploy")
+MOVING = ("sample", "deploy", "excite")
 SETTLE_WITHIN_NS = 2_000_000_000
 LOAD_TIMEOUT_S = 30.0
+INPUTS_TIMEOUT_S = 120.0
+"""The model is rolled out over them, one step after the other: 0.1 ms a row."""
 PROGRESS_NS = 200_000_000
 RESULT_OF = {"sample": "gap", "trace": "trace", "deploy": "verify", "verify": "verify"}
 """Whose result goes with the answer to a verb."""
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a client may ask. deploy: path, parameters, certificate (text). adopt: text of the model's TOML, base its folder."""
+    """What a client may ask. deploy: path, parameters, certificate (text). adopt: text of the model's TOML, base its folder; no text: the
+    proposed one. excite: path. trace: text says what.
+    """
 
     verb: str
     path: str = ""
@@ -84,6 +88,8 @@ class Desk:
                 phase, taken, n, rejected, left_s = sampling
                 detail = phase + "".join(f", {count} {reason}" for reason, count in sorted(rejected.items()))
                 self.progress(taken, n, detail, None if self._d.clock.lockstep else left_s)
+            elif (driven := self._d.excitation.progress()) is not None:
+                self.progress(driven[1], driven[2], driven[0])
 
     def progress(self, done: float, total: float, detail: str, left_s: float | None = None) -> None:
         """How far what is being waited for is."""
@@ -134,6 +140,8 @@ class Desk:
 
     def result_of(self, verb: str) -> Any:
         """The newest result of what the verb asks for, as plain data."""
+        if verb == "excite":
+            return self._d.excitation.result()
         return msgspec.to_builtins(self._d.actions.results.get(RESULT_OF.get(verb, "")))
 
     # ------------------------------------------------------------------ the socket
@@ -158,12 +166,14 @@ class Desk:
                 self._deploy(connection, request)
             case "adopt":
                 self._adopt(connection, request)
+            case "excite":
+                self._excite(connection, request)
             case verb if verb in PLAIN:
                 if not 0.0 <= request.duration_s < float("inf") or not 0 <= request.count < 2**31:
                     raise ConfigError(f"{verb}: duration_s is {request.duration_s} and count {request.count}, must be >= 0 and finite")
                 self.request(verb, connection, text=request.text, duration_s=request.duration_s, count=request.count)
             case verb:
-                connection.answer(2, f"{verb}: no such request; there are: status, deploy, adopt, {', '.join(PLAIN)}")
+                connection.answer(2, f"{verb}: no such request; there are: status, deploy, adopt, excite, {', '.join(PLAIN)}")
 
     def _deploy(self, connection: Connection, request: Request) -> None:
         def loaded(result: Result | Failed) -> None:
@@ -191,9 +201,29 @@ class Desk:
             connection.answer(*self._said)
         return not self._said[0]
 
+    def _excite(self, connection: Connection, request: Request) -> None:
+        """Given inputs are read and looked through elsewhere; the core says whether they may be driven now."""
+        state = self._d.state
+        if state.deployment is not None or state.campaign is not None:  # the core says why not; nothing is read while something drives
+            self.request("excite", connection, digest="none", count=1)
+            return
+
+        def loaded(result: Result | Failed) -> None:
+            if isinstance(result, Failed) or result.inputs is None:
+                connection.answer(78, f"--inputs: {result.text}" if isinstance(result, Failed) else "no inputs were read")
+                return
+            given = result.inputs
+            self._d.excitation.keep(given)
+            self._d.logbook.attach(f"inputs/{given.digest}", "text/csv", given.text.encode())
+            self.request("excite", connection, digest=given.digest, count=len(given.rows))
+
+        seen = state.observation if not state.trouble else None
+        job = InputsJob(request.path, self._d.profile, () if seen is None else seen.x)
+        self._d.workshop.start(job, INPUTS_TIMEOUT_S, loaded)
+
     def _adopt(self, connection: Connection, request: Request) -> None:
         """Looks whether the model can take the place of the one in force; the robot has the same states, inputs and step either way."""
-        spec = parse_model(request.text, request.base, "adopt")
+        spec = parse_model(request.text, request.base, "adopt") if request.text else self._proposed()
         current = self._d.profile
         if spec.dt != current.model.dt:
             raise ConfigError(f"adopt: model.dt is {spec.dt} s, must be the profile's {current.model.dt} s")
@@ -204,14 +234,22 @@ class Desk:
                 connection.answer(78, wrong or "adopt: the model has other states or inputs than the robot's")
                 return
             try:
-                self._d.models.keep(spec)
+                kept = self._d.models.keep(spec)
             except OSError as error:
                 connection.answer(70, f"adopt: the model cannot be kept: {error.strerror}")
                 return
-            self._d.adopting[spec.digest()] = profile
+            self._d.adopting[spec.digest()] = msgspec.structs.replace(profile, model=kept)
             # before the decision, so that a reader of the log has the model when it comes into force
             self._d.logbook.attach(f"model/{spec.digest()}", "application/toml", dump_model(spec).encode())
             self.request("adopt", connection, digest=spec.digest())
 
         self._numbers += 1
         self._d.watcher.check(self._numbers, profile, "adopt", checked)
+
+    def _proposed(self) -> ModelSpec:
+        """The model that tracing proposes. Raises UsageError if there is none."""
+        proposal = self._d.state.memory.proposal
+        spec = None if proposal is None else self._d.models.load(proposal.digest)
+        if spec is None:
+            raise UsageError("adopt: no model is proposed; name one, or trace first: s2r trace --live campaign")
+        return spec

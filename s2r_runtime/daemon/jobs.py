@@ -1,4 +1,6 @@
-"""What a worker does: load a controller, bound a gap, verify, trace. Each a pure function of its job, so that an audit can repeat it."""
+"""What a worker does: load a controller, read inputs, bound a gap, verify, trace. Each a pure function of its job (a controller's and
+inputs' of their files too), so that an audit can repeat it.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,9 @@ from pathlib import Path
 
 from s2r_runtime.controllers.confinement import confine
 from s2r_runtime.controllers.file import load
-from s2r_runtime.daemon.worker import GapJob, Job, LoadJob, Result, TraceJob, VerifyJob
+from s2r_runtime.daemon.given_inputs import BYTES_MAX, GivenInputs, parse_inputs
+from s2r_runtime.daemon.settings import ModelFacts, settings_of
+from s2r_runtime.daemon.worker import GapJob, InputsJob, Job, LoadJob, Result, TraceJob, VerifyJob
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import Gap
 
@@ -30,7 +34,11 @@ def run(job: Job, progress: Progress) -> Result:
         case VerifyJob():
             return verify(job, progress)
         case TraceJob():
-            return trace(job, progress)
+            from s2r_runtime.daemon.trace_job import trace
+
+            return Result(trace=trace(job, progress))
+        case InputsJob():
+            return Result(inputs=inputs(job))
 
 
 def gap(job: GapJob) -> Gap:
@@ -102,26 +110,30 @@ def _discard_prints() -> None:
     os.close(nowhere)
 
 
-def trace(job: TraceJob, progress: Progress) -> Result:
-    """What the residual of a campaign depends on, and the model that has it, written to `job.out`. That model names what it was
-    fitted on: the logs as they are now, and the samples, in whatever log they stand (guarantee G6).
-    """
-    import msgspec
+def inputs(job: InputsJob) -> GivenInputs:
+    """Given inputs. Raises ConfigError if a row leaves its bounds, or where the model says that the robot would leave the geofence."""
+    import numpy as np
 
-    from s2r_runtime.daemon.persistence import replace
+    from s2r_runtime.gate import inside
     from s2r_runtime.models.composed import compose
-    from s2r_runtime.modelspec import dump_model
-    from s2r_runtime.trace.tracer import load_dataset, trace
-    from s2r_runtime.transitions import from_samples
 
-    profile = job.profile
+    path, profile = Path(job.path), job.profile
+    if not path.is_file():
+        raise ConfigError(f"{path}: is no file")
+    with path.open("rb") as file:
+        data = file.read(BYTES_MAX + 1)
     model = compose(profile.model)
-    weights = tuple(profile.norm.weights.get(name, 1.0) for name in model.states)
-    found = trace(
-        load_dataset(job.logs, model, epoch=job.epoch), model, seed=job.seed, progress=progress, weights=weights, kind=profile.norm.set
-    )
-    samples = from_samples(job.samples, source=f"campaign of epoch {job.epoch}").digest
-    fitted = tuple(dict.fromkeys((*found.spec.fitted_on, samples)))
-    text = dump_model(msgspec.structs.replace(found.spec, fitted_on=fitted), found.comments())
-    replace(Path(job.out), text.encode())
-    return Result(trace={**found.to_json(), "text": found.text(), "model_path": job.out, "model_toml": text})
+    given = parse_inputs(data, path.name, model.inputs, profile.inputs, model.dt, profile.columns)
+    if not job.x:
+        return given
+    settings = settings_of(profile, profile.model, ModelFacts(model.states, model.inputs, tuple(model.nominal.angles)))
+    x, hidden = np.array([job.x], dtype=np.float64), model.at_rest(1)
+    for number, row in enumerate(given.rows):
+        x, hidden = model.step(x, np.array([row]), hidden)
+        if inside(settings, tuple(x[0].tolist()), settings.geofence) < 0.0:
+            where = ", ".join(f"{name} {value:.3g}" for name, value in zip(model.states, x[0], strict=True))
+            raise ConfigError(
+                f"{path.name}: row {number + 1} of {len(given.rows)} would take the robot out of the geofence, by the model to {where}; "
+                "bring it to where there is room"
+            )
+    return given

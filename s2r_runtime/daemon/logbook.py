@@ -110,6 +110,16 @@ class Logbook:
         return (*self._earlier, *(self._writer.parts if self._writer is not None else ()))
 
     @property
+    def parts(self) -> tuple[Path, ...]:
+        """The files of this run, oldest first."""
+        return tuple(self._writer.parts) if self._writer is not None else ()
+
+    @property
+    def run(self) -> str:
+        """This run's name."""
+        return self._writer.path.stem if self._writer is not None else ""
+
+    @property
     def faulty(self) -> bool:
         """Whether a message was lost, so that this run's log is at its end."""
         return self._recorder is not None and self._recorder.health().unrecorded > 0

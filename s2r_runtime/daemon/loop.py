@@ -29,6 +29,7 @@ from s2r_runtime.daemon import control, issuing
 from s2r_runtime.daemon.actions import Actions
 from s2r_runtime.daemon.desk import Desk
 from s2r_runtime.daemon.driver import Driver
+from s2r_runtime.daemon.excitation import Excitation
 from s2r_runtime.daemon.logbook import Logbook
 from s2r_runtime.daemon.model_store import ModelStore
 from s2r_runtime.daemon.persistence import StateFolder
@@ -38,6 +39,7 @@ from s2r_runtime.daemon.settings import ModelFacts, settings_of
 from s2r_runtime.daemon.stop_signals import StopSignals
 from s2r_runtime.daemon.systemd import Notifier
 from s2r_runtime.daemon.workshop import Watcher, Workshop
+from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import (
     AnalyticsChanged,
     Command,
@@ -57,6 +59,7 @@ from s2r_runtime.messages import (
     Ticked,
     WallClockRead,
 )
+from s2r_runtime.modelspec import dump_model
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import Profile
 
@@ -146,7 +149,7 @@ class Daemon:
         self._signals = stack.enter_context(StopSignals(self.selector))
         self.folder = stack.enter_context(StateFolder(self.state_dir, profile.robot.name))
         self.memory = self.folder.memory(self._log_dir.glob(f"{profile.robot.name}-*.mcap") if self._log_file is None else ())
-        self.models = ModelStore(self.folder.path, profile.model)
+        self.models = ModelStore(self.folder.path, profile.model.digest())
         self.profile = profile = self.models.in_force(profile, self.memory)
         self.key = issuing.signing_key(self._key_path, self.folder.path, self.say)
         self.watcher = Watcher(self.selector, profile, str(self._profile_path), self.feed, self._analytics)
@@ -161,11 +164,13 @@ class Daemon:
         self.settings = settings_of(profile, profile.model, self.facts, self.seed)
         self.link = link_of(self.profile, self.facts, self._record_frame)
         self.logbook.begin(self._profile_path, self.profile.model, self.profile.files)
+        self._recall_proposal()
         stack.callback(self._close_log)
         stack.callback(self._close_link)
         self.keeper = Keeper(self.folder, self.say)
         stack.callback(self.keeper.close)
         self.sampler = Sampler(self.folder, self.keeper, profile.sampling, lambda: tuple(map(str, self.logbook.paths)), self.next_seq)
+        self.excitation = Excitation()
         self.driver = Driver(self.selector, profile, lambda: self.settings, self.feed, self.clock.now, self.next_seq)
         stack.callback(self.driver.stop)
         self.actions = Actions(self)
@@ -179,6 +184,22 @@ class Daemon:
         self._begin_run()
         self.notifier.ready("waiting for the robot")
         self.say(f"robot {profile.robot.name!r}: log {self.logbook.paths[-1]}, state {self.folder.path}")
+
+    def _recall_proposal(self) -> None:
+        """A model that waits to be adopted belongs into this log too. One that is not there any more, or not this profile's, can't be."""
+        proposal = self.memory.proposal
+        if proposal is None:
+            return
+        try:
+            spec = self.models.load(proposal.digest)
+        except ConfigError as error:
+            self.say(str(error))
+            spec = None
+        if spec is None:
+            self.say(f"the proposed model {proposal.digest} is not there any more; trace again")
+            self.memory = msgspec.structs.replace(self.memory, proposal=None)
+        else:
+            self.logbook.attach(f"model/{proposal.digest}", "application/toml", dump_model(spec).encode())
 
     def _open_link(self) -> None:
         self.link.open()
@@ -276,8 +297,11 @@ class Daemon:
     def use_model(self, digest: str) -> None:
         """A model was adopted: everything that is started from here on uses it."""
         profile = self.adopting.pop(digest, None)
-        if profile is None or profile.model.digest() != digest:
-            return  # it is in force already
+        if profile is None:  # the profile's own decision for a proposed one
+            spec = self.models.load(digest)
+            if spec is None:
+                raise RuntimeError(f"the adopted model {digest} is not in {self.models.folder}")
+            profile = msgspec.structs.replace(self.profile, model=spec)
         self.profile = profile
         self.settings = settings_of(profile, profile.model, self.facts, self.seed)
         self.driver.use(profile)
@@ -337,7 +361,7 @@ class Daemon:
         self.feed_first(RecorderChanged(0, ok, detail))
 
     def _end_sources(self, why: str) -> None:
-        self.feed(*self.sampler.stop(0, why))
+        self.feed(*self.sampler.stop(0, why), *self.excitation.stop(0, why))
         self.feed(Stopping(0, why))
         self.driver.stop()
         self.watcher.end()

@@ -1,15 +1,15 @@
-"""The adopted model, in the robot's state folder, and repaired models that wait to be adopted.
+"""Models in the robot's state folder: adopted ones, and repaired ones that wait to be adopted.
 
-    model.toml          the model in force, if it isn't the profile's; `base` is the digest of the profile's model it replaced
-    models/<name>.toml  what tracing proposed
+    models/<digest>.toml    a model; `base` is the digest of the profile's model in whose place it may come
 
-The file alone puts nothing in force: the memory must name its digest (that is a person's decision, and logged), and a profile whose
-own model was changed since has the last word.
+A file alone puts nothing in force: the memory must name its digest (that is a decision, and logged), and a profile whose own model was
+changed since has the last word. Two files of one digest compute the same; what they were fitted on is united (guarantee G6).
 """
 
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -20,35 +20,54 @@ from s2r_runtime.messages import Memory
 from s2r_runtime.modelspec import ModelSpec, dump_model, load_model
 from s2r_runtime.profile import Profile
 
+DIGITS = 16
+"""Of a digest, in a file's name; what is in the file is compared with all of it."""
+
 
 class ModelStore:
-    """Keeps the model that a person adopted. profile_model: as the profile's file has it."""
+    """Keeps models by digest. base: digest of the profile's model, as the profile's file has it."""
 
-    def __init__(self, folder: Path, profile_model: ModelSpec) -> None:
-        self._folder, self._base = folder, profile_model.digest()
+    def __init__(self, folder: Path, base: str) -> None:
+        self.folder, self.base = folder, base
+
+    def file(self, digest: str) -> Path:
+        """Where the model of that digest is, or would be."""
+        return self.folder / "models" / f"{digest.removeprefix('sha256:')[:DIGITS]}.toml"
+
+    def load(self, digest: str) -> ModelSpec | None:
+        """The model of that digest; None if there is none for this profile. Raises ConfigError if its file is damaged."""
+        file = self.file(digest)
+        if not file.exists():
+            file = self.folder / "model.toml"  # where version 0.1 kept the adopted one
+        if not file.exists() or not _of_base(file, self.base):
+            return None
+        spec = load_model(file)
+        if spec.digest() != digest:
+            raise ConfigError(f"{file}: is not the model that was adopted ({digest}); put it back, or adopt a model again")
+        return spec
 
     def in_force(self, profile: Profile, memory: Memory) -> Profile:
         """The profile with the adopted model, if there is one. Raises ConfigError if its file is damaged."""
-        file = self._folder / "model.toml"
-        if not memory.model_digest or memory.model_digest == self._base or not file.exists():
+        if not memory.model_digest or memory.model_digest == self.base:
             return profile
-        if tomllib.loads(file.read_text(encoding="utf-8")).get("base") != self._base:
-            return profile
-        spec = load_model(file)
-        if spec.digest() != memory.model_digest:
-            raise ConfigError(f"{file}: is not the model that was adopted ({memory.model_digest}); put it back, or adopt a model again")
-        return msgspec.structs.replace(profile, model=spec)
+        spec = self.load(memory.model_digest)
+        return profile if spec is None else msgspec.structs.replace(profile, model=spec)
 
-    def keep(self, spec: ModelSpec) -> None:
-        """Puts the model beside the memory, durably, before the memory names it. Raises OSError."""
-        text = f'base = "{self._base}"\n' + dump_model(spec, ("Adopted; the daemon's own file.",))
-        replace(self._folder / "model.toml", text.encode())
+    def keep(self, spec: ModelSpec, comments: Sequence[str] = ()) -> ModelSpec:
+        """Puts the model there, durably, before any memory names it; gives it back with all that it was fitted on. Raises OSError."""
+        digest, file = spec.digest(), self.file(spec.digest())
+        if file.exists() and _of_base(file, self.base) and (known := load_model(file)).digest() == digest:
+            spec = msgspec.structs.replace(spec, fitted_on=tuple(dict.fromkeys((*known.fitted_on, *spec.fitted_on))))
+        file.parent.mkdir(mode=0o700, exist_ok=True)
+        replace(file, (f'base = "{self.base}"\n' + dump_model(spec, tuple(comments))).encode())
+        return spec
 
-    def proposal(self, name: str) -> Path:
-        """Where a repaired model of that name is written."""
-        folder = self._folder / "models"
-        folder.mkdir(mode=0o700, exist_ok=True)
-        return folder / f"{name}.toml"
+
+def _of_base(file: Path, base: str) -> bool:
+    try:
+        return bool(tomllib.loads(file.read_text(encoding="utf-8")).get("base") == base)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{file}: is damaged: {error}") from None
 
 
 def parse_model(text: str, base: str, where: str) -> ModelSpec:

@@ -68,6 +68,11 @@ def settings_of(profile: Profile, model: ModelSpec, facts: ModelFacts, seed: int
         certificate_lifetime_s=round(profile.certificate.lifetime),
         seed=profile.sampling.seed if seed is None else seed,
         trace_after_campaign=profile.repair.after_campaign,
+        trace_after_inputs=profile.repair.after_inputs,
+        trace_on_growth=profile.repair.on_growth,
+        trace_delay_ns=round(profile.repair.delay * 1e9),
+        trace_rows=profile.repair.rows,
+        adopt=profile.repair.adopt,
         required_laws=profile.verification.required,
         campaign_digest=campaign_digest(profile),
     )

@@ -14,12 +14,20 @@ if TYPE_CHECKING:
 
 def status(daemon: Daemon) -> dict[str, Any]:
     """Plain data: what the core says (docs/json.md), and beside it the campaign under way, the scenarios driven, the log, the processes."""
-    found, sampling, health = core.status(daemon.state), daemon.sampler.progress(), daemon.logbook.health()
+    trace = daemon.actions.last_trace
+    found: dict[str, Any] = core.status(daemon.state)
+    sampling, health = daemon.sampler.progress(), daemon.logbook.health()
     memory, observation = daemon.state.memory, daemon.observation
     return found | {
         "robot": daemon.settings.robot,
         "job": daemon.state.jobs[0].purpose if daemon.state.jobs else None,
-        "phase": None if sampling is None else sampling[0],
+        "phase": "inputs" if daemon.excitation.running else None if sampling is None else sampling[0],
+        "proposal": None
+        if found["proposal"] is None
+        else {**found["proposal"], "path": str(daemon.models.file(found["proposal"]["digest"]))},
+        "trace": None
+        if trace is None
+        else {"stretch": trace.stretch, "epoch": trace.epoch, "verdict": trace.verdict, "reason": trace.reason},
         "rejected": {} if sampling is None else sampling[3],
         "revoked": dict(memory.revoked),
         "measured": memory.watch_n,

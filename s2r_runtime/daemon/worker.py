@@ -7,6 +7,7 @@ function of its message: all that it depends on is in there, the seed too.
 from __future__ import annotations
 
 import contextlib
+import signal
 import sys
 import time
 import traceback
@@ -16,9 +17,11 @@ import msgspec
 
 from s2r_runtime.child import Child, die_with_parent, say, take_stdout
 from s2r_runtime.controllers.file import ControllerFile
+from s2r_runtime.daemon.given_inputs import GivenInputs
 from s2r_runtime.errors import S2RError
-from s2r_runtime.messages import Gap, SampleTaken, Verification
+from s2r_runtime.messages import Gap, SampleTaken, Stretch, Verification
 from s2r_runtime.profile import Profile
+from s2r_runtime.recording.stretches import Cut
 
 
 class GapJob(msgspec.Struct, frozen=True, tag="gap"):
@@ -52,18 +55,37 @@ class VerifyJob(msgspec.Struct, frozen=True, tag="verify"):
 
 
 class TraceJob(msgspec.Struct, frozen=True, tag="trace"):
-    """Trace the residual in a campaign's samples and logs. out: where the repaired model is written."""
+    """Trace the residual of the profile's model in a stretch, its newest `rows` observations.
+
+    In the daemon it is cut out of `logs`, before the order `job_id` of `run`; an audit gives the rows, and what stands for their logs. out:
+    folder of the repaired model, `base` as in `ModelStore`; empty: it is not written. cpu_s: processor time after which it is given up
+    (0: never).
+    """
 
     profile: Profile
-    logs: tuple[str, ...]
-    samples: tuple[SampleTaken, ...]
-    rejected: dict[str, int]
+    stretch: Stretch
     epoch: int
+    rows: int
     seed: int
-    out: str
+    logs: tuple[str, ...] = ()
+    run: str = ""
+    job_id: int = 0
+    cut: Cut | None = None
+    identities: tuple[str, ...] = ()
+    out: str = ""
+    base: str = ""
+    cpu_s: float = 0.0
 
 
-Job = LoadJob | GapJob | VerifyJob | TraceJob
+class InputsJob(msgspec.Struct, frozen=True, tag="inputs"):
+    """Read given inputs, and look whether they may be driven from where the robot is. x: (nx,), or empty if that isn't known."""
+
+    path: str
+    profile: Profile
+    x: tuple[float, ...]
+
+
+Job = LoadJob | GapJob | VerifyJob | TraceJob | InputsJob
 
 
 class Progress(msgspec.Struct, frozen=True, tag="progress"):
@@ -75,13 +97,14 @@ class Progress(msgspec.Struct, frozen=True, tag="progress"):
 
 
 class Result(msgspec.Struct, frozen=True, tag="result"):
-    """What a job found: the fields of JobFinished that it fills, or the controller that was loaded."""
+    """What a job found: the fields of JobFinished that it fills, or the controller or inputs that were loaded."""
 
     gap: Gap | None = None
     verification: Verification | None = None
     trace: dict[str, Any] | None = None
     safety: dict[str, list[float]] = {}
     controller: ControllerFile | None = None
+    inputs: GivenInputs | None = None
 
 
 class Failed(msgspec.Struct, frozen=True, tag="failed"):
@@ -102,7 +125,9 @@ class Worker:
     def __init__(self, job: Job, timeout_s: float) -> None:
         self._child = Child("s2r_runtime.daemon.worker")
         self._deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
-        self._overdue = f"not done within {timeout_s:g} s" + (" (verification.timeout)" if isinstance(job, VerifyJob) else "")
+        setting = {VerifyJob: " (verification.timeout)", TraceJob: " (repair.timeout)"}.get(type(job), "")
+        self._overdue = f"not done within {timeout_s:g} s{setting}"
+        self._paused_ns: int | None = None
         self._child.send(_ENCODE(job))
 
     @property
@@ -127,9 +152,22 @@ class Worker:
                 return came
         if not self._child.alive():
             came.append(Failed(f"the worker died: {self._child.ending()}"))
-        elif now_ns > self._deadline_ns:
+        elif self._paused_ns is None and now_ns > self._deadline_ns:
             came.append(Failed(self._overdue))
         return came
+
+    def pause(self, now_ns: int) -> None:
+        """Others go first: the process stands still, and its time with it. May be called twice."""
+        if self._paused_ns is None:
+            self._paused_ns = now_ns
+            self._child.signal(signal.SIGSTOP)
+
+    def resume(self, now_ns: int) -> None:
+        """Goes on."""
+        if self._paused_ns is not None:
+            self._deadline_ns += now_ns - self._paused_ns
+            self._paused_ns = None
+            self._child.signal(signal.SIGCONT)
 
     def stop(self) -> None:
         """Ends the process; may be called twice."""

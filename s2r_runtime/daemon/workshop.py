@@ -17,7 +17,7 @@ import msgspec
 from s2r_runtime.child import Child
 from s2r_runtime.daemon.analytics import Analytics, Ready, Refused, Reply, Upward, Watching
 from s2r_runtime.daemon.settings import ModelFacts
-from s2r_runtime.daemon.worker import Failed, Job, Progress, Result, Worker
+from s2r_runtime.daemon.worker import Failed, Job, Progress, Result, TraceJob, Worker
 from s2r_runtime.messages import AnalyticsChanged, Event, Measured, Observation, Send
 from s2r_runtime.profile import Profile
 
@@ -29,10 +29,13 @@ class _Running(NamedTuple):
     worker: Worker
     done: Callable[[Result | Failed], None]
     progress: Callable[[Progress], None]
+    patient: bool
 
 
 class Workshop:
-    """Workers under way. `done` is called exactly once for each, from the daemon's loop."""
+    """Workers under way. `done` is called exactly once for each, from the daemon's loop. A trace stands still while there is any other
+    work: somebody waits for that, and the robot may, too.
+    """
 
     def __init__(self, selector: selectors.BaseSelector) -> None:
         self._selector = selector
@@ -47,8 +50,9 @@ class Workshop:
         except OSError as error:
             done(Failed(f"the worker cannot be started: {error.strerror}"))
             return
-        running = _Running(worker, done, progress)
+        running = _Running(worker, done, progress, isinstance(job, TraceJob))
         self._running.append(running)
+        self._yield_or_go_on()
         self._selector.register(worker, selectors.EVENT_READ, lambda _: self._poll(running, time.monotonic_ns()))
 
     @property
@@ -78,6 +82,13 @@ class Workshop:
         self._running.remove(running)
         self._selector.unregister(running.worker)
         running.worker.stop()
+        self._yield_or_go_on()
+
+    def _yield_or_go_on(self) -> None:
+        now_ns, busy = time.monotonic_ns(), any(not one.patient for one in self._running)
+        for one in self._running:
+            if one.patient:
+                (one.worker.pause if busy else one.worker.resume)(now_ns)
 
 
 class Watcher:

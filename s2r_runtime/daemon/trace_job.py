@@ -1,0 +1,199 @@
+"""The worker's trace: cuts the stretch that was ordered out of the logs, traces it, and says what it was made on, so that an audit can
+do the same. Deterministic: the same rows, model, seed and options give the same result.
+
+The log is still being written: the order to trace is the last record that counts, and is waited for. Nothing here is in a hurry: the
+process steps back behind everything else on the machine.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from s2r_runtime.daemon.model_store import ModelStore
+from s2r_runtime.daemon.worker import TraceJob
+from s2r_runtime.errors import RecordingError
+from s2r_runtime.messages import StartJob
+from s2r_runtime.recording.logs import runs
+from s2r_runtime.recording.stretches import CHANNELS, Cut, Rows, Stretches, log_identity
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from s2r_runtime.models.composed import ComposedModel
+    from s2r_runtime.profile import Profile
+    from s2r_runtime.trace.dataset import Dataset
+    from s2r_runtime.trace.result import TraceResult
+
+WRITTEN_WITHIN_S = 10.0
+"""The recorder hands over what it has every 50 ms; a disk that takes nothing for this long is full."""
+HORIZON_S = 1.0
+VOLATILE = ("model_path", "cpu_s")
+"""What a result says that does not follow from the log."""
+
+
+def trace(job: TraceJob, progress: Callable[[float, float, str], None]) -> dict[str, Any]:
+    """The result as the log holds it (docs/log-format.md). Raises S2RError with why there is none."""
+    if job.cpu_s:
+        seconds = max(1, round(job.cpu_s))
+        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+    cut, identities = (job.cut, job.identities) if job.cut is not None else _read(job)
+    found, fitted = traced(job.profile, cut, identities, job.seed, progress)
+    result = plain(job, cut, found, fitted)
+    if job.out and fitted.effects != job.profile.model.effects:
+        path = Path(job.out)
+        ModelStore(path, job.base).keep(fitted, found.comments())
+        result["model_path"] = str(ModelStore(path, job.base).file(fitted.digest()))
+    result["cpu_s"] = round(time.process_time(), 3)
+    return result
+
+
+def traced(
+    profile: Profile, cut: Cut, identities: tuple[str, ...], seed: int, progress: Callable[[float, float, str], None]
+) -> tuple[TraceResult, Any]:
+    """What the tracer says; and the repaired model, which remembers what it was fitted on (guarantee G6): the rows, a campaign's
+    samples in whatever log they stand, and for anything else the whole log.
+    """
+    from s2r_runtime.models.composed import compose
+    from s2r_runtime.trace.tracer import trace as tracer
+    from s2r_runtime.transitions import from_samples
+
+    model = compose(profile.model)
+    about = cut.about
+    source = f"{about.stretch} of epoch {about.epoch}"
+    more = (from_samples(cut.samples, source=source).digest,) if cut.samples else identities
+    data = dataset(model, cut, source, (about.digest,))
+    found = tracer(
+        data, model, horizon=HORIZON_S, seed=seed, progress=progress, weights=weights(profile, model.states), kind=profile.norm.set
+    )
+    fitted = found.spec
+    if fitted.effects != profile.model.effects:
+        fitted = msgspec.structs.replace(fitted, fitted_on=tuple(dict.fromkeys((*fitted.fitted_on, *more))))
+    return found, fitted
+
+
+def plain(job: TraceJob, cut: Cut, found: TraceResult, fitted: Any) -> dict[str, Any]:
+    """What stands in the log, but for VOLATILE."""
+    from s2r_runtime.modelspec import dump_model
+
+    new = found.model.effects[len(job.profile.model.effects) :] if len(found.effects) else ()
+    why = ""
+    if found.verdict != "traced":
+        why = f"the verdict is {found.verdict}"
+    elif fitted.effects == job.profile.model.effects:
+        why = "no effect was added"
+    elif any(getattr(a.effect, "timed", False) for a in found.model.effects if (a.effect.name, a.channel) in _names(found)):
+        why = "an effect counts its time from this recording's start, so it foretells no other"
+    return {
+        **found.to_json(),
+        "text": found.text(),
+        "recording": msgspec.to_builtins(cut.about),
+        "model": job.profile.model.digest(),
+        "seed": job.seed,
+        "options": options(job.profile, found.nominal.states, job.rows),
+        "proposal": {"digest": fitted.digest(), "proposed": not why, "reason": why, "effects": [e.text() for e in found.effects]},
+        "model_toml": dump_model(fitted, found.comments()),
+        "model_path": "",
+        "added": bool(new),
+    }
+
+
+def options(profile: Profile, states: Sequence[str], rows: int) -> dict[str, Any]:
+    """What the tracer was told besides rows, model and seed."""
+    return {"horizon_s": HORIZON_S, "weights": list(weights(profile, states)), "set": profile.norm.set, "rows": rows}
+
+
+def weights(profile: Profile, states: Sequence[str]) -> tuple[float, ...]:
+    """The norm's, one a state."""
+    return tuple(profile.norm.weights.get(name, 1.0) for name in states)
+
+
+def dataset(model: ComposedModel, cut: Cut, source: str, digests: tuple[str, ...]) -> Dataset:
+    """The stretch on the model's grid. Raises RecordingError if its rows are not of this model, or too far apart."""
+    from s2r_runtime.trace.dataset import from_streams
+
+    for segment in cut.segments:
+        for rows, names in ((segment.states, model.states), (segment.inputs, model.inputs)):
+            if any(len(values) != len(names) for _, values in rows):
+                raise RecordingError(f"{source}: its rows are not of {', '.join(names)}")
+    segments = [(_stream(one.states, len(model.states)), _stream(one.inputs, len(model.inputs))) for one in cut.segments]
+    return from_streams(model, segments, source, digests)
+
+
+def _stream(rows: Rows, width: int) -> Any:
+    """Sorted by stamp; equal stamps keep their order."""
+    import numpy as np
+
+    from s2r_runtime.trace.dataset import Stream
+
+    t = np.array([stamp for stamp, _ in rows], dtype=np.int64)
+    order = np.argsort(t, kind="stable")
+    values = np.array([values for _, values in rows], dtype=np.float64).reshape(len(rows), width)
+    return Stream(np.asarray(t[order] * 1e-9, dtype=np.float64), values[order])
+
+
+def _names(found: TraceResult) -> set[tuple[str, str]]:
+    return {(e.name, e.channel) for e in found.effects}
+
+
+# ---------------------------------------------------------------- from logs that are being written
+
+
+def _read(job: TraceJob) -> tuple[Cut, tuple[str, ...]]:
+    """The stretch, and what stands for its logs."""
+    _step_back()
+    limit = time.monotonic() + WRITTEN_WITHIN_S
+    while True:
+        time.sleep(0.1)
+        found = _once(job)
+        if found is not None:
+            return found
+        if time.monotonic() > limit:
+            raise RecordingError(f"the order to trace did not reach the log within {WRITTEN_WITHIN_S:g} s")
+
+
+def _once(job: TraceJob) -> tuple[Cut, tuple[str, ...]] | None:
+    """None while the order is not in the log yet."""
+    stretches, keys = Stretches(job.rows), {}
+    for parts in runs(_with_later_parts(job.logs), CHANNELS):
+        run = parts[0].run
+        stretches.begin_run(run)
+        for reading in parts:
+            keys[run] = reading.public_key
+            for entry in reading:
+                message = entry.message
+                if isinstance(message, StartJob) and run == job.run and (message.kind, message.job_id) == ("trace", job.job_id):
+                    return _cut(job, stretches, keys)
+                stretches.take(entry.index, message)
+            if reading.ending.kind == "broken":
+                raise RecordingError(f"{reading.path}: is damaged {reading.ending.detail}")
+    return None
+
+
+def _cut(job: TraceJob, stretches: Stretches, keys: dict[str, bytes]) -> tuple[Cut, tuple[str, ...]]:
+    cut = stretches.cut(job.stretch, job.epoch)
+    if cut is None:
+        raise RecordingError(f"nothing was recorded of the {job.stretch} of epoch {job.epoch}")
+    return cut, tuple(log_identity(part.run, keys[part.run]) for part in cut.about.parts)
+
+
+def _with_later_parts(logs: Sequence[str]) -> list[Path]:
+    """A log may have gone on in another part since the order."""
+    found = [Path(log) for log in logs]
+    for path in list(found):
+        found += [later for later in sorted(path.parent.glob(f"{path.stem}.[0-9][0-9][0-9]{path.suffix}")) if later not in found]
+    return found
+
+
+def _step_back() -> None:
+    """Behind everything else that wants the processor."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.nice(19)
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
