@@ -39,12 +39,11 @@ BODY_FRAMES = (8, 9, 12)
 
 
 class Message(NamedTuple):
-    """One kind of message. least: bytes of its payload without extensions, which is all that version 1 knows."""
+    """One kind of message."""
 
     number: int
     name: str
     layout: struct.Struct
-    least: int
     fields: tuple[str, ...]
 
     def pack(self, *values: Any) -> bytes:
@@ -59,9 +58,8 @@ class Message(NamedTuple):
         return self.layout.unpack_from(payload.ljust(size, b"\0"))
 
 
-def _message(number: int, name: str, layout: str, fields: str, least: int = 0) -> Message:
-    packed = struct.Struct("<" + layout)
-    return Message(number, name, packed, least or packed.size, tuple(fields.split()))
+def _message(number: int, name: str, layout: str, fields: str) -> Message:
+    return Message(number, name, struct.Struct("<" + layout), tuple(fields.split()))
 
 
 _TARGET = "target_system target_component"
@@ -75,24 +73,23 @@ MESSAGES: dict[int, Message] = {
         _message(GLOBAL_POSITION_INT, "GLOBAL_POSITION_INT", "I4i3hH", "time_boot_ms lat lon alt relative_alt vx vy vz hdg"),
         _message(COMMAND_INT, "COMMAND_INT", "4f2ifH5B", f"param1 param2 param3 param4 x y z command {_TARGET} frame current autocontinue"),
         _message(COMMAND_LONG, "COMMAND_LONG", "7fH3B", f"param1 param2 param3 param4 param5 param6 param7 command {_TARGET} confirmation"),
-        _message(COMMAND_ACK, "COMMAND_ACK", "HBBiBB", f"command result progress result_param2 {_TARGET}", 3),
+        _message(COMMAND_ACK, "COMMAND_ACK", "HBBiBB", f"command result progress result_param2 {_TARGET}"),
         _message(
             SET_POSITION_TARGET_LOCAL_NED,
             "SET_POSITION_TARGET_LOCAL_NED",
             "I11fH3B",
             f"time_boot_ms x y z vx vy vz afx afy afz yaw yaw_rate type_mask {_TARGET} coordinate_frame",
         ),
-        _message(VISION_POSITION_ESTIMATE, "VISION_POSITION_ESTIMATE", "Q6f21fB", "usec x y z roll pitch yaw covariance reset_counter", 32),
-        _message(TIMESYNC, "TIMESYNC", "qqBB", f"tc1 ts1 {_TARGET}", 16),
+        _message(VISION_POSITION_ESTIMATE, "VISION_POSITION_ESTIMATE", "Q6f21fB", "usec x y z roll pitch yaw covariance reset_counter"),
+        _message(TIMESYNC, "TIMESYNC", "qqBB", f"tc1 ts1 {_TARGET}"),
         _message(MESSAGE_INTERVAL, "MESSAGE_INTERVAL", "iH", "interval_us message_id"),
-        _message(STATUSTEXT, "STATUSTEXT", "B50sHB", "severity text id chunk_seq", 51),
+        _message(STATUSTEXT, "STATUSTEXT", "B50sHB", "severity text id chunk_seq"),
         _message(
             ODOMETRY,
             "ODOMETRY",
             "Q3f4f6f21f21f4Bb",
             "time_usec x y z q vx vy vz rollspeed pitchspeed yawspeed pose_covariance velocity_covariance "
             "frame_id child_frame_id reset_counter estimator_type quality",
-            230,
         ),
     )
 }

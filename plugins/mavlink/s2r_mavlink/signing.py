@@ -62,20 +62,18 @@ def default_state(key: bytes) -> Path:
 
 
 class Signing:
-    """Signs and verifies under one key. state: the file that keeps the floor. Raises ConfigError if that file is no good.
-
-    good, refused: counts; refused by reason.
-    """
+    """Signs and verifies under one key. state: the file that keeps the floor. Raises ConfigError if that file is no good."""
 
     def __init__(self, key: bytes, state: Path, unix_s: float, link: int = 0) -> None:
         self._key, self._state, self._link = key, state, link
         self._streams: dict[tuple[int, int, int], int] = {}
         self._floor = self._newest = max(stamp_of(unix_s), _kept(state))
-        self._reserved = 0
-        self._writer: threading.Thread | None = None
-        self.good = 0
-        self.refused: dict[str, int] = {"bad_signature": 0, "old_stamp": 0, "far_future": 0, "unsigned": 0}
-        self._write(self._newest + RESERVE)
+        self._reserved = self._newest + RESERVE
+        try:
+            _keep(state, self._reserved)
+        except OSError as error:
+            raise ConfigError(f"transport.signing_state: {state}: cannot be written: {error.strerror}") from None
+        self._keeper = _Keeper(state)
 
     def sign(self, frame: bytes, unix_s: float) -> bytes:
         """The frame (made with `signed`) with its signature behind it. Stamps only rise, also where the wall clock steps back."""
@@ -87,50 +85,68 @@ class Signing:
     def verify(self, frame: bytes, *, signed: bool) -> str:
         """Why this whole frame does not count, or empty. Only one that counts changes anything."""
         if not signed:
-            return self._refuse("unsigned")
+            return "unsigned"
         if not hmac.compare_digest(hashlib.sha256(self._key + frame[:-6]).digest()[:6], frame[-6:]):
-            return self._refuse("bad_signature")
+            return "bad_signature"
         stream, stamp = (frame[-13], frame[5], frame[6]), int.from_bytes(frame[-12:-6], "little")
         if stamp <= self._streams.get(stream, self._floor):
-            return self._refuse("old_stamp")
+            return "old_stamp"
         if stamp >= LATEST:
-            return self._refuse("far_future")
+            return "far_future"
         self._streams[stream] = stamp
         if stamp > self._newest:
             self._newest = stamp
             self._look_ahead()
-        self.good += 1
         return ""
-
-    def _refuse(self, reason: str) -> str:
-        self.refused[reason] += 1
-        return reason
 
     def close(self) -> None:
         """Writes where the stamps stand; may be called twice."""
-        if self._writer is not None:
-            self._writer.join()
+        self._keeper.close()
         with suppress(OSError):  # what was written ahead holds
             _keep(self._state, self._newest)
 
     def _look_ahead(self) -> None:
-        """Writes the floor of a later run before it is needed, without waiting for the disk."""
-        if self._newest + RESERVE // 2 < self._reserved or (self._writer is not None and self._writer.is_alive()):
-            return
-        self._reserved = self._newest + RESERVE
-        self._writer = threading.Thread(target=self._written, args=(self._reserved,), name="mavlink-signing", daemon=True)
-        self._writer.start()
+        """Has the floor of a later run written before it is needed, without waiting for the disk."""
+        if self._newest + RESERVE // 2 >= self._reserved:
+            self._reserved = self._newest + RESERVE
+            self._keeper.keep(self._reserved)
 
-    def _written(self, floor: int) -> None:
-        with suppress(OSError):  # tried again with half of the reserve left; the next start then asks for a disk
-            _keep(self._state, floor)
 
-    def _write(self, floor: int) -> None:
-        try:
-            _keep(self._state, floor)
-        except OSError as error:
-            raise ConfigError(f"transport.signing_state: {self._state}: cannot be written: {error.strerror}") from None
-        self._reserved = floor
+class _Keeper:
+    """Writes the newest floor that it is given, from a thread of its own. A write that fails is tried again with the next."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._wake = threading.Condition()
+        self._floor, self._written, self._ending = 0, 0, False
+        self._thread = threading.Thread(target=self._run, name="mavlink-signing", daemon=True)
+        self._thread.start()
+
+    def keep(self, floor: int) -> None:
+        """Returns at once."""
+        with self._wake:
+            self._floor = floor
+            self._wake.notify()
+
+    def close(self) -> None:
+        """Writes what is left; may be called twice."""
+        with self._wake:
+            self._ending = True
+            self._wake.notify()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                while self._floor == self._written and not self._ending:
+                    self._wake.wait()
+                floor, ending = self._floor, self._ending
+            if floor != self._written:
+                with suppress(OSError):
+                    _keep(self._path, floor)
+                self._written = floor
+            elif ending:
+                return
 
 
 def _kept(path: Path) -> int:
