@@ -3,6 +3,7 @@
 Found out on python-can 4.6 and held by tests:
 - a socketcand connection that its server closed reads as an endless silence at full speed, and connecting to nobody as ten seconds of
   the same: so somebody looks whether the server is there, before and after;
+- over socketcand, frames that follow each other wait up to 40 ms for the acknowledgement of the first, unless `tcp_tune` is set;
 - udp_multicast gives back what was sent, whatever `receive_own_messages` says: each frame of ours is taken out once;
 - one datagram that is no CAN frame raises; it is counted, and the next one read;
 - `send` blocks on sockets and serial lines: those get a thread of their own, and a short queue;
@@ -120,8 +121,12 @@ class Port:
         if self._config["interface"] == "socketcand":
             with socket.create_connection((self._config.get("host"), self._config.get("port")), timeout=0.5):
                 pass
-        filters = {"can_filters": self._filters} if self._filters and self._config["interface"] == "socketcan" else {}
-        return can.Bus(**{"ignore_config": True, **self._config, **filters})
+        more: dict[str, Any] = {"ignore_config": True}
+        if self._config["interface"] == "socketcan" and self._filters:
+            more["can_filters"] = self._filters
+        if self._config["interface"] == "socketcand":
+            more["tcp_tune"] = True
+        return can.Bus(**{**more, **self._config})
 
     def _hear(self, bus: can.BusABC) -> None:
         """Until the port is closed. Raises what the driver raises when it is of no use any more."""

@@ -219,7 +219,9 @@ class SocketRig(Rig):
 
     def __init__(self, **more: Any) -> None:
         self.hub = Hub().start()
-        super().__init__({"interface": "socketcand", "host": "127.0.0.1", "port": self.hub.port, "channel": "can0"}, **more)
+        super().__init__(
+            {"interface": "socketcand", "host": "127.0.0.1", "port": self.hub.port, "channel": "can0", "tcp_tune": True}, **more
+        )
 
     def __exit__(self, *_: object) -> None:
         super().__exit__()
