@@ -4,17 +4,26 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import add_model_options, chosen_model, count, positive, weights_of, writable
-from s2r_runtime.errors import UsageError
+from s2r_runtime.cli.daemon_verbs import add_daemon_options, run_live_trace
+from s2r_runtime.errors import NotEnoughEvidence, UsageError
+
+if TYPE_CHECKING:
+    from s2r_runtime.models.composed import ComposedModel
+    from s2r_runtime.profile import Profile
+    from s2r_runtime.trace.dataset import Dataset
+    from s2r_runtime.trace.result import TraceResult
+    from s2r_runtime.trace.suggestion import Suggestion
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verb."""
     verb = verbs.add_parser("trace", help="find the effect that the model lacks, add it, and report the error before and after")
     verb.add_argument(
-        "recording", type=Path, metavar="RECORDING", help="a log's MCAP, CSV (.gz), or a robot's own log that a plug-in reads"
+        "recording", type=Path, nargs="?", metavar="RECORDING", help="a log's MCAP, CSV (.gz), or a robot's own log that a plug-in reads"
     )
     add_model_options(verb)
     verb.add_argument(
@@ -31,6 +40,20 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         metavar="HZ",
         help="within which states that the recording lacks are reconstructed from those that it has (default: what the data bear)",
     )
+    verb.add_argument(
+        "--suggest",
+        type=Path,
+        metavar="FILE.csv",
+        help="write a sequence of inputs that would tell apart what these data cannot, within the profile's bounds (else the range seen)",
+    )
+    verb.add_argument("--suggest-duration", type=positive, metavar="S", help="length of that sequence in s (default 20)")
+    verb.add_argument(
+        "--live",
+        choices=("campaign", "drive", "inputs"),
+        help="instead of a recording: what the running daemon recorded, of its newest campaign, of controllers since, or of given inputs; "
+        "it traces with its profile's model, and proposes the repaired one (s2r adopt)",
+    )
+    add_daemon_options(verb)
     verb.add_argument("-o", "--output", type=Path, metavar="MODEL.toml", help="write the repaired model")
     verb.add_argument("--report", type=Path, metavar="FILE.html", help="write a self-contained page with plots")
     verb.add_argument("--json", action="store_true", help="print one JSON object")
@@ -39,11 +62,16 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Exit 0 with any verdict, 3 with too little data."""
-    from s2r_runtime.modelspec import dump_model
     from s2r_runtime.trace.tracer import load_dataset, trace
 
-    writable(args.output)
-    writable(args.report)
+    if (args.recording is None) == (args.live is None):
+        raise UsageError("trace: give a RECORDING, or --live with what the running daemon recorded")
+    if args.live:
+        return run_live_trace(args)
+    for path in (args.output, args.report, args.suggest):
+        writable(path)
+    if args.suggest_duration and not args.suggest:
+        raise UsageError("--suggest-duration: belongs to --suggest FILE.csv")
     model, profile = chosen_model(args)
     columns, transport = (dict(profile.columns), profile.transport) if profile else ({}, None)
     data = load_dataset(args.recording, model, columns, bandwidth=args.bandwidth, transport=transport)
@@ -63,23 +91,78 @@ def run(args: argparse.Namespace) -> int:
             weights=weights_of(model.states, [], profile),
             kind=profile.norm.set if profile else "ball",
         )
+        if args.suggest:
+            bar(100.0, 100.0, "looking for a drive")
+        suggested = _suggested(args, result, profile) if args.suggest else None
+    except NotEnoughEvidence:
+        bar.close()
+        if args.suggest:
+            _suggest_first(args, model, data, profile)
+        raise
     finally:
         bar.close()
+    _write(args, result, suggested)
+    if args.json:
+        told = result.to_json()
+        output.result_json(told | ({"suggested_sequence": suggested.to_json(str(args.suggest))} if suggested else {}))
+    else:
+        _tell(args, result, suggested, changed=result.spec.effects != model.spec.effects)
+    return 0
+
+
+def _write(args: argparse.Namespace, result: TraceResult, suggested: Suggestion | None) -> None:
+    """The files that were asked for."""
+    from s2r_runtime.modelspec import dump_model
+
     if args.output:
         args.output.write_text(dump_model(result.spec, result.comments()), encoding="utf-8")
+    if suggested and suggested.u is not None:
+        args.suggest.write_text(suggested.to_csv(), encoding="utf-8")
     if args.report:
         from s2r_runtime.report.trace_page import trace_page
 
-        args.report.write_text(trace_page(result), encoding="utf-8")
-    if args.json:
-        output.result_json(result.to_json())
-    else:
-        output.out(result.text())
-        if args.output:
-            output.out(
-                f"model written to {args.output}"
-                + ("" if result.spec.effects != model.spec.effects else " (unchanged: no effect was added)")
-            )
-        if args.report:
-            output.out(f"report written to {args.report}")
-    return 0
+        args.report.write_text(trace_page(result, suggested), encoding="utf-8")
+
+
+def _tell(args: argparse.Namespace, result: TraceResult, suggested: Suggestion | None, *, changed: bool) -> None:
+    output.out(result.text())
+    if suggested:
+        _tell_drive(args.suggest, suggested)
+    if args.output:
+        output.out(f"model written to {args.output}" + ("" if changed else " (unchanged: no effect was added)"))
+    if args.report:
+        output.out(f"report written to {args.report}")
+
+
+def _tell_drive(path: Path, suggested: Suggestion) -> None:
+    from s2r_runtime.trace.account import labelled
+
+    output.out("")
+    for line in labelled("drive", suggested.lines()):
+        output.out(line)
+    if suggested.u is not None:
+        output.out(f"drive written to {path}")
+
+
+def _suggested(args: argparse.Namespace, result: TraceResult, profile: Profile | None) -> Suggestion:
+    from s2r_runtime.trace.excitation import suggest
+
+    bounds, region = _allowed(profile)
+    return suggest(result, bounds=bounds, region=region, duration=args.suggest_duration, seed=args.seed)
+
+
+def _suggest_first(args: argparse.Namespace, model: ComposedModel, data: Dataset, profile: Profile | None) -> None:
+    """For a recording that cannot be traced: a first drive, where a profile says what is allowed."""
+    from s2r_runtime.trace.excitation import suggest_first
+
+    bounds, region = _allowed(profile)
+    drive = suggest_first(model, data, bounds=bounds, region=region, duration=args.suggest_duration, seed=args.seed)
+    if drive.u is not None:
+        args.suggest.write_text(drive.to_csv(), encoding="utf-8")
+    if not args.json:
+        _tell_drive(args.suggest, drive)
+
+
+def _allowed(profile: Profile | None) -> tuple[dict[str, tuple[float, float]] | None, dict[str, tuple[float, float]] | None]:
+    """Bounds of the inputs, and of the states: the geofence where there is one, else the region."""
+    return (dict(profile.inputs), {**profile.region, **profile.geofence}) if profile else (None, None)

@@ -25,6 +25,9 @@ FRAMED, MARGIN = 0.998, 1.2
 
 SIGMAS = 1.96
 
+POINTS = 600
+"""Of a scatter: enough to see a cloud's shape, and forty of them stay a page."""
+
 NEAR = 12.0
 """Half widths of an interval within which the value of no effect is drawn beside it."""
 
@@ -52,7 +55,7 @@ def against(part: Component, over: Variable, *, changed: bool) -> str:
     fx, ux = shown_as(over.unit if over.unit == "rad" else "", 0.0) if over.unit == "rad" else (1.0, over.unit)
     limit = _frame(part.before, part.after)
     fy, uy = shown_as(part.unit, limit)
-    rows = spread(900, part.before, part.after)
+    rows = spread(POINTS, part.before, part.after)
     series = [(part.before, ORANGE), (part.after, BLUE)] if changed else [(part.after, BLUE)]
     for values, colour in series:
         _points(ax, fx * over.values[rows], fy * values[rows], fy * limit, colour)

@@ -8,7 +8,6 @@ from typing import Any
 
 from s2r_runtime.report.page import Page
 from s2r_runtime.trace.found import Found
-from s2r_runtime.trace.plain_words import degrees
 
 SAY = {
     "none": ("nothing beyond noise is left in the residual.", "good"),
@@ -84,7 +83,7 @@ def _errors(page: Page, error: dict[str, Any], noise: str) -> None:
     columns = [(name, values) for name, values in columns if not (same and name == "after")]
     rows = []
     for state in before["one_step_rms"]:
-        units = [(unit.get(state, ""), 1.0)] + ([(degrees(unit[state]), math.degrees(1.0))] if degrees(unit.get(state, "")) else [])
+        units = [(unit.get(state, ""), 1.0)] + ([("deg", math.degrees(1.0))] if unit.get(state) == "rad" else [])
         for name, factor in units:
             cells = [f"{factor * values[state]:.3g}" if state in values else "" for _, values in columns]
             rows.append((f"{state} ({name})" if name else state, *cells))

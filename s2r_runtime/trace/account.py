@@ -10,7 +10,6 @@ from itertools import groupby
 from typing import TYPE_CHECKING
 
 from s2r_runtime.trace.found import Found
-from s2r_runtime.trace.plain_words import degrees
 from s2r_runtime.trace.residual import rms
 from s2r_runtime.trace.shape import Shape, components, derived, strongest, variables
 
@@ -40,13 +39,13 @@ ARROW = "->"
 def account(r: TraceResult) -> str:
     """The lines."""
     lines = [f"{r.verdict}: {headline(r)}", *_explained(r)]
-    lines += ["", *_labelled("left over", _left_over(r))]
+    lines += ["", *labelled("left over", _left_over(r))]
     lines += ["", *_table(r), ""]
-    lines += _labelled("gap", _gap(r))
-    lines += _labelled("still there", _still_there(r))
-    lines += _labelled("faults", list(_faults(r)))
-    lines += _labelled("not shown", _unseen(r))
-    lines += _labelled("data", _data(r))
+    lines += labelled("gap", _gap(r))
+    lines += labelled("still there", _still_there(r))
+    lines += labelled("faults", list(_faults(r)))
+    lines += labelled("not shown", _unseen(r))
+    lines += labelled("data", _data(r))
     return "\n".join(lines)
 
 
@@ -67,7 +66,7 @@ def _explained(r: TraceResult) -> list[str]:
     lines += [f"  {'':<4}the same thing on this model: {e.text()}" for e in r.same]
     if r.rivals:
         lines += ["cannot be told from:", *(line for e in r.rivals for line in _effect(e))]
-        lines += _labelled("try next", [r.suggested_excitation or "", "(--suggest FILE.csv writes such a drive)"])
+        lines += labelled("try next", [r.suggested_excitation or "", "(--suggest FILE.csv writes such a drive)"])
     if r.partial:
         lines += ["explains a part only, so no name is lent to it:", *(line for e in r.partial for line in _effect(e))]
     return lines
@@ -135,7 +134,7 @@ def _table(r: TraceResult) -> list[str]:
     rows = []
     for i, state in enumerate(r.nominal.states):
         unit = units.get(state, "")
-        for name, factor in [(unit, 1.0)] + ([(degrees(unit), math.degrees(1.0))] if degrees(unit) else []):
+        for name, factor in [(unit, 1.0)] + ([("deg", math.degrees(1.0))] if unit == "rad" else []):
             row = f"{(f'{state} ({name})' if name else state):<18}"
             for before, after, floor in pairs:
                 now = f"{_short(factor * before[i])} {ARROW} {_short(factor * after[i])}" if changed else _short(factor * before[i])
@@ -167,7 +166,8 @@ def _still_there(r: TraceResult) -> list[str]:
         return ["nothing beyond noise"] if r.verdict != "unexplained" else ["structure; what it depends on cannot be told"]
     if r.depends_on == ("noise",):
         return ["coloured noise: correlated in time, whatever the inputs do"]
-    much = f" ({100.0 * r.share_left:.0f} % of what the model lacked)" if r.effects else ""
+    percent = f"{100.0 * r.share_left:.0f} %" if r.share_left >= 0.01 else "under 1 %"
+    much = f" ({percent} of what the model lacked)" if r.effects else ""
     lines = [f"structure{much} that depends on {', '.join(r.depends_on)}"]
     return [*lines, "its shape is on the page that --report FILE.html writes"] if r.verdict == "unexplained" else lines
 
@@ -208,7 +208,8 @@ def _data(r: TraceResult) -> list[str]:
     return lines
 
 
-def _labelled(label: str, lines: Sequence[str]) -> list[str]:
+def labelled(label: str, lines: Sequence[str]) -> list[str]:
+    """Lines behind a word on the left, broken at words to fit."""
     fitting = [piece for line in lines for piece in _wrapped(line)]
     return [f"{label if i == 0 else '':<{LABEL}}{line}" for i, line in enumerate(fitting)]
 

@@ -1,23 +1,93 @@
-"""What to drive so that effects which explain the same data can be told apart.
+"""What to drive so that effects which explain the same data can be told apart: in a sentence, and as a sequence of inputs.
 
 Each effect is told from the others by what it does to one feature of the input: a bias by zero and both signs, a gain by several
 sizes, a limit by sizes up to the largest, memory by steps seen at once after they are made, and one that couples inputs by
 values of the one at several values of the other.
+
+A sequence is found by drawing many (`drives`) and taking the one under which the smallest expected log likelihood difference between
+rivals (`separation`) is largest; for the whole library, the one under which most effects are told from one another and from none.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace.drives import Room, draw, room_of
+from s2r_runtime.trace.errors import Held
+from s2r_runtime.trace.fitting import Fit, evaluate
+from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.rival_fits import Rivals, ground, library, rivals_of
+from s2r_runtime.trace.separation import as_data, between, expected, refitted, trajectories
+from s2r_runtime.trace.suggestion import ENOUGH, Suggestion
 
+if TYPE_CHECKING:
+    from s2r_runtime.trace.dataset import Dataset
+    from s2r_runtime.trace.result import TraceResult
+
+Array = NDArray[np.float64]
+Bounds = Mapping[str, tuple[float, float]]
+
+DURATION_S, FEWEST, MOST = 20.0, 300, 4000
+"""Length of a drive if none is asked for, s; and in rows at least and at most."""
+
+ROWS, SEQUENCES = 30_000, (8, 60)
+"""Rows that are simulated for each rival, and how many sequences that may be."""
+
+FINALS = 4
+"""Sequences that are looked at again with rivals really refitted."""
+
+PLENTY = 10.0 * ENOUGH
+"""More nats than this are worth nothing."""
+
+HOMEWARD = 0.3
+"""Share of its worth that a drive loses if it ends at the edge of the room."""
+
+NESTED = 0.02
+"""A rival that loses no more than this share, whatever is driven, of what the truth would lose in its place, can become the truth."""
+
+REPEATS = 10.0
+"""A drive that would have to be driven more often than that until it tells two apart is none."""
+
+_SIZES = "at least three sizes"
+_FAR = "steps between values far apart, each held until the response has settled"
+_BOTH = "slow and fast in both directions, and coasting at zero input"
+_TURNS = "every heading, at several speeds"
 _NEEDS = {
     "input_bias": "zero and both signs",
-    "input_gain": "at least three sizes",
+    "input_gain": _SIZES,
+    "input_gain_asymmetry": "at least three sizes of both signs",
     "input_saturation": "sizes from small up to the largest that is allowed",
     "wheel_saturation": "the largest values of each at several values of the other",
     "input_delay": "steps between values far apart, with single periods recorded after each",
-    "input_lag": "steps between values far apart, each held until the response has settled",
+    "input_lag": _FAR,
+    "input_rate_limit": "small and large steps, each held until the response has settled",
+    "input_deadband": "values around zero, small and large, of both signs",
+    "input_backlash": "reversals, small and large",
+    "input_coupling": "several values of each at several values of the other",
+    "input_gain_drift": "the same values early and late",
+    "regime_change": "the same values early and late",
+    "periodic_disturbance": "one value, held for many seconds",
+    "viscous_friction": _BOTH,
+    "coulomb_friction": _BOTH,
+    "stribeck_friction": "very slow and fast in both directions",
+    "quadratic_drag": "at least three speeds",
+    "cubic_stiffness": "the whole range of positions",
+    "constant_disturbance": _TURNS,
+    "gravity_slope": _TURNS,
+    "heading_offset": _TURNS,
+    "position_field": "all over the floor",
+    "lateral_slip": "curves of several radii at several speeds",
+    "understeer": "the same steering at several speeds",
+    "longitudinal_slip": _SIZES,
+    "track_scale": _SIZES,
+    "sensor_lever_arm": "turning on the spot, and driving straight",
 }
 _OTHERWISE = "steps of several sizes and both signs"
 
@@ -27,10 +97,162 @@ def advice(model: ComposedModel, tied: Iterable[tuple[str, str]]) -> str:
     wanted: dict[str, list[str]] = {}
     for name, channel in tied:
         for single in model.inputs if channel == "*" else (channel,):
-            needs = wanted.setdefault(single, [])
+            needs = wanted.setdefault(single if single in model.inputs else "", [])
             text = _NEEDS.get(name, _OTHERWISE)
             if text not in needs:
                 needs.append(text)
-    parts = [f"{channel}: {'; '.join(needs)}" for channel, needs in wanted.items()]
-    apart = " Change one input at a time while the others hold still." if len(wanted) > 1 else ""
+    parts = [f"{channel}: {'; '.join(needs)}" if channel else "; ".join(needs) for channel, needs in sorted(wanted.items(), reverse=True)]
+    apart = " Change one input at a time while the others hold still." if len([c for c in wanted if c]) > 1 else ""
     return "Drive " + ". ".join(parts) + "." + apart
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """u: (T, nu); pairs: (one, other, nats), the closest first; never: pairs that no sequence tells apart."""
+
+    u: Array
+    pairs: tuple[tuple[str, str, float], ...]
+    never: tuple[str, ...]
+
+
+def suggest(
+    r: TraceResult,
+    *,
+    bounds: Bounds | None = None,
+    region: Bounds | None = None,
+    duration: float | None = None,
+    seed: int = 0,
+) -> Suggestion:
+    """The drive for a trace. bounds: of the inputs (None: the range seen); region: of states that must be kept; duration: s."""
+    given = ground(r.held)
+    rivals = rivals_of(r, given)
+    base = evaluate(given, r.model) if rivals is None else rivals.fits[0]
+    return _suggested(r.held, base, rivals, bounds, region, duration, seed)
+
+
+def suggest_first(
+    model: ComposedModel, data: Dataset, *, bounds: Bounds | None, region: Bounds | None, duration: float | None, seed: int
+) -> Suggestion:
+    """The drive for a recording that says too little to be traced: one that shows whatever the library has."""
+    steps = steps_of(data)
+    held = Held(data, steps, (), np.ones(sum(len(run.y) - 1 for run in data.runs), dtype=bool), 1)
+    return _suggested(held, evaluate(ground(held), model), None, bounds, region, duration, seed)
+
+
+def _suggested(
+    held: Held, base: Fit, rivals: Rivals | None, bounds: Bounds | None, region: Bounds | None, duration: float | None, seed: int
+) -> Suggestion:
+    model, rng = base.model, np.random.default_rng(seed)
+    ends = _bounds(held, model.inputs, bounds)
+    told = {name: (float(low), float(high)) for name, (low, high) in zip(model.inputs, ends, strict=True)}
+    nothing = Suggestion(model.inputs, model.dt, told, bounds is None, rivals is not None)
+    if not np.any(ends[:, 1] > ends[:, 0]):
+        return replace(nothing, refused="the bounds leave no input that may change; a profile would say what is allowed (--profile)")
+    room = room_of(model, held, ends, region)
+    steps = _steps(duration, model.dt)
+    drawn = draw(rng, model, room, ends, int(np.clip(ROWS // steps, *SEQUENCES)), steps)
+    drawn = _inside(rivals.fits if rivals else (base,), room, drawn, strictly=region is not None)
+    if not len(drawn):
+        return replace(nothing, refused="no drive of that length stays inside the region; give a shorter one or a larger region")
+    choice = _for_rivals(rivals, held, room, drawn, rng) if rivals else None
+    if choice is None or not (choice.pairs or choice.never):
+        nothing, choice = replace(nothing, tied=False), _for_library(base, held, room, drawn, rng)
+    if not choice.pairs or (nothing.tied and choice.pairs[0][2] * REPEATS < ENOUGH):
+        which = "; ".join(choice.never) or f"{choice.pairs[0][0]} and {choice.pairs[0][1]}"
+        return replace(nothing, refused=f"nothing within the bounds tells apart {which}", never=choice.never)
+    y = trajectories(model, None, room.start, choice.u[None], rng)[0]
+    away = np.hypot(*(y - room.start)[:, list(room.pose)].T) if room.pose is not None else room.excess(y)
+    begin = tuple((s, float(room.start[i])) for i, s in enumerate(model.states) if region and s in region and s in {"x", "y", "q"})
+    return replace(
+        nothing,
+        u=choice.u,
+        pairs=choice.pairs,
+        never=choice.never,
+        begin=begin,
+        farthest=float(np.max(away)),
+        ends=float(away[-1]),
+        metres=room.pose is not None,
+    )
+
+
+def _bounds(held: Held, inputs: tuple[str, ...], bounds: Bounds | None) -> Array:
+    """(nu, 2). The range seen has zero in it: the robot stood before it was driven."""
+    if bounds is not None:
+        return np.array([bounds[name] for name in inputs], dtype=np.float64)
+    u = np.concatenate([run.u for run in held.data.runs])
+    return np.column_stack([np.minimum(u.min(axis=0), 0.0), np.maximum(u.max(axis=0), 0.0)])
+
+
+def _steps(duration: float | None, dt: float) -> int:
+    return max(2, round(duration / dt)) if duration is not None else int(np.clip(round(DURATION_S / dt), FEWEST, MOST))
+
+
+def _inside(fits: tuple[Fit, ...], room: Room, drawn: Array, *, strictly: bool) -> Array:
+    """Of the sequences (count, T, nu) those under which every rival stays in the room. Without a region it is only what was seen: then at
+    least the ones that leave it least.
+    """
+    worst = np.zeros(len(drawn))
+    for fit in fits:
+        y = trajectories(fit.model, None, room.start, drawn, np.random.default_rng(0))
+        worst = np.maximum(worst, room.excess(y).max(axis=1))
+    good = np.flatnonzero(worst <= 1.0)
+    return drawn[good] if len(good) or strictly else drawn[np.argsort(worst)[: SEQUENCES[0]]]
+
+
+def _for_rivals(rivals: Rivals, held: Held, room: Room, drawn: Array, rng: np.random.Generator) -> _Choice:
+    """The sequence under which the closest pair is farthest apart; the best few with rivals really refitted."""
+    fits = rivals.fits
+    couples = [(i, j) for i, j in combinations(range(len(fits)), 2) if i == 0 or rivals.every]
+    nats = np.zeros((len(drawn), len(fits), len(fits)))
+    for truth, fit in enumerate(fits):
+        y = trajectories(fit.model, fit.noise, room.start, drawn, rng)
+        for c, u in enumerate(drawn):
+            nats[c, truth] = expected(fits, truth, as_data(held.data, y[c], u))
+    ways = [_ways(nats, i, j) for i, j in couples]
+    both = np.array([[min(n[way] for way in told) for told in ways] for n in nats])
+    can = both.max(axis=0) * REPEATS >= ENOUGH
+    never = tuple(" and ".join(rivals.named(i, j)) for (i, j), ok in zip(couples, can, strict=True) if not ok)
+    never = never if rivals.every else ()
+    if not can.any():
+        return _Choice(drawn[0], (), never)
+    best: tuple[float, _Choice] | None = None
+    ends = room.excess(trajectories(fits[0].model, None, room.start, drawn, rng)[:, -1])
+    first = np.minimum(both[:, can].min(axis=1), PLENTY) * (1.0 - HOMEWARD * np.minimum(ends, 1.0))
+    for c in np.argsort(-first)[:FINALS]:
+        pairs = []
+        for (i, j), told, ok, roughly in zip(couples, ways, can, both[c], strict=True):
+            if ok:
+                really = min(refitted(fits, *way, held.data, room.start, drawn[c]) for way in told)
+                pairs.append((*rivals.named(i, j), round(min(float(roughly), really), 2)))
+        pairs.sort(key=lambda pair: pair[2])
+        worth = min(pairs[0][2], PLENTY) * (1.0 - HOMEWARD * min(float(ends[c]), 1.0))
+        if best is None or worth > best[0]:
+            best = worth, _Choice(drawn[c], tuple(pairs), never)
+    assert best is not None  # noqa: S101 - there is at least one sequence
+    return best[1]
+
+
+def _ways(nats: Array, i: int, j: int) -> tuple[tuple[int, int], ...]:
+    """(truth, rival) that count for a pair, of nats (count, R, R): both, but not the one in which the rival can become the truth itself (a
+    gain by sign a gain): the tracer takes the simpler of two that say the same thing.
+    """
+    there, back = nats[:, i, j], nats[:, j, i]
+    if np.all(there < 1.0 + NESTED * back):
+        return ((j, i),)
+    return ((i, j),) if np.all(back < 1.0 + NESTED * there) else ((i, j), (j, i))
+
+
+def _for_library(base: Fit, held: Held, room: Room, drawn: Array, rng: np.random.Generator) -> _Choice:
+    """The sequence under which most effects are told from one another, and from none."""
+    y = trajectories(base.model, base.noise, room.start, drawn, rng)
+    rivals = library(base, as_data(held.data, y[0], drawn[0]))
+    drawn, y = drawn[: SEQUENCES[0] * 2], y[: SEQUENCES[0] * 2]
+    tables = np.stack([between(rivals.fits, base, as_data(held.data, y[c], u)) for c, u in enumerate(drawn)])
+    either = np.maximum(tables, tables.transpose(0, 2, 1))  # of two that nest, the richer one may be what the robot does
+    couples = list(combinations(range(len(rivals.fits)), 2))
+    best = int(np.argmax(np.minimum(either / ENOUGH, 1.0).sum(axis=(1, 2))))
+    shown = either[:, 0].max(axis=0) * REPEATS >= ENOUGH
+    shown[0] = True
+    pairs = [(rivals.names[i], rivals.names[j], round(float(either[best, i, j]), 2)) for i, j in couples if shown[i] and shown[j]]
+    never = tuple(name for name, ok in zip(rivals.names, shown, strict=True) if not ok)
+    return _Choice(drawn[best], tuple(sorted(pairs, key=lambda pair: pair[2])), never)

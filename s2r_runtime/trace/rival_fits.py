@@ -1,0 +1,125 @@
+"""The models that a suggested drive is to tell apart, each fitted to the recording.
+
+The ones that tie; else the one that was found and those that came closest to it; else one for every effect of the library, at the size from
+which the tracer would begin to look for it, each against the others and against none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.plugins import registry
+from s2r_runtime.trace.candidates import candidates
+from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.errors import Held
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, insert, problem, without
+from s2r_runtime.trace.found import Found
+from s2r_runtime.trace.holdout import part
+from s2r_runtime.trace.residual import first_steps
+from s2r_runtime.trace.scores import best_candidates, name_of
+from s2r_runtime.trace.slots import Added, bounds_of, free_of, slots_of, values_of
+
+if TYPE_CHECKING:
+    from s2r_runtime.trace.result import TraceResult
+
+STEPS = 4000
+"""Transitions that rivals are fitted on at most."""
+
+CLOSEST, LOOKED_AT = 3, 8
+"""Rivals of what was found that are taken, of those that are fitted."""
+
+
+@dataclass(frozen=True)
+class Rivals:
+    """fits: the models, the chosen one first; names: as a person says them; instead: of each, what it replaces in the chosen one. every:
+    whether all of them are to be told from one another (any may be true), or the others from the chosen one.
+    """
+
+    fits: tuple[Fit, ...]
+    names: tuple[str, ...]
+    instead: tuple[str, ...]
+    every: bool
+
+    def named(self, i: int, j: int) -> tuple[str, str]:
+        """Two of them, i < j."""
+        return self.instead[j] if i == 0 else self.names[i], self.names[j]
+
+
+def ground(held: Held) -> Problem:
+    """All that may be judged on and fitted on, thinned."""
+    everything = np.ones(first_steps(held.data)[-1], dtype=bool)
+    few = part(held.data, held.left_out, everything, STEPS)
+    return problem(few.data, few.steps)
+
+
+def rivals_of(r: TraceResult, given: Problem) -> Rivals | None:
+    """The ones that tie, or came closest; None if there are none (`library` then)."""
+    best = evaluate(given, r.model)
+    if r.rivals:
+        found = [(_said(f.name, f.channel), _with(given, best, f)) for f in r.rivals]
+        others = [(name, fit) for name, fit in found if fit is not None]
+    elif r.effects and all(v.size is not None for v in r.could_see):
+        same = {(f.name, f.channel) for f in (*r.effects, *r.same)}
+        others = [(name, fit) for name, key, fit in _closest(given, best) if key not in same][:CLOSEST]
+    else:
+        return None
+    if not others:
+        return None
+    fits = (best, *(fit for _, fit in others))
+    lost = [_effects(best) - _effects(fit) for fit in fits]
+    instead = tuple(" and ".join(_said(*key) for key in sorted(keys)) for keys in lost)
+    return Rivals(fits, ("", *(name for name, _ in others)), instead, every=bool(r.rivals))
+
+
+def _effects(fit: Fit) -> set[tuple[str, str]]:
+    return {name_of(fit.model.effects[i]) for i in fit.added}
+
+
+def library(base: Fit, rich: Dataset) -> Rivals:
+    """One model for each effect on each channel, at the size in the middle of those from which the tracer begins on a rich drive."""
+    found: dict[tuple[str, str], ComposedModel] = {}
+    for candidate in candidates(base.model, rich):
+        key = candidate.name, candidate.channel
+        models = candidate.models(base.model)
+        if key not in found and models:
+            found[key] = sorted(models, key=lambda m: _size(m, candidate.place if candidate.replaced < 0 else candidate.replaced))[
+                len(models) // 2
+            ]
+    fits = [replace(base, model=m, free=free_of(m)) for m in found.values()]
+    names = ("no effect", *(_said(*key) for key in found))
+    return Rivals((base, *fits), names, ("no effect",) * len(names), every=True)
+
+
+def _size(model: ComposedModel, place: int) -> float:
+    slots = tuple(slots_of(model.effects[place], place))
+    neutral = np.array([bounds_of(model, s).neutral or 0.0 for s in slots])
+    return float(np.max(np.abs(values_of(model, slots) - neutral), initial=0.0))
+
+
+def _with(given: Problem, best: Fit, found: Found) -> Fit | None:
+    """The chosen model with one effect replaced by another one: the one by which the likelihood suffers least."""
+    effect = registry().get("effects", found.name)
+    added = Added(effect, found.channel, found.values)
+    models = [insert(without(best.model, place), added, at) for place in best.added for at in sorted({place, len(best.model.effects) - 1})]
+    fits = [evaluate(given, model, best.noise) for model in models]
+    fits.sort(key=lambda fit: -fit.white)
+    return fitted(given, fits[0], fits[0].model, 1) if fits else None
+
+
+def _closest(given: Problem, best: Fit) -> Iterator[tuple[str, tuple[str, str], Fit]]:
+    """Fitted models that have another effect instead of one that was found, the closest first."""
+    found = []
+    for place in best.added:
+        base = fitted(given, best, without(best.model, place), 1)
+        found += [(gain(s.fit, best), s.name, s.channel, s.fit) for s in best_candidates(given, base, LOOKED_AT)[0] if s.fit is not None]
+    for _, name, channel, fit in sorted(found, key=lambda f: -f[0]):
+        yield _said(name, channel), (name, channel), fit
+
+
+def _said(name: str, channel: str) -> str:
+    return f"{name} on {channel}"
