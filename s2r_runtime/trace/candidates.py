@@ -11,11 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.effects.classes import canonical
 from s2r_runtime.hookspecs import Effect
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.fitting import insert
+from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.residual import sequence, times
 from s2r_runtime.trace.slots import Added
 
@@ -41,8 +43,10 @@ class Candidate:
         return [insert(model, start, self.place) for start in self.starts]
 
 
-def candidates(model: ComposedModel, data: Dataset) -> list[Candidate]:
-    """All that can be added to the model. What the tracer added already is not added again on the same channel."""
+def candidates(model: ComposedModel, data: Dataset, left: Leftover | None = None) -> list[Candidate]:
+    """All that can be added to the model; what the tracer added already is not added again on the same channel. left: what it leaves, for
+    those that begin there.
+    """
     found = []
     taken = {(a.effect.name, a.channel) for a in model.effects if isinstance(a, Added)}
     inputs, begun, t = [run.u for run in data.runs], [run.start_s for run in data.runs], times(data)
@@ -51,6 +55,8 @@ def candidates(model: ComposedModel, data: Dataset) -> list[Candidate]:
     for name in registry().names("effects"):
         effect = registry().get("effects", name)
         for channel in effect.channels(model.nominal):
+            if canonical(model.for_effects, name, channel) != (name, channel):
+                continue  # the same thing under another name is looked for already
             if (name, channel) in taken or (channel == "*" and len(model.inputs) == 1 and len(effect.channels(model.nominal)) > 1):
                 continue
             there = [i for i, a in enumerate(model.effects) if a.effect is effect]

@@ -37,7 +37,10 @@ ALPHA = 1e-3
 BLOCKS = 8
 """Of the cross-validation."""
 
-FEW = 8
+LEADING = 48
+"""Columns of a dictionary that are judged at most."""
+
+FEW = 6
 """Dictionaries that are judged with their own noise, after a first look under the model's."""
 
 ALIKE = 3.0
@@ -127,7 +130,7 @@ def _forward(left: _Left, found: Sequence[tuple[str, Array]]) -> tuple[list[_Jud
     looked = _best_of_each(sorted(((_first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True), found)
     gains = {token: 0.0 for token, _ in found}
     chosen: list[_Judged] = []
-    rest = [found[i] for _, i in looked[:FEW]]
+    rest = [(found[i][0], _leading(left, found[i][1])) for _, i in looked[:FEW]]
     while rest and len(chosen) < 3:
         before = chosen[-1] if chosen else None
         judged = [_judge(left, token, x if before is None else np.concatenate([before.x, x], axis=2)) for token, x in rest]
@@ -163,6 +166,15 @@ def _first_look(left: _Left, x: Array) -> float:
     z = left.fit.z.ravel()
     weighted = white * noises.weight(z)[:, None]
     return evidence(white.T @ weighted, weighted.T @ z).log
+
+
+def _leading(left: _Left, x: Array) -> Array:
+    """The combinations of the columns that move the residual most, (n, nx, at most LEADING): the others are what a ridge would suppress."""
+    if x.shape[2] <= LEADING:
+        return x
+    white = left.fit.whiten(x).reshape(-1, x.shape[2])
+    _, vectors = np.linalg.eigh(white.T @ white)
+    return np.asarray(x @ vectors[:, -LEADING:])
 
 
 def _beyond_chance(left: _Left, best: _Judged, before: _Judged | None, threshold: float) -> bool:

@@ -201,15 +201,14 @@ class Colour:
 
     def __call__(self, z: Array, joined: Mask) -> Array:
         """What of z (n, nx) or (n, nx, m) the past does not foretell, in standard deviations."""
-        out, past = z.copy(), z
+        out = z.copy()
         there = joined.copy()
         for lag in range(1, self.coefficients.shape[1] + 1):
-            past = np.concatenate([np.zeros_like(past[:1]), past[:-1]])
             if lag > 1:
                 there = there & np.append(False, there[:-1])
-            shape = (len(z), 1) + (1,) * (z.ndim - 2)
-            c = self.coefficients[:, lag - 1].reshape((1, -1) + (1,) * (z.ndim - 2))
-            out -= np.where(there.reshape(shape), c * past, 0.0)
+            for i in np.flatnonzero(self.coefficients[:, lag - 1]).tolist():
+                past = np.where(there[lag:].reshape((-1,) + (1,) * (z.ndim - 2)), z[:-lag, i], 0.0)
+                out[lag:, i] -= self.coefficients[i, lag - 1] * past
         return np.asarray(out / self.scale.reshape((1, -1) + (1,) * (z.ndim - 2)))
 
 

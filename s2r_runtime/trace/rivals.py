@@ -4,8 +4,8 @@ A rival replaces one effect of the chosen model and explains as much: its log li
 one's. What its parameters cost does not count here: being simpler is a reason to prefer, not to know.
 
 A richer effect that has fitted itself to the chosen one (a gain by sign with both gains alike) says the same thing and is no rival. That is
-seen on inputs that these data need not have: values of both signs up to the largest seen, held short and long, from states that were
-visited, at times over the whole recording.
+seen on inputs and states that these data need not have: values of both signs up to the largest seen, held short and long, from
+anywhere about where the robot was, in any direction, at times over the whole recording.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ PROBES, PROBE_STEPS = 8, 120
 def rivals(given: Problem, fit: Fit) -> list[Scored]:
     """Models with one effect replaced by another, of which the likelihood says the same."""
     found = []
-    rich = _rich(given) if fit.added else None
+    rich = _rich(given, fit.model) if fit.added else None
     for place in fit.added:
         mine = name_of(fit.model.effects[place])
         base = fitted(given, fit, without(fit.model, place), 1)
@@ -54,7 +54,7 @@ def rivals(given: Problem, fit: Fit) -> list[Scored]:
 
 @dataclass(frozen=True)
 class _Rich:
-    """Rich inputs on a robot, from states that were visited. scale: (nx,) of its steps."""
+    """Rich inputs on a robot, from states all about. scale: (nx,) of its steps."""
 
     data: Dataset
     scale: Array
@@ -66,15 +66,18 @@ class _Rich:
         return float(np.mean((one.difference(a, b) / self.scale) ** 2))
 
 
-def _rich(given: Problem) -> _Rich:
+def _rich(given: Problem, model: ComposedModel) -> _Rich:
     rng = np.random.default_rng(0)
     source, steps = given.data, given.steps
     largest = np.max(np.abs(np.concatenate([run.u for run in source.runs])), axis=0)
+    low, high = np.min(steps.y0, axis=0), np.max(steps.y0, axis=0)
+    low, high = low - 0.5 * (high - low), high + 0.5 * (high - low)
+    low[model.angle_columns], high[model.angle_columns] = -np.pi, np.pi
     runs = []
     for start in np.linspace(float(steps.t[0]), float(steps.t[-1]), PROBES):
         hold = np.maximum(1, np.rint(10.0 ** rng.uniform(0.0, 1.6, PROBE_STEPS)).astype(int))
         u = np.repeat(rng.uniform(-1.0, 1.0, (PROBE_STEPS, len(largest))) * largest, hold, axis=0)[:PROBE_STEPS]
-        y = steps.y0[rng.integers(0, len(steps), PROBE_STEPS + 1)]
+        y = rng.uniform(low, high, (PROBE_STEPS + 1, len(low)))
         runs.append(Run(float(start), y, np.repeat(u, source.substeps, axis=0)))
     made = Dataset(source.states, source.inputs, source.dt, source.substeps, tuple(runs), False, 0, "rich inputs")
     return _Rich(made, np.sqrt(np.mean((steps.y1 - steps.y0) ** 2, axis=0)) + 1e-12)

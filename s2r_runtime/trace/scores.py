@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain
+from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.screening import screen
 from s2r_runtime.trace.slots import Added
 
@@ -40,7 +41,7 @@ def price(k: int, n: int) -> float:
 
 def best_candidates(given: Problem, base: Fit, few: int = FEW) -> tuple[list[Scored], int]:
     """The candidates for one more effect, fitted, best score first; and how many starts were looked at."""
-    screened, tried = screen(given, base, candidates(base.model, given.data))
+    screened, tried = screen(given, base, candidates(base.model, given.data, Leftover(given, base)))
     scored: dict[tuple[str, str], Scored] = {}
     promising = [s for s in screened[:few] if s.value > max(HOPELESS, HOPELESS_SHARE * screened[0].value)]
     for s in promising:

@@ -90,8 +90,8 @@ def _probes(candidate: Candidate, model: ComposedModel) -> Iterator[_Probe]:
         slots = tuple(slots_of(start.effects[place], place))
         held = tuple(start.effects[place].p)
         neutral = [bounds_of(start, s).neutral for s in slots]
-        smooth = all(v is not None and not bounds_of(start, s).kink for s, v in zip(slots, neutral, strict=True))
-        if slots and smooth and (len(slots) == 1 or getattr(start.effects[place].effect, "additive", False)):
+        known = all(v is not None for v in neutral)
+        if slots and known and (len(slots) == 1 or getattr(start.effects[place].effect, "additive", False)):
             alone = [_alone(start, slots, i, neutral) for i in range(len(slots))]
             if all(m is not None for m in alone):
                 yield _Probe(candidate, start, tuple(m for m in alone if m is not None), slots, held)
@@ -120,9 +120,11 @@ class _Aside:
         if probe.free:
             scaled, beta = self._left(self.z, np.hstack([c, self._j]))
             neutral = np.array([bounds_of(start, s).neutral or 0.0 for s in probe.free])
-            values = neutral + beta[: len(probe.free)] * (values_of(start, probe.free) - neutral)
+            size = beta[: len(probe.free)]
+            values = neutral + size * (values_of(start, probe.free) - neutral)
             other = with_values(start, probe.free, inside(start, probe.free, values))
-            if other is not None and scaled > value:
+            bent = any(bounds_of(start, s).kink for s in probe.free)  # then it is nearly linear between nothing and the start only
+            if other is not None and scaled > value and (not bent or np.all((size > 0.0) & (size < 1.0))):
                 value, start = scaled, other
         return value, start
 

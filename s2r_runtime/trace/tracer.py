@@ -77,7 +77,22 @@ def trace(
     Raises NotEnoughEvidence if there are too few transitions or nothing was asked of the robot, UsageError if dataset and
     model do not belong together.
     """
-    say: Progress = progress or (lambda done, total, detail: None)
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(limits=1):
+        return _traced(dataset, model, test, horizon, seed, progress or (lambda done, total, detail: None), (weights, kind))
+
+
+def _traced(
+    dataset: Dataset,
+    model: ComposedModel,
+    test: Dataset | None,
+    horizon: float,
+    seed: int,
+    say: Progress,
+    norm: tuple[tuple[float, ...] | None, Kind],
+) -> TraceResult:
+    weights, kind = norm
     _belongs(dataset, model)
     asked = model
     if test is not None:
