@@ -25,9 +25,9 @@ def add_trace(page: Page, trace: dict[str, Any]) -> None:
     """The section without figures. trace: as `s2r trace --json` prints it."""
     text, kind = SAY[trace["verdict"]]
     page.text(f"{trace['verdict']}: {text}", f"verdict {kind}")
-    same = trace["verdict"] != "ambiguous"
     rows = list(_rows(trace["effects"], ""))
-    rows += _rows(trace["ambiguous_with"], "the same thing on this model" if same else "or")
+    for e in trace["ambiguous_with"]:
+        rows += _rows([e], "the same thing on this model" if e.get("same_thing", trace["verdict"] != "ambiguous") else "or")
     rows += _rows(trace.get("partial", ()), "explains a part only")
     if rows:
         page.table(("", "effect", "acts on", "parameter", "value and 95 % interval", "that is"), rows)

@@ -62,14 +62,18 @@ def headline(r: TraceResult) -> str:
 
 
 def _explained(r: TraceResult) -> list[str]:
-    lines = [line for e in r.effects for line in _effect(e)]
-    lines += [f"  {'':<4}the same thing on this model: {e.text()}" for e in r.same]
+    lines = [line for e in r.effects for line in _known(r, e)]
     if r.rivals:
-        lines += ["cannot be told from:", *(line for e in r.rivals for line in _effect(e))]
+        lines += ["cannot be told from:", *(line for e in r.rivals for line in _known(r, e))]
         lines += labelled("try next", [r.suggested_excitation or "", "(--suggest FILE.csv writes such a drive)"])
     if r.partial:
         lines += ["explains a part only, so no name is lent to it:", *(line for e in r.partial for line in _effect(e))]
     return lines
+
+
+def _known(r: TraceResult, e: Found) -> list[str]:
+    """An effect, and other names for it."""
+    return [*_effect(e), *(f"      the same thing on this model: {other.text()}" for other in r.same(e))]
 
 
 def _effect(e: Found) -> list[str]:

@@ -127,7 +127,9 @@ def suggest(
     given = ground(r.held)
     rivals = rivals_of(r, given)
     base = evaluate(given, r.model) if rivals is None else rivals.fits[0]
-    return _suggested(r.held, base, rivals, bounds, region, duration, seed)
+    found = _suggested(r.held, base, rivals, bounds, region, duration, seed)
+    longer = max(1, round(r.model.dt / r.spec.dt))  # what was fitted and judged on longer steps than the model's is driven on the model's
+    return found if found.u is None else replace(found, u=np.repeat(found.u, longer, axis=0), dt=r.spec.dt)
 
 
 def suggest_first(

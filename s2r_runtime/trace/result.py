@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.effects.classes import same
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.account import account
@@ -55,15 +57,23 @@ class TraceResult:
     reconstruction: Reconstruction | None = None
     could_see: tuple[Visible, ...] = ()
 
-    @property
-    def same(self) -> tuple[Found, ...]:
+    def same(self, found: Found) -> tuple[Found, ...]:
         """Of `ambiguous_with`: other names of the very same thing on this model."""
-        return self.ambiguous_with if self.verdict != "ambiguous" else ()
+        alike = {(name, channel) for name, channel, _ in same(self.nominal.nominal, found.name, found.channel, found.values)}
+        return tuple(e for e in self.ambiguous_with if (e.name, e.channel) in alike)
 
-    @property
+    @cached_property
     def rivals(self) -> tuple[Found, ...]:
-        """Of `ambiguous_with`: other things, which these data cannot tell from the one that was found."""
-        return self.ambiguous_with if self.verdict == "ambiguous" else ()
+        """Of `ambiguous_with`: other things, which these data cannot tell from what was found. Of several names for a thing the first."""
+        if self.verdict != "ambiguous":
+            return ()
+        known = [e for found in self.effects for e in (found, *self.same(found))]
+        kept: list[Found] = []
+        for e in self.ambiguous_with:
+            if e not in known:
+                kept.append(e)
+                known += [e, *self.same(e)]
+        return tuple(kept)
 
     @property
     def done_to_data(self) -> tuple[str, ...]:
@@ -83,11 +93,12 @@ class TraceResult:
         """Plain data; numbers in SI."""
         states = self.nominal.states
         units: dict[str, str] = getattr(self.nominal.nominal, "units", {})
+        alike = [e for found in self.effects for e in self.same(found)]
         return {
             "verdict": self.verdict,
             "effects": [e.to_json() for e in self.effects],
             "candidates": [{"name": n, "channel": c, "score": round(s, 3)} for n, c, s in self.candidates],
-            "ambiguous_with": [e.to_json() for e in self.ambiguous_with],
+            "ambiguous_with": [{**e.to_json(), "same_thing": e in alike} for e in self.ambiguous_with],
             "partial": [e.to_json() for e in self.partial],
             "depends_on": list(self.depends_on),
             "suggested_excitation": self.suggested_excitation,
