@@ -29,7 +29,8 @@ bench: $(STAMP)
 SETS ?= --seeds 1000000:1000020 --jobs 2
 
 bench-trace: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
+	@$(BIN)/python -c 'import importlib.util, sys; sys.exit(importlib.util.find_spec("pysindy") is None)' || \
+	    $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
 	$(BIN)/python tools/bench_trace.py $(SETS)
 
 format: $(STAMP)
