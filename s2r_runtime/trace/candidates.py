@@ -67,6 +67,8 @@ def candidates(model: ComposedModel, data: Dataset, left: Leftover | None = None
                 if place not in given:
                     given[place] = sequence(model, _input_effects(model, place), inputs, part, begun)
                 starts = _starts(effect, given[place], model, channel, data.dt, t)
+                if left is not None and place == len(model.effects):
+                    starts += left.starts(effect, channel)
                 if starts:
                     found.append(Candidate(name, channel, place, tuple(AppliedEffect(effect, channel, p) for p in starts)))
     return found
