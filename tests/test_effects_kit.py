@@ -26,6 +26,7 @@ VALUES = {
         {"frequency": 20.0, "amplitude": 0.2, "phase": -3.0},
         {"frequency": 0.7, "amplitude": 0.0, "phase": 0.0},
     ),
+    "quadratic_drag": ({"coefficient": 0.3},),
     "wheel_saturation": ({"speed": 0.5, "track": 0.7},),
 }
 

@@ -14,10 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.hookspecs import NominalModel, Parameter
-from s2r_runtime.models.forces import Axis, Push, axes, mass_name, pushed
+from s2r_runtime.models.forces import Axis, Push, axes, mass, mass_name, pushed
 
 Array = NDArray[np.float64]
 Values = dict[str, Any]
+
+REMEMBERED_S = 1.0
+"""Of the order of what friction and a person who drives back and forth make of it."""
 
 POSE = {"x", "y", "theta"}
 
@@ -112,6 +115,14 @@ def length_unit(model: NominalModel, axis: Axis) -> str:
 def axis_of(model: NominalModel, channel: str) -> Axis | None:
     """The axis whose position or velocity the channel is."""
     return next((axis for axis in axes(model) if channel in {model.states[axis.velocity], model.states[axis.position]}), None)
+
+
+def usual_speed(u: Array, model: NominalModel, dt: float) -> float:
+    """Rms of what u (T, nu) adds to the speed of an axis within REMEMBERED_S, as a guess of the speeds that a recording shows."""
+    total = np.cumsum(np.vstack([np.zeros((1, u.shape[1])), u]), axis=0) * dt / mass(model)
+    ago = np.maximum(np.arange(1, len(total)) - max(1, round(REMEMBERED_S / dt)), 0)
+    gained = total[1:] - total[ago]
+    return float(np.sqrt(np.mean(gained * gained))) if np.any(u) else 1.0
 
 
 def size_of(u: Array) -> float:

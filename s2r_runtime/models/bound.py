@@ -6,7 +6,7 @@ the rest is the shared model's.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from s2r_runtime.hookspecs import Follows, NominalModel
 Array = NDArray[np.float64]
 
 
-@dataclass
+@dataclass(eq=False)
 class BoundModel:
     """shared: the nominal model itself; parameters: the values used. The others as in `NominalModel`, empty where it does not say."""
 
@@ -30,6 +30,8 @@ class BoundModel:
     integration: str
     reached: dict[str, str]
     follows: dict[str, Follows]
+    schemes: dict[str, BoundModel] = field(default_factory=dict, repr=False)
+    """The same by the scheme that integrates its pose, as far as asked for: one object a scheme."""
 
     def step(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
         """The shared model's."""
@@ -50,3 +52,12 @@ def bind(model: NominalModel, parameters: dict[str, float]) -> BoundModel:
         getattr(model, "reached", {}),
         getattr(model, "follows", {}),
     )
+
+
+def integrating(model: BoundModel, scheme: str) -> BoundModel:
+    """The model as one that integrates its pose by this scheme."""
+    if scheme == model.integration:
+        return model
+    if scheme not in model.schemes:
+        model.schemes[scheme] = replace(model, integration=scheme, schemes={})
+    return model.schemes[scheme]

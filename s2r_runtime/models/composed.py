@@ -19,7 +19,7 @@ the effects are run in SUBSTEPS parts of the step, of which the last one stands 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from s2r_runtime.canonical import digest
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import Effect, NominalModel, Parameter
-from s2r_runtime.models.bound import BoundModel, bind
+from s2r_runtime.models.bound import BoundModel, bind, integrating
 from s2r_runtime.models.file_model import load_file_model
 from s2r_runtime.models.forces import Pushing, pushed
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
@@ -153,7 +153,7 @@ class ComposedModel:
 
     def advance(self, x: Array, mean: Array, end: Array) -> Array:
         """x one step later under an input that acts as `act` says; angles are not wrapped."""
-        given = self._given
+        given = self.for_effects
         for a in reversed(self._sensors):
             x = a.effect.to_true(x, given, a.channel, a.p)
         x_next = self.nominal.step(x, mean, self.dt, self.parameters)
@@ -169,10 +169,10 @@ class ComposedModel:
         return x_next
 
     @cached_property
-    def _given(self) -> BoundModel:
-        """What effects on the step are given: they see the scheme by which the pose is integrated."""
+    def for_effects(self) -> BoundModel:
+        """The nominal model as effects are given it on a step: they see the scheme by which the pose is integrated."""
         schemes = [a.effect.integrates(a.p) for a in self.effects if hasattr(a.effect, "integrates")]
-        return replace(self.nominal, integration=schemes[-1]) if schemes else self.nominal
+        return integrating(self.nominal, schemes[-1]) if schemes else self.nominal
 
     def _pushes(self, a: AppliedEffect) -> bool:
         pushes = getattr(a.effect, "pushes", None)

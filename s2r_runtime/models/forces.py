@@ -7,7 +7,8 @@ An axis is a position q and its rate v. The nominal step takes v0 to v1 with the
 
 With constant coefficients this has an exact solution: one exponential up to the moment of standing still, another one after it, or none.
 So dry friction stops a motion and never turns it, whatever the step. Coefficients that depend on the state are taken at the middle
-of parts of the step (second order). Positions move by the integral of v. All accelerations: of a force over the mass, if there is one.
+of parts of the step (second order; a position there is that at the part's start and half a part of the speed there, which keeps the
+energy of a spring). Positions move by the integral of v. All accelerations: of a force over the mass, if there is one.
 """
 
 from __future__ import annotations
@@ -93,8 +94,8 @@ def pushed(x: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushi
     for _ in range(parts):
         at = now
         if varies:
-            middle = [_glide(now[:, k.velocity], g, _together(now, k, model, pushing), 0.5 * h) for k, g in zip(moved, given, strict=True)]
-            at = _moved(now, moved, middle)
+            halves = [_glide(now[:, k.velocity], g, _together(now, k, model, pushing), 0.5 * h) for k, g in zip(moved, given, strict=True)]
+            at = _moved(now, moved, [(v, 0.5 * h * now[:, k.velocity]) for k, (v, _) in zip(moved, halves, strict=True)])
         ends = [_glide(now[:, k.velocity], g, _together(at, k, model, pushing), h) for k, g in zip(moved, given, strict=True)]
         now = _moved(now, moved, ends)
     after = x_next.copy()
