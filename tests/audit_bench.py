@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import random
+import re
 from collections import deque
 from pathlib import Path
 from typing import Any, ClassVar
@@ -23,12 +24,15 @@ from s2r_runtime.comparison import Campaign
 from s2r_runtime.controllers.file import load
 from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
-from s2r_runtime.daemon import jobs
+from s2r_runtime.daemon import jobs, trace_job
+from s2r_runtime.daemon.excitation import Excitation
+from s2r_runtime.daemon.given_inputs import parse_inputs
+from s2r_runtime.daemon.model_store import parse_model
 from s2r_runtime.daemon.settings import ModelFacts, settings_of
-from s2r_runtime.daemon.worker import GapJob
+from s2r_runtime.daemon.worker import GapJob, TraceJob
 from s2r_runtime.hookspecs import Offer, hookimpl
 from s2r_runtime.models.composed import compose
-from s2r_runtime.modelspec import dump_model
+from s2r_runtime.modelspec import ModelSpec, dump_model
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import parse_profile
 from s2r_runtime.recording.writer import Writer
@@ -73,6 +77,47 @@ name = "bench"
 name = "bench"
 """
 CONTROLLER = "def control(x, theta, parameters):\n    return 0.0 * x[:, :2] + 0.1\n"
+
+
+TRACED: dict[str, dict[str, Any]] = {}
+"""Honest results by their rows: one trace is enough for all liars."""
+
+
+def _effect(trace: dict[str, Any], **changes: float) -> list[Any]:
+    effects: list[Any] = msgspec.json.decode(msgspec.json.encode(trace["effects"]))
+    effects[0]["parameters"]["gain"].update(changes)
+    return effects
+
+
+def _other_model(trace: dict[str, Any]) -> dict[str, Any]:
+    """All that it says of the model is changed, and fits."""
+    text = re.sub(r'("gain" = )\S+', r"\g<1>0.9", str(trace["model_toml"]))
+    return {"model_toml": text, "proposal": {**trace["proposal"], "digest": parse_model(text, ".", "lie").digest()}}
+
+
+TRACE_LIES: dict[str, Any] = {
+    "trace verdict": lambda _: {"verdict": "none"},
+    "parameter": lambda t: {"effects": _effect(t, value=0.71)},
+    "interval": lambda t: {"effects": _effect(t, low=0.2)},
+    "effects": lambda _: {"effects": []},
+    "traced model": lambda _: {"model": "sha256:" + "0" * 64},
+    "range": lambda t: {"recording": {**t["recording"], "parts": [{**t["recording"]["parts"][0], "last": 999}]}},
+    "rows": lambda t: {"recording": {**t["recording"], "digest": "sha256:" + "0" * 64}},
+    "epoch": lambda t: {"recording": {**t["recording"], "epoch": 2}},
+    "seed": lambda _: {"seed": 7},
+    "options": lambda t: {"options": {**t["options"], "rows": 100}},
+    "proposed digest": lambda t: {"proposal": {**t["proposal"], "digest": "sha256:" + "1" * 64}},
+    "other model": _other_model,
+    "error": lambda t: {"error": {**t["error"], "noise_floor": {}}},
+}
+"""What a trace may say of itself that isn't so."""
+
+
+def _halved(event: Any) -> Any:
+    """A command with half the input."""
+    if not isinstance(event, m.Proposed):
+        return event
+    return msgspec.structs.replace(event, command=msgspec.structs.replace(event.command, u=tuple(0.5 * v for v in event.command.u)))
 
 
 class BenchTransport:
@@ -147,8 +192,13 @@ class Bench:
         self.campaign: Campaign | None = None
         self.order: m.StartCampaign | None = None
         self.samples: list[m.SampleTaken] = []
+        self.folder = folder
+        self.excitation = Excitation()
+        self.failing = ""
+        self.earlier: list[Path] = []
         self.stream: Stream | None = None
         self.epoch, self.reason, self.driving = 0, "", False
+        self.models: dict[str, ModelSpec] = {}
         settings = self._told("settings", self.settings, lambda s: msgspec.structs.replace(s, input_bounds=((-9.0, 9.0), (-9.0, 9.0))))
         self.feed(m.Started(0, START_UNIX_S, settings, memory or m.Memory(robot="bench", schema=m.MEMORY_SCHEMA)))
 
@@ -175,6 +225,32 @@ class Bench:
         self.ask("stop")
         self.ask("clear", text="emergency_stop")
         self.ask("sample")
+
+    def trace(self, stretch: str = "campaign") -> Bench:
+        """Traces a stretch of what is in the log so far."""
+        self.ask("trace", text=stretch)
+        return self
+
+    def adopt(self, spec: ModelSpec | None = None) -> Bench:
+        """A person adopts the model that was proposed, or his own."""
+        if spec is not None:
+            self.items.append((f"model/{spec.digest()}", "application/toml", dump_model(spec).encode()))
+            self.models[spec.digest()] = spec
+            self.ask("adopt", digest=spec.digest())
+        elif (proposal := self.state.memory.proposal) is not None:
+            self.ask("adopt", digest=proposal.digest)
+        return self
+
+    def excite(self, rows: int = 60) -> Bench:
+        """Drives given inputs."""
+        lines = [f"{0.05 * k:.3f},{0.3 * math.sin(0.4 * k):.6f},{2.0 * math.cos(0.3 * k):.6f}" for k in range(rows)]
+        text = "t,v,w\n" + "\n".join(lines) + "\n"
+        given = parse_inputs(text.encode(), "inputs.csv", self.model.inputs, self.profile.inputs, self.model.dt, {})
+        self.excitation.keep(given)
+        self.items.append((f"inputs/{given.digest}", "text/csv", text.encode()))
+        self.ask("excite", digest=given.digest, count=rows)
+        self.steps(rows + 3)
+        return self
 
     def stop(self) -> Bench:
         """An orderly end."""
@@ -266,6 +342,9 @@ class Bench:
                     self.campaign.refused(output.obs_seq, self.reason)
             case m.Decided():
                 self.reason = output.reason
+            case m.Ask(source="sampler") if self.excitation.running:
+                self.numbers += 1
+                self.feed(*self._excited(output))
             case m.Ask(source="sampler"):
                 self.feed(*self._sampler(output))
             case m.Ask():
@@ -278,9 +357,22 @@ class Bench:
                 )
                 if output.resume:
                     self.campaign.restore(self.snapshot)
+                elif self.lie != "old samples":
+                    self.samples.clear()
+                else:
+                    self.samples = [msgspec.structs.replace(sample, epoch=output.epoch) for sample in self.samples]
                 again = [msgspec.structs.replace(sample, again=True) for sample in self.samples]
                 self.snapshot = self.campaign.snapshot()
                 self.feed(m.SourceStarted(0, "sampler", self.campaign.digest), *again)
+            case m.StartInputs():
+                self.feed(*self.excitation.start(output, self.settings))
+            case m.StopCampaign() if self.excitation.running:
+                self.feed(*self.excitation.stop(0, output.reason))
+            case m.ModelAdopted():
+                self.profile = msgspec.structs.replace(self.profile, model=self.models[output.digest])
+                self.model = compose(self.profile.model)
+                facts = ModelFacts(self.model.states, self.model.inputs, tuple(self.model.nominal.angles))
+                self.settings = settings_of(self.profile, self.profile.model, facts)
             case m.StopCampaign() if self.campaign is not None:
                 assert self.order is not None
                 rejected, self.campaign = self.campaign.progress().rejected, None
@@ -288,6 +380,8 @@ class Bench:
                 self.feed(m.SourceStopped(0, "sampler", "stopped", output.reason), ended)
             case m.StartJob(kind="gap"):
                 self.feed(self._gap(output))
+            case m.StartJob(kind="trace"):
+                self.feed(self._trace(output))
             case m.StartJob(kind="verify"):
                 self.feed(self._verify(output))
             case m.IssueCertificate():
@@ -322,6 +416,36 @@ class Bench:
         u = self._told("input law", step.u, lambda u: (u[0] / 2, u[1] / 2), step.phase == "hold" and len(self.samples) == 3)
         self.numbers += 1
         return [*events, m.Proposed(0, m.Command(self.numbers, ask.t_ns, "sampler", u, ask.obs_seq, 100_000_000))]
+
+    def _excited(self, ask: m.Ask) -> list[m.Event]:
+        events = self.excitation.ask(ask.t_ns, self.observation, self.numbers)
+        return self._told("given input", events, lambda e: [_halved(one) for one in e], self.seq % 40 == 0)
+
+    def _trace(self, order: m.StartJob) -> m.JobFinished:
+        """As the daemon's worker does it: on the log so far, in which the order stands."""
+        log = self.write(self.folder / f"trace-{order.job_id}.mcap")
+        if self.failing:
+            return m.JobFinished(0, order.job_id, "trace", error=self.failing)
+        logs = tuple(map(str, (*self.earlier, log)))
+        job = TraceJob(self.profile, order.stretch or "campaign", order.epoch, order.rows, order.seed, logs, "bench", order.job_id)
+        found = trace_job.cut_out(job)
+        assert found is not None
+        cut, identities = found
+        if cut.about.digest not in TRACED:
+            TRACED[cut.about.digest] = trace_job.trace(msgspec.structs.replace(job, cut=cut, identities=identities), lambda *_: None)
+        trace = TRACED[cut.about.digest]
+        for lie, change in TRACE_LIES.items():
+            trace = self._told(lie, trace, lambda honest, change=change: {**honest, **change(honest)})
+        text = str(trace["model_toml"])
+        spec = parse_model(text, ".", "bench")
+        self.models[spec.digest()] = spec
+        if spec.effects != self.profile.model.effects:
+            attached = self._told(
+                "forgetful model", text, lambda t: "".join(x for x in t.splitlines(True) if not x.startswith("fitted_on"))
+            )
+            if self.lie != "no model":
+                self.items.append((f"model/{spec.digest()}", "application/toml", attached.encode()))
+        return m.JobFinished(0, order.job_id, "trace", trace=trace)
 
     def _gap(self, order: m.StartJob) -> m.JobFinished:
         gap = jobs.gap(GapJob(self.profile, tuple(self.samples), {}, order.epoch, order.beta))

@@ -153,6 +153,10 @@ class CampaignReplay:
         """A sample: the campaign's, and the robot's."""
         kept = self.samples.setdefault(event.epoch, [])
         if event.again:
+            if self._order is None or not self._order.resume:
+                self._findings.differ(
+                    entry.index, entry.channel, "a sample is logged once more, but its campaign began here", entry.raw, None
+                )
             self._once_more(entry, event, kept)
             return
         self._settle()

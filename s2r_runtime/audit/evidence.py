@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from s2r_runtime.audit.findings import Findings, alike, close
+from s2r_runtime.audit.traces import Traces
 from s2r_runtime.bounds import clopper_pearson_upper
 from s2r_runtime.canonical import digest_of
 from s2r_runtime.controllers.file import ControllerFile
@@ -42,8 +43,8 @@ ROUNDED = 1e-6
 class Evidence:
     """Of all runs. rerun: whether attached controllers may run, confined."""
 
-    def __init__(self, findings: Findings, *, rerun: bool, progress: Callable[[str], None]) -> None:
-        self._findings, self._rerun, self._progress = findings, rerun, progress
+    def __init__(self, findings: Findings, traces: Traces, *, rerun: bool, progress: Callable[[str], None]) -> None:
+        self._findings, self._traces, self._rerun, self._progress = findings, traces, rerun, progress
         self._jobs: dict[int, tuple[StartJob, Gap | None]] = {}
         self._gaps: dict[str, str] = {}
         self._verifications: dict[str, str] = {}
@@ -109,8 +110,6 @@ class Evidence:
             self._gap(entry, event.gap, job, profile, samples.get(job.epoch, ()), rejected.get(job.epoch, {}))
         elif event.verification is not None:
             self._verification(entry, event, event.verification, job, gap, profile, attachments)
-        elif event.trace is not None:
-            self._findings.count("traces (not recomputed)")
 
     def _gap(
         self, entry: Entry, gap: Gap, job: StartJob, profile: Profile, samples: Sequence[SampleTaken], rejected: dict[str, int]
@@ -126,6 +125,10 @@ class Evidence:
         except S2RError as error:
             self._differ(entry, f"the gap of epoch {job.epoch} cannot be computed: {error}", gap, None)
             self._gaps[digest_of(gap)] = "its gap does not follow from the samples"
+            return
+        if problem := self._traces.seen_by_the_fit(profile.model, samples, round(profile.model.dt * 1e9)):
+            self._differ(entry, f"the gap of epoch {job.epoch}: {problem}", gap, None)
+            self._gaps[digest_of(gap)] = problem
             return
         if not alike(again, gap):
             self._differ(entry, f"the gap of epoch {job.epoch} is another one", gap, again)

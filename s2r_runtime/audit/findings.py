@@ -32,17 +32,27 @@ class CertificateFinding(msgspec.Struct):
     reason: str
 
 
+class ModelFinding(msgspec.Struct):
+    """A model that was put in force: who decided, and where it is from."""
+
+    digest: str
+    adopted_by: str
+    origin: str
+
+
 class Findings:
-    """Collects. `file`, `same_platform`: of what is being read now."""
+    """Collects. `file`, `same_platform`, `same_machine` (and processor): of what is being read now."""
 
     def __init__(self) -> None:
         self.file = ""
-        self.same_platform = True
+        self.same_platform = self.same_machine = True
         self.first: Difference | None = None
         self.differences = 0
         self.counts: dict[str, int] = {}
         self.unchecked: dict[str, None] = {}
         self.missing: list[str] = []
+        self.skipped: dict[str, None] = {}
+        self.models: list[ModelFinding] = []
         self.certificates: dict[str, CertificateFinding] = {}
 
     def differ(self, index: int, channel: str, what: str, recorded: Any, recomputed: Any) -> None:
@@ -58,6 +68,10 @@ class Findings:
     def cannot(self, what: str) -> None:
         """Something that is there could not be recomputed here: no pass."""
         self.unchecked[what] = None
+
+    def skip(self, what: str) -> None:
+        """Something could be recomputed here, but nobody asked for so much: neither passed nor failed."""
+        self.skipped[what] = None
 
     def lack(self, what: str) -> None:
         """Something is not in what was given. That is no difference."""

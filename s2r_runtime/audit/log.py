@@ -17,8 +17,9 @@ from s2r_runtime import keys
 from s2r_runtime.audit.campaign import CampaignReplay
 from s2r_runtime.audit.certificates import Certificates
 from s2r_runtime.audit.evidence import Evidence
-from s2r_runtime.audit.findings import CertificateFinding, Difference, Findings
+from s2r_runtime.audit.findings import CertificateFinding, Difference, Findings, ModelFinding
 from s2r_runtime.audit.run import Across, RunAudit
+from s2r_runtime.audit.traces import SECONDS, Traces
 from s2r_runtime.errors import NotEnoughEvidence, RecordingError
 from s2r_runtime.recording.blocks import find
 from s2r_runtime.recording.channels import UNRECORDED, Unrecorded
@@ -29,6 +30,8 @@ from s2r_runtime.recording.writer import environment
 
 PROGRESS_EVERY = 2000
 """Messages between two looks at how far it is."""
+MACHINE = "cpu"
+"""With the same platform and processor, so must those be that a fit came to by many steps of arithmetic."""
 PLATFORM = ("python", "platform", "byteorder", "version.numpy", "version.scipy", "version.s2r-runtime")
 """Where these are the same, numbers must be identical."""
 
@@ -37,8 +40,9 @@ class AuditResult(msgspec.Struct, frozen=True):
     """What an audit says (docs/json.md).
 
     `ok`: everything that is there was recomputed and holds. `chain`: intact, broken or unsigned tail. `recomputed`: how many of what.
-    `unchecked`: what could not be recomputed here, and why: then it is not ok. `signed_by`: the key, and whether it is one that was
-    asked for. `head`: of the chain, to compare with what the daemon printed.
+    `unchecked`: what could not be recomputed here, and why: then it is not ok. `skipped`: what was not, because it takes long: neither
+    passed nor failed. `models`: those that were put in force. `signed_by`: the key, and whether it is one that was asked for.
+    `head`: of the chain, to compare with what the daemon printed.
     """
 
     ok: bool
@@ -53,6 +57,8 @@ class AuditResult(msgspec.Struct, frozen=True):
     recomputed: dict[str, int]
     unchecked: list[str]
     files: list[str]
+    skipped: list[str] = []
+    models: list[ModelFinding] = []
 
     def to_json(self) -> dict[str, Any]:
         """Plain data."""
@@ -69,6 +75,8 @@ class AuditResult(msgspec.Struct, frozen=True):
             lines += [f"  recorded   {d.recorded}", f"  recomputed {d.recomputed}"]
         lines += [f"missing      {one}" for one in self.missing]
         lines += [f"unchecked    {one}" for one in self.unchecked]
+        lines += [f"skipped      {one}" for one in self.skipped]
+        lines += [f"model        {one.digest}: adopted by {one.adopted_by}: {one.origin}" for one in self.models]
         lines += [f"certificate  {one.id}: {'valid' if one.valid else 'NOT VALID'}: {one.reason}" for one in self.certificates]
         lines.append("recomputed   " + (", ".join(f"{count} {what}" for what, count in self.recomputed.items()) or "nothing"))
         return "\n".join(lines)
@@ -78,19 +86,22 @@ def audit(
     paths: Sequence[Path],
     public_key: bytes | None = None,
     rerun_controllers: bool = False,
+    rerun_traces: bool = False,
     progress: Callable[[float, float, str], None] | None = None,
 ) -> AuditResult:
     """Audits the files of one or more runs of a robot. public_key: the Ed25519 key that must have signed them, 32 bytes.
 
-    rerun_controllers: run the attached controllers' code, confined, to repeat the verifications. progress: (done, total, what).
+    rerun_controllers: run the attached controllers' code, confined, to repeat the verifications. rerun_traces: run traces again however
+    long they take (else those that are done within `traces.SECONDS`). progress: (done, total, what).
     Raises RecordingError for a file that is no log, NotEnoughEvidence if no record can be read,
     ConfigError or PluginError where this machine lacks what the log needs.
     """
     findings = Findings()
     tell = _Progress(paths, progress)
     trusted = () if public_key is None else (public_key,)
-    evidence = Evidence(findings, rerun=rerun_controllers, progress=tell.detail)
-    across = Across(findings, CampaignReplay(findings), evidence, Certificates(findings, evidence), trusted, rerun_controllers)
+    traces = Traces(findings, seconds=None if rerun_traces else SECONDS, progress=tell.detail)
+    evidence = Evidence(findings, traces, rerun=rerun_controllers, progress=tell.detail)
+    across = Across(findings, CampaignReplay(findings), evidence, Certificates(findings, evidence), traces, trusted, rerun_controllers)
     readings: list[Reading] = []
     try:
         grouped = runs(paths)
@@ -119,6 +130,8 @@ def audit(
         recomputed=dict(sorted(findings.counts.items())),
         unchecked=list(findings.unchecked),
         files=[reading.path.name for reading in readings],
+        skipped=list(findings.skipped),
+        models=list(findings.models),
     )
 
 
@@ -146,7 +159,9 @@ def _run(run: RunAudit, parts: list[Reading], findings: Findings, tell: _Progres
         if not _continues(before, reading, findings):
             break
         here = environment()
-        findings.same_platform = all(reading.metadata.get(ABOUT, {}).get(key) == here.get(key) for key in PLATFORM)
+        told = reading.metadata.get(ABOUT, {})
+        findings.same_platform = all(told.get(key) == here.get(key) for key in PLATFORM)
+        findings.same_machine = findings.same_platform and bool(told.get(MACHINE)) and told.get(MACHINE) == here.get(MACHINE)
         run.part(reading)
         for number, entry in enumerate(reading):
             if entry.channel == UNRECORDED:

@@ -13,6 +13,8 @@ from s2r_runtime.audit.core import CoreReplay, in_effect_order
 from s2r_runtime.audit.evidence import Evidence
 from s2r_runtime.audit.findings import Findings
 from s2r_runtime.audit.frames import Frames
+from s2r_runtime.audit.inputs import InputsReplay
+from s2r_runtime.audit.traces import RELEVANT, Traces
 from s2r_runtime.audit.watch import WatchReplay
 from s2r_runtime.canonical import digest
 from s2r_runtime.daemon.model_store import parse_model
@@ -28,10 +30,12 @@ from s2r_runtime.messages import (
     EpochChanged,
     Event,
     Frame,
+    InputsFinished,
     IssueCertificate,
     JobFinished,
     Measured,
     ModelAdopted,
+    Observation,
     Observed,
     Output,
     Proposed,
@@ -44,6 +48,7 @@ from s2r_runtime.messages import (
     StartCampaign,
     StartController,
     Started,
+    StartInputs,
     StartJob,
     StopController,
     Stopping,
@@ -65,6 +70,7 @@ class Across(NamedTuple):
     campaigns: CampaignReplay
     evidence: Evidence
     certificates: Certificates
+    traces: Traces
     trusted: tuple[bytes, ...]
     rerun: bool
 
@@ -79,7 +85,10 @@ class RunAudit:
             across.evidence,
             across.certificates,
         )
+        self._traces = across.traces
         self._trusted, self._rerun = across.trusted, across.rerun
+        self._inputs = InputsReplay(across.findings)
+        self._observation: Observation | None = None
         self._core = CoreReplay(across.findings)
         self._watch = WatchReplay(across.findings)
         self._frames: Frames | None = None
@@ -101,13 +110,15 @@ class RunAudit:
     def entry(self, entry: Entry) -> None:
         """The next message."""
         self._entry = entry
+        message = entry.message if entry.channel in RELEVANT or entry.channel.startswith(("event/", "frame/")) else None
+        if message is not None and entry.channel in RELEVANT:
+            self._traces.take(entry, message)
         family = entry.channel.partition("/")[0]
         if family == "event":
-            self._take(entry, entry.message)  # type: ignore[arg-type]
+            self._take(entry, message)  # type: ignore[arg-type]
         elif family == "out":
             self._core.output(entry)
         elif family == "frame" and self._frames is not None:
-            message = entry.message
             assert isinstance(message, Frame)  # noqa: S101 - the channel's type
             (self._frames.inbound if message.inbound else self._frames.outbound)(entry, message)
 
@@ -136,26 +147,36 @@ class RunAudit:
         if isinstance(event, JobFinished) and self._profile is not None:
             samples, rejected = self._campaigns.samples, self._campaigns.rejected
             self._evidence.finished(entry, event, self._profile, samples, rejected, self._attached())
+            if event.kind == "trace":
+                self._traced(entry, event, self._profile)
+
+    def _traced(self, entry: Entry, event: JobFinished, profile: Profile) -> None:
+        settings = self._core.state.settings
+        if settings is not None:
+            runnable = event.error == "" and self._compose(profile.model) is not None
+            self._traces.finished(entry, event, profile, settings.states, self._attached(), runnable=runnable)
 
     def _before(self, entry: Entry, event: Event) -> None:
         """What is recomputed of an event, before the core's outputs take effect."""
         match event:
             case Observed(t_ns=t_ns, observation=observation):
-                self._seen_seq = observation.seq
+                self._seen_seq, self._observation = observation.seq, observation
                 self._watch.observed(entry, observation, t_ns)
                 self._campaigns.observed(observation)
             case Measured():
                 self._watch.measured(entry, event)
             case Proposed() if event.command.source == "sampler":
-                self._campaigns.proposed(entry, event)
+                (self._inputs if self._inputs.driving else self._campaigns).proposed(entry, event)
             case SampleTaken():
                 self._campaigns.sample(entry, event)
             case CampaignFinished():
                 self._campaigns.finished(entry, event)
+            case InputsFinished():
+                self._inputs.finished(entry, event)
             case SourceStarted(source="sampler"):
-                self._campaigns.started(entry, event)
+                (self._inputs if self._inputs.driving else self._campaigns).started(entry, event)
             case SourceStopped(source="sampler"):
-                self._campaigns.stopped(entry, event)
+                (self._inputs if self._inputs.driving else self._campaigns).stopped(entry, event)
             case SourceStopped(source="controller", reason="start_failed"):
                 self._watch.doubted()
             case AnalyticsChanged(up=up):
@@ -187,6 +208,8 @@ class RunAudit:
                 entry.index, entry.channel, "the settings are not those of the attached profile and model", settings, told
             )
         self._evidence.begin_run(entry, event.memory)
+        if self._reading is not None:
+            self._traces.begin_run(self._reading.run, self._reading.public_key, settings.trace_rows, event.memory)
         self._certificates.remembered(event.memory)
         options = {name: value for name, value in profile.transport.items() if name != "name"}
         transport = registry().get("transports", str(profile.transport.get("name")))
@@ -213,8 +236,12 @@ class RunAudit:
                 self._campaigns.sent(output)
                 if self._frames is not None:
                     self._frames.send(output)
+            case Ask(source="sampler") if self._inputs.driving:
+                self._inputs.ask(output, self._observation, settings.command_ttl_ns)
             case Ask(source="sampler"):
                 self._campaigns.ask(output, settings.command_ttl_ns)
+            case StartInputs():
+                self._inputs.start(entry, output, profile, settings.inputs, self._attached())
             case Decided():
                 self._campaigns.decided(output.reason)
             case StartCampaign():
@@ -236,6 +263,7 @@ class RunAudit:
             case Revoked():
                 self._certificates.revoked(output)
             case ModelAdopted(digest=adopted):
+                self._traces.adopted(output)
                 self._profile = self._with_model(profile, adopted)
             case _:
                 pass

@@ -20,6 +20,11 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     audit.add_argument(
         "--rerun-controllers", action="store_true", help="run the attached controllers again, confined, to recompute verifications"
     )
+    audit.add_argument(
+        "--rerun-traces",
+        action="store_true",
+        help="run every trace again, however long it takes (default: those that take at most 30 s of the processor; the others are named)",
+    )
     audit.add_argument("--json", action="store_true", help="print one JSON object")
     audit.set_defaults(run=run_audit)
 
@@ -51,7 +56,11 @@ def run_audit(args: argparse.Namespace) -> int:
     bar = output.Progress("auditing")
     try:
         result = audit(
-            args.log, public_key=keys.load_public(args.key) if args.key else None, rerun_controllers=args.rerun_controllers, progress=bar
+            args.log,
+            public_key=keys.load_public(args.key) if args.key else None,
+            rerun_controllers=args.rerun_controllers,
+            rerun_traces=args.rerun_traces,
+            progress=bar,
         )
     finally:
         bar.close()

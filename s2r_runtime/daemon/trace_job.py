@@ -12,6 +12,7 @@ import os
 import resource
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -68,8 +69,9 @@ def traced(
     model = compose(profile.model)
     about = cut.about
     source = f"{about.stretch} of epoch {about.epoch}"
-    more = (from_samples(cut.samples, source=source).digest,) if cut.samples else identities
-    data = dataset(model, cut, source, (about.digest,))
+    samples = from_samples(cut.samples, source=source) if cut.samples else None
+    more = identities if samples is None else (samples.digest,)
+    data = replace(dataset(model, cut, source, (about.digest,)), campaign=samples)
     found = tracer(
         data, model, horizon=HORIZON_S, seed=seed, progress=progress, weights=weights(profile, model.states), kind=profile.norm.set
     )
@@ -152,15 +154,15 @@ def _read(job: TraceJob) -> tuple[Cut, tuple[str, ...]]:
     limit = time.monotonic() + WRITTEN_WITHIN_S
     while True:
         time.sleep(0.1)
-        found = _once(job)
+        found = cut_out(job)
         if found is not None:
             return found
         if time.monotonic() > limit:
             raise RecordingError(f"the order to trace did not reach the log within {WRITTEN_WITHIN_S:g} s")
 
 
-def _once(job: TraceJob) -> tuple[Cut, tuple[str, ...]] | None:
-    """None while the order is not in the log yet."""
+def cut_out(job: TraceJob) -> tuple[Cut, tuple[str, ...]] | None:
+    """The stretch out of the job's logs, and what stands for them; None while the order is not in there yet."""
     stretches, keys = Stretches(job.rows), {}
     for parts in runs(_with_later_parts(job.logs), CHANNELS):
         run = parts[0].run

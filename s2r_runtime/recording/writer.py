@@ -41,12 +41,22 @@ _FRAME_IN, _FRAME_OUT = NUMBERS[FRAME_IN], NUMBERS[FRAME_OUT]
 
 
 def environment() -> dict[str, str]:
-    """What ran: versions of interpreter and packages, platform. Imports none of them."""
-    found = {"python": platform.python_version(), "platform": platform.platform(), "byteorder": sys.byteorder}
+    """What ran: versions of interpreter and packages, platform, processor. Imports none of them."""
+    found = {"python": platform.python_version(), "platform": platform.platform(), "byteorder": sys.byteorder, "cpu": _processor()}
     for name in ("s2r-runtime", "numpy", "scipy", "msgspec", "mcap", "zstandard", "cryptography"):
         with contextlib.suppress(packages.PackageNotFoundError):
             found[f"version.{name}"] = packages.version(name)
     return found
+
+
+def _processor(info: Path = Path("/proc/cpuinfo")) -> str:
+    """Its model: libraries choose their arithmetic by it, so last digits may depend on it. Empty if it isn't known."""
+    with contextlib.suppress(OSError):
+        for line in info.read_text(errors="replace").splitlines():
+            key, _, value = line.partition(":")
+            if key.strip() in {"model name", "CPU part", "Model"} and value.strip():
+                return value.strip()
+    return platform.processor()
 
 
 class Writer:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.errors import RecordingError
+from s2r_runtime.gap import Transitions
 from s2r_runtime.models.composed import SUBSTEPS, ComposedModel
 from s2r_runtime.trace.reconstruct import Reconstruction, at_step, independent_step, snapped
 from s2r_runtime.trace.streams import (
@@ -89,7 +90,7 @@ class Run:
 class Dataset:
     """What the tracer works on. digests: of the recording's files (guarantee G6); rows: stamps at which states were measured; origin_s: the
     stamp from which times count. apart: steps that make one which is independent of the next. interval: s between rows, as recorded.
-    segments: as received.
+    segments: as received. campaign: its samples, if they are known besides (else they are looked for in `paths`).
     """
 
     states: tuple[str, ...]
@@ -108,6 +109,7 @@ class Dataset:
     apart: int = 1
     interval: float = 0.0
     segments: tuple[tuple[Stream, Stream], ...] = field(default=(), repr=False)
+    campaign: Transitions | None = field(default=None, repr=False)
 
 
 def from_arrays(model: ComposedModel, runs: Sequence[tuple[Array, Array]], source: str = "arrays") -> Dataset:

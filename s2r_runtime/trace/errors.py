@@ -7,6 +7,7 @@ rollout_rms is the error at the end of rollouts of the stated horizon, started a
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -158,13 +159,10 @@ def _campaign_gap(model: ComposedModel, samples: Transitions, weights: Array, ki
 
 def _campaign(model: ComposedModel, given: Held) -> Transitions | None:
     """Samples of the recording's campaign that lie in what is held out."""
-    if len(given.data.paths) != 1 or given.data.paths[0].suffix != ".mcap" or len(given.data.runs) >= FEWEST_RUNS or not len(given.steps):
+    if len(given.data.runs) >= FEWEST_RUNS or not len(given.steps):
         return None
-    from s2r_runtime.transitions import from_mcap
-
-    try:
-        found = from_mcap(given.data.paths[0], model)
-    except S2RError:
+    found = given.data.campaign or _in_file(model, given.data.paths)
+    if found is None:
         return None
     nearest = np.searchsorted(given.steps.t, found.t0_s - given.data.origin_s - 0.5 * given.data.dt)
     apart = given.steps.t[np.minimum(nearest, len(given.steps) - 1)] - (found.t0_s - given.data.origin_s)
@@ -173,3 +171,15 @@ def _campaign(model: ComposedModel, given: Held) -> Transitions | None:
         return None
     keep = found.held[inside] if found.held is not None else None
     return replace(found, x0=found.x0[inside], u=found.u[inside], x1=found.x1[inside], t0_s=found.t0_s[inside], held=keep)
+
+
+def _in_file(model: ComposedModel, paths: tuple[Path, ...]) -> Transitions | None:
+    """A campaign's samples in a log."""
+    if len(paths) != 1 or paths[0].suffix != ".mcap":
+        return None
+    from s2r_runtime.transitions import from_mcap
+
+    try:
+        return from_mcap(paths[0], model)
+    except S2RError:
+        return None
