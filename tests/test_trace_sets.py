@@ -19,6 +19,7 @@ from trace_sets.making import EXACT, Draft, Missing, draw_missing
 from trace_sets.noise import Noise
 from trace_sets.outside_inputs import resonance
 from trace_sets.recording import record
+from trace_sets.same import names
 from trace_sets.scale import PLANTS, draw_scale
 from trace_sets.world import Start, World, rollout_errors
 
@@ -272,6 +273,22 @@ def test_the_library_means_the_same_by_its_effects(robot):
         full = compose(ModelSpec(told["name"], told["dt"], told["parameters"], (EffectSpec(**missing.told()), *declared)))
         before, after, _ = errors_again(draft, 0, nominal, full, None)["clean"]
         assert after < 0.1 * before + 1e-6, missing
+
+
+@pytest.mark.parametrize("robot", PLANTS)
+def test_names_for_the_same_thing_are_those_that_the_library_finds_by_trying(robot):
+    classes = pytest.importorskip("s2r_runtime.effects.classes")
+    s = draw_scale(np.random.default_rng(1), (robot,))
+    told = Draft(s, Noise("none", np.zeros(len(s.plant.states))), "holds", declared=(EXACT,) if s.plant.pose else ())
+    model = told.model()
+    composed = compose(ModelSpec(model["name"], model["dt"], model["parameters"], tuple(EffectSpec(**e) for e in model["effects"])))
+    for name in draws.names(s.plant):
+        missing = draw_missing(np.random.default_rng(zlib.crc32(name.encode())), s, name, 1.0)
+        ours = names(s.plant, missing, told)
+        theirs = [found[:2] for found in classes.same(composed.nominal, missing.name, missing.channel, missing.p)]
+        assert all(scoring.is_one_of(found, ours) for found in theirs), (missing, theirs)
+        known = {n for n, _ in theirs} | {name}
+        assert {n for n, _ in ours} <= known | {"sensor_offset", "heading_offset"}, (missing, ours, theirs)
 
 
 # ---------------------------------------------------------------- the scorer

@@ -45,6 +45,10 @@ def names(plant: Plant, m: Missing, draft: Draft) -> list[Name]:
         found += [(m.name, "*"), (m.name, plant.inputs[0])]
     if m.name == "constant_disturbance" and plant.name == "unicycle" and m.channel == "body" and m.p["y"] == 0.0:
         found.append(("input_bias", "v"))
+    if m.name == "input_bias" and plant.name == "double_integrator":  # a push along that axis alone
+        found += [("constant_disturbance", "world"), ("gravity_slope", None)]
+    if m.name == "input_bias" and plant.name == "unicycle" and m.channel == "v":
+        found.append(("constant_disturbance", "body"))
     if m.name == "heading_offset":
         found.append(("sensor_offset", "theta"))
     return list(dict.fromkeys(found))
@@ -56,9 +60,11 @@ def groups(plant: Plant) -> list[list[Name]]:
         return [[("track_scale", None), ("input_gain", "w")], [("longitudinal_slip", None), ("input_gain", "v")]]
     if plant.name == "joint":
         return [
-            [("constant_disturbance", "world"), ("input_bias", "force"), ("constant_disturbance", "body"), ("constant_disturbance", "*")],
+            [("constant_disturbance", "world"), ("input_bias", "force"), ("gravity_slope", None)],
             [("mass_change", None), ("input_gain", "force")],
         ]
+    if plant.name == "double_integrator":
+        return [[("constant_disturbance", "world"), ("gravity_slope", None)]]
     return []
 
 
