@@ -187,7 +187,7 @@ class EffectKit:
             pytest.skip("has no neutral value")
         for model, channel, p in self._tried(cases):
             x, u = self._states(model, 6), self._inputs(model, 10)[:6]
-            at = {name: neutral.get(name, value) if isinstance(value, float) else value for name, value in p.items()}
+            at = {name: self._like(value, neutral[name]) if name in neutral else value for name, value in p.items()}
             expected = model.step(x, u, DT, model.parameters) if self.effect.stage == "step" else u if self.effect.stage == "input" else x
             np.testing.assert_allclose(self._step(model, channel, x, u, at), expected, rtol=1e-12, atol=1e-12)
 
@@ -215,7 +215,7 @@ class EffectKit:
                 starts = self._starts(u, model, channel)
                 assert len(starts) <= MOST_STARTS
                 for p in starts:
-                    self._allowed(p)
+                    self._allowed(p, model, channel)
                     if u.any():
                         assert self._step(model, channel, self._states(model, 2), u[:2], p).shape[0] == 2
 
@@ -228,7 +228,7 @@ class EffectKit:
                 residual, t = rng.normal(size=(n, len(model.states))), DT * np.cumsum(rng.integers(1, 3, n))
                 for pushes in (np.zeros_like(residual), np.full_like(residual, DT)):
                     for p in self.effect.starts_from_residual(residual, t, pushes, model, channel, DT):
-                        self._allowed(p)
+                        self._allowed(p, model, channel)
 
     # ------------------------------------------------------------ in a model
 
@@ -263,7 +263,18 @@ class EffectKit:
         for model, channel in cases:
             for given in (self.parameters, *self.others):
                 other = {name: first_of(model, channel) for name in getattr(self.effect, "named", ()) if name in given}
-                yield model, channel, {**given, **other}
+                values = {**given, **other}
+                if hasattr(self.effect, "takes"):
+                    values = {name: value for name, value in values.items() if name in self.effect.takes(model, channel)}
+                yield model, channel, values
+
+    def _takes(self, model: NominalModel, channel: str) -> set[str]:
+        """Names of the parameters that it has there."""
+        return {*(self.effect.takes(model, channel) if hasattr(self.effect, "takes") else (p.name for p in self.effect.parameters))}
+
+    def _like(self, value: object, number: float | None) -> object:
+        """The number, in every entry if the value is a matrix."""
+        return [[number for _ in row] for row in value] if isinstance(value, list) else number
 
     def _inputs(self, model: NominalModel, steps: int) -> Array:
         """Held values that change now and then, and a stretch of zeros."""
@@ -292,9 +303,10 @@ class EffectKit:
             return list(self.effect.starts(u, model, channel, DT, DT * np.arange(len(u))))
         return list(self.effect.starts(u, model, channel, DT))
 
-    def _allowed(self, p: Values) -> None:
+    def _allowed(self, p: Values, model: NominalModel, channel: str) -> None:
         """Known names, none left out that must be there, finite and inside the bounds."""
-        known = {q.name: q for q in self.effect.parameters}
+        takes = self._takes(model, channel)
+        known = {q.name: q for q in self.effect.parameters if q.name in takes}
         assert set(known) - set(getattr(self.effect, "optional", ())) <= set(p) <= set(known)
         for name, value in p.items():
             if isinstance(value, float):
