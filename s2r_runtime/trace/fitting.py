@@ -31,6 +31,9 @@ without noise stay solvable."""
 WIDEST = 5.0
 """Cap of the widening of intervals: beyond it the model is wrong and no interval is right."""
 
+SCORE_BLOCKS = 10
+"""Blocks of time whose scores are compared: long against what noise remembers, many enough to tell."""
+
 ROUNDED = 10
 """Changes of a state that must be whole multiples of the smallest one before it counts as rounded."""
 
@@ -138,6 +141,15 @@ def sensitivities(given: Problem, fit: Fit, model: ComposedModel, free: Free) ->
     return fit.colour(fit.whiten(moved), given.steps.joined).reshape(n * nx, len(free))
 
 
+def scatter(given: Problem, fit: Fit) -> Array:
+    """(k,) by how much more than white noise the scores of blocks of time scatter, as a ratio of standard deviations, for what was fitted."""
+    z = objective(given, fit, fit.model)
+    j = sensitivities(given, fit, fit.model, fit.free)
+    w = noises.weight(z).ravel()
+    covariance = np.linalg.pinv(j.T @ (j * w[:, None]), rcond=1e-12, hermitian=True)
+    return widening(j * (w * z.ravel())[:, None], np.asarray(covariance), z.shape[1], SCORE_BLOCKS)
+
+
 def widening(scores: Array, covariance: Array, nx: int, blocks: int) -> Array:
     """(k,) ratio of the sandwich's standard deviation to the plain one, within [1, WIDEST]. scores: (n nx, k), in order of time.
 
@@ -161,7 +173,7 @@ def _differences(given: Problem, model: ComposedModel, free: Free) -> list[float
     return steps
 
 
-def refine(given: Problem, fit: Fit, model: ComposedModel, free: Free | None = None) -> ComposedModel:
+def refine(given: Problem, fit: Fit, model: ComposedModel, free: Free | None = None, iterations: int = ITERATIONS) -> ComposedModel:
     """Parameters that maximise the likelihood under the noise of `fit`, from where the model stands."""
     free = free_of(model) if free is None else free
     if not free:
@@ -169,7 +181,7 @@ def refine(given: Problem, fit: Fit, model: ComposedModel, free: Free | None = N
     z = objective(given, fit, model)
     best = float(np.sum(noises.log_density(z)))
     damping = 1e-4
-    for _ in range(ITERATIONS):
+    for _ in range(iterations):
         j = sensitivities(given, fit, model, free)
         w = noises.weight(z).ravel()
         normal, slope = j.T @ (j * w[:, None]), j.T @ (w * z.ravel())

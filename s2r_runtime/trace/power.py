@@ -22,7 +22,7 @@ from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.candidates import Candidate, candidates
 from s2r_runtime.trace.fitting import Fit, Problem, sensitivities
 from s2r_runtime.trace.residual import acting, predicted
-from s2r_runtime.trace.scores import price
+from s2r_runtime.trace.scores import STRICT
 from s2r_runtime.trace.slots import Slot, bounds_of, slots_of, values_of
 
 Array = NDArray[np.float64]
@@ -43,8 +43,8 @@ class Visible:
     unit: str
 
 
-def visible(given: Problem, fit: Fit, needed: float) -> tuple[Visible, ...]:
-    """Of every effect with a neutral value that the model does not have yet. needed: nats from which one is taken, price apart."""
+def visible(given: Problem, fit: Fit, tried: int) -> tuple[Visible, ...]:
+    """Of every effect with a neutral value that the model does not have yet. tried: starts that were looked at."""
     before = predicted(fit.model, given.steps, acting(fit.model, given.data))
     white = replace(fit, colour=noises.no_colour(fit.z.shape[1]))
     j = sensitivities(given, white, fit.model, fit.free)
@@ -59,7 +59,7 @@ def visible(given: Problem, fit: Fit, needed: float) -> tuple[Visible, ...]:
         bounds, neutral = bounds_of(start, slot), bounds_of(start, slot).neutral or 0.0
         gained = 0.5 * float(column @ column)
         size = abs(float(values_of(start, (slot,))[0]) - neutral)
-        enough = needed + price(1, len(given.steps))
+        enough = STRICT.needed(tried, 1, len(given.steps))
         seen = size * math.sqrt(enough / gained) if gained > INVISIBLE else None
         unit = start.effects[slot.place].effect.unit(start.nominal, candidate.channel, slot.name)
         found[key] = Visible(*key, slot.name, None if seen is None or seen > bounds.high - neutral else seen, neutral, unit)

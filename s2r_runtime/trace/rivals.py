@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset, Run
-from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, without
+from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, scatter, without
 from s2r_runtime.trace.residual import acting, steps_of
 from s2r_runtime.trace.scores import Scored, best_candidates, name_of
 
@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 
 CLOSE = 3.0
 """Nats of likelihood within which rivals cannot be told apart: odds of 20 to 1."""
+
+LOOSEST = 6.0
+"""Noise that wanders makes differences of likelihood larger than they mean, up to this."""
 
 FITTED = 12
 """Candidates that are fitted as rivals, after screening."""
@@ -40,12 +43,14 @@ def rivals(given: Problem, fit: Fit) -> list[Scored]:
     """Models with one effect replaced by another, of which the likelihood says the same."""
     found = []
     rich = _rich(given, fit.model) if fit.added else None
+    loose = scatter(given, fit) ** 2 if fit.free else np.ones(0)
     for place in fit.added:
+        close = CLOSE * min(max([1.0, *(loose[i] for i, slot in enumerate(fit.free) if slot.place == place)]), LOOSEST)
         mine = name_of(fit.model.effects[place])
         base = fitted(given, fit, without(fit.model, place), 1)
         here = gain(fit, base)
         for s in best_candidates(given, base, FITTED)[0]:
-            if s.fit is None or (s.name, s.channel) == mine or gain(s.fit, base) < here - CLOSE:
+            if s.fit is None or (s.name, s.channel) == mine or gain(s.fit, base) < here - close:
                 continue
             if s.fit.k <= fit.k or rich is None or rich.apart(s.fit.model, fit.model) > ALIKE * rich.apart(fit.model, base.model):
                 found.append(s)

@@ -34,19 +34,37 @@ class Scored:
     fit: Fit | None = None
 
 
-def price(k: int, n: int) -> float:
-    """Of k parameters on n transitions (Schwarz)."""
-    return 0.5 * k * math.log(max(n, 2))
+@dataclass(frozen=True)
+class Bar:
+    """What an effect must clear. alpha: chance of naming anything where nothing is, as far as the likelihood is right; each: nats a
+    parameter costs, None for Schwarz's price.
+    """
+
+    alpha: float
+    each: float | None = None
+
+    def price(self, k: int, n: int) -> float:
+        """Of k parameters on n transitions."""
+        return k * (0.5 * math.log(max(n, 2)) if self.each is None else self.each)
+
+    def needed(self, tried: int, k: int, n: int) -> float:
+        """Nats of gain from which on an effect counts, everything tried paid for."""
+        return math.log(max(tried, 1) / self.alpha) + self.price(k, n)
 
 
-def best_candidates(given: Problem, base: Fit, few: int = FEW) -> tuple[list[Scored], int]:
+STRICT = Bar(1e-3)
+LENIENT = Bar(0.3, 1.5)
+"""For where structure is shown already."""
+
+
+def best_candidates(given: Problem, base: Fit, few: int = FEW, bar: Bar = STRICT) -> tuple[list[Scored], int]:
     """The candidates for one more effect, fitted, best score first; and how many starts were looked at."""
     screened, tried = screen(given, base, candidates(base.model, given.data, Leftover(given, base)))
     scored: dict[tuple[str, str], Scored] = {}
     promising = [s for s in screened[:few] if s.value > max(HOPELESS, HOPELESS_SHARE * screened[0].value)]
     for s in promising:
         fit = fitted(given, base, s.start, 2)
-        value = gain(fit, base) - price(fit.k - base.k, len(given.steps))
+        value = gain(fit, base) - bar.price(fit.k - base.k, len(given.steps))
         key = (s.candidate.name, s.candidate.channel)
         if key not in scored or value > scored[key].score:
             scored[key] = Scored(*key, value, fit)

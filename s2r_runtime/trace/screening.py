@@ -19,11 +19,14 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.candidates import Candidate
-from s2r_runtime.trace.fitting import Fit, Problem, sensitivities
+from s2r_runtime.trace.fitting import Fit, Problem, refine, sensitivities
 from s2r_runtime.trace.residual import acting, predicted
 from s2r_runtime.trace.slots import Free, bounds_of, inside, slots_of, values_of, with_values
 
 Array = NDArray[np.float64]
+
+STEPS_ON = 2
+"""Gauss-Newton steps from the best start of an effect with several numbers: enough to show whether it leads anywhere."""
 
 CHUNK = 48
 """Columns that are whitened together: few enough to stay in the cache of a small machine."""
@@ -70,7 +73,20 @@ def screen(given: Problem, base: Fit, found: Sequence[Candidate]) -> tuple[list[
             key: tuple[str | int, ...] = (probe.candidate.name, probe.candidate.channel, probe.candidate.place, *sorted(probe.values))
             if np.isfinite(value) and (key not in best or value - level > best[key].value):
                 best[key] = Screened(value - level, probe.candidate, start)
-    return sorted(best.values(), key=lambda s: -s.value), len(probes)
+    moved_on = [_moved_on(given, white, aside, before, s, level) for s in best.values()]
+    return sorted(moved_on, key=lambda s: -s.value), len(probes)
+
+
+def _moved_on(given: Problem, white: Fit, aside: _Aside, before: Array, s: Screened, level: float) -> Screened:
+    """An effect of several numbers that no scale brings in place, some steps on from its best start."""
+    place = s.candidate.place if s.candidate.replaced < 0 else s.candidate.replaced
+    slots = tuple(slots_of(s.start.effects[place], place))
+    if len(slots) < 2 or getattr(s.start.effects[place].effect, "additive", False):
+        return s
+    start = refine(given, white, s.start, slots, STEPS_ON)
+    column = white.whiten(predicted(start, given.steps, acting(start, given.data)) - before).reshape(-1, 1)
+    value, _ = aside.look(_Probe(s.candidate, start, (start,), (), ()), column)
+    return Screened(value - level, s.candidate, start) if value - level > s.value else s
 
 
 def _chunks(probes: Sequence[_Probe]) -> Iterator[list[_Probe]]:

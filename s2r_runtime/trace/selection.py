@@ -2,13 +2,12 @@
 
 gain          of a model over the one without the effect, the smaller of white and coloured (`scores`): "just more noise" and
               "coloured noise" are rivals
-significant   gain > log(tried / ALPHA) + k/2 log n               (k parameters; everything tried is paid for)
+significant   gain > log(tried / alpha) + price                   (everything tried is paid for; `scores.Bar`)
 relevant      some rollout's rms error falls by RELEVANT, on blocks that the parameters (all but those blocks) never saw
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -25,28 +24,22 @@ from s2r_runtime.trace.fitting import (
     fitted,
     gain,
     objective,
+    scatter,
     sensitivities,
-    widening,
     without,
 )
 from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
 from s2r_runtime.trace.rivals import CLOSE, rivals
-from s2r_runtime.trace.scores import Scored, best_candidates, name_of, names, price
+from s2r_runtime.trace.scores import STRICT, Bar, Scored, best_candidates, name_of, names
 from s2r_runtime.trace.slots import values_of, with_values
 
 Array = NDArray[np.float64]
-
-ALPHA = 1e-3
-"""Chance of naming anything on clean data, as far as the likelihood is right."""
 
 RELEVANT = 0.05
 """An effect that lowers no rollout error by this share is left out: nobody would notice it."""
 
 MOST = 5
 """Effects that are looked for at most."""
-
-SCORE_BLOCKS = 10
-"""Blocks of time whose scores are compared: long against what noise remembers, many enough to tell."""
 
 BLOCKS = 5
 """Of the cross-validation."""
@@ -68,46 +61,41 @@ class Selection:
     rivals: tuple[Scored, ...]
 
 
-def select(given: Problem, model: ComposedModel, horizon: int, progress: Callable[[float], None]) -> Selection:
+def select(given: Problem, model: ComposedModel, horizon: int, progress: Callable[[float], None], bar: Bar = STRICT) -> Selection:
     """The effects that the transitions call for."""
     nominal = evaluate(given, model)
     fit, tried = nominal, 0
     ranking: list[Scored] = []
     for step in range(MOST):
-        found, columns = best_candidates(given, fit)
+        found, columns = best_candidates(given, fit, bar=bar)
         tried = max(tried, columns)
         if not ranking:
             ranking = found
         progress(0.1 + 0.6 * (step + 1) / (MOST + 1))
-        chosen = next((s.fit for s in found if s.fit is not None and accepted(given, s.fit, fit, tried, horizon)), None)
+        chosen = next((s.fit for s in found if s.fit is not None and accepted(given, s.fit, fit, tried, horizon, bar)), None)
         if chosen is None:
             break
         chosen = fitted(given, chosen, chosen.model)
-        fit = exchanged(given, chosen) if len(chosen.added) > 1 else chosen
-    fit = pruned(given, fit, tried, horizon)
+        fit = exchanged(given, chosen, bar) if len(chosen.added) > 1 else chosen
+    fit = pruned(given, fit, tried, horizon, bar)
     progress(0.8)
     return Selection(nominal, fit, tried, tuple(ranking), tuple(rivals(given, fit)))
 
 
-def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int) -> bool:
+def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int, bar: Bar = STRICT) -> bool:
     """Significant and relevant."""
-    return significant(given, fit, base, tried) and relevant(given, fit, base, horizon)
+    return significant(given, fit, base, tried, bar) and relevant(given, fit, base, horizon)
 
 
-def significant(given: Problem, fit: Fit, base: Fit, tried: int) -> bool:
+def significant(given: Problem, fit: Fit, base: Fit, tried: int, bar: Bar = STRICT) -> bool:
     """Beyond chance, everything tried paid for; the gain shrunk by how much more than white noise the scores of blocks scatter."""
-    needed = math.log(max(tried, 1) / ALPHA) + price(fit.k - base.k, len(given.steps))
+    needed = bar.needed(tried, fit.k - base.k, len(given.steps))
     reached = gain(fit, base)
     if reached <= needed or reached > WIDEST**2 * needed or not fit.free:
         return reached > needed
     there = names(base.model)
     new = [i for i, slot in enumerate(fit.free) if name_of(fit.model.effects[slot.place]) not in there]
-    z = objective(given, fit, fit.model)
-    j = sensitivities(given, fit, fit.model, fit.free)
-    w = noises.weight(z).ravel()
-    covariance = np.linalg.pinv(j.T @ (j * w[:, None]), rcond=1e-12, hermitian=True)
-    wider = widening(j * (w * z.ravel())[:, None], np.asarray(covariance), z.shape[1], SCORE_BLOCKS)
-    return reached > needed * float(np.max(wider[new], initial=1.0)) ** 2
+    return reached > needed * float(np.max(scatter(given, fit)[new], initial=1.0)) ** 2
 
 
 def relevant(given: Problem, fit: Fit, base: Fit, horizon: int) -> bool:
@@ -154,25 +142,25 @@ def _less_each_block(given: Problem, fit: Fit, edges: Array) -> list[ComposedMod
     return models
 
 
-def exchanged(given: Problem, fit: Fit) -> Fit:
+def exchanged(given: Problem, fit: Fit, bar: Bar) -> Fit:
     """Replaces an earlier effect where another one does better beside the later ones: the first choice was made without them."""
     for place in fit.added[:-1]:
         base = fitted(given, fit, without(fit.model, place), 1)
-        found, _ = best_candidates(given, base, 4)
+        found, _ = best_candidates(given, base, 4, bar)
         best = found[0].fit if found else None
-        if best is not None and gain(best, fit) > price(best.k - fit.k, len(given.steps)) + CLOSE:
+        if best is not None and gain(best, fit) > bar.price(best.k - fit.k, len(given.steps)) + CLOSE:
             fit = fitted(given, best, best.model)
     return fit
 
 
-def pruned(given: Problem, fit: Fit, tried: int, horizon: int) -> Fit:
+def pruned(given: Problem, fit: Fit, tried: int, horizon: int, bar: Bar) -> Fit:
     """Drops every effect that the others make superfluous."""
     again = True
     while again and fit.added:
         again = False
         for place in fit.added:
             less = fitted(given, fit, without(fit.model, place), 1)
-            if not accepted(given, fit, less, tried, horizon):
+            if not accepted(given, fit, less, tried, horizon, bar):
                 fit, again = less, True
                 break
     return fit

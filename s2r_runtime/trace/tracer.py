@@ -11,7 +11,6 @@ Deterministic: the same recording, model and seed give the same result.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -35,7 +34,8 @@ from s2r_runtime.trace.lack_of_fit import Structure, lack_of_fit
 from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.residual import Mask, first_steps, rms, steps_of
 from s2r_runtime.trace.result import Found, Limit, TraceResult
-from s2r_runtime.trace.selection import ALPHA, Selection, select
+from s2r_runtime.trace.scores import LENIENT, names
+from s2r_runtime.trace.selection import Selection, select
 from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.verdict import confirmed, final_fit, foretells, verdict_of
 
@@ -111,6 +111,11 @@ def _traced(
     chosen = confirmed(given, chosen, judged_on)
     say(80.0, 100.0, "testing what is left")
     structure = _structure(checked, chosen, ahead)
+    if structure.matters:  # something is there: which name it has may be asked with a lower bar, if that leaves nothing
+        other = confirmed(given, select(given, model, ahead, lambda share: None, LENIENT), judged_on)
+        if names(other.fit.model) != names(chosen.fit.model):
+            rest = _structure(checked, other, ahead)
+            chosen, structure = (chosen, structure) if rest.matters else (other, rest)
     say(90.0, 100.0, "judging on held-out data")
     w = np.ones(len(model.states)) if weights is None else np.asarray(weights, dtype=np.float64)
     result = _result(dataset, checked, given, chosen, structure, judged_on, seed, w, kind)
@@ -165,7 +170,7 @@ def _result(
         source=dataset.source,
         interpolated=dataset.interpolated,
         reconstruction=dataset.reconstruction,
-        could_see=visible(given, final, math.log(max(chosen.tried, 1) / ALPHA)),
+        could_see=visible(given, final, chosen.tried),
     )
 
 
