@@ -142,7 +142,7 @@ def sensitivities(given: Problem, fit: Fit, model: ComposedModel, free: Free) ->
 
 
 def scatter(given: Problem, fit: Fit) -> Array:
-    """(k,) by how much more than white noise the scores of blocks of time scatter, as a ratio of standard deviations, for what was fitted."""
+    """(k,) how much more than white noise the scores of blocks of time scatter, a ratio of standard deviations, of what was fitted."""
     z = objective(given, fit, fit.model)
     j = sensitivities(given, fit, fit.model, fit.free)
     w = noises.weight(z).ravel()
