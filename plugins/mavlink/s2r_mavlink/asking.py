@@ -49,10 +49,25 @@ Send = Callable[[int, bytes], bool]
 
 
 class Rate:
-    """One message's interval: wanted, asked for now, granted (0: not yet), ms."""
+    """One message's interval, ms: wanted, asked for now, the slowest that was denied, the fastest that was accepted (0: none), and the one
+    that is in force (0: not known yet).
+    """
 
     def __init__(self, number: int, wanted_ms: int) -> None:
-        self.number, self.wanted_ms, self.asked_ms, self.granted_ms = number, wanted_ms, wanted_ms, 0.0
+        self.number, self.wanted_ms = number, wanted_ms
+        self.begin()
+
+    def begin(self) -> None:
+        """Nothing was asked yet."""
+        self.asked_ms, self.denied_ms, self.accepted_ms, self.granted_ms = self.wanted_ms, 0, 0, 0.0
+
+    def next_ms(self) -> int:
+        """What to ask for next: slower until something is accepted, then between that and what was denied; 0: nothing more."""
+        if not self.denied_ms:
+            return 0 if self.accepted_ms else self.wanted_ms
+        if not self.accepted_ms:
+            return max(self.denied_ms + 1, math.ceil(SLOWER * self.denied_ms))
+        return (self.denied_ms + self.accepted_ms) // 2 if self.accepted_ms - self.denied_ms > 1 else 0
 
     @property
     def name(self) -> str:
@@ -88,6 +103,7 @@ class Asking:
         self._may_take = self._take_over != "never" and self._mode is not None
         self._reason = ""
         self._drives = False
+        self._mode_seen: int | None = None
         self._drove_ns = -DRIVING_NS
 
     # ------------------------------------------------------------------ what the transport tells
@@ -151,6 +167,8 @@ class Asking:
         if robot.overrides != self._overrides:
             self._overrides, self._may_take = robot.overrides, False
             self._say(f"the robot was stopped or taken over; to go on: s2r clear, and {self._give_back()}")
+        if robot.mode != self._mode_seen:  # the next order needn't wait for the last one
+            self._mode_seen, self._order_ns = robot.mode, 0
         drives = robot.drives and robot.mode is not None
         if drives != self._drives:
             self._drives = drives
@@ -179,7 +197,7 @@ class Asking:
 
     def _begin_rates(self) -> None:
         for rate in self.rates:
-            rate.asked_ms, rate.granted_ms = rate.wanted_ms, 0.0
+            rate.begin()
         self._turn, self._later_ns = None, 0
 
     def _ask_rates(self, now_ns: int) -> None:
@@ -193,7 +211,7 @@ class Asking:
         if now_ns - self._asked_ns < ANSWER_NS:
             return
         if self._confirming:  # it can't say what it granted
-            self._grant(self._turn, self._turn.asked_ms)
+            self._grant(self._turn, self._turn.accepted_ms)
         elif self._tries >= PATIENCE:
             self._say(f"the robot doesn't answer when asked for {self._turn.name}; asked again later")
             self._turn, self._later_ns = None, now_ns + LATER_NS
@@ -208,28 +226,33 @@ class Asking:
     def _answered(self, f: Fields, now_ns: int) -> None:
         command, result = f[0], f[1]
         if command == dialect.SET_MESSAGE_INTERVAL and self._turn is not None and not self._confirming:
-            if result == dialect.ACCEPTED:
-                self._confirming, self._asked_ns = True, now_ns
-                self._command(dialect.GET_MESSAGE_INTERVAL, self._turn.number)
-            elif result != dialect.IN_PROGRESS:
-                self._denied(self._turn, result, now_ns)
+            if result != dialect.IN_PROGRESS:
+                self._next_rate(self._turn, result, now_ns)
         elif command in (dialect.DO_SET_MODE, dialect.COMPONENT_ARM_DISARM) and result not in (dialect.ACCEPTED, dialect.IN_PROGRESS):
             what = "change its mode" if command == dialect.DO_SET_MODE else "arm"
             self._say(f"the robot won't {what}: {_result(result)}")
 
-    def _denied(self, rate: Rate, result: int, now_ns: int) -> None:
-        slower = max(rate.asked_ms + 1, math.ceil(SLOWER * rate.asked_ms))
-        if slower > SLOWEST_MS or result == dialect.UNSUPPORTED:
+    def _next_rate(self, rate: Rate, result: int, now_ns: int) -> None:
+        """One interval was accepted or denied: the next one, or the question what is in force now."""
+        if result == dialect.ACCEPTED:
+            rate.accepted_ms = rate.asked_ms
+        else:
+            rate.denied_ms = rate.asked_ms
+        following = rate.next_ms()
+        if following > SLOWEST_MS or (result == dialect.UNSUPPORTED and not rate.accepted_ms):
             self._say(f"{rate.name}: the robot grants no rate ({_result(result)}); it comes as it may")
             rate.granted_ms, self._turn = math.inf, None
-            return
-        rate.asked_ms, self._tries = slower, 0
-        self._ask(rate, now_ns)
+        elif following:
+            rate.asked_ms, self._tries = following, 0
+            self._ask(rate, now_ns)
+        else:
+            self._confirming, self._asked_ns = True, now_ns
+            self._command(dialect.GET_MESSAGE_INTERVAL, rate.number)
 
     def _interval(self, f: Fields, now_ns: int) -> None:
         interval_us, number = f
         if self._turn is not None and self._confirming and number == self._turn.number:
-            self._grant(self._turn, interval_us * 1e-3 if interval_us > 0 else self._turn.asked_ms)
+            self._grant(self._turn, interval_us * 1e-3 if interval_us > 0 else self._turn.accepted_ms)
             self._ask_rates(now_ns)
 
     def _grant(self, rate: Rate, granted_ms: float) -> None:
@@ -246,7 +269,7 @@ class Asking:
         if seconds > 1.5e-9 * LATER_NS or not before:
             return  # it was silent, or this is the first look
         for rate in self.rates:
-            due = 1000.0 * seconds / rate.granted_ms
+            due = 1000.0 * seconds / rate.granted_ms if rate.granted_ms else 0.0
             if rate.number in before and self._told[rate.number] - before[rate.number] < SPARSE * due - 2.0:
                 self._say(f"{rate.name} comes less often than granted; asked for again")
                 self._begin_rates()

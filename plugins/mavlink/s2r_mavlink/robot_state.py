@@ -3,15 +3,15 @@
 It can be driven while its heartbeats are fresh, its mode is the one in which it takes velocity commands, and it is armed. Otherwise its
 observations carry a fault: a robot that doesn't obey would be measured as one whose model is wrong.
 
-A person takes over by changing the mode or disarming; that stops everything until a person clears it. A change that the robot confirmed
-to us (COMMAND_ACK with our ids) a moment before is our own doing.
+A person takes over by changing the mode or disarming; that stops everything until a person clears it. A change to the profile's `stop_mode`
+that the robot confirmed to us (COMMAND_ACK with our ids) a moment before is our own doing.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from s2r_mavlink.dialect import ACCEPTED, COMPONENT_ARM_DISARM, DO_SET_MODE
+from s2r_mavlink.dialect import ACCEPTED, DO_SET_MODE
 from s2r_runtime.messages import OverrideChanged
 
 SECOND = 1_000_000_000
@@ -42,10 +42,10 @@ def mode_name(number: int) -> str:
 
 
 class RobotState:
-    """wanted: the number of the mode in which it can be driven; None: it has no modes, and is always ready."""
+    """wanted: the number of the mode in which it can be driven; None: it has no modes, and is always ready. stop: of `stop_mode`."""
 
-    def __init__(self, wanted: int | None) -> None:
-        self._wanted = wanted
+    def __init__(self, wanted: int | None, stop: int | None) -> None:
+        self._wanted, self._stop = wanted, stop
         self.mode: int | None = None
         self.armed = False
         self.status = 0
@@ -66,15 +66,17 @@ class RobotState:
         if self.status >= CRITICAL and self.status != was and (drove or self.status >= EMERGENCY):
             state = STATES[self.status] if self.status < len(STATES) else f"in state {self.status}"
             stops.append(OverrideChanged(now_ns, "emergency_stop", f"the robot says that it is {state}"))
-        own = self._own_ns is not None and now_ns - self._own_ns <= OWN_DOING_NS
+        own = self.mode == self._stop and self.armed and self._own_ns is not None and now_ns - self._own_ns <= OWN_DOING_NS
         if drove and not self.drives and not own:
             stops.append(OverrideChanged(now_ns, "manual_override", f"the robot was taken over: {self._manner()}"))
+        if self.drives:
+            self._own_ns = None
         self.overrides += len(stops)
         return stops
 
     def answer(self, command: int, result: int, now_ns: int) -> None:
         """COMMAND_ACK to a command of ours."""
-        if command in (DO_SET_MODE, COMPONENT_ARM_DISARM) and result == ACCEPTED:
+        if command == DO_SET_MODE and result == ACCEPTED:
             self._own_ns = now_ns
 
     def restarted(self, now_ns: int) -> list[OverrideChanged]:

@@ -8,6 +8,7 @@ targets in GUIDED that lapse after 3 s, LOCAL_POSITION_NED and ATTITUDE, TIMESYN
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 import os
@@ -39,15 +40,15 @@ stdout  one JSON line for everything that happens to it, with its own time: {"t"
 
 
 class Rover:
-    """The autopilot. speedup: its seconds in one of the host's."""
+    """The autopilot. say: told everything that happens to it."""
 
-    def __init__(self, line: Line, body: RoverBody, options: argparse.Namespace) -> None:
-        self._line, self._body, self._options = line, body, options
+    def __init__(self, line: Line, options: argparse.Namespace, say: Callable[[dict[str, object]], None]) -> None:
+        self._line, self._options, self._tell_person = line, options, say
+        self._body = RoverBody(tuple(options.start), options.sigma, options.seed, options.turn_gain)
         self._period: float = 1.0 / options.loop_rate
-        self._input = b""
+        self._uptime: float = options.uptime
         self.running = True
         self.mode, self.armed, self.state = ROVER_MODES[options.mode], options.armed, 4
-        self._begin()
         self._doers: dict[str, Callable[[Any], object]] = {
             "COMMAND_LONG": self._command,
             "SET_POSITION_TARGET_LOCAL_NED": self._target,
@@ -55,6 +56,8 @@ class Rover:
             "TIMESYNC": self._timesync,
             "REQUEST_DATA_STREAM": self._stream,
         }
+        self._begin()
+        self.due_s = time.monotonic()
 
     def _begin(self) -> None:
         """As it is after power came on."""
@@ -74,17 +77,24 @@ class Rover:
     @property
     def now_s(self) -> float:
         """Its clock."""
-        return float(self._options.uptime) + self._k * self._period
+        return self._uptime + self._k * self._period
 
-    def run(self) -> None:
-        """Steps at its loop rate until it is told to quit."""
+    def advance(self) -> None:
+        """Takes what came, and steps as often as is due (`due_s`, host's clock). Not for long if it was held up for long."""
         step = self._period / self._options.speedup
-        due = time.monotonic()
-        while self.running:
+        now_s = time.monotonic()
+        while data := self._line.read():
+            if now_s >= self.due_s - 20.0 * step:  # what comes while it starts is not heard
+                self._hear(data)
+        self.due_s = max(self.due_s, now_s - 20.0 * step)
+        while self.due_s <= now_s:
             self._step()
-            due = max(due + step, time.monotonic() - 20 * step)
-            while self.running and (left := due - time.monotonic()) > 0.0:
-                self._wait(left)
+            self.due_s += step
+
+    @property
+    def descriptors(self) -> list[int]:
+        """Readable when something came."""
+        return self._line.descriptors()
 
     def _step(self) -> None:
         aim = self._aim if self.mode == ROVER_MODES["GUIDED"] and self.armed and self.now_s - self._aimed_s <= LAPSE_S else (0.0, 0.0)
@@ -113,14 +123,6 @@ class Rover:
         self._line.write(data)
 
     # ------------------------------------------------------------------ what comes
-
-    def _wait(self, seconds: float) -> None:
-        watched = [0, *self._line.descriptors()] if self._options.stdin else self._line.descriptors()
-        for ready in select.select(watched, [], [], seconds)[0]:
-            if ready == 0:
-                self._read_stdin()
-            else:
-                self._hear(self._line.read())
 
     def _hear(self, data: bytes) -> None:
         for message in (self._mav.parse_buffer(data) or []) if data else []:
@@ -197,24 +199,17 @@ class Rover:
 
     def _reboot(self) -> None:
         self._say(reboot=True)
-        time.sleep(BOOT_S)
         self._body.stand()
         self.mode, self.armed, self.state = ROVER_MODES["HOLD"], False, 4
-        self._options.uptime = 0.0
+        self._uptime = 0.0
         self._begin()
+        self.due_s = time.monotonic() + BOOT_S
 
     # ------------------------------------------------------------------ the person beside it
 
-    def _read_stdin(self) -> None:
-        data = os.read(0, 65_536)
-        if not data:
-            self._options.stdin = False
-        *lines, self._input = (self._input + data).split(b"\n")
-        for line in lines:
-            self._obey(line.decode("utf-8", "replace").split())
-
-    def _obey(self, words: list[str]) -> None:
-        match words:
+    def obey(self, line: str) -> None:
+        """What a person does to it."""
+        match line.split():
             case ["mode", name] if name in ROVER_MODES:
                 self._set_mode(ROVER_MODES[name])
             case ["arm" | "disarm" as what]:
@@ -228,10 +223,10 @@ class Rover:
             case []:
                 pass
             case _:
-                self._say(error=f"{' '.join(words)!r} is none of: mode NAME, arm, disarm, reboot, state critical|active, quit")
+                self._say(error=f"{line!r} is none of: mode NAME, arm, disarm, reboot, state critical|active, quit")
 
     def _say(self, **facts: object) -> None:
-        print(json.dumps({"t": round(self.now_s, 3), **facts}), flush=True)
+        self._tell_person({"t": round(self.now_s, 3), **facts})
 
 
 def parser() -> argparse.ArgumentParser:
@@ -261,10 +256,24 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+def run(rover: Rover) -> None:
+    """Until it is told to quit."""
+    person = [0] if sys.stdin is not None and not sys.stdin.closed else []
+    typed = b""
+    while rover.running:
+        rover.advance()
+        left = max(0.0, rover.due_s - time.monotonic())
+        if 0 in select.select([*person, *rover.descriptors], [], [], left)[0]:
+            data = os.read(0, 65_536)
+            person = person if data else []
+            *lines, typed = (typed + data).split(b"\n")
+            for line in lines:
+                rover.obey(line.decode("utf-8", "replace"))
+
+
 def main(argv: list[str] | None = None) -> int:
     """Runs until `quit` or a signal. Returns the exit code."""
     options = parser().parse_args(argv)
-    options.stdin = sys.stdin is not None and not sys.stdin.closed
     if options.parent:
         die_with_parent(options.parent)
     try:
@@ -272,13 +281,8 @@ def main(argv: list[str] | None = None) -> int:
     except (ConfigError, OSError) as error:
         print(f"rover: {options.line}: {error}", file=sys.stderr)
         return 78
-    body = RoverBody(tuple(options.start), options.sigma, options.seed, options.turn_gain)
-    try:
-        Rover(line, body, options).run()
-    except KeyboardInterrupt:
-        pass
-    finally:
-        line.close()
+    with contextlib.closing(line), contextlib.suppress(KeyboardInterrupt):
+        run(Rover(line, options, lambda facts: print(json.dumps(facts), flush=True)))
     return 0
 
 

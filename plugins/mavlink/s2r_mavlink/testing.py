@@ -10,16 +10,25 @@ class TestUdp(TransportKit):
 
 from __future__ import annotations
 
+import json
 import math
+import os
+import select
+import signal
 import socket
+import subprocess
+import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any, Self
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from s2r_mavlink.rover_lines import Line, TcpServerLine, UdpLine, pseudo_terminal
+from s2r_mavlink.rover import Rover, parser
+from s2r_mavlink.rover_lines import Line, TcpServerLine, UdpLine, line_of, pseudo_terminal
 from s2r_mavlink.transport import MavlinkTransport
-from s2r_runtime.messages import Command
+from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
 
 STATES, INPUTS = ("x", "y", "theta"), ("v", "w")
 GUIDED, HOLD = 15, 4
@@ -27,6 +36,8 @@ ARMED = 0x81
 NUMBERS_EACH = 3
 """Sequence numbers that one observation takes: of a heartbeat, sent now and then, an attitude and a position."""
 HEARTBEAT_S = 0.4
+PATIENCE_S = 15.0
+"""How long anything may take that takes milliseconds on an idle machine."""
 
 
 def free_port(kind: int = socket.SOCK_DGRAM) -> int:
@@ -134,3 +145,164 @@ class MavlinkRig:
     def __exit__(self, *_: object) -> None:
         self.transport.close()
         self.robot.line.close()
+
+
+# ---------------------------------------------------------------- the stand-in rover, and a loop like the daemon's
+
+
+class RoverProcess:
+    """The stand-in as a process. What it says comes in `said`, one dict a line."""
+
+    def __init__(self, line: str, *arguments: str) -> None:
+        argv = [sys.executable, "-m", "s2r_mavlink.rover", line, "--parent", str(os.getpid()), *arguments]
+        theirs_in, self._in = os.pipe()
+        self._out, theirs_out = os.pipe()
+        self.process = subprocess.Popen(argv, stdin=theirs_in, stdout=theirs_out)
+        for descriptor in (theirs_in, theirs_out):
+            os.close(descriptor)
+        os.set_blocking(self._out, False)
+        self._rest = b""
+        self._said: list[dict[str, Any]] = []
+
+    def tell(self, line: str) -> None:
+        """What a person beside it does: `mode HOLD`, `disarm`, `reboot`, ..."""
+        os.write(self._in, line.encode() + b"\n")
+
+    def advance(self) -> None:
+        """It does so by itself."""
+
+    @property
+    def said(self) -> list[dict[str, Any]]:
+        """Everything that happened to it so far."""
+        with suppress(BlockingIOError):
+            while data := os.read(self._out, 65_536):
+                *lines, self._rest = (self._rest + data).split(b"\n")
+                self._said += [json.loads(line) for line in lines]
+        return self._said
+
+    def end(self) -> None:
+        """Ends it, also when it is stopped."""
+        self.process.send_signal(signal.SIGCONT)
+        self.process.kill()
+        self.process.wait(PATIENCE_S)
+        for descriptor in (self._in, self._out):
+            os.close(descriptor)
+
+
+class RoverHere:
+    """The stand-in in this process: it goes on with every turn of the loop, and can be frozen."""
+
+    def __init__(self, line: str, *arguments: str) -> None:
+        self._line = line_of(line)
+        self.said: list[dict[str, Any]] = []
+        self.frozen = False
+        self._rover = Rover(self._line, parser().parse_args([line, *arguments]), self.said.append)
+
+    def tell(self, line: str) -> None:
+        """As `RoverProcess.tell`."""
+        self._rover.obey(line)
+
+    def advance(self) -> None:
+        """What is due."""
+        if not self.frozen:
+            self._rover.advance()
+
+    def end(self) -> None:
+        """Ends it."""
+        self._line.close()
+
+
+@contextmanager
+def rover(line: str, *arguments: str, process: bool = False) -> Iterator[RoverProcess | RoverHere]:
+    """The stand-in while it is needed."""
+    made = RoverProcess(line, *arguments) if process else RoverHere(line, *arguments)
+    try:
+        yield made
+    finally:
+        made.end()
+
+
+class Runtime:
+    """A transport and a loop like the daemon's, which answers every good observation with `command` (nothing if it is None)."""
+
+    def __init__(self, robot: str, **options: Any) -> None:
+        self.options = {"robot": robot, **options}
+        self.transport = MavlinkTransport(self.options, STATES, INPUTS)
+        self.frames: list[Frame] = []
+        self.messages: list[Observation | Command | LinkChanged | OverrideChanged] = []
+        self.lines: list[str] = []
+        self.command: tuple[float, float] | None = None
+        self.source: Any = "sampler"
+        self.beside: list[RoverProcess | RoverHere] = []
+        self._sent = 0
+
+    def __enter__(self) -> Self:
+        self.transport.open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.transport.close()
+
+    def turn(self) -> None:
+        """One turn, of the robots `beside` it too."""
+        for robot in self.beside:
+            robot.advance()
+        select.select([self.transport.fileno()], [], [], 0.005)
+        for frame in self.transport.receive():
+            self.frames.append(frame)
+            for message in self.transport.decode(frame):
+                self.messages.append(message)
+                if isinstance(message, Observation) and not message.fault and self.command is not None:
+                    self._sent += 1
+                    command = Command(self._sent, time.monotonic_ns(), self.source, self.command, message.seq, 10**8)
+                    self.transport.send(self.transport.encode(command))
+        self.messages += self.transport.poll(time.monotonic_ns())
+        self.lines += self.transport.lines()
+
+    def until(self, ready: Callable[[], Any], within_s: float = PATIENCE_S) -> bool:
+        """Turns until it is so; False when the time is over."""
+        end = time.monotonic() + within_s
+        while not ready():
+            if time.monotonic() > end:
+                return False
+            self.turn()
+        return True
+
+    def run(self, seconds: float) -> None:
+        """Turns for so long."""
+        self.until(lambda: False, seconds)
+
+    def more(self, count: int = 20) -> bool:
+        """Whether that many good observations more come."""
+        wanted = len(self.good) + count
+        return self.until(lambda: len(self.good) >= wanted)
+
+    @property
+    def observations(self) -> list[Observation]:
+        """All, faulty ones too."""
+        return [m for m in self.messages if isinstance(m, Observation)]
+
+    @property
+    def good(self) -> list[Observation]:
+        """Those without a fault."""
+        return [o for o in self.observations if not o.fault]
+
+    @property
+    def faults(self) -> list[str]:
+        """What was wrong with the others."""
+        return [o.fault for o in self.observations if o.fault]
+
+    @property
+    def ups(self) -> list[bool]:
+        """Link changes."""
+        return [m.up for m in self.messages if isinstance(m, LinkChanged)]
+
+    @property
+    def overrides(self) -> list[OverrideChanged]:
+        """Stops by a person, or by the robot itself."""
+        return [m for m in self.messages if isinstance(m, OverrideChanged)]
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """The transport's."""
+        return self.transport.counters()

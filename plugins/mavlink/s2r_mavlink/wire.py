@@ -61,7 +61,7 @@ class Wire:
         self._max_age_ns = options["max_age"] * 1e9
         self.clock = RobotClock(round(options["observation_timeout"] * 1e9))
         self.pose = PoseSource(options["pose"], states, tuple(options["origin"]))
-        self.robot = RobotState(mode_number(options["mode"]) if options["mode"] else None)
+        self.robot = RobotState(*(mode_number(options[name]) if options[name] else None for name in ("mode", "stop_mode")))
         self.heard: deque[tuple[int, Fields]] = deque(maxlen=ANSWERS_KEPT)
         self.malformed = self.stale = 0
         self._seen = self._commands = 0
