@@ -23,11 +23,13 @@ _COMMAND = re.compile(rb"<\s*([^<>]*?)\s*>")
 CLIENT_BYTES = 1 << 16
 """What may wait for a client that is late; whole frames are dropped beyond."""
 LINE_MAX = 4096
+QUIET_S = 0.02
+"""python-can's client takes the answer to its last command and a frame right behind it for a wrong answer."""
 
 
 class _Client:
     def __init__(self, connection: socket.socket) -> None:
-        self.connection, self.channel, self.raw = connection, "", False
+        self.connection, self.channel, self.raw_from = connection, "", float("inf")
         self.incoming, self.outgoing = b"", b""
 
 
@@ -108,18 +110,20 @@ class Hub:
                 self._tell(client, b"< ok >")
             case [b"rawmode"]:
                 self._tell(client, b"< ok >")
-                client.raw = True
+                client.raw_from = time.monotonic() + QUIET_S
             case [b"send", identifier, length, *payload] if len(payload) == int(length, 16) <= 8:
                 told = b"< frame %s %.6f %s >" % (identifier, time.time(), b"".join(byte.rjust(2, b"0") for byte in payload))
-                for other in list(self._clients.values()):
-                    if other is not client and other.raw and other.channel == client.channel:
-                        self._tell(other, told)
+                self._spread(client, told)
             case [b"error", kind]:  # not of socketcand: a test's way to an error frame
-                for other in list(self._clients.values()):
-                    if other is not client and other.raw and other.channel == client.channel:
-                        self._tell(other, b"< error %s %.6f >" % (kind, time.time()))
+                self._spread(client, b"< error %s %.6f >" % (kind, time.time()))
             case _:
                 self._tell(client, b"< error unknown command >")
+
+    def _spread(self, sender: _Client, line: bytes) -> None:
+        now = time.monotonic()
+        for other in list(self._clients.values()):
+            if other is not sender and other.channel == sender.channel and other.raw_from <= now:
+                self._tell(other, line)
 
     def _tell(self, client: _Client, line: bytes) -> None:
         if len(client.outgoing) + len(line) <= CLIENT_BYTES:

@@ -9,3 +9,10 @@ from s2r_runtime.hookspecs import Offer, hookimpl
 def s2r_transports() -> list[Offer]:
     """The CAN transport."""
     return [Offer("can", "s2r_can.transport:CanTransport", "robots on a CAN bus, described by its DBC", files=("dbc",))]
+
+
+@hookimpl
+def s2r_recordings() -> list[Offer]:
+    """Logs of a CAN bus."""
+    what = {"log": "candump", "asc": "Vector ASC", "blf": "Vector BLF"}
+    return [Offer(f"can.{suffix}", "s2r_can.recordings:read", f"{name} logs of a bus, by its DBC") for suffix, name in what.items()]

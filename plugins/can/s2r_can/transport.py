@@ -18,11 +18,11 @@ from s2r_can.commander import Commander
 from s2r_can.database import Database
 from s2r_can.inbox import Bell, Inbox, Metronome
 from s2r_can.listening import layout_of
-from s2r_can.observer import COUNTS, Decoded, Observer
-from s2r_can.odometry import Odometry
+from s2r_can.observer import Decoded, Observer
 from s2r_can.options import OPTIONS, Options, checked
 from s2r_can.port import Port
 from s2r_can.proposals import Proposals
+from s2r_can.reckoning import odometry_of
 from s2r_can.records import ERROR, EXTENDED, Record, packed, records
 from s2r_runtime.messages import Command, Frame, LinkChanged, Observation
 
@@ -237,7 +237,7 @@ class CanTransport:
     def counters(self) -> dict[str, int]:
         """Since construction; explained in docs/can.md."""
         totals = self._totals()
-        counts = {name: self._observer.counts[name] for name in COUNTS}
+        counts = dict(self._observer.counts)
         counts["foreign"] += self._unheard
         return {
             "received": totals["received"],
@@ -252,14 +252,6 @@ class CanTransport:
             "interface_errors": totals["errors"],
             "opened": totals["opened"],
         }
-
-
-def odometry_of(options: Options) -> Odometry | None:
-    """What reckons the pose, if the profile wants that."""
-    o = options.dead_reckoning
-    if not o:
-        return None
-    return Odometry(track=o.get("track", 0.0), radius=o.get("wheel_radius", 0.0), start=o.get("start", (0.0, 0.0, 0.0)))
 
 
 def _frame(channel: str, batch: Iterable[Record]) -> Frame:
