@@ -51,9 +51,9 @@ def account(r: TraceResult) -> str:
 
 def headline(r: TraceResult) -> str:
     """What the verdict says, in a clause."""
-    if r.verdict == "ambiguous":
+    if r.rivals:
         return f"these data cannot decide between {1 + len(r.rivals)} explanations; the best is"
-    if r.verdict == "traced":
+    if r.effects:
         count = len(r.effects)
         return f"the model lacks {'one effect' if count == 1 else f'{count} effects'}" + (
             ", which explains what was left over" if count == 1 else ", which explain what was left over"

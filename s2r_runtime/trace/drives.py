@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +27,14 @@ CHOICES = 10
 LOOK_S, LOOKS = 0.1, 24
 """Step in which a next hold is foretold, s, and steps at most."""
 
-COAST_S = 0.7
+COAST_S = 1.0
 """For so long a robot goes on at what it then does before something else takes hold."""
+
+TURN_S = 0.2
+"""Length of a hold that is to turn the robot round at the edge of the room, s."""
+
+FEW_INPUTS = 4
+"""Inputs of which all combinations of extremes are tried for that."""
 
 PLANNED = 0.8
 """Part of what is allowed that is planned with: rivals and noise stray from the plan."""
@@ -41,7 +48,7 @@ SEEN = 1.2
 """Times the values that were seen, for a state's rates."""
 
 AT_LEAST_S = 1.0
-"""A place to drive in holds at least so many seconds at the largest inputs, however little of it was seen."""
+"""What was seen is widened to what the largest inputs do in so many seconds from rest: a robot that stood still saw nothing."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +94,7 @@ def room_of(model: ComposedModel, held: Held, bounds: Array, region: Mapping[str
             half = max(0.5 * float(np.ptp(y[:, i])), largest[i])
             low[i], high[i] = start[i] - half, start[i] + half
         elif name not in free:
-            size = SEEN * max(float(np.max(np.abs(y[:, i]))), 1e-9)
+            size = max(SEEN * float(np.max(np.abs(y[:, i]))), largest[i], 1e-9)
             low[i], high[i] = -size, size
     if pose is None:
         return Room(start, low, high, math.inf, None)
@@ -118,6 +125,7 @@ def draw(rng: np.random.Generator, model: ComposedModel, room: Room, bounds: Arr
     nu = len(bounds)
     rest = np.clip(0.0, bounds[:, 0], bounds[:, 1])
     u = np.tile(rest, (count, steps, 1))
+    corners = np.array(list(product(*bounds.tolist())) if nu <= FEW_INPUTS else bounds.T)
     characters = [_Character.drawn(rng, model.dt) for _ in range(count)]
     x, hidden = np.tile(room.start, (count, 1)), model.at_rest(count)
     until = np.full(count, max(1, round(0.2 / model.dt)))  # begins at rest, so that hidden states are known
@@ -127,9 +135,14 @@ def draw(rng: np.random.Generator, model: ComposedModel, room: Room, bounds: Arr
             home = k > HOME * steps
             length = characters[c].length(rng, model.dt)
             options = np.stack([characters[c].next(rng, before, bounds, rest) for _ in range(CHOICES)])
-            value = options[_chosen(model, room, x[c], options, length, home=home)]
+            place, inside = _chosen(model, room, x[c], options, length, home=home)
+            if not inside:  # turn round, for a moment
+                length = max(1, round(TURN_S / model.dt))
+                options = np.concatenate([options, corners])
+                place, _ = _chosen(model, room, x[c], options, length, home=home)
+            value = options[place]
             end = min(k + length, steps)
-            ramp = characters[c].ramps > rng.random()
+            ramp = inside and characters[c].ramps > rng.random()
             share = np.linspace(0.0, 1.0, end - k + 1)[1:, None] if ramp else np.ones((end - k, 1))
             u[c, k:end] = before + share * (value - before)
             until[c] = end
@@ -141,8 +154,10 @@ def draw(rng: np.random.Generator, model: ComposedModel, room: Room, bounds: Arr
     return u
 
 
-def _chosen(model: ComposedModel, room: Room, x: Array, options: Array, length: int, *, home: bool) -> int:
-    """The first of the options that stays in the room; near the end, the one that ends nearest to the start."""
+def _chosen(model: ComposedModel, room: Room, x: Array, options: Array, length: int, *, home: bool) -> tuple[int, bool]:
+    """The first of the options that stays in the room (else the one that leaves it least); near the end, the one that ends nearest to the
+    start. And whether it stays in the room.
+    """
     duration = length * model.dt
     looks = max(1, min(LOOKS, math.ceil(duration / LOOK_S)))
     state, worst = np.tile(x, (len(options), 1)), np.zeros(len(options))
@@ -152,10 +167,11 @@ def _chosen(model: ComposedModel, room: Room, x: Array, options: Array, length: 
         worst = np.maximum(worst, room.excess(state))
     coasting = state + (state - before) * (COAST_S * looks / duration)
     worst = np.maximum(worst, room.excess(np.where(np.isfinite(room.high - room.low) | _placed(room), coasting, state)))
-    if home:
-        return int(np.argmin(np.maximum(worst / PLANNED, 1.0) + room.excess(0.5 * (state + coasting))))
     inside = np.flatnonzero(worst <= PLANNED)
-    return int(inside[0]) if len(inside) else int(np.argmin(worst))
+    if home:
+        best = int(np.argmin(np.maximum(worst / PLANNED, 1.0) + room.excess(0.5 * (state + coasting))))
+        return best, bool(worst[best] <= PLANNED)
+    return (int(inside[0]), True) if len(inside) else (int(np.argmin(worst)), False)
 
 
 def _placed(room: Room) -> NDArray[np.bool_]:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Bounds = Mapping[str, tuple[float, float]]
+Ways = tuple[tuple[int, int], ...]
 
 DURATION_S, FEWEST, MOST = 20.0, 300, 4000
 """Length of a drive if none is asked for, s; and in rows at least and at most."""
@@ -40,8 +41,8 @@ DURATION_S, FEWEST, MOST = 20.0, 300, 4000
 ROWS, SEQUENCES = 30_000, (8, 60)
 """Rows that are simulated for each rival, and how many sequences that may be."""
 
-FINALS = 4
-"""Sequences that are looked at again with rivals really refitted."""
+FINALS, CLOSEST = 3, 5
+"""Sequences that are looked at again with rivals really refitted, and the closest pairs of each; of the best one all pairs."""
 
 PLENTY = 10.0 * ENOUGH
 """More nats than this are worth nothing."""
@@ -54,6 +55,9 @@ NESTED = 0.02
 
 REPEATS = 10.0
 """A drive that would have to be driven more often than that until it tells two apart is none."""
+
+MOST_NEEDS = 4
+"""Of one input that a sentence names."""
 
 _SIZES = "at least three sizes"
 _FAR = "steps between values far apart, each held until the response has settled"
@@ -101,7 +105,8 @@ def advice(model: ComposedModel, tied: Iterable[tuple[str, str]]) -> str:
             text = _NEEDS.get(name, _OTHERWISE)
             if text not in needs:
                 needs.append(text)
-    parts = [f"{channel}: {'; '.join(needs)}" if channel else "; ".join(needs) for channel, needs in sorted(wanted.items(), reverse=True)]
+    told = {channel: "; ".join(needs[:MOST_NEEDS]) for channel, needs in sorted(wanted.items(), reverse=True)}
+    parts = [f"{channel}: {needs}" if channel else needs for channel, needs in told.items()]
     apart = " Change one input at a time while the others hold still." if len([c for c in wanted if c]) > 1 else ""
     return "Drive " + ". ".join(parts) + "." + apart
 
@@ -159,9 +164,10 @@ def _suggested(
     choice = _for_rivals(rivals, held, room, drawn, rng) if rivals else None
     if choice is None or not (choice.pairs or choice.never):
         nothing, choice = replace(nothing, tied=False), _for_library(base, held, room, drawn, rng)
-    if not choice.pairs or (nothing.tied and choice.pairs[0][2] * REPEATS < ENOUGH):
-        which = "; ".join(choice.never) or f"{choice.pairs[0][0]} and {choice.pairs[0][1]}"
-        return replace(nothing, refused=f"nothing within the bounds tells apart {which}", never=choice.never)
+    if not choice.pairs:
+        return replace(
+            nothing, refused=f"nothing within the bounds tells apart {'; '.join(choice.never) or 'anything'}", never=choice.never
+        )
     y = trajectories(model, None, room.start, choice.u[None], rng)[0]
     away = np.hypot(*(y - room.start)[:, list(room.pose)].T) if room.pose is not None else room.excess(y)
     begin = tuple((s, float(room.start[i])) for i, s in enumerate(model.states) if region and s in region and s in {"x", "y", "q"})
@@ -211,30 +217,35 @@ def _for_rivals(rivals: Rivals, held: Held, room: Room, drawn: Array, rng: np.ra
         for c, u in enumerate(drawn):
             nats[c, truth] = expected(fits, truth, as_data(held.data, y[c], u))
     ways = [_ways(nats, i, j) for i, j in couples]
-    both = np.array([[min(n[way] for way in told) for told in ways] for n in nats])
-    can = both.max(axis=0) * REPEATS >= ENOUGH
-    never = tuple(" and ".join(rivals.named(i, j)) for (i, j), ok in zip(couples, can, strict=True) if not ok)
-    never = never if rivals.every else ()
-    if not can.any():
-        return _Choice(drawn[0], (), never)
-    best: tuple[float, _Choice] | None = None
+    roughly = np.array([[min(n[way] for way in told) for told in ways] for n in nats])
     ends = room.excess(trajectories(fits[0].model, None, room.start, drawn, rng)[:, -1])
-    first = np.minimum(both[:, can].min(axis=1), PLENTY) * (1.0 - HOMEWARD * np.minimum(ends, 1.0))
-    for c in np.argsort(-first)[:FINALS]:
-        pairs = []
-        for (i, j), told, ok, roughly in zip(couples, ways, can, both[c], strict=True):
-            if ok:
-                really = min(refitted(fits, *way, held.data, room.start, drawn[c]) for way in told)
-                pairs.append((*rivals.named(i, j), round(min(float(roughly), really), 2)))
-        pairs.sort(key=lambda pair: pair[2])
-        worth = min(pairs[0][2], PLENTY) * (1.0 - HOMEWARD * min(float(ends[c]), 1.0))
-        if best is None or worth > best[0]:
-            best = worth, _Choice(drawn[c], tuple(pairs), never)
-    assert best is not None  # noqa: S101 - there is at least one sequence
-    return best[1]
+    finals = np.argsort(-_worth(roughly, ends))[:FINALS]
+    really = roughly[finals]
+    for row, c in zip(really, finals, strict=True):
+        _refit(rivals, held, room, drawn[c], ways, row, np.argsort(row)[:CLOSEST])
+    best = int(np.argmax(_worth(really, ends[finals])))
+    _refit(rivals, held, room, drawn[finals[best]], ways, really[best], np.argsort(really[best]))
+    named = [rivals.named(i, j) for i, j in couples]
+    found = sorted(((*name, round(float(n), 2)) for name, n in zip(named, really[best], strict=True)), key=lambda pair: pair[2])
+    never = tuple(f"{one} and {other}" for one, other, n in found if n * REPEATS < ENOUGH) if rivals.every else ()
+    return _Choice(drawn[finals[best]], tuple(pair for pair in found if pair[2] * REPEATS >= ENOUGH), never)
 
 
-def _ways(nats: Array, i: int, j: int) -> tuple[tuple[int, int], ...]:
+def _refit(rivals: Rivals, held: Held, room: Room, u: Array, ways: list[Ways], nats: Array, which: NDArray[np.int64]) -> None:
+    """Lowers nats (pairs,) of some pairs to what is left when the rival is really fitted."""
+    for pair in which:
+        if nats[pair] * REPEATS >= ENOUGH:
+            nats[pair] = min(nats[pair], *(refitted(rivals.fits, *way, held.data, room.start, u) for way in ways[pair]))
+
+
+def _worth(nats: Array, ends: Array) -> Array:
+    """(count,) of drives with nats (count, pairs): of the closest pair among those that some drive tells apart; less if it ends far off."""
+    can = nats.max(axis=0) * REPEATS >= ENOUGH
+    closest = nats[:, can].min(axis=1) if can.any() else nats.max(axis=1)
+    return np.asarray(np.minimum(closest, PLENTY) * (1.0 - HOMEWARD * np.minimum(ends, 1.0)))
+
+
+def _ways(nats: Array, i: int, j: int) -> Ways:
     """(truth, rival) that count for a pair, of nats (count, R, R): both, but not the one in which the rival can become the truth itself (a
     gain by sign a gain): the tracer takes the simpler of two that say the same thing.
     """

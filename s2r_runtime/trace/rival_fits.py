@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 STEPS = 4000
 """Transitions that rivals are fitted on at most."""
 
+SMALL = 3
+"""Of the sizes from which the tracer begins, the one at a third: smaller ones matter little, larger ones everybody sees."""
+
 CLOSEST, LOOKED_AT = 3, 8
 """Rivals of what was found that are taken, of those that are fitted."""
 
@@ -81,15 +84,15 @@ def _effects(fit: Fit) -> set[tuple[str, str]]:
 
 
 def library(base: Fit, rich: Dataset) -> Rivals:
-    """One model for each effect on each channel, at the size in the middle of those from which the tracer begins on a rich drive."""
+    """One model for each effect on each channel, of a small size of those from which the tracer begins on a rich drive."""
     found: dict[tuple[str, str], ComposedModel] = {}
     for candidate in candidates(base.model, rich):
         key = candidate.name, candidate.channel
         models = candidate.models(base.model)
         if key not in found and models:
-            found[key] = sorted(models, key=lambda m: _size(m, candidate.place if candidate.replaced < 0 else candidate.replaced))[
-                len(models) // 2
-            ]
+            place = candidate.place if candidate.replaced < 0 else candidate.replaced
+            sized = sorted((_size(m, place), i) for i, m in enumerate(models))
+            found[key] = models[sized[len(sized) // SMALL if sized[-1][0] > 0.0 else -1][1]]
     fits = [replace(base, model=m, free=free_of(m)) for m in found.values()]
     names = ("no effect", *(_said(*key) for key in found))
     return Rivals((base, *fits), names, ("no effect",) * len(names), every=True)

@@ -65,13 +65,16 @@ def expected(fits: Sequence[Fit], truth: int, data: Dataset) -> Array:
 
 
 def between(fits: Sequence[Fit], base: Fit, data: Dataset) -> Array:
-    """(R, R) nats of each against each, all on one trajectory of the base."""
+    """(R, R) nats of each against each, all on one trajectory of the base; 0 for one that runs away to infinity on it."""
     given, white = _seen(base, data)
-    foretold = [predicted(fit.model, given.steps, acting(fit.model, data)) for fit in fits]
-    spaces = [_basis(sensitivities(given, white, fit.model, fit.free)) for fit in fits]
     nats = np.zeros((len(fits), len(fits)))
-    for i in range(len(fits)):
-        for j in range(len(fits)):
+    with np.errstate(all="ignore"):
+        foretold = [predicted(fit.model, given.steps, acting(fit.model, data)) for fit in fits]
+        moved = [sensitivities(given, white, fit.model, fit.free) for fit in fits]
+    sound = [i for i in range(len(fits)) if np.isfinite(foretold[i]).all() and np.isfinite(moved[i]).all()]
+    spaces = {i: _basis(moved[i]) for i in sound}
+    for i in sound:
+        for j in sound:
             if i != j:
                 d = white.whiten(base.model.difference(foretold[i].copy(), foretold[j])).ravel()
                 nats[i, j] = 0.5 * max(float(d @ d - np.sum((spaces[j].T @ d) ** 2)), 0.0)
