@@ -4,6 +4,7 @@
     clock_step   as above, but the robot moved as in one usual interval: the stamps jumped, not time
     frozen       a state repeats exactly while the model says that it moves
     spike        one row (or few) away from where the rows before and after, and the model, say it is; and back
+    inconsistent the heading leaves the motion while the position does not (heading.py)
     offset_jump  one transition by more than the inputs could move the state, and it stays there; to the end, or until it jumps back
 
 A fault must be beyond what any effect on the input could do: an effect that the model lacks is not to be explained away as a
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset, Pause
+from s2r_runtime.trace.heading import departures
 from s2r_runtime.trace.residual import Acting, acting, advanced, first_steps
 
 Array = NDArray[np.float64]
@@ -34,6 +36,9 @@ TAIL_SIGMAS = 3.5
 BEYOND = 2.2
 """Times the largest move in a step: a command that reverses and is late, or followed with a lag, leaves up to twice that."""
 
+ONE_IN = 100.0
+"""Recordings in which noise may once reach a spike's size."""
+
 RARE = 0.01
 """Share of rows above which spikes are a property of the sensor's noise."""
 
@@ -46,11 +51,17 @@ AROUND = 4
 RIGHT_AT_FIRST = 0.3
 """Of a heading that jumped for good, what was before counts if it is at least this part of the run."""
 
+QUANTA = 6.0
+"""Least changes by which a state must have moved on while it repeated: below that it may be resolution."""
+
 LONG_FROZEN = 50
 """Rows of exact repeats that need no catching up to count as frozen."""
 
 LONG = 3.5
 """Usual intervals without a measurement before it is called a dropout."""
+
+MANY_ROWS = 60
+"""Rows of a run in which a heading's departure from the motion is looked for."""
 
 BRIEF = 4
 """Rows that a spike lasts at most; a jump that comes back later is an offset."""
@@ -82,6 +93,7 @@ def check(model: ComposedModel, data: Dataset) -> Checked:
     reach = _reach(model, data, act)
     faults = [_of_pause(model, data, pause, reach) for pause in data.pauses]
     found = [f for f in faults if f is not None]
+    pose = _pose(model)
     bad = [np.zeros(run.y.shape, dtype=bool) for run in data.runs]
     left_out: list[tuple[int, int]] = []
     spikes: list[Fault] = []
@@ -93,8 +105,10 @@ def check(model: ComposedModel, data: Dataset) -> Checked:
         spikes += some
         found += jumps
         left_out += cut
+        if pose is not None:
+            found += _inconsistent(model, data, act, i, bad[i], reach, pose)
     rows = sum(len(run.y) for run in data.runs)
-    many = tails > max(RARE * rows, 3.0)
+    many = max(tails, len({f.from_s for f in spikes})) > max(RARE * rows, 3.0)
     runs = tuple(replace(run, y=np.where(b.any(axis=1, keepdims=True), np.nan, run.y)) for run, b in zip(data.runs, bad, strict=True))
     if many:  # two of them in a row look like a jump
         found = [f for f in found if f.kind != "offset_jump"]
@@ -104,10 +118,13 @@ def check(model: ComposedModel, data: Dataset) -> Checked:
 
 @dataclass(frozen=True)
 class _Reach:
-    """noise: (nx,) robust standard deviation of a residual; move: (nx,) largest move in a step that the model foresees."""
+    """noise: (nx,) robust standard deviation of a residual; move: (nx,) largest move in a step that the model foresees; tail: (nx,)
+    leg of a spike that noise with tails such as these has in one recording of a hundred.
+    """
 
     noise: Array
     move: Array
+    tail: Array
     instant: Mask
 
 
@@ -121,10 +138,24 @@ def _reach(model: ComposedModel, data: Dataset, act: Acting) -> _Reach:
     good = np.flatnonzero(np.isfinite(residuals).all(axis=1))
     instant = np.array([s in getattr(model.nominal, "reached", {}) for s in model.states])
     if not len(good):
-        return _Reach(np.ones(len(model.states)), np.ones(len(model.states)), instant)
+        one = np.ones(len(model.states))
+        return _Reach(one, one, one, instant)
     noise = np.median(np.abs(residuals[good]), axis=0) / 0.6745
     largest = np.quantile(np.abs(move[good]), 0.999, axis=0)
-    return _Reach(np.maximum(noise, 1e-12), largest, instant)
+    return _Reach(np.maximum(noise, 1e-12), largest, _tail(residuals), instant)
+
+
+def _tail(residuals: Array) -> Array:
+    """(nx,) by extrapolation of the quantiles of how far rows are from both neighbours, as a power law: what the tail itself says it
+    may reach. Spikes themselves are on fewer rows than are looked at.
+    """
+    apart = 0.5 * np.abs(np.diff(residuals, axis=0))
+    apart = apart[np.isfinite(apart).all(axis=1)]
+    if len(apart) < 100:
+        return np.zeros(residuals.shape[1])
+    bulk, rare = np.quantile(apart, (0.9, 0.98), axis=0)
+    steepness = np.log(np.clip(rare / np.maximum(bulk, 1e-300), 1.0, 5.0)) / math.log(5.0)
+    return np.asarray(rare * (0.02 * ONE_IN * len(apart)) ** steepness)
 
 
 def _predicted(model: ComposedModel, data: Dataset, act: Acting, run: int) -> Array:
@@ -157,7 +188,7 @@ def _of_pause(model: ComposedModel, data: Dataset, pause: Pause, reach: _Reach) 
 def _frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: _Reach) -> list[Fault]:
     """Exact repeats through which the model moves the state by more than noise and quantisation, and after which it catches up.
 
-    Without catching up the robot itself may have stood still; only a long silence is then a fault.
+    Without catching up the robot itself may have stood still; only a long silence of a state that jitters otherwise is then a fault.
     """
     run = data.runs[i]
     if len(run.y) < FROZEN_ROWS + 1:
@@ -169,17 +200,46 @@ def _frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask,
         change = np.abs(np.diff(run.y[:, j]))
         if reach.instant[j] or not np.any(change > 0.0):
             continue
-        least = SIGMAS * reach.noise[j] + 3.0 * float(np.min(change[change > 0.0]))
+        quantum = float(np.min(change[change > 0.0]))
+        least = SIGMAS * reach.noise[j] + QUANTA * quantum
         for a, b in _stretches(change == 0.0):
-            expected = float(np.nansum(moves[a:b, j]))
-            if b - a < FROZEN_ROWS or abs(expected) < least:
+            if b - a < FROZEN_ROWS:
+                continue
+            path = np.cumsum(np.nan_to_num(moves[a:b, j]))
+            expected, far = float(path[-1]), float(np.max(np.abs(path)))
+            if far < least:
                 continue
             off = float(e[min(b, len(e) - 1), j]) - expected
             off = math.remainder(off, math.tau) if name in model.nominal.angles else off
-            caught_up = b < len(e) and abs(off) < 0.5 * abs(expected)
-            if caught_up or (b - a > LONG_FROZEN and abs(expected) > 10.0 * reach.move[j]):
+            caught_up = b < len(e) and abs(expected) > least and abs(off) < 0.5 * abs(expected)
+            jitters = reach.noise[j] > QUANTA * quantum  # even where the robot stands
+            if caught_up or (b - a > LONG_FROZEN and jitters and far > 10.0 * reach.move[j]):
                 bad[a + 1 : b + 1, j] = True
                 found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
+    return found
+
+
+def _pose(model: ComposedModel) -> list[int] | None:
+    """Columns of x, y and heading of a robot that moves along its heading."""
+    if getattr(model.nominal, "integration", None) is None or not {"x", "y", "theta"} <= set(model.states):
+        return None
+    return [model.states.index(name) for name in ("x", "y", "theta")]
+
+
+def _inconsistent(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: _Reach, pose: list[int]) -> list[Fault]:
+    """A heading that leaves the motion, by more than a spike or a jump."""
+    run = data.runs[i]
+    if len(run.y) < MANY_ROWS:
+        return []
+    y = np.where(bad, np.nan, run.y)[:, pose]
+    predicted = _predicted(model, data, act, i)[:, pose[2]]
+    turned = np.where(np.isnan(np.diff(y[:, 2])), np.nan, run.y[1:, pose[2]] - predicted)
+    turned = (turned + math.pi) % math.tau - math.pi
+    noise = float(np.max(reach.noise[pose[:2]]))
+    found = []
+    for off in departures(y, turned, predicted - run.y[:-1, pose[2]], noise):
+        bad[off.first : off.last + 1, pose[2]] = True
+        found.append(Fault(run.start_s + data.dt * off.first, run.start_s + data.dt * off.last, model.states[pose[2]], "inconsistent"))
     return found
 
 
@@ -201,6 +261,7 @@ def _jumps(
     spikes: list[Fault] = []
     jumps: list[Fault] = []
     cut: list[tuple[int, int]] = []
+    lost = np.isnan(run.y)
     for j, name in enumerate(model.states):
         series = np.nan_to_num(change[:, j] if reach.instant[j] else e[:, j])
         limit = SIGMAS * reach.noise[j] + BEYOND * reach.move[j]
@@ -211,11 +272,13 @@ def _jumps(
             rows = _there_and_back(series, k)
             if rows is None:
                 around = np.abs(np.concatenate([series[max(k - 2, 0) : k], series[k + 1 : k + 3]]))
-                if np.all(around < 0.3 * abs(series[k])):  # an effect's onset dies away, a jump does not
+                beside = lost[max(k - 1, 0) : k + 3, j].any() or bad[max(k - 1, 0) : k + 3, j].any()  # there the way back is not seen
+                if not beside and np.all(around < 0.3 * abs(series[k])):  # an effect's onset dies away, a jump does not
                     single.append(k)
                 continue
             bad[rows[0] : rows[1] + 1, j] = True
-            spikes.append(Fault(run.start_s + data.dt * rows[0], run.start_s + data.dt * rows[1], name, "spike"))
+            if abs(float(series[k])) > reach.tail[j]:
+                spikes.append(Fault(run.start_s + data.dt * rows[0], run.start_s + data.dt * rows[1], name, "spike"))
         if not reach.instant[j]:
             for k, back in _offsets(series, single):
                 end = len(run.y) - 1 if back is None else back

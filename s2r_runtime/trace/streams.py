@@ -123,10 +123,17 @@ def _coarse(change: Array) -> bool:
         moved = np.sort(column[column > 0.0])
         if len(moved) < 10:
             return True
-        quantum = float(moved[len(moved) // 100])
-        if np.median(moved) < COARSE * quantum and np.mean(np.abs(moved / quantum - np.rint(moved / quantum)) < 0.02) > 0.9:
+        least = float(moved[len(moved) // 100])
+        if np.median(moved) < COARSE * least and any(_whole(moved, least / k) for k in (1, 2, 3)):
             return True
     return False
+
+
+def _whole(moved: Array, quantum: float) -> bool:
+    """Whether changes are whole numbers of a quantum, as nearly as rounded digits say."""
+    number = np.rint(moved / quantum)
+    quantum = float(np.median(moved[number > 0] / number[number > 0]))
+    return bool(np.mean(np.abs(moved / quantum - np.rint(moved / quantum)) < 0.05) > 0.85)
 
 
 def held(values: Array) -> Array:
