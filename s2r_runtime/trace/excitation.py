@@ -233,9 +233,10 @@ def _for_rivals(rivals: Rivals, held: Held, room: Room, drawn: Array, rng: np.ra
 
 def _refit(rivals: Rivals, held: Held, room: Room, u: Array, ways: list[Ways], nats: Array, which: NDArray[np.int64]) -> None:
     """Lowers nats (pairs,) of some pairs to what is left when the rival is really fitted."""
-    for pair in which:
+    for pair in which.tolist():
         if nats[pair] * REPEATS >= ENOUGH:
-            nats[pair] = min(nats[pair], *(refitted(rivals.fits, *way, held.data, room.start, u) for way in ways[pair]))
+            left = [refitted(rivals.fits, truth, rival, held.data, room.start, u) for truth, rival in ways[pair]]
+            nats[pair] = min(float(nats[pair]), *left)
 
 
 def _worth(nats: Array, ends: Array) -> Array:
