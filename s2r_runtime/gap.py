@@ -46,7 +46,7 @@ class Transitions:
 
     `independent`: drawn independently from one law; if not, `doubt` says why, and there is no statement. `assumption`: what the user
     vouched for instead. `digest`: of the recording's bytes; `samples_digest`: of a campaign's samples, alike in every log that holds
-    them; `content_digest`: of a table's numbers, however they are written.
+    them; `content_digest`: of a table's numbers, however they are written; for driving in a daemon's log, of which run it is.
     `noise`: (nx,) standard deviation of the measurements, None if the recording doesn't show it.
     """
 

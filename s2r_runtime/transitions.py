@@ -212,7 +212,7 @@ def from_mcap(path: Path, model: ComposedModel, *, epoch: int | None = None) -> 
         there = ", ".join(str(e) for e in log.samples) or "none"
         raise RecordingError(f"{path}: has no samples of epoch {epoch}; it has samples of: {there}")
     if not log.samples:
-        return drive_transitions(model, log.stretches(model), recording, str(path))
+        return replace(drive_transitions(model, log.stretches(model), recording, str(path)), content_digest=log.identity)
     complete = [e for e in log.samples if e in log.finished and log.finished[e].complete and len(log.samples[e]) == log.finished[e].n]
     chosen = epoch if epoch is not None else (complete or list(log.samples))[-1]
     ending = log.finished.get(chosen)
@@ -262,12 +262,14 @@ def _standing_noise(samples: Sequence[SampleTaken]) -> Array | None:
 class _Log:
     """What a log holds of states, inputs and samples (by epoch and index), in its order.
 
-    rows: a list a stretch (a new one wherever the robot's clock went back: it was restarted) of (stamp s, x or (), u or ()).
+    rows: a list a stretch (a new one wherever the robot's clock went back: it was restarted) of (stamp s, x or (), u or ()). identity: of
+    the run, which a model remembers that was fitted on its driving (guarantee G6).
     """
 
     samples: dict[int, dict[int, SampleTaken]]
     finished: dict[int, CampaignFinished]
     rows: list[list[tuple[float, tuple[float, ...], tuple[float, ...]]]]
+    identity: str = ""
 
     def stretches(self, model: ComposedModel) -> list[Streams]:
         """Measured states and inputs sent, by the robot's stamps."""
@@ -282,10 +284,12 @@ class _Log:
 
 
 def _read_log(path: Path, model: ComposedModel) -> _Log:
+    from s2r_runtime.recording.stretches import log_identity
     from s2r_runtime.recording.writer import read
 
     log = _Log({}, {}, [[]])
     reading = read(path, CHANNELS)
+    log.identity = log_identity(reading.run, reading.public_key)
     seen: dict[int, tuple[int, int]] = {}  # seq -> (daemon's clock, robot's clock), both ns: when the last observation came
     for entry in reading:
         match entry.message:

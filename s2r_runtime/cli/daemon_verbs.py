@@ -181,8 +181,15 @@ def run_adopt(args: argparse.Namespace) -> int:
 
 def run_live_trace(args: argparse.Namespace) -> int:
     """Exit 0 with any verdict, 1 if there is none, 3 if there is nothing to trace."""
+    fixed = ("profile", "model", "dt", "param", "test", "seed", "bandwidth", "suggest", "suggest_duration", "report")
+    if given := [name for name in fixed if getattr(args, name, None)] + (["horizon"] if args.horizon != 1.0 else []):
+        raise UsageError(
+            f"--{given[0].replace('_', '-')}: the daemon traces as its profile says; leave it out, or name its log as RECORDING"
+        )
     answer = _call(args, {"verb": "trace", "text": args.live})
     found = answer.get("data")
+    if args.output and found:
+        args.output.write_text(str(found["model_toml"]), encoding="utf-8")
     if args.json:
         output.result_json(answer if answer["exit_code"] or not found else found)
     elif answer["exit_code"]:

@@ -87,13 +87,16 @@ class Demonstration:
         return bool(answer["exit_code"] == 0)
 
     def _repair(self) -> bool:
-        self._step("s2r trace", "what does the model lack?")
-        answer = self._ask({"verb": "trace"})
+        self._step("s2r trace --live campaign", "what does the model lack?")
+        answer = self._ask({"verb": "trace", "text": "campaign"})
         data = answer.get("data") or {}
         if data.get("text"):
             self._say(str(data["text"]))
         if answer["exit_code"] != 0 or data.get("verdict") not in {"traced", "ambiguous"} or not data.get("effects"):
             return False
+        if data["proposal"]["proposed"]:
+            self._step("s2r adopt", "use the model that is proposed; its gap comes from a fresh campaign")
+            return bool(self._ask({"verb": "adopt"})["exit_code"] == 0)
         model = Path(str(data["model_path"]))
         self._step(f"s2r adopt {model.name}", "use the repaired model; its gap comes from a fresh campaign")
         text = model.read_text(encoding="utf-8")

@@ -172,6 +172,7 @@ class Actions:
 
     def _start_job(self, order: m.StartJob) -> None:
         job = self._job(order)
+        self.results.pop(order.kind, None)
         if isinstance(job, str):
             self._d.feed(m.JobFinished(order.t_ns, order.job_id, order.kind, error=job))
             return

@@ -136,7 +136,8 @@ class Desk:
         if connection is None:
             self.answers[answer.request_id] = answer
         else:
-            connection.answer(answer.exit_code, answer.text, self.result_of(verb))
+            refused = answer.exit_code and verb == "trace"  # what is there is another trace's
+            connection.answer(answer.exit_code, answer.text, None if refused else self.result_of(verb))
 
     def result_of(self, verb: str) -> Any:
         """The newest result of what the verb asks for, as plain data."""

@@ -26,6 +26,7 @@ class Excitation:
     def keep(self, inputs: GivenInputs) -> None:
         """They were read, and may be driven; only the newest."""
         self._loaded = {inputs.digest: inputs}
+        self._result = None
 
     @property
     def running(self) -> bool:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 WRITTEN_WITHIN_S = 10.0
 """The recorder hands over what it has every 50 ms; a disk that takes nothing for this long is full."""
+NICE = 10
 HORIZON_S = 1.0
 VOLATILE = ("model_path", "cpu_s")
 """What a result says that does not follow from the log."""
@@ -195,7 +196,7 @@ def _with_later_parts(logs: Sequence[str]) -> list[Path]:
 
 
 def _step_back() -> None:
-    """Behind everything else that wants the processor."""
+    """Behind everything that wants the processor: a tenth of the weight, and no say in when it gets it."""
     with contextlib.suppress(OSError, AttributeError):
-        os.nice(19)
+        os.nice(NICE)
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
