@@ -156,7 +156,8 @@ class Observer:
             self._seq += 1 + heard.lost + (kind in ("resumed", "restarted"))
         stamp_ns = now_ns
         if self._clock is not None and layout.stamp is not None:
-            tock, stamp_ns = self._clock.judge(field(layout.stamp[0], heard.little, heard.big), silent=silent)
+            believed = silent or kind == "restarted"
+            tock, stamp_ns = self._clock.judge(field(layout.stamp[0], heard.little, heard.big), silent=believed)
             if tock in ("repeated", "old"):
                 self._malformed(said, "the robot's clock does not rise")
                 return

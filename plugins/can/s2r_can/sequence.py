@@ -10,8 +10,8 @@ delta = (counter - last) mod modulus:
 
     jump = modulus / 4; where the cycle is known no more than the time since then allows, times SLACK, and FRAMES more
 
-Whoever is not believed three times in a row, each time one step on from the time before, is: the sender began to count anew
-(`restarted`). A frame that is accepted in between ends such a row, so that what is replayed beside a living sender stays out. After
+Whoever is not believed three times in a row, each time one step on from the time before and about a cycle later, is: the sender began to
+count anew (`restarted`). Where the DBC does not say the cycle, it is what the sender kept so far. A frame that is accepted in between ends such a row, so that what is replayed beside a living sender stays out. After
 `silence` without any, the next one may count from anywhere (`resumed`). A counter is no proof of who sent it: docs/can.md.
 
 A clock of n bits goes on by (ticks - last) mod 2^n if that is less than half of its range; else it ran back, which is believed of
@@ -29,6 +29,8 @@ SLACK = 1.5
 """Cycles are kept within some percent; what came late came together."""
 FRAMES = 2
 ROW = 3
+LEARNT = 8
+"""Intervals over which the usual one is averaged."""
 RESTART_GAP_NS = 1_000_000_000
 """So far a robot's clock is set on when it started anew: a hole that nobody takes for one period."""
 
@@ -41,7 +43,7 @@ class Sequence:
         self._jump = jump or max(1, modulus // 4)
         self._last = self._odd = -1
         self._row = 0
-        self._last_ns = self._odd_ns = 0
+        self._last_ns = self._odd_ns = self._usual_ns = 0
 
     def judge(self, counter: int, now_ns: int) -> tuple[Kind, int]:
         """(what the frame is, how many were lost before it). now_ns: when it came."""
@@ -58,6 +60,8 @@ class Sequence:
         if self._cycle_ns:
             jump = min(jump, int(SLACK * passed_ns / self._cycle_ns) + FRAMES)
         if 1 <= delta <= jump:
+            if delta == 1:
+                self._usual_ns += (passed_ns - self._usual_ns) // (LEARNT if self._usual_ns else 1)
             return self._accept("next", counter, now_ns), delta - 1
         if self._goes_on(counter, now_ns):
             return self._accept("restarted", counter, now_ns), 0
@@ -75,7 +79,9 @@ class Sequence:
 
     def _goes_on(self, counter: int, now_ns: int) -> bool:
         """Whether this ends a row of refused frames that count on properly."""
-        follows = self._row > 0 and (counter - self._odd) % self._modulus == 1 and now_ns - self._odd_ns <= self._silence_ns
+        apart_ns = now_ns - self._odd_ns
+        in_time = (self._cycle_ns or self._usual_ns) // 2 <= apart_ns <= self._silence_ns
+        follows = self._row > 0 and (counter - self._odd) % self._modulus == 1 and in_time
         self._row = self._row + 1 if follows else 1
         self._odd, self._odd_ns = counter, now_ns
         return self._row >= ROW

@@ -169,6 +169,27 @@ class Robot:
         return found
 
 
+def options_of(dbc: str, robot: dict[str, Any]) -> dict[str, Any]:
+    """A transport's options for CLASSIC or WIDE. robot: python-can settings."""
+    wide = dbc is WIDE
+    head = "Pose" if wide else "Position"
+    guarded = ("Pose", "Drive") if wide else ("Heading", "Clock", "Drive")
+    return {
+        "dbc": {"file": "rig.dbc", "text": dbc},
+        "robot": robot,
+        "states": {"x": f"{head}.X", "y": f"{head}.Y", "theta": "Pose.Theta" if wide else "Heading.Theta"},
+        "inputs": {"v": "Drive.V", "w": "Drive.W"},
+        "constants": {"Drive.Enable": 1},
+        "counters": {name: f"{name}Counter" for name in guarded},
+        "checksums": {name: f"{name}Checksum" for name in guarded},
+        "overrides": {"emergency_stop": "Pose.Stop" if wide else "Clock.Stop"},
+        "stamp": "Pose.Stamp" if wide else "Clock.Stamp",
+        "message_timeout": 0.2,
+        "observation_timeout": 0.3,
+        "queue": 48,
+    }
+
+
 class Rig:
     """Transport and robot on one bus."""
 
@@ -176,26 +197,9 @@ class Rig:
     dbc = CLASSIC
 
     def __init__(self, robot: dict[str, Any], **more: Any) -> None:
-        wide = self.dbc is WIDE
-        head = "Pose" if wide else "Position"
-        guarded = ("Pose", "Drive") if wide else ("Heading", "Clock", "Drive")
-        self.options: dict[str, Any] = {
-            "dbc": {"file": "rig.dbc", "text": self.dbc},
-            "robot": robot,
-            "states": {"x": f"{head}.X", "y": f"{head}.Y", "theta": "Pose.Theta" if wide else "Heading.Theta"},
-            "inputs": {"v": "Drive.V", "w": "Drive.W"},
-            "constants": {"Drive.Enable": 1},
-            "counters": {name: f"{name}Counter" for name in guarded},
-            "checksums": {name: f"{name}Checksum" for name in guarded},
-            "overrides": {"emergency_stop": "Pose.Stop" if wide else "Clock.Stop"},
-            "stamp": "Pose.Stamp" if wide else "Clock.Stamp",
-            "message_timeout": 0.2,
-            "observation_timeout": 0.3,
-            "queue": 48,
-            **more,
-        }
+        self.options = {**options_of(self.dbc, robot), **more}
         self.transport = CanTransport(self.options, STATES, INPUTS)
-        self.robot = Robot({k: v for k, v in robot.items() if k != "can_filters"}, self.dbc)
+        self.robot = Robot(robot, self.dbc)
 
     def __enter__(self) -> Self:
         return self
