@@ -130,10 +130,27 @@ def test_the_time_of_a_change_is_found_in_the_residual(share, gain, gaps):
     when = float(np.quantile(t, share)) + 0.4 * DT
     r += pushes * (gain - 1.0) * (t >= when)[:, None]
     found = effect.starts_from_residual(r, t, pushes, UNICYCLE, "w", DT)
-    # rows taken for the wrong side cost sum (gain - 1)² |pushes|² / noise², which is seldom beyond 20 by chance
-    wrong = (t >= min(when, found[0]["time"])) & (t < max(when, found[0]["time"]))
+    # rows taken for the wrong side (but the one in which it comes) cost sum (gain - 1)² |pushes|² / noise², seldom beyond 20 by chance
+    wrong = (t >= min(when, found[0]["time"]) + DT) & (t < max(when, found[0]["time"]))
     assert np.sum((pushes[wrong] * (gain - 1.0)) ** 2) / 0.004**2 < 20.0
     assert found[0]["gain"] == pytest.approx(gain, abs=5.0 * 0.004 / np.sqrt(np.sum(pushes[t >= when] ** 2)) + 0.01)
+
+
+@pytest.mark.parametrize("name", ["periodic_disturbance", "regime_change"])
+def test_wild_measurements_found_nothing(name):
+    effect, rng = registry().get("effects", name), np.random.default_rng(8)
+    t, pushes, r = _along(1500, rng, 1.0)
+    u = np.repeat(rng.uniform(-1.5, 1.5, 75), 20)
+    if name == "regime_change":
+        pushes *= u[:, None]
+        r += pushes * -0.3 * (t >= 40.0)[:, None]
+    else:
+        r[:, 2] += DT * 0.05 * np.sin(2.0 * np.pi * 0.9 * (t + DT / 2))
+    clean = effect.starts_from_residual(r, t, pushes, UNICYCLE, "w", DT)[0]
+    r[rng.choice(1500, 15, replace=False), 2] += rng.normal(size=15) * 0.4  # a hundred standard deviations, on one row in a hundred
+    spoilt = effect.starts_from_residual(r, t, pushes, UNICYCLE, "w", DT)[0]
+    key = "time" if name == "regime_change" else "frequency"
+    assert spoilt[key] == pytest.approx(clean[key], rel=0.02)
 
 
 @pytest.mark.parametrize("name", ["periodic_disturbance", "regime_change"])

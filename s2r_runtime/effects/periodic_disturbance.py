@@ -14,6 +14,7 @@ import numpy as np
 
 from s2r_runtime.effects.input_effect import Array, Values
 from s2r_runtime.effects.periodogram import peaks
+from s2r_runtime.effects.projection import along
 from s2r_runtime.effects.timed_input import TimedInputEffect
 from s2r_runtime.hookspecs import NominalModel, Parameter
 
@@ -55,7 +56,7 @@ class PeriodicDisturbance(TimedInputEffect):
     def starts_from_residual(self, residual: Array, t: Array, pushes: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
         """The highest peaks of the periodogram of the residual along the channel."""
         found: list[Values] = []
-        for peak in peaks(t + 0.5 * dt, np.sum(pushes * residual, axis=1), np.sum(pushes * pushes, axis=1), dt, BEST):
+        for peak in peaks(t + 0.5 * dt, *along(residual, pushes), dt, BEST):
             amplitude, phase = float(np.hypot(peak.sine, peak.cosine)), float(np.arctan2(peak.cosine, peak.sine))
             found.append({"frequency": peak.frequency, "amplitude": amplitude / float(np.sinc(peak.frequency * dt)), "phase": phase})
         return found

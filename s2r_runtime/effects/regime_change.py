@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from s2r_runtime.effects.input_effect import Array, Values, columns
+from s2r_runtime.effects.projection import along
 from s2r_runtime.effects.timed_input import TimedInputEffect
 from s2r_runtime.hookspecs import NominalModel, Parameter
 
@@ -27,6 +28,8 @@ BEST = 3
 
 EDGE = 0.02
 """A change before or after which the input does less than this share of what it does in all is a constant gain, or none."""
+
+PARTS = (0.05, 0.15, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.95)
 
 APART = 0.02
 """Peaks nearer to each other than this share of the rows are one."""
@@ -62,17 +65,28 @@ class RegimeChange(TimedInputEffect):
 
     def starts_from_residual(self, residual: Array, t: Array, pushes: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
         """The best times, each with the gain that fits."""
-        a = np.cumsum(np.sum(pushes * residual, axis=1)[::-1])[::-1]
-        b = np.cumsum(np.sum(pushes * pushes, axis=1)[::-1])[::-1]
+        a, b = (np.cumsum(part[::-1])[::-1] for part in along(residual, pushes))
         inside = (b > EDGE * b[:1]) & (b < (1.0 - EDGE) * b[:1])
         explained = np.where(inside, a * a / np.maximum(b, 1e-300), 0.0)
         found: list[Values] = []
         apart = max(1, round(APART * len(t)))
         while len(found) < BEST and explained.max(initial=0.0) > 0.0:
             k = int(np.argmax(explained))
-            found.append({"time": max(float(t[k]), 0.0), "gain": float(np.clip(1.0 + a[k] / b[k], 0.0, 100.0))})
+            found.append(_within(k, a, b, t, dt))
             explained[max(0, k - apart) : k + apart + 1] = 0.0
         return found
+
+
+def _within(k: int, a: Array, b: Array, t: Array, dt: float) -> Values:
+    """A change at about the start of step k, to a tenth of a step: of a step in which it comes a part s only has the new gain."""
+    best: tuple[float, float, float] = (0.0, float(t[k]), float(a[k] / b[k]))
+    for j in range(max(k - 1, 0), min(k + 1, len(t) - 1)):
+        for s in PARTS:
+            above = a[j + 1] + s * (a[j] - a[j + 1])
+            below = b[j + 1] + s * s * (b[j] - b[j + 1])
+            if below > 0.0 and above * above / below > best[0]:
+                best = float(above * above / below), float(t[j] + (1.0 - s) * dt), float(above / below)
+    return {"time": max(best[1], 0.0), "gain": float(np.clip(1.0 + best[2], 0.0, 100.0))}
 
 
 EFFECT = RegimeChange()
