@@ -16,6 +16,7 @@ import contextlib
 import logging
 import queue
 import socket
+import struct
 import threading
 import time
 from collections import deque
@@ -126,7 +127,11 @@ class Port:
             more["can_filters"] = self._filters
         if self._config["interface"] == "socketcand":
             more["tcp_tune"] = True
-        return can.Bus(**{**more, **self._config})
+        bus = can.Bus(**{**more, **self._config})
+        connection = _connection(bus)
+        if connection is not None:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", 0, round(LISTEN_S * 1e6)))
+        return bus
 
     def _hear(self, bus: can.BusABC) -> None:
         """Until the port is closed. Raises what the driver raises when it is of no use any more."""
@@ -209,8 +214,8 @@ class Port:
             self._put(record)
 
     def _put(self, record: Record) -> bool:
+        bus = self._bus
         try:
-            bus = self._bus
             if bus is None:
                 raise ConnectionError("not open")
             if self._config["interface"] in ECHOING:
@@ -218,6 +223,10 @@ class Port:
             bus.send(_message(record), timeout=0.0 if self._prompt else LISTEN_S)
         except Exception:  # noqa: BLE001 - a full buffer, a cable, a driver: the robot's time-out and ours deal with it
             self._count(dropped=1)
+            connection = _connection(bus)
+            if connection is not None:  # half a line may have left: whatever followed it would be read wrong
+                with contextlib.suppress(OSError):
+                    connection.shutdown(socket.SHUT_RDWR)
             return False
         self._count(sent=1)
         return True
@@ -255,9 +264,14 @@ def _said(error: Exception) -> str:
     return " ".join(str(error).split())[:160] or type(error).__name__
 
 
+def _connection(bus: can.BusABC | None) -> socket.socket | None:
+    """The socket of a socketcand client, which it does not give out."""
+    return getattr(bus, "_SocketCanDaemonBus__socket", None)
+
+
 def _hung_up(bus: can.BusABC) -> bool:
     """Whether a socketcand server closed the connection, which its `recv` takes for silence."""
-    connection = getattr(bus, "_SocketCanDaemonBus__socket", None)
+    connection = _connection(bus)
     if connection is None:
         return False
     try:

@@ -11,8 +11,9 @@ delta = (counter - last) mod modulus:
     jump = modulus / 4; where the cycle is known no more than the time since then allows, times SLACK, and FRAMES more
 
 Whoever is not believed three times in a row, each time one step on from the time before and about a cycle later, is: the sender began to
-count anew (`restarted`). Where the DBC does not say the cycle, it is what the sender kept so far. A frame that is accepted in between ends such a row, so that what is replayed beside a living sender stays out. After
-`silence` without any, the next one may count from anywhere (`resumed`). A counter is no proof of who sent it: docs/can.md.
+count anew (`restarted`). Where the DBC does not say the cycle, it is what the sender kept so far. A frame that is accepted in between
+ends such a row, so that what is replayed beside a living sender stays out. After `silence` without any, the next one may count from
+anywhere too (`resumed`); how many were lost is then known by the cycle only. A counter is no proof of who sent it: docs/can.md.
 
 A clock of n bits goes on by (ticks - last) mod 2^n if that is less than half of its range; else it ran back, which is believed of
 a robot that started anew, by the same rule of three.
