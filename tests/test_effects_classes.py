@@ -1,6 +1,5 @@
 """The table of effects that are one and the same: every row of it is true, and no two others are."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -201,71 +200,68 @@ def test_a_model_of_the_users_own_has_the_classes_that_hold_on_it(tmp_path):
     assert canonical(model, "track_scale", "theta") == ("track_scale", "theta")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_no_two_effects_are_the_same_that_the_table_does_not_know(name):
-    """Every effect is fitted, from several values, to what every other one does; what it reaches to a billionth must be in the table."""
+    """Every effect is fitted, from two sets of values, to what every other one does: what fits to a ten-millionth must be in the table."""
     bare = _model(name)
-    plain = _driven(bare)
     places = list(_places(name))
-    unknown = []
+    unknown, missed = [], []
     for effect, channel, values in places:
-        target = _driven(_model(name, (effect, channel, values)))
-        size = np.max(np.abs(bare.difference(target, plain)))
+        target = _at_once(bare, effect, channel, values)
+        known = {(effect, channel), *(found[:2] for found in same(bare.for_effects, effect, channel, values))}
+        # a gain is a gain each way, and a gain from the start on
+        wider = {(more, on) for gain, on in known if gain == "input_gain" for more in ("input_gain_asymmetry", "regime_change")}
         for other, other_channel, begin in places:
-            if (other, other_channel) == (effect, channel) or not _fits(name, other, other_channel, begin, target, size):
+            if (other, other_channel) in wider - known:
                 continue
-            known = {found[:2] for found in same(bare.for_effects, effect, channel, values)}
-            if (other, other_channel) not in known and not _nested(effect, other):
+            fits = _fits(bare, target, other, other_channel, begin)
+            if fits and (other, other_channel) not in known:
                 unknown.append((effect, channel, other, other_channel))
+            if not fits and (other, other_channel) in known:
+                missed.append((effect, channel, other, other_channel))
     assert unknown == []
+    assert missed == []  # this search finds what the table knows
 
 
-def _nested(effect, other):
-    """One of two numbers: a gain is a gain each way."""
-    return (effect, other) == ("input_gain", "input_gain_asymmetry")
+def _at_once(bare, effect, channel, p):
+    """(ROWS, nx): the steps of the bare model with one effect more, the input over time at once."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-1.0, 1.0, (ROWS // 4, len(bare.inputs))), 4, axis=0)
+    x = rng.uniform(-1.0, 1.0, (ROWS, len(bare.states)))
+    model = bare
+    if effect:
+        registered = registry().get("effects", effect)
+        model = replace(bare, effects=(AppliedEffect(registered, channel, p), *bare.effects))
+        u = registered.input_sequence(u, bare.nominal, channel, DT, p) if registered.stage == "input" else u
+    return model.advance(x, u, u)
 
 
-def _fits(name, effect, channel, begin, target, size):
+def _fits(bare, target, effect, channel, begin):
     """Whether some values of the effect do what was done."""
     registered = registry().get("effects", effect)
-    bare = _model(name)
     bounds = {p.name: p for p in registered.parameters}
     free = [key for key, value in begin.items() if not isinstance(value, str)]
-    shapes = [np.shape(begin[key]) for key in free]
-    lengths = [math.prod(shape) for shape in shapes]
-
-    def values(theta):
-        parts = np.split(theta, np.cumsum(lengths)[:-1])
-        own = {k: (v.reshape(s).tolist() if s else float(v[0])) for k, v, s in zip(free, parts, shapes, strict=True)}
-        return {**begin, **own}
+    lengths = [np.size(begin[key]) for key in free]
+    low, high = (
+        np.concatenate([np.full(n, getattr(bounds[k], end)) for k, n in zip(free, lengths, strict=True)]) for end in ("low", "high")
+    )
+    size = float(np.max(np.abs(bare.difference(target, _at_once(bare, "", "", {})))))
 
     def error(theta):
-        p = values(theta)
+        parts = np.split(np.clip(theta, low, high), np.cumsum(lengths)[:-1])
+        p = {**begin, **{k: v.reshape(2, 2).tolist() if len(v) == 4 else float(v[0]) for k, v in zip(free, parts, strict=True)}}
         if getattr(registered, "wrong", lambda p: "")(p):
             return np.full(target.size, 10.0 * size)
-        model = compose_with(bare, registered, channel, p)
-        return bare.difference(target, _driven(model)).ravel()
+        return bare.difference(target, _at_once(bare, effect, channel, p)).ravel()
 
-    low = np.concatenate([np.full(n, bounds[k].low) for k, n in zip(free, lengths, strict=True)]) if free else np.zeros(0)
-    high = np.concatenate([np.full(n, bounds[k].high) for k, n in zip(free, lengths, strict=True)]) if free else np.zeros(0)
-    start = np.concatenate([np.ravel(begin[k]) for k in free]) if free else np.zeros(0)
-    if not free:
-        return bool(np.max(np.abs(error(start))) < 1e-7 * size)
     for factor in (1.0, -0.5):
-        theta = np.clip(factor * start, low, high)
+        theta = np.clip(factor * np.concatenate([np.ravel(begin[k]) for k in free]), low, high)
         here = error(theta)
-        # a least-squares fit by a linear model of the error first: what is far away after that is not the same
-        jacobian = np.stack([(error(theta + h) - here) / 1e-6 for h in 1e-6 * np.eye(len(theta))], axis=1)
-        left = here - jacobian @ np.linalg.lstsq(jacobian, here, rcond=None)[0]
-        if np.linalg.norm(left) > 0.5 * np.linalg.norm(here) and np.max(np.abs(left)) > 0.05 * size:
+        slope = np.stack([(error(theta + h) - here) / 1e-6 for h in 1e-6 * np.eye(len(theta))], axis=1)
+        left = here - slope @ np.linalg.lstsq(slope, here, rcond=None)[0]
+        if np.max(np.abs(left)) > 0.3 * size:  # nowhere near, and not for want of a better start
             continue
-        found = least_squares(error, theta, bounds=(low, high), xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=40)
+        found = least_squares(error, theta, bounds=(low - 1e-9, high + 1e-9), xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=60)
         if np.max(np.abs(found.fun)) < 1e-7 * size:
             return True
     return False
-
-
-def compose_with(bare, effect, channel, p):
-    """The bare model and one effect, without asking whether its values are within bounds."""
-    return replace(bare, effects=(AppliedEffect(effect, channel, p), *bare.effects))
