@@ -54,6 +54,7 @@ class Law:
     faults: int = 0
     permit: int | None = None
     sampling: bool = False
+    inputs: str = ""
     latest: m.Observation | None = None
     good: m.Observation | None = None
     good_ns: int = -(10**18)
@@ -102,7 +103,7 @@ class Law:
     def _facts(self, event: m.Event, outputs: tuple[m.Output, ...]) -> None:
         match event:
             case m.Started():
-                self.started, self.model, self.unix = True, self.settings.model_digest, (event.unix_s, event.t_ns)
+                self.started, self.model, self.unix = True, event.settings.model_digest, (event.unix_s, event.t_ns)
                 self.up = frozenset({"recorder", "analytics"})
                 self.running, self.sampling, self.permit, self.asked = None, False, None, None
                 self.gate, self.answered, self.last = False, True, None
@@ -127,7 +128,9 @@ class Law:
                 self.running = None
             case m.SourceStopped(source="sampler") if event.reason != "finished":
                 self.sampling = False
-            case m.CampaignFinished():
+            case m.CampaignFinished() if not self.inputs:
+                self.sampling = False
+            case m.InputsFinished() if event.digest == self.inputs:
                 self.sampling = False
             case m.SourceStarted(source="controller"):
                 self.running, self.faults = event.digest, 0
@@ -155,6 +158,8 @@ class Law:
                     self.running = None
                 case m.StopCampaign():
                     self.sampling = False
+                case m.StartCampaign() | m.StartInputs():
+                    self.inputs = output.digest if isinstance(output, m.StartInputs) else ""
                 case m.IssueCertificate():
                     self.issuing |= {output.request_id}
                 case _:

@@ -25,6 +25,7 @@ from s2r_runtime.messages import (
     Command,
     Event,
     GateChanged,
+    InputsFinished,
     IssueCertificate,
     JobFinished,
     LawResult,
@@ -46,6 +47,7 @@ from s2r_runtime.messages import (
     StartCampaign,
     StartController,
     Started,
+    StartInputs,
     StartJob,
     StopCampaign,
     Stopping,
@@ -63,10 +65,14 @@ class World:
     def __init__(self, seed: int, *, lockstep: bool) -> None:
         self.rng = random.Random(seed)
         self.settings = msgspec.structs.replace(WALK, lockstep=lockstep, recovery=self.rng.choice(["stop", "hold", "return"]))
+        traces = random.Random(seed)
+        often: dict[str, Any] = {name: traces.random() < 0.5 for name in ("trace_after_campaign", "trace_after_inputs", "trace_on_growth")}
+        self.settings = msgspec.structs.replace(self.settings, adopt=traces.choice(["ask", "always"]), trace_delay_ns=5 * DT, **often)
         self.law, self.state = Law(self.settings), core.initial()
         self.t, self.seq, self.numbers, self.requests = S, 0, 0, 0
         self.ask: Ask | None = None
         self.campaign: StartCampaign | None = None
+        self.inputs: StartInputs | None = None
         self.duties: tuple[Output, ...] = ()
         self.memory = Memory("r", MEMORY_SCHEMA)
         self.recent: Observation | None = None
@@ -91,7 +97,7 @@ class World:
         for output in outputs:
             self._take(output)
         if isinstance(event, Stopping):
-            self.ask, self.campaign, self.duties = None, None, ()
+            self.ask, self.campaign, self.inputs, self.duties = None, None, None, ()
 
     def _take(self, output: Output) -> None:
         kind = type(output).__name__
@@ -104,8 +110,11 @@ class World:
             case StartCampaign():
                 self.campaign = output
                 self.duties = (*self.duties, output)
+            case StartInputs():
+                self.inputs = output
+                self.duties = (*self.duties, output)
             case StopCampaign():
-                self.campaign = None
+                self.campaign = self.inputs = None
             case StartJob() | IssueCertificate() | StartController():
                 self.duties = (*self.duties, output)
             case Persist():
@@ -134,13 +143,14 @@ class World:
             self.feed(Stopping(self.t))
             assert self.law.requests - self.law.final <= self.lost, "a request without its answer"
         self.lost |= self.law.requests - self.law.final
-        self.state, self.ask, self.campaign, self.duties = core.initial(), None, None, ()
+        self.state, self.ask, self.campaign, self.inputs, self.duties = core.initial(), None, None, None, ()
         self.begin()
 
     def begin(self) -> None:
         """A run starts."""
         self.events.clear()
-        self.feed(Started(self.t, 1500, self.settings, self.memory))
+        in_force = self.memory.model_digest or self.settings.model_digest  # as the daemon has it, from its model store
+        self.feed(Started(self.t, 1500, msgspec.structs.replace(self.settings, model_digest=in_force), self.memory))
         self.feed(LinkChanged(self.t, up=True))
 
     def later(self, step: int) -> int:
@@ -196,25 +206,29 @@ class World:
         """Mostly what brings the story forward."""
         rng, state = self.rng, self.state
         if rng.random() < 0.12:
-            self.request(rng.choice(["undeploy", "revoke", "adopt", "cancel", "stop", "trace"]), digest="model")
+            verb = rng.choice(["undeploy", "revoke", "adopt", "cancel", "stop", "trace"])
+            self.request(verb, digest="model", text=rng.choice(["", "drive", "inputs"]) if verb == "trace" else "")
         elif state.memory.latched:
             self.request("clear", text=rng.choice(state.memory.latched))
         elif state.permit_until_ns is None or state.permit_until_ns <= self.t:
             self.request("permit", duration_s=rng.choice([0.0, 1.0, 3.0, 60.0, math.nan]))
         elif state.memory.gap is None or state.memory.alarm_epoch or state.memory.campaign_epoch:
-            self.request("sample")
+            self.request("sample") if rng.random() < 0.7 else self.request("excite", digest="inputs", count=5)
         elif self.campaign is not None:
             self.sample()
         elif state.deployment is None:
             self.request("deploy", digest=rng.choice(["c1", "c1", "c2"]))
         else:
             self.request(rng.choice(["verify", "permit"]), digest="c2", duration_s=9.0)
-        if self.campaign is not None:
+        if self.campaign is not None or self.inputs is not None:
             self.sample()
 
     def sample(self) -> None:
         """The campaign goes on, or ends."""
         campaign = self.campaign
+        if self.inputs is not None and self.rng.random() < 0.1:
+            inputs, self.inputs = self.inputs, None
+            self.feed(InputsFinished(self.t, inputs.digest, inputs.n, complete=self.rng.random() < 0.5))
         if campaign is None or self.rng.random() < 0.5:
             return
         if self.rng.random() < 0.5:
@@ -237,7 +251,7 @@ class World:
         duty, bad = self.duties[index], self.rng.random() < 0.15
         self.duties = self.duties[:index] + self.duties[index + 1 :]
         match duty:
-            case StartCampaign():
+            case StartCampaign() | StartInputs():
                 self.feed(SourceStopped(self.t, "sampler", "start_failed") if bad else SourceStarted(self.t, "sampler", ""))
             case StartController():
                 digest = "another" if bad and rng.random() < 0.5 else duty.digest
@@ -245,12 +259,16 @@ class World:
                 self.feed(failed if bad and digest == duty.digest else SourceStarted(self.t, "controller", digest))
             case StartJob(kind="gap"):
                 n = self.state.memory.campaign_n
-                gap = msgspec.structs.replace(GAP, epoch=duty.epoch, n=n, epsilon=0.2, radius=rng.uniform(0.005, 0.02))
+                model = self.state.memory.model_digest
+                gap = msgspec.structs.replace(GAP, epoch=duty.epoch, n=n, epsilon=0.2, radius=rng.uniform(0.005, 0.02), model_digest=model)
                 self.feed(JobFinished(self.t, duty.job_id, "gap", gap=None if bad else gap, error="killed" if bad else ""))
             case StartJob(kind="verify"):
                 self.feed(JobFinished(self.t, duty.job_id, "verify", verification=self.verification(duty, bad)))
             case StartJob():
-                self.feed(JobFinished(self.t, duty.job_id, "trace", trace={"verdict": "none"}))
+                found: dict[str, object] = {"verdict": "none"}
+                if rng.random() < 0.3:
+                    found = {"verdict": "traced", "proposal": {"digest": rng.choice(["model", "better"]), "proposed": True}}
+                self.feed(JobFinished(self.t, duty.job_id, "trace", trace=None if bad else found, error="killed" if bad else ""))
             case IssueCertificate():
                 v = duty.verification
                 number = f"{v.attempt}/{duty.gap.epoch}"
@@ -277,7 +295,18 @@ class World:
         n = ledger.sample_size(0.2, duty.beta)
         law = LawResult("uniform", n, -1.0 if bad else 0.1, int(bad), 0.5, 1.0, True, True, not bad)
         return Verification(
-            not bad, duty.radius, duty.hold_radius, 0.0, 0.2, duty.beta, duty.attempt, duty.seed, (law,), duty.digest, "model", "task"
+            not bad,
+            duty.radius,
+            duty.hold_radius,
+            0.0,
+            0.2,
+            duty.beta,
+            duty.attempt,
+            duty.seed,
+            (law,),
+            duty.digest,
+            self.state.memory.model_digest,
+            "task",
         )
 
     def chaos(self) -> None:
