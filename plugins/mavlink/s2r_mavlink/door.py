@@ -7,7 +7,7 @@ the log says it too:
 
     dropped N                 N messages about the pose gave way, the runtime was late
     rejected REASON=N ...     since the last such note, at most one a second
-    twin, alone               two robots answer to one system id; only one does again
+    twin, alone               two robots answer to one system id, and both hear what is sent to one; only one does again
 """
 
 from __future__ import annotations
@@ -91,8 +91,7 @@ class Door:
                 return self._reject(reason)
         elif signed:
             return self._reject("signed_without_key")
-        if not line.accept(source, now_ns):
-            track.stranger()
+        if not line.accept(source, now_ns):  # whoever it is, it doesn't hear what is sent to the robot
             return self._reject("other_address")
         facts = header(data)
         if track.place(facts.sequence, now_ns, checked=facts.known) in {"off", "again"}:

@@ -29,7 +29,6 @@ class Sequence:
         self._heard_ns = 0
         self._other = -1
         self._proof = 0
-        self._strange = False
         self._conflicts: deque[int] = deque(maxlen=CONFLICTS)
         self.lost = self.off = self.again = 0
 
@@ -39,7 +38,7 @@ class Sequence:
         if self._newest < 0 or (d > AHEAD and now_ns - self._heard_ns > SILENT_NS and checked):
             return self._next(number, now_ns, 0)
         if 0 < d <= (AHEAD if checked else AHEAD_UNCHECKED):
-            if self._proof or self._strange:
+            if self._proof:
                 self._conflicts.append(now_ns)
             return self._next(number, now_ns, d - 1)
         if d == 0:
@@ -50,7 +49,7 @@ class Sequence:
         return self._try(number, now_ns) if checked else "off"
 
     def _next(self, number: int, now_ns: int, lost: int) -> Place:
-        self._newest, self._heard_ns, self._proof, self._strange = number, now_ns, 0, False
+        self._newest, self._heard_ns, self._proof = number, now_ns, 0
         self.lost += lost
         return "next"
 
@@ -62,10 +61,6 @@ class Sequence:
             return self._next(number, now_ns, (number - self._newest - 1) & 0xFF)
         self.off += 1
         return "off"
-
-    def stranger(self) -> None:
-        """Somebody else used these ids. It is a conflict once the one who has them goes on."""
-        self._strange = True
 
     def shared(self, now_ns: int) -> bool:
         """Whether two senders use these ids."""
