@@ -20,8 +20,8 @@ Record = dict[str, Any]
 RIGHT, NOT_WRONG = {"right"}, {"right", "tie", "none"}
 LARGE = 50_000
 """Steps of a long set."""
-WHITE = {"clean", "clean_closed", "clean_quantised", "clean_poor", "long_clean"}
-ROUGH = {"clean_coloured", "clean_outliers", "clean_student", "clean_jittered"}
+WHITE = {"clean", "clean_closed", "clean_poor", "long_clean"}
+ROUGH = {"clean_coloured", "clean_outliers", "clean_student", "clean_quantised", "clean_jittered"}
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def rows(records: list[Record]) -> list[Row]:
     return [
         _share("false alarms, clean, white noise", words(of(*WHITE), "alarm"), 0.01, at_most=True),
         _share("  of these in closed loop", words(of("clean_closed"), "alarm"), 0.01, at_most=True),
-        _share("false alarms, clean, coloured, heavy-tailed, jittered", words(of(*ROUGH), "alarm"), 0.05, at_most=True),
+        _share("false alarms, clean, coloured, heavy-tailed, quantised, jittered", words(of(*ROUGH), "alarm"), 0.05, at_most=True),
         _share("one effect that matters (>= 1.5): right name", words(strong, *RIGHT), 0.90),
         _share("one weak effect (1.1 to 1.5): right, honest tie or none", words(weak, *NOT_WRONG), 0.85),
         _share("one effect: wrong name", words(one, "wrong"), 0.03, at_most=True),
@@ -141,7 +141,7 @@ def beside(records: list[Record]) -> list[Row]:
     rows_of = [
         share("STLSQ: keeps a term on clean data, white noise", [r["sindy"]["terms"] > 0 for r in told if r["family"] in WHITE]),
         share("STLSQ:   in closed loop", [r["sindy"]["terms"] > 0 for r in told if r["family"] == "clean_closed"]),
-        share("STLSQ:   coloured, heavy-tailed, jittered", [r["sindy"]["terms"] > 0 for r in told if r["family"] in ROUGH]),
+        share("STLSQ:   coloured, heavy-tailed, quantised, jittered", [r["sindy"]["terms"] > 0 for r in told if r["family"] in ROUGH]),
         share(
             "STLSQ: one effect that matters: top term of the right kind", [r["sindy"]["right"] for r in one if (r["ratio"] or 0) >= STRONG]
         ),
