@@ -62,12 +62,13 @@ from s2r_runtime.messages import (
 class World:
     """Robot, daemon, workers and operator, mostly doing what they should. `feed` hands an event to core and law."""
 
-    def __init__(self, seed: int, *, lockstep: bool) -> None:
+    def __init__(self, seed: int, *, lockstep: bool, tracing: bool = True) -> None:
         self.rng = random.Random(seed)
         self.settings = msgspec.structs.replace(WALK, lockstep=lockstep, recovery=self.rng.choice(["stop", "hold", "return"]))
-        traces = random.Random(seed)
-        often: dict[str, Any] = {name: traces.random() < 0.5 for name in ("trace_after_campaign", "trace_after_inputs", "trace_on_growth")}
-        self.settings = msgspec.structs.replace(self.settings, adopt=traces.choice(["ask", "always"]), trace_delay_ns=5 * DT, **often)
+        if tracing:
+            traces = random.Random(seed)
+            often: dict[str, Any] = {n: traces.random() < 0.5 for n in ("trace_after_campaign", "trace_after_inputs", "trace_on_growth")}
+            self.settings = msgspec.structs.replace(self.settings, adopt=traces.choice(["ask", "always"]), trace_delay_ns=5 * DT, **often)
         self.law, self.state = Law(self.settings), core.initial()
         self.t, self.seq, self.numbers, self.requests = S, 0, 0, 0
         self.ask: Ask | None = None

@@ -148,7 +148,7 @@ ALPHABET: dict[str, Letter] = {
 
 def chapter(name: str, *, lockstep: bool) -> World:
     """A world at a place where much can go wrong."""
-    world = World(3, lockstep=lockstep)
+    world = World(3, lockstep=lockstep, tracing=False)
     world.rng.seed(3)
 
     def spell(*letters: str) -> None:
