@@ -62,6 +62,36 @@ def test_a_frozen_heading_is_reported_and_taken_out():
     assert np.isnan(checked.data.runs[0].y[305:355]).all()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_heading_that_leaves_the_motion_and_comes_back_is_found(seed):
+    """0.8 rad, over 30 rows each way. The path is as straight or bent as it was: only the compass says otherwise."""
+    rng = np.random.default_rng(60 + seed)
+    u = commands(rng, 1, STEPS, DT, [(0.1, 0.2), (-1.0, 1.0)], rest=0.0)
+    y = drive(rng, "unicycle", u, ROBOTARIUM, DT, NOISE)[0]
+    y[:, 2] += np.interp(np.arange(STEPS + 1), [300, 330, 500, 530], [0.0, 0.8, 0.8, 0.0])
+    t = DT * np.arange(STEPS + 1)
+    checked = check(declared(), from_streams(declared(), [(Stream(t, y), Stream(t[:-1], u[0]))], "here"))
+    (fault,) = checked.faults
+    assert (fault.kind, fault.channel) == ("inconsistent", "theta")
+    assert fault.from_s == pytest.approx(300 * DT, abs=6 * DT)
+    assert fault.to_s == pytest.approx(530 * DT, abs=6 * DT)
+    assert np.isnan(checked.data.runs[0].y[310:520]).all()
+
+
+@pytest.mark.parametrize(
+    "outside",
+    [
+        lambda x, v, w: (v, w, 0.05, 0.03),
+        lambda x, v, w: (v, w, -0.3 * w * v * np.sin(x[:, 2]), 0.3 * w * v * np.cos(x[:, 2])),
+        lambda x, v, w: (v, w + 0.3 * np.sin(x[:, 0]), 0.0, 0.0),
+    ],
+    ids=["wind", "sideways slip", "a yaw of its own"],
+)
+def test_a_robot_that_goes_another_way_than_it_points_is_no_fault(outside):
+    for data in recordings([], 4, steps=STEPS, seed=70, outside=outside):
+        assert check(declared(), data).faults == ()
+
+
 @pytest.mark.parametrize(
     "effects",
     [

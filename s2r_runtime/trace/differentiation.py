@@ -83,9 +83,9 @@ def _closed(x: Array, pad: int, size: int) -> Array:
     return np.concatenate([longer, longer[-1:] + share * (longer[:1] - longer[-1:])])
 
 
-def bandwidth(stretches: Sequence[Array], dt: float, derivative: int = 2) -> float:
+def bandwidth(stretches: Sequence[Array], dt: float, derivative: int = 2, *, rows: int = ROWS) -> float:
     """Hz, of what the columns of x (n, c), in stretches without gaps, say about their derivative of that order. The column that says most
-    decides: one in which nothing moves says nothing. To two digits, to be said and given again.
+    decides: one in which nothing moves says nothing. To two digits, to be said and given again. rows: independent ones that are enough.
     """
     longest = max(len(x) for x in stretches)
     size = min(BINS, longest - 2)
@@ -93,7 +93,7 @@ def bandwidth(stretches: Sequence[Array], dt: float, derivative: int = 2) -> flo
     if size < FEWEST:
         return highest
     f, density = _density(stretches, dt, size)
-    enough = 0.5 * ROWS / (dt * sum(len(x) for x in stretches))
+    enough = 0.5 * rows / (dt * sum(len(x) for x in stretches))
     found = [_seen(f, p, derivative, enough) for p in density.T]
     return float(f"{np.clip(max(found), min(lowest, highest), highest):.2g}")
 

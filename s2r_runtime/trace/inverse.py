@@ -62,7 +62,7 @@ def inverse(model: ComposedModel, data: Dataset, held_out: Steps) -> Inverse | N
     if not len(steps):
         return None
     edges = [0, *(np.flatnonzero(~steps.joined[1:]) + 1).tolist(), len(steps)]
-    band = data.reconstruction.bandwidth if data.reconstruction else _bandwidth(model, steps, edges, fine.dt)
+    band = data.reconstruction.needed if data.reconstruction else _bandwidth(model, steps, edges, fine.dt)
     least = 2 * differentiation.reach(fine.dt, band)
     stretches = tuple((a, b) for a, b in pairwise(edges) if b - a > least)
     return Inverse(fine, steps, stretches, band) if stretches else None
@@ -121,4 +121,4 @@ def _bandwidth(model: ComposedModel, steps: Steps, edges: list[int], dt: float) 
     resting = model.nominal.step(steps.y0[:1], at, model.dt, model.parameters)
     moved = np.max([np.abs(p - resting)[0] for p in pushed], axis=0)
     fast = np.flatnonzero(moved > 0.5 * moved.max())
-    return differentiation.bandwidth([steps.y0[a:b][:, fast] for a, b in pairwise(edges)], dt, 1)
+    return differentiation.bandwidth([steps.y0[a:b][:, fast] for a, b in pairwise(edges)], dt, 1, rows=0)

@@ -35,11 +35,14 @@ SNAPPED = 0.01
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """States that were not measured; Hz within which they, and everything with them, were reconstructed; s between the rows used."""
+    """States that were not measured; Hz within which they, and everything with them, were reconstructed; s between the rows used; Hz that
+    hold nearly all of the motion.
+    """
 
     states: tuple[str, ...]
     bandwidth: float
     interval: float
+    needed: float
 
     def to_json(self) -> dict[str, object]:
         """docs/json.md's `reconstructed`."""
@@ -85,7 +88,7 @@ def reconstruct(
             f"{source}: {', '.join(missing)} cannot be reconstructed within {band:g} Hz, which takes more than "
             f"{2.0 / band:.3g} s without a gap"
         )
-    return made, Reconstruction(tuple(missing), band, interval)
+    return made, Reconstruction(tuple(missing), band, interval, min(band, differentiation.bandwidth(rows, interval, rows=0)))
 
 
 def independent_step(done: Reconstruction, dt: float) -> int:

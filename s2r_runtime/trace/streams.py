@@ -118,22 +118,26 @@ def _length(yes: Mask) -> NDArray[np.int64]:
 
 
 def _coarse(change: Array) -> bool:
-    """Whether some column moves by a few quanta at a time: then it repeats by itself."""
-    for column in np.abs(change).T:
-        moved = np.sort(column[column > 0.0])
+    """Whether every column moves by a few quanta at a time: then they repeat by themselves."""
+    for column in change.T:
+        moved = np.sort(np.abs(column[column != 0.0]))
         if len(moved) < 10:
-            return True
+            continue
         least = float(moved[len(moved) // 100])
-        if np.median(moved) < COARSE * least and any(_whole(moved, least / k) for k in (1, 2, 3)):
-            return True
-    return False
+        if np.median(moved) >= COARSE * least or not any(_whole(column, least / k) for k in (1, 2, 3)):
+            return False
+    return True
 
 
-def _whole(moved: Array, quantum: float) -> bool:
-    """Whether changes are whole numbers of a quantum, as nearly as rounded digits say."""
-    number = np.rint(moved / quantum)
-    quantum = float(np.median(moved[number > 0] / number[number > 0]))
-    return bool(np.mean(np.abs(moved / quantum - np.rint(moved / quantum)) < 0.05) > 0.85)
+def _whole(change: Array, quantum: float) -> bool:
+    """Whether changes, and sums of some of them, are whole numbers of a quantum, as nearly as rounded digits say."""
+    number = np.rint(np.abs(change) / quantum)
+    quantum = float(np.median(np.abs(change[number > 0]) / number[number > 0]))
+    for rows in (1, 4, 12):
+        ratio = np.convolve(change, np.ones(rows), "valid") / quantum
+        if not len(ratio) or np.mean(np.abs(ratio - np.rint(ratio)) < 0.08) < 0.85:
+            return False
+    return True
 
 
 def held(values: Array) -> Array:

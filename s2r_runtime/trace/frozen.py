@@ -1,0 +1,65 @@
+"""A state that repeats exactly while the model says that it moves: the sensor, or what carries its readings, stands still."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.reach import SIGMAS, Fault, Reach, predicted
+from s2r_runtime.trace.residual import Acting
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+FROZEN_ROWS = 5
+"""Rows that repeat a state exactly before it counts as frozen."""
+
+QUANTA = 6.0
+"""Least changes by which a state must have moved on while it repeated: below that it may be resolution."""
+
+LONG_FROZEN = 50
+"""Rows of exact repeats that need no catching up to count as frozen."""
+
+
+def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: Reach) -> list[Fault]:
+    """Exact repeats through which the model moves the state by more than noise and quantisation, and after which it catches up.
+
+    Without catching up the robot itself may have stood still; only a long silence of a state that jitters otherwise is then a fault.
+    """
+    run = data.runs[i]
+    if len(run.y) < FROZEN_ROWS + 1:
+        return []
+    foretold = predicted(model, data, act, i)
+    moves, e = model.difference(foretold, run.y[:-1]), model.difference(run.y[1:], foretold)
+    found = []
+    for j, name in enumerate(model.states):
+        change = np.abs(np.diff(run.y[:, j]))
+        if reach.instant[j] or not np.any(change > 0.0):
+            continue
+        quantum = float(np.min(change[change > 0.0]))
+        least = SIGMAS * reach.noise[j] + QUANTA * quantum
+        for a, b in _stretches(change == 0.0):
+            if b - a < FROZEN_ROWS:
+                continue
+            path = np.cumsum(np.nan_to_num(moves[a:b, j]))
+            expected, far = float(path[-1]), float(np.max(np.abs(path)))
+            if far < least:
+                continue
+            off = float(e[min(b, len(e) - 1), j]) - expected
+            off = math.remainder(off, math.tau) if name in model.nominal.angles else off
+            caught_up = b < len(e) and abs(expected) > least and abs(off) < 0.5 * abs(expected)
+            jitters = reach.noise[j] > QUANTA * quantum  # even where the robot stands
+            if caught_up or (b - a > LONG_FROZEN and jitters and far > 10.0 * reach.move[j]):
+                bad[a + 1 : b + 1, j] = True
+                found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
+    return found
+
+
+def _stretches(yes: Mask) -> list[tuple[int, int]]:
+    """[a, b) of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], yes.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -1,0 +1,123 @@
+"""Rows away from where the rows before and after, and the model, say they are: spikes, tails of the noise, and offsets that stay.
+
+spike        one row (or few) away, and back
+offset_jump  one transition by more than the inputs could move the state, and it stays there; to the end, or until it jumps back
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.reach import SIGMAS, Fault, Reach, predicted
+from s2r_runtime.trace.residual import Acting
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+TAIL_SIGMAS = 3.5
+"""Robust standard deviations of both legs of a spike that count as tails: white noise has one in a million."""
+
+BEYOND = 2.2
+"""Times the largest move in a step: a command that reverses and is late, or followed with a lag, leaves up to twice that."""
+
+RIGHT_AT_FIRST = 0.3
+"""Of a heading that jumped for good, what was before counts if it is at least this part of the run."""
+
+BRIEF = 4
+"""Rows that a spike lasts at most; a jump that comes back later is an offset."""
+
+
+@dataclass(frozen=True)
+class Jumps:
+    """Of one run: spikes; rows that the noise's own tail took away (`tails`, as spikes); offsets that stay; (run, step) transitions across
+    them.
+    """
+
+    spikes: list[Fault]
+    tails: list[Fault]
+    offsets: list[Fault]
+    cut: list[tuple[int, int]]
+
+
+def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: Reach) -> Jumps:
+    """Of run i; marks in `bad` what of it is wrong."""
+    run = data.runs[i]
+    found = Jumps([], [], [], [])
+    if len(run.y) < 3:
+        return found
+    e = model.difference(run.y[1:], predicted(model, data, act, i))
+    change = model.difference(run.y[1:].copy(), run.y[:-1])
+    for j, name in enumerate(model.states):
+        series = np.nan_to_num(change[:, j] if reach.instant[j] else e[:, j])
+        limit = SIGMAS * reach.noise[j] + BEYOND * reach.move[j]
+        lost = np.isnan(run.y[:, j])
+        single: list[int] = []
+        for k in np.flatnonzero(np.abs(series) > limit).tolist():
+            if bad[k, j] or bad[k + 1, j]:  # the end of something that is taken out already
+                continue
+            rows = _there_and_back(series, k)
+            if rows is not None:
+                bad[rows[0] : rows[1] + 1, j] = True
+                kind = found.spikes if abs(float(series[k])) > reach.tail[j] else found.tails
+                kind.append(Fault(run.start_s + data.dt * rows[0], run.start_s + data.dt * rows[1], name, "spike"))
+            elif _alone(series, k) and not np.any((lost | bad[:, j])[max(k - 1, 0) : k + 3]):  # where rows lack, the way back is not seen
+                single.append(k)
+        if not reach.instant[j]:
+            for k, back in _offsets(series, single):
+                _take_out(found, model, data, i, j, k, back, bad)
+    return found
+
+
+def _alone(series: Array, k: int) -> bool:
+    """An effect's onset dies away over steps, a jump does not."""
+    around = np.abs(np.concatenate([series[max(k - 2, 0) : k], series[k + 1 : k + 3]]))
+    return bool(np.all(around < 0.3 * abs(series[k])))
+
+
+def _take_out(found: Jumps, model: ComposedModel, data: Dataset, i: int, j: int, k: int, back: int | None, bad: Mask) -> None:
+    """An offset from step k on, to the end or to the step `back`."""
+    run = data.runs[i]
+    end = len(run.y) - 1 if back is None else back
+    found.offsets.append(Fault(run.start_s + data.dt * (k + 1), run.start_s + data.dt * end, model.states[j], "offset_jump"))
+    found.cut.extend([(i, k)] if back is None else [(i, k), (i, back)])
+    if model.states[j] in model.nominal.angles:  # a heading that is off leaves the motion; it was right at first, if that is long enough
+        off = slice(k + 1, end + 1) if back is not None or k >= RIGHT_AT_FIRST * len(bad) else slice(0, k + 1)
+        bad[off, j] = True
+
+
+def tails_of(model: ComposedModel, data: Dataset, act: Acting, i: int, reach: Reach) -> int:
+    """Rows that are away from both neighbours by more than white noise would have them, whatever the inputs could do."""
+    run = data.runs[i]
+    e = np.nan_to_num(model.difference(run.y[1:], predicted(model, data, act, i)))
+    first, second = e[:-1], e[1:]
+    back = np.abs(first + second) < 0.35 * np.maximum(np.abs(first), np.abs(second))
+    away = np.minimum(np.abs(first), np.abs(second)) > TAIL_SIGMAS * reach.noise
+    return int(np.count_nonzero((back & away & ~reach.instant).any(axis=1)))
+
+
+def _there_and_back(series: Array, k: int) -> tuple[int, int] | None:
+    """First and last row that are away, if the residual at step k is one leg of a spike."""
+    for length in range(1, BRIEF + 1):
+        for begin in (k, k - length):
+            legs = series[max(begin, 0) : begin + length + 1]
+            if len(legs) == length + 1 and abs(float(np.sum(legs))) < 0.35 * abs(float(series[k])):
+                return begin + 1, begin + length
+    return None
+
+
+def _offsets(series: Array, single: list[int]) -> list[tuple[int, int | None]]:
+    """Each jump with the one that takes it back, if there is one."""
+    found: list[tuple[int, int | None]] = []
+    left = list(single)
+    while left:
+        k = left.pop(0)
+        back = next((m for m in left if abs(float(series[m] + series[k])) < 0.35 * abs(float(series[k]))), None)
+        if back is not None:
+            left.remove(back)
+        found.append((k, back))
+    return found

@@ -1,0 +1,83 @@
+"""What the inputs, and the noise, can do to a state in one step: a fault must be beyond it, or an effect would be explained away as one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.residual import Acting, advanced, first_steps
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+SIGMAS = 8.0
+"""Robust standard deviations from which a single residual is suspected."""
+
+ONE_IN = 100.0
+"""Recordings in which noise may once reach a spike's size."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """An interval of the recording, s since its first stamp. channel: a state, or `*`. kind: as docs/json.md."""
+
+    from_s: float
+    to_s: float
+    channel: str
+    kind: str
+
+
+@dataclass(frozen=True)
+class Reach:
+    """noise: (nx,) robust standard deviation of a residual; move: (nx,) largest move in a step that the model foresees; tail: (nx,)
+    leg of a spike that noise with tails such as these has in one recording of a hundred.
+    """
+
+    noise: Array
+    move: Array
+    tail: Array
+    instant: Mask
+
+
+def reach_of(model: ComposedModel, data: Dataset, act: Acting) -> Reach:
+    """From the residuals of all runs."""
+    e, moves = [], []
+    for i, run in enumerate(data.runs):
+        p = predicted(model, data, act, i)
+        e.append(model.difference(run.y[1:], p))
+        moves.append(model.difference(p, run.y[:-1]))
+    residuals, move = np.concatenate(e), np.concatenate(moves)
+    good = np.flatnonzero(np.isfinite(residuals).all(axis=1))
+    instant = np.array([s in getattr(model.nominal, "reached", {}) for s in model.states])
+    if not len(good):
+        one = np.ones(len(model.states))
+        return Reach(one, one, one, instant)
+    noise = np.median(np.abs(residuals[good]), axis=0) / 0.6745
+    largest = np.quantile(np.abs(move[good]), 0.999, axis=0)
+    return Reach(np.maximum(noise, 1e-12), largest, _tail(residuals), instant)
+
+
+def _tail(residuals: Array) -> Array:
+    """(nx,) by extrapolation of the quantiles of how far rows are from both neighbours, as a power law: what the tail itself says it
+    may reach. Spikes themselves are on fewer rows than are looked at.
+    """
+    apart = 0.5 * np.abs(np.diff(residuals, axis=0))
+    apart = apart[np.isfinite(apart).all(axis=1)]
+    if len(apart) < 100:
+        return np.zeros(residuals.shape[1])
+    bulk, rare = np.quantile(apart, (0.9, 0.98), axis=0)
+    steepness = np.log(np.clip(rare / np.maximum(bulk, 1e-300), 1.0, 5.0)) / math.log(5.0)
+    return np.asarray(rare * (0.02 * ONE_IN * len(apart)) ** steepness)
+
+
+def predicted(model: ComposedModel, data: Dataset, act: Acting, run: int) -> Array:
+    """(K, nx) of a run: the state after each of its steps, from the one measured before."""
+    begin = first_steps(data)[run]
+    y = data.runs[run].y[:-1]
+    here = slice(begin, begin + len(y))
+    return advanced(model, y, act, here)

@@ -1,0 +1,90 @@
+"""What was received is told from what was only repeated, and streams on stamps of their own are brought together."""
+
+import numpy as np
+import pytest
+
+from s2r_runtime.errors import RecordingError
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.trace.dataset import from_streams, thinned
+from s2r_runtime.trace.faults import check
+from s2r_runtime.trace.streams import Stream, complete, fresh
+
+
+def _pose(t):
+    return np.stack([t, 0.3 * np.sin(t), 0.5 * t], axis=1)
+
+
+def _model(dt=0.05):
+    return compose(ModelSpec("unicycle", dt))
+
+
+def test_rows_that_repeat_a_slower_sensor_are_no_measurements():
+    rng, t = np.random.default_rng(1), 0.05 * np.arange(400)
+    y = _pose(t) + 1e-3 * rng.normal(size=(400, 3))
+    again = rng.random(400) < 0.45
+    again[::5] = False  # a recorder repeats a few rows at a time
+    for k in np.flatnonzero(again):
+        y[k] = y[k - 1]
+    seen = fresh(Stream(t, y))
+    assert np.array_equal(np.isnan(seen.values[:, 0]), again)
+    data = from_streams(_model(), [(Stream(t, y), Stream(t, np.tile([1.0, 0.5], (400, 1))))], "here")
+    model, data, _ = thinned(_model(), data)
+    assert "frozen" not in {f.kind for f in check(model, data).faults}
+
+
+@pytest.mark.parametrize("quantum", [1e-3, 1e-2])
+def test_a_coarse_sensor_that_repeats_by_itself_is_measured_all_the_same(quantum):
+    t = 0.05 * np.arange(400)
+    y = np.rint(_pose(0.1 * t) / quantum) * quantum
+    assert not np.isnan(fresh(Stream(t, y)).values).any()
+
+
+def test_a_sensor_that_stood_still_for_long_is_left_to_the_search_for_faults():
+    t = 0.05 * np.arange(400)
+    y = _pose(t) + 1e-3 * np.random.default_rng(2).normal(size=(400, 3))
+    y[100:160] = y[100]
+    assert not np.isnan(fresh(Stream(t, y)).values).any()
+
+
+def test_states_on_rows_of_their_own_meet_on_those_of_the_rarest_but_not_across_its_gaps():
+    t = 0.05 * np.arange(200)
+    values = _pose(t)
+    values[::2, :2] = np.nan
+    values[1::2, 2] = np.nan
+    values[60:80, 2] = np.nan
+    met = complete(Stream(t, values))
+    assert np.allclose(met.values, _pose(met.t), atol=2e-3)
+    assert not np.any((met.t > t[60]) & (met.t < t[79]))
+
+
+def test_steps_between_rows_that_are_rarer_than_the_model_s_are_taken_together():
+    t = 0.1 * np.arange(300)
+    data = from_streams(_model(0.05), [(Stream(t, _pose(t)), Stream(t, np.ones((300, 2))))], "here")
+    model, data, _ = thinned(_model(0.05), data)
+    assert model.dt == pytest.approx(0.1)
+    assert len(data.runs[0].y) == 300
+
+
+def test_inputs_from_before_the_first_state_are_kept():
+    t = 0.05 * np.arange(100)
+    inputs = np.stack([np.arange(100.0), np.zeros(100)], axis=1)
+    data = from_streams(_model(), [(Stream(t[20:], _pose(t[20:])), Stream(t, inputs))], "here")
+    run = data.runs[0]
+    assert np.isnan(run.y[:20]).all()
+    assert not np.isnan(run.y[20:]).any()
+    assert run.start_s == pytest.approx(-1.0)
+    assert np.array_equal(run.u[:20, 0], np.arange(20.0))
+
+
+def test_an_input_given_once_long_before_still_holds():
+    t = 60.0 + 0.05 * np.arange(100)
+    data = from_streams(_model(), [(Stream(t, _pose(t)), Stream(np.array([55.0]), np.array([[1.0, 0.5]])))], "here")
+    assert np.allclose(data.runs[0].u, [1.0, 0.5])
+
+
+@pytest.mark.parametrize("shift", [3600.0, -3600.0])
+def test_inputs_and_states_that_share_no_time_are_of_two_clocks(shift):
+    t = 0.05 * np.arange(100)
+    with pytest.raises(RecordingError, match="their stamps must be of one clock"):
+        from_streams(_model(), [(Stream(t, _pose(t)), Stream(t + shift, np.ones((100, 2))))], "here.csv")
