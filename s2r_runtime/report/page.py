@@ -9,6 +9,10 @@ from importlib import resources
 _STYLE = resources.files("s2r_runtime").joinpath("data/page.css").read_text(encoding="utf-8")
 
 
+SENTENCE = 25
+"""Characters from which on a cell may be broken at its spaces."""
+
+
 class Page:
     """Collects sections and renders them. Everything given as text is escaped; figures are SVG of our own."""
 
@@ -29,9 +33,15 @@ class Page:
         self._parts.append(f'<ol class="{escape(kind)}">' + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ol>")
 
     def table(self, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-        """A table; numbers are set in equal width."""
-        cells = "".join("<tr>" + "".join(f'<td class="n">{escape(str(c))}</td>' for c in row) + "</tr>" for row in rows)
+        """A table; numbers are set in equal width, and only what is as long as a sentence is broken into lines."""
+        cells = "".join("<tr>" + "".join(_cell(str(c)) for c in row) + "</tr>" for row in rows)
         self._parts.append(f'<div class="scroll"><table><tr>{"".join(f"<th>{escape(h)}</th>" for h in head)}</tr>{cells}</table></div>')
+
+    def folded(self, summary: str, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+        """A table that is shown when its summary is clicked."""
+        self._parts.append(f"<details><summary>{escape(summary)}</summary>")
+        self.table(head, rows)
+        self._parts.append("</details>")
 
     def figure(self, svg: str, caption: str) -> None:
         """An SVG figure with its caption."""
@@ -67,3 +77,7 @@ class Page:
         kind = ' class="wide"' if self._wide else ""
         body = f"<body><main{kind}>{''.join(self._parts)}</main></body>"
         return f'<!doctype html><html lang="en"><head>{head}<style>{_STYLE}</style></head>{body}</html>\n'
+
+
+def _cell(text: str) -> str:
+    return f'<td class="n">{escape(text)}</td>' if len(text) < SENTENCE or " " not in text else f"<td>{escape(text)}</td>"

@@ -151,7 +151,7 @@ def _over_time(page: Page, r: TraceResult, changed: bool) -> None:
     note = (
         "Grey: held out, the fit never saw it." if everything.held_out else "All of it is held out: the fit was made on another recording."
     )
-    page.text(note + (" Red: faults of measurement, left out." if r.faults and same else ""), "soft")
+    page.text(note + (" Red: faults of measurement; what they spoil is left out." if r.faults and same else ""), "soft")
     page.key(BEFORE_AFTER if changed else [("residual", "blue")])
     for part in everything.parts:
         faults = (
@@ -187,8 +187,13 @@ def _candidates(page: Page, trace: dict[str, Any]) -> None:
     for c in trace["candidates"][:CANDIDATES]:
         key = c["name"], c["channel"]
         colour = "good" if key in found else "orange" if key in rivals else "quiet"
+        if c["score"] <= 0.0 and colour == "quiet":
+            continue
         rows.append((f"{c['name']} on {c['channel']}", c["score"], f"{c['score']:.1f}", colour))
-    page.bars(rows)
+    if rows:
+        page.bars(rows)
+    else:
+        page.text("No effect of the library gains anything.")
 
 
 def _could_see(page: Page, trace: dict[str, Any]) -> None:
@@ -201,10 +206,9 @@ def _could_see(page: Page, trace: dict[str, Any]) -> None:
         " there, smaller.",
         "soft",
     )
-    page.table(
-        ("effect", "acts on", "from"),
-        [(v["name"], v["channel"], _size(v)) for v in sorted(rows, key=lambda v: (v["size"] is None, v["name"], v["channel"]))],
-    )
+    told = [(v["name"], v["channel"], _size(v)) for v in sorted(rows, key=lambda v: (v["size"] is not None, v["name"], v["channel"]))]
+    blind = sum(1 for v in rows if v["size"] is None)
+    page.folded(f"{len(rows)} effects" + (f", {blind} of them not at all" if blind else ""), ("effect", "acts on", "from"), told)
 
 
 def _size(v: dict[str, Any]) -> str:
@@ -217,7 +221,8 @@ def _suggested(page: Page, r: TraceResult, suggested: Any) -> None:
         return
     units: dict[str, str] = getattr(r.nominal.nominal, "units", {})
     page.heading("What to drive next")
-    page.text(suggested.text())
+    for line in suggested.lines():
+        page.text(f"{line[0].upper()}{line[1:]}.")
     if suggested.u is not None:
         t = r.nominal.dt * np.arange(len(suggested.u), dtype=np.float64)
         for svg in plots.sequence(t, suggested.u, r.nominal.inputs, [units.get(name, "") for name in r.nominal.inputs]):

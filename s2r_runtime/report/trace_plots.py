@@ -25,7 +25,10 @@ FRAMED, MARGIN = 0.998, 1.2
 
 SIGMAS = 1.96
 
-POINTS = 600
+SILENT = 8.0
+"""Usual distances between the values of a curve from which on it is broken."""
+
+POINTS = 500
 """Of a scatter: enough to see a cloud's shape, and forty of them stay a page."""
 
 NEAR = 12.0
@@ -79,7 +82,9 @@ def over_time(part: Component, all_of_it: OverTime, faults: Sequence[tuple[float
         ax.axvspan(begin, end, color=GRID, linewidth=0, zorder=0.2)
     for values, colour in [(part.before, ORANGE), (part.after, BLUE)] if changed else [(part.after, BLUE)]:
         rows = envelope(all_of_it.t, values)
-        ax.plot(all_of_it.t[rows], np.clip(fy * values[rows], -fy * limit, fy * limit), color=colour, linewidth=0.6)
+        t, e = all_of_it.t[rows], np.clip(fy * values[rows], -fy * limit, fy * limit)
+        far = np.flatnonzero(np.diff(t) > SILENT * float(np.median(np.diff(t)))) + 1
+        ax.plot(np.insert(t, far, np.nan), np.insert(e, far, np.nan), color=colour, linewidth=0.6)
     ax.set_ylim(-fy * limit, fy * limit)
     _mark_faults(ax, faults)
     ax.set_xlabel("s")
@@ -166,7 +171,7 @@ def interval(name: str, value: float, low: float | None, high: float | None, uni
     """A parameter's 95 % interval; `none` marks the value at which there would be no effect, if it lies near."""
     fig, (ax,) = figure(WIDTH, 1.0)
     ends = [v for v in (low, high) if v is not None and math.isfinite(v) and abs(v) < 1e5]
-    reach = max([abs(v - value) for v in ends] + [0.02 * abs(value), 1e-9])
+    reach = max([abs(v - value) for v in ends] + [1e-4 * abs(value), 1e-9])
     if neutral is not None and abs(neutral - value) < NEAR * reach:
         reach = max(reach, abs(neutral - value))
         ax.axvline(neutral, color=SOFT, linewidth=1.2, linestyle=":")

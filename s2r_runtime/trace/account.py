@@ -64,7 +64,8 @@ def headline(r: TraceResult) -> str:
 def _explained(r: TraceResult) -> list[str]:
     lines = [line for e in r.effects for line in _known(r, e)]
     if r.rivals:
-        lines += ["cannot be told from:", *(line for e in r.rivals for line in _known(r, e))]
+        where = "cannot be told from" + (", each in place of one of them" if len(r.effects) > 1 else "")
+        lines += [f"{where}:", *(line for e in r.rivals for line in _known(r, e))]
         lines += labelled("try next", [r.suggested_excitation or "", "(--suggest FILE.csv writes such a drive)"])
     if r.partial:
         lines += ["explains a part only, so no name is lent to it:", *(line for e in r.partial for line in _effect(e))]
@@ -189,7 +190,7 @@ def _faults(r: TraceResult) -> Iterator[str]:
     if silent:
         yield f"{len(silent)} dropout{'s' if len(silent) > 1 else ''}, the longest {max(f.to_s - f.from_s for f in silent):.3g} s"
     if r.faults:
-        yield "all left out of the fit"
+        yield "what they spoil is left out"
 
 
 def _unseen(r: TraceResult) -> list[str]:

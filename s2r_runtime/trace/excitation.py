@@ -106,9 +106,9 @@ def advice(model: ComposedModel, tied: Iterable[tuple[str, str]]) -> str:
             if text not in needs:
                 needs.append(text)
     told = {channel: "; ".join(needs[:MOST_NEEDS]) for channel, needs in sorted(wanted.items(), reverse=True)}
-    parts = [f"{channel}: {needs}" if channel else needs for channel, needs in told.items()]
+    parts = [f"{channel}: {needs}" if channel else f"{needs[0].upper()}{needs[1:]}" for channel, needs in told.items()]
     apart = " Change one input at a time while the others hold still." if len([c for c in wanted if c]) > 1 else ""
-    return "Drive " + ". ".join(parts) + "." + apart
+    return ("Drive " if next(iter(told)) else "") + ". ".join(parts) + "." + apart
 
 
 @dataclass(frozen=True)

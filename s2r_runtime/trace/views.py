@@ -32,7 +32,7 @@ LAGS = 40
 POINTS = 1500
 """Points of a scatter."""
 
-BUCKETS = 500
+BUCKETS = 400
 """Buckets of a curve over time; each keeps its least and its largest value."""
 
 AROUND = 2
@@ -211,6 +211,7 @@ def _stretch(r: TraceResult, said: str, start: int) -> Stretch:
     around = min(AROUND, (LONGEST // horizon - 1) // 2)
     there = np.isfinite(held.data.runs[run].y).all(axis=1)
     good = held.within[begin[run] : begin[run + 1]] & np.asarray(there)[:-1]
+    good[[k for i, k in held.left_out if i == run]] = False
     first = last = start - int(begin[run])
     last += horizon
     for _ in range(around):
