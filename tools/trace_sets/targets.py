@@ -114,6 +114,7 @@ def rows(records: list[Record]) -> list[Row]:
         _share("two effects: exact pair", words(pairs, "right"), 0.75),
         _share("outside the library: unflagged false name", words(outside, "false_name"), 0.10, at_most=True),
         _share("outside the library: right depends_on", [r["depends_right"] for r in outside], 0.70),
+        replace(_share("  said that nothing is left, or noise", words(outside, "none"), 0.0), target="", met=None),
         _share("not separable by construction: tie reported", words(of("tie"), "tie"), 0.90),
         _figure("error reduction reached, median (matters, pairs)", share, lambda v: float(np.median(v)), 0.97),
         _figure("error reduction reached, 10th percentile", share, lambda v: float(np.quantile(v, 0.1)), 0.85),
