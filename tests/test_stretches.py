@@ -97,14 +97,14 @@ def test_a_drive_is_while_a_controller_drives_since_the_gap_in_force() -> None:
     assert log.stretches.cut("drive", 1) is None, "another log, another drive"
 
 
-def test_inputs_are_the_newest_drive_of_them() -> None:
+def test_inputs_are_the_newest_ones_every_time_that_they_were_driven() -> None:
     log = Log()
-    for digest in ("one", "two"):
+    for digest in ("one", "two", "two"):
         log.put(m.StartInputs(log.t, digest, 2))
         log.step(2)
         log.put(m.InputsFinished(log.t, digest, 2, True))
         log.step(1)
-    assert states(log.cut("inputs")) == [[3.0, 4.0, 5.0]]
+    assert states(log.cut("inputs")) == [[3.0, 4.0, 5.0], [6.0, 7.0, 8.0]]
 
 
 def test_the_newest_rows_are_kept_with_the_commands_that_still_act_on_them() -> None:

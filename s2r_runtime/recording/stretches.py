@@ -2,7 +2,7 @@
 
     campaign   from the order to start the newest campaign to its end, over all logs in which it went on
     drive      while a controller drove, since the gap in force was found or this run began
-    inputs     from the order to drive given inputs to their end, the newest time
+    inputs     from the order to drive given inputs to their end: the newest ones, every time that they were driven in this run
 
 All end with the record of the order to trace, at the latest. A stretch is a list of segments, in each of which the robot's clock runs
 on; a segment has rows of observations (the robot's stamp, x) and of commands (u, and the stamp of the observation that it answers plus
@@ -156,12 +156,11 @@ class Stretches:
     def __init__(self, limit: int) -> None:
         self._windows: dict[Stretch, _Window] = {"campaign": _Window(limit), "drive": _Window(limit), "inputs": _Window(limit)}
         self._samples: dict[int, SampleTaken] = {}
-        self._inputs = ""
         self.begin_run("")
 
     def begin_run(self, run: str, limit: int | None = None) -> None:
         """Another log. A campaign may go on in it; nothing else does."""
-        self._run = run
+        self._run, self._inputs = run, ""
         self._stamps: dict[int, tuple[int, int]] = {}
         self._last = (-1, -1)
         self._row: tuple[int, int, tuple[float, ...]] | None = None
@@ -202,7 +201,8 @@ class Stretches:
             case StopController() | SourceStopped(source="controller"):
                 self._windows["drive"].open = False
             case StartInputs(digest=inputs):
-                self._windows["inputs"].clear()
+                if inputs != self._inputs:
+                    self._windows["inputs"].clear()
                 self._inputs = inputs
                 self._begin("inputs")
             case InputsFinished():
