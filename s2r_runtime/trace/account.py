@@ -195,11 +195,11 @@ def _faults(r: TraceResult) -> Iterator[str]:
 
 def _unseen(r: TraceResult) -> list[str]:
     """Effects of which `none` on these data says nothing."""
-    blind = [f"{v.name}({v.channel})" for v in r.could_see if v.size is None]
+    blind = [f"{name}({channel})" for name, channel in r.blind]
     if not blind or r.verdict not in {"none", "traced"}:
         return []
     more = f" and {len(blind) - LISTED} more" if len(blind) > LISTED else ""
-    return [f"{', '.join(blind[:LISTED])}{more}: these inputs could not have shown them (--suggest FILE.csv writes some that do)"]
+    return [f"{', '.join(blind[:LISTED])}{more}: these data could not have shown that (--suggest FILE.csv writes a drive that does)"]
 
 
 def _data(r: TraceResult) -> list[str]:

@@ -76,6 +76,12 @@ class TraceResult:
         return tuple(kept)
 
     @property
+    def blind(self) -> tuple[tuple[str, str], ...]:
+        """Effects that these data could not have shown. Where one was found already, a second one on the same channel is another question."""
+        there = {e.channel for e in self.effects}
+        return tuple((v.name, v.channel) for v in self.could_see if v.size is None and v.channel not in there)
+
+    @property
     def done_to_data(self) -> tuple[str, ...]:
         """What stands between the measurements and what was fitted, one line each."""
         lines = [] if self.reconstruction is None else self.reconstruction.text()

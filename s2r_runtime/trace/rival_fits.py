@@ -66,7 +66,7 @@ def rivals_of(r: TraceResult, given: Problem) -> Rivals | None:
     if r.rivals:
         found = [(_said(f.name, f.channel), _with(given, best, f)) for f in r.rivals]
         others = [(name, fit) for name, fit in found if fit is not None]
-    elif r.effects and all(v.size is not None for v in r.could_see):
+    elif r.effects and not r.blind:
         same = {(f.name, f.channel) for f in (*r.effects, *r.ambiguous_with)}
         others = [(name, fit) for name, key, fit in _closest(given, best) if key not in same][:CLOSEST]
     else:
