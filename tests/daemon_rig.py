@@ -253,8 +253,17 @@ class Rig:
             sock.sendto(json.dumps(fields).encode(), str(self.folder / "daemon.sock"))
 
 
-def made_up_certificate(profile_path: Path, key: Path, controller: Path, *, radius: float, verified: float, epoch: int) -> str:
-    """A certificate for a controller. Its evidence is made up: nothing was sampled or verified."""
+def made_up_certificate(
+    profile_path: Path,
+    key: Path,
+    controller: Path,
+    *,
+    radius: float,
+    verified: float,
+    epoch: int,
+    weights: tuple[float, ...] = (1.0, 1.0, 0.0525),
+) -> str:
+    """A certificate for a controller. Its evidence is made up: nothing was sampled or verified. weights: one a state."""
     profile, file = load_profile(profile_path), load(controller)
     beta, epsilon = profile.guarantee.beta, profile.guarantee.epsilon
     gap = Gap(
@@ -263,7 +272,7 @@ def made_up_certificate(profile_path: Path, key: Path, controller: Path, *, radi
         hold_radius=radius,
         hold_periods=5,
         set="ball",
-        weights=(1.0, 1.0, 0.0525),
+        weights=weights,
         n=campaign_size(epsilon, share(beta, epoch), 0),
         discarded=0,
         epsilon=epsilon,

@@ -33,8 +33,8 @@ LISTEN_S = 0.1
 """How long the thread listens before it looks whether it is to end."""
 AGAIN_S = 0.2
 """Between two attempts to open: a link that is back is used within half a second."""
-ERRORS_IN_ROW = 5
-"""Read errors after which the interface is opened anew."""
+ERRORS_S, ERRORS_FAST = 0.5, 100
+"""An interface that has given nothing but errors for so long is opened anew; after so many in a row they are read more slowly."""
 PROMPT = ("socketcan", "udp_multicast", "virtual")
 """Interfaces whose `send` does not wait when it is told not to, and whose stamps are this host's clock (wall time)."""
 ECHOING = ("udp_multicast",)
@@ -135,22 +135,23 @@ class Port:
 
     def _hear(self, bus: can.BusABC) -> None:
         """Until the port is closed. Raises what the driver raises when it is of no use any more."""
-        failed = 0
+        failed, good_at = 0, time.monotonic()
         while not self._ending.is_set():
             try:
                 message = bus.recv(LISTEN_S)
-            except Exception:
+            except Exception:  # bytes that are no frame, or a driver that broke
                 failed += 1
                 self.counts["errors"] += 1
-                if failed >= ERRORS_IN_ROW:
+                if time.monotonic() - good_at > ERRORS_S:
                     raise
-                self._ending.wait(0.001)
+                if failed > ERRORS_FAST:
+                    self._ending.wait(0.001)
                 continue
+            failed, good_at = 0, time.monotonic()
             if message is None:
                 if _hung_up(bus):
                     raise ConnectionError("the other end closed the connection")
                 continue
-            failed = 0
             record = self._record(message)
             if not self._own(record):
                 self.counts["received"] += 1
