@@ -35,7 +35,7 @@ def intervals(given: Problem, fit: Fit) -> dict[Slot, tuple[float, float]]:
     values = values_of(fit.model, fit.free)
     for index, slot in enumerate(fit.free):
         bounds, value = bounds_of(fit.model, slot), float(values[index])
-        s = float(np.sqrt(max(covariance[index, index], 0.0))) * wider[index]
+        s = float(np.sqrt(max(covariance[index, index], 0.0)) * wider[index])
         known = normal[index, index] > 1e-12 * max(float(np.max(np.diag(normal))), 1e-300)
         if bounds.kink or not known:
             found[slot] = _profile(given, fit, index, value, s, wider[index], bounds.low, bounds.high)
