@@ -69,7 +69,11 @@ def read(path: Path, states: tuple[str, ...], inputs: tuple[str, ...], options: 
         raise RecordingError(f"{path}: holds no MAVLink frame, must be a telemetry log (.tlog)")
     chosen = _options(path, records, options, states, inputs)
     starts, commands = _sorted(records, chosen, states)
-    found = [stretch for start in starts for stretch in _stretches(start, _acting(start, commands, inputs), len(states), len(inputs))]
+    begins = [start.host[0] for start in starts[1:]]
+    found: list[tuple[Rows, Rows]] = []
+    for start, since, until in zip(starts, [-np.inf, *begins], [*begins, np.inf], strict=True):
+        given = [command for command in commands if since <= command[0] < until]
+        found += _stretches(start, _acting(start, given, inputs), len(states), len(inputs))
     if not found:
         raise RecordingError(f"{path}: system {chosen['system']} tells no pose while it obeys (mode {chosen['mode'] or 'any'}, armed)")
     return found

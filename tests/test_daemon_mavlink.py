@@ -1,0 +1,246 @@
+"""The daemon with the stand-in rover over real MAVLink on loopback: campaign, drive, a person's hand, others on the line, and the audit."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from daemon_rig import Rig, made_up_certificate
+
+from s2r_runtime.messages import Decided, GateChanged, Observed, OverrideChanged, Send
+
+pytest.importorskip("s2r_mavlink")
+
+from pymavlink.dialects.v20 import common as mavlink
+from s2r_mavlink.testing import RoverProcess, free_port
+
+PROFILE = """
+clock = "realtime"
+[robot]
+name = "rig"
+[model]
+name = "unicycle"
+dt = 0.1
+[[model.effects]]
+name = "input_rate_limit"
+channel = "v"
+parameters = {{ rate = 1.0 }}
+[[model.effects]]
+name = "input_rate_limit"
+channel = "w"
+parameters = {{ rate = 2.09 }}
+[region]
+x = [-4.0, 4.0]
+y = [-4.0, 4.0]
+[geofence]
+x = [-6.0, 6.0]
+y = [-6.0, 6.0]
+[inputs]
+v = [-1.0, 1.0]
+w = [-1.0, 1.0]
+[norm]
+weights = {{ theta = 0.25 }}
+[sampling]
+hold_periods = 5
+stop_periods = 15
+waypoint_radius = 0.5
+waypoint_margin = 0.5
+position_gain = 0.5
+heading_gain = 1.0
+[guarantee]
+epsilon = 0.3
+beta = 0.5
+[verification]
+epsilon = 0.3
+[gate]
+controller_deadline = 0.5
+command_ttl = 0.5
+observation_timeout = 0.5
+[task]
+name = "keep_out"
+[task.parameters]
+x_low = -4.0
+x_high = 4.0
+y_low = -4.0
+y_high = 4.0
+[transport]
+name = "mavlink"
+robot = "{robot}"
+rate = 40.0
+take_over = "arm"
+stop_mode = "HOLD"
+max_age = 0.6
+companion = "tcpin:127.0.0.1:{companion}"
+{more}
+"""
+
+
+class MavlinkRig(Rig):
+    """As `Rig`, with a rover whose time runs four times as fast."""
+
+    def __init__(self, folder: Path, kind: str = "udp", more: str = "", *arguments: str) -> None:
+        super().__init__(folder, clock="realtime")
+        port, self.companion = free_port(socket.SOCK_STREAM), free_port(socket.SOCK_STREAM)
+        ours, theirs = ("udp", "udpout") if kind == "udp" else ("tcp", "tcpin")
+        self.profile.write_text(PROFILE.format(robot=f"{ours}:127.0.0.1:{port}", companion=self.companion, more=more))
+        self.rover = RoverProcess(f"{theirs}:127.0.0.1:{port}", "--speedup", "4", *arguments)
+
+    def close(self) -> None:
+        super().close()
+        self.rover.end()
+
+    def certificate(self, controller: Path, *, radius: float = 0.3, verified: float = 0.5, epoch: int = 1) -> str:
+        return made_up_certificate(self.profile, self.state / "key.pem", controller, radius=radius, verified=verified, epoch=epoch)
+
+    def ready(self) -> None:
+        """Until the robot can be driven."""
+        self.until(lambda: (seen := self.status()["observation"]) and not seen["fault"])
+
+    def moved(self) -> bool:
+        """Whether our controller has driven it somewhere."""
+        x = self.status()["observation"]["x"]
+        return len(x) == 3 and abs(x[0]) + abs(x[1]) > 0.3
+
+    def audit(self) -> dict[str, Any]:
+        (log,) = self.log_files()
+        return dict(json.loads(self.s2r("audit", str(log), "--key", str(self.state / "key.pub"), "--json").stdout))
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[MavlinkRig]:
+    opened = MavlinkRig(tmp_path)
+    yield opened
+    opened.close()
+
+
+def circle(rig: MavlinkRig) -> Path:
+    return rig.controller("    return np.tile([0.4, 0.6], (len(x), 1))\n")
+
+
+@pytest.mark.slow
+def test_campaign_drive_a_persons_hand_and_audit_over_mavlink(tmp_path: Path) -> None:
+    rig = MavlinkRig(tmp_path, "tcp")
+    try:
+        rig.start()
+        rig.ready()
+        answer = rig.deploy(circle(rig))
+        assert answer["exit_code"] == 0, answer
+        rig.until(rig.moved)
+        rig.rover.tell("mode MANUAL")
+        rig.until(lambda: rig.status()["latched"] == ["manual_override"])
+        assert rig.status()["gate"] == "closed"
+        assert rig.ask("clear", text="manual_override")["exit_code"] == 0
+        rig.ready()
+        answer = rig.sample()
+        assert answer["exit_code"] == 0, answer
+        assert rig.ask("stop")["exit_code"] == 0
+        rig.until(lambda: [line["mode"] for line in rig.rover.said if "mode" in line][-1] == "HOLD")
+        assert rig.stop() == 0
+        found = rig.audit()
+        assert (found["ok"], found["first_difference"], found["chain"]) == (True, None, "intact"), found
+        sent = [m for m in rig.messages("out/send") if isinstance(m, Send)]
+        assert {m.source for m in sent} == {"controller", "sampler", "recovery"}
+        (override,) = (m for m in rig.messages("event/override_changed") if isinstance(m, OverrideChanged))
+        assert override.detail == "the robot was taken over: MANUAL, armed"
+        assert "the robot can be driven" in rig.said()
+        assert "every 25 ms" in rig.said()
+    finally:
+        rig.close()
+
+
+def test_no_sample_is_taken_from_a_robot_that_does_not_obey(tmp_path: Path) -> None:
+    rig = MavlinkRig(tmp_path, "udp", "", "--prearm-fails")
+    try:
+        rig.start()
+        rig.until(lambda: rig.status()["observation"])
+        answer = rig.sample()
+        assert answer["exit_code"] == 1
+        assert "observation_invalid" in answer["text"]
+        rig.until(lambda: "the robot says: Arm: GPS 1: Bad fix" in rig.said())
+        assert rig.status()["observation"]["fault"] == "the robot can't be driven: GUIDED, disarmed"
+    finally:
+        rig.close()
+
+
+def test_controller_of_somebody_else_is_refused_and_told_so_while_ours_drives(rig: MavlinkRig) -> None:
+    rig.start()
+    rig.ready()
+    assert rig.deploy(circle(rig))["exit_code"] == 0
+    rig.until_status(gate="open")
+    mav, said = mavlink.MAVLink(None, 1, 195), []
+    mav.robust_parsing = True
+    with socket.create_connection(("127.0.0.1", rig.companion)) as companion:
+        companion.settimeout(0.02)
+
+        def told() -> bool:
+            for _ in range(5):
+                companion.sendall(mav.set_position_target_local_ned_encode(0, 1, 1, 8, 1479, 0, 0, 0, -1.0, 0, 0, 0, 0, 0, 0, 0).pack(mav))
+            try:
+                said.extend(m.text for m in mav.parse_buffer(companion.recv(1 << 16)) or [] if m.get_type() == "STATUSTEXT")
+            except TimeoutError:
+                return False
+            return "s2r: refused external: source_not_allowed" in said
+
+        rig.until(told)
+    assert rig.status()["gate"] == "open"
+    assert rig.stop() == 0
+    refused = [m for m in rig.messages("out/decided") if isinstance(m, Decided) and m.source == "external"]
+    assert refused
+    assert {(m.allow, m.reason) for m in refused} == {(False, "source_not_allowed")}
+    assert all(m.u[0] >= 0.0 for m in rig.messages("out/send") if isinstance(m, Send) and m.source == "controller")
+    assert rig.audit()["ok"]
+
+
+def test_signed_robot_is_driven_and_the_audit_needs_no_key(tmp_path: Path) -> None:
+    key = tmp_path / "key"
+    key.write_text(os.urandom(32).hex())
+    key.chmod(0o600)
+    more = f'signing_key_file = "{key}"\nsigning_state = "{tmp_path}/signing.json"'
+    rig = MavlinkRig(tmp_path, "udp", more, "--key-file", str(key))
+    try:
+        rig.start()
+        rig.ready()
+        assert rig.deploy(circle(rig))["exit_code"] == 0
+        rig.until(rig.moved)
+        assert rig.stop() == 0
+        key.unlink()
+        found = rig.audit()
+        assert (found["ok"], found["first_difference"]) == (True, None), found
+    finally:
+        rig.close()
+
+
+@pytest.mark.slow
+def test_robot_that_starts_anew_in_a_campaign_is_not_sampled_across_it(rig: MavlinkRig) -> None:
+    rig.start()
+    rig.ready()
+    rig.ask("permit", duration_s=3600.0)
+    heard: list[dict[str, Any]] = []
+
+    def reboot_after_a_while() -> None:
+        rig.until(lambda: rig.status()["phase"] == "hold")
+        rig.rover.tell("reboot")
+
+    thread = threading.Thread(target=reboot_after_a_while)
+    thread.start()
+    answer = rig.ask("sample", heard)
+    thread.join()
+    assert answer["exit_code"] == 1
+    assert "manual_override" in answer["text"]
+    assert rig.ask("clear", text="manual_override")["exit_code"] == 0
+    rig.ready()
+    assert rig.ask("sample")["exit_code"] == 0, "the campaign goes on where it was"
+    assert rig.stop() == 0
+    observed = [m.observation for m in rig.messages("event/observed") if isinstance(m, Observed)]
+    good = [o for o in observed if not o.fault]
+    assert all(b.stamp_ns > a.stamp_ns and b.seq > a.seq for a, b in itertools.pairwise(good))
+    changes = [m.reason for m in rig.messages("out/gate_changed") if isinstance(m, GateChanged)]
+    assert "manual_override" in changes
+    assert rig.audit()["ok"]
