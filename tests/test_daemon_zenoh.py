@@ -85,6 +85,54 @@ def test_campaign_outlives_a_robot_that_freezes_dies_and_loses_messages(rig: Zen
     assert [m.up for m in rig.messages("event/link_changed") if isinstance(m, LinkChanged)].count(False) >= 2
 
 
+def test_given_inputs_reach_the_robot_over_zenoh_row_by_row(rig: ZenohRig) -> None:
+    rig.start()
+    rig.start_robot()
+    rig.until(lambda: rig.status()["observation"])
+    rig.ask("permit", duration_s=3600.0)
+    path = rig.folder / "inputs.csv"
+    rows = [(0.05, (-1.0) ** (k // 20)) for k in range(100)]
+    path.write_text("t,v,w\n" + "".join(f"{0.033 * k:.9g},{v},{w}\n" for k, (v, w) in enumerate(rows)))
+    done = rig.s2r("sample", str(rig.profile), "--inputs", str(path))
+    assert (done.returncode, "100 rows driven" in done.stdout) == (0, True), done.stderr
+    assert rig.stop() == 0
+    assert [m.u for m in rig.messages("out/send") if isinstance(m, Send) and m.source == "sampler"] == rows
+    (log,) = rig.log_files()
+    found = json.loads(rig.s2r("audit", str(log), "--key", str(rig.state / "key.pub"), "--json").stdout)
+    assert (found["ok"], found["recomputed"]["commands of given inputs"]) == (True, 100), found
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(480)
+def test_a_suggested_drive_is_driven_and_tells_apart_what_the_first_one_could_not(rig: ZenohRig) -> None:
+    """The loop of docs/robot-owner.md: drive something, trace it, drive what the tracer asks for, trace that."""
+    rig.start()
+    rig.start_robot("--effect", "input_gain:w gain=0.7")
+    rig.until(lambda: rig.status()["observation"])
+    rig.ask("permit", duration_s=3600.0)
+    first, suggested = rig.folder / "first.csv", rig.folder / "next.csv"
+    first.write_text("t,v,w\n" + "".join(f"{0.033 * k:.9g},0.05,{(-1.0) ** (k // 20)}\n" for k in range(160)))
+    done = rig.s2r("sample", str(rig.profile), "--inputs", str(first))
+    assert (done.returncode, "160 rows driven" in done.stdout) == (0, True), done.stderr
+    before = rig.ask("trace", text="inputs")["data"]
+    assert before["verdict"] == "ambiguous", before["text"]
+    done = rig.s2r("trace", rig.status()["log"], "--profile", str(rig.profile), "--suggest", str(suggested))
+    assert done.returncode == 0, done.stderr
+    done = rig.s2r("sample", str(rig.profile), "--inputs", str(suggested))
+    assert done.returncode == 0, done.stderr
+    after = rig.ask("trace", text="inputs")["data"]
+    told_apart = {e["name"] for e in before["ambiguous_with"]} - {e["name"] for e in after["ambiguous_with"]}
+    assert after["effects"][0]["name"] == "input_gain"
+    assert after["effects"][0]["channel"] == "w"
+    assert "input_saturation" in told_apart, (before["text"], after["text"])
+    assert rig.stop() == 0
+    (log,) = rig.log_files()
+    found = json.loads(rig.s2r("audit", str(log), "--key", str(rig.state / "key.pub"), "--json").stdout)
+    assert found["ok"], found
+    assert found["recomputed"]["traces run again"] == 2
+    assert found["recomputed"]["commands of given inputs"] == 160 + len(suggested.read_text().splitlines()) - 1
+
+
 def test_uninvited_commands_are_logged_and_never_obeyed(rig: ZenohRig) -> None:
     rig.start()
     rig.start_robot()

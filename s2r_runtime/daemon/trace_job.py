@@ -48,7 +48,7 @@ def trace(job: TraceJob, progress: Callable[[float, float, str], None]) -> dict[
         resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
     cut, identities = (job.cut, job.identities) if job.cut is not None else _read(job)
     found, fitted = traced(job.profile, cut, identities, job.seed, progress)
-    result = plain(job, cut, found, fitted)
+    result: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(plain(job, cut, found, fitted), enc_hook=_number))
     if job.out and fitted.effects != job.profile.model.effects:
         path = Path(job.out)
         ModelStore(path, job.base).keep(fitted, found.comments())
@@ -106,6 +106,11 @@ def plain(job: TraceJob, cut: Cut, found: TraceResult, fitted: Any) -> dict[str,
         "model_path": "",
         "added": bool(new),
     }
+
+
+def _number(value: Any) -> Any:
+    """A library's own number or array as plain data."""
+    return value.tolist()
 
 
 def options(profile: Profile, states: Sequence[str], rows: int) -> dict[str, Any]:

@@ -190,14 +190,14 @@ def main(arguments: list[str]) -> int:
     try:
         from s2r_runtime.daemon.jobs import run
 
-        result: Upward = run(job, progress)
+        line = _ENCODE(run(job, progress))
     except S2RError as error:
-        result = Failed(str(error))
+        line = _ENCODE(Failed(str(error)))
     except Exception as error:  # noqa: BLE001 - whatever a job raises is its result; a verification that failed to run is a refusal
         with contextlib.suppress(OSError):  # confined, it may not write to a file
             traceback.print_exc()
-        result = Failed(f"{type(error).__name__}: {error}")
-    say(channel, _ENCODE(result))
+        line = _ENCODE(Failed(f"{type(error).__name__}: {error}"))
+    say(channel, line)
     return 0
 
 
