@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from s2r_runtime.models.composed import compose
+from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
 from s2r_runtime.trace.holdout import part
 from s2r_runtime.trace.residual import acting, first_steps, residual, rms, steps_of
 
@@ -160,3 +161,24 @@ def test_a_residual_that_shows_nothing_gives_no_start_or_a_harmless_one(name, n)
     for pushes in (np.zeros((n, 3)), np.ones((n, 3))):
         for p in effect.starts_from_residual(np.zeros((n, 3)), DT * np.arange(n), pushes, UNICYCLE, "w", DT):
             compose(ModelSpec("unicycle", DT, {}, (EffectSpec(name, "w", p),)))
+
+
+def test_the_fit_of_a_sine_reaches_the_truth_on_a_long_recording():
+    """Two runs 2400 s apart: the phase of the second turns by 15 rad for a thousandth of a hertz."""
+    model, p, n = compose(ModelSpec("unicycle", DT)), {"frequency": 3.2, "amplitude": 0.2, "phase": 1.0}, 1000
+    effect, rng, starts = registry().get("effects", "periodic_disturbance"), np.random.default_rng(9), (0.0, 2400.0)
+    runs = []
+    for start in starts:
+        u = np.column_stack([np.zeros(n), np.repeat(rng.uniform(-1.0, 1.0, n // 20), 20)])
+        turned = DT * np.cumsum(effect.input_sequence(u, UNICYCLE, "w", DT, p, start=start)[:, 1])
+        y = np.column_stack([np.zeros((n + 1, 2)), np.append(0.0, turned)]) + rng.normal(size=(n + 1, 3)) * [0.001, 0.001, 0.003]
+        runs.append((y, u))
+    data = from_arrays(model, runs)
+    data = replace(data, runs=tuple(replace(run, start_s=start) for run, start in zip(data.runs, starts, strict=True)))
+    given = problem(data, steps_of(data))
+    near = AppliedEffect(effect, "w", {"frequency": 3.2 + 2e-5, "amplitude": 0.15, "phase": 0.7})
+    found = fitted(given, evaluate(given, model), insert(model, near, 0)).model.effects[0].p
+    # from the difference of the two phases, each known to sqrt(2/n) noise / amplitude; the noise of a rate is blue: this is much
+    s = np.sqrt(2.0 / n) * (0.003 / DT) / 0.2
+    assert found["frequency"] == pytest.approx(3.2, abs=5.0 * np.sqrt(2.0) * s / (2.0 * np.pi * 2400.0))
+    assert found["amplitude"] == pytest.approx(0.2, abs=5.0 * s * 0.2)

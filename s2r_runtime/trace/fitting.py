@@ -166,8 +166,12 @@ def widening(scores: Array, covariance: Array, nx: int, blocks: int) -> Array:
 def _differences(given: Problem, model: ComposedModel, free: Free) -> list[float]:
     """Wide enough that a kink is seen, small against the value."""
     steps = []
+    span = float(np.ptp(given.steps.t)) + given.data.dt
     for slot, value in zip(free, values_of(model, free).tolist(), strict=True):
         p = bounds_of(model, slot)
+        if p.unit == "Hz":
+            steps.append(1e-3 / span)  # moves the phase at the end of the data by a thousandth of a turn, whatever the frequency
+            continue
         usual = given.data.dt if p.unit == "s" else 1e-3
         steps.append((1e-3 if p.kink else 1e-4) * max(abs(value - (p.neutral or 0.0)), usual))
     return steps
