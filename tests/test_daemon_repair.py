@@ -113,6 +113,12 @@ def test_a_drive_is_traced_on_demand_and_the_log_says_on_which_rows(rigs: Any) -
     audited = json.loads(rig.s2r("audit", str(log), "--key", str(rig.state / "key.pub"), "--json").stdout)
     assert (audited["ok"], audited["recomputed"]["traces run again"]) == (True, 1), audited
     assert "the one that trace" in audited["models"][0]["origin"]
+    page = rig.folder / "report.html"
+    assert rig.s2r("report", str(log), "-o", str(page)).returncode == 0
+    text = page.read_text(encoding="utf-8")
+    assert "Made on the drive of epoch 1" in text
+    assert f"It proposes the repaired model {status['model'][7:19]}" in text
+    assert "the proposed model adopted by user" in text
 
 
 def test_given_inputs_are_driven_recorded_and_traced(rigs: Any) -> None:

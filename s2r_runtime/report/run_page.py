@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,6 +38,7 @@ def log_page(paths: Sequence[Path]) -> str:
     _gaps(page, story, log.models())
     for number, trace in enumerate(story.traces, 1):
         page.heading(f"Residual traced{f' ({number})' if len(story.traces) > 1 else ''}")
+        _made_on(page, trace)
         add_trace(page, trace)
     _verifications(page, story)
     _driving(page, story)
@@ -44,6 +46,23 @@ def log_page(paths: Sequence[Path]) -> str:
     page.heading("Not shown")
     page.items(not_shown(), "soft")
     return page.html()
+
+
+def _made_on(page: Page, trace: dict[str, Any]) -> None:
+    """Which rows of this log a trace stands for, and what becomes of its model."""
+    recording, proposal = trace.get("recording"), trace.get("proposal")
+    if not recording or not proposal:
+        return
+    parts = "; ".join(f"records {part['first']} to {part['last']} of {part['run']}" for part in recording["parts"])
+    page.text(
+        f"Made on the {recording['stretch']} of epoch {recording['epoch']}: {recording['observations']} observations and "
+        f"{recording['commands']} commands, {parts}. Model {trace['model'][7:19]}, seed {trace['seed']}.",
+        "soft",
+    )
+    if proposal["proposed"]:
+        page.text(f"It proposes the repaired model {proposal['digest'][7:19]}; adopted, its gap comes from a fresh campaign.")
+    elif trace["effects"]:
+        page.text(f"It proposes no model: {proposal['reason']}.", "warn")
 
 
 def _summary(page: Page, story: Story) -> None:

@@ -128,9 +128,17 @@ def _take_decision(story: Story, message: Any) -> None:
             mark(f"attempt {v.attempt} {'passed' if v.passed else 'failed'}", "good" if v.passed else "bad")
         case m.JobFinished(kind="trace", trace=trace) if trace is not None:
             story.traces.append(trace)
-            mark(f"residual traced: {trace.get('verdict')}")
-        case m.ModelAdopted():
-            mark("repaired model adopted")
+        case m.TraceEnded(stretch=stretch, verdict="", reason=reason):
+            mark(f"no trace of the {stretch}: {reason}", "bad")
+        case m.TraceEnded(stretch=stretch, verdict=verdict, proposal=proposal):
+            mark(f"residual of the {stretch} traced: {verdict}" + ("; a repaired model is proposed" if proposal else ""))
+        case m.ModelAdopted(by=by, proposed=proposed):
+            who = "the profile" if by < 0 else f"user {by}"
+            mark(f"{'the proposed' if proposed else 'another'} model adopted by {who}; a fresh campaign is due")
+        case m.StartInputs(n=n):
+            mark(f"given inputs are driven, {n} rows")
+        case m.InputsFinished(n=n, complete=complete, detail=detail):
+            mark(f"{n} rows driven" + ("" if complete else f", not all: {detail}"), "plain" if complete else "bad")
         case m.CertificateInstalled(facts=facts):
             story.certificates.append(facts)
             story._verified = facts.verified_radius
