@@ -20,27 +20,33 @@ Array = NDArray[np.float64]
 
 
 class BodyMotion(NamedTuple):
-    """(n,) each."""
+    """(n,) each. heading: mean of (cos, sin) that the move was made along."""
 
     forward: Array
     left: Array
     turn: Array
+    heading: tuple[Array, Array]
 
 
 def body_motion(x: Array, x_next: Array, model: NominalModel) -> BodyMotion:
     """Of the step from x to x_next (n, nx)."""
     px, py, theta = _columns(model)
+    arc = not getattr(model, "integration", "")
     turn = x_next[:, theta] - x[:, theta]
-    c, s = _mean_direction(x[:, theta], turn, arc=not getattr(model, "integration", ""))
-    scale = c * c + s * s
+    c, s = heading = _mean_direction(x[:, theta], turn, arc=arc)
     dx, dy = x_next[:, px] - x[:, px], x_next[:, py] - x[:, py]
-    return BodyMotion((c * dx + s * dy) / scale, (c * dy - s * dx) / scale, turn)
+    forward, left = c * dx + s * dy, c * dy - s * dx
+    if arc:
+        scale = c * c + s * s
+        forward, left = forward / scale, left / scale
+    return BodyMotion(forward, left, turn, heading)
 
 
 def moved(x: Array, x_next: Array, model: NominalModel, motion: BodyMotion) -> Array:
     """x_next with this motion of the body instead of its own."""
     px, py, theta = _columns(model)
-    c, s = _mean_direction(x[:, theta], motion.turn, arc=not getattr(model, "integration", ""))
+    arc = not getattr(model, "integration", "")
+    c, s = _mean_direction(x[:, theta], motion.turn, arc=True) if arc else motion.heading
     after = x_next.copy()
     after[:, px] = x[:, px] + c * motion.forward - s * motion.left
     after[:, py] = x[:, py] + s * motion.forward + c * motion.left

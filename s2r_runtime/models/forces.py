@@ -17,11 +17,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.hookspecs import NominalModel
+from s2r_runtime.models.bound import BoundModel
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -35,6 +37,9 @@ not chosen by what the coefficient does there: predictions would jump where its 
 
 LEAST = -50.0
 """Of rate times time: a motion that feeds itself grows by e^50 within a step at most, so that numbers stay finite."""
+
+SMALL = 1e-3
+"""Of rate times time: below it a series of four terms is exact to rounding."""
 
 NAMED_RATES = {"vx": "x", "vy": "y", "vz": "z", "qd": "q"}
 """Rates by their names, in models that do not say whose rates their states are. With a heading, vx could be along the body: it must say."""
@@ -63,6 +68,17 @@ Pushing = tuple[Any, str, dict[str, Any]]
 
 def axes(model: NominalModel) -> tuple[Axis, ...]:
     """The model's axes, in the order of their velocities."""
+    if isinstance(model, BoundModel):
+        if model not in _KNOWN:
+            _KNOWN[model] = _axes(model)
+        return _KNOWN[model]
+    return _axes(model)
+
+
+_KNOWN: WeakKeyDictionary[BoundModel, tuple[Axis, ...]] = WeakKeyDictionary()
+
+
+def _axes(model: NominalModel) -> tuple[Axis, ...]:
     rates = {} if "theta" in model.states else {v: q for v, q in NAMED_RATES.items() if {v, q} <= {*model.states}}
     for name, follows in getattr(model, "follows", {}).items():
         if len(follows.of) == 1:
@@ -86,31 +102,28 @@ def mass(model: NominalModel) -> float:
 def pushed(x: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushing], dt: float) -> Array:
     """The result of the step without these effects, x_next (n, nx), with all of them."""
     varies = any(effect.varies for effect, _, _ in pushing)
+    moved = [k for k in axes(model) if any(effect.push(x[:1], k, model, channel, p) is not None for effect, channel, p in pushing)]
+    given = [(x_next[:, k.velocity] - x[:, k.velocity]) / dt for k in moved]
     parts = math.ceil(dt / PART_S - 1e-9) if varies else 1
     h = dt / parts
-    moved = [k for k in axes(model) if any(effect.push(x[:1], k, model, channel, p) is not None for effect, channel, p in pushing)]
-    given = [(x_next[:, axis.velocity] - x[:, axis.velocity]) / dt for axis in moved]
-    now = x.copy()
-    for _ in range(parts):
-        at = now
-        if varies:
-            halves = [_glide(now[:, k.velocity], g, _together(now, k, model, pushing), 0.5 * h) for k, g in zip(moved, given, strict=True)]
-            at = _moved(now, moved, [(v, 0.5 * h * now[:, k.velocity]) for k, (v, _) in zip(moved, halves, strict=True)])
-        ends = [_glide(now[:, k.velocity], g, _together(at, k, model, pushing), h) for k, g in zip(moved, given, strict=True)]
-        now = _moved(now, moved, ends)
+    now, at = (x.copy(), x.copy()) if varies else (x, x)
+    for _ in range(parts if varies else 0):
+        for k, g in zip(moved, given, strict=True):
+            half, _ = _glide(now[:, k.velocity], g, _together(now, k, model, pushing), 0.5 * h)
+            at[:, k.position] = now[:, k.position] + 0.5 * h * now[:, k.velocity]
+            at[:, k.velocity] = half
+        for k, g in zip(moved, given, strict=True):
+            now[:, k.velocity], way = _glide(now[:, k.velocity], g, _together(at, k, model, pushing), h)
+            now[:, k.position] += way
     after = x_next.copy()
-    for axis, g in zip(moved, given, strict=True):
-        way = now[:, axis.position] - x[:, axis.position]
-        after[:, axis.position] += way - (dt * x[:, axis.velocity] + 0.5 * dt * dt * g)
-        after[:, axis.velocity] = now[:, axis.velocity]
-    return after
-
-
-def _moved(x: Array, moved: Sequence[Axis], steps: Sequence[tuple[Array, Array]]) -> Array:
-    after = x.copy()
-    for axis, (v, way) in zip(moved, steps, strict=True):
-        after[:, axis.position] += way
-        after[:, axis.velocity] = v
+    for k, g in zip(moved, given, strict=True):
+        v = np.ascontiguousarray(x[:, k.velocity])
+        if varies:
+            end, way = now[:, k.velocity], now[:, k.position] - x[:, k.position]
+        else:
+            end, way = _glide(v, g, _together(x, k, model, pushing), dt)
+        after[:, k.position] += way - (dt * v + 0.5 * dt * dt * g)
+        after[:, k.velocity] = end
     return after
 
 
@@ -137,48 +150,60 @@ def _sum(a: Pair, b: Pair) -> Pair:
 def _glide(v: Array, given: Array, push: Push, h: float) -> tuple[Array, Array]:
     """v (n,) h seconds later, and the way made, with constant coefficients; given: (n,) acceleration without the push."""
     drive = given + push.drive
-    if _alike(push.rate) and not any(np.any(force) for force in (*push.dry, *(push.hold or ()))):
-        return _free(v, drive, push.rate[0], h)
+    held = push.hold or push.dry
+    if _alike(push.rate) and not any(np.any(force) for force in (*push.dry, *held)):
+        return _moved(v, drive, _flow(push.rate[0], h))
+    forward = v > 0.0
     sign = np.sign(v)
-    rate, dry = _by_sign(push.rate, v > 0.0), _by_sign(push.dry, v > 0.0)
-    pull = drive - sign * dry
-    end, way = _free(v, pull, rate, h)
+    pull = drive - sign * _by_sign(push.dry, forward)
+    flow = _flow(push.rate[0], h)
+    if not _alike(push.rate):
+        back = _flow(push.rate[1], h)
+        flow = Flow(*(_by_sign(pair, forward) for pair in zip(flow, back, strict=True)))
+    end, way = _moved(v, pull, flow)
     stops = np.flatnonzero(end * sign <= 0.0)
     if len(stops):
-        begun, c, b = v[stops], _at(rate, stops), pull[stops]
-        until = np.minimum(_time_to_rest(begun, b, c), h)
-        _, before = _free(begun, b, c, until)
-        held = push.hold or push.dry
-        force = drive[stops]
-        onward = np.where(force > _at(held[0], stops), 1.0, np.where(force < -_at(held[1], stops), -1.0, 0.0))
-        c2, f2 = (_by_sign((_at(pair[0], stops), _at(pair[1], stops)), onward > 0.0) for pair in (push.rate, push.dry))
-        end[stops], after = _free(np.zeros_like(begun), np.where(onward == 0.0, 0.0, force - onward * f2), c2, h - until)
+        begun, force = v[stops], drive[stops]
+        until = np.minimum(_time_to_rest(begun, pull[stops], _by_sign(_at(push.rate, stops), begun > 0.0)), h)
+        _, before = _moved(begun, pull[stops], _flow(_by_sign(_at(push.rate, stops), begun > 0.0), until))
+        up, down = _at(held, stops)
+        onward = np.where(force > up, 1.0, np.where(force < -down, -1.0, 0.0))
+        rate, dry = (_by_sign(_at(pair, stops), onward > 0.0) for pair in (push.rate, push.dry))
+        end[stops], after = _moved(np.zeros_like(begun), np.where(onward == 0.0, 0.0, force - onward * dry), _flow(rate, h - until))
         way[stops] = before + after
     return end, way
 
 
-def _free(v: Array, pull: Array, rate: Value, t: Value) -> tuple[Array, Array]:
-    """v' = pull - rate v for t seconds: v then, and the way made."""
-    z = np.maximum(rate * t, LEAST) if isinstance(rate * t, np.ndarray) else max(rate * t, LEAST)
-    first = _phi1(z)
-    return v * (1.0 - z * first) + pull * t * first, v * t * first + pull * t * t * _phi2(z, first)
+class Flow(NamedTuple):
+    """v' = pull - rate v over a time t, linear in v and pull:  v+ = keep v + first pull,  way = first v + second pull."""
+
+    keep: Value
+    first: Value
+    second: Value
 
 
-def _phi1(z: Value) -> Value:
-    """(1 - exp(-z))/z."""
-    if isinstance(z, float):
-        return 1.0 if z == 0.0 else -math.expm1(-z) / z
-    safe = np.where(z == 0.0, 1.0, z)
-    return np.where(z == 0.0, 1.0, -np.expm1(-safe) / safe)
+def _flow(rate: Value, t: Value) -> Flow:
+    """keep = exp(-z), first = t (1 - exp(-z))/z, second = t² (z - 1 + exp(-z))/z², z = rate t."""
+    z = rate * t
+    if isinstance(z, np.ndarray):
+        z = np.maximum(z, LEAST)
+        safe = np.where(z == 0.0, 1.0, z)
+        one = np.where(z == 0.0, 1.0, -np.expm1(-safe) / safe)
+        small = np.abs(z) < SMALL
+        two = np.where(small, _series(z), (1.0 - one) / np.where(small, 1.0, z))
+        return Flow(1.0 - z * one, t * one, t * t * two)
+    z = max(float(z), LEAST)
+    single = -math.expm1(-z) / z if z else 1.0
+    return Flow(1.0 - z * single, t * single, t * t * (_series(z) if abs(z) < SMALL else (1.0 - single) / z))
 
 
-def _phi2(z: Value, first: Value) -> Value:
-    """(1 - phi1(z))/z; below a thousandth by its series, where the difference loses digits."""
-    small = np.abs(z) < 1e-3
-    series = 0.5 - z * (1.0 / 6.0 - z * (1.0 / 24.0 - z / 120.0))
-    if not np.any(small):
-        return (1.0 - first) / z
-    return series if np.all(small) else np.where(small, series, (1.0 - first) / np.where(small, 1.0, z))
+def _series(z: Value) -> Value:
+    """(z - 1 + exp(-z))/z², where the difference would lose digits."""
+    return 0.5 - z * (1.0 / 6.0 - z * (1.0 / 24.0 - z / 120.0))
+
+
+def _moved(v: Array, pull: Array, flow: Flow) -> tuple[Array, Array]:
+    return flow.keep * v + flow.first * pull, flow.first * v + flow.second * pull
 
 
 def _time_to_rest(v: Array, pull: Array, rate: Value) -> Array:
@@ -197,5 +222,6 @@ def _by_sign(pair: Pair, forward: Mask) -> Value:
     return pair[0] if _alike(pair) else np.where(forward, pair[0], pair[1])
 
 
-def _at(value: Value, rows: NDArray[np.int64]) -> Value:
-    return value[rows] if isinstance(value, np.ndarray) else value
+def _at(pair: Pair, rows: NDArray[np.int64]) -> Pair:
+    first = pair[0][rows] if isinstance(pair[0], np.ndarray) else pair[0]
+    return first, first if pair[1] is pair[0] else pair[1][rows] if isinstance(pair[1], np.ndarray) else pair[1]
