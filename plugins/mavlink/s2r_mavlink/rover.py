@@ -48,6 +48,7 @@ class Rover:
         self._period: float = 1.0 / options.loop_rate
         self._uptime: float = options.uptime
         self.running = True
+        self.sent: dict[str, int] = {}
         self.mode, self.armed, self.state = ROVER_MODES[options.mode], options.armed, 4
         self._doers: dict[str, Callable[[Any], object]] = {
             "COMMAND_LONG": self._command,
@@ -121,6 +122,7 @@ class Rover:
         data = message.pack(self._mav)
         self._mav.seq = (self._mav.seq + 1) % 256
         self._line.write(data)
+        self.sent[message.get_type()] = self.sent.get(message.get_type(), 0) + 1
 
     # ------------------------------------------------------------------ what comes
 
@@ -220,6 +222,7 @@ class Rover:
                 self.state = 5 if state == "critical" else 4
             case ["quit"]:
                 self.running = False
+                self._say(sent=dict(self.sent))
             case []:
                 pass
             case _:

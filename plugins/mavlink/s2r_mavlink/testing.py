@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import random
 import select
 import signal
 import socket
@@ -306,3 +307,42 @@ class Runtime:
     def counters(self) -> dict[str, int]:
         """The transport's."""
         return self.transport.counters()
+
+
+# ---------------------------------------------------------------- spoilt bytes
+
+
+def fuzzed(draw: random.Random, corpus: list[bytes]) -> bytes:
+    """A frame of the corpus, spoilt in one of the ways that lines and attackers have; or noise."""
+    data = bytearray(draw.choice(corpus))
+    for _ in range(draw.randint(1, 3)):
+        way = draw.randrange(7)
+        if not data:
+            break
+        if way == 0:
+            data[draw.randrange(len(data))] ^= 1 << draw.randrange(8)
+        elif way == 1:
+            data[draw.randrange(len(data))] = draw.randrange(256)
+        elif way == 2:
+            del data[draw.randrange(len(data)) :]
+        elif way == 3:
+            at = draw.randrange(len(data))
+            data[at:at] = bytes(draw.randrange(256) for _ in range(draw.randint(1, 20)))
+        elif way == 4:
+            data += draw.choice(corpus)
+        elif way == 5:
+            at = draw.randrange(len(data))
+            del data[at : at + draw.randint(1, 8)]
+        else:
+            data = bytearray(draw.randrange(256) for _ in range(draw.randint(0, 300)))
+    return bytes(data)
+
+
+def flipped(draw: random.Random, frame: bytes) -> bytes:
+    """One to three bits the other way, which the checksum is sure to find at these lengths; never in the message's number, which decides
+    what checksum there is.
+    """
+    data = bytearray(frame)
+    for bit in draw.sample([8 * i + b for i in range(len(data)) if i not in (0, 7, 8, 9) for b in range(8)], draw.randint(1, 3)):
+        data[bit // 8] ^= 1 << bit % 8
+    return bytes(data)

@@ -19,7 +19,7 @@ from s2r_mavlink.dialect import MESSAGES
 from s2r_mavlink.frames import build, header, is_frame
 from s2r_mavlink.rover_lines import TcpServerLine, UdpLine
 from s2r_mavlink.signing import stamp_of
-from s2r_mavlink.testing import HOLD, INPUTS, STATES, Robot, Runtime, free_port
+from s2r_mavlink.testing import HOLD, INPUTS, STATES, Robot, Runtime, free_port, fuzzed
 from s2r_mavlink.transport import MavlinkTransport
 
 from s2r_runtime.messages import Command, Frame, LinkChanged, Observation
@@ -354,32 +354,6 @@ def test_everything_that_is_sent_is_signed_and_the_log_holds_no_signature(signed
 
 
 # ---------------------------------------------------------------- any bytes at all
-
-
-def fuzzed(draw: random.Random, corpus: list[bytes]) -> bytes:
-    """A frame of the corpus, spoilt in one of the ways that lines and attackers have; or noise."""
-    data = bytearray(draw.choice(corpus))
-    for _ in range(draw.randint(1, 3)):
-        way = draw.randrange(7)
-        if not data:
-            break
-        if way == 0:
-            data[draw.randrange(len(data))] ^= 1 << draw.randrange(8)
-        elif way == 1:
-            data[draw.randrange(len(data))] = draw.randrange(256)
-        elif way == 2:
-            del data[draw.randrange(len(data)) :]
-        elif way == 3:
-            at = draw.randrange(len(data))
-            data[at:at] = bytes(draw.randrange(256) for _ in range(draw.randint(1, 20)))
-        elif way == 4:
-            data += draw.choice(corpus)
-        elif way == 5:
-            at = draw.randrange(len(data))
-            del data[at : at + draw.randint(1, 8)]
-        else:
-            data = bytearray(draw.randrange(256) for _ in range(draw.randint(0, 300)))
-    return bytes(data)
 
 
 def test_any_bytes_end_in_a_fault_or_nothing_and_never_in_an_exception() -> None:
