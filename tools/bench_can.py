@@ -232,13 +232,17 @@ def at_100_hz(seconds: float) -> dict[str, Any]:
         with bench.robot() as robot:
             bench.until(lambda s: s["link"])
             shares: dict[str, float] = {}
+            reasons: dict[str, str] = {}
 
             def measured(what: str) -> None:
                 pids = {key: pid for key, pid in bench.status()["pids"].items() if pid}
                 before, begin = {key: cpu_s(pid) for key, pid in pids.items()}, time.monotonic()
                 time.sleep(seconds / 2)
+                after = bench.status()
                 for key, pid in pids.items():
-                    shares[f"{what}_{key}_core"] = (cpu_s(pid) - before[key]) / (time.monotonic() - begin)
+                    if after["pids"].get(key) == pid:  # else it ended, and `reason` says why
+                        shares[f"{what}_{key}_core"] = (cpu_s(pid) - before[key]) / (time.monotonic() - begin)
+                reasons[what] = f"gate {after['gate']}, {after['reason'] or 'no reason'}"
 
             bench.drive()
             measured("driving")
@@ -276,6 +280,7 @@ def at_100_hz(seconds: float) -> dict[str, Any]:
         "commands_refused_by_robot": tally["commands_refused"],
         "commands_after_its_end": max(0, counters["sent"] - tally["commands"] - tally["commands_refused"]),
         "counters": {key: value for key, value in counters.items() if value},
+        "at_the_end_of": reasons,
         **shares,
     }
 

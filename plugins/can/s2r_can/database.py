@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import logging
 import re
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -34,7 +36,12 @@ class Database:
 
     def __init__(self, option: Any) -> None:
         self.name, text = _text(option)
-        self._messages = {message.name: message for message in _parsed(self.name, text).messages}
+        messages = _parsed(self.name, text).messages
+        self._messages = {message.name: message for message in messages}
+        self._twice = {name for name, count in Counter(message.name for message in messages).items() if count > 1}
+        self._same: dict[int, list[str]] = {}
+        for message in messages:
+            self._same.setdefault(key_of(message.frame_id, extended=message.is_extended_frame), []).append(message.name)
         self._branches = {int(number): set(_BRANCH.findall(body)) for number, body in _MESSAGE.findall(text)}
 
     def message(self, name: object, where: str) -> Message:
@@ -42,6 +49,10 @@ class Database:
         found = self._messages.get(name) if isinstance(name, str) else None
         if found is None:
             raise ConfigError(f"{where}: {self.name} has no message {name!r}; {_nearest(str(name), list(self._messages))}")
+        same = self._same[key_of(found.frame_id, extended=found.is_extended_frame)]
+        if name in self._twice or len(same) > 1:
+            what = f"has several messages {name!r}" if name in self._twice else f"gives one identifier to {' and '.join(same)}"
+            raise ConfigError(f"{where}: {self.name} {what}: leave the right one in it")
         if found.is_container:
             raise ConfigError(f"{where}: message {name!r} is a container, which cannot be read")
         return found
@@ -56,7 +67,7 @@ class Database:
         if not dot:
             having = [m for m in self._messages.values() if any(s.name == name for s in m.signals)]
             if len(having) == 1:
-                return self.signal_in(having[0], name, where)
+                return self.signal_in(self.message(having[0].name, where), name, where)
             if having:
                 several = ", ".join(f"{m.name}.{name}" for m in having[:5])
                 raise ConfigError(f"{where}: {len(having)} messages of {self.name} have a signal {name!r}: say which: {several}")
@@ -96,6 +107,7 @@ def _text(option: Any) -> tuple[str, str]:
 def _parsed(name: str, text: str) -> CanDatabase:
     import cantools
 
+    logging.getLogger("cantools").setLevel(logging.CRITICAL)  # what it warns of is refused here, where it matters
     suffix = Path(name).suffix.lower().removeprefix(".")
     kind = FORMATS.get(suffix, "dbc")
     try:
