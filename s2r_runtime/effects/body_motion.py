@@ -54,10 +54,11 @@ def moved(x: Array, x_next: Array, model: NominalModel, motion: BodyMotion) -> A
     return after
 
 
-def mean_heading(x: Array, turn: Array, model: NominalModel) -> tuple[Array, Array]:
-    """Mean of (cos, sin) of the heading over the step, (n,) each: at its start by Euler's rule, along the arc otherwise."""
-    theta = x[:, model.states.index("theta")]
-    return _mean_direction(theta, turn, arc=getattr(model, "integration", "") != "euler")
+def mean_of_twice(x: Array, x_next: Array, model: NominalModel) -> tuple[Array, Array]:
+    """Mean of (cos, sin) of twice the heading over the step, (n,) each: at its start by Euler's rule, along the arc otherwise."""
+    theta = model.states.index("theta")
+    turn = x_next[:, theta] - x[:, theta]
+    return _mean_direction(2.0 * x[:, theta], 2.0 * turn, arc=getattr(model, "integration", "") != "euler")
 
 
 def _mean_direction(theta: Array, turn: Array, *, arc: bool) -> tuple[Array, Array]:

@@ -7,8 +7,8 @@ a single axis  v' += x/mass
 
 from __future__ import annotations
 
-from s2r_runtime.effects.body_motion import body_motion, mean_heading, moved
-from s2r_runtime.effects.constant_disturbance import ConstantDisturbance, directions
+from s2r_runtime.effects.body_motion import mean_of_twice
+from s2r_runtime.effects.constant_disturbance import ConstantDisturbance, directions, shifted
 from s2r_runtime.effects.step_effect import Array, Values, has_pose
 from s2r_runtime.hookspecs import NominalModel
 from s2r_runtime.models.forces import axes, pushed
@@ -24,16 +24,16 @@ class GravitySlope(ConstantDisturbance):
         return ("*",) if directions(model) and (has_pose(model) or axes(model)) else ()
 
     def frame(self, model: NominalModel, channel: str) -> str:
-        """It is felt along the body."""
-        return "body"
+        """It adds along the headings that the step has had."""
+        return "world"
 
     def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
         """Rates on a pose, forces on axes."""
         if self.pushes(model, channel):
             return pushed(x, x_next, model, [(self, channel, p)], dt)
-        motion = body_motion(x, x_next, model)
-        c, s = mean_heading(x, motion.turn, model)
-        return moved(x, x_next, model, motion._replace(forward=motion.forward + dt * (float(p["x"]) * c + float(p["y"]) * s)))
+        px, py = float(p["x"]), float(p["y"])
+        c, s = mean_of_twice(x, x_next, model)
+        return shifted(x_next, model, 0.5 * dt * (px + px * c + py * s), 0.5 * dt * (py + px * s - py * c))
 
 
 EFFECT = GravitySlope()
