@@ -153,20 +153,30 @@ class ComposedModel:
 
     def advance(self, x: Array, mean: Array, end: Array) -> Array:
         """x one step later under an input that acts as `act` says; angles are not wrapped."""
-        given = self.for_effects
-        for a in reversed(self._sensors):
-            x = a.effect.to_true(x, given, a.channel, a.p)
+        x = self.true(x)
         x_next = self.nominal.step(x, mean, self.dt, self.parameters)
         if end is not mean:
             for state, name in getattr(self.nominal, "reached", {}).items():
                 x_next[:, self.states.index(state)] = end[:, self.inputs.index(name)]
+        return self.measured(self.corrected(x, mean, x_next, self.for_effects))
+
+    def corrected(self, x: Array, u: Array, x_next: Array, given: BoundModel) -> Array:
+        """x_next (n, nx), true, as effects of stage `step` change it. given: how it was reached (`integration`)."""
         for a in self._after:
-            x_next = a.effect.after_step(x, mean, x_next, given, a.channel, self.dt, a.p)
-        if self._forces:
-            x_next = pushed(x, x_next, given, self._forces, self.dt)
+            x_next = a.effect.after_step(x, u, x_next, given, a.channel, self.dt, a.p)
+        return pushed(x, x_next, given, self._forces, self.dt) if self._forces else x_next
+
+    def true(self, x: Array) -> Array:
+        """Measured states (n, nx) -> true ones."""
+        for a in reversed(self._sensors):
+            x = a.effect.to_true(x, self.for_effects, a.channel, a.p)
+        return x
+
+    def measured(self, x: Array) -> Array:
+        """True states (n, nx) -> measured ones."""
         for a in self._sensors:
-            x_next = a.effect.to_measured(x_next, given, a.channel, a.p)
-        return x_next
+            x = a.effect.to_measured(x, self.for_effects, a.channel, a.p)
+        return x
 
     @cached_property
     def for_effects(self) -> BoundModel:

@@ -8,7 +8,7 @@ One period of dt, for the pose (x, y, theta) and a command (v, w):
     motion     exact: along the arc of (v, w);  euler: along the tangent at the period's start
     walls      the position is clamped to the arena: the robot stops at its wall, wheels spinning
 
-    observation = pose + noise, theta in (-pi, pi]
+    observation = pose + noise, theta in (-pi, pi]; of the pose that the effects on sensors make of it
 
 Scalar arithmetic, because a robot in lockstep is asked for thousands of periods a second; effects of the library are batched over
 arrays and cost some ten microseconds each, which a robot pays that has them. All randomness is seeded, and drawn once a period
@@ -55,7 +55,7 @@ class Body:
 
     def observe(self) -> Pose:
         """The pose as measured now; call once a period."""
-        x, y, theta = self.pose
+        x, y, theta = self.pose if self._library is None else self._library.measured(self.pose)
         gauss, position = self._noise.gauss, self.sheet.sigma_position
         return (x + gauss(0.0, position), y + gauss(0.0, position), _wrapped(theta + gauss(0.0, self.sheet.sigma_heading)))
 
@@ -84,7 +84,7 @@ class Body:
             self._faults[effect.key] = effect.fault
         else:
             known = self._library.specs if self._library else {}
-            self._library = Library({**known, effect.key: effect.spec}, self.sheet.dt)
+            self._library = Library({**known, effect.key: effect.spec}, self.sheet.dt, arcs=self.sheet.integration == "exact")
         return effect.key
 
     def clear(self) -> None:

@@ -9,6 +9,7 @@ no effect of that library has, so that it can be seen what a tracer says where i
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -44,26 +45,30 @@ def parse_effect(text: str) -> ParsedEffect:
         if not equals:
             raise ConfigError(f"effect {text!r}: {word!r} must be PARAMETER=VALUE")
         try:
-            parameters[key] = float(value)
+            parameters[key] = json.loads(value) if value.startswith("[") else float(value)
         except ValueError:
             parameters[key] = value
     spec = EffectSpec(name, channel or "*", parameters)
     fault = _own(name, parameters, text) if name in _OWN else None
     if fault is None:
-        Library({text: spec}, 1.0)  # says at once what is wrong with it
+        Library({text: spec}, 1.0, arcs=True)  # says at once what is wrong with it
     return ParsedEffect(f"{name}:{spec.channel}", spec, fault)
 
 
 class Library:
-    """Effects of the runtime's library, composed as its models do it, on one robot. specs: by key, in the order in which they act."""
+    """Effects of the runtime's library, composed as its models do it, on one robot. specs: by key, in the order in which they act; arcs:
+    whether the robot moves along arcs of its own accord.
+    """
 
-    def __init__(self, specs: dict[str, EffectSpec], dt: float) -> None:
+    def __init__(self, specs: dict[str, EffectSpec], dt: float, *, arcs: bool) -> None:
         import numpy as np  # a robot without such effects does without numpy
 
+        from s2r_runtime.models.bound import integrating
         from s2r_runtime.models.composed import compose
 
         self.specs, self._array = specs, np.array
         self._model: ComposedModel = compose(ModelSpec("unicycle", dt, effects=tuple(specs.values())), "robot")
+        self._reached = integrating(self._model.nominal, "") if arcs else self._model.for_effects
         self._hidden = list(self._model.at_rest(1))
 
     def act(self, twist: Twist) -> Twist:
@@ -76,13 +81,13 @@ class Library:
 
     def correct(self, before: Pose, twist: Twist, after: Pose) -> Pose:
         """What the effects on the step make of the pose after it."""
-        stepwise = [a for a in self._model.effects if a.effect.stage == "step"]
-        if not stepwise:
-            return after
-        x, u, x_next = self._array([before]), self._array([twist]), self._array([after])
-        for a in stepwise:
-            x_next = a.effect.after_step(x, u, x_next, self._model.nominal, a.channel, self._model.dt, a.p)
-        return float(x_next[0, 0]), float(x_next[0, 1]), float(x_next[0, 2])
+        x = self._model.corrected(self._array([before]), self._array([twist]), self._array([after]), self._reached)
+        return float(x[0, 0]), float(x[0, 1]), float(x[0, 2])
+
+    def measured(self, pose: Pose) -> Pose:
+        """What the effects on sensors make of the pose."""
+        x = self._model.measured(self._array([pose]))
+        return float(x[0, 0]), float(x[0, 1]), float(x[0, 2])
 
 
 def _slip_patch(x: float, y: float, radius: float, gain: float) -> Fault:

@@ -119,6 +119,30 @@ def test_effect_acts_after_the_wheels_limit() -> None:
     assert held(b, 0.0, 10.0, 1)[2] == pytest.approx(0.033 * 0.5 * limit)
 
 
+def test_robot_slides_along_the_arc_that_it_drives() -> None:
+    b = body()
+    b.switch_on("constant_disturbance:body x=0 y=0.1")
+    x, y, _ = held(b, 0.0, 1.0, 90)
+    turned = 90 * 0.033
+    # the left of a heading that turns from 0: (-sin, cos), averaged over the way
+    assert (x, y) == pytest.approx((0.1 * (math.cos(turned) - 1.0), 0.1 * math.sin(turned)), abs=1e-12)
+
+
+def test_sensor_that_is_mounted_askew_shows_another_pose_and_the_robot_is_where_it_is() -> None:
+    b, straight = body(), body()
+    b.switch_on("heading_offset:theta angle=0.2")
+    b.switch_on("sensor_lever_arm x=0.1 y=0")
+    x, y, theta = held(b, 0.1, 0.5, 40)
+    assert (x, y, theta) == held(straight, 0.1, 0.5, 40)
+    assert b.observe() == pytest.approx((x + 0.1 * math.cos(theta + 0.2), y + 0.1 * math.sin(theta + 0.2), theta + 0.2))
+
+
+def test_effect_with_a_matrix_is_read() -> None:
+    b = body(start=(0.5, 0.0, 0.0))
+    b.switch_on("position_field matrix=[[0,0],[0.2,0]]")
+    assert held(b, 0.0, 0.0, 10)[:2] == pytest.approx((0.5, 0.5 * 0.2 * 0.33))
+
+
 def test_slip_patch_is_a_place() -> None:
     b = body()
     b.switch_on("slip_patch x=0.5 y=0 radius=0.2 gain=0.4")
