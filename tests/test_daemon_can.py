@@ -65,6 +65,7 @@ class CanRig(Rig):
             old = f'interface = "udp_multicast"\nchannel = "{channel}"\nport = {port}'
             assert text.count(old) == 1
             text = text.replace(old, "\n".join(f"{key} = {json.dumps(value)}" for key, value in self.sides[side].items()))
+        text = text.replace('trigger = "Heading"', 'command_cycle = 0.02\ntrigger = "Heading"')  # copies between the commands, audited too
         self.profile.write_text(text + "\n[transport.timeouts]\nBaseStatus = 0.6\n")
         (folder / "amr-can.dbc").write_bytes((ROOT / "profiles" / "amr-can.dbc").read_bytes())
 
@@ -141,6 +142,7 @@ def test_campaign_certificate_drive_and_audit_over_can(rig: CanRig) -> None:
     counters = rig.status()["counters"]
     assert rig.stop() == 0
     assert counters["received"] > 500
+    assert counters["copies"] > 100
     assert counters["malformed"] == counters["checksum"] == counters["dropped_in"] == counters["dropped_out"] == counters["strangers"] == 0
     assert {m.source for m in rig.messages("out/send") if isinstance(m, Send)} == {"recovery", "sampler", "controller"}
     (log,) = rig.log_files()

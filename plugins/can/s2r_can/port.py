@@ -52,6 +52,7 @@ class Port:
         self._side, self._config, self._take, self._filters = side, config, take, filters
         self.trouble = ""
         """Why nothing can be heard or sent; empty while the interface works."""
+        self._failing: tuple[float, float, str] = (0.0, 0.0, "")
         self.counts = dict.fromkeys(("received", "sent", "dropped", "errors", "opened"), 0)
         self._bus: can.BusABC | None = None
         self._ending = threading.Event()
@@ -93,6 +94,11 @@ class Port:
         threads, self._threads = self._threads, []
         for thread in threads:
             thread.join(2.0)
+
+    def refuses(self, seconds: float) -> str:
+        """Why nothing that was sent in so many seconds was taken; empty where something was, or nothing was sent."""
+        first, last, why = self._failing
+        return f"{self._named()} takes no frames: {why}" if first and last - first > seconds > time.monotonic() - last else ""
 
     # ------------------------------------------------------------------ in
 
@@ -222,14 +228,17 @@ class Port:
             if self._config["interface"] in ECHOING:
                 self._expect_echo(record)
             bus.send(_message(record), timeout=0.0 if self._prompt else LISTEN_S)
-        except Exception:  # noqa: BLE001 - a full buffer, a cable, a driver: the robot's time-out and ours deal with it
+        except Exception as error:  # noqa: BLE001 - a full buffer, a cable, a driver: the robot's time-out and ours deal with it
             self._count(dropped=1)
+            now = time.monotonic()
+            self._failing = (self._failing[0] or now, now, _said(error))
             connection = _connection(bus)
             if connection is not None:  # half a line may have left: whatever followed it would be read wrong
                 with contextlib.suppress(OSError):
                     connection.shutdown(socket.SHUT_RDWR)
             return False
         self._count(sent=1)
+        self._failing = (0.0, 0.0, "")
         return True
 
     def _count(self, *, sent: int = 0, dropped: int = 0) -> None:

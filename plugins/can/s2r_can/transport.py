@@ -161,7 +161,7 @@ class CanTransport:
 
     def poll(self, now_ns: int) -> list[LinkChanged]:
         """Link lost or back, by the time since the last observation, and by what the interface says. now_ns: the host's monotonic clock."""
-        trouble = self._robot.trouble if self._robot is not None else ""
+        trouble = (self._robot.trouble or self._robot.refuses(self._timeout_ns * 1e-9)) if self._robot is not None else ""
         silent_ns = now_ns - self._heard_ns
         if silent_ns <= self._timeout_ns and not trouble:
             if self._up is not False or self._observer.bus_off or self._observer.newest[0] < 0:

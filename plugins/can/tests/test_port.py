@@ -319,3 +319,28 @@ def test_silence_names_the_messages_that_are_missing() -> None:
         assert line.until(lambda: line.links == [False])
         (change,) = [m for m in line.messages if isinstance(m, LinkChanged)]
         assert change.detail == "no observation yet; missing: Pose (no good frame)"
+
+
+def test_interface_that_takes_no_commands_is_a_lost_link() -> None:
+    """Such as one that was not opened for CAN FD while the command needs it: the robot is heard, and hears nobody."""
+    with VirtualRig() as rig:
+        rig.transport.open()
+        line = Line(rig)
+        seq = line.link((0.0, 0.0, 0.0))
+        port_ = rig.transport._robot
+        assert port_ is not None
+        assert port_._bus is not None
+
+        def refuse(message: can.Message, timeout: float | None = None) -> None:
+            raise can.CanOperationError("cannot send FD message over bus with CAN FD disabled")
+
+        port_._bus.send = refuse  # type: ignore[method-assign]
+        end = time.monotonic() + PATIENCE_S
+        while line.links[-1] and time.monotonic() < end:
+            seq += 1
+            rig.robot.publish(seq, seq * 10_000_000, (0.0, 0.0, 0.0))
+            line.transport.send(line.transport.encode(Command(seq, 0, "sampler", (0.1, 0.0), seq, 10**8)))
+            line.turn()
+            time.sleep(0.005)
+        (change,) = [m for m in line.messages if isinstance(m, LinkChanged) and not m.up]
+        assert "takes no frames: cannot send FD message over bus with CAN FD disabled" in change.detail
