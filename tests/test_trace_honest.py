@@ -50,9 +50,9 @@ def test_wandering_yaw_noise_gets_no_name():
     [
         ([("wavy", "w", {"height": 0.3})], None, "w"),
         ([], lambda x, v, w: (v * (1 + 0.3 * np.cos(x[:, 2])), w * (1 + 0.3 * np.cos(x[:, 2])), 0.0, 0.0), "heading"),
-        ([], lambda x, v, w: (v, w, -0.06 * x[:, 1], 0.06 * x[:, 0]), "position"),
+        ([], lambda x, v, w: (v * np.where(np.sin(4.0 * x[:, 0]) > 0.0, 0.7, 1.1), w, 0.0, 0.0), "position"),
     ],
-    ids=["wavy response", "gain that depends on the heading", "position field"],
+    ids=["wavy response", "gain that depends on the heading", "stripes that slip"],
 )
 def test_an_effect_outside_the_library_gets_no_name_but_what_it_depends_on(effects, outside, depends_on):
     results = [trace(data, declared()) for data in recordings(effects, 3, steps=1200, seed=21, outside=outside)]

@@ -25,9 +25,6 @@ SLIDES = 80
 NEAREST = 0.08
 """Of the recording: slides by less than this leave slow things in place."""
 
-BEYOND = 5.0
-"""Nats by which the evidence must exceed that of every slide."""
-
 
 @dataclass(frozen=True)
 class Evidence:
@@ -44,8 +41,10 @@ def evidence(product: Array, slope: Array) -> Evidence:
     return Evidence(float(told[0]), float(best[0]))
 
 
-def beyond_chance(white: Array, z: Array, weight: Array) -> bool:
-    """Whether the evidence is out of reach of the slid residual's. white: (n, nx, m) whitened terms; z, weight: (n, nx)."""
+def margin(white: Array, z: Array, weight: Array, least: float) -> float:
+    """Nats by which the evidence exceeds that of every slide of the residual; 0 if it is below `least`. white: (n, nx, m) whitened
+    terms; z, weight: (n, nx).
+    """
     n, m = len(z), white.shape[2]
     x, push = white.reshape(-1, m), z * weight
     product = x.T @ (x * weight.reshape(-1, 1))
@@ -54,7 +53,7 @@ def beyond_chance(white: Array, z: Array, weight: Array) -> bool:
     slid = np.stack([push.ravel(), *(np.roll(push, int(k), axis=0).ravel() for k in shifts)], axis=1)
     values, vectors = np.linalg.eigh(product)
     told, _ = _evidences(values, vectors.T @ (x.T @ slid), product)
-    return bool(told[0] > np.max(told[1:]) + BEYOND)
+    return float(told[0] - max(float(np.max(told[1:])), 0.0)) if told[0] > least else 0.0
 
 
 def _evidences(values: Array, along: Array, product: Array) -> tuple[Array, Array]:

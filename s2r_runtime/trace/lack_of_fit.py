@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.evidence import beyond_chance, evidence
+from s2r_runtime.trace.evidence import evidence, margin
 from s2r_runtime.trace.fitting import Fit, Problem
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
 from s2r_runtime.trace.residual import acting, residual, rms, rollout, rollout_starts, state_jacobian
@@ -54,6 +54,15 @@ MATTERS = 0.05
 
 SLIDING = ("constant", "time")
 """What slides along with the residual, so that sliding tells nothing."""
+
+SLOW = 3.0
+"""Times the usual nats for those: noise that wanders foretells the next second well, whatever its cause."""
+
+BEYOND = 8.0
+"""Nats by which the evidence must exceed that of every slide."""
+
+MOST_GROUPS = 3
+"""Groups that are named at most."""
 
 COLOURED = 0.2
 """Autoregression coefficient from which noise is called coloured."""
@@ -129,23 +138,35 @@ def _forward(left: _Left, found: Sequence[tuple[str, Array]]) -> tuple[list[_Jud
     threshold = math.log(len(found) / ALPHA)
     looked = _best_of_each(sorted(((_first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True), found)
     gains = {token: 0.0 for token, _ in found}
-    chosen: list[_Judged] = []
-    rest = [(found[i][0], _leading(left, found[i][1])) for _, i in looked[:FEW]]
-    while rest and len(chosen) < 3:
-        before = chosen[-1] if chosen else None
-        judged = [_judge(left, token, x if before is None else np.concatenate([before.x, x], axis=2)) for token, x in rest]
-        if before is None:
-            for j in judged:
-                gains[j.token] = max(gains[j.token], j.gain)
-            rest = [(token, x) for token, x in rest if gains[token] > threshold]
-        most = max(j.gain for j in judged)
-        best = min((j for j in judged if j.gain >= most - ALIKE), key=lambda j: (j.x.shape[2], -j.gain))
-        reached = before.gain if before else 0.0
-        if best.gain - reached < max(threshold, ADDS * reached) or not _beyond_chance(left, best, before, threshold):
+    terms = [(found[i][0], _leading(left, found[i][1])) for _, i in looked[:FEW]]
+    judged = [_judge(left, token, x) for token, x in terms]
+    for j in judged:
+        gains[j.token] = max(gains[j.token], j.gain)
+    strengths = [(_strength(left, j, threshold), j) for j in judged]
+    strongest = max(strength for strength, _ in strengths)
+    if strongest <= 0.0:
+        return [], gains
+    chosen = [min((j for s, j in strengths if s >= strongest - ALIKE), key=lambda j: (j.x.shape[2], -j.gain))]
+    rest = [(j.token, j.x) for j in judged if gains[j.token] > threshold and j.token != chosen[0].token]
+    while rest and len(chosen) < MOST_GROUPS:
+        before = chosen[-1]
+        judged = [_judge(left, token, np.concatenate([before.x, x], axis=2)) for token, x in rest]
+        best = max(judged, key=lambda j: j.gain)
+        if best.gain - before.gain < max(threshold * best.scatter, ADDS * before.gain):
             break
         chosen.append(best)
         rest = [(token, x) for token, x in rest if token != best.token]
     return chosen, gains
+
+
+def _strength(left: _Left, j: _Judged, threshold: float) -> float:
+    """Nats by which a dictionary is beyond chance, of whichever test shows it more clearly; 0 if neither does."""
+    needed = threshold * j.scatter * (SLOW if j.token in SLIDING else 1.0)
+    foretold = j.gain if j.gain > needed else 0.0
+    if j.token in SLIDING:
+        return foretold
+    out_of_reach = margin(left.fit.whiten(j.x), left.fit.z, noises.weight(left.fit.z), threshold)
+    return max(foretold, out_of_reach if out_of_reach > BEYOND else 0.0)
 
 
 def _best_of_each(looked: list[tuple[float, int]], found: Sequence[tuple[str, Array]]) -> list[tuple[float, int]]:
@@ -177,14 +198,6 @@ def _leading(left: _Left, x: Array) -> Array:
     return np.asarray(x @ vectors[:, -LEADING:])
 
 
-def _beyond_chance(left: _Left, best: _Judged, before: _Judged | None, threshold: float) -> bool:
-    if best.gain - (before.gain if before else 0.0) > threshold * best.scatter:
-        return True
-    if before is not None or best.token in SLIDING:
-        return False
-    return beyond_chance(left.fit.whiten(best.x), left.fit.z, noises.weight(left.fit.z))
-
-
 def _judge(left: _Left, token: str, x: Array) -> _Judged:
     """Held-out gain. Several passes: what is left after one has less noise, under which the next one sees more. The first one takes
     no colour into account: the colour that is there may well be the structure.
@@ -192,21 +205,30 @@ def _judge(left: _Left, token: str, x: Array) -> _Judged:
     whiten: Whitener = left.fit.whiten
     colour: Colour | None = None
     joined = left.given.steps.joined
-    betas, gain, scatter = np.zeros((BLOCKS, x.shape[2])), 0.0, 1.0
+    betas: Array | None = None
+    gain, scatter = 0.0, 1.0
     for _ in range(PASSES):
         betas_now = _betas(left, x, whiten, colour)
+        betas = betas_now if betas is None else betas
         rest = left.r - np.einsum("kim,km->ki", x, betas_now[left.block])
         level = noises.estimate(rest, left.f, joined, left.given.floor)
         whiten = Whitener(level, left.f, joined)
         z = whiten(rest)
         colour = noises.colour(z, joined)
-        z = colour(z, joined)
-        likelihood = float(np.sum(noises.log_density(z))) - whiten.logdet - len(z) * float(np.sum(np.log(colour.scale)))
-        if likelihood - left.fit.coloured > gain:
+        reached = _likelihood(z, whiten, colour, joined)
+        # without the terms, under the same noise: a better estimate of the noise alone is no structure
+        bare = max(left.fit.coloured, *(_likelihood(whiten(left.r), whiten, c, joined) for c in (colour, left.fit.colour)))
+        if reached - bare > gain:
             push = colour(whiten(left.r - rest), joined)
-            gain, betas = likelihood - left.fit.coloured, betas_now
+            z = colour(z, joined)
+            gain, betas = reached - bare, betas_now
             scatter = _scatter(push * z * noises.weight(z), push, left.block)
-    return _Judged(token, x, gain, scatter, betas)
+    return _Judged(token, x, gain, scatter, betas_now if betas is None else betas)
+
+
+def _likelihood(z: Array, whiten: Whitener, colour: Colour, joined: NDArray[np.bool_]) -> float:
+    """Log likelihood of a whitened residual, coloured."""
+    return float(np.sum(noises.log_density(colour(z, joined)))) - whiten.logdet - len(z) * float(np.sum(np.log(colour.scale)))
 
 
 def _scatter(scores: Array, push: Array, block: NDArray[np.int64]) -> float:

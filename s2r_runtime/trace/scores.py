@@ -8,17 +8,21 @@ score   gain less price
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain
 from s2r_runtime.trace.leftover import Leftover
-from s2r_runtime.trace.screening import screen
+from s2r_runtime.trace.screening import Screened, screen
 from s2r_runtime.trace.slots import Added
 
 FEW = 10
-"""Candidates that are fitted as composed models, after screening."""
+"""Effects that are fitted as composed models, after screening."""
+
+PLACES = 2
+"""Places in the list of effects that are fitted of one candidate."""
 
 HOPELESS, HOPELESS_SHARE = 2.0, 0.05
 """A candidate that screening gives fewer nats, or less than this share of the best one's, is not fitted."""
@@ -61,16 +65,30 @@ def best_candidates(given: Problem, base: Fit, few: int = FEW, bar: Bar = STRICT
     """The candidates for one more effect, fitted, best score first; and how many starts were looked at."""
     screened, tried = screen(given, base, candidates(base.model, given.data, Leftover(given, base)))
     scored: dict[tuple[str, str], Scored] = {}
-    promising = [s for s in screened[:few] if s.value > max(HOPELESS, HOPELESS_SHARE * screened[0].value)]
+    promising = _promising(screened, few)
     for s in promising:
         fit = fitted(given, base, s.start, 2)
         value = gain(fit, base) - bar.price(fit.k - base.k, len(given.steps))
         key = (s.candidate.name, s.candidate.channel)
         if key not in scored or value > scored[key].score:
             scored[key] = Scored(*key, value, fit)
-    for s in screened[len(promising) :]:
+    for s in screened:
         scored.setdefault((s.candidate.name, s.candidate.channel), Scored(s.candidate.name, s.candidate.channel, min(s.value, 0.0)))
     return sorted(scored.values(), key=lambda s: (s.fit is None, -s.score)), tried
+
+
+def _promising(screened: Sequence[Screened], few: int) -> list[Screened]:
+    """The best of so many (effect, channel), each at its two best places in the list."""
+    kept: list[Screened] = []
+    places: dict[tuple[str, str], int] = {}
+    for s in screened:
+        key = s.candidate.name, s.candidate.channel
+        if s.value <= max(HOPELESS, HOPELESS_SHARE * screened[0].value) or (key not in places and len(places) == few):
+            break
+        places[key] = places.get(key, 0) + 1
+        if places[key] <= PLACES:
+            kept.append(s)
+    return kept
 
 
 def names(model: ComposedModel) -> tuple[tuple[str, str], ...]:

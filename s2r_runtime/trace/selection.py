@@ -31,12 +31,15 @@ from s2r_runtime.trace.fitting import (
 from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
 from s2r_runtime.trace.rivals import CLOSE, rivals
 from s2r_runtime.trace.scores import STRICT, Bar, Scored, best_candidates, name_of, names
-from s2r_runtime.trace.slots import values_of, with_values
+from s2r_runtime.trace.slots import bounds_of, values_of, with_values
 
 Array = NDArray[np.float64]
 
 RELEVANT = 0.05
 """An effect that lowers no rollout error by this share is left out: nobody would notice it."""
+
+WITHIN = 0.4
+"""Of a step: what stamps off the grid can look like."""
 
 MOST = 5
 """Effects that are looked for at most."""
@@ -84,7 +87,22 @@ def select(given: Problem, model: ComposedModel, horizon: int, progress: Callabl
 
 def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int, bar: Bar = STRICT) -> bool:
     """Significant and relevant."""
-    return significant(given, fit, base, tried, bar) and relevant(given, fit, base, horizon)
+    return significant(given, fit, base, tried, bar) and _told_by_stamps(given, fit, base) and relevant(given, fit, base, horizon)
+
+
+def _told_by_stamps(given: Problem, fit: Fit, base: Fit) -> bool:
+    """False for a time within a step where rows do not lie on the step: stamps, averages and reality differ by that much."""
+    data = given.data
+    if not data.interpolated and all(run.lasts is None for run in data.runs):
+        return True
+    there = names(base.model)
+    values = values_of(fit.model, fit.free)
+    new = [
+        (bounds_of(fit.model, slot), value)
+        for slot, value in zip(fit.free, values.tolist(), strict=True)
+        if name_of(fit.model.effects[slot.place]) not in there
+    ]
+    return all(p.unit != "s" or p.neutral != 0.0 or value > WITHIN * data.dt for p, value in new)
 
 
 def significant(given: Problem, fit: Fit, base: Fit, tried: int, bar: Bar = STRICT) -> bool:
