@@ -137,6 +137,16 @@ def test_the_time_of_a_change_is_found_in_the_residual(share, gain, gaps):
     assert found[0]["gain"] == pytest.approx(gain, abs=5.0 * 0.004 / np.sqrt(np.sum(pushes[t >= when] ** 2)) + 0.01)
 
 
+def test_a_change_where_nothing_was_measured_is_put_in_the_middle_of_that():
+    effect, rng = registry().get("effects", "regime_change"), np.random.default_rng(7)
+    t, pushes, r = _along(2000, rng, 1.0)
+    pushes *= np.repeat(rng.uniform(0.5, 1.5, 100), 20)[:, None]
+    r += pushes * -0.4 * (t >= 47.0)[:, None]
+    seen = (t < 40.0) | (t >= 60.0)
+    found = effect.starts_from_residual(r[seen], t[seen], pushes[seen], UNICYCLE, "w", DT)
+    assert found[0]["time"] == pytest.approx(50.0, abs=DT)
+
+
 @pytest.mark.parametrize("name", ["periodic_disturbance", "regime_change"])
 def test_wild_measurements_found_nothing(name):
     effect, rng = registry().get("effects", name), np.random.default_rng(8)
