@@ -26,6 +26,7 @@ _LIGHTER = tuple(
         (r"<metadata>.*?</metadata>", ""),
         (r" font-family: [^;]*;", " font-family: sans-serif;"),
         (r' transform="rotate\(-0 [^"]*"', ""),
+        (r"(?<=base64,)\s+", ""),
         (r">\s+<", "><"),
         (r"\s*\n\s*", " "),
     )

@@ -24,8 +24,11 @@ LABEL = 12
 LISTED = 6
 """Faults, and effects that could not have been seen, that are listed one by one."""
 
-TOLD, FOLLOWED = 1.05, 0.3
-"""A part of the residual is spoken of from this many times the noise on; what it follows, from this share on."""
+TOLD, FOLLOWED, SEEN = 1.05, 0.3, 0.1
+"""A part of the residual is spoken of from this many times the noise on; what it follows, from this share (of all of it) on."""
+
+TOLD_AWAY = 1.25
+"""The same at the end of rollouts, of which few are independent."""
 
 HEADLINES = {
     "none": "nothing is left beyond noise: the model explains these data",
@@ -91,28 +94,33 @@ def _effect(e: Found) -> list[str]:
 
 def _left_over(r: TraceResult) -> list[str]:
     """Of the model as it was given."""
-    parts = components(r.nominal, r.held, r.before.one_step, r.after.one_step, r.floor[0])
-    loud = [p for p in parts if float(rms(p.before)) > TOLD * p.floor]
-    if not loud:
-        quiet = "nothing beyond noise in one step"
-        return [quiet if not _over_rollouts(r) else f"{quiet}; {_over_rollouts(r)}"]
+    if r.verdict in {"none", "sensor_fault"}:
+        return ["nothing beyond noise"]
     over = variables(r.nominal, r.held)
     inputs = over[: len(r.nominal.inputs)]
     over += derived(r.nominal, r.held)
-    told = [v for v in over if r.verdict == "unexplained" and v.token in r.depends_on]
-    shapes = strongest(loud, told or over, inputs)
-    return [*(_told(s, bool(told)) for s in shapes[:3]), *([_over_rollouts(r)] if _over_rollouts(r) else [])]
+    away = [_over_rollouts(r)] if _over_rollouts(r) else []
+    if r.verdict == "unexplained":  # the noise was estimated with the structure in it: shares are of all, noise included
+        parts = components(r.nominal, r.held, r.before.one_step, r.after.one_step, 0.0 * r.floor[0])
+        told = [v for v in over if v.token in r.depends_on]
+        shapes = [s for s in strongest(parts, told, inputs) if s.share > SEEN and s.variable is not None] if told else []
+        return [*(f"{s.component.said}: {_percent(s.share)} of it, noise included, {s.said}" for s in shapes[:2]), *away] or ["structure"]
+    parts = components(r.nominal, r.held, r.before.one_step, r.after.one_step, r.floor[0])
+    loud = [p for p in parts if float(rms(p.before)) > TOLD * p.floor]
+    shapes = strongest(loud, over, inputs)
+    return [*(_told(s) for s in shapes[:3]), *away] if loud else [f"nothing beyond noise in one step{'; ' if away else ''}{''.join(away)}"]
 
 
-def _told(shape: Shape, swallowed: bool) -> str:
-    """One line about a part of the residual and what it follows. swallowed: the noise was estimated with the structure in it, so a share
-    of what is not noise says nothing.
-    """
+def _told(shape: Shape) -> str:
+    """One line about a part of the residual and what it follows."""
     part = shape.component
     ratio = float(rms(part.before)) / max(part.floor, 1e-300)
-    much = "it" if swallowed else f"{100.0 * shape.share:.0f} % of that"
-    follows = f"{much} {shape.said}" if shape.share > FOLLOWED else "it follows no single variable"
+    follows = f"{_percent(shape.share)} of that {shape.said}" if shape.share > FOLLOWED else "it follows no single variable"
     return f"{part.said}: {ratio:.3g} x the noise in one step; {follows}"
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.0f} %"
 
 
 def _over_rollouts(r: TraceResult) -> str:
@@ -122,7 +130,9 @@ def _over_rollouts(r: TraceResult) -> str:
     ratio = rms(r.before.ends) / r.floor[1].clip(1e-300)
     worst = int(ratio.argmax())
     return (
-        f"{r.nominal.states[worst]} ends {float(ratio[worst]):.3g} x the noise away after {r.horizon_s:g} s" if ratio[worst] > TOLD else ""
+        f"{r.nominal.states[worst]} ends {float(ratio[worst]):.3g} x the noise away after {r.horizon_s:g} s"
+        if ratio[worst] > TOLD_AWAY
+        else ""
     )
 
 

@@ -77,7 +77,7 @@ class TraceResult:
 
     @property
     def blind(self) -> tuple[tuple[str, str], ...]:
-        """Effects that these data could not have shown. Where one was found already, a second one on the same channel is another question."""
+        """Effects that these data could not have shown. A second one on a channel where one was found is another question."""
         there = {e.channel for e in self.effects}
         return tuple((v.name, v.channel) for v in self.could_see if v.size is None and v.channel not in there)
 

@@ -210,11 +210,13 @@ def shape_of(part: Component, over: Sequence[Variable], inputs: Sequence[Variabl
 
 
 def strongest(parts: Sequence[Component], over: Sequence[Variable], inputs: Sequence[Variable], *, after: bool = False) -> list[Shape]:
-    """`shape_of` each component; the one in which there is most beyond noise first."""
+    """`shape_of` each component; the one with most beyond noise first (without a floor, the one that is accounted for best)."""
     shapes = [shape_of(part, over, inputs, after=after) for part in parts]
-    return sorted(
-        shapes, key=lambda s: -s.share * float(np.mean((s.component.after if after else s.component.before) ** 2)) / s.component.floor**2
-    )
+    return sorted(shapes, key=lambda s: -s.share * _loudness(s.component, after=after))
+
+
+def _loudness(part: Component, *, after: bool) -> float:
+    return float(np.mean((part.after if after else part.before) ** 2)) / part.floor**2 if part.floor > 0.0 else 1.0
 
 
 def of_tokens(tokens: Sequence[str], over: Sequence[Variable]) -> Iterator[tuple[str, list[Variable]]]:
