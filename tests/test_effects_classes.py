@@ -1,6 +1,7 @@
 """The table of effects that are one and the same: every row of it is true, and no two others are."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -265,3 +266,12 @@ def _fits(bare, target, effect, channel, begin):
         if np.max(np.abs(found.fun)) < 1e-7 * size:
             return True
     return False
+
+
+def test_the_page_on_effects_has_every_effect_with_all_of_its_parameters():
+    page = (Path(__file__).parent.parent / "docs" / "effects.md").read_text(encoding="utf-8")
+    for name in registry().names("effects"):
+        lines = [line for line in page.splitlines() if line.startswith(f"| `{name}`")]
+        assert lines, name
+        for parameter in registry().get("effects", name).parameters:
+            assert any(f"`{parameter.name}`" in line for line in lines), (name, parameter.name)
