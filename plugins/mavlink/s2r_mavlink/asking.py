@@ -4,8 +4,8 @@ It acts only when it is called by who knows the daemon's state (`Transport.poll`
 
 Rates. SET_MESSAGE_INTERVAL for one message after the other, in whole milliseconds, because that is what ArduPilot keeps; where it is denied
 (ArduPilot: above 0.8 of its loop rate) the next slower one, until it is granted. What was granted is then asked for, because some accept
-and do what they like. Asked again when the robot starts anew, when a ground station asked for rates of its own, and when far less comes
-than was granted.
+and do what they like. Asked again when the robot starts anew, when a ground station asked for rates of its own, when a message comes after
+a gap (MAVProxy sets all rates to its own every 15 s), and when far less comes than was granted.
 
 Mode and arming, as the profile's `take_over` says: when the robot is found, and again when a person cleared a stop. Once somebody changed
 the mode or disarmed it, it is left alone. After an emergency stop, and at the end, `stop_mode`.
@@ -19,6 +19,7 @@ from collections.abc import Callable
 from typing import Any
 
 from s2r_mavlink import dialect
+from s2r_mavlink.door import Told
 from s2r_mavlink.pose import SOURCES
 from s2r_mavlink.robot_state import mode_name, mode_number
 from s2r_mavlink.wire import Fields, Wire
@@ -38,6 +39,12 @@ SLOWER = 1.25
 SPARSE = 0.6
 """Of what was granted: below it the rates are asked for again. A simulator that can't keep up asks for nothing else."""
 DRIVING_NS = SECOND
+GAP, GAP_LEAST_NS = 4.0, 60 * 1_000_000
+"""Intervals between two of a message, above which it is asked for again."""
+SETTLING_NS = SECOND
+"""After a rate was granted, before gaps count: the first one may still be an old one's."""
+GAPS_MOST = 3
+"""In a row, before the robot is left in peace for a while: it can't, then."""
 LINES_MOST = 20
 SAID_AGAIN_NS = 60 * SECOND
 ONBOARD_CONTROLLER, NO_AUTOPILOT = 18, 8
@@ -59,7 +66,7 @@ class Rate:
 
     def begin(self) -> None:
         """Nothing was asked yet."""
-        self.asked_ms, self.denied_ms, self.accepted_ms, self.granted_ms = self.wanted_ms, 0, 0, 0.0
+        self.asked_ms, self.denied_ms, self.accepted_ms, self.granted_ms, self.granted_ns = self.wanted_ms, 0, 0, 0.0, 0
 
     def next_ms(self) -> int:
         """What to ask for next: slower until something is accepted, then between that and what was denied; 0: nothing more."""
@@ -76,12 +83,12 @@ class Rate:
 
 
 class Asking:
-    """send: hands a message (number, payload) to the robot, False if it couldn't; told: messages that came so far, by number.
+    """send: hands a message (number, payload) to the robot, False if it couldn't; told: messages about the pose that came, by number.
 
     lines: for the journal.
     """
 
-    def __init__(self, options: dict[str, Any], wire: Wire, told: dict[int, int], send: Send) -> None:
+    def __init__(self, options: dict[str, Any], wire: Wire, told: dict[int, Told], send: Send) -> None:
         self._wire, self._told, self._send = wire, told, send
         self._target = (options["system"], options["component"])
         self._mode = mode_number(options["mode"]) if options["mode"] else None
@@ -99,6 +106,7 @@ class Asking:
         self._asked_ns = self._heartbeat_ns = self._time_ns = self._order_ns = self._later_ns = self._count_ns = 0
         self._tries = self._orders = 0
         self._counted: dict[int, int] = {}
+        self._gaps = self._gap_ns = 0
         self._restarts = self._overrides = 0
         self._may_take = self._take_over != "never" and self._mode is not None
         self._reason = ""
@@ -206,6 +214,7 @@ class Asking:
                 self._turn = next((rate for rate in self.rates if not rate.granted_ms), None)
                 self._tries, self._confirming, self._asked_ns = 0, False, 0
             if self._turn is None:
+                self._watch_gaps(now_ns)
                 self._watch_rates(now_ns)
                 return
         if now_ns - self._asked_ns < ANSWER_NS:
@@ -256,21 +265,39 @@ class Asking:
             self._ask_rates(now_ns)
 
     def _grant(self, rate: Rate, granted_ms: float) -> None:
-        rate.granted_ms, self._turn, self._confirming = granted_ms, None, False
+        rate.granted_ms, rate.granted_ns, self._turn, self._confirming = granted_ms, self._now_ns, None, False
         why = f", asked for {rate.wanted_ms} ms" if granted_ms != rate.wanted_ms else ""
         self._say(f"{rate.name} every {granted_ms:g} ms{why}")
+
+    def _watch_gaps(self, now_ns: int) -> None:
+        """Whether a message that was granted came after a gap. Only that one is asked for, as it was granted."""
+        for rate in self.rates:
+            told = self._told.get(rate.number)
+            if told is None or not 0.0 < rate.granted_ms < math.inf:
+                continue
+            gap_ns, told.gap_ns = told.gap_ns, 0
+            if now_ns - rate.granted_ns < SETTLING_NS:
+                continue
+            if gap_ns > max(GAP_LEAST_NS, GAP * 1e6 * rate.granted_ms / min(1.0, self._wire.clock.pace)) and now_ns >= self._gap_ns:
+                self._gaps = self._gaps + 1 if now_ns - self._gap_ns < LATER_NS else 1
+                self._gap_ns = now_ns + (LATER_NS if self._gaps >= GAPS_MOST * len(self._told) else 0)
+                self._say(f"{rate.name} comes less often than granted; asked for again")
+                self._turn, self._tries, rate.asked_ms, rate.granted_ms = rate, 0, rate.accepted_ms or rate.wanted_ms, 0.0
+                rate.denied_ms = rate.accepted_ms = 0
+                self._ask(rate, now_ns)
+                return
 
     def _watch_rates(self, now_ns: int) -> None:
         """Whether about as much comes as was granted, over a few seconds of the robot's."""
         if now_ns - self._count_ns < LATER_NS:
             return
         seconds, before = (now_ns - self._count_ns) * 1e-9 * min(1.0, self._wire.clock.pace), self._counted
-        self._count_ns, self._counted = now_ns, dict(self._told)
+        self._count_ns, self._counted = now_ns, {number: told.count for number, told in self._told.items()}
         if seconds > 1.5e-9 * LATER_NS or not before:
             return  # it was silent, or this is the first look
         for rate in self.rates:
             due = 1000.0 * seconds / rate.granted_ms if rate.granted_ms else 0.0
-            if rate.number in before and self._told[rate.number] - before[rate.number] < SPARSE * due - 2.0:
+            if rate.number in before and self._counted[rate.number] - before[rate.number] < SPARSE * due - 2.0:
                 self._say(f"{rate.name} comes less often than granted; asked for again")
                 self._begin_rates()
                 return

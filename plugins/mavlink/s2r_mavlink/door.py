@@ -13,6 +13,7 @@ the log says it too:
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 
 from s2r_mavlink.dialect import COMMAND_ACK, HEARTBEAT, MESSAGE_INTERVAL, STATUSTEXT, TIMESYNC
 from s2r_mavlink.endpoints import Endpoint, Piece
@@ -26,6 +27,21 @@ REJECTIONS = ("foreign", "bad_signature", "old_stamp", "far_future", "unsigned",
 ANSWERS_MOST = 64
 """Frames about other things than the pose that are kept for a runtime that is late."""
 ANSWERS = frozenset((HEARTBEAT, COMMAND_ACK, MESSAGE_INTERVAL, STATUSTEXT, TIMESYNC))
+
+
+@dataclass
+class Told:
+    """How often a message about the pose came, when it came last, and the longest time between two since somebody looked."""
+
+    count: int = 0
+    newest_ns: int = 0
+    gap_ns: int = 0
+
+    def came(self, now_ns: int) -> None:
+        """Once more."""
+        if self.newest_ns:
+            self.gap_ns = max(self.gap_ns, now_ns - self.newest_ns)
+        self.count, self.newest_ns = self.count + 1, now_ns
 
 
 class Door:
@@ -43,7 +59,7 @@ class Door:
         self.signing: Signing | None = None
         self.received = self.dropped = 0
         self.questions: deque[int] = deque(maxlen=4)
-        self.told: dict[int, int] = dict.fromkeys(pose, 0)
+        self.told = {number: Told() for number in pose}
         self.rejected = dict.fromkeys(REJECTIONS, 0)
 
     @property
@@ -94,12 +110,14 @@ class Door:
         if not line.accept(source, now_ns):  # whoever it is, it doesn't hear what is sent to the robot
             return self._reject("other_address")
         facts = header(data)
-        if track.place(facts.sequence, now_ns, checked=facts.known) in {"off", "again"}:
+        place = track.place(facts.sequence, now_ns, checked=facts.known)
+        if place == "off" or place == "again" or not facts.known:
             return -1
-        if facts.number in self.told:
-            self.told[facts.number] += 1
+        if facts.number in self._pose:
+            self.told[facts.number].came(now_ns)
+            return facts.number
         # the pose may be another component's; everything else is the autopilot's to say
-        return facts.number if facts.known and (facts.number in self._pose or sender == self._autopilot) else -1
+        return facts.number if sender == self._autopilot and place == "next" else -1
 
     def _reject(self, reason: str) -> int:
         self.rejected[reason] += 1

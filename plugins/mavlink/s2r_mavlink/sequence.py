@@ -1,6 +1,8 @@
 """Whose turn it is: a sender's numbers, modulo 256, tell what was lost, what came late, and that a second sender uses the same ids.
 
-d = (number - newest) mod 256.  0: again.  1 to `AHEAD`: next, d - 1 were lost.  Above 256 - `BEHIND`: late.  Else: off the track.
+d = (number - newest) mod 256.  0: again.  1 to `NEAR`: next.  To `AHEAD`: skipped.  Above 256 - `BEHIND`: late.  Else: off the track.
+Before one that is next or skipped, d - 1 were lost. What has no stamp of its own may be acted on only if it is next: a recorded frame
+that is played again has any number.
 Off the track, another track is tried: it takes over after `PROOF` frames in a row without one of the old track between them, or at once
 if the old one was silent for `SILENT_NS` (a robot started anew, a long loss). Both in turns are a conflict: two senders, or a replay.
 """
@@ -10,11 +12,10 @@ from __future__ import annotations
 from collections import deque
 from typing import Literal
 
-Place = Literal["next", "late", "again", "off"]
+Place = Literal["next", "skipped", "late", "again", "off"]
 
-AHEAD, BEHIND = 32, 16
-AHEAD_UNCHECKED = 8
-"""For a frame whose checksum nobody here can check: its number may be noise."""
+NEAR, AHEAD, BEHIND = 8, 32, 16
+"""A frame whose checksum nobody here can check is near or off: its number may be noise."""
 PROOF = 4
 SILENT_NS = 500_000_000
 CONFLICTS, WITHIN_NS = 8, 10_000_000_000
@@ -33,14 +34,15 @@ class Sequence:
         self.lost = self.off = self.again = 0
 
     def place(self, number: int, now_ns: int, *, checked: bool = True) -> Place:
-        """Where this frame stands. Only `next` and `late` may be acted on."""
+        """Where this frame stands. `again` and `off` are never acted on, `skipped` and `late` only where a stamp says more."""
         d = (number - self._newest) & 0xFF
         if self._newest < 0 or (d > AHEAD and now_ns - self._heard_ns > SILENT_NS and checked):
             return self._next(number, now_ns, 0)
-        if 0 < d <= (AHEAD if checked else AHEAD_UNCHECKED):
+        if 0 < d <= (AHEAD if checked else NEAR):
             if self._proof:
                 self._conflicts.append(now_ns)
-            return self._next(number, now_ns, d - 1)
+            self._next(number, now_ns, d - 1)
+            return "next" if d <= NEAR else "skipped"
         if d == 0:
             self.again += 1
             return "again"
