@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace.candidates import candidates
@@ -75,6 +75,12 @@ def best_candidates(given: Problem, base: Fit, few: int = FEW, bar: Bar = STRICT
     for s in screened:
         scored.setdefault((s.candidate.name, s.candidate.channel), Scored(s.candidate.name, s.candidate.channel, min(s.value, 0.0)))
     return sorted(scored.values(), key=lambda s: (s.fit is None, -s.score)), tried
+
+
+def rescored(found: Sequence[Scored], base: Fit, n: int, bar: Bar) -> list[Scored]:
+    """The same candidates under another bar. base: the model that they were fitted beside."""
+    again = [s if s.fit is None else replace(s, score=gain(s.fit, base) - bar.price(s.fit.k - base.k, n)) for s in found]
+    return sorted(again, key=lambda s: (s.fit is None, -s.score))
 
 
 def _promising(screened: Sequence[Screened], few: int) -> list[Screened]:

@@ -30,7 +30,7 @@ from s2r_runtime.trace.fitting import (
 )
 from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
 from s2r_runtime.trace.rivals import CLOSE, rivals
-from s2r_runtime.trace.scores import STRICT, Bar, Scored, best_candidates, name_of, names
+from s2r_runtime.trace.scores import STRICT, Bar, Scored, best_candidates, name_of, names, rescored
 from s2r_runtime.trace.slots import bounds_of, values_of, with_values
 
 Array = NDArray[np.float64]
@@ -64,13 +64,23 @@ class Selection:
     rivals: tuple[Scored, ...]
 
 
-def select(given: Problem, model: ComposedModel, horizon: int, progress: Callable[[float], None], bar: Bar = STRICT) -> Selection:
-    """The effects that the transitions call for."""
-    nominal = evaluate(given, model)
+def select(
+    given: Problem,
+    model: ComposedModel,
+    horizon: int,
+    progress: Callable[[float], None],
+    bar: Bar = STRICT,
+    before: Selection | None = None,
+) -> Selection:
+    """The effects that the transitions call for. before: what was selected with another bar; its first round is not fitted again."""
+    nominal = evaluate(given, model) if before is None else before.nominal
     fit, tried = nominal, 0
     ranking: list[Scored] = []
     for step in range(MOST):
-        found, columns = best_candidates(given, fit, bar=bar)
+        if before is not None and not step:
+            found, columns = rescored(before.ranking, nominal, len(given.steps), bar), before.tried
+        else:
+            found, columns = best_candidates(given, fit, bar=bar)
         tried = max(tried, columns)
         if not ranking:
             ranking = found

@@ -112,7 +112,7 @@ def _traced(
     say(80.0, 100.0, "testing what is left")
     structure = _structure(checked, chosen, ahead)
     if structure.matters:  # something is there: which name it has may be asked with a lower bar, if that leaves nothing
-        other = confirmed(given, select(given, model, ahead, lambda share: None, LENIENT), judged_on)
+        other = confirmed(given, select(given, model, ahead, lambda share: None, LENIENT, chosen), judged_on)
         if names(other.fit.model) != names(chosen.fit.model):
             rest = _structure(checked, other, ahead)
             chosen, structure = (chosen, structure) if rest.matters else (other, rest)
