@@ -38,6 +38,11 @@ BODY_FRAMES = (8, 9, 12)
 """MAV_FRAME BODY_NED, BODY_OFFSET_NED, BODY_FRD: forward, right, down."""
 
 
+def result(number: int) -> str:
+    """A result in words."""
+    return RESULTS[number] if number < len(RESULTS) else f"result {number}"
+
+
 class Message(NamedTuple):
     """One kind of message."""
 

@@ -13,6 +13,7 @@ from s2r_runtime.errors import ConfigError
 
 INPUTS = ("v", "w")
 TAKE_OVER = ("never", "mode", "arm")
+STOP_WHEN = ("emergency", "closed")
 
 DEFAULTS: dict[str, Any] = {
     "robot": "",
@@ -28,6 +29,7 @@ DEFAULTS: dict[str, Any] = {
     "mode": "GUIDED",
     "take_over": "never",
     "stop_mode": "",
+    "stop_when": "emergency",
     "observation_timeout": 0.5,
     "max_age": 0.3,
     "queue": 64,
@@ -49,6 +51,7 @@ MEANINGS: dict[str, str] = {
     "mode": "the mode in which it takes velocity commands: one of ArduPilot Rover's, a number, or empty if it has none (default GUIDED)",
     "take_over": "what the runtime does when it finds the robot: never (a person does it), mode (switches to that mode), arm (and arms it)",
     "stop_mode": "mode to switch to after an emergency stop and when the runtime ends, such as HOLD (default: zero velocity is all)",
+    "stop_when": "emergency (the default), or closed: also while the gate is closed on a controller's, certificate's or the log's account",
     "observation_timeout": "s without an observation after which the link counts as lost (default 0.5)",
     "max_age": "s; an observation that was longer on its way is faulty (default 0.3)",
     "queue": "messages about the pose kept for a runtime that is late; older ones are dropped and counted (default 64)",
@@ -80,6 +83,7 @@ def checked(given: dict[str, Any], states: tuple[str, ...], inputs: tuple[str, .
     if options["queue"] < 2:
         raise ConfigError(f"transport.queue is {options['queue']}, must be >= 2")
     _choice("take_over", options["take_over"], TAKE_OVER)
+    _choice("stop_when", options["stop_when"], STOP_WHEN)
     _choice("pose", options["pose"], tuple(SOURCES))
     _modes(options)
     _origin(options)
@@ -126,6 +130,8 @@ def _modes(options: dict[str, Any]) -> None:
         raise ConfigError("transport.mode is empty, must be a mode where take_over or stop_mode change it")
     if options["stop_mode"] and mode_number(options["stop_mode"]) == mode_number(options["mode"]):
         raise ConfigError(f"transport.stop_mode is {options['stop_mode']!r}, must be another mode than transport.mode")
+    if options["stop_when"] == "closed" and not options["stop_mode"]:
+        raise ConfigError("transport.stop_when is 'closed', must come with transport.stop_mode, such as HOLD")
 
 
 def _origin(options: dict[str, Any]) -> None:

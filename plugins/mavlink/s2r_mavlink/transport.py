@@ -147,7 +147,7 @@ class MavlinkTransport:
             relay.line.maintain(now_ns)
             if relay.disturbed:
                 relay.disturbed = False
-                self._asking.disturbed()
+                self._asking.rates.begin()
         self._asking.tick(now_ns)
         self._answer_questions(now_ns)
         heard_ns = self._wire.clock.heard_ns
@@ -225,9 +225,7 @@ class MavlinkTransport:
 
     def lines(self) -> list[str]:
         """For the journal, since the last call: rates that were granted, what the robot says, who took it over."""
-        told = list(self._asking.lines)
-        self._asking.lines.clear()
-        return told
+        return self._asking.journal.take()
 
     def counters(self) -> dict[str, int]:
         """Since construction. See docs/mavlink.md."""
@@ -254,6 +252,6 @@ class MavlinkTransport:
         for relay in self._relays:
             for name in ("passed", "refused", "blocked", "unlogged"):
                 counts[f"{relay.channel}_{name}"] = getattr(relay, name)
-        for rate in self._asking.rates:
+        for rate in self._asking.rates.all:
             counts[f"interval_us_{rate.name}"] = round(1000.0 * min(rate.granted_ms, 1e9))
         return counts

@@ -235,6 +235,31 @@ def test_emergency_stop_changes_the_mode_and_is_nobodys_override() -> None:
         assert runtime.more()
 
 
+def test_gate_that_closes_sets_the_robot_aside_until_nothing_else_stands_in_the_way() -> None:
+    with driven(stop_mode="HOLD", stop_when="closed") as (runtime, robot):
+
+        def gate(reason: str) -> None:
+            runtime.transport.inform(GateChanged(0, open=not reason, reason=reason or "allowed"))
+
+        def modes() -> list[str]:
+            return [str(line["mode"]) for line in robot.said if "mode" in line]
+
+        gate("no_certificate")  # it never was open
+        runtime.run(0.5)
+        assert modes() == ["GUIDED"]
+        for reason in ("radius_above_verified", "latched:controller_fault"):
+            gate("")
+            gate("outside_region")
+            runtime.run(0.3)
+            assert modes()[-1] == "GUIDED", "zero velocity is enough, and it must be able to come back"
+            gate(reason)
+            assert runtime.until(lambda: modes()[-1] == "HOLD" and runtime.observations[-1].fault)
+            gate("observation_invalid")
+            assert runtime.more()
+        assert modes() == ["GUIDED", "HOLD", "GUIDED", "HOLD", "GUIDED"]
+        assert runtime.overrides == []
+
+
 def test_end_of_the_runtime_puts_the_robot_aside() -> None:
     with driven(stop_mode="HOLD") as (runtime, robot):
         runtime.transport.close()

@@ -41,6 +41,7 @@ UDP = {"robot": "udp:127.0.0.1:14551"}
         ({**UDP, "mode": "GIUDED"}, "mode is 'GIUDED', must be a mode of ArduPilot Rover"),
         ({**UDP, "mode": "", "take_over": "arm"}, "mode is empty, must be a mode where take_over"),
         ({**UDP, "stop_mode": "guided"}, "must be another mode than transport.mode"),
+        ({**UDP, "stop_when": "closed"}, "must come with transport.stop_mode, such as HOLD"),
         ({**UDP, "origin": [48.0, 11.0]}, "only with pose = gps"),
         ({**UDP, "pose": "gps"}, "origin is [], must be [latitude, longitude]"),
         ({**UDP, "pose": "gps", "origin": [91.0, 0.0]}, "must be [latitude, longitude]"),
