@@ -223,7 +223,7 @@ def at_100_hz(seconds: float) -> dict[str, Any]:
     """Every frame and command accounted for, and the daemon's share of a core."""
     from bench_daemon import cpu_s
 
-    from s2r_runtime.messages import Observed, Send
+    from s2r_runtime.messages import Observed, Send, SourceStopped
     from s2r_runtime.recording.reading import read
 
     with tempfile.TemporaryDirectory(prefix="s2r-bench-") as name, contextlib.closing(Bench(Path(name))) as bench, bench.daemon():
@@ -258,22 +258,26 @@ def at_100_hz(seconds: float) -> dict[str, Any]:
             tally = json.loads(out.splitlines()[-1])
         time.sleep(0.5)
         counters = bench.status()["counters"]
-        observed = [m.observation for e in read(bench.log(), ["event/observed"]) if isinstance(m := e.message, Observed)]
-        sends = sum(isinstance(e.message, Send) for e in read(bench.log(), ["out/send"]))
+        log = bench.log()
+        observed = [m.observation for e in read(log, ["event/observed"]) if isinstance(m := e.message, Observed)]
+        sends = sum(isinstance(e.message, Send) for e in read(log, ["out/send"]))
+        stopped = [m for e in read(log, ["event/source_stopped"]) if isinstance(m := e.message, SourceStopped) and m.source == "controller"]
     good = sum(not o.fault for o in observed)
-    explained_in = counters["dropped_in"] + tally["withheld"]
     return {
         "bus": "udp_multicast" if bench.multicast else "socketcand",
         "seconds": seconds,
         "frames_sent_by_robot": tally["sent"],
         "frames_received": counters["received"],
-        "frames_dropped_and_counted": explained_in,
-        "frames_unexplained": tally["sent"] - counters["received"] - explained_in,
+        "frames_not_sent_by_robot": tally["failed"],
+        "frames_dropped_and_counted": counters["dropped_in"],
+        "frames_lost_by_their_counters": counters["lost"],
+        "frames_unexplained": tally["sent"] - counters["received"],
+        "gaps_unexplained": counters["lost"] - tally["failed"] - counters["dropped_in"],
         "periods": tally["periods"],
         "observations": good,
         "faulty_observations": len(observed) - good,
         "incomplete_and_counted": counters["incomplete"],
-        "observations_unexplained": tally["periods"] - good - counters["incomplete"] - counters["lost"],
+        "observations_unexplained": max(0, tally["periods"] - good - counters["incomplete"] - counters["lost"]),
         "commands_decided": sends,
         "commands_dropped_and_counted": counters["dropped_out"],
         "commands_heard_by_robot": tally["commands"] + tally["commands_refused"],
@@ -281,6 +285,7 @@ def at_100_hz(seconds: float) -> dict[str, Any]:
         "commands_after_its_end": max(0, counters["sent"] - tally["commands"] - tally["commands_refused"]),
         "counters": {key: value for key, value in counters.items() if value},
         "at_the_end_of": reasons,
+        "controller_stopped": [f"{m.reason} {m.detail}" for m in stopped],
         **shares,
     }
 
@@ -358,6 +363,7 @@ def main() -> int:
         for name, ok in (
             ("decoding below 100 000 frames/s", found["decoding"]["frames_per_s"] >= 1e5),
             ("frames unexplained", rate["frames_unexplained"] == 0),
+            ("gaps unexplained", rate["gaps_unexplained"] == 0),
             ("observations unexplained", rate["observations_unexplained"] == 0),
             ("the gate closed late", link["gate_closed_after_s"]["max"] <= TIMEOUT_S + 2 * TICK_S),
             ("a command passed too late", link["commands_allowed_too_late"] == 0),

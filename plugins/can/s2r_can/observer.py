@@ -49,7 +49,10 @@ class Observer:
         self._triggered_ns: int | None = None
         self._said_ns: dict[str, int] = {}
         self._up = False
+        self._anew = False
         self._commands = layout.commands
+        vital = {index for index in (*layout.states, *layout.reckoning.values()) if index is not None}
+        self._vital = {group.index for group in layout.groups if vital & set(group.into)}
         self._reckoning = Reckoning(layout, odometry, self._values)
 
     # ------------------------------------------------------------------ frames
@@ -165,22 +168,32 @@ class Observer:
         elif stamp_ns <= self.newest[1]:
             stamp_ns = self.newest[1] + 1
         if kind == "restarted":
+            self._anew = True
             self._reckoning.rest()
         self._reckoning.came(layout.trigger, stamp_ns)
-        for group in layout.groups:
-            at_ns = self.times[group.index]
-            if group.max_age_ns is not None and (at_ns is None or now_ns - at_ns > group.max_age_ns):
-                self.counts["incomplete"] += 1
-                return
+        if not self._complete(now_ns):
+            self.counts["incomplete"] += 1
+            return
         x = tuple(self._value(i, name) for i, name in zip(layout.states, self._names, strict=True))
-        if kind == "restarted":
+        if self._anew:
             said.append(LinkChanged(now_ns, up=False, detail="the robot started anew"))
-            self._up = False
+            self._anew = self._up = False
         if not self._up:
             said.append(LinkChanged(now_ns, up=True))
             self._up, self.bus_off = True, False
         self.newest = self._seq, stamp_ns
         said.append(Observation(self._seq, stamp_ns, x))
+
+    def _complete(self, now_ns: int) -> bool:
+        """Whether all that is needed was said, and lately. What is sent only when it changes may be missing yet, unless it is a state."""
+        for group in self._layout.groups:
+            at_ns = self.times[group.index]
+            if at_ns is None:
+                if group.max_age_ns is not None or group.index in self._vital:
+                    return False
+            elif group.max_age_ns is not None and now_ns - at_ns > group.max_age_ns:
+                return False
+        return True
 
     def _value(self, index: int | None, name: str) -> float:
         return self._values[index] if index is not None else self._reckoning.pose[("x", "y", "theta").index(name)]

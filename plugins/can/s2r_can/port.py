@@ -4,7 +4,8 @@ Found out on python-can 4.6 and held by tests:
 - a socketcand connection that its server closed reads as an endless silence at full speed, and connecting to nobody as ten seconds of
   the same: so somebody looks whether the server is there, before and after;
 - over socketcand, frames that follow each other wait up to 40 ms for the acknowledgement of the first, unless `tcp_tune` is set;
-- udp_multicast gives back what was sent, whatever `receive_own_messages` says: each frame of ours is taken out once;
+- some drivers give back what was sent, marked as such; udp_multicast does so unmarked, whatever `receive_own_messages` says: each frame of
+  ours is taken out once;
 - one datagram that is no CAN frame raises; it is counted, and the next one read;
 - `send` blocks on sockets and serial lines: those get a thread of their own, and a short queue;
 - log messages go to stderr unless somebody says otherwise.
@@ -159,7 +160,7 @@ class Port:
                     raise ConnectionError("the other end closed the connection")
                 continue
             record = self._record(message)
-            if not self._own(record):
+            if message.is_rx and not self._own(record):
                 self.counts["received"] += 1
                 self._take(record)
 

@@ -151,6 +151,27 @@ def test_robot_that_starts_anew_goes_on_above_its_numbers_with_the_link_down_and
     assert [m.up for m in said[where - 2 : where]] == [False, True]
 
 
+def test_robot_that_starts_anew_while_a_message_is_missing_is_told_with_the_next_observation(bench: Bench) -> None:
+    said = []
+    for seq in range(6):
+        position, heading, clock = bench.records(seq)
+        bench.now_ns += 9_700_000 + (250 * MS if seq == 0 else 0)  # the last heading is too old by then
+        said += bench.hear(position, clock) if seq < 4 else bench.hear(position, heading, clock)
+    first = next(m for m in said if isinstance(m, LinkChanged))
+    assert (first.up, first.detail) == (False, "the robot started anew")
+    assert said.index(good(said)[0]) > said.index(first)
+
+
+def test_state_that_was_never_said_is_not_zero_however_long_it_would_be_good() -> None:
+    bench = Bench(timeouts={"Position": math.inf})
+    for seq in range(100, 105):
+        _, heading, clock = bench.records(seq)
+        bench.now_ns += 9_700_000
+        assert good(bench.hear(heading, clock)) == []
+    assert bench.counters["incomplete"] == 5
+    assert len(good(bench.period(105))) == 1
+
+
 def test_foreign_frames_are_counted_and_mean_nothing(bench: Bench) -> None:
     draw = random.Random(1)
     for _ in range(200):
