@@ -6,7 +6,9 @@ The liars sign their logs with the right key, and all that follows is consistent
 from __future__ import annotations
 
 import importlib.util
+import random
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,8 +21,11 @@ from s2r_runtime.audit import traces
 from s2r_runtime.audit.findings import Findings
 from s2r_runtime.audit.log import AuditResult, audit
 from s2r_runtime.audit.traces import Traces, near, unlike
+from s2r_runtime.daemon.worker import Failed, Progress, TraceJob, Worker
 from s2r_runtime.modelspec import EffectSpec
+from s2r_runtime.profile import parse_profile
 from s2r_runtime.recording.reading import Entry
+from s2r_runtime.recording.stretches import Cut, Part, Recorded, Segment
 from s2r_runtime.recording.writer import read
 
 if "audit_bench" not in sys.modules:
@@ -92,6 +97,22 @@ def test_a_trace_that_takes_long_is_skipped_and_said_so_unless_it_was_asked_for(
     assert "it was not run again" in skipped.models[0].origin
     asked = audit([path], rerun_traces=True)
     assert (asked.ok, asked.skipped, asked.recomputed["traces run again"]) == (True, [], 1)
+
+
+def test_a_trace_is_given_up_after_its_time_of_the_processor() -> None:
+    rng = random.Random(1)
+    rows = tuple((k * 33_000_000, (rng.random(), rng.random(), rng.random())) for k in range(20_000))
+    inputs = tuple((t, (rng.random(), rng.random())) for t, _ in rows)
+    about = Recorded("drive", 1, (Part("a", 1, 2),), len(rows), len(rows), "digest")
+    profile = parse_profile(audit_bench.PROFILE.replace("dt = 0.05", "dt = 0.033"), "profile.toml", Path())
+    worker = Worker(TraceJob(profile, "drive", 1, 20_000, 0, cut=Cut(about, (Segment("a", rows, inputs),)), cpu_s=1.0), 100.0)
+    said: list[Any] = []
+    while not said or isinstance(said[-1], Progress):
+        said += worker.poll(time.monotonic_ns())
+        time.sleep(0.01)
+    worker.stop()
+    assert isinstance(said[-1], Failed)
+    assert said[-1].text == "the worker died: killed by signal 24"
 
 
 def test_a_trace_without_a_result_is_counted_as_that(tmp_path: Path) -> None:

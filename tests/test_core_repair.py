@@ -98,6 +98,13 @@ def test_nothing_is_traced_of_a_growth_where_the_profile_does_not_ask_for_it_or_
     assert of(rig.feed(Stopping(rig.t)), StartJob) == []
 
 
+def test_a_trace_that_the_daemons_end_cuts_off_is_recorded_as_that() -> None:
+    rig = Rig(trace_after_campaign=True)
+    rig.gap()
+    ended = one(rig.feed(Stopping(rig.t)), TraceEnded)
+    assert (ended.stretch, ended.epoch, ended.verdict, ended.reason) == ("campaign", 1, "", "the daemon stopped before it was done")
+
+
 def test_a_trace_never_keeps_a_controller_from_driving() -> None:
     rig = Rig(trace_after_campaign=True)
     rig.gap()

@@ -236,6 +236,8 @@ def test_a_daemon_that_ends_takes_its_trace_along(rigs: Any) -> None:
     (worker,) = rig.until(lambda: rig.children("s2r_runtime.daemon.worker"))
     rig.stop()
     rig.until(lambda: state(worker) in ("", "Z"))
+    (ended,) = [m for m in rig.messages("out/trace_ended") if isinstance(m, TraceEnded)]
+    assert ended.reason == "the daemon stopped before it was done"
 
 
 def nice(pid: int) -> int:
@@ -284,6 +286,8 @@ def test_a_proposal_outlives_the_daemon_and_is_adopted_by_a_person(rigs: Any) ->
     rig.start()
     rig.until(lambda: rig.status()["observation"])
     assert rig.status()["proposal"] == proposed
+    again = rig.ask("trace")
+    assert (again["exit_code"], again["data"]["proposal"]["digest"]) == (0, proposed["digest"]), "the same rows, out of the log before"
     assert rig.s2r("adopt", "--socket", str(rig.socket)).returncode == 0
     assert rig.status()["model"] == proposed["digest"]
     spec = load_model(Path(proposed["path"]))
@@ -291,6 +295,14 @@ def test_a_proposal_outlives_the_daemon_and_is_adopted_by_a_person(rigs: Any) ->
     stripped.write_text("".join(line for line in Path(proposed["path"]).read_text().splitlines(True) if not line.startswith("fitted_on")))
     rig.ask("adopt", text=stripped.read_text(), base=str(rig.folder))
     assert load_model(Path(proposed["path"])).fitted_on == spec.fitted_on, "what it was fitted on is not forgotten"
+    rig.stop()
+    first, second = rig.log_files()
+    both = json.loads(rig.s2r("audit", str(first), str(second), "--json").stdout)
+    assert (both["ok"], both["recomputed"]["traces run again"]) == (True, 2), both
+    alone = json.loads(rig.s2r("audit", str(second), "--json").stdout)
+    assert alone["ok"], alone
+    assert any("was made on, in an earlier log that was not given" in one for one in alone["missing"])
+    assert "traces run again" not in alone["recomputed"]
 
 
 def test_a_model_that_was_refused_is_not_the_one_in_force_after_a_restart(rigs: Any) -> None:

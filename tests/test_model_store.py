@@ -40,6 +40,8 @@ def test_the_adopted_model_is_in_force_and_a_changed_profile_has_the_last_word(t
     assert store.in_force(profile, adopted).model == repaired
     assert store.in_force(profile, Memory("rig", 1)).model == profile.model
     assert store.in_force(profile, Memory("rig", 1, model_digest=profile.model.digest())).model == profile.model
+    store.file(repaired.digest()).rename(tmp_path / "model.toml")  # as version 0.1 kept it
+    assert store.in_force(profile, adopted).model == repaired
     changed = ModelStore(tmp_path, "sha256:" + "0" * 64)
     assert changed.in_force(profile, adopted).model == profile.model
 

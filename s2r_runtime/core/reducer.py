@@ -48,6 +48,7 @@ from s2r_runtime.messages import (
     Started,
     Stopping,
     Ticked,
+    TraceEnded,
     WallClockRead,
 )
 
@@ -186,6 +187,9 @@ def _stopping(turn: Turn, event: Stopping) -> None:
     pending = {one.request_id: None for one in (*turn.state.jobs, *filter(None, (turn.state.issuing,))) if one.purpose != "deploy"}
     for request_id in pending:
         turn.answer(request_id, 1, "the daemon stopped before this was done")
+    for one in turn.state.jobs:
+        if one.purpose == "trace":
+            turn.emit(TraceEnded(turn.now, one.id, one.stretch, one.epoch, "", "the daemon stopped before it was done"))
     turn.set(jobs=(), issuing=None)
     turn.remember()
 

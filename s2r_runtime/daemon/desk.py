@@ -241,7 +241,7 @@ class Desk:
                 return
             self._d.adopting[spec.digest()] = msgspec.structs.replace(profile, model=kept)
             # before the decision, so that a reader of the log has the model when it comes into force
-            self._d.logbook.attach(f"model/{spec.digest()}", "application/toml", dump_model(spec).encode())
+            self._d.logbook.attach(f"model/{spec.digest()}", "application/toml", dump_model(kept).encode())
             self.request("adopt", connection, digest=spec.digest())
 
         self._numbers += 1
