@@ -49,30 +49,33 @@ class Bell:
 
 
 class Inbox:
-    """At most `capacity` records. per_second: more than that are dropped at the door (0: no such limit)."""
+    """At most `capacity` records."""
 
-    def __init__(self, bell: Bell, capacity: int, per_second: int = 0) -> None:
-        self._bell, self._capacity, self._per_second = bell, capacity, per_second
+    def __init__(self, bell: Bell, capacity: int) -> None:
+        self._bell, self._capacity = bell, capacity
         self._waiting: deque[Record] = deque()
         self._lock = threading.Lock()
         self._rung = False
         self._second = self._in_second = 0
         self.dropped = 0
 
-    def put(self, record: Record, *, ring: bool) -> None:
-        """From any thread. ring: the daemon is to come now; else it may wait for what comes next."""
+    def put(self, record: Record, *, ring: bool, per_second: int = 0) -> bool:
+        """From any thread. ring: the daemon is to come now; else it may wait for what comes next. per_second: more records than that which are
+        put with such a limit are dropped at the door (0: no limit). False if this one was.
+        """
         with self._lock:
-            if self._per_second and self._over_rate(record.stamp_ns // 1_000_000_000):
+            if per_second and self._over_rate(record.stamp_ns // 1_000_000_000, per_second):
                 self.dropped += 1
-                return
+                return False
             if len(self._waiting) >= self._capacity:
                 self._waiting.popleft()
                 self.dropped += 1
             self._waiting.append(record)
             if self._rung or not (ring or 2 * len(self._waiting) >= self._capacity):
-                return
+                return True
             self._rung = True
         self._bell.ring()
+        return True
 
     def take(self) -> list[Record]:
         """What waited, oldest first."""
@@ -82,11 +85,11 @@ class Inbox:
             self._rung = False
         return taken
 
-    def _over_rate(self, second: int) -> bool:
+    def _over_rate(self, second: int, per_second: int) -> bool:
         if second != self._second:
             self._second, self._in_second = second, 0
         self._in_second += 1
-        return self._in_second > self._per_second
+        return self._in_second > per_second
 
 
 class Metronome:

@@ -45,8 +45,7 @@ class CanTransport:
         self._proposals = Proposals(self._layout, inputs)
         self._bell = Bell()
         self._inbox = Inbox(self._bell, self._options.queue)
-        self._others = Inbox(self._bell, PROPOSALS_PER_SECOND, PROPOSALS_PER_SECOND)
-        self._errors = Inbox(self._bell, ERRORS_PER_SECOND, ERRORS_PER_SECOND)
+        self._others = Inbox(self._bell, PROPOSALS_PER_SECOND)
         self._commands = self._layout.commands
         self._ring = self._keys()
         self._robot: Port | None = None
@@ -110,7 +109,7 @@ class CanTransport:
         if ring is not None:
             self._inbox.put(record, ring=ring)
         elif record.key & ERROR:
-            self._errors.put(record, ring=True)
+            self._inbox.put(record, ring=True, per_second=ERRORS_PER_SECOND)
         else:
             self._unheard += 1
         others = self._controllers
@@ -122,17 +121,14 @@ class CanTransport:
     def _from_controllers(self, record: Record) -> None:
         if record.key in self._commands:
             self._proposed += 1
-            self._others.put(record, ring=True)
+            self._others.put(record, ring=True, per_second=PROPOSALS_PER_SECOND)
 
     def receive(self) -> list[Frame]:
         """What came since the last call, oldest first; never blocks. A frame ends with what makes an observation."""
         self._bell.answer()
         frames = self._repeat()
-        waiting = self._inbox.take()
-        if errors := self._errors.take():
-            waiting = sorted([*waiting, *errors], key=lambda record: record.stamp_ns)
         batch: list[Record] = []
-        for record in waiting:
+        for record in self._inbox.take():
             batch.append(record)
             if self._ring.get(record.key, True):
                 frames.append(_frame("robot", batch))
@@ -242,7 +238,7 @@ class CanTransport:
         return {
             "received": totals["received"],
             "sent": totals["sent"],
-            "dropped_in": self._inbox.dropped + self._others.dropped + self._errors.dropped,
+            "dropped_in": self._inbox.dropped + self._others.dropped,
             "dropped_out": totals["dropped"],
             **counts,
             "copies": self._copies,

@@ -344,3 +344,27 @@ def test_interface_that_takes_no_commands_is_a_lost_link() -> None:
             time.sleep(0.005)
         (change,) = [m for m in line.messages if isinstance(m, LinkChanged) and not m.up]
         assert "takes no frames: cannot send FD message over bus with CAN FD disabled" in change.detail
+
+
+def test_error_frames_of_a_bus_are_told_in_their_place_and_a_storm_of_them_is_cut_at_the_door() -> None:
+    with SocketRig() as rig:
+        rig.transport.open()
+        line = Line(rig)
+        seq = line.link((0.0, 0.0, 0.0))
+        raw = socket.create_connection(("127.0.0.1", rig.hub.port))
+        for word in (b"< open can0 >", b"< rawmode >"):
+            raw.recv(64)
+            raw.sendall(word)
+        raw.recv(64)
+        raw.sendall(b"< error 20000040 >")
+        assert line.until(lambda: line.links[-1] is False)
+        assert line.until(lambda: "bus-off" in [m.detail for m in line.messages if isinstance(m, LinkChanged)][-1])
+        rig.robot.publish(seq + 1, (seq + 1) * 10_000_000, (0.0, 0.0, 0.0))
+        assert line.until(lambda: line.links[-1])
+        raw.sendall(b"< error 20000004 >" * 2000)
+        assert line.until(lambda: line.transport.counters()["dropped_in"] > 1900)
+        rig.robot.publish(seq + 2, (seq + 2) * 10_000_000, (0.0, 0.0, 0.0))
+        assert line.until(lambda: line.reached(seq + 2))
+        assert not [m for m in line.messages if isinstance(m, Observation) and m.fault]
+        assert line.transport.counters()["error_frames"] <= 1 + 64
+        raw.close()
