@@ -14,8 +14,8 @@ from s2r_runtime.hookspecs import NominalModel, Parameter
 SHARPEST = 20.0
 """Times the ideal turn. A car that oversteers (K < 0) has no steady turn at all above sqrt(-L/K); numbers stay finite."""
 
-SHARE = 0.05
-"""Of the wheel base: K v² where the tracer begins."""
+SHARES = (0.05, 0.7)
+"""Of the wheel base: K v² where the tracer begins; a strong one no longer acts in proportion."""
 
 
 class Understeer(StepEffect):
@@ -40,9 +40,10 @@ class Understeer(StepEffect):
         return moved(x, x_next, model, motion._replace(turn=factor * motion.turn))
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
-        """One is enough: the response is nearly linear."""
+        """A weak one and a strong one."""
         speeds = [j for j, name in enumerate(model.inputs) if getattr(model, "units", {}).get(name, "m/s") == "m/s"]
-        return [{"coefficient": SHARE * model.parameters["wheel_base"] / size_of(u[:, speeds]) ** 2}]
+        square = size_of(u[:, speeds]) ** 2
+        return [{"coefficient": share * model.parameters["wheel_base"] / square} for share in SHARES]
 
 
 EFFECT = Understeer()
