@@ -72,6 +72,8 @@ def sum8(covered: Covered) -> int:
 
 
 BUILT_IN: dict[str, Scheme] = {"crc8_j1850": crc8_j1850, "xor8": xor8, "sum8": sum8}
+_CUT = frozenset(BUILT_IN.values())
+"""Schemes that look at `cut` only."""
 
 
 def scheme_of(name: str, where: str) -> Scheme:
@@ -107,9 +109,13 @@ class Guarded(NamedTuple):
 
     def expected(self, payload: bytes) -> int:
         """The checksum that this payload should have; its own bits in it don't matter."""
-        size = len(payload)
-        zeroed = (int.from_bytes(payload, "little") & ~self.mask).to_bytes(size, "little")
-        cut = self.prefix + (payload[: self.first] + payload[self.last + 1 :] if self.first <= self.last else zeroed)
+        if self.first <= self.last:
+            cut = self.prefix + payload[: self.first] + payload[self.last + 1 :]
+            if self.scheme in _CUT:
+                return self.scheme(Covered(cut, payload, self.arbitration_id, self.data_id)) & self.bits_mask
+        zeroed = (int.from_bytes(payload, "little") & ~self.mask).to_bytes(len(payload), "little")
+        if self.first > self.last:
+            cut = self.prefix + zeroed
         return self.scheme(Covered(cut, zeroed, self.arbitration_id, self.data_id)) & self.bits_mask
 
 

@@ -60,8 +60,8 @@ class Inbox:
         self.dropped = 0
 
     def put(self, record: Record, *, ring: bool, per_second: int = 0) -> bool:
-        """From any thread. ring: the daemon is to come now; else it may wait for what comes next. per_second: more records than that which are
-        put with such a limit are dropped at the door (0: no limit). False if this one was.
+        """From any thread. ring: the daemon is to come now; else it may wait for what comes next. per_second: more records than that, put
+        with such a limit, are dropped at the door (0: no limit). False if this one was.
         """
         with self._lock:
             if per_second and self._over_rate(record.stamp_ns // 1_000_000_000, per_second):
