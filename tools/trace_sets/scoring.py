@@ -140,6 +140,8 @@ def covered(truth: Truth, answer: Answer) -> list[tuple[str, bool]]:
     for effect, place in pairs:
         if place is None or place >= len(truth["effects"]) or truth["effects"][place]["name"] != effect["name"]:
             continue
+        if {truth["effects"][place]["channel"], effect["channel"]} == {"world", "body"}:
+            continue  # the same push, along other axes
         true = truth["effects"][place]["parameters"]
         for name, value in effect["parameters"].items():
             low, high = value["low"], value["high"]
