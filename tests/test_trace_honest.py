@@ -50,7 +50,7 @@ def test_wandering_yaw_noise_gets_no_name():
     [
         ([("wavy", "w", {"height": 0.3})], None, "w"),
         ([], lambda x, v, w: (v * (1 + 0.3 * np.cos(x[:, 2])), w * (1 + 0.3 * np.cos(x[:, 2])), 0.0, 0.0), "heading"),
-        ([], lambda x, v, w: (v * np.where(np.sin(40.0 * x[:, 0]) > 0.0, 0.7, 1.1), w, 0.0, 0.0), "position"),
+        ([], lambda x, v, w: (v * (1.0 + 0.4 * np.sin(25.0 * x[:, 0])), w, 0.0, 0.0), "position"),
     ],
     ids=["wavy response", "gain that depends on the heading", "stripes that slip"],
 )
