@@ -112,7 +112,7 @@ def _constant(signal: Signal, given: float | None, limits: tuple[int, int]) -> f
 
 
 def protect(layout: Layout, options: Options, database: Database) -> None:
-    """Adds counters and checksums to the messages that have them. Raises ConfigError."""
+    """Adds counters and checksums to the messages that have them; those of messages that are not used wait for it. Raises ConfigError."""
     for table, entries in (("counters", options.counters), ("checksums", options.checksums)):
         for name, option in entries.items():
             where = f"transport.{table}.{name}"
@@ -120,8 +120,6 @@ def protect(layout: Layout, options: Options, database: Database) -> None:
             key = key_of(message.frame_id, extended=message.is_extended_frame)
             users: list[Inbound | Outbound] = [out for out in layout.outbound if out.key == key]
             users += [layout.inbound[key]] if key in layout.inbound else []
-            if not users:
-                raise ConfigError(f"{where}: nothing of {name} is read or sent by this profile")
             signal = database.signal_in(message, str(option.signal).removeprefix(f"{name}."), where).signal
             if selectors_of(message, signal, where):
                 raise ConfigError(f"{where}: {signal.name} is multiplexed, so not every frame has it")

@@ -147,6 +147,21 @@ def test_dbc_is_part_of_the_profile_and_found_beside_it(tmp_path: Path) -> None:
         load_profile(path)
 
 
+def test_the_profiles_advice_for_a_bus_without_a_pose_works(tmp_path: Path) -> None:
+    text = (ROOT / "profiles" / "amr-can.toml").read_text()
+    for line in ('x = "Position.X"\n', 'y = "Position.Y"\n'):
+        text = text.replace(line, "")
+    lines = [line for line in text.splitlines() if not line.startswith(("theta = ", "stamp = "))]
+    reckoning = next(k for k, line in enumerate(lines) if line == "# [transport.dead_reckoning]")
+    for k in range(reckoning, reckoning + 5):
+        lines[k] = lines[k].removeprefix("# ")
+    text = "\n".join(lines).replace('trigger = "Heading"', 'trigger = "WheelSpeeds"')
+    (tmp_path / "amr-can.dbc").write_bytes((ROOT / "profiles" / "amr-can.dbc").read_bytes())
+    profile = parse_profile(text, "advised", tmp_path)
+    states = ("x", "y", "theta", "wheel_left", "wheel_right")
+    CanTransport({k: v for k, v in profile.transport.items() if k != "name"}, states, ("cmd_left", "cmd_right"))
+
+
 def test_stand_in_and_profile_have_the_same_dbc() -> None:
     from s2r_can.standin import DBC
 
