@@ -71,12 +71,12 @@ class Sequence:
         return ("old" if modulus - delta <= self._jump else "jumped"), 0
 
     def _lost_in_silence(self, delta: int, passed_ns: int) -> int:
-        """The number that the counter allows which is nearest to what the cycle says; without a cycle the least one."""
+        """The most that the counter and the cycle allow, but none where the counter goes on by one: then the sender paused, in all likelihood."""
         least = (delta - 1) % self._modulus
         if not self._cycle_ns:
             return least if 1 <= delta <= self._jump else 0
-        rounds = (passed_ns / self._cycle_ns - 1.0 - least) / self._modulus
-        return least + self._modulus * max(0, round(rounds))
+        rounds = (passed_ns // self._cycle_ns - 1 - least) // self._modulus
+        return least + self._modulus * max(0, rounds) if least else 0
 
     def _goes_on(self, counter: int, now_ns: int) -> bool:
         """Whether this ends a row of refused frames that count on properly."""
