@@ -117,7 +117,7 @@ def lack_of_fit(given: Problem, fit: Fit, nominal: Fit, horizon: int) -> Structu
     left = _Left(given, fit, residual(fit.model, given.steps, act), state_jacobian(fit.model, given.steps, act), block)
     found = [(token, _columns(terms)) for token, terms in dictionaries(given, fit.model, act)]
     found = [(token, x) for token, x in found if x.shape[2]]
-    chosen, gains = _forward(left, found)
+    chosen, gains = _forward(left, found) if found else ([], {})
     coloured = ("noise",) if np.any(fit.colour.strength > COLOURED) else ()
     if not chosen:
         return Structure(coloured, False, 0.0, gains)
