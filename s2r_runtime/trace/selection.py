@@ -38,6 +38,9 @@ Array = NDArray[np.float64]
 RELEVANT = 0.05
 """An effect that lowers no rollout error by this share is left out: nobody would notice it."""
 
+FAR = 100.0
+"""Bounds beyond it are there for form's sake: no robot's parameter is near them."""
+
 WITHIN = 0.4
 """Of a step: what stamps off the grid can look like."""
 
@@ -97,7 +100,21 @@ def select(
 
 def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int, bar: Bar = STRICT) -> bool:
     """Significant and relevant."""
-    return significant(given, fit, base, tried, bar) and _told_by_stamps(given, fit, base) and relevant(given, fit, base, horizon)
+    return (
+        _limited(fit)
+        and significant(given, fit, base, tried, bar)
+        and _told_by_stamps(given, fit, base)
+        and relevant(given, fit, base, horizon)
+    )
+
+
+def _limited(fit: Fit) -> bool:
+    """False if a number has run off to its bound: friction without limit says that nothing moves, not why."""
+    ends = [bounds_of(fit.model, slot) for slot in fit.free]
+    return all(
+        (v < 0.99 * p.high or p.high < FAR) and (v > 0.99 * p.low or p.low > -FAR)
+        for v, p in zip(values_of(fit.model, fit.free).tolist(), ends, strict=True)
+    )
 
 
 def _told_by_stamps(given: Problem, fit: Fit, base: Fit) -> bool:
