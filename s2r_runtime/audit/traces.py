@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 ELSEWHERE = 1e-6
 """How far a number of a trace may be off on another machine: a fit takes many steps of arithmetic that differ in their last digits."""
-SECONDS = 30.0
+SECONDS = 60.0
 """Of the processor, for one trace, if nothing else was asked for."""
 PATIENCE = 20.0
 """Times that, by the clock, on a busy machine."""

@@ -23,7 +23,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     audit.add_argument(
         "--rerun-traces",
         action="store_true",
-        help="run every trace again, however long it takes (default: those that take at most 30 s of the processor; the others are named)",
+        help="run every trace again, however long it takes (default: those within a minute of the processor; the others are named)",
     )
     audit.add_argument("--json", action="store_true", help="print one JSON object")
     audit.set_defaults(run=run_audit)
