@@ -59,6 +59,11 @@ changes its speed at once look slow."""
 SLOWEST, THINNED = 1.5, 3.2
 """Rows farther apart than this many steps do not give every step; farther apart than so many, the step was meant for another recording."""
 
+MOST_PARTS = 2
+"""Parts of a step that is many of the model's at most: what an input does within it is then placed to a quarter of it, and more would cost
+as much more and ask of a measured robot what no model of it holds.
+"""
+
 BEFORE = 600
 """Steps before the first state for which inputs are kept at most: hidden states have settled then."""
 
@@ -109,6 +114,8 @@ class Dataset:
     apart: int = 1
     interval: float = 0.0
     segments: tuple[tuple[Stream, Stream], ...] = field(default=(), repr=False)
+    in_parts: bool = False
+    """The model takes each of the S parts of a step by itself: its own steps are that much shorter."""
     campaign: Transitions | None = field(default=None, repr=False)
 
 
@@ -129,8 +136,10 @@ def from_streams(
     digests: tuple[str, ...] = (),
     paths: tuple[Path, ...] = (),
     reconstruction: Reconstruction | None = None,
+    in_parts: int = 0,
 ) -> Dataset:
-    """Segments of (states, inputs), both as received. reconstruction: what was done to them before.
+    """Segments of (states, inputs), both as received. reconstruction: what was done to them before. in_parts: S, if the model
+    is to take each part of a step by itself.
 
     Raises RecordingError if states come too seldom for the model's dt, or never, or inputs at another time.
     """
@@ -151,7 +160,7 @@ def from_streams(
         apart = max(apart, independent_step(reconstruction, dt))
     exact = all(on_grid(states.t, dt) for states, _ in stretches)
     as_they_are = not exact and spacing <= NEAREST * dt
-    parts = _parts(model, stretches, exact)
+    parts = in_parts or _parts(model, stretches, exact)
     origin = min(float(states.t[0]) for states, _ in stretches)
     runs: list[Run] = []
     pauses: list[Pause] = []
@@ -187,21 +196,22 @@ def from_streams(
         apart,
         reconstruction.interval if reconstruction else snapped(spacing, dt),
         tuple(segments),
+        in_parts > 0,
     )
 
 
-def regridded(data: Dataset, model: ComposedModel) -> Dataset:
+def regridded(data: Dataset, model: ComposedModel, in_parts: int = 0) -> Dataset:
     """The same recording on the grid of a model with another step."""
-    return from_streams(model, data.segments, data.source, data.digests, data.paths, data.reconstruction)
+    return from_streams(model, data.segments, data.source, data.digests, data.paths, data.reconstruction, in_parts)
 
 
 def thinned(model: ComposedModel, data: Dataset, test: Dataset | None = None) -> tuple[ComposedModel, Dataset, Dataset | None]:
     """The same on the shortest steps that are independent of each other in both: unchanged, if they are."""
     apart = max(data.apart, test.apart if test else 1)
-    if apart == 1:
+    if apart == 1 and (data.reconstruction is None or data.interval * MOST_PARTS > data.dt):
         return model, data, test
-    longer = at_step(model, apart * model.dt)
-    return longer, regridded(data, longer), regridded(test, longer) if test else None
+    longer, parts = at_step(model, apart * model.dt), MOST_PARTS
+    return longer, regridded(data, longer, parts), regridded(test, longer, parts) if test else None
 
 
 def least_parts(model: ComposedModel) -> int:

@@ -34,6 +34,9 @@ ROUNDS = 40
 CLOSE = 1e-7
 """Change, over the input's size, at which the iteration ends."""
 
+FARTHEST = 100.0
+"""Times the input's size that the one that the motion takes may be away: a model that asks for more explains nothing."""
+
 ROWS = 200_000
 """At most; of a longer recording a part of that length at the beginning."""
 
@@ -63,6 +66,9 @@ def inverse(model: ComposedModel, data: Dataset, held_out: Steps) -> Inverse | N
         return None
     edges = [0, *(np.flatnonzero(~steps.joined[1:]) + 1).tolist(), len(steps)]
     band = data.reconstruction.needed if data.reconstruction else _bandwidth(model, steps, edges, fine.dt)
+    longest = max(b - a for a, b in pairwise(edges))
+    while 4 * differentiation.reach(fine.dt, band) > longest and band < differentiation.HIGHEST / fine.dt:
+        band *= 1.5
     least = 2 * differentiation.reach(fine.dt, band)
     stretches = tuple((a, b) for a, b in pairwise(edges) if b - a > least)
     return Inverse(fine, steps, stretches, band) if stretches else None
@@ -86,24 +92,24 @@ def input_relative(model: ComposedModel, given: Inverse) -> float:
 def _needed(model: ComposedModel, steps: Steps, mean: Array, end: Array) -> Array:
     """u*, (n, nu)."""
     size = np.maximum(np.sqrt(np.mean(mean**2, axis=0)), 1e-12)
-    answer = np.stack([_slope(model, steps, mean, end, j, 0.1 * float(size[j])) for j in range(mean.shape[1])], axis=1)
+    answer = np.stack([_slope(model, steps, mean, end, j, float(size[j])) for j in range(mean.shape[1])], axis=1)
     back = np.linalg.pinv(answer)  # (nu, nx)
     shift = np.zeros_like(mean)
     for _ in range(ROUNDS):
         e = model.difference(steps.y1, model.advance(steps.y0, mean + shift, end + shift))
         step = e @ back.T
-        shift = shift + step
+        shift = np.clip(shift + step, -FARTHEST * size, FARTHEST * size)
         if np.all(np.abs(step) < CLOSE * size):
             break
     return np.asarray(mean + shift)
 
 
 def _slope(model: ComposedModel, steps: Steps, mean: Array, end: Array, j: int, h: float) -> Array:
-    """(nx,) what a unit more of input j does to the state, at the middle of all rows: where friction holds, it does nothing."""
+    """(nx,) what a unit more of input j does to the state, where it does much: where friction holds, it does nothing."""
     up = np.zeros(mean.shape[1])
     up[j] = h
     change = model.advance(steps.y0, mean + up, end + up) - model.advance(steps.y0, mean - up, end - up)
-    return np.asarray(np.median(change, axis=0) / (2.0 * h))
+    return np.asarray(np.quantile(np.abs(change), 0.9, axis=0) * np.sign(np.sum(change, axis=0)) / (2.0 * h))
 
 
 def _within(steps: Steps, dt: float, held_out: Steps, longer: float) -> Mask:

@@ -42,7 +42,7 @@ class Leftover:
         columns = slice(None) if channel == "*" else slice(model.inputs.index(channel), model.inputs.index(channel) + 1)
         more[:, columns] = here.mean[:, columns] if proportional else 1.0
         h = NUDGE * max(float(np.max(np.abs(here.mean), initial=0.0)), NUDGE) / max(float(np.max(np.abs(more), initial=0.0)), NUDGE)
-        nudged = Acting(here.mean + h * more, here.end + h * more, here.lasts)
+        nudged = here.moved(h * more)
         return (advanced(model, steps.y0, nudged, steps.place) - advanced(model, steps.y0, here, steps.place)) / h
 
     @cached_property

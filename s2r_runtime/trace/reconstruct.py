@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import msgspec
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.hookspecs import Follows
-from s2r_runtime.models.composed import ComposedModel, compose
+from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import differentiation
 from s2r_runtime.trace.streams import Stream, complete, held_means, unwrapped
 
@@ -98,7 +98,7 @@ def independent_step(done: Reconstruction, dt: float) -> int:
 
 def at_step(model: ComposedModel, dt: float) -> ComposedModel:
     """The same model with another step."""
-    return compose(msgspec.structs.replace(model.spec, dt=dt))
+    return replace(model, spec=msgspec.structs.replace(model.spec, dt=dt))
 
 
 def _check_follows(model: ComposedModel, missing: Sequence[str], source: str) -> None:

@@ -53,12 +53,18 @@ class Steps:
 @dataclass(frozen=True)
 class Acting:
     """The input as it acts over every step of all runs laid end to end: mean over the step, and at its end, (M, nu). lasts: (M,) s, of each
-    step, None where all last dt.
+    step, None where all last dt. parts: (M, S, nu) over parts of it, where the model takes each part by itself.
     """
 
     mean: Array
     end: Array
     lasts: Array | None = None
+    parts: Array | None = None
+
+    def moved(self, shift: Array) -> Acting:
+        """The same with (M, nu) more."""
+        parts = None if self.parts is None else self.parts + shift[:, None, :]
+        return Acting(self.mean + shift, self.end + shift, self.lasts, parts)
 
 
 def first_steps(data: Dataset) -> Index:
@@ -96,7 +102,8 @@ def acting(model: ComposedModel, data: Dataset, effects: Sequence[AppliedEffect]
         return Acting(u, u, lasts)
     table = u.reshape(-1, data.substeps * u.shape[1])
     mean = table @ np.tile(np.eye(u.shape[1]) / data.substeps, (data.substeps, 1))
-    return Acting(mean, table[:, -u.shape[1] :].copy(), lasts)
+    parts = u.reshape(-1, data.substeps, u.shape[1]) if data.in_parts else None
+    return Acting(mean, table[:, -u.shape[1] :].copy(), lasts, parts)
 
 
 def sequence(model: ComposedModel, chain: Sequence[AppliedEffect], inputs: Sequence[Array], dt: float, starts: Sequence[float]) -> Array:
@@ -140,15 +147,26 @@ def _side_by_side(model: ComposedModel, chain: Sequence[AppliedEffect], inputs: 
 
 
 def advanced(model: ComposedModel, x: Array, act: Acting, place: Index | slice) -> Array:
-    """x (n, nx) one step later, angles not wrapped; place: which of the steps.
+    """x (n, nx) one step later, angles not wrapped; place: which of the steps. A step of a thinned recording is many of the model's.
 
     A model has one dt. Steps that last h are interpolated between the model's at dt (1 - s), dt and dt (1 + s), a quadratic in h: exact for
     poses by Euler and for constant accelerations.
     """
-    mean, end = act.mean[place], act.end[place]
-    if act.lasts is None:
+    lasts = None if act.lasts is None else act.lasts[place]
+    if act.parts is None:
+        return _once(model, x, act.mean[place], act.end[place], lasts)
+    parts = act.parts[place]
+    count = parts.shape[1]
+    short = replace(model, spec=structs.replace(model.spec, dt=model.dt / count))
+    for i in range(count):
+        x = _once(short, x, parts[:, i], parts[:, i], None if lasts is None else lasts / count)
+    return x
+
+
+def _once(model: ComposedModel, x: Array, mean: Array, end: Array, lasts: Array | None) -> Array:
+    if lasts is None:
         return model.advance(x, mean, end)
-    h = (act.lasts[place] / model.dt - 1.0)[:, None]
+    h = (lasts / model.dt - 1.0)[:, None]
     s = float(np.clip(np.max(np.abs(h), initial=0.0), 0.05, 0.9))
     short, long = (replace(model, spec=structs.replace(model.spec, dt=model.dt * (1.0 + r))).advance(x, mean, end) for r in (-s, s))
     usual = model.advance(x, mean, end)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.errors import MANY
 from s2r_runtime.trace.fitting import evaluate, problem
-from s2r_runtime.trace.residual import Steps, acting, first_steps, residual, rollout_starts, steps_of
+from s2r_runtime.trace.residual import Steps, acting, advanced, first_steps, residual, rollout_starts, steps_of
 from s2r_runtime.trace.shape import Component, components, variables
 
 if TYPE_CHECKING:
@@ -231,5 +231,5 @@ def _rolled(model: ComposedModel, r: TraceResult, place: int, y: Array, begins: 
     x[0] = y[0]
     for k in range(len(y) - 1):
         here = y[k] if k in begins else x[k]
-        x[k + 1] = model.advance(here[None, :], act.mean[place + k : place + k + 1], act.end[place + k : place + k + 1])[0]
+        x[k + 1] = advanced(model, here[None, :], act, slice(place + k, place + k + 1))[0]
     return x
