@@ -148,12 +148,14 @@ class Rates:
     # ------------------------------------------------------------------ what comes
 
     def _watch_gaps(self, now_ns: int) -> None:
-        """Whether a message that was granted came after a gap. Only that one is asked for, as it was granted."""
+        """Whether a message that was granted came after a gap, or fails to come. Only that one is asked for, as it was granted: if it is the
+        link that is silent, asking costs nothing.
+        """
         for rate in self.all:
             told = self._told.get(rate.number)
             if told is None or not 0.0 < rate.granted_ms < math.inf:
                 continue
-            gap_ns, told.gap_ns = told.gap_ns, 0
+            gap_ns, told.gap_ns = max(told.gap_ns, now_ns - told.newest_ns), 0
             most_ns = max(GAP_LEAST_NS, GAP * 1e6 * rate.granted_ms / min(1.0, self._clock.pace))
             if gap_ns > most_ns and now_ns - rate.granted_ns >= SETTLING_NS and now_ns >= self._gap_ns:
                 self._gaps = self._gaps + 1 if now_ns - self._gap_ns < LATER_NS else 1

@@ -180,7 +180,7 @@ class Rover:
         wanted_ms = DEFAULT_INTERVALS_MS[number] if interval_us == 0 else 0 if interval_us < 0 else max(1, int(interval_us / 1000.0))
         if wanted_ms and wanted_ms < self._least_ms():
             return int(mavlink.MAV_RESULT_DENIED)
-        self._intervals[number] = wanted_ms
+        self._intervals[number], self._due[number] = wanted_ms, self.now_s + 1e-3 * wanted_ms
         self._say(interval=number, ms=wanted_ms)
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
