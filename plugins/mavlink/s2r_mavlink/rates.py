@@ -148,8 +148,8 @@ class Rates:
     # ------------------------------------------------------------------ what comes
 
     def _watch_gaps(self, now_ns: int) -> None:
-        """Whether a message that was granted came after a gap, or fails to come. Only that one is asked for, as it was granted: if it is the
-        link that is silent, asking costs nothing.
+        """Whether a message that was granted came after a gap, or fails to come. Only that one is asked for, as it was granted: if it is
+        the link that is silent, asking costs nothing.
         """
         for rate in self.all:
             told = self._told.get(rate.number)
