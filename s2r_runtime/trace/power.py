@@ -1,10 +1,10 @@
-"""What these data could have shown: the smallest size of each effect that would have been taken for one.
+"""What these data could have shown: the smallest size of each effect that they would have told from noise.
 
 To first order an effect of size s (its parameter less the neutral value) that is not there yet gains
 
     s^2 / (2 s0^2) |c - J delta|^2 nats          c: its whitened column at a small size s0; J delta: what the model's own parameters take up
 
-and it is taken from `needed` nats on (everything tried paid for). Where the column vanishes, nothing on these data can show the effect:
+and it is told from noise from `needed` nats on (everything tried paid for). Where the column vanishes, nothing on these data can show the effect:
 "none" says nothing about it.
 """
 

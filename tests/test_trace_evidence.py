@@ -1,0 +1,71 @@
+"""What a name rests on: the evidence for a dictionary, what chance makes of it, and what a recording could have shown."""
+
+import numpy as np
+import pytest
+from trace_robots import DT, NOISE, ROBOTARIUM, declared, drive, recordings
+
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.evidence import RIDGES, evidence, margin
+from s2r_runtime.trace.tracer import trace
+
+
+def test_the_evidence_is_the_ratio_of_two_normal_densities():
+    rng = np.random.default_rng(1)
+    x, z = rng.normal(size=(60, 4)), rng.normal(size=60)
+    z = z + x @ np.array([1.0, -0.5, 0.0, 0.2])
+    found = evidence(x.T @ x, x.T @ z)
+    size = float(np.mean(np.diag(x.T @ x)))
+    told = []
+    for ridge in RIDGES * size:
+        cov = np.eye(60) + x @ x.T / ridge
+        told.append(0.5 * float(z @ z) - 0.5 * float(z @ np.linalg.solve(cov, z)) - 0.5 * float(np.linalg.slogdet(cov)[1]))
+    assert found.log == pytest.approx(max(told), rel=1e-9)
+
+
+def _slow(rng, n, keep):
+    """A disturbance that wanders: standard deviation 1, remembered for 1 / (1 - keep) steps."""
+    e = np.zeros(n)
+    for k in range(1, n):
+        e[k] = keep * e[k - 1] + np.sqrt(1.0 - keep * keep) * rng.normal()
+    return e
+
+
+def test_noise_that_wanders_is_not_beyond_what_sliding_reaches():
+    """40 recordings without structure, noise and terms both slow: at 5 nats beyond 80 slides hardly one in a hundred would be."""
+    alarms = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        terms = np.stack([_slow(rng, 500, 0.95) for _ in range(3)], axis=1)[:, None, :]
+        z = 3.0 * _slow(rng, 500, 0.9)[:, None]
+        assert evidence(terms[:, 0].T @ terms[:, 0], terms[:, 0].T @ z[:, 0]).log > -5.0
+        alarms += margin(terms, z, np.ones_like(z), 0.0) > 5.0
+    assert alarms <= 2
+
+
+def test_structure_in_wandering_noise_is_beyond_what_sliding_reaches():
+    for seed in range(5):
+        rng = np.random.default_rng(100 + seed)
+        terms = np.stack([_slow(rng, 1500, 0.9) for _ in range(3)], axis=1)[:, None, :]
+        z = _slow(rng, 1500, 0.9)[:, None] + 0.8 * terms[:, :, 1]
+        assert margin(terms, z, np.ones_like(z), 5.0) > 8.0
+
+
+def test_a_gain_well_above_the_size_that_could_be_seen_is_named():
+    clean = recordings([], 1, steps=700, seed=41)[0]
+    could = {(v.name, v.channel): v for v in trace(clean, declared()).could_see}
+    least = could["input_gain", "w"].size
+    assert 0.0 < least < 0.01
+    off = recordings([("input_gain", "w", {"gain": 0.98})], 1, steps=700, seed=41)[0]
+    found = trace(off, declared())
+    assert ("input_gain", "w") in {(e.name, e.channel) for e in (*found.effects, *found.ambiguous_with)}
+
+
+def test_inputs_that_never_change_could_not_have_shown_a_coupling_of_what_is_zero():
+    u = np.zeros((1, 400, 2))
+    u[0, :, 0] = 0.1
+    y = drive(np.random.default_rng(3), "unicycle", u, ROBOTARIUM, DT, NOISE)
+    told = trace(from_arrays(declared(), [(y[0], u[0])]), declared())
+    assert told.verdict == "none"
+    sizes = {(v.name, v.channel): v.size for v in told.could_see}
+    assert sizes["input_gain", "w"] is None
+    assert sizes["input_gain", "v"] is not None
