@@ -71,7 +71,7 @@ class Sequence:
         return ("old" if modulus - delta <= self._jump else "jumped"), 0
 
     def _lost_in_silence(self, delta: int, passed_ns: int) -> int:
-        """The most that the counter and the cycle allow, but none where the counter goes on by one: then the sender paused, in all likelihood."""
+        """The most that counter and cycle allow; none where the counter goes on by one: then the sender paused, in all likelihood."""
         least = (delta - 1) % self._modulus
         if not self._cycle_ns:
             return least if 1 <= delta <= self._jump else 0

@@ -32,6 +32,7 @@ from s2r_runtime.errors import ConfigError, S2RError
 DBC = Path(__file__).parent / "data" / "amr-can.dbc"
 COMMAND_TIMEOUT_S = 0.1
 STATUS_EVERY = 5
+COLLECT_S = 0.002
 COMMAND_JUMP = 3
 """Steps of the command's counter that count as lost commands; others are not obeyed until they go on properly."""
 EPILOG = """
@@ -73,7 +74,10 @@ class Standin:
         due = time.monotonic() + dt
         while self.running:
             self._publish(self._body.observe())
-            self._listen(due)
+            if self._options.eager:
+                self._await()
+            else:
+                self._listen(due)
             fresh = time.monotonic() - self._commanded_at <= COMMAND_TIMEOUT_S
             allowed = fresh and not self._stop and not self._manual
             self.tally["stopped_periods"] += not allowed
@@ -136,6 +140,13 @@ class Standin:
                 continue
             if message is not None and message.arbitration_id == 513 and not message.is_error_frame and len(message.data) == 8:
                 self._obey_frame(bytes(message.data))
+
+    def _await(self) -> None:
+        """Until a command came, and a little longer, so that the newest counts; or for so long that there is nobody."""
+        before, end = self.tally["commands"], time.monotonic() + 2.0 * COMMAND_TIMEOUT_S
+        while self.running and self.tally["commands"] == before and time.monotonic() < end:
+            self._listen(min(end, time.monotonic() + COLLECT_S))
+        self._listen(time.monotonic() + COLLECT_S)
 
     def _obey_frame(self, data: bytes) -> None:
         told = self._db.decode_message(513, data)
@@ -224,6 +235,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--time-constant", type=float, default=sheet.time_constant, help="of the wheels, s (default %(default)s)")
     p.add_argument("--latency", type=int, default=sheet.latency, help="periods until a command acts (default %(default)s)")
     p.add_argument("--effect", action="append", default=[], metavar="EFFECT", help="undeclared, from the start; repeatable")
+    p.add_argument(
+        "--eager", action="store_true", help="a period is over when a command came: time goes as fast as it is answered, for tests"
+    )
     p.add_argument("--lose", type=float, default=0.0, metavar="P", help="probability that a frame is not sent")
     p.add_argument("--corrupt", type=float, default=0.0, metavar="P", help="probability that a bit of a frame is wrong")
     p.add_argument("--duplicate", type=float, default=0.0, metavar="P", help="probability that a frame is sent twice")
