@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from s2r_runtime.effects import classes
 from s2r_runtime.effects.classes import canonical, same, several
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
@@ -199,6 +200,24 @@ def test_a_model_of_the_users_own_has_the_classes_that_hold_on_it(tmp_path):
     assert canonical(model, "longitudinal_slip", "*") == ("input_gain", "ahead")
     # this one moves along the chord without shortening it: turning less is not the same as turning the command down
     assert canonical(model, "track_scale", "theta") == ("track_scale", "theta")
+
+
+def test_what_an_effect_of_others_says_of_itself_counts(monkeypatch):
+    class Weakness:
+        """input_gain by another name."""
+
+        stage = "input"
+
+        def channels(self, model):
+            return model.inputs
+
+        def same_as(self, model, channel):
+            return (("input_gain", channel, lambda p: {"gain": 1.0 - p["lost"]}),)
+
+    monkeypatch.setattr(classes, "_effects", lambda: iter([("weakness", Weakness())]))
+    model = _model("unicycle").for_effects
+    assert canonical(model, "weakness", "w") == ("input_gain", "w")
+    assert ("track_scale", "theta", {"gain": 0.75}) in same(model, "weakness", "w", {"lost": 0.25})
 
 
 @pytest.mark.parametrize("name", MODELS)
