@@ -6,17 +6,23 @@ are is tried out on the nominal step: f(x + b e) - b e is not f(x).
 
 from __future__ import annotations
 
+from weakref import WeakKeyDictionary
+
 import numpy as np
 
 from s2r_runtime.effects.step_effect import Array, SensorEffect, Values, size_of
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import NominalModel, Parameter
+from s2r_runtime.models.bound import BoundModel
 
 TRIED, TRIED_DT_S, TRIED_OFFSET = 8, 0.1, 0.5
 """States, step and offset on which it is tried; any will do."""
 
 SAME = 1e-9
 """Less than this and the step has moved along with the offset, but for rounding."""
+
+
+_KNOWN: WeakKeyDictionary[BoundModel, tuple[str, ...]] = WeakKeyDictionary()
 
 
 class SensorOffset(SensorEffect):
@@ -27,7 +33,14 @@ class SensorOffset(SensorEffect):
     value = "offset"
 
     def channels(self, model: NominalModel) -> tuple[str, ...]:
-        """States on which the step depends otherwise than by moving along."""
+        """States on which the step depends otherwise than by moving along; tried out once a model."""
+        if not isinstance(model, BoundModel):
+            return self._shown(model)
+        if model not in _KNOWN:
+            _KNOWN[model] = self._shown(model)
+        return _KNOWN[model]
+
+    def _shown(self, model: NominalModel) -> tuple[str, ...]:
         rng = np.random.default_rng(0)
         x = rng.uniform(-1.0, 1.0, (TRIED, len(model.states)))
         u = rng.uniform(-1.0, 1.0, (TRIED, len(model.inputs)))
