@@ -52,6 +52,7 @@ class CampaignReplay:
         self._sends: deque[Send] = deque(maxlen=KEPT)
         self._reason = ""
         self._resumed: dict[str, Any] | None = None
+        self._again: list[SampleTaken] = []
         self._asked: deque[tuple[Ask, Observation, int]] = deque()
         self._exact = True
 
@@ -72,6 +73,7 @@ class CampaignReplay:
         self._campaign, self._doubtful = None, False
         self._due.clear()
         self._asked.clear()
+        self._again.clear()
         try:
             campaign = Campaign.from_settings(settings, sampling, n=order.n, epoch=order.epoch, seed=order.seed)
             if order.resume:
@@ -98,13 +100,16 @@ class CampaignReplay:
     def _settle(self) -> None:
         """Answers what was asked. A campaign that goes on is first told where it stood: at the samples that were logged once more.
 
-        The daemon kept those, and may have kept one that a crash cut from the log before; the other counts may lack what it cut.
+        The daemon kept those. It may have kept one that a crash cut from the log before, and may not have kept one that stands there;
+        the other counts may lack what it cut.
         """
         campaign, order = self._campaign, self._order
         if campaign is None or order is None:
             return
         if self._resumed is not None:
-            taken = len(self.samples.get(order.epoch, ()))
+            taken = len(self._again)
+            if len(self.samples.get(order.epoch, ())) > taken:
+                self.samples[order.epoch] = list(self._again)
             if taken != self._resumed["index"]:
                 self._exact = False
                 campaign.restore({**self._resumed, "index": taken})
@@ -167,6 +172,7 @@ class CampaignReplay:
 
     def _once_more(self, entry: Entry, event: SampleTaken, kept: list[SampleTaken]) -> None:
         """A sample of before the interruption: the same as it was, if that log was given."""
+        self._again.append(event)
         told = next((one for one in kept if one.index == event.index), None)
         if told is None:
             kept.append(event)

@@ -183,7 +183,7 @@ class Stretches:
                 for window in self._windows.values():
                     window.input(*row)
             case SampleTaken() if message.epoch == self._windows["campaign"].epoch:
-                self._samples.setdefault(message.index, message)  # one logged once more is the same
+                self._samples[message.index] = message  # one logged once more is the same; one that a crash took back is drawn anew
             case StartCampaign(epoch=epoch):
                 window = self._windows["campaign"]
                 if epoch != window.epoch:
