@@ -27,7 +27,7 @@ from s2r_can.records import ERROR, EXTENDED, Record, packed, records
 from s2r_runtime.messages import Command, Frame, LinkChanged, Observation
 
 PROPOSALS_PER_SECOND = 32
-ERRORS_PER_SECOND = 32
+ERRORS_PER_SECOND = STRANGERS_PER_SECOND = 32
 
 
 class CanTransport:
@@ -106,8 +106,8 @@ class CanTransport:
     def _from_robot(self, record: Record) -> None:
         """On the port's thread: keeps what this profile reads, and passes on what the other side may hear."""
         ring = self._ring.get(record.key)
-        if ring is not None:
-            self._inbox.put(record, ring=ring)
+        if ring is not None:  # of a stranger's commands some will do
+            self._inbox.put(record, ring=ring, per_second=STRANGERS_PER_SECOND if record.key in self._commands else 0)
         elif record.key & ERROR:
             self._inbox.put(record, ring=True, per_second=ERRORS_PER_SECOND)
         else:
