@@ -224,7 +224,7 @@ def _suggested(page: Page, r: TraceResult, suggested: Any) -> None:
     for line in suggested.lines():
         page.text(f"{line[0].upper()}{line[1:]}.")
     if suggested.u is not None:
-        t = r.nominal.dt * np.arange(len(suggested.u), dtype=np.float64)
+        t = suggested.dt * np.arange(len(suggested.u), dtype=np.float64)
         for svg in plots.sequence(t, suggested.u, r.nominal.inputs, [units.get(name, "") for name in r.nominal.inputs]):
             page.broad(svg, "")
 
