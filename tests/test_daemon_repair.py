@@ -321,3 +321,39 @@ def test_a_model_that_was_refused_is_not_the_one_in_force_after_a_restart(rigs: 
     rig.stop()
     rig.start()
     assert rig.status()["model"] == adopted
+
+
+# ---------------------------------------------------------------- the command line
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["sample", "rig.toml", "--inputs", "inputs.csv"], "--inputs: no daemon of robot 'rig' is running"),
+        (["trace"], "give a RECORDING, or --live"),
+        (["trace", "log.mcap", "--live", "drive"], "give a RECORDING, or --live"),
+        (["trace", "--live", "drive", "--profile", "rig.toml"], "--profile: the daemon traces as its profile says"),
+        (["trace", "--live", "drive", "--horizon", "2"], "--horizon: the daemon traces as its profile says"),
+        (["trace", "--live", "drive"], "no daemon is running here"),
+        (["adopt"], "no daemon is running here"),
+    ],
+)
+def test_what_makes_no_sense_is_one_line(tmp_path: Path, argv: list[str], said: str) -> None:
+    rig = Rig(tmp_path)
+    inputs_file(rig, 3)
+    done = rig.s2r(*argv)
+    assert (done.returncode, said in done.stderr, done.stderr.count("\n")) == (2, True, 1), done.stderr
+
+
+def test_beside_a_file_of_inputs_nothing_else_is_asked_for(rigs: Any) -> None:
+    rig = rigs()
+    path = inputs_file(rig, 3)
+    for more, said in ((["-n", "3"], "leave -n and --cancel out"), (["--cancel"], "leave -n and --cancel out"), ([], "no such file")):
+        file = str(path) if more else "none.csv"
+        done = rig.s2r("sample", str(rig.profile), "--inputs", file, *more)
+        assert (done.returncode, said in done.stderr) == (2, True), done.stderr
+    wrong = rig.folder / "wrong.toml"
+    wrong.write_text(rig.profile.read_text() + '[repair]\nadopt = "never"\n')
+    assert "repair.adopt" in rig.s2r("profile", "check", str(wrong)).stderr
+    wrong.write_text(rig.profile.read_text() + "[repair]\nrows = 10\n")
+    assert "repair.rows is 10, must be >= 100" in rig.s2r("profile", "check", str(wrong)).stderr
