@@ -64,13 +64,12 @@ class Fit:
     z: Array
     white: float
     coloured: float
-    idle: int = 0
 
     @property
     def k(self) -> int:
-        """Number of fitted parameters that these data feel at all (`idle` ones do not); an effect without any counts as one."""
+        """Number of fitted parameters, also of those that these data hardly feel; an effect without any counts as one."""
         named = {slot.place for slot in self.free}
-        return max(len(self.free) - self.idle, 0) + sum(1 for i in self.added if i not in named)
+        return len(self.free) + sum(1 for i in self.added if i not in named)
 
     @property
     def added(self) -> tuple[int, ...]:
@@ -214,14 +213,7 @@ def fitted(given: Problem, start: Fit, model: ComposedModel, rounds: int = ROUND
         before, fit = fit, evaluate(given, model, fit.noise)
         if turn and fit.white - before.white < SETTLED:
             break
-    return replace(fit, idle=_idle(given, fit))
-
-
-def _idle(given: Problem, fit: Fit) -> int:
-    """Parameters that change nothing here: a limit that is never reached."""
-    j = sensitivities(given, fit, fit.model, fit.free)
-    sizes = np.maximum(np.abs(values_of(fit.model, fit.free)), 1e-9)
-    return int(np.count_nonzero(np.sqrt(np.sum(j * j, axis=0)) * sizes < 0.1))
+    return fit
 
 
 def insert(model: ComposedModel, effect: AppliedEffect, place: int) -> ComposedModel:
