@@ -4,8 +4,8 @@ To first order an effect of size s (its parameter less the neutral value) that i
 
     s^2 / (2 s0^2) |c - J delta|^2 nats          c: its whitened column at a small size s0; J delta: what the model's own parameters take up
 
-and it is told from noise from `needed` nats on (everything tried paid for). Where the column vanishes, nothing on these data can show the effect:
-"none" says nothing about it.
+and it is told from noise from `needed` nats on (everything tried paid for). Where the column vanishes, nothing on these data can show
+the effect: "none" says nothing about it.
 """
 
 from __future__ import annotations
