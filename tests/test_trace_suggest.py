@@ -12,8 +12,10 @@ import pytest
 from trace_robots import commands, drive
 
 from s2r_runtime.cli.main import main
+from s2r_runtime.daemon.given_inputs import parse_inputs
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec, dump_model
+from s2r_runtime.profile import load_profile
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.excitation import suggest, suggest_first
 from s2r_runtime.trace.suggestion import ENOUGH
@@ -218,7 +220,10 @@ def test_a_recording_in_which_nothing_was_asked_gets_a_first_drive_where_a_profi
     out, err = capsys.readouterr()
     assert "every input is zero" in err
     assert "pairs of effects apart" in out
+    robot = load_profile(profile)
+    driven = parse_inputs(file.read_bytes(), "drive.csv", ("v", "w"), robot.inputs, robot.model.dt, {})  # what the daemon would drive
     table = np.loadtxt(file, delimiter=",", skiprows=1)
+    assert np.array_equal(driven.rows, table[:, 1:])
     assert len(table) == round(5 / 0.033)
     assert np.abs(table[:, 1]).max() <= 0.2
     assert np.abs(table[:, 2]).max() > 1.0
