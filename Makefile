@@ -1,5 +1,6 @@
 # make run    sets everything up and runs the whole loop on the built-in robot over real Zenoh
 # make test   sets everything up and runs the tests
+# make test-long  the tests that need minutes each: measured recordings, ties broken by suggested drives
 # make check  format, lint, types, import walls, docs
 # make bench  the figures that the docs state, as ratios in one run
 # make bench-trace  the tracer on seeded recordings that it has never seen, in some 15 minutes; SETS="--seeds 0:5 --failures" for others
@@ -8,13 +9,16 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: run test check bench bench-trace format clean wheels setup
+.PHONY: run test test-long check bench bench-trace format clean wheels setup
 
 run: $(STAMP)
 	$(BIN)/s2r demo
 
 test: $(STAMP)
 	$(BIN)/pytest
+
+test-long: $(STAMP)
+	$(BIN)/pytest -m long
 
 check: $(STAMP)
 	$(BIN)/ruff format --check .

@@ -18,7 +18,7 @@ RECORDING = FOLDER / "mrclam_ds4_robot3.csv.gz"
 
 
 @pytest.mark.skipif(not RECORDING.exists(), reason="the measured recordings are not here")
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_delay_of_a_real_robot_is_found_and_its_heading_is_foretold_as_well_as_others_found():
     """Published for this recording at 10 Hz: a transport delay or lag of 0.17 s in w and 0.21 s in v dominates; the one-step heading error
     on held-out data falls from .0133 to .0079 rad by the delay alone.

@@ -253,7 +253,7 @@ def test_a_page_fits_narrow_and_wide_windows(pages, verdict, width, tmp_path):
     assert figures >= 25
 
 
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("bicycle", "double_integrator")]
+SLOW = [pytest.param(name, marks=pytest.mark.long) for name in ("bicycle", "double_integrator")]
 
 
 @pytest.mark.parametrize("name", ["differential_drive", "joint", *SLOW])
@@ -289,7 +289,7 @@ def test_a_suggested_drive_stands_on_the_page(results):
     assert 'aria-label="suggested w over time"' in page
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_page_of_a_hundred_thousand_rows_stays_a_page():
     rng = np.random.default_rng(3)
     u = commands(rng, 1, 100_000, DT, BOUNDS)

@@ -71,7 +71,7 @@ def named(found):
 SOON = ("bias at constant speed", "gain at two yaw rates", "lag in slow turns")
 
 
-@pytest.mark.parametrize("case", [case if case in SOON else pytest.param(case, marks=pytest.mark.slow) for case in TIES])
+@pytest.mark.parametrize("case", [case if case in SOON else pytest.param(case, marks=pytest.mark.long) for case in TIES])
 def test_the_suggested_drive_breaks_the_tie_and_the_right_effect_is_named(case):
     inputs, effect, rival = TIES[case]
     first = recorded([effect], inputs(np.random.default_rng(5)))
