@@ -14,7 +14,7 @@ from s2r_runtime.modelspec import dump_model, load_model
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.tracer import trace
 
-SETS, STEPS = 3, 700
+SETS, STEPS = 2, 600
 
 
 def _names(found):
