@@ -211,7 +211,7 @@ class Desk:
 
         def loaded(result: Result | Failed) -> None:
             if isinstance(result, Failed) or result.inputs is None:
-                connection.answer(78, f"--inputs: {result.text}" if isinstance(result, Failed) else "no inputs were read")
+                connection.answer(1, f"refused: {result.text if isinstance(result, Failed) else 'no inputs were read'}")
                 return
             given = result.inputs
             self._d.excitation.keep(given)
