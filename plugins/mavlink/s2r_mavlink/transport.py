@@ -235,6 +235,7 @@ class MavlinkTransport:
             "sent": self._sent,
             "dropped_in": door.dropped + self._line.overflowed,
             "dropped_out": self._dropped_out,
+            "overflowed": self._line.overflowed,
             "malformed": self._line.malformed + self._wire.malformed,
             "lost": door.lost,
             "old": clock.old,
