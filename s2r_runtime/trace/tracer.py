@@ -31,6 +31,7 @@ from s2r_runtime.trace.fitting import Fit, Problem, evaluate, problem
 from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.intervals import intervals
 from s2r_runtime.trace.lack_of_fit import Structure, lack_of_fit
+from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.residual import Mask, first_steps, rms, steps_of
 from s2r_runtime.trace.result import Found, Limit, TraceResult
@@ -98,6 +99,7 @@ def _traced(
     if test is not None:
         _belongs(test, model)
     model, dataset, test = thinned(model, dataset, test)
+    check_plausible(model, dataset)
     say(0.0, 100.0, "looking for faults of measurement")
     checked = check(model, with_history(model, dataset))
     seen = fit_mask(checked.data, seed, everything=test is not None)

@@ -40,6 +40,7 @@ def bad(name: str, seed: int, rng: Rng) -> TraceSet:
     runs, _ = drive(rng, draft)
     runs[0] = _odd(rng, kind, s, runs[0])
     recording = recording_of(rng, draft, runs)
+    recording.wrap = recording.wrap and kind != "degrees"  # who writes degrees does not wrap them at pi
     truth = {"expect": "bad", **common(draft, None), "kind": kind, "must_refuse": kind in BROKEN, "accepted": []}
     return TraceSet(name, seed, recording, draft.model(), truth, raw=_broken(kind, recording) if kind in BROKEN else None, draft=draft)
 

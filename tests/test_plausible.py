@@ -1,0 +1,89 @@
+"""Columns that are not what they say are refused in one line that says what they seem to be; a robot with a strong effect is not."""
+
+import numpy as np
+import pytest
+from trace_robots import GEOMETRY, INPUTS, commands, drive
+
+from s2r_runtime.errors import RecordingError
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.trace.dataset import Stream, from_streams
+from s2r_runtime.trace.plausible import check_plausible
+from s2r_runtime.trace.tracer import trace
+
+DT, STEPS = 0.05, 700
+BOUNDS = {
+    "unicycle": [(-0.3, 1.0), (-1.5, 1.5)],
+    "bicycle": [(-0.4, 0.4), (0.2, 2.0)],
+    "differential_drive": [(-3.0, 8.0)] * 2,
+    "joint": [(-3.0, 3.0)],
+    "double_integrator": [(-1.0, 1.0)] * 2,
+}
+
+
+def _model(name):
+    pose = (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),) if name not in {"joint", "double_integrator"} else ()
+    return compose(ModelSpec(name, DT, GEOMETRY.get(name, {}), pose))
+
+
+def _driven(name, seed=1, effects=()):
+    rng = np.random.default_rng(seed)
+    u = commands(rng, 1, STEPS, DT, BOUNDS[name])
+    y = drive(rng, name, u, effects, DT, 1e-3)[0]
+    return y[:-1], u[0]
+
+
+def _data(model, y, u, early=0.0, rate=1.0):
+    t = DT * np.arange(STEPS)
+    return from_streams(model, [(Stream(t, y), Stream(rate * t + early, u))], "here.csv")
+
+
+MISTAKES = {
+    "degrees": ("unicycle", lambda y, u: (y * [1, 1, 180 / np.pi], u), "theta seems to be in degrees"),
+    "x and y": ("unicycle", lambda y, u: (y[:, [1, 0, 2]], u), "the columns x and y seem to be exchanged"),
+    "inputs": ("bicycle", lambda y, u: (y, u[:, ::-1]), "the columns steer_cmd and speed_cmd seem to be exchanged"),
+    "clockwise": ("unicycle", lambda y, u: (y * [1, 1, -1], u), "seems to"),
+    "compass": ("bicycle", lambda y, u: (np.column_stack([y[:, :2], np.pi / 2 - y[:, 2], y[:, 3]]), u), "clockwise from y"),
+    "millimetres": ("unicycle", lambda y, u: (y * [1000, 1000, 1], u), "x and y seem to be in mm"),
+    "degrees a second": ("unicycle", lambda y, u: (y, u * [1, 180 / np.pi]), "w seems to be in degrees a second"),
+    "steer in degrees": ("bicycle", lambda y, u: (y, u * [180 / np.pi, 1]), "steer_cmd seems to be in degrees"),
+}
+
+
+@pytest.mark.parametrize("case", MISTAKES)
+def test_a_usual_mistake_is_named(case):
+    name, spoil, said = MISTAKES[case]
+    with pytest.raises(RecordingError, match=said):
+        check_plausible(_model(name), _data(_model(name), *spoil(*_driven(name))))
+
+
+def test_the_tracer_says_so_instead_of_looking_for_an_effect():
+    name, spoil, said = MISTAKES["degrees"]
+    with pytest.raises(RecordingError, match=said):
+        trace(_data(_model(name), *spoil(*_driven(name))), _model(name))
+
+
+@pytest.mark.parametrize("name", ["unicycle", "joint"])
+def test_motion_that_comes_before_its_cause_is_of_another_clock(name):
+    with pytest.raises(RecordingError, match=r"the motion comes about 0.[23]\d* s before"):
+        check_plausible(_model(name), _data(_model(name), *_driven(name), early=0.25))
+
+
+def test_clocks_that_drift_apart_are_told():
+    with pytest.raises(RecordingError, match="their clocks run at different rates"):
+        check_plausible(_model("unicycle"), _data(_model("unicycle"), *_driven("unicycle"), rate=1.03))
+
+
+@pytest.mark.parametrize("name", BOUNDS)
+def test_a_strong_effect_is_no_mistake_of_the_columns(name):
+    channels = INPUTS[name]
+    strong = [
+        [],
+        [("input_delay", "*", {"delay": 0.4})],
+        *[[("input_lag", c, {"time_constant": 1.2})] for c in channels],
+        *[[("input_gain", c, {"gain": 0.3})] for c in channels],
+        *[[("input_bias", c, {"bias": 0.5 * high})] for c, (_, high) in zip(channels, BOUNDS[name], strict=True)],
+        *[[("input_saturation", c, {"low": 0.3 * low, "high": 0.3 * high})] for c, (low, high) in zip(channels, BOUNDS[name], strict=True)],
+    ]
+    for seed, effects in enumerate(strong):
+        check_plausible(_model(name), _data(_model(name), *_driven(name, 20 + seed, effects)))
