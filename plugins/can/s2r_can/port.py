@@ -54,7 +54,7 @@ class Port:
         self.trouble = ""
         """Why nothing can be heard or sent; empty while the interface works."""
         self._failing: tuple[float, float, str] = (0.0, 0.0, "")
-        self.counts = dict.fromkeys(("received", "sent", "dropped", "errors", "opened"), 0)
+        self._counts = dict.fromkeys(("received", "sent", "dropped", "errors", "opened"), 0)
         self._bus: can.BusABC | None = None
         self._ending = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -101,6 +101,12 @@ class Port:
         first, last, why = self._failing
         return f"{self._named()} takes no frames: {why}" if first and last - first > seconds > time.monotonic() - last else ""
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """sent + dropped is what was handed to `send`, at every instant: what waits counts as sent until it turns out otherwise."""
+        with self._lock:
+            return dict(self._counts)
+
     # ------------------------------------------------------------------ in
 
     def _listen(self) -> None:
@@ -112,7 +118,7 @@ class Port:
                 self._ending.wait(AGAIN_S)
                 continue
             self._bus, self.trouble = bus, ""
-            self.counts["opened"] += 1
+            self._counts["opened"] += 1
             try:
                 self._hear(bus)
             except Exception as error:  # noqa: BLE001 - as above
@@ -148,7 +154,7 @@ class Port:
                 message = bus.recv(LISTEN_S)
             except Exception:  # bytes that are no frame, or a driver that broke
                 failed += 1
-                self.counts["errors"] += 1
+                self._counts["errors"] += 1
                 if time.monotonic() - good_at > ERRORS_S:
                     raise
                 if failed > ERRORS_FAST:
@@ -161,7 +167,7 @@ class Port:
                 continue
             record = self._record(message)
             if message.is_rx and not self._own(record):
-                self.counts["received"] += 1
+                self._counts["received"] += 1
                 self._take(record)
 
     def _record(self, message: can.Message) -> Record:
@@ -204,7 +210,7 @@ class Port:
             return False
         if self._prompt:
             return self._put(record)
-        self._count(sent=1)
+        self._count(sent=1)  # until it turns out otherwise: what waits or is in hand must not be missing from the sum
         self._writing.put(record)
         while self._writing.qsize() > WRITING:
             with contextlib.suppress(queue.Empty):
@@ -216,12 +222,18 @@ class Port:
         writing = self._writing
         while True:
             record = writing.get()
-            if record is None or self._ending.is_set():
+            if record is None:
                 return
-            self._count(sent=-1)  # it was counted when it was handed over
-            self._put(record)
+            if self._ending.is_set() or not self._handed_over(record):
+                self._count(sent=-1, dropped=1)
 
     def _put(self, record: Record) -> bool:
+        taken = self._handed_over(record)
+        self._count(sent=int(taken), dropped=int(not taken))
+        return taken
+
+    def _handed_over(self, record: Record) -> bool:
+        """Whether the interface took it."""
         bus = self._bus
         try:
             if bus is None:
@@ -230,7 +242,6 @@ class Port:
                 self._expect_echo(record)
             bus.send(_message(record), timeout=0.0 if self._prompt else LISTEN_S)
         except Exception as error:  # noqa: BLE001 - a full buffer, a cable, a driver: the robot's time-out and ours deal with it
-            self._count(dropped=1)
             now = time.monotonic()
             self._failing = (self._failing[0] or now, now, _said(error))
             connection = _connection(bus)
@@ -238,14 +249,13 @@ class Port:
                 with contextlib.suppress(OSError):
                     connection.shutdown(socket.SHUT_RDWR)
             return False
-        self._count(sent=1)
         self._failing = (0.0, 0.0, "")
         return True
 
     def _count(self, *, sent: int = 0, dropped: int = 0) -> None:
         with self._lock:
-            self.counts["sent"] += sent
-            self.counts["dropped"] += dropped
+            self._counts["sent"] += sent
+            self._counts["dropped"] += dropped
 
     def _expect_echo(self, record: Record) -> None:
         now = time.monotonic()

@@ -149,11 +149,14 @@ def test_sending_to_a_server_that_does_not_read_does_not_wait() -> None:
         with port(config) as (opened, _):
             assert until(lambda: opened.counts["opened"])
             begin = time.monotonic()
-            for k in range(20_000):
+            for k in range(1, 20_001):
                 opened.send(Record(0, k & 0x7FF, 0, bytes(8)))
+                counts = opened.counts
+                assert counts["sent"] + counts["dropped"] == k, "a frame that waits or is in hand is missing from the sum"
             assert time.monotonic() - begin < 5.0, "a fraction of a millisecond a frame"
             assert until(lambda: opened.counts["dropped"] > 0)
-            assert opened.counts["sent"] + opened.counts["dropped"] == 20_000
+        counts = opened.counts
+        assert counts["sent"] + counts["dropped"] == 20_000, "what waited when the port was closed was not sent"
     for connection in connections:
         connection.close()
 
