@@ -32,6 +32,8 @@ check: $(STAMP)
 	$(BIN)/pytest tests/test_docs.py
 
 bench: $(STAMP)
+	-@$(BIN)/python -c 'import importlib.util, sys; sys.exit(importlib.util.find_spec("rtamt") is None)' || \
+	    $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
 	$(BIN)/python tools/bench.py
 
 SETS ?= --seeds 1000000:1000020 --jobs 2
