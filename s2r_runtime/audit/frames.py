@@ -7,17 +7,22 @@ from collections import deque
 import msgspec
 
 from s2r_runtime.audit.findings import Findings
-from s2r_runtime.daemon.robot_link import Inbound
+from s2r_runtime.daemon import transport_values
+from s2r_runtime.daemon.transport_values import Inbound
 from s2r_runtime.hookspecs import Transport
 from s2r_runtime.messages import Command, Event, Frame, LinkChanged, Observation, Observed, OverrideChanged, Proposed, Send
 from s2r_runtime.recording.reading import Entry
+
+DECODE_FAILED = "transport: decode "
+"""How the daemon's event of a frame begins whose decoding failed there."""
 
 
 class Frames:
     """One run's frames, through a transport of the log's own profile that is never opened."""
 
-    def __init__(self, transport: Transport, findings: Findings) -> None:
-        self._transport, self._findings = transport, findings
+    def __init__(self, transport: Transport, nx: int, findings: Findings) -> None:
+        """nx: components of a state."""
+        self._transport, self._nx, self._findings = transport, nx, findings
         self._due: deque[Inbound] = deque()
         self._source = 0
         self._sends: deque[Send] = deque()
@@ -29,7 +34,7 @@ class Frames:
         self._events_are_there(entry)
         self._source = entry.index
         try:
-            self._due.extend(self._transport.decode(frame))
+            self._due.extend(transport_values.decoded(self._transport, frame, self._nx))
         except Exception:  # noqa: BLE001 - a plug-in's defect; the daemon took it for a lost link and went on, and so does this
             self._due.clear()
         self._findings.count("frames")
@@ -41,6 +46,8 @@ class Frames:
         if isinstance(event, LinkChanged):
             if isinstance(due, LinkChanged) and (due.up, due.detail) == (event.up, event.detail):
                 self._due.popleft()
+            elif not event.up and event.detail.startswith(DECODE_FAILED):
+                self._due.clear()  # then, it did not answer, or not with what it says now
             return  # otherwise it is the daemon's own: a time-out
         told = _message(event)
         if told is None:
@@ -98,8 +105,8 @@ class Frames:
         """Each command is encoded once, in order, as the daemon did: a transport may count them."""
         command = Command(send.seq, send.t_ns, send.source, send.u, send.obs_seq, send.ttl_ns)
         try:
-            return self._transport.encode(command).data
-        except ValueError:
+            return transport_values.outbound(self._transport.encode(command)).data
+        except Exception:  # noqa: BLE001 - it refused the command, or a plug-in's defect: nothing left then either
             return None
 
 

@@ -213,7 +213,7 @@ class RunAudit:
         self._certificates.remembered(event.memory)
         options = {name: value for name, value in profile.transport.items() if name != "name"}
         transport = registry().get("transports", str(profile.transport.get("name")))
-        self._frames = Frames(transport(options, facts.states, facts.inputs), self._findings)
+        self._frames = Frames(transport(options, facts.states, facts.inputs), len(facts.states), self._findings)
 
     def _stored(self, entry: Entry, event: CertificateStored) -> None:
         settings = self._core.state.settings
@@ -250,8 +250,7 @@ class RunAudit:
             case StartController():
                 model = self._compose(profile.model)
                 if state.memory.gap is not None and model is not None:
-                    fault_jump, lockstep = profile.watch.fault_jump, settings.lockstep
-                    self._watch.begin(model, state.memory.gap, fault_jump, state.memory, lockstep=lockstep)
+                    self._watch.begin(model, state.memory.gap, profile, state.memory, lockstep=settings.lockstep)
             case StopController():
                 self._watch.end()
             case StartJob():

@@ -30,14 +30,16 @@ from s2r_runtime.daemon.actions import Actions
 from s2r_runtime.daemon.desk import Desk
 from s2r_runtime.daemon.driver import Driver
 from s2r_runtime.daemon.excitation import Excitation
+from s2r_runtime.daemon.hang_guard import HangGuard
 from s2r_runtime.daemon.logbook import Logbook
 from s2r_runtime.daemon.model_store import ModelStore
 from s2r_runtime.daemon.persistence import StateFolder
-from s2r_runtime.daemon.robot_link import Clock, Inbound, link_of
+from s2r_runtime.daemon.robot_link import Clock, link_of
 from s2r_runtime.daemon.sampler import Keeper, Sampler
 from s2r_runtime.daemon.settings import ModelFacts, settings_of
 from s2r_runtime.daemon.stop_signals import StopSignals
 from s2r_runtime.daemon.systemd import Notifier
+from s2r_runtime.daemon.transport_values import Inbound
 from s2r_runtime.daemon.workshop import Watcher, Workshop
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import (
@@ -147,6 +149,7 @@ class Daemon:
         stack.callback(self.selector.close)
         stack.callback(self.notifier.close)
         self._signals = stack.enter_context(StopSignals(self.selector))
+        self.guard = stack.enter_context(HangGuard(self.say))
         self.folder = stack.enter_context(StateFolder(self.state_dir, profile.robot.name))
         self.memory = self.folder.memory(self._log_dir.glob(f"{profile.robot.name}-*.mcap") if self._log_file is None else ())
         self.models = ModelStore(self.folder.path, profile.model.digest())
@@ -162,7 +165,7 @@ class Daemon:
         )
         self.facts: ModelFacts = self.watcher.facts()
         self.settings = settings_of(profile, profile.model, self.facts, self.seed)
-        self.link = link_of(self.profile, self.facts, self._record_frame)
+        self.link = link_of(self.profile, self.facts, self._record_frame, self.guard)
         self.logbook.begin(self._profile_path, self.profile.model, self.profile.files)
         self._recall_proposal()
         stack.callback(self._close_log)
@@ -203,11 +206,18 @@ class Daemon:
 
     def _open_link(self) -> None:
         self.link.open()
-        self.selector.register(self.link, selectors.EVENT_READ, self._robot_ready)
+        if not self.link.out_of_use:
+            try:
+                self.selector.register(self.link, selectors.EVENT_READ, self._robot_ready)
+            except (ValueError, KeyError, OSError) as error:
+                self.link.refuse("fileno", error)
+
+    def _leave_link(self) -> None:
+        with contextlib.suppress(KeyError, ValueError):  # it did not get that far
+            self.selector.unregister(self.link)
 
     def _close_link(self) -> None:
-        with contextlib.suppress(KeyError):  # it did not get that far
-            self.selector.unregister(self.link)
+        self._leave_link()
         self.link.close()
 
     def _begin_run(self) -> None:
@@ -235,6 +245,8 @@ class Daemon:
             self.feed(change)
         for line in self.link.lines():
             self.say(line)
+        if self.link.out_of_use:
+            self._leave_link()
         self.driver.poll(now_ns)
         self.watcher.tick(now_ns)
         if now_ns >= self._next_round_ns:
@@ -347,7 +359,7 @@ class Daemon:
         """
         self._end_sources("the log failed")
         self._close_link()
-        self.link = link_of(self.profile, self.facts, self._record_frame)
+        self.link = link_of(self.profile, self.facts, self._record_frame, self.guard)
         self.logbook.switch()
         self.say(f"a new log begins: {self.logbook.paths[-1]}")
         self.memory, self._recorder_ok, self.observation = self.state.memory, True, None

@@ -1,22 +1,30 @@
-"""The daemon's side of the transport: frames in, messages out; commands in, frames out. What a transport raises ends here.
+"""The daemon's side of the transport: frames in, messages out; commands in, frames out. What a transport raises, or gives that it may not,
+ends here: a link that is down, with the plug-in and the call named. A call that hangs puts the transport out of use (`hang_guard`).
 
 Also the daemon's clock: the host's monotonic one in real time; in lockstep the robot's own, as its newest observation shows it.
 """
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable, Iterator
+from typing import TypeVar
 
+from s2r_runtime.daemon import transport_values as values
+from s2r_runtime.daemon.hang_guard import CALL_S, OPEN_S, HangGuard, Hung
 from s2r_runtime.daemon.settings import ModelFacts
-from s2r_runtime.errors import one_line
+from s2r_runtime.daemon.transport_values import Inbound
+from s2r_runtime.errors import ConfigError, PluginError, S2RError, one_line
 from s2r_runtime.hookspecs import Transport
-from s2r_runtime.messages import Command, Decided, Frame, GateChanged, LinkChanged, Observation, OverrideChanged, Send
+from s2r_runtime.messages import Command, Decided, Frame, GateChanged, LinkChanged, Observation, Send
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import Profile
 
-Inbound = Observation | Command | LinkChanged | OverrideChanged
+Result = TypeVar("Result")
+
+CALM_NS = 1_000_000_000
+"""Without a flood, after which a link that was flooded is used again."""
+METHODS = ("open", "fileno", "receive", "decode", "poll", "encode", "send", "counters", "close")
 
 
 class Clock:
@@ -44,98 +52,191 @@ class Clock:
 
 
 class RobotLink:
-    """A transport that never raises. A fault in it is a lost link, which closes the gate, until an observation gets through again.
+    """A transport that never raises and never hangs. A fault in it is a lost link, which closes the gate, until the call that failed
+    works again and an observation gets through. After a hang nothing more is asked of it: `out_of_use`.
 
-    record: takes every frame, inbound ones before they are decoded.
+    named: the transport and who made it, for people. nx: components of a state. record: takes every frame, inbound ones before they are
+    decoded.
     """
 
-    def __init__(self, transport: Transport, record: Callable[[Frame], None]) -> None:
+    def __init__(self, transport: Transport, named: str, nx: int, record: Callable[[Frame], None], guard: HangGuard) -> None:
         self.transport = transport
-        self._record = record
-        self._fault = ""
+        self._named, self._nx, self._record, self._guard = named, nx, record, guard
+        self._faults: dict[str, str] = {}
+        self._down = False
+        self._calm_ns = 0
+        self._flooded = 0
+        self._fileno = -1
+        self._news: list[LinkChanged] = []
+        self._journal: list[str] = []
+        self.out_of_use = False
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the transport itself; empty while it does what it should."""
+        return "; ".join(self._faults.values())
 
     def open(self) -> None:
         """Connects. Raises ConfigError if that can never succeed."""
-        self.transport.open()
+        doing = "open"
+        try:
+            self._ask(doing, self.transport.open, limit_s=OPEN_S)
+            doing = "fileno"
+            self._fileno = values.descriptor(self._ask(doing, self.transport.fileno))
+        except ConfigError:
+            raise
+        except BaseException as error:  # noqa: BLE001 - a plug-in's defect must not stop the daemon, which keeps the gate closed
+            self.refuse(doing, error)
 
     def fileno(self) -> int:
-        """Readable when `receive` has something."""
-        return self.transport.fileno()
+        """Readable when `receive` has something; -1 if there is nothing to wait for."""
+        return self._fileno
+
+    def refuse(self, what: str, error: BaseException) -> None:
+        """Nothing more is asked of this transport."""
+        self.out_of_use = True
+        self._news += self._failed(what, error)
 
     def receive(self) -> Iterator[tuple[int, Inbound]]:
         """(arrival on the host's clock, ns; what came), in order. The caller acts on each before it takes the next."""
+        if self.out_of_use:
+            return
         try:
-            frames = self.transport.receive()
-        except Exception as error:  # noqa: BLE001 - a plug-in's defect must not stop the gate
+            frames = values.frames(self._ask("receive", self.transport.receive), time.monotonic_ns())
+        except BaseException as error:  # noqa: BLE001 - a plug-in's defect must not stop the gate
             for change in self._failed("receive", error):
                 yield change.t_ns, change
             return
+        if time.monotonic_ns() >= self._calm_ns:
+            self._faults.pop("receive", None)
         for frame in frames:
             self._record(frame)
             try:
-                messages = self.transport.decode(frame)
-            except Exception as error:  # noqa: BLE001 - as above
+                messages = self._ask("decode", values.decoded, self.transport, frame, self._nx)
+            except BaseException as error:  # noqa: BLE001 - as above
                 messages = list(self._failed("decode", error))
+            else:
+                self._faults.pop("decode", None)
             for message in messages:
-                if self._fault and isinstance(message, Observation):
-                    self._fault = ""
+                if self._down and not self._faults and isinstance(message, Observation):
+                    self._down = False
+                    self._journal.append(f"{self._named} works again")
                     yield frame.arrival_ns, LinkChanged(frame.arrival_ns, up=True, detail="the transport works again")
                 yield frame.arrival_ns, message
+                if self._faults and isinstance(message, LinkChanged) and message.up:  # it may hear its robot, and be of no use yet
+                    yield frame.arrival_ns, LinkChanged(frame.arrival_ns, up=False, detail=f"transport: {self.trouble}")
+            if self.out_of_use:
+                return
 
     def poll(self, now_ns: int) -> Iterator[LinkChanged]:
         """Link lost or back, by the transport's own time-outs. now_ns: the host's clock."""
+        news, self._news = self._news, []
+        yield from news
+        if self.out_of_use:
+            return
         try:
-            yield from self.transport.poll(now_ns)
-        except Exception as error:  # noqa: BLE001 - as above
+            changes = values.link_changes(self._ask("poll", self.transport.poll, now_ns))
+        except BaseException as error:  # noqa: BLE001 - as above
             yield from self._failed("poll", error)
+            return
+        self._faults.pop("poll", None)
+        yield from (change for change in changes if not (change.up and self._faults))
 
     def send(self, send: Send) -> Iterator[LinkChanged]:
         """The robot is told; the frame is recorded after it left."""
+        if self.out_of_use:
+            return
+        command = Command(send.seq, send.t_ns, send.source, send.u, send.obs_seq, send.ttl_ns)
         try:
-            frame = self.transport.encode(Command(send.seq, send.t_ns, send.source, send.u, send.obs_seq, send.ttl_ns))
-            self.transport.send(frame)
-        except Exception as error:  # noqa: BLE001 - as above
+            frame = values.outbound(self._ask("encode", self.transport.encode, command))
+        except BaseException as error:  # noqa: BLE001 - as above
+            yield from self._failed("encode", error)
+            return
+        self._faults.pop("encode", None)
+        try:
+            self._ask("send", self.transport.send, frame)
+        except BaseException as error:  # noqa: BLE001 - as above
             yield from self._failed("send", error)
             return
+        self._faults.pop("send", None)
         self._record(frame)
 
     def inform(self, record: GateChanged | Decided) -> None:
         """For people on the robot's side, if the transport tells them anything."""
-        with contextlib.suppress(Exception):  # nobody's safety hangs on it
-            if (inform := getattr(self.transport, "inform", None)) is not None:
-                inform(record)
+        self._aside("inform", record)
 
     def lines(self) -> list[str]:
-        """For the journal, if the transport has anything to say."""
-        with contextlib.suppress(Exception):  # as above
-            if (lines := getattr(self.transport, "lines", None)) is not None:
-                return [one_line(str(line)) for line in lines()]
-        return []
+        """For the journal: what became of the transport, and what it has to say itself."""
+        own, self._journal = self._journal, []
+        given: object = self._aside("lines")
+        try:
+            said = [] if given is None else values.lines(given)
+        except BaseException:  # noqa: BLE001 - nobody's safety hangs on it
+            said = []
+        return [one_line(line) for line in own + said]
 
     def counters(self) -> dict[str, int]:
         """The transport's counters."""
+        given: object = self._aside("counters")
         try:
-            return self.transport.counters()
-        except Exception:  # noqa: BLE001 - numbers for a status line
-            return {}
+            found = {} if given is None else values.counters(given)
+        except TypeError:
+            found = {}
+        return found | ({"flooded": self._flooded} if self._flooded else {})
 
     def close(self) -> None:
-        """Frees the transport."""
+        """Frees the transport; one that hung is left as it is."""
+        if not self.out_of_use:
+            self._aside("close", limit_s=OPEN_S)
+
+    # ------------------------------------------------------------------ asking
+
+    def _ask(self, what: str, function: Callable[..., Result], *args: object, limit_s: float = 0.0) -> Result:
+        return self._guard.call(f"{self._named}: {what}", limit_s or CALL_S, function, *args)
+
+    def _aside(self, what: str, *args: object, limit_s: float = 0.0) -> object:
+        """What nobody's safety hangs on, as long as it returns. None where it isn't there, or failed."""
+        if self.out_of_use or (function := getattr(self.transport, what, None)) is None:
+            return None
         try:
-            self.transport.close()
-        except Exception:  # noqa: BLE001 - on the way out there is nobody left to tell
-            return
+            given: object = self._ask(what, function, *args, limit_s=limit_s)
+        except Hung as error:
+            self.refuse(what, error)
+        except BaseException:  # noqa: BLE001 - it is only for people
+            return None
+        else:
+            return given
+        return None
 
-    def _failed(self, what: str, error: Exception) -> Iterator[LinkChanged]:
+    def _failed(self, what: str, error: BaseException) -> Iterator[LinkChanged]:
         """One event a fault, not one a call: a transport that fails at 100 Hz must not fill the log."""
-        text = f"transport: {what} raised {type(error).__name__}: {error}"
-        if text != self._fault:
-            self._fault = text
-            yield LinkChanged(time.monotonic_ns(), up=False, detail=text)
+        now_ns = time.monotonic_ns()
+        self.out_of_use = self.out_of_use or isinstance(error, Hung)
+        if isinstance(error, values.Flood):
+            self._flooded += 1
+            self._calm_ns = now_ns + CALM_NS
+        if what in self._faults:
+            return
+        self._down = True
+        plain = isinstance(error, Hung | values.Flood)
+        said = one_line(f"{what} {error}" if plain else f"{what} raised {type(error).__name__}: {error}")
+        self._faults[what] = said
+        self._journal.append(f"{self._named}: {said}" + ("; out of use until the daemon starts anew" if self.out_of_use else ""))
+        yield LinkChanged(now_ns, up=False, detail=f"transport: {said}")
 
 
-def link_of(profile: Profile, facts: ModelFacts, record: Callable[[Frame], None]) -> RobotLink:
+def link_of(profile: Profile, facts: ModelFacts, record: Callable[[Frame], None], guard: HangGuard) -> RobotLink:
     """The link that the profile describes, not opened yet. Raises ConfigError for an unknown transport or a bad option."""
     options = {name: value for name, value in profile.transport.items() if name != "name"}
-    transport = registry().get("transports", str(profile.transport.get("name")))
-    return RobotLink(transport(options, facts.states, facts.inputs), record)
+    name = str(profile.transport.get("name"))
+    make = registry().get("transports", name)
+    named = f"transport {name!r} of {registry().offered('transports', name).distribution}"
+    try:
+        transport = guard.call(f"{named}: construction", CALL_S, make, options, facts.states, facts.inputs)
+    except S2RError:
+        raise
+    except BaseException as error:  # noqa: BLE001 - a plug-in's defect, said as one
+        raise PluginError(one_line(f"{named} cannot be made: {type(error).__name__}: {error}")) from None
+    if missing := [method for method in METHODS if not callable(getattr(transport, method, None))]:
+        raise PluginError(f"{named} lacks {', '.join(missing)}: see Transport in s2r_runtime/hookspecs.py")
+    return RobotLink(transport, named, len(facts.states), record, guard)

@@ -39,6 +39,7 @@ def status(daemon: Daemon) -> dict[str, Any]:
         "recorder": "ok" if health.ok else health.detail,
         "log": str(daemon.logbook.paths[-1]),
         "recorded": health.recorded,
+        "link_trouble": daemon.link.trouble,
         "counters": daemon.link.counters(),
         "controller_latency_ms": daemon.driver.latency_ns * 1e-6,
         "uptime_s": (time.monotonic_ns() - daemon.began_ns) * 1e-9,
