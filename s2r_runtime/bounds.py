@@ -1,4 +1,4 @@
-"""The theorems as pure functions (guarantee G1, G2, G4, G9). No data, no state; every argument is a number.
+"""The theorems as pure functions (guarantee G1, G2, G4, G5, G9). No data, no state; every argument is a number.
 
 Scenario bound with discards. N discrepancies drawn independently from one law, k of them discarded, N and k fixed
 beforehand, r the (k+1)-th largest, V(r) = P[a new one > r]. Let q = inf {x : P[X > x] <= eps}. Then V(r) > eps iff r < q iff at
@@ -15,11 +15,25 @@ P(Bin(n, u) <= f) = beta; so u = betaincinv(f+1, n-f, 1-beta), and 1 if every ru
 Spending (G4). The budget beta of a robot's life is halved, and the i-th of either kind spends 3 beta / (pi^2 i^2):
 
     sum_{i>=1} 3 beta / (pi^2 i^2) = (3 beta / pi^2) (pi^2 / 6) = beta / 2
+
+Splitting. Statements that are all to hold share their beta (union bound): r and r_h half each. Disturbance laws of one attempt need no
+split: a false pass needs every required law to pass wrongly, so it is no more likely than with one law (intersection-union; Berger 1982).
+Controllers and radii need none beyond the attempts that they are.
+
+At all times. S_n of n indicators are 1 and P(X_i = 1 | past) >= p for every i. For any t < p the likelihood ratio of t against p is then a
+supermartingale; mixed over t, uniform on (0, p), it is the beta-binomial e-process (Robbins 1970; Howard & Ramdas 2022, one-sided)
+
+    E_n(p) = (1/p) int_0^p (t/p)^S ((1-t)/(1-p))^(n-S) dt = betainc(S+1, n-S+1, p) / ((n+1) C(n, S) p^(S+1) (1-p)^(n-S))
+
+and P(sup_n E_n >= 1/beta) <= beta (Ville). It grows with p and falls with S. So the largest p with E_n(p) < 1/beta bounds an exceedance
+probability from above at all times at once, and the (k+1)-th largest of n draws, k the largest S with E_n(eps) >= 1/beta, is not below the
+(1-eps)-quantile of their law: at any n, however often one looks. Not so with `scenario_confidence`, which holds for an n fixed beforehand.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from s2r_runtime.errors import UsageError
 
@@ -93,6 +107,75 @@ def clopper_pearson_lower(failures: int, n: int, beta: float) -> float:
     from scipy.special import betaincinv
 
     return float(betaincinv(failures, n - failures + 1, beta))
+
+
+def split(beta: float, weights: Sequence[float]) -> tuple[float, ...]:
+    """Shares of beta for statements that are all to hold, in proportion to `weights`; together they are no more than beta.
+
+    >>> split(0.05, (1, 1))
+    (0.025, 0.025)
+    """
+    check_probability("beta", beta)
+    total = math.fsum(weights)
+    if not weights or not all(0.0 < weight < math.inf for weight in weights):
+        raise UsageError(f"weights are {list(weights)}, must be at least one number > 0")
+    return tuple(beta * (weight / total) for weight in weights)
+
+
+def anytime_evidence(exceedances: int, n: int, p: float) -> float:
+    """log E_n(p): evidence that an exceedance is not always at least as probable as p, after so many of n; -inf where it underflows."""
+    check_probability("p", p)
+    _check_counts(exceedances, n, p)
+    from scipy.special import betainc, betaln
+
+    below = float(betainc(exceedances + 1, n - exceedances + 1, p))
+    if below == 0.0:
+        return -math.inf
+    log_beta = float(betaln(exceedances + 1, n - exceedances + 1))  # 1 / ((n+1) C(n, S))
+    return math.log(below) + log_beta - (exceedances + 1) * math.log(p) - (n - exceedances) * math.log1p(-p)
+
+
+def anytime_upper(exceedances: int, n: int, beta: float) -> float:
+    """Upper limit of an exceedance probability that holds at every n at once, with confidence 1-beta. n = 0: 1, nothing is known."""
+    _check_counts(exceedances, n, beta)
+    if exceedances == n:
+        return 1.0
+    low, high, bar = exceedances / n, 1.0, -math.log(beta)  # E is at most 1 at the observed share, and grows from there
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if not low < middle < high:
+            break
+        low, high = (low, middle) if anytime_evidence(exceedances, n, middle) >= bar else (middle, high)
+    return high
+
+
+def anytime_discards(n: int, eps: float, beta: float) -> int:
+    """k: the (k+1)-th largest of n draws bounds the (1-eps)-quantile at every n at once, with confidence 1-beta; -1: none does yet."""
+    check_probability("epsilon", eps)
+    _check_counts(0, n, beta)
+    bar = -math.log(beta)
+    low, high = -1, n  # at n there is no evidence
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if anytime_evidence(middle, n, eps) >= bar else (low, middle)
+    return low
+
+
+def anytime_sample_size(eps: float, beta: float) -> int:
+    """The smallest n at which `anytime_discards` gives a bound. UsageError out of range or beyond 1e9 samples.
+
+    >>> anytime_sample_size(0.01, 0.05)
+    449
+    """
+    low, high = 0, 1
+    while anytime_discards(high, eps, beta) < 0:
+        low, high = high, 2 * high
+        if high > MAX_SAMPLES:
+            raise UsageError(f"epsilon {eps:g} with beta {beta:g} asks for more than {MAX_SAMPLES:g} samples")
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if anytime_discards(middle, eps, beta) >= 0 else (middle, high)
+    return high
 
 
 def check_probability(name: str, value: float) -> None:

@@ -60,6 +60,9 @@ class Command(Struct, frozen=True, tag="command"):
 
 # ---------------------------------------------------------------- results that events carry
 
+SERIAL = "the discrepancy of a sample depends on the one before"
+"""`Gap.white_reason` begins with this where the samples were not independent: such a campaign founds no gap (guarantee G1)."""
+
 
 class Gap(Struct, frozen=True, tag="gap"):
     """Gap of a model on one campaign (guarantee G1). `radius` in the weighted norm's unit; weights: (nx,).
@@ -187,10 +190,23 @@ class Settings(Struct, frozen=True):
     """Disturbance laws that must pass (guarantee G8); empty: not said, the verification's own word counts."""
     campaign_digest: str = ""
     """Of what a gap rests on besides the model: region, inputs, norm, sampling, guarantee. Another one voids the gap."""
+    run_length: float = 1e5
+    """Discrepancies between two false notices of change, at least, on average (guarantee G5)."""
 
 
 MEMORY_SCHEMA = 1
 """Of `Memory`: a memory of another schema is refused."""
+
+
+class WatchStood(Struct, frozen=True):
+    """Where the watch of an epoch stands: what goes on after a restart. counts: of discrepancies by bin (`core.stream`)."""
+
+    n: int = 0
+    exceedances: int = 0
+    e_value: float = 1.0
+    change: float = 0.0
+    exchange: float = 1.0
+    counts: tuple[int, ...] = ()
 
 
 class Proposal(Struct, frozen=True):
@@ -231,6 +247,10 @@ class Memory(Struct, frozen=True):
     watch_exceedances: int = 0
     watch_e_value: float = 1.0
     """Where the watch of this epoch stood when the memory was last written, so that a restart forgives nothing."""
+    watch_change: float = 0.0
+    watch_exchange: float = 1.0
+    watch_counts: tuple[int, ...] = ()
+    """Its other tests, and how many discrepancies fell into each bin (`core.stream`)."""
     traced: bool = False
     """An effect was traced in the residual and no model that has it was adopted since (guarantee G8)."""
     proposal: Proposal | None = None
@@ -314,7 +334,8 @@ class OverrideChanged(Struct, frozen=True, tag="override_changed"):
 class Measured(Struct, frozen=True, tag="measured"):
     """One discrepancy of the stream, from analytics: of the transition that ended with observation `obs_seq`.
 
-    `fault`: the measurement-fault rule that rejected it (then it does not count), or empty. `e_value`: the watch's, after it.
+    `fault`: the measurement-fault rule that rejected it (then it does not count), or empty. `e_value`: the watch's, after it; `change`: of
+    its detector of changes; `exchange`: its evidence that the discrepancies are not exchangeable.
     """
 
     t_ns: int
@@ -326,6 +347,8 @@ class Measured(Struct, frozen=True, tag="measured"):
     exceedances: int
     epoch: int = 0
     """Of the gap it was measured against; one of another epoch than that in force is ignored (0: not said)."""
+    change: float = 0.0
+    exchange: float = 1.0
 
 
 class SourceStarted(Struct, frozen=True, tag="source_started"):
@@ -629,6 +652,19 @@ class AlarmRaised(Struct, frozen=True, tag="alarm_raised"):
     epoch: int
 
 
+class ChangeNoticed(Struct, frozen=True, tag="change_noticed"):
+    """The robot is probably not what it was. change: the detector reached `bar`, the average number of discrepancies between two such
+    notices where nothing changed. exchangeability: the discrepancies of this epoch's driving are not of one law. Neither revokes anything.
+    """
+
+    t_ns: int
+    kind: Literal["change", "exchangeability"]
+    value: float
+    bar: float
+    epoch: int
+    obs_seq: int
+
+
 class CertificateInstalled(Struct, frozen=True, tag="certificate_installed"):
     t_ns: int
     facts: CertificateFacts
@@ -669,7 +705,7 @@ Action = (
     | Answer
 )  # fmt: skip
 Record = (
-    Decided | GateChanged | EpochChanged | AttemptSpent | AttemptEnded | RadiusGrew | AlarmRaised | CertificateInstalled | Revoked
-    | TraceEnded | ModelAdopted
+    Decided | GateChanged | EpochChanged | AttemptSpent | AttemptEnded | RadiusGrew | AlarmRaised | ChangeNoticed | CertificateInstalled
+    | Revoked | TraceEnded | ModelAdopted
 )  # fmt: skip
 Output = Action | Record

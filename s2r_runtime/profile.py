@@ -122,10 +122,13 @@ class Recovery(_Table, frozen=True):
 class Watch(_Table, frozen=True):
     """`fault_jump`: a discrepancy above it (in the norm's unit) is a fault of measurement, not motion; 0: there is no such rule.
     More than `max_faults` of them in a deployment close the gate.
+
+    `run_length`: discrepancies between two false notices of a change, at least, on average.
     """
 
     fault_jump: float = 0.0
     max_faults: int = 20
+    run_length: float = 1e5
 
 
 class CertificateSettings(_Table, frozen=True):
@@ -402,6 +405,7 @@ def _checks(p: Profile) -> list[tuple[str, object, str]]:
     need(p.repair.rows >= 100, "repair.rows", p.repair.rows, ">= 100 (a trace needs some dozens of transitions)")
     need(0.0 < p.repair.timeout < math.inf, "repair.timeout", p.repair.timeout, "> 0 s")
     need(p.task.episodes >= 0, "task.episodes", p.task.episodes, ">= 0 (0: no end)")
+    need(1.0 <= p.watch.run_length <= 1e12, "watch.run_length", p.watch.run_length, "1 to 1e12 discrepancies")
     need(p.watch.fault_jump >= 0.0, "watch.fault_jump", p.watch.fault_jump, ">= 0 (0: no such rule)")
     need(isinstance(p.transport.get("name"), str), "transport.name", p.transport.get("name"), "the name of a transport")
     return found

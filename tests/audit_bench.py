@@ -24,6 +24,7 @@ from s2r_runtime.comparison import Campaign
 from s2r_runtime.controllers.file import load
 from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
+from s2r_runtime.core.stream import stood
 from s2r_runtime.daemon import jobs, trace_job
 from s2r_runtime.daemon.excitation import Excitation
 from s2r_runtime.daemon.given_inputs import parse_inputs
@@ -391,7 +392,7 @@ class Bench:
                 assert gap is not None
                 self.epoch = gap.epoch
                 memory = self.state.memory
-                self.stream = Stream(self.model, gap, n=memory.watch_n, exceedances=memory.watch_exceedances, e_value=memory.watch_e_value)
+                self.stream = Stream(self.model, gap, **msgspec.structs.asdict(stood(memory)))
                 self.feed(m.SourceStarted(0, "controller", output.digest))
             case m.StopController():
                 self.stream = None

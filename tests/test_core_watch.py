@@ -99,7 +99,7 @@ def test_growth_while_another_controller_is_verified_waits_for_that_attempt() ->
 def test_an_alarm_ends_everything_on_its_gap_until_a_fresh_campaign() -> None:
     rig = Rig()
     rig.driving()
-    assert rig.measure(0.001, e_value=99.9) == []
+    assert kinds(rig.measure(0.001, e_value=99.9)) == ["Persist"]  # no alarm, and not to be forgotten
     outputs = rig.measure(0.001, e_value=100.0)
     assert kinds(outputs)[:2] == ["GateChanged", "Send"]
     assert (one(outputs, GateChanged).reason, sources(outputs)) == ("watch_alarm", ["recovery"])

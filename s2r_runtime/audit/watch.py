@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from s2r_runtime.audit.findings import Findings, alike
-from s2r_runtime.messages import Gap, Measured, Memory, Observation, Send
+from s2r_runtime.core import stream
+from s2r_runtime.messages import Gap, Measured, Memory, Observation, Send, WatchStood
+from s2r_runtime.profile import Profile
 from s2r_runtime.recording.reading import Entry
 from s2r_runtime.watch import Stream
 
@@ -28,18 +30,19 @@ class WatchReplay:
     def __init__(self, findings: Findings) -> None:
         self._findings = findings
         self._stream: Stream | None = None
-        self._begun: tuple[ComposedModel, Gap, float] | None = None
-        self._memory: Memory | None = None
-        self._stood: Measured | None = None
+        self._begun: tuple[ComposedModel, Gap, Profile] | None = None
+        self._stood: tuple[Gap, WatchStood] | None = None
         self._due: deque[Measured] = deque()
         """t_ns: of the observation."""
         self._lockstep = False
         self._sure = True
 
-    def begin(self, model: ComposedModel, gap: Gap, fault_jump: float, memory: Memory, *, lockstep: bool) -> None:
+    def begin(self, model: ComposedModel, gap: Gap, profile: Profile, memory: Memory, *, lockstep: bool) -> None:
         """A controller starts. memory: the core's, which says where this epoch's watch stands."""
         self._lockstep, self._sure = lockstep, True
-        self._begun, self._memory = (model, gap, fault_jump), memory
+        self._begun = (model, gap, profile)
+        if self._stood is None or self._stood[0].epoch != gap.epoch:
+            self._stood = (gap, stream.stood(memory))
         self._start()
 
     def end(self) -> None:
@@ -73,7 +76,9 @@ class WatchReplay:
 
     def measured(self, entry: Entry, event: Measured) -> None:
         """A discrepancy is recorded: it must be the next that is due."""
-        self._stood = event
+        if self._stood is not None and self._stood[0].epoch == event.epoch:
+            gap, before = self._stood
+            self._stood = (gap, stream.after(before, event, gap.radius))
         due = self._due.popleft() if self._due else None
         if due is None or not alike(due, msgspec.structs.replace(event, t_ns=due.t_ns)):
             what = "the discrepancy (or what the watch makes of it) is another one"
@@ -97,11 +102,8 @@ class WatchReplay:
 
     def _start(self) -> None:
         assert self._begun is not None  # noqa: S101 - callers checked
-        assert self._memory is not None  # noqa: S101 - set with it
-        model, gap, fault_jump = self._begun
-        stood = self._stood
-        if stood is not None and stood.epoch == gap.epoch:
-            n, exceedances, e_value = stood.n, stood.exceedances, stood.e_value
-        else:
-            n, exceedances, e_value = self._memory.watch_n, self._memory.watch_exceedances, self._memory.watch_e_value
-        self._stream = Stream(model, gap, fault_jump=fault_jump, n=n, exceedances=exceedances, e_value=e_value)
+        assert self._stood is not None  # noqa: S101 - set with it
+        model, gap, profile = self._begun
+        stood = msgspec.structs.asdict(self._stood[1])
+        alpha, watch = profile.guarantee.alpha, profile.watch
+        self._stream = Stream(model, gap, fault_jump=watch.fault_jump, alpha=alpha, run_length=watch.run_length, **stood)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import msgspec
 
 from s2r_runtime import gate
-from s2r_runtime.core import ledger
+from s2r_runtime.core import ledger, stream
 from s2r_runtime.core.certificates import ROUNDING, facts_problem, install, reverify_if_due, revoke
 from s2r_runtime.core.drive import latch, recover_now, regate
 from s2r_runtime.core.sources import end_deployment
@@ -18,6 +18,7 @@ from s2r_runtime.messages import (
     AlarmRaised,
     CampaignFinished,
     CertificateStored,
+    ChangeNoticed,
     EpochChanged,
     Gap,
     JobFinished,
@@ -112,7 +113,7 @@ def _enforce(turn: Turn, gap: Gap) -> None:
     old = [facts.id for facts in turn.memory.certificates]
     epochs = max(turn.memory.epochs, gap.epoch)
     turn.remember(gap=gap, radius=gap.radius, epochs=epochs, alarm_epoch=0, campaign_digest=turn.settings.campaign_digest)
-    turn.remember(watch_n=0, watch_exceedances=0, watch_e_value=1.0)
+    _watch_anew(turn)
     revoke(turn, old, "new_epoch")
     turn.persist()
     turn.emit(EpochChanged(turn.now, gap.epoch, ledger.share(turn.settings.beta, gap.epoch), gap))
@@ -122,8 +123,12 @@ def void_gap(turn: Turn, reason: str) -> None:
     """No gap any more, nor an unfinished campaign; certificates end with it. Counters stay: what is spent is spent."""
     old = [facts.id for facts in turn.memory.certificates]
     turn.remember(gap=None, radius=0.0, campaign_epoch=0, campaign_n=0, alarm_epoch=0, traced=False)
-    turn.remember(watch_n=0, watch_exceedances=0, watch_e_value=1.0)
+    _watch_anew(turn)
     revoke(turn, old, reason)
+
+
+def _watch_anew(turn: Turn) -> None:
+    turn.remember(watch_n=0, watch_exceedances=0, watch_e_value=1.0, watch_change=0.0, watch_exchange=1.0, watch_counts=())
 
 
 def certificate_loaded(turn: Turn, event: CertificateStored, gap: Gap) -> None:
@@ -161,13 +166,13 @@ def measured(turn: Turn, event: Measured) -> None:
     gap = usable_gap(turn.state)
     if gap is None or event.epoch not in (0, gap.epoch):
         return
-    usable = gate.finite(event.discrepancy) and event.discrepancy >= 0.0 and gate.finite(event.e_value) and event.e_value >= 0.0
-    if event.fault or not usable:
+    numbers = (event.discrepancy, event.e_value, event.change, event.exchange)
+    if event.fault or not all(gate.finite(value) and value >= 0.0 for value in numbers):
         turn.set(faults=turn.state.faults + 1)  # a deployment that begins counts from 0
         regate(turn)
         return
-    counted = {"watch_n": event.n, "watch_exceedances": event.exceedances, "watch_e_value": event.e_value}
-    turn.set(memory=msgspec.structs.replace(turn.memory, **counted))  # written with what is remembered next: a write each is too many
+    noticed = turn.memory.watch_exchange
+    _counted(turn, event, gap)
     grew = event.discrepancy > turn.memory.radius
     if grew:
         turn.remember(radius=event.discrepancy)
@@ -179,10 +184,27 @@ def measured(turn: Turn, event: Measured) -> None:
     if grew:
         verified = facts.verified_radius if facts is not None else 0.0
         turn.emit(RadiusGrew(turn.now, turn.memory.radius, verified, event.obs_seq))
+    if event.change >= turn.settings.run_length:
+        turn.emit(ChangeNoticed(turn.now, "change", event.change, turn.settings.run_length, gap.epoch, event.obs_seq))
+    bar = 1.0 / turn.settings.alpha
+    if noticed < bar <= event.exchange:
+        turn.emit(ChangeNoticed(turn.now, "exchangeability", event.exchange, bar, gap.epoch, event.obs_seq))
     if alarm:
         _alarm(turn, event, gap)
     turn.persist()
     reverify_if_due(turn)
+
+
+def _counted(turn: Turn, event: Measured, gap: Gap) -> None:
+    """Where the watch stands. A write each would be too many: it is written with what is remembered next, and as soon as the evidence has
+    doubled since, so that a daemon that is killed forgets less than a factor of two of it.
+    """
+    now = stream.after(stream.stood(turn.memory), event, gap.radius)
+    changes = {f"watch_{name}": value for name, value in msgspec.structs.asdict(now).items()}
+    if event.e_value >= 2.0 * max(1.0, turn.state.saved_e_value):
+        turn.remember(**changes)
+    else:
+        turn.set(memory=msgspec.structs.replace(turn.memory, **changes))
 
 
 def _alarm(turn: Turn, event: Measured, gap: Gap) -> None:

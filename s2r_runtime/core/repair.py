@@ -4,8 +4,8 @@ A trace is a job like any other: ordered here, done by a worker beside everythin
 itself. A model that it proposes is adopted by a person, or by the profile (`repair.adopt = "always"`) once nothing drives and no worker is
 busy with the model in force. Adopting voids the gap: the next one comes from a fresh campaign, on which nothing was fitted (guarantee G6).
 
-A gap that grows while a controller drives is traced `repair.delay` later, when there is something to see, or at once where the deployment
-ends; and again only when it has grown by a tenth since.
+A gap that grows while a controller drives, or is exceeded more often than it was, is traced `repair.delay` later, when there is something
+to see, or at once where the deployment ends; after a growth again only when it has grown by a tenth since.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from s2r_runtime.core.drive import regate
 from s2r_runtime.core.gaps import void_gap
 from s2r_runtime.core.state import VERIFYING, Job, Turn, job
 from s2r_runtime.messages import (
+    ChangeNoticed,
     EpochChanged,
     Event,
     JobFinished,
@@ -67,6 +68,8 @@ def follow(turn: Turn, event: Event) -> None:
     for output in tuple(turn.outputs):
         if isinstance(output, RadiusGrew):
             _growth_noticed(turn)
+        elif isinstance(output, ChangeNoticed) and output.kind == "change":
+            _change_noticed(turn)
         elif isinstance(output, EpochChanged) and output.gap is not None:
             _gap_found(turn, sampled=isinstance(event, JobFinished))
     _trace_if_due(turn)
@@ -84,6 +87,12 @@ def _growth_noticed(turn: Turn) -> None:
     """The radius grew while a controller drives. There is little to see of it yet."""
     state = turn.state
     if turn.settings.trace_on_growth and state.trace_due_ns is None and turn.memory.radius >= GROWN * state.traced_radius:
+        turn.set(trace_due_ns=turn.now + turn.settings.trace_delay_ns)
+
+
+def _change_noticed(turn: Turn) -> None:
+    """The gap is exceeded more often than it was, be it by little. There is little to see of it yet."""
+    if turn.settings.trace_on_growth and turn.state.trace_due_ns is None:
         turn.set(trace_due_ns=turn.now + turn.settings.trace_delay_ns)
 
 

@@ -97,7 +97,7 @@ class State(Struct, frozen=True):
     gate_said: the reason last recorded; `ended`: why the last deployment ended. clear_since_ns: since when all standing
     conditions of the gate hold. driven: a controller has, since the gap came into force; excited: given inputs were. trace_due_ns: when a
     growth of the gap is to be traced; traced_radius: the radius when one was traced last. unsaved: the memory holds what was not
-    persisted yet.
+    persisted yet; saved_e_value: the watch's in what was.
     """
 
     settings: Settings | None = None
@@ -143,6 +143,7 @@ class State(Struct, frozen=True):
     trace_due_ns: int | None = None
     traced_radius: float = 0.0
     unsaved: bool = False
+    saved_e_value: float = 1.0
 
     @property
     def e_value(self) -> float:
@@ -247,7 +248,7 @@ class Turn:
             self._unsaved = True
         if self._unsaved:
             self._unsaved = False
-            self.set(unsaved=False)
+            self.set(unsaved=False, saved_e_value=self.state.memory.watch_e_value)
             self.outputs.append(Persist(self.now, self.state.memory))
 
     def emit(self, *outputs: Output) -> None:

@@ -17,6 +17,7 @@ import msgspec
 
 from s2r_runtime import messages as m
 from s2r_runtime.controllers.file import ControllerFile
+from s2r_runtime.core import stream
 from s2r_runtime.daemon.analytics import Watching
 from s2r_runtime.daemon.worker import Failed, GapJob, Progress, Result, TraceJob, VerifyJob
 
@@ -158,8 +159,9 @@ class Actions:
             return
         memory, profile = self._d.state.memory, self._d.profile
         if memory.gap is not None:
-            stood = (memory.watch_n, memory.watch_exceedances, memory.watch_e_value)
-            watching = Watching(profile.model, memory.gap, profile.watch.fault_jump, *stood)
+            stood, settings = msgspec.structs.asdict(stream.stood(memory)), self._d.settings
+            jump, alpha, run_length = profile.watch.fault_jump, settings.alpha, settings.run_length
+            watching = Watching(profile.model, memory.gap, jump, alpha=alpha, run_length=run_length, **stood)
             self._d.watcher.begin(watching)
         self.episodes.clear()
         self._d.driver.start(file, self._d.settings.seed)

@@ -44,7 +44,9 @@ class CheckModel(msgspec.Struct, frozen=True, tag="check_model"):
 
 
 class Watching(msgspec.Struct, frozen=True, tag="watching"):
-    """From here on measure against this gap of this model. n, exceedances, e_value: of this epoch so far (a restart goes on there)."""
+    """From here on measure against this gap of this model. alpha, run_length: bars of the watch's notices. The rest: where the watch of
+    this epoch stood (a restart goes on there; see `messages.WatchStood`).
+    """
 
     model: ModelSpec
     gap: Gap
@@ -52,6 +54,11 @@ class Watching(msgspec.Struct, frozen=True, tag="watching"):
     n: int = 0
     exceedances: int = 0
     e_value: float | None = None
+    change: float = 0.0
+    exchange: float = 1.0
+    counts: tuple[int, ...] = ()
+    alpha: float = 0.01
+    run_length: float = 1e5
 
 
 class Ready(msgspec.Struct, frozen=True, tag="ready"):
@@ -238,6 +245,11 @@ def _stream(watching: Watching) -> Stream:
         n=watching.n,
         exceedances=watching.exceedances,
         e_value=watching.e_value,
+        change=watching.change,
+        exchange=watching.exchange,
+        counts=watching.counts,
+        alpha=watching.alpha,
+        run_length=watching.run_length,
     )
 
 

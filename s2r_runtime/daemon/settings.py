@@ -75,6 +75,7 @@ def settings_of(profile: Profile, model: ModelSpec, facts: ModelFacts, seed: int
         adopt=profile.repair.adopt,
         required_laws=profile.verification.required,
         campaign_digest=campaign_digest(profile),
+        run_length=profile.watch.run_length,
     )
 
 

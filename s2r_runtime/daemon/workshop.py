@@ -15,10 +15,11 @@ from typing import NamedTuple
 import msgspec
 
 from s2r_runtime.child import Child
+from s2r_runtime.core import stream
 from s2r_runtime.daemon.analytics import Analytics, Ready, Refused, Reply, Upward, Watching
 from s2r_runtime.daemon.settings import ModelFacts
 from s2r_runtime.daemon.worker import Failed, Job, Progress, Result, TraceJob, Worker
-from s2r_runtime.messages import AnalyticsChanged, Event, Measured, Observation, Send
+from s2r_runtime.messages import AnalyticsChanged, Event, Gap, Measured, Observation, Send, WatchStood
 from s2r_runtime.profile import Profile
 
 AGAIN_AFTER_NS = 1_000_000_000
@@ -104,7 +105,8 @@ class Watcher:
         self._ready = False
         self._checks: dict[int, Callable[[str, ModelFacts | None], None]] = {}
         self._watching: Watching | None = None
-        self._stood: Measured | None = None
+        self._stood: tuple[Gap, WatchStood] | None = None
+        """Where the watch of that gap stands."""
 
     @property
     def pid(self) -> int:
@@ -138,9 +140,12 @@ class Watcher:
 
     def begin(self, watching: Watching) -> None:
         """Measures from here on; goes on where the watch of that epoch stood."""
-        stood = self._stood
-        if stood is not None and stood.epoch == watching.gap.epoch:
-            watching = msgspec.structs.replace(watching, n=stood.n, exceedances=stood.exceedances, e_value=stood.e_value)
+        if self._stood is not None and self._stood[0].epoch == watching.gap.epoch:
+            watching = msgspec.structs.replace(watching, **msgspec.structs.asdict(self._stood[1]))
+        else:
+            e_value = 1.0 if watching.e_value is None else watching.e_value
+            stood = WatchStood(watching.n, watching.exceedances, e_value, watching.change, watching.exchange, watching.counts)
+            self._stood = (watching.gap, stood)
         self._watching = watching
         if self._analytics is not None:
             self._analytics.watch(watching)
@@ -210,11 +215,17 @@ class Watcher:
             answer(analytics.down, None)
         self._checks.clear()
 
+    def _measured(self, measured: Measured) -> None:
+        """Keeps where the watch stands, for a process that is started again."""
+        if self._stood is not None and self._stood[0].epoch == measured.epoch:
+            gap, before = self._stood
+            self._stood = (gap, stream.after(before, measured, gap.radius))
+        self._emit(measured)
+
     def _take(self, message: Upward) -> None:
         if isinstance(message, Reply):
             if message.measured is not None:
-                self._stood = message.measured
-                self._emit(message.measured)
+                self._measured(message.measured)
         elif message.ref in self._checks:
             answer = self._checks.pop(message.ref)
             answer(message.text, None) if isinstance(message, Refused) else answer("", message.facts)

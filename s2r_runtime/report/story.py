@@ -150,6 +150,10 @@ def _take_decision(story: Story, message: Any) -> None:
             story._radius = radius
         case m.AlarmRaised(e_value=e):
             mark(f"the watch raises an alarm (e-value {e:.3g})", "bad")
+        case m.ChangeNoticed(kind="change"):
+            mark("the watch notices a change: the gap is exceeded more often than before", "bad")
+        case m.ChangeNoticed(kind="exchangeability"):
+            mark("the discrepancies of this epoch's driving are not of one law")
         case m.Revoked(certificate_id=identity, reason=reason):
             story.revoked.append((identity, reason))
             mark(f"certificate {identity[7:15]} revoked: {reason}", "bad")

@@ -1,29 +1,18 @@
-"""Sequential watch on the stream of discrepancies while a controller drives (guarantee G5). No independence is assumed.
-
-X_i = 1 iff the i-th counted discrepancy exceeds the epoch's own r (never a grown one). Null hypothesis: P(X_i = 1 | past) <= eps.
-For any p in (eps, 1) and any start k the product
-
-    L_k(p) = prod_{i >= k} (p / eps)^X_i ((1-p) / (1-eps))^(1-X_i)
-
-is a supermartingale under it: each factor's mean grows with P(X_i = 1 | past), and is 1 at eps. The e-value mixes such products, over a
-grid of p and over the start k, so that a robot that changes after a long good time is caught about as soon as one bad at once:
-
-    E_n = T(n) + sum_{k <= n} (T(k-1) - T(k)) mean_p L_k(p),      T(n) = 1 / (1 + ln(1 + n))
-
-T(n) is the part not staked yet. E_0 = 1 and the mean of E_n is at most 1, so by Ville's inequality P(sup E_n >= 1/alpha) <= alpha: an
-alarm at 1/alpha is false with probability at most alpha, over the whole epoch. A start after n good steps costs ln n + 2 ln ln n nats.
-A discrepancy that a measurement-fault rule rejects is no X_i; a rule that rejects only exceedances keeps the null hypothesis true.
-
-One number a p: memory and work an update are constant. Everything in logarithms: no overflow, no NaN.
-"""
+"""Observations and commands while a controller drives -> discrepancies, and what the watch's tests make of them (guarantee G5)."""
 
 from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from s2r_runtime.core.ledger import seed
+from s2r_runtime.core.stream import bin_of
 from s2r_runtime.messages import Gap, Measured, Observation, Send
+from s2r_runtime.watch.change import ChangeDetector
+from s2r_runtime.watch.exceedance import EProcess
+from s2r_runtime.watch.exchangeability import ConformalTest
 
 if TYPE_CHECKING:
     import numpy as np
@@ -33,55 +22,11 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-GRID = 8
-"""Values of p, geometrically between eps and 1; the best of them loses a few per cent of the growth of the best p."""
-
-LARGEST = 1e300
-"""What an e-value above it is reported as."""
-
 STAMP_TOLERANCE = 0.2
 """Of dt: how far two observations may be from dt apart to be the ends of one transition."""
 
 LONGEST_HOLD = 2000
 """Periods for which a held input is carried into an effect's memory; after more of them nothing changes any more."""
-
-
-class EProcess:
-    """The e-value of the null hypothesis, exceedance by exceedance.
-
-    n, exceedances, e_value: where an earlier one stood (a restart goes on there: what had been won is staked anew, evenly over the
-    grid, which keeps every promise above; without the e_value it is given up). Raises ValueError if they can't be.
-    """
-
-    def __init__(self, epsilon: float, *, n: int = 0, exceedances: int = 0, e_value: float | None = None) -> None:
-        if not 0.0 < epsilon < 1.0:
-            raise ValueError(f"epsilon is {epsilon}, must be between 0 and 1")
-        if not 0 <= exceedances <= n:
-            raise ValueError(f"{exceedances} exceedances of {n}: must be between 0 and their number")
-        p = [epsilon ** (1.0 - j / (GRID + 1)) for j in range(1, GRID + 1)]
-        self._if_exceeds = [math.log(q / epsilon) for q in p]
-        self._if_not = [math.log1p(-q) - math.log1p(-epsilon) for q in p]
-        won = max(0.0, e_value - _unstaked(n)) if e_value is not None else 0.0
-        self._log_won = [math.log(won / GRID) if won > 0.0 else -math.inf] * GRID
-        self.n, self.exceedances = n, exceedances
-
-    @property
-    def e_value(self) -> float:
-        """E_n, at most LARGEST."""
-        most = max(self._log_won)
-        if most > math.log(LARGEST / GRID):
-            return LARGEST
-        return _unstaked(self.n) + sum(math.exp(log_won) for log_won in self._log_won)
-
-    def update(self, exceeds: bool) -> float:
-        """One more counted discrepancy; gives the e-value after it."""
-        self.n += 1
-        self.exceedances += exceeds
-        n = self.n
-        stake = math.log(math.log1p(1.0 / n) / ((1.0 + math.log(n)) * (1.0 + math.log1p(n))) / GRID)
-        growth = self._if_exceeds if exceeds else self._if_not
-        self._log_won = [_log_add(won, stake) + g for won, g in zip(self._log_won, growth, strict=True)]
-        return self.e_value
 
 
 def measurement_fault(discrepancy: float, fault_jump: float) -> str:
@@ -97,16 +42,31 @@ class Stream:
 
     A transition is an observation, the one command that answered it, and the next observation about dt later. Where an observation
     is lost, stands at another time, or another command was sent in between, there is none: `lost` counts those. The effects' memory
-    goes on by the commands sent, whatever is observed; it begins at rest. fault_jump: see `measurement_fault`. The rest: `EProcess`.
+    goes on by the commands sent, whatever is observed; it begins at rest. fault_jump: see `measurement_fault`. alpha, run_length: bars of
+    the notices. The rest is where an earlier one stood: see the three tests.
     """
 
     def __init__(
-        self, model: ComposedModel, gap: Gap, *, fault_jump: float = 0.0, n: int = 0, exceedances: int = 0, e_value: float | None = None
+        self,
+        model: ComposedModel,
+        gap: Gap,
+        *,
+        fault_jump: float = 0.0,
+        n: int = 0,
+        exceedances: int = 0,
+        e_value: float | None = None,
+        change: float = 0.0,
+        exchange: float = 1.0,
+        counts: Sequence[int] = (),
+        alpha: float = 0.01,
+        run_length: float = 1e5,
     ) -> None:
         self._model, self._radius, self._kind = model, gap.radius, gap.set
         self._weights, self._fault_jump = gap.weights, fault_jump
         self._dt_ns = model.dt * 1e9
         self.watch = EProcess(gap.epsilon, n=n, exceedances=exceedances, e_value=e_value)
+        self.change = ChangeDetector(gap.epsilon, run_length, value=change)
+        self.exchange = ConformalTest(seed("ties", gap.transitions_digest, gap.epoch), alpha, counts=counts, value=exchange)
         self.lost = 0
         self._begin()
 
@@ -170,9 +130,22 @@ class Stream:
     def _measured(self, observation: Observation, d: float) -> Measured:
         fault = measurement_fault(d, self._fault_jump)
         if not fault:
-            self.watch.update(d > self._radius)
+            exceeds = d > self._radius
+            self.watch.update(exceeds)
+            self.change.update(exceeds)
+            self.exchange.update(bin_of(d, self._radius))
         watch = self.watch
-        return Measured(0, observation.seq, d, fault, watch.e_value, watch.n, watch.exceedances)
+        return Measured(
+            0,
+            observation.seq,
+            d,
+            fault,
+            watch.e_value,
+            watch.n,
+            watch.exceedances,
+            change=self.change.value,
+            exchange=self.exchange.value,
+        )
 
     def _hold(self, u: tuple[float, ...], periods: int) -> None:
         import numpy as np
@@ -180,14 +153,3 @@ class Stream:
         command = np.array([u])
         for _ in range(periods):
             _, _, self._hidden = self._model.act(command, self._hidden)
-
-
-def _unstaked(n: int) -> float:
-    """T(n)."""
-    return 1.0 / (1.0 + math.log1p(n))
-
-
-def _log_add(a: float, b: float) -> float:
-    """log(exp(a) + exp(b)); b is finite."""
-    high, low = max(a, b), min(a, b)
-    return high + math.log1p(math.exp(low - high))
