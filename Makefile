@@ -8,18 +8,18 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-TRACER := $(wildcard tests/test_trace*.py tests/test_effects*.py tests/test_faults.py tests/test_plausible.py tests/test_plugin_effect.py)
 
 .PHONY: run test test-long check bench bench-trace format clean wheels setup
 
 run: $(STAMP)
 	$(BIN)/s2r demo
 
-# the tracer's tests compute, the others mostly wait for robots: side by side they take half the time on two cores
+# Some tests compute, most wait for robots: side by side they keep two cores busy. All of it at the lowest priority, since the daemon's
+# worker runs at that: beside tests of a higher one it would hardly run at all.
+TESTS := nice -n 19 $(BIN)/pytest -n 3 --dist loadfile
+
 test: $(STAMP)
-	@$(BIN)/pytest $(TRACER) > $(VENV)/tracer-tests.log 2>&1 & tracer=$$!; status=0; \
-	    $(BIN)/pytest $(addprefix --ignore=,$(TRACER)) || status=$$?; \
-	    wait $$tracer || status=$$?; cat $(VENV)/tracer-tests.log; exit $$status
+	$(TESTS)
 
 test-long: $(STAMP)
 	$(BIN)/pytest -m long

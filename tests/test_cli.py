@@ -182,7 +182,8 @@ def test_doctor_and_plugins_say_what_is_here() -> None:
 def test_a_controller_that_fails_never_passes(tmp_path: Path, code: str, reason: str) -> None:
     controller, profile = tmp_path / "bad.py", tmp_path / "robot.toml"
     controller.write_text(code)
-    profile.write_text(PROFILE.read_text().replace("[verification]", "[verification]\ntimeout = 4.0"))
+    timeout = 4.0 if "while True" in code else 60.0
+    profile.write_text(PROFILE.read_text().replace("[verification]", f"[verification]\ntimeout = {timeout}"))
     done = s2r("verify", controller, "--profile", profile, "--radius", "0.0015", "--hold-radius", "0.002", "--json")
     assert done.returncode == 1, done.stderr
     answer = json.loads(done.stdout)

@@ -12,9 +12,10 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.recording.writer import Writer
 from s2r_runtime.trace.beginning import with_history
+from s2r_runtime.trace.chains import Inputs
 from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
 from s2r_runtime.trace.dataset_files import load_dataset
-from s2r_runtime.trace.residual import acting, first_steps, rollout_starts, sequence, steps_of
+from s2r_runtime.trace.residual import acting, first_steps, rollout_starts, steps_of
 
 
 def _model(dt=0.1, name="unicycle", effects=()):
@@ -186,7 +187,7 @@ def test_short_runs_side_by_side_act_as_one_after_the_other():
     model, rng = _model(effects=effects), np.random.default_rng(4)
     runs = [(np.zeros((n + 1, 3)), rng.normal(size=(n, 2))) for n in rng.integers(3, 12, 20)]
     together = acting(model, from_arrays(model, runs)).mean
-    alone = np.concatenate([sequence(model, model.effects, [u], 0.1, [0.0]) for _, u in runs])
+    alone = np.concatenate([Inputs([u], 0.1, [0.0]).through(model, model.effects) for _, u in runs])
     assert np.allclose(together, alone, rtol=1e-12, atol=1e-14)
 
 

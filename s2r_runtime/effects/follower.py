@@ -16,8 +16,8 @@ import numpy as np
 from s2r_runtime.effects.input_effect import Array, InputEffect, Values, columns, replaced
 from s2r_runtime.hookspecs import NominalModel
 
-MANY = 50
-"""Columns side by side from which a row at a time is faster than a column at a time."""
+SHORT = 2
+"""Rows a column below which a row at a time is faster than a column at a time."""
 
 
 class Follower(InputEffect):
@@ -47,20 +47,23 @@ class Follower(InputEffect):
     def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
         """u (T, nu) or (T, runs, nu), from rest."""
         given = u[..., columns(model, channel)].reshape(len(u), -1)
-        y = self._by_rows(given, dt, p) if given.shape[1] >= MANY else self._by_stretches(given, dt, p)
+        y = self._by_rows(given, dt, p) if SHORT * given.shape[1] >= len(u) else self._by_stretches(given, dt, p)
         return replaced(u, model, channel, self.mean(y, given, dt, p).reshape(*u.shape[:-1], -1))
 
     def _by_stretches(self, u: Array, dt: float, p: Values) -> Array:
         """u (T, m) -> y at the start of each step, (T, m)."""
-        rows = np.arange(len(u))
-        y = np.empty_like(u)
-        for j, column in enumerate(u.T):
-            first = np.flatnonzero(np.append(True, column[1:] != column[:-1])) if len(u) else rows
-            edges = [*first.tolist(), len(u)]
-            begun = np.array(self.begins(column[first].tolist(), [b - a for a, b in pairwise(edges)], dt, p))
-            stretch = np.repeat(np.arange(len(first)), np.diff(edges))
-            y[:, j] = self.after(begun[stretch], column, (rows - first[stretch]).astype(np.float64), dt, p)
-        return y
+        rows, many = u.shape
+        flat = u.T.ravel()
+        new = np.append(True, flat[1:] != flat[:-1])
+        new[::rows] = True
+        first = np.flatnonzero(new)
+        steps = np.diff(np.append(first, len(flat)))
+        held, counts, begun = flat[first].tolist(), steps.tolist(), []
+        for a, b in pairwise(np.searchsorted(first, rows * np.arange(many + 1)).tolist()):
+            begun += self.begins(held[a:b], counts[a:b], dt, p)
+        since = (np.arange(len(flat)) - np.repeat(first, steps)).astype(np.float64)
+        y = self.after(np.repeat(np.array(begun), steps), flat, since, dt, p)
+        return y.reshape(many, rows).T
 
     def _by_rows(self, u: Array, dt: float, p: Values) -> Array:
         """The same, a row at a time."""

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
+from s2r_runtime.trace.chains import Inputs
 from s2r_runtime.trace.dataset import Dataset, Run
-from s2r_runtime.trace.residual import acting, residual, sequence, steps_of
+from s2r_runtime.trace.residual import acting, residual, steps_of
 
 Array = NDArray[np.float64]
 
@@ -50,7 +51,7 @@ def _under_way(model: ComposedModel, data: Dataset, run: Run, steps: int, usual:
     held = np.concatenate([np.tile(run.u[:1], (steps * data.substeps, 1)), run.u[:first]])
     part = data.dt / data.substeps
     acted = [
-        sequence(model, _chain(model), [u], part, [run.start_s + part * (first - len(u))])[-first:].reshape(FIRST, data.substeps, -1)
+        Inputs([u], part, [run.start_s + part * (first - len(u))]).through(model, _chain(model))[-first:].reshape(FIRST, data.substeps, -1)
         for u in (held, run.u[:first])
     ]
     if np.allclose(acted[0], acted[1]):  # nothing in the model remembers: what was before shows in the first step alone

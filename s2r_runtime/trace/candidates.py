@@ -18,7 +18,7 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.fitting import insert
 from s2r_runtime.trace.leftover import Leftover
-from s2r_runtime.trace.residual import sequence, times
+from s2r_runtime.trace.residual import times
 from s2r_runtime.trace.slots import Added
 
 Array = NDArray[np.float64]
@@ -49,8 +49,7 @@ def candidates(model: ComposedModel, data: Dataset, left: Leftover | None = None
     """
     found = []
     taken = {(a.effect.name, a.channel) for a in model.effects if isinstance(a, Added)}
-    inputs, begun, t = [run.u for run in data.runs], [run.start_s for run in data.runs], times(data)
-    part = data.dt / data.substeps
+    t = times(data)
     given: dict[int, Array] = {}
     for name in registry().names("effects"):
         effect = registry().get("effects", name)
@@ -65,7 +64,7 @@ def candidates(model: ComposedModel, data: Dataset, left: Leftover | None = None
                 continue
             for place in _places(model, effect, channel):
                 if place not in given:
-                    given[place] = sequence(model, _input_effects(model, place), inputs, part, begun)
+                    given[place] = data.chains.through(model, _input_effects(model, place))
                 starts = _starts(effect, given[place], model, channel, data.dt, t)
                 if left is not None and place == len(model.effects):
                     starts += left.starts(effect, channel)

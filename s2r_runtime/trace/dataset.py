@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.gap import Transitions
 from s2r_runtime.models.composed import SUBSTEPS, ComposedModel
+from s2r_runtime.trace.chains import Inputs
 from s2r_runtime.trace.reconstruct import Reconstruction, at_step, independent_step, snapped
 from s2r_runtime.trace.streams import (
     ALIGNED,
@@ -117,6 +119,11 @@ class Dataset:
     in_parts: bool = False
     """The model takes each of the S parts of a step by itself: its own steps are that much shorter."""
     campaign: Transitions | None = field(default=None, repr=False)
+
+    @cached_property
+    def chains(self) -> Inputs:
+        """The inputs of its runs, for chains of effects."""
+        return Inputs([run.u for run in self.runs], self.dt / self.substeps, [run.start_s for run in self.runs])
 
 
 def from_arrays(model: ComposedModel, runs: Sequence[tuple[Array, Array]], source: str = "arrays") -> Dataset:

@@ -94,7 +94,7 @@ def times(data: Dataset) -> Array:
 def acting(model: ComposedModel, data: Dataset, effects: Sequence[AppliedEffect] | None = None) -> Acting:
     """The input as it acts after the effects of stage `input` (None: the model's)."""
     chain = [a for a in (model.effects if effects is None else effects) if a.effect.stage == "input"]
-    u = sequence(model, chain, [run.u for run in data.runs], data.dt / data.substeps, [run.start_s for run in data.runs])
+    u = data.chains.through(model, chain)
     lasts = None
     if any(run.lasts is not None for run in data.runs):
         lasts = np.concatenate([np.full(len(run.y) - 1, data.dt) if run.lasts is None else run.lasts for run in data.runs])
@@ -104,46 +104,6 @@ def acting(model: ComposedModel, data: Dataset, effects: Sequence[AppliedEffect]
     mean = table @ np.tile(np.eye(u.shape[1]) / data.substeps, (data.substeps, 1))
     parts = u.reshape(-1, data.substeps, u.shape[1]) if data.in_parts else None
     return Acting(mean, table[:, -u.shape[1] :].copy(), lasts, parts)
-
-
-def sequence(model: ComposedModel, chain: Sequence[AppliedEffect], inputs: Sequence[Array], dt: float, starts: Sequence[float]) -> Array:
-    """Inputs of each run, (T_i, nu), through a chain of effects from rest; laid end to end, (sum T_i, nu). starts: of the runs, s."""
-    longest = max(len(u) for u in inputs)
-    if chain and len(inputs) > 3 and len(inputs) * longest < 2 * sum(len(u) for u in inputs):
-        return _side_by_side(model, chain, inputs, dt, np.array(starts, dtype=np.float64))
-    done = []
-    for u, start in zip(inputs, starts, strict=True):
-        for a in chain:
-            u = _over_time(a, u, model, dt, start)
-        done.append(u)
-    return np.concatenate(done)
-
-
-def _over_time(a: AppliedEffect, u: Array, model: ComposedModel, dt: float, start: float | Array) -> Array:
-    """`input_sequence`; an effect that depends on time is told when the first row is."""
-    if getattr(a.effect, "timed", False):
-        return a.effect.input_sequence(u, model.nominal, a.channel, dt, a.p, start=start)  # type: ignore[call-arg]
-    return a.effect.input_sequence(u, model.nominal, a.channel, dt, a.p)
-
-
-def _side_by_side(model: ComposedModel, chain: Sequence[AppliedEffect], inputs: Sequence[Array], dt: float, starts: Array) -> Array:
-    """Many short runs at once, starts (runs,); an effect that cannot do that is taken step by step."""
-    lengths = np.array([len(u) for u in inputs])
-    table = np.zeros((lengths.max(), len(inputs), inputs[0].shape[1]))
-    for i, u in enumerate(inputs):
-        table[: len(u), i] = u
-    for a in chain:
-        if getattr(a.effect, "side_by_side", False):
-            table = _over_time(a, table, model, dt, starts)
-            continue
-        z, done = a.effect.hidden(len(inputs), model.nominal, a.channel, dt, a.p), []
-        if getattr(a.effect, "timed", False):
-            z[:, 0] = starts
-        for u in table:
-            acting_now, z = a.effect.input_step(u, z, model.nominal, a.channel, dt, a.p)
-            done.append(acting_now)
-        table = np.stack(done)
-    return table.transpose(1, 0, 2)[np.arange(len(table)) < lengths[:, None]]
 
 
 def advanced(model: ComposedModel, x: Array, act: Acting, place: Index | slice) -> Array:

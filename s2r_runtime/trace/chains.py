@@ -1,0 +1,112 @@
+"""The inputs of all runs through chains of effects, each link worked out once.
+
+A tracer asks for thousands of chains that differ in one number. What acts on an input depends on the effects that touch it, in their order,
+and on the inputs that these read: so every link is known by its effect, its values and the links before it on those inputs, and what it
+gave is kept. An effect on the speed is not worked out again because the steering's delay changed.
+
+Many short runs are worked out side by side, (T, runs, nu); few or very unequal ones one after the other.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.models.composed import AppliedEffect, ComposedModel
+
+Array = NDArray[np.float64]
+Key = tuple[object, ...]
+
+KEPT = 24_000_000
+"""Bytes of results that are kept; the longest unused go first."""
+
+
+class Inputs:
+    """Held inputs of runs, (T_i, nu) each, in rows of dt; starts: of the runs, s."""
+
+    def __init__(self, inputs: Sequence[Array], dt: float, starts: Sequence[float]) -> None:
+        self._dt = dt
+        self._kept: OrderedDict[Key, list[Array]] = OrderedDict()
+        self._bytes = 0
+        lengths = np.array([len(u) for u in inputs])
+        self._rows: NDArray[np.int64] | None = None
+        self._starts: list[float | Array] = [float(s) for s in starts]
+        self._tables = [np.asarray(u, dtype=np.float64) for u in inputs]
+        if len(inputs) > 3 and len(inputs) * lengths.max() < 2 * lengths.sum():
+            table = np.zeros((lengths.max(), len(inputs), inputs[0].shape[1]))
+            for i, u in enumerate(inputs):
+                table[: len(u), i] = u
+            self._tables, self._starts = [table], [np.array(starts, dtype=np.float64)]
+            run, row = np.nonzero(np.arange(len(table)) < lengths[:, None])
+            self._rows = row * len(inputs) + run  # of the table laid flat, in the order of runs laid end to end
+
+    def through(self, model: ComposedModel, chain: Sequence[AppliedEffect]) -> Array:
+        """What acts after the chain, from rest: the runs laid end to end, (sum T_i, nu)."""
+        nominal = model.nominal
+        who: Key = (nominal.shared, *sorted(nominal.parameters.items()))
+        links: list[Key] = [(who, name) for name in nominal.inputs]
+        now = self._tables
+        for a in chain:
+            touched = self._touched(a, model)
+            key: Key = (a.effect, a.channel, _values(a), *(links[c] for c in touched))
+            found = self._kept.get(key)
+            if found is None:
+                found = [table[..., touched] for table in self._apply(a, now, model)]
+                self._keep(key, found)
+            else:
+                self._kept.move_to_end(key)
+            now = [_with(table, touched, columns) for table, columns in zip(now, found, strict=True)]
+            for c in touched:
+                links[c] = key
+        if self._rows is not None:
+            return np.asarray(now[0].reshape(-1, now[0].shape[2])[self._rows])
+        return np.concatenate(now)
+
+    def _touched(self, a: AppliedEffect, model: ComposedModel) -> list[int]:
+        """Columns that the effect changes or reads."""
+        names = model.nominal.inputs
+        if a.channel not in names:
+            return list(range(len(names)))
+        reads = getattr(a.effect, "reads", None)
+        also = reads(model.nominal, a.channel) if reads else ()
+        return [i for i, name in enumerate(names) if name == a.channel or name in also]
+
+    def _apply(self, a: AppliedEffect, tables: list[Array], model: ComposedModel) -> list[Array]:
+        if self._rows is None or getattr(a.effect, "side_by_side", False):
+            return [self._over_time(a, u, model, start) for u, start in zip(tables, self._starts, strict=True)]
+        z, done = a.effect.hidden(tables[0].shape[1], model.nominal, a.channel, self._dt, a.p), []
+        if getattr(a.effect, "timed", False):
+            z[:, 0] = self._starts[0]
+        for u in tables[0]:
+            acting_now, z = a.effect.input_step(u, z, model.nominal, a.channel, self._dt, a.p)
+            done.append(acting_now)
+        return [np.stack(done)]
+
+    def _over_time(self, a: AppliedEffect, u: Array, model: ComposedModel, start: float | Array) -> Array:
+        """`input_sequence`; an effect that depends on time is told when the first row is."""
+        if getattr(a.effect, "timed", False):
+            return a.effect.input_sequence(u, model.nominal, a.channel, self._dt, a.p, start=start)  # type: ignore[call-arg]
+        return a.effect.input_sequence(u, model.nominal, a.channel, self._dt, a.p)
+
+    def _keep(self, key: Key, found: list[Array]) -> None:
+        self._kept[key] = found
+        self._bytes += sum(columns.nbytes for columns in found)
+        while self._bytes > KEPT and len(self._kept) > 1:
+            _, gone = self._kept.popitem(last=False)
+            self._bytes -= sum(columns.nbytes for columns in gone)
+
+
+def _with(table: Array, columns: list[int], values: Array) -> Array:
+    if values.shape == table.shape:
+        return values
+    changed = table.copy()
+    changed[..., columns] = values
+    return changed
+
+
+def _values(a: AppliedEffect) -> Key:
+    """Parameter values as something that can be looked up."""
+    return tuple((name, str(value) if isinstance(value, list) else value) for name, value in sorted(a.p.items()))
