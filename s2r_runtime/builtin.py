@@ -66,4 +66,7 @@ def s2r_tasks() -> list[Offer]:
     return [
         Offer("grid_world", "s2r_runtime.tasks.grid_world:GridWorld", "the paper's grid with static and moving obstacles"),
         Offer("keep_out", "s2r_runtime.tasks.keep_out:KeepOut", "reach a goal, stay out of a disc"),
+        Offer(
+            "stl", "s2r_runtime.tasks.stl_task:StlTask", "what the profile says: a formula of signal temporal logic or a barrier function"
+        ),
     ]

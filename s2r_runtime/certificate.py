@@ -21,9 +21,9 @@ from s2r_runtime.canonical import canonical, digest
 from s2r_runtime.controllers.file import ControllerFile, Identity
 from s2r_runtime.core.ledger import binomial_tail, campaign_size, sample_size, share
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
-from s2r_runtime.messages import CertificateFacts, Gap, Struct, Verification
+from s2r_runtime.messages import SERIAL, CertificateFacts, Gap, Struct, Verification
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.profile import Profile
+from s2r_runtime.profile import Profile, TaskValue
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -50,7 +50,7 @@ class Certificate(Struct, frozen=True):
     model: ModelSpec
     model_digest: str
     task: str
-    task_parameters: dict[str, float]
+    task_parameters: dict[str, TaskValue]
     task_digest: str
     profile_digest: str
     gap: Gap
@@ -258,6 +258,7 @@ def _evidence(c: Certificate, *, traced_not_adopted: bool) -> list[tuple[str, bo
         ("the verified radius is below the gap", v.radius >= gap.radius and (not holds or v.hold_radius >= gap.hold_radius), 0),
         ("the gap spends more than its epoch's share of beta", gap.beta <= share(c.budget, gap.epoch) * slack, 0),
         ("the verification spends more than its attempt's share of beta", v.beta <= share(c.budget, v.attempt) * slack, 0),
+        (f"the samples were not drawn independently: {gap.white_reason}", not gap.white_reason.startswith(SERIAL), 0),
         (
             f"{gap.n} samples do not carry the gap's statement",
             binomial_tail(gap.n, gap.discarded, gap.epsilon) <= gap.beta / (2.0 if holds else 1.0) * slack,

@@ -227,8 +227,8 @@ class Task(Protocol):
 
     name: str
     horizon: int
-    PARAMETERS: ClassVar[dict[str, tuple[float, str]]]
-    """Every parameter: default and meaning."""
+    PARAMETERS: ClassVar[dict[str, tuple[Any, str]]]
+    """Every parameter: default and meaning. Most are numbers; a text, a list of numbers or a table may be one too."""
 
     def draw(self, rng: np.random.Generator, n: int) -> Scenario:
         """n scenarios from the law, independent; each holds `start`, (n, nx)."""

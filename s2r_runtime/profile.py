@@ -85,11 +85,16 @@ class VerificationSettings(_Table, frozen=True):
     timeout: float = 60.0
 
 
+TaskLaw = float | str | list[float] | dict[str, list[float]]
+TaskValue = float | str | list[float] | dict[str, TaskLaw]
+"""What a task's parameter may be; most are numbers, the task `stl` has texts and tables."""
+
+
 class TaskChoice(_Table, frozen=True):
     """Which task, its parameters, and how many scenarios are driven one after the other once deployed (0: no end)."""
 
     name: str
-    parameters: dict[str, float] = {}
+    parameters: dict[str, TaskValue] = {}
     episodes: int = 0
 
 
@@ -162,14 +167,17 @@ class Repair(_Table, frozen=True):
 
 
 class Profile(_Table, frozen=True):
-    """A robot. region: where the certificate holds, bounds by state (an angle may be left out: all of it)."""
+    """A robot. region: where the certificate holds, bounds by state (an angle may be left out: all of it).
+
+    transport: empty where nobody is to drive: what is computed from recordings and models alone needs none.
+    """
 
     robot: Robot
     model: ModelSpec
     region: dict[str, tuple[float, float]]
     inputs: dict[str, tuple[float, float]]
-    transport: dict[str, Any]
     task: TaskChoice
+    transport: dict[str, Any] = {}
     geofence: dict[str, tuple[float, float]] = {}
     columns: dict[str, str] = {}
     norm: Norm = Norm()
@@ -201,6 +209,14 @@ class Profile(_Table, frozen=True):
         return digest_of(
             {"task": self.task.name, "parameters": self.task.parameters, "dt": self.model.dt, "threshold": self.verification.threshold}
         )
+
+
+def load_driving_profile(path: Path) -> Profile:
+    """As `load_profile`, for a robot that is to be driven: it must name its transport."""
+    profile = load_profile(path)
+    if not profile.transport:
+        raise ConfigError(f"{path}: transport is missing; to drive a robot, a profile must say how it is reached: [transport] name = ...")
+    return profile
 
 
 def load_profile(path: Path) -> Profile:
@@ -235,7 +251,7 @@ def _with_files(transport: dict[str, Any], where: str, base: Path, given: Mappin
     from s2r_runtime.plugins import registry
 
     found = registry()
-    if transport["name"] not in found.names("transports"):
+    if transport.get("name") not in found.names("transports"):
         return transport
     options = dict(transport)
     for option in found.offered("transports", transport["name"]).offer.files:
@@ -271,6 +287,8 @@ def check_names(profile: Profile, where: str) -> None:
     from s2r_runtime.plugins import registry
 
     model = check_model(profile, where)
+    if not profile.transport:
+        return
     try:
         transport = registry().get("transports", str(profile.transport.get("name")))
     except ConfigError as error:
@@ -303,7 +321,10 @@ def check_model(profile: Profile, where: str) -> ComposedModel:
         task = registry().get("tasks", profile.task.name)
     except ConfigError as error:
         raise ConfigError(f"{where}: task.name: {error}") from None
-    task(profile.task.parameters, model.nominal, profile.model.dt)
+    try:
+        task(profile.task.parameters, model.nominal, profile.model.dt)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
     return model
 
 
@@ -407,5 +428,5 @@ def _checks(p: Profile) -> list[tuple[str, object, str]]:
     need(p.task.episodes >= 0, "task.episodes", p.task.episodes, ">= 0 (0: no end)")
     need(1.0 <= p.watch.run_length <= 1e12, "watch.run_length", p.watch.run_length, "1 to 1e12 discrepancies")
     need(p.watch.fault_jump >= 0.0, "watch.fault_jump", p.watch.fault_jump, ">= 0 (0: no such rule)")
-    need(isinstance(p.transport.get("name"), str), "transport.name", p.transport.get("name"), "the name of a transport")
+    need(not p.transport or isinstance(p.transport.get("name"), str), "transport.name", p.transport.get("name"), "the name of a transport")
     return found

@@ -99,9 +99,9 @@ def _common(verb: argparse.ArgumentParser) -> None:
 def run_daemon(args: argparse.Namespace) -> int:
     """Runs until SIGTERM or SIGINT. Exit 0 on a clean end."""
     from s2r_runtime.daemon import analytics
-    from s2r_runtime.profile import load_profile
+    from s2r_runtime.profile import load_driving_profile
 
-    profile = load_profile(args.profile)
+    profile = load_driving_profile(args.profile)
     child = analytics.start()  # it loads its libraries while the daemon's are loaded here; it ends with this process
     from s2r_runtime.daemon.loop import Daemon
 
@@ -120,9 +120,9 @@ def run_daemon(args: argparse.Namespace) -> int:
 def run_sample(args: argparse.Namespace) -> int:
     """Exit 0 if the campaign is complete, or all of the given inputs were driven."""
     from s2r_runtime.daemon import control
-    from s2r_runtime.profile import load_profile
+    from s2r_runtime.profile import load_driving_profile
 
-    profile = load_profile(args.profile)
+    profile = load_driving_profile(args.profile)
     socket = args.socket or control.find_socket(args.robot or profile.robot.name, required=False)
     if socket is not None:
         if args.output:

@@ -81,7 +81,7 @@ def profile_check(args: argparse.Namespace) -> int:
             }
         )
         return 0
-    model, transport = f"model {profile.model.name} at {profile.model.dt} s", profile.transport["name"]
+    model, transport = f"model {profile.model.name} at {profile.model.dt} s", profile.transport.get("name", "none (nobody can drive)")
     output.out(f"{args.profile}: valid. Robot {profile.robot.name!r}, {model}, task {profile.task.name}, transport {transport}.")
     if args.defaults:
         for table, values in msgspec.to_builtins(profile).items():

@@ -64,6 +64,11 @@ class Formula:
         """Raises ConfigError `where, column 5: ...`."""
         return cls(parse_truth(text, names, dt, where), text)
 
+    @property
+    def width(self) -> int:
+        """How many leaves it has."""
+        return len(self._leaves)
+
     def leaves(self, signals: Signals, n: int) -> tuple[Array, ...]:
         """Its leaves at one instant, (n,) each. signals: name -> (n,) or a number."""
         with np.errstate(all="ignore"):

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +65,7 @@ class GridWorld:
         "min_progress": (0.4, "median distance travelled along the shortest path that counts as doing the task, m"),
     }
 
-    def __init__(self, parameters: dict[str, float], model: NominalModel, dt: float) -> None:
+    def __init__(self, parameters: dict[str, Any], model: NominalModel, dt: float) -> None:
         p = filled_in(self.name, parameters, self.PARAMETERS)
         self._check(p)
         self._x, self._y, self._theta = columns_of(self.name, model, ("x", "y", "theta"))

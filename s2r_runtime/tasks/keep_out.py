@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,7 +58,7 @@ class KeepOut:
         "min_progress": (0.5, "median of the share of the distance to the goal that was covered"),
     }
 
-    def __init__(self, parameters: dict[str, float], model: NominalModel, dt: float) -> None:
+    def __init__(self, parameters: dict[str, Any], model: NominalModel, dt: float) -> None:
         p = filled_in(self.name, parameters, self.PARAMETERS)
         whole(self.name, p, 1, ("steps",))
         for name, ok, must in (

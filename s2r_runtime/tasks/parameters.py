@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import NominalModel
 
 
-def filled_in(task: str, given: dict[str, float], known: dict[str, tuple[float, str]]) -> dict[str, float]:
-    """Every parameter's value. Raises ConfigError for an unknown name (with the nearest) or a value that is not a finite number."""
+def known_name(task: str, name: str, known: Iterable[str]) -> None:
+    """Raises ConfigError for an unknown parameter, with the nearest."""
+    known = list(known)
+    if name not in known:
+        near = difflib.get_close_matches(name, known, 1, 0.6)
+        hint = f"did you mean {near[0]!r}?" if near else f"it has: {', '.join(known)}"
+        raise ConfigError(f"task {task}: has no parameter {name!r}; {hint}")
+
+
+def filled_in(task: str, given: Mapping[str, Any], known: dict[str, tuple[float, str]]) -> dict[str, float]:
+    """Every parameter's value. Raises ConfigError for an unknown name or a value that is not a finite number."""
     for name, value in given.items():
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1, 0.6)
-            hint = f"did you mean {near[0]!r}?" if near else f"it has: {', '.join(known)}"
-            raise ConfigError(f"task {task}: has no parameter {name!r}; {hint}")
+        known_name(task, name, known)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise ConfigError(f"task {task}: {name} is {value!r}, must be a finite number")
     return {name: float(given.get(name, default)) for name, (default, _) in known.items()}
