@@ -17,11 +17,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.bounds import check_probability, sample_size, scenario_confidence
+from s2r_runtime.bounds import check_probability, sample_size, scenario_confidence, split
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, UsageError
-from s2r_runtime.messages import Gap
+from s2r_runtime.messages import SERIAL, Gap
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.whiteness import DEPENDENT, whiteness
+from s2r_runtime.whiteness import DEPENDENT, SERIAL_ALPHA, Whiteness, serial_p, whiteness
 
 Array = NDArray[np.float64]
 Kind = Literal["ball", "box"]
@@ -123,8 +123,11 @@ def estimate_gap(
     e = residuals(model, tr)
     radius = _largest(discrepancy(e, w, kind), discard)
     e_hold = hold_residuals(model, tr)
-    paid = e_hold is not None and (not tr.independent or scenario_confidence(n, discard, epsilon) <= beta / 2.0)
+    paid = e_hold is not None and (not tr.independent or scenario_confidence(n, discard, epsilon) <= split(beta, (1, 1))[0])
     white = whiteness(model, tr.x0, tr.u, e, first_lag=1 if tr.independent else 2)
+    if tr.independent:
+        found = [discrepancy(one, w, kind) for one in (e, e_hold) if one is not None]
+        white = _in_order(found) or white
     return Gap(
         radius=radius,
         radius_literal=_largest(discrepancy(e, np.ones_like(w), kind), discard),
@@ -144,6 +147,12 @@ def estimate_gap(
         white=white.white,
         white_reason=white.reason,
     )
+
+
+def _in_order(found: list[Array]) -> Whiteness | None:
+    """What speaks against the independence of the samples, if it speaks clearly: the order of these discrepancies (each (n,))."""
+    p = len(found) * min(serial_p(d) for d in found)
+    return Whiteness(False, f"{SERIAL} (p = {p:.1g})") if p < SERIAL_ALPHA else None
 
 
 def refuse_fitted(model: ComposedModel, tr: Transitions) -> None:
@@ -206,6 +215,13 @@ def blocked(tr: Transitions, seconds: float, dt: float) -> Transitions:
         rejected={**tr.rejected, "blocking": len(tr.x0) - len(first)},
         drive=replace(tr.drive, step=tr.drive.step[first]),
     )
+
+
+def doubted(gap: Gap, tr: Transitions) -> Transitions:
+    """The transitions, with a doubt where their order matters: then their gap carries no statement (guarantee G1)."""
+    if not tr.independent or not gap.white_reason.startswith(SERIAL):
+        return tr
+    return replace(tr, independent=False, doubt=f"the samples were not drawn independently: {gap.white_reason}")
 
 
 def statement(gap: Gap, independent: bool, *, assumption: str = "", doubt: str = "", states: tuple[str, ...] = ()) -> str:

@@ -9,6 +9,10 @@ has no mean in the world's axes). Three questions, each by a rank or normal stat
     input   rank correlation of e_i with each of u, |u|, u_j u_k, u_j |u_k|     normal, times sqrt(n-1)
 
 The smallest p-value counts, times the number of tests (Bonferroni): noise alone is called structured with probability <= ALPHA.
+
+Whether samples were independent is a question by itself (`serial_p`), about the discrepancy, which is what the gap bounds (guarantee
+G1): the same statistic of order, with ranks shared among ties, for half of the discrepancies may be the same number. Where the limit law
+says that it is rare, its place among PERMUTATIONS seeded permutations counts, which is exact for any law of the discrepancy.
 """
 
 from __future__ import annotations
@@ -29,6 +33,15 @@ LAGS = 5
 FEWEST = 30
 """Below this the statistics are not near their limit laws; then the answer is `not white`, for nothing was shown."""
 
+SERIAL_ALPHA = 5e-3
+"""Of campaigns whose samples are independent, this share is refused. Small enough to be rare; large enough that whoever repeats campaigns
+with dependent samples until one is accepted still gets a wrong gap with probability below beta = 5 %, for autoregressions of any
+strength (tools/bench_missions.py)."""
+PERMUTATIONS = 9999
+PERMUTED_AT_ONCE = 1_000_000
+"""Numbers, 8 MB."""
+RARE = 0.02
+"""A p-value by the limit law below which the permutations are made."""
 DEPENDENT = "depends on the one before"
 """Stands in the reason where the order of the samples matters: they were hardly drawn independently."""
 
@@ -60,6 +73,22 @@ def whiteness(model: ComposedModel, x0: Array, u: Array, e: Array, *, first_lag:
             found += [(_normal_p(score * _correlation(ranks, r)), f"the residual in {state} depends on {name}") for name, r in inputs]
     structure = sorted((DEPENDENT not in reason, p, reason) for p, reason in found if p * len(found) < ALPHA)
     return Whiteness(False, structure[0][2]) if structure else Whiteness(True, "")
+
+
+def serial_p(d: Array, *, first_lag: int = 1) -> float:
+    """How likely a statistic of order as large as that of d (n,), in the order of the samples, is among independent ones; 1 for too few."""
+    n = len(d)
+    ranks = _ranks(d)
+    if n < FEWEST + LAGS or np.ptp(ranks) == 0.0:
+        return 1.0
+    limit = _serial_p(ranks, first_lag)
+    if limit > RARE:
+        return limit
+    observed, larger, rng = _serial_statistic(ranks[None, :], first_lag)[0], 0, np.random.default_rng(0)
+    for size in np.diff(np.linspace(0, PERMUTATIONS, 2 + PERMUTATIONS * n // PERMUTED_AT_ONCE).astype(int)):
+        shuffled = rng.permuted(np.broadcast_to(ranks, (size, n)), axis=1)
+        larger += int(np.count_nonzero(_serial_statistic(shuffled, first_lag) >= observed * (1.0 - 1e-12)))
+    return (1.0 + larger) / (1.0 + PERMUTATIONS)
 
 
 def body_axes(model: ComposedModel, x0: Array, e: Array) -> Array:
@@ -107,10 +136,14 @@ def _mean_score(values: Array) -> float:
 def _serial_p(ranks: Array, first_lag: int) -> float:
     from scipy.special import gammaincc
 
-    total = float(ranks @ ranks)
+    return float(gammaincc(LAGS / 2.0, _serial_statistic(ranks[None, :], first_lag)[0] / 2.0))
+
+
+def _serial_statistic(ranks: Array, first_lag: int) -> Array:
+    """(m, n) centred ranks -> (m,): sum over lags of n rho_l^2."""
+    total = np.einsum("mn,mn->m", ranks, ranks)
     lags = range(first_lag, first_lag + LAGS)
-    statistic = sum(len(ranks) * (float(ranks[lag:] @ ranks[:-lag]) / total) ** 2 for lag in lags)
-    return float(gammaincc(LAGS / 2.0, statistic / 2.0))
+    return np.asarray(sum(ranks.shape[1] * (np.einsum("mn,mn->m", ranks[:, lag:], ranks[:, :-lag]) / total) ** 2 for lag in lags))
 
 
 def _normal_p(z: float) -> float:

@@ -8,17 +8,20 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from s2r_runtime.bounds import clopper_pearson_lower, clopper_pearson_upper, sample_size, scenario_confidence
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, UsageError
-from s2r_runtime.gap import Drive, Transitions, blocked, discrepancy, estimate_gap, gap_json, noise_share, residuals, statement
+from s2r_runtime.gap import Drive, Transitions, blocked, discrepancy, doubted, estimate_gap, gap_json, noise_share, residuals, statement
+from s2r_runtime.messages import SERIAL
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.whiteness import whiteness
+from s2r_runtime.whiteness import SERIAL_ALPHA, serial_p, whiteness
 
 DT = 0.1
 UNICYCLE = compose(ModelSpec("unicycle", DT))
 ONES = (1.0, 1.0, 1.0)
+SETTINGS = {"epsilon": 0.01, "beta": 0.05, "weights": ONES}
 SURE = 1e-3
 """A repetition test may fail by chance once in a thousand."""
 
@@ -347,9 +350,48 @@ def test_an_exact_model_without_noise_is_white_and_too_few_samples_are_not_calle
     assert "too few" in few.reason
 
 
-def test_dependent_samples_are_held_against_the_statement() -> None:
+def test_samples_whose_discrepancies_depend_on_each_other_carry_no_statement() -> None:
     rng = np.random.default_rng(18)
     e = np.cumsum(rng.normal(scale=0.001, size=(300, 3)), axis=0)
-    gap = estimate_gap(UNICYCLE, transitions(e, rng), epsilon=0.01, beta=0.05, weights=ONES)
+    tr = transitions(e, rng)
+    gap = estimate_gap(UNICYCLE, tr, epsilon=0.01, beta=0.05, weights=ONES)
     assert not gap.white
+    assert gap.white_reason.startswith(SERIAL)
+    assert "Against the independence speaks that the discrepancy" in statement(gap, True)
+    told = gap_json(gap, doubted(gap, tr), UNICYCLE.states)
+    assert told["independent"] is False
+    assert told["statement"].startswith("No statement: the samples were not drawn independently")
+    fine = transitions(rng.permutation(e), rng)
+    gap = estimate_gap(UNICYCLE, fine, epsilon=0.01, beta=0.05, weights=ONES)
+    assert doubted(gap, fine) is fine
+
+
+def test_a_residual_that_depends_on_the_one_before_is_held_against_the_statement() -> None:
+    rng = np.random.default_rng(19)
+    sign = np.where(np.arange(300) // 10 % 2, 1.0, -1.0)[:, None]
+    e = sign * rng.exponential(size=(300, 1)) * np.array([[0.0, 0.0, 0.1]])  # of one size, in an order of signs
+    gap = estimate_gap(UNICYCLE, transitions(e, rng), **SETTINGS)
     assert "Against the independence speaks that the residual in" in statement(gap, True)
+
+
+@pytest.mark.parametrize("zeros", [0.0, 0.58])
+def test_independent_discrepancies_are_refused_no_more_often_than_said(zeros: float) -> None:
+    """58 % of them exactly 0, as where saturation hides the error; and a heavy tail."""
+    rng = np.random.default_rng(20)
+    campaigns = 2500
+    d = np.abs(rng.standard_t(2.5, size=(campaigns, 161))) * (rng.uniform(size=(campaigns, 161)) >= zeros)
+    refused = sum(serial_p(one) < SERIAL_ALPHA for one in d)
+    assert clopper_pearson_lower(refused, campaigns, SURE) <= SERIAL_ALPHA
+
+
+@pytest.mark.parametrize(("rho", "zeros"), [(0.98, False), (0.9, False), (0.98, True)])
+def test_autoregressive_discrepancies_are_refused(rho: float, zeros: bool) -> None:
+    rng = np.random.default_rng(21)
+    for _ in range(20):
+        z = np.abs(lfilter([math.sqrt(1 - rho * rho)], [1.0, -rho], rng.normal(size=1000)))[-161:]
+        assert serial_p(np.where(z < np.quantile(z, 0.58), 0.0, z) if zeros else z) < SERIAL_ALPHA
+
+
+def test_few_or_equal_discrepancies_say_nothing_of_their_order() -> None:
+    assert serial_p(np.zeros(500)) == 1.0
+    assert serial_p(np.arange(20.0)) == 1.0

@@ -92,6 +92,7 @@ def run_gap(args: argparse.Namespace) -> int:
         kind=args.set or (profile.norm.set if profile else "ball"),
         weights=weights_of(model.states, args.weight, profile),
     )
+    found = gaps.doubted(result, found)
     answer = gaps.gap_json(result, found, model.states)
     if args.json:
         output.result_json(answer)

@@ -15,6 +15,7 @@ from s2r_runtime.core.drive import latch, recover_now, regate
 from s2r_runtime.core.sources import end_deployment
 from s2r_runtime.core.state import Campaign, Job, Turn, certificate, job, usable_gap
 from s2r_runtime.messages import (
+    SERIAL,
     AlarmRaised,
     CampaignFinished,
     CertificateStored,
@@ -85,6 +86,9 @@ def campaign_finished(turn: Turn, event: CampaignFinished) -> None:
 def gap_finished(turn: Turn, done: Job, event: JobFinished) -> None:
     """The campaign's gap comes into force."""
     gap = event.gap
+    if gap is not None and not event.error and gap.white_reason.startswith(SERIAL):
+        _not_independent(turn, done, gap)
+        return
     problem = event.error or ("the worker returned none" if gap is None else _gap_problem(turn, gap, done.epoch))
     if gap is None or problem:
         turn.answer(done.request_id, 1, f"no gap: {problem}; s2r sample tries again with the samples that are there")
@@ -92,6 +96,14 @@ def gap_finished(turn: Turn, done: Job, event: JobFinished) -> None:
     turn.remember(campaign_epoch=0, campaign_n=0, traced=False)
     _enforce(turn, gap)
     turn.answer(done.request_id, 0, f"gap of epoch {gap.epoch}: {gap.radius:.6g} at epsilon {gap.epsilon:g}, from {gap.n} samples")
+
+
+def _not_independent(turn: Turn, done: Job, gap: Gap) -> None:
+    """The samples depend on each other, so they bound nothing (guarantee G1): the campaign is given up, and its share stays spent."""
+    turn.remember(campaign_epoch=0, campaign_n=0)
+    turn.persist()
+    why = f"the samples of epoch {gap.epoch} were not drawn independently: {gap.white_reason}; they bound nothing"
+    turn.answer(done.request_id, 3, f"no gap: {why}, and their share of beta is spent: find out what drifts before the next campaign")
 
 
 def _gap_problem(turn: Turn, gap: Gap, epoch: int) -> str:
@@ -103,6 +115,8 @@ def _gap_problem(turn: Turn, gap: Gap, epoch: int) -> str:
         return "its radius is not a finite number >= 0"
     if gap.epsilon != settings.epsilon or gap.discarded != settings.discard:
         return "its epsilon or discards are not the profile's"
+    if gap.white_reason.startswith(SERIAL):
+        return f"its samples were not drawn independently: {gap.white_reason}"
     half = 0.5 * ledger.share(settings.beta, epoch)
     if gap.n < 1 or ledger.binomial_tail(gap.n, gap.discarded, gap.epsilon) > half * (1.0 + ROUNDING):
         return f"{gap.n} samples are too few for the share of epoch {epoch}"
