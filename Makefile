@@ -49,16 +49,17 @@ format: $(STAMP)
 
 wheels: $(STAMP)
 	rm -rf dist
-	for package in . plugins/zenoh plugins/can plugins/mavlink plugins/standins; do $(BIN)/python -m build --wheel --outdir dist $$package || exit 1; done
+	for package in . plugins/zenoh plugins/can plugins/mavlink plugins/standins plugins/ros2; do $(BIN)/python -m build --wheel --outdir dist $$package || exit 1; done
 
 setup: $(STAMP)
 
-$(STAMP): pyproject.toml constraints.txt plugins/zenoh/pyproject.toml plugins/can/pyproject.toml plugins/mavlink/pyproject.toml plugins/standins/pyproject.toml
+$(STAMP): pyproject.toml constraints.txt plugins/zenoh/pyproject.toml plugins/can/pyproject.toml plugins/mavlink/pyproject.toml plugins/standins/pyproject.toml plugins/ros2/pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed; this is $$($(PYTHON) --version). Set PYTHON=..." >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || { echo "the venv module is missing: sudo apt-get install python3-venv" >&2; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-	    --editable '.[report,dev]' --editable plugins/zenoh --editable plugins/can --editable plugins/mavlink --editable plugins/standins
+	    --editable '.[report,dev]' --editable plugins/zenoh --editable plugins/can --editable plugins/mavlink --editable plugins/standins \
+	    --editable plugins/ros2
 	@touch $(STAMP)
 
 clean:

@@ -125,7 +125,7 @@ class Inbox:
     def put(self, sample: zenoh.Sample) -> None:
         """Callback of the subscription, on Zenoh's thread."""
         arrival_ns = time.monotonic_ns()
-        data = sample.payload.to_bytes()
+        data = self.content(sample)
         with self._lock:
             self.received += 1
             if self._per_second and self._over_rate(arrival_ns // 1_000_000_000):
@@ -139,8 +139,12 @@ class Inbox:
         if quiet:
             self._bell.ring()
 
+    def content(self, sample: zenoh.Sample) -> bytes:
+        """What is kept of a sample: its payload. For others to override."""
+        return sample.payload.to_bytes()
+
     def take(self) -> list[tuple[int, bytes]]:
-        """What waited, oldest first: (arrival on the host's monotonic clock, payload)."""
+        """What waited, oldest first: (arrival on the host's monotonic clock, content)."""
         with self._lock:
             taken = list(self._waiting)
             self._waiting.clear()

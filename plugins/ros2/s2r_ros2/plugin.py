@@ -1,0 +1,17 @@
+"""What this package offers."""
+
+from __future__ import annotations
+
+from s2r_runtime.hookspecs import Offer, hookimpl
+
+
+@hookimpl
+def s2r_transports() -> list[Offer]:
+    """The ROS 2 transport."""
+    return [Offer("ros2", "s2r_ros2.transport:Ros2Transport", "ROS 2 robots over Zenoh (bridge or rmw_zenoh), without ROS")]
+
+
+@hookimpl
+def s2r_recordings() -> list[Offer]:
+    """Bags."""
+    return [Offer("ros2.mcap", "s2r_ros2.bags:read", "rosbag2 bags in MCAP files")]
