@@ -13,16 +13,17 @@ campaign's acted: the campaign must be told. Everything that happens comes as an
 
 The parts: `state`, `drive` (instants, sends, the gate opening and closing), `sources` (who may command), `gaps` (campaigns, gap, watch),
 `excitation` (given inputs), `repair` (traces, proposed models), `certificates` (attempts, certificates), `requests` (what a person asks
-for), `gate` (the verdict on a command), `ledger` (what is spent).
+for), `gate` (the verdict on a command), `ledger` (what is spent), `stream` (what is kept of the discrepancies), `status`.
 """
 
 from __future__ import annotations
 
 import msgspec
 
-from s2r_runtime.core import certificates, drive, excitation, gaps, ledger, repair, sources
+from s2r_runtime.core import certificates, drive, excitation, gaps, repair, sources
 from s2r_runtime.core.requests import requested
-from s2r_runtime.core.state import NANO, State, Turn, certificate, unix_now
+from s2r_runtime.core.state import State, Turn
+from s2r_runtime.core.status import status
 from s2r_runtime.messages import (
     MEMORY_SCHEMA,
     AnalyticsChanged,
@@ -205,50 +206,3 @@ def _job_finished(turn: Turn, event: JobFinished) -> None:
         repair.trace_finished(turn, done, event)
     else:
         certificates.verification_finished(turn, done, event)
-
-
-# ---------------------------------------------------------------- status
-
-
-def status(state: State) -> dict[str, object]:
-    """What `s2r status` shows: plain data, finite numbers, None where there is nothing (docs/json.md)."""
-    memory, settings, deployment, campaign = state.memory, state.settings, state.deployment, state.campaign
-    facts, beta = certificate(state), 0.0 if settings is None else settings.beta
-    spent = ledger.spent(beta, memory.epochs, memory.attempts)
-    left_ns = 0 if state.permit_until_ns is None else max(0, state.permit_until_ns - state.now_ns)
-    return {
-        "gate": "open" if state.gate_open else "closed",
-        "reason": state.gate_reason,
-        "controller": None if deployment is None else deployment.digest,
-        "stage": None if deployment is None else deployment.stage,
-        "certificate": None if facts is None else facts.id,
-        "certificate_left_s": None if facts is None else facts.expires_unix_s - unix_now(state),
-        "radius": None if memory.gap is None else memory.radius,
-        "gap_radius": None if memory.gap is None else memory.gap.radius,
-        "verified_radius": None if facts is None else facts.verified_radius,
-        "e_value": state.e_value,
-        "alarm": memory.gap is not None and memory.gap.epoch == memory.alarm_epoch,
-        "epoch": memory.epochs,
-        "attempts": memory.attempts,
-        "beta_spent": spent,
-        "beta_left": max(0.0, beta - spent),
-        "latched": list(memory.latched),
-        "driving": None if state.sent is None else state.sent.source,
-        "campaign": None
-        if campaign is None or campaign.inputs
-        else {"epoch": campaign.epoch, "taken": campaign.taken, "n": campaign.n, "running": campaign.running},
-        "inputs": None
-        if campaign is None or not campaign.inputs
-        else {"digest": campaign.inputs, "driven": campaign.taken, "n": campaign.n, "running": campaign.running},
-        "unfinished_epoch": memory.campaign_epoch or None,
-        "permit_left_s": left_ns / NANO,
-        "jobs": [one.purpose for one in state.jobs],
-        "measurement_faults": state.faults,
-        "episodes": state.episodes,
-        "model": memory.model_digest,
-        "proposal": None
-        if memory.proposal is None
-        else {**msgspec.structs.asdict(memory.proposal), "adopt": None if settings is None else settings.adopt},
-        "traced": memory.traced,
-        "link": state.link_up,
-    }

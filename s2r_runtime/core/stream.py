@@ -22,8 +22,8 @@ from s2r_runtime.messages import Measured, Memory, WatchStood
 EDGES = (0.0, *(i / 16.0 for i in range(1, 17)), *(1.25**j for j in range(1, 16)))
 """Upper edges in multiples of r. Fine where a good robot's discrepancies lie, coarse up to 28 r, beyond which only `beyond` matters."""
 BINS = len(EDGES) + 1
-EXACT_TERMS = 1000
-"""Up to so many exceedances the binomial sum is exact; beyond, one half bounds it from below (its median), 0.7 nats of many."""
+EXACT_TERMS = 30
+"""Up to so many exceedances the binomial sum is exact; beyond, one half bounds it from below (its median), at most 0.7 nats of many."""
 
 
 def bin_of(discrepancy: float, radius: float) -> int:

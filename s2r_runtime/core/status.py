@@ -1,0 +1,98 @@
+"""What `s2r status` shows of the core's state: plain data, finite numbers, None where there is nothing (docs/json.md)."""
+
+from __future__ import annotations
+
+import msgspec
+
+from s2r_runtime.core import ledger, stream
+from s2r_runtime.core.state import NANO, State, certificate, unix_now, usable_gap
+
+
+def status(state: State) -> dict[str, object]:
+    """What `s2r status` shows: plain data, finite numbers, None where there is nothing (docs/json.md)."""
+    memory, settings, deployment, campaign = state.memory, state.settings, state.deployment, state.campaign
+    facts, beta = certificate(state), 0.0 if settings is None else settings.beta
+    spent = ledger.spent(beta, memory.epochs, memory.attempts)
+    left_ns = 0 if state.permit_until_ns is None else max(0, state.permit_until_ns - state.now_ns)
+    return {
+        "gate": "open" if state.gate_open else "closed",
+        "reason": state.gate_reason,
+        "controller": None if deployment is None else deployment.digest,
+        "stage": None if deployment is None else deployment.stage,
+        "certificate": None if facts is None else facts.id,
+        "certificate_left_s": None if facts is None else facts.expires_unix_s - unix_now(state),
+        "radius": None if memory.gap is None else memory.radius,
+        "gap_radius": None if memory.gap is None else memory.gap.radius,
+        "verified_radius": None if facts is None else facts.verified_radius,
+        "headroom_used": None if facts is None or not facts.verified_radius > 0.0 else memory.radius / facts.verified_radius,
+        "samples_to_certificate": samples_to_certificate(state),
+        "stream": _stream(state),
+        "e_value": state.e_value,
+        "alarm": memory.gap is not None and memory.gap.epoch == memory.alarm_epoch,
+        "epoch": memory.epochs,
+        "attempts": memory.attempts,
+        "beta": beta,
+        "beta_spent": spent,
+        "beta_left": max(0.0, beta - spent),
+        "latched": list(memory.latched),
+        "driving": None if state.sent is None else state.sent.source,
+        "campaign": None
+        if campaign is None or campaign.inputs
+        else {"epoch": campaign.epoch, "taken": campaign.taken, "n": campaign.n, "running": campaign.running},
+        "inputs": None
+        if campaign is None or not campaign.inputs
+        else {"digest": campaign.inputs, "driven": campaign.taken, "n": campaign.n, "running": campaign.running},
+        "unfinished_epoch": memory.campaign_epoch or None,
+        "permit_left_s": left_ns / NANO,
+        "jobs": [one.purpose for one in state.jobs],
+        "measurement_faults": state.faults,
+        "episodes": state.episodes,
+        "model": memory.model_digest,
+        "proposal": None
+        if memory.proposal is None
+        else {**msgspec.structs.asdict(memory.proposal), "adopt": None if settings is None else settings.adopt},
+        "traced": memory.traced,
+        "link": state.link_up,
+    }
+
+
+def samples_to_certificate(state: State) -> int | None:
+    """How many samples are lacking before a verification may be begun: 0 with a gap in force; of a campaign that was interrupted, at most.
+    None: no number would do.
+    """
+    settings, memory, campaign = state.settings, state.memory, state.campaign
+    if settings is None:
+        return None
+    if campaign is not None and not campaign.inputs:
+        return max(0, campaign.n - campaign.taken)
+    if usable_gap(state) is not None:
+        return 0
+    if memory.campaign_epoch:
+        return memory.campaign_n
+    try:
+        needed = ledger.campaign_size(settings.epsilon, ledger.share(settings.beta, memory.epochs + 1), settings.discard)
+    except ValueError:
+        return None
+    return max(needed, settings.campaign_n)
+
+
+def _stream(state: State) -> dict[str, object] | None:
+    """What driving shows of itself, under the gap in force; the bounds hold at all times at once, each with confidence 1 - alpha."""
+    settings, memory = state.settings, state.memory
+    if settings is None or memory.gap is None:
+        return None
+    n, exceedances, alpha = memory.watch_n, memory.watch_exceedances, settings.alpha
+    return {
+        "n": n,
+        "exceedances": exceedances,
+        "exceedance_upper": stream.share_above(exceedances, n, alpha),
+        "quantile": stream.quantile(memory.watch_counts, memory.gap.radius, memory.gap.epsilon, alpha),
+        "epsilon": memory.gap.epsilon,
+        "alpha": alpha,
+        "e_value": state.e_value,
+        "alarm_at": 1.0 / alpha,
+        "change": memory.watch_change,
+        "change_at": settings.run_length,
+        "exchange": memory.watch_exchange,
+        "exchange_at": 1.0 / alpha,
+    }
