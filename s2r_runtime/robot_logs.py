@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError, RecordingError, UsageError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.plugins import registry
+from s2r_runtime.recording.origin import other_writer
 from s2r_runtime.tables import Table
 
 Array = NDArray[np.float64]
@@ -42,8 +43,10 @@ def suffix_of(path: Path) -> str:
 
 
 def is_robot_log(path: Path) -> bool:
-    """Whether an installed plug-in reads files with this suffix."""
+    """Whether an installed plug-in reads files with this suffix. An MCAP file is one if somebody else wrote it."""
     suffix = suffix_of(path)
+    if path.name.lower().endswith(".mcap") and not other_writer(path):
+        return False
     return bool(suffix) and any(name.partition(".")[2] == suffix[1:] for name in registry().names("recordings"))
 
 

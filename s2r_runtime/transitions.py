@@ -58,11 +58,12 @@ def load_transitions(
             log = file.read(5) == b"\x89MCAP"
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
-    if log or path.suffix == ".mcap":
+    robots = is_robot_log(path)
+    if (log or path.suffix == ".mcap") and not robots:
         return from_mcap(path, model, epoch=epoch)
     if epoch is not None:
         raise UsageError(f"{path}: a CSV has no epochs, nor has a log that is not of the daemon")
-    if is_robot_log(path):
+    if robots:
         return from_robot_log(path, model, transport)
     return from_csv(path, model, columns or {}, model.dt)
 

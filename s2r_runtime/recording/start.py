@@ -13,6 +13,7 @@ from mcap.records import Header
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.recording.chain import GENESIS
 from s2r_runtime.recording.layout import ABOUT, LIBRARY, MAGIC, RECORD, metadata_fields, metadata_record, pack
+from s2r_runtime.recording.origin import other_writer
 
 FIRST = MAGIC + pack(Header("", LIBRARY))
 
@@ -45,6 +46,8 @@ def read_start(file: BinaryIO, path: Path, size: int) -> Start:
     """Reads the start of a file of `size` bytes. Raises RecordingError if it is no log, or its start is damaged."""
     found = file.read(len(FIRST))
     if found != FIRST[: len(found)]:
+        if other := other_writer(path):
+            raise RecordingError(f"{path}: is an MCAP file of others ({other}), not a log of s2r")
         raise RecordingError(f"{path}: is not a log of this version of s2r (its first bytes are not those of one)")
     head = file.read(RECORD.size)
     if len(head) < RECORD.size or len(FIRST) + RECORD.size + RECORD.unpack(head)[1] > size:

@@ -43,9 +43,10 @@ def load_dataset(
     paths = tuple(Path(p) for p in ([path] if isinstance(path, str | Path) else path))
     digests = tuple(_digest(p) for p in paths)
     source = ", ".join(str(p) for p in paths)
-    if _is_log(paths[0]):
+    robots = is_robot_log(paths[0])
+    if _is_log(paths[0]) and not robots:
         return from_streams(model, _log_segments(paths, model, epoch), source, digests, paths)
-    if is_robot_log(paths[0]):
+    if robots:
         segments, missing, content = _robot_segments(paths[0], model, transport)
     else:
         segments, missing, content = _table_segments(paths[0], model, columns or {})

@@ -14,4 +14,4 @@ def s2r_transports() -> list[Offer]:
 @hookimpl
 def s2r_recordings() -> list[Offer]:
     """Bags."""
-    return [Offer("ros2.mcap", "s2r_ros2.bags:read", "rosbag2 bags in MCAP files")]
+    return [Offer(f"ros2.{suffix}", "s2r_ros2.bags:read", "rosbag2 bags in MCAP files") for suffix in ("mcap", "zstd")]
