@@ -70,3 +70,12 @@ def s2r_tasks() -> list[Offer]:
             "stl", "s2r_runtime.tasks.stl_task:StlTask", "what the profile says: a formula of signal temporal logic or a barrier function"
         ),
     ]
+
+
+@hookimpl
+def s2r_kits() -> list[Offer]:
+    """For those of the above that the kits can't try on values of their own."""
+    return [
+        Offer("effects.periodic_disturbance", "s2r_runtime.testing.builtin_kits:PeriodicKit"),
+        Offer("tasks.stl", "s2r_runtime.testing.builtin_kits:StlKit"),
+    ]

@@ -5,6 +5,14 @@ these names marked with `@hookimpl`. Each returns a list of *offers*: a name and
 heavy is imported until it is used. Built-in models, effects and tasks come through the same hooks
 (`s2r_runtime.builtin`). Names are unique: a plug-in that reuses one is refused, naming both distributions.
 
+    what                               is
+    transport                          `s2r_transports`, `Transport`: a robot's protocol. Its robot logs: `s2r_recordings`
+    model, effect                      `s2r_models`, `NominalModel`; `s2r_effects`, `Effect`
+    task, with its safety metric       `s2r_tasks`, `Task`: the metric is what `safety` says, >= 0 iff safe
+    kit                                `s2r_kits`: how `s2r plugin check` tries what is offered
+    controller                         no hook: a Python file, named where it is used (its bytes are what a certificate is about)
+    recorder, dashboard                no hook: the log can be read while it is written, by a process of one's own (docs/plugin-author.md)
+
     from s2r_runtime.hookspecs import Offer, hookimpl
 
     @hookimpl
@@ -30,6 +38,7 @@ if TYPE_CHECKING:
 
 GROUP = "s2r_runtime"
 API_VERSION = 1
+"""A plug-in's module may say for which it was written: `S2R_API_VERSION = 1`. One that was written for another is not used."""
 
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)
@@ -302,6 +311,16 @@ def s2r_recordings() -> list[Offer]:
     profile is of another transport. A list of contiguous stretches; t (N,) s, ascending, of one clock; x (N, nx), u (M, nu) in SI units,
     NaN where a column was not received at that stamp. Raises ConfigError for bad or missing options, RecordingError for a file that
     can't be read.
+    """
+    return []
+
+
+@hookspec
+def s2r_kits() -> list[Offer]:
+    """Kits (`s2r_runtime.testing`) with what is needed to run them, for `s2r plugin check`. An offer's name is `KIND.NAME`
+    (`transports.my_bus`), with further words where there are several (`transports.my_bus.serial`); the attribute is a subclass of
+    `TransportKit`, `ModelKit`, `EffectKit` or `TaskKit`. A transport needs one: nobody else has its robot's end. For models, effects
+    and tasks there is a kit without one, on values of its own.
     """
     return []
 

@@ -1,13 +1,15 @@
 """Finds plug-ins by entry point, each loaded on its own: one that fails is reported and skipped, never fatal.
 
 Names are unique over all plug-ins. Where two offer the same name the later one is refused and both distributions are named;
-built-in names are taken first, so a third party cannot replace one.
+built-in names are taken first, so a third party cannot replace one. What a plug-in raises on the way, SystemExit included, is its report
+(`s2r plugin list`); only Ctrl-C is the user's.
 """
 
 from __future__ import annotations
 
 import difflib
 import importlib
+import re
 from functools import cache
 from importlib import metadata
 from typing import Any, NamedTuple
@@ -15,23 +17,31 @@ from typing import Any, NamedTuple
 import pluggy
 
 from s2r_runtime import hookspecs
-from s2r_runtime.errors import PluginError
+from s2r_runtime.errors import PluginError, one_line
 from s2r_runtime.hookspecs import API_VERSION, GROUP, Offer
 
-KINDS = ("transports", "models", "effects", "tasks", "recordings", "robots")
+KINDS = ("transports", "models", "effects", "tasks", "recordings", "robots", "kits")
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
+TARGET = re.compile(r"\w+(\.\w+)*:\w+")
+OFFERS_MOST = 1000
+"""Of one kind by one plug-in: a list, not a stream."""
 
 INSTALL = {"zenoh": "s2r-zenoh", "mavlink": "s2r-mavlink", "can": "s2r-can", "robotarium": "s2r-standins"}
 """Names that a package of this project offers, for the hint when it is not installed."""
 
 
 class Loaded(NamedTuple):
-    """One plug-in as found. `error` is empty iff it is in use; `offers`: kind -> names."""
+    """One plug-in as found. `error` is empty iff all of it is in use; `offers`: kind -> names. `origin`: the file or folder that it came
+    from; `api`: the version of the interface that it was written for (0: not known, it could not be loaded).
+    """
 
     name: str
     distribution: str
     version: str
     error: str
     offers: dict[str, tuple[str, ...]]
+    origin: str = ""
+    api: int = 0
 
 
 class Offered(NamedTuple):
@@ -50,43 +60,61 @@ class Registry:
 
     def add(self, name: str, distribution: str, version: str, module: object) -> None:
         """Takes a plug-in module's offers. A name already taken is refused with both distributions named."""
+        origin = str(getattr(module, "__file__", None) or "")
+        if known := next((p.distribution for p in self.loaded if p.name == name), ""):
+            self.fail(
+                name, distribution, version, f"the plug-in {name!r} of {distribution} is refused: {known} has one of that name", origin
+            )
+            return
         manager = pluggy.PluginManager(GROUP)
         manager.add_hookspecs(hookspecs)
-        errors: list[str] = []
-        taken: dict[str, tuple[str, ...]] = {}
-        wanted = getattr(module, "S2R_API_VERSION", API_VERSION)
-        if wanted != API_VERSION:
-            self.fail(name, distribution, version, f"written for plug-in API {wanted}, this is API {API_VERSION}")
-            return
         try:
+            wanted: object = getattr(module, "S2R_API_VERSION", API_VERSION)
+            if wanted != API_VERSION:
+                self.fail(name, distribution, version, f"written for plug-in API {wanted}, this is API {API_VERSION}", origin)
+                return
             manager.register(module, name)
             manager.check_pending()
-        except Exception as error:  # noqa: BLE001 - a third party's module: whatever it raises is its report, not our end
-            self.fail(name, distribution, version, f"{type(error).__name__}: {error}")
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # noqa: BLE001 - a third party's module: whatever it raises is its report, not our end
+            self.fail(name, distribution, version, said(error), origin)
             return
+        errors: list[str] = []
+        taken: dict[str, tuple[str, ...]] = {}
         for kind in KINDS:
             try:
-                offers = [offer for given in getattr(manager.hook, f"s2r_{kind}")() for offer in given]
-            except Exception as error:  # noqa: BLE001 - as above
-                errors.append(f"s2r_{kind}: {type(error).__name__}: {error}")
+                offers = _offers(getattr(manager.hook, f"s2r_{kind}")())
+            except KeyboardInterrupt:
+                raise
+            except BaseException as error:  # noqa: BLE001 - as above
+                errors.append(f"s2r_{kind}: {said(error)}")
                 continue
-            taken[kind] = tuple(o.name for o in offers if self._take(kind, o, distribution, errors))
-        self.loaded.append(Loaded(name, distribution, version, "; ".join(errors), {k: v for k, v in taken.items() if v}))
+            taken[kind] = tuple(new for offer in offers if (new := self._take(kind, offer, distribution, errors)))
+        offered = {kind: names for kind, names in taken.items() if names}
+        self.loaded.append(Loaded(name, distribution, version, "; ".join(errors), offered, origin, API_VERSION))
 
-    def fail(self, name: str, distribution: str, version: str, error: str) -> None:
+    def fail(self, name: str, distribution: str, version: str, error: str, origin: str = "") -> None:
         """Notes a plug-in that could not be loaded."""
-        self.loaded.append(Loaded(name, distribution, version, error, {}))
+        self.loaded.append(Loaded(name, distribution, version, error, {}, origin))
 
-    def _take(self, kind: str, offer: Offer, distribution: str, errors: list[str]) -> bool:
+    def _take(self, kind: str, offer: object, distribution: str, errors: list[str]) -> str:
+        """The offer's name if it is in force now, else empty."""
         if not isinstance(offer, Offer):
             errors.append(f"s2r_{kind}: offers {type(offer).__name__}, must be Offer(name, target)")
-            return False
+            return ""
+        if not isinstance(offer.name, str) or not NAME.fullmatch(offer.name):
+            errors.append(one_line(f"s2r_{kind}: offers the name {offer.name!r}, must be letters, digits, _ . -"))
+            return ""
+        if not isinstance(offer.target, str) or not TARGET.fullmatch(offer.target):
+            errors.append(one_line(f"s2r_{kind}: {offer.name} has the target {offer.target!r}, must be module:attribute"))
+            return ""
         known = self._offers[kind].get(offer.name)
         if known is not None:
             errors.append(f"{kind[:-1]} {offer.name!r} of {distribution} is refused: {known.distribution} has that name")
-            return False
+            return ""
         self._offers[kind][offer.name] = Offered(offer, distribution)
-        return True
+        return offer.name
 
     def names(self, kind: str) -> list[str]:
         """Registered names of a kind, sorted."""
@@ -105,8 +133,10 @@ class Registry:
         module, _, attribute = offer.target.partition(":")
         try:
             return getattr(importlib.import_module(module), attribute)
-        except Exception as error:  # noqa: BLE001 - as in `add`
-            raise PluginError(f"{kind[:-1]} {name!r} of {distribution} cannot be loaded: {type(error).__name__}: {error}") from None
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # noqa: BLE001 - as in `add`
+            raise PluginError(f"{kind[:-1]} {name!r} of {distribution} cannot be loaded: {said(error)}") from None
 
     def _hint(self, kind: str, name: str) -> str:
         broken = [f"{p.name} ({p.error})" for p in self.loaded if p.error]
@@ -127,11 +157,33 @@ def registry() -> Registry:
         distribution, version = (point.dist.name, point.dist.version) if point.dist else ("?", "?")
         try:
             module = point.load()
-        except Exception as error:  # noqa: BLE001 - as in `Registry.add`
-            found.fail(point.name, distribution, version, f"{type(error).__name__}: {error}")
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # noqa: BLE001 - as in `Registry.add`
+            found.fail(point.name, distribution, version, said(error), _folder(point))
             continue
         found.add(point.name, distribution, version, module)
     return found
+
+
+def said(error: BaseException) -> str:
+    """What somebody else's code raised, on one line."""
+    return one_line(f"{type(error).__name__}: {error}")
+
+
+def _offers(given: object) -> list[object]:
+    """What a hook of one plug-in gave: pluggy makes a list of the answers. Raises TypeError."""
+    found: list[object] = []
+    for offers in given if isinstance(given, list) else [given]:
+        if not isinstance(offers, list | tuple) or len(offers) > OFFERS_MOST:
+            raise TypeError(f"gives {type(offers).__name__}, must be a list of Offer")
+        found += offers
+    return found
+
+
+def _folder(point: metadata.EntryPoint) -> str:
+    """Where a plug-in that could not be imported is installed."""
+    return str(point.dist.locate_file("")) if point.dist else ""
 
 
 def _version(distribution: str) -> str:

@@ -1,4 +1,4 @@
-"""Verbs that set things up and look at them: plugin, profile, keys, doctor."""
+"""Verbs that set things up and look at them: profile, keys, doctor."""
 
 from __future__ import annotations
 
@@ -25,11 +25,6 @@ MINIMUM_FREE_BYTES = 1_000_000_000
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verbs of this module."""
-    plugin = verbs.add_parser("plugin", help="what is installed").add_subparsers(dest="what", metavar="WHAT", required=True)
-    listing = plugin.add_parser("list", help="every plug-in found, what it offers, and why one could not be loaded")
-    listing.add_argument("--json", action="store_true", help="print one JSON object")
-    listing.set_defaults(run=plugin_list)
-
     profile = verbs.add_parser("profile", help="check a robot's profile").add_subparsers(dest="what", metavar="WHAT", required=True)
     check = profile.add_parser("check", help="is this profile valid here, and what does it mean")
     check.add_argument("profile", type=Path, metavar="PROFILE")
@@ -45,24 +40,6 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     doctor = verbs.add_parser("doctor", help="what is missing on this machine, and what to do about it")
     doctor.add_argument("--json", action="store_true", help="print one JSON object")
     doctor.set_defaults(run=doctor_run)
-
-
-def plugin_list(args: argparse.Namespace) -> int:
-    """Exit 0 if every plug-in found is in use, 1 if one is not."""
-    from s2r_runtime.plugins import registry
-
-    loaded = registry().loaded
-    if args.json:
-        output.result_json({"plugins": [p._asdict() for p in loaded]})
-    else:
-        for plugin in loaded:
-            output.out(
-                f"{plugin.name} ({plugin.distribution} {plugin.version})"
-                + (f"  {output.styled('not in use', 'red')}: {plugin.error}" if plugin.error else "")
-            )
-            for kind, names in plugin.offers.items():
-                output.out(f"    {kind}: {', '.join(names)}")
-    return 1 if any(plugin.error for plugin in loaded) else 0
 
 
 def profile_check(args: argparse.Namespace) -> int:

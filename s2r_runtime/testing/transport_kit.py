@@ -135,7 +135,8 @@ class TransportKit:
     transport's. resolution_ns: of its stamps.
     """
 
-    rig: ClassVar[Callable[[], Rig]]
+    rig: ClassVar[Callable[[], Any]]
+    """Makes a `Rig`."""
     carries: ClassVar[tuple[str, ...]] = ("seq", "obs_seq", "ttl_ns")
     tolerance: ClassVar[float] = 0.0
     numbered: ClassVar[bool] = True

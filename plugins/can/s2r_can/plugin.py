@@ -16,3 +16,12 @@ def s2r_recordings() -> list[Offer]:
     """Logs of a CAN bus."""
     what = {"log": "candump", "asc": "Vector ASC", "blf": "Vector BLF"}
     return [Offer(f"can.{suffix}", "s2r_can.recordings:read", f"{name} logs of a bus, by its DBC") for suffix, name in what.items()]
+
+
+@hookimpl
+def s2r_kits() -> list[Offer]:
+    """How the transport is tried."""
+    return [
+        Offer("transports.can", "s2r_can.kits:WideKit"),
+        Offer("transports.can.classic", "s2r_can.kits:ClassicKit"),
+    ]

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from s2r_can.testing import SocketRig, VirtualRig
-
-from s2r_runtime.testing import TransportKit
+from s2r_can.kits import ClassicKit, WideKit
 
 
-class TestWide(TransportKit):
-    rig = VirtualRig
-    carries = ()
+class TestWide(WideKit):
+    pass
 
 
-class TestClassic(TransportKit):
-    rig = SocketRig
-    carries = ()
-    tolerance = 1e-6
+class TestClassic(ClassicKit):
+    pass

@@ -15,3 +15,14 @@ def s2r_transports() -> list[Offer]:
 def s2r_recordings() -> list[Offer]:
     """Telemetry logs."""
     return [Offer("mavlink.tlog", "s2r_mavlink.tlog:read", "telemetry logs of MAVLink ground stations (.tlog, .tlog.gz)")]
+
+
+@hookimpl
+def s2r_kits() -> list[Offer]:
+    """How the transport is tried."""
+    return [
+        Offer("transports.mavlink", "s2r_mavlink.kits:UdpKit"),
+        Offer("transports.mavlink.tcp", "s2r_mavlink.kits:TcpKit"),
+        Offer("transports.mavlink.serial", "s2r_mavlink.kits:SerialKit"),
+        Offer("transports.mavlink.odometry", "s2r_mavlink.kits:OdometryKit"),
+    ]

@@ -2,31 +2,20 @@
 
 from __future__ import annotations
 
-from functools import partial
-
-from s2r_mavlink.testing import MavlinkRig
-
-from s2r_runtime.testing import TransportKit
+from s2r_mavlink.kits import OdometryKit, SerialKit, TcpKit, UdpKit
 
 
-class TestUdp(TransportKit):
-    rig = partial(MavlinkRig, "udp")
-    carries = ()
-    tolerance = 1e-6
-    numbered = False
-    resolution_ns = 1_000_000
+class TestUdp(UdpKit):
+    pass
 
 
-class TestTcp(TestUdp):
-    rig = partial(MavlinkRig, "tcp")
+class TestTcp(TcpKit):
+    pass
 
 
-class TestSerial(TestUdp):
-    rig = partial(MavlinkRig, "serial")
+class TestSerial(SerialKit):
+    pass
 
 
-class TestOdometry(TestUdp):
+class TestOdometry(OdometryKit):
     """Its stamps are in microseconds."""
-
-    rig = partial(MavlinkRig, "udp", odometry=True)
-    resolution_ns = 1000

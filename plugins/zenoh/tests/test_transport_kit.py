@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
-
-from s2r_zenoh.testing import ZenohRig
-
-from s2r_runtime.testing import TransportKit
+from s2r_zenoh.kits import ClientKit, PeerKit
 
 
-class TestPeer(TransportKit):
-    rig = ZenohRig
+class TestPeer(PeerKit):
+    pass
 
 
-class TestClient(TransportKit):
-    rig = partial(ZenohRig, "client")
+class TestClient(ClientKit):
+    pass

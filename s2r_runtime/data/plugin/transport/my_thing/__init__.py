@@ -1,0 +1,1 @@
+"""Transport my_thing for s2r_runtime."""
