@@ -158,6 +158,18 @@ def load(data: bytes, trusted_keys: Iterable[bytes], now_unix_s: int | None = No
     return signed.certificate
 
 
+def assumption_problem(certificate: Certificate, profile: Profile) -> str:
+    """Why this profile does not vouch for the assumption that the certificate's gap rests on, or empty. (Its key vouches for the rest.)"""
+    rests = [line for line in certificate.shown if statements.ASSUMED in line]
+    if not rests:
+        return ""
+    if profile.driving.block <= 0.0:
+        return "its gap rests on an assumption about ordinary driving, and the profile makes none ([driving])"
+    if any(statements.assumption(profile.driving) not in line for line in rests):
+        return f"its gap rests on another assumption than the profile's: {statements.assumption(profile.driving)}"
+    return ""
+
+
 def facts(certificate: Certificate) -> CertificateFacts:
     """What the gate compares."""
     return CertificateFacts(
@@ -266,8 +278,8 @@ def _evidence(c: Certificate, *, traced_not_adopted: bool) -> list[tuple[str, bo
         ),
         (
             f"{least_n} scenarios do not carry the verification's statement",
-            binomial_tail(least_n, 0, v.epsilon) <= v.beta * slack,
-            sample_size(v.epsilon, v.beta) - least_n,
+            v.split >= 1 and binomial_tail(least_n, 0, v.epsilon) <= v.beta / v.split * slack,
+            sample_size(v.epsilon, v.beta / max(v.split, 1)) - least_n,
         ),
         (
             "only the law uniform was required, and the residual is not white" + (f": {gap.white_reason}" if gap.white_reason else ""),

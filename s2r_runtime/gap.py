@@ -183,7 +183,8 @@ def radius_of_noise(model: ComposedModel, tr: Transitions, weights: Array, kind:
 
 
 def blocked(tr: Transitions, seconds: float, dt: float) -> Transitions:
-    """The first transition of every block of that length; independent under the assumption that blocks are, which is then stated.
+    """The first transition of every block of that length, no two nearer than that; independent under the assumption that blocks are, which
+    is then stated.
 
     dt: the model's step, s; neighbours share a measurement, so a block takes two steps at least. The digests stay those of the
     recording. Raises UsageError if the block is shorter, or these are no drive: segments and samples of a campaign are independent
@@ -203,6 +204,8 @@ def blocked(tr: Transitions, seconds: float, dt: float) -> Transitions:
         raise UsageError(f"{tr.source}: blocking is for ordinary driving, here {tr.doubt}")
     block = np.floor((tr.t0_s - tr.t0_s[0]) / seconds)
     _, first = np.unique(block, return_index=True)
+    apart = np.diff(tr.t0_s[first], prepend=-np.inf)
+    first = first[apart >= seconds - 1.5 * dt]  # where a hole delayed the one of a block, the next block's may be too near
     return replace(
         tr,
         x0=tr.x0[first],

@@ -61,6 +61,16 @@ class Sampling(_Table, frozen=True):
     seed: int = 1
 
 
+class Driving(_Table, frozen=True):
+    """Whether ordinary driving may found a gap, and on which assumption: `block` s apart, transitions are `mixing`-close to independent (a
+    bound on the beta-mixing coefficient, 0: independent), `because` of what. block 0: driving founds nothing.
+    """
+
+    block: float = 0.0
+    mixing: float = 0.0
+    because: str = ""
+
+
 class Guarantee(_Table, frozen=True):
     """epsilon, beta of guarantee G1 to G4, alpha of the watch's alarm, k discarded samples."""
 
@@ -182,6 +192,7 @@ class Profile(_Table, frozen=True):
     columns: dict[str, str] = {}
     norm: Norm = Norm()
     sampling: Sampling = Sampling()
+    driving: Driving = Driving()
     guarantee: Guarantee = Guarantee()
     verification: VerificationSettings = VerificationSettings()
     gate: Gate = Gate()
@@ -422,6 +433,20 @@ def _checks(p: Profile) -> list[tuple[str, object, str]]:
             reason in REASONS, "gate.latching", repr(reason), "one of the gate's reasons" + (f"; did you mean {near[0]!r}?" if near else "")
         )
     need(p.certificate.lifetime >= 1.0, "certificate.lifetime", p.certificate.lifetime, ">= 1 s")
+    d = p.driving
+    need(
+        d.block == 0.0 or 2.0 * p.model.dt <= d.block < math.inf,
+        "driving.block",
+        d.block,
+        "0 (driving founds no gap) or two steps and more, s",
+    )
+    need(0.0 <= d.mixing < 1.0, "driving.mixing", d.mixing, "a bound on the beta-mixing coefficient, 0 to 1")
+    need(
+        (d.block > 0.0) == bool(d.because.strip()),
+        "driving.because",
+        repr(d.because),
+        "the reason why blocks mix, if and only if there are blocks",
+    )
     need(0.0 <= p.repair.delay < math.inf, "repair.delay", p.repair.delay, ">= 0 s")
     need(p.repair.rows >= 100, "repair.rows", p.repair.rows, ">= 100 (a trace needs some dozens of transitions)")
     need(0.0 < p.repair.timeout < math.inf, "repair.timeout", p.repair.timeout, "> 0 s")

@@ -11,6 +11,9 @@ from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from s2r_runtime.core.ledger import spent
 from s2r_runtime.messages import Gap, LawResult, Verification
 from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.profile import Driving
+
+ASSUMED = "rests on an assumption that the user made"
 
 
 def shown(
@@ -32,6 +35,15 @@ def shown(
             f"{bound(verification.beta)} of beta = {budget:g}; the epochs and attempts up to these spent "
             f"{bound(spent(budget, gap.epoch, verification.attempt))} of it, and all there will ever be spend no more than all of it."
         ),
+    )
+
+
+def assumption(driving: Driving) -> str:
+    """The words of the profile's mixing assumption, as they stand on the certificate."""
+    mixing = "independent" if driving.mixing == 0.0 else f"beta-mixing with a coefficient of at most {driving.mixing:g} a block"
+    return (
+        f"this drive is stationary, and transitions from different blocks of {driving.block:g} s, one from each, are {mixing}, because "
+        f"{driving.because}"
     )
 
 
@@ -89,15 +101,16 @@ def _gap(robot: str, model: ModelSpec, gap: Gap, assumption: str) -> tuple[str, 
         )
     noise = f"; noise alone would make about {min(gap.radius_noise, gap.radius):.2g} of r" if gap.radius_noise is not None else ""
     basis = (
-        f"rests on an assumption that the user made: {assumption}"
+        f"{ASSUMED}: {assumption}"
         if assumption
         else "were drawn independently, one from each held input (G7), each after a random waypoint and a full stop"
     )
     whether = "they" if not assumption else "their independence"
+    law = "the campaign's law" if not assumption else "the law of that driving"
     return (
         (
             f"Gap (G1). With confidence {confidence(gap.beta)}, a new discrepancy between robot {robot!r} and one step of {model.dt:g} s "
-            f"of the model {model.name}{effects}, drawn from the campaign's law, exceeds r = {bound(gap.radius)} ({norm}) with probability "
+            f"of the model {model.name}{effects}, drawn from {law}, exceeds r = {bound(gap.radius)} ({norm}) with probability "
             f"at most {bound(gap.epsilon)}{hold}."
         ),
         (
@@ -113,6 +126,11 @@ def _controller(task: str, gap: Gap, v: Verification) -> tuple[str, ...]:
     grown = v.radius / gap.radius if gap.radius > 0.0 else math.inf
     times = f", {grown:.3g} times r" if math.isfinite(grown) else ""
     lines = [_law(task, law, v, times) for law in required]
+    if v.split > 1:
+        lines.append(
+            f"Headroom (G5). {worst(v.radius)} is the largest of {v.split} radii, fixed beforehand, at which it was seen to pass; each of "
+            f"them had 1/{v.split} of the attempt's beta, so the confidence holds whichever it is. Growth up to it costs nothing."
+        )
     if len(required) > 1:
         lines.append(
             f"Each of these {len(required)} values of s* has this confidence on its own; that the failure probability is at most "

@@ -86,6 +86,8 @@ class Certificates:
         certificate = certificates.load(data.data, {*trusted, signer} if elsewhere else trusted[:1], None, "certificate")
         if certificates.facts(certificate) != event.facts or event.gap not in (None, certificate.gap):
             raise ConfigError("what the gate was told is not what it says")
+        if problem := certificates.assumption_problem(certificate, profile):
+            raise ConfigError(problem)
         if elsewhere:
             known = "a trusted key" if signer in trusted else f"key {keys.fingerprint(signer)}, not compared with a trusted one"
             return f"signed elsewhere by {known}; its evidence is not in this log"

@@ -18,7 +18,13 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     verb = verbs.add_parser("certify", help="gap + verify + sign: a certificate for this controller from a recorded campaign")
     verb.add_argument("controller", type=Path, metavar="CONTROLLER")
     verb.add_argument("--profile", type=Path, required=True, metavar="P")
-    verb.add_argument("--recording", type=Path, required=True, metavar="REC", help="a campaign's MCAP")
+    verb.add_argument(
+        "--recording",
+        type=Path,
+        required=True,
+        metavar="REC",
+        help="a campaign's MCAP; or a drive, if the profile vouches for blocks of it ([driving])",
+    )
     verb.add_argument("-o", "--output", type=Path, required=True, metavar="CERT")
     verb.add_argument("--model", metavar="MODEL.toml", help="a repaired model instead of the profile's")
     verb.add_argument("--key", type=Path, metavar="FILE", help="signing key (default: the user's; make one with s2r keys new)")
@@ -33,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     from s2r_runtime import verify as verification
     from s2r_runtime.bounds import attempt_beta, epoch_beta
     from s2r_runtime.canonical import digest
-    from s2r_runtime.cli.evidence import at_headroom, gap_of, print_verification, profile_model, run_verification
+    from s2r_runtime.cli.evidence import gap_of, print_verification, profile_model, run_verification
     from s2r_runtime.daemon import persistence
     from s2r_runtime.plugins import registry
 
@@ -48,11 +54,11 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"{args.recording}: cannot be read: {error.strerror}") from None
     ledger = offline_ledger.open_ledger(key_path, profile.robot.name)
     epoch = ledger.epoch_for(recording, model.spec.digest(), profile.digest())
-    gap = gap_of(args.recording, model, profile, beta=epoch_beta(profile.guarantee.beta, epoch), epoch=epoch)
+    gap, assumption = gap_of(args.recording, model, profile, beta=epoch_beta(profile.guarantee.beta, epoch), epoch=epoch)
     attempt = ledger.spend_attempt(controller.digest)
     beta = attempt_beta(profile.guarantee.beta, attempt)
-    against = at_headroom(gap, profile)
-    result = run_verification(controller, model, profile, gap=against, laws=profile.verification.laws, n=0, attempt=attempt, beta=beta)
+    headroom, laws = profile.verification.headroom, profile.verification.laws
+    result = run_verification(controller, model, profile, gap=gap, headroom=headroom, laws=laws, n=0, attempt=attempt, beta=beta)
     spent = ledger.spent(profile.guarantee.beta)
     if result.passed:
         task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
@@ -63,6 +69,7 @@ def run(args: argparse.Namespace) -> int:
             verification=result,
             issued_unix_s=int(time.time()),
             horizon=task.horizon,
+            assumption=assumption,
         )
         persistence.replace(args.output, certificate.sign(issued, key))
     if args.json:
@@ -72,6 +79,7 @@ def run(args: argparse.Namespace) -> int:
                 **answer,
                 "certificate": str(args.output) if result.passed else None,
                 "gap": gap,
+                "verified_radius": result.radius if result.passed else None,
                 "epoch": epoch,
                 "attempt": attempt,
                 "beta_spent": spent,
@@ -81,5 +89,6 @@ def run(args: argparse.Namespace) -> int:
     else:
         print_verification(verification.verification_json(result))
         output.out(f"gap epoch {epoch}, verification attempt {attempt}: {spent:.4f} of beta {profile.guarantee.beta} spent")
-        output.out(f"certificate written to {args.output}" if result.passed else "no certificate")
+        told = f"gap {gap.radius:.4g}, certified to {result.radius:.4g}: certificate written to {args.output}"
+        output.out(told if result.passed else "no certificate")
     return 0 if result.passed else 1

@@ -11,7 +11,7 @@ import msgspec
 
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import add_model_options, chosen_model, controller_at, count, load_checked, positive, probability, weights_of
-from s2r_runtime.errors import NotEnoughEvidence
+from s2r_runtime.errors import NotEnoughEvidence, UsageError
 
 if TYPE_CHECKING:
     from s2r_runtime.controllers.hosted import ControllerFile
@@ -50,14 +50,18 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     verify.add_argument("--model", metavar="MODEL.toml", help="a repaired model instead of the profile's")
     size = verify.add_mutually_exclusive_group(required=True)
     size.add_argument("--radius", type=positive, metavar="R", help="radius of the gap set")
-    size.add_argument(
-        "--recording", type=Path, metavar="REC", help="take radius and hold gap from this campaign (times the profile's headroom)"
-    )
+    size.add_argument("--recording", type=Path, metavar="REC", help="take radius and hold gap from this campaign")
     verify.add_argument(
         "--hold-radius",
         type=positive,
         metavar="R",
         help="hold gap for the persistent law (with --radius; default: the radius times sqrt(hold periods))",
+    )
+    verify.add_argument(
+        "--headroom",
+        type=positive,
+        metavar="H",
+        help="look for the largest radius, up to H times, at which it passes (default: the profile's with --recording, else 1)",
     )
     verify.add_argument("-n", type=count, default=0, metavar="N", help="scenarios for each law (default: what beta asks for)")
     verify.add_argument(
@@ -92,7 +96,8 @@ def run_gap(args: argparse.Namespace) -> int:
         kind=args.set or (profile.norm.set if profile else "ball"),
         weights=weights_of(model.states, args.weight, profile),
     )
-    found = gaps.doubted(result, found)
+    if found.samples_digest:  # of a table nobody can say in which order its segments were drawn: there it stands in the statement
+        found = gaps.doubted(result, found)
     answer = gaps.gap_json(result, found, model.states)
     if args.json:
         output.result_json(answer)
@@ -122,23 +127,22 @@ def run_verify(args: argparse.Namespace) -> int:
 
     profile = load_checked(args.profile)
     model = profile_model(args, profile)
-    epoch_gap = gap_of(args.recording, model, profile) if args.recording else None
+    epoch_gap = gap_of(args.recording, model, profile)[0] if args.recording else None
     laws = tuple(args.law) if args.law else profile.verification.laws
-    gap = at_headroom(epoch_gap, profile) if epoch_gap else _gap_at(args.radius, args.hold_radius, model, profile)
+    gap = epoch_gap or _gap_at(args.radius, args.hold_radius, model, profile)
+    headroom = args.headroom or (profile.verification.headroom if epoch_gap else 1.0)
+    if headroom < 1.0:
+        raise UsageError(f"--headroom {headroom:g}: must be >= 1")
     controller = controller_at(args.controller, args.param)
-    result = run_verification(controller, model, profile, gap=gap, laws=laws, n=args.n, attempt=1, beta=profile.guarantee.beta)
-    answer = verification.verification_json(result)
+    result = run_verification(
+        controller, model, profile, gap=gap, headroom=headroom, laws=laws, n=args.n, attempt=1, beta=profile.guarantee.beta
+    )
+    answer = {**verification.verification_json(result), "gap_radius": gap.radius}
     if args.json:
         output.result_json(answer)
     else:
         print_verification(answer)
     return 0 if result.passed else 1
-
-
-def at_headroom(gap: Gap, profile: Profile) -> Gap:
-    """The gap that is verified against: both radii times the profile's headroom."""
-    headroom = profile.verification.headroom
-    return msgspec.structs.replace(gap, radius=gap.radius * headroom, hold_radius=gap.hold_radius * headroom)
 
 
 def _gap_at(radius: float, hold_radius: float | None, model: ComposedModel, profile: Profile) -> Gap:
@@ -173,26 +177,38 @@ def profile_model(args: argparse.Namespace, profile: Profile) -> ComposedModel:
     return compose(profile.model, f"{args.profile}: model")
 
 
-def gap_of(recording: Path, model: ComposedModel, profile: Profile, *, beta: float | None = None, epoch: int = 1) -> Gap:
-    """The gap that a campaign shows under the profile's settings. Raises NotEnoughEvidence if it carries no statement."""
+def gap_of(recording: Path, model: ComposedModel, profile: Profile, *, beta: float | None = None, epoch: int = 1) -> tuple[Gap, str]:
+    """The gap that a campaign shows under the profile's settings, or driving that the profile vouches for, with the assumption that it
+    then rests on. beta: the epoch's share; without one the gap founds no certificate. Raises NotEnoughEvidence if it carries no statement.
+    """
     from s2r_runtime import gap as gaps
     from s2r_runtime.transitions import load_transitions
 
     found = load_transitions(recording, model, dict(profile.columns), transport=profile.transport)
+    share = beta or profile.guarantee.beta
+    if found.drive is not None and profile.driving.block > 0.0:
+        from s2r_runtime import blocked
+
+        epsilon, discard = profile.guarantee.epsilon, profile.guarantee.discard
+        found = blocked.founding(found, profile.driving, model.dt, epsilon=epsilon, share=share, discard=discard)
     if not found.independent:
         raise NotEnoughEvidence(
-            f"{recording}: is ordinary driving, not a campaign; its transitions are not independent, so its gap carries no statement"
+            f"{recording}: is ordinary driving, not a campaign; its transitions are not independent, so its gap carries no statement, "
+            "unless the profile vouches for blocks of it: [driving]"
         )
-    return gaps.estimate_gap(
+    gap = gaps.estimate_gap(
         model,
         found,
         epsilon=profile.guarantee.epsilon,
-        beta=beta or profile.guarantee.beta,
+        beta=share,
         discard=profile.guarantee.discard,
         kind=profile.norm.set,
         weights=weights_of(model.states, [], profile),
         epoch=epoch,
     )
+    if beta is not None and gaps.doubted(gap, found) is not found:
+        raise NotEnoughEvidence(f"{recording}: {gaps.doubted(gap, found).doubt}; its gap carries no statement")
+    return gap, found.assumption
 
 
 def run_verification(
@@ -201,12 +217,14 @@ def run_verification(
     profile: Profile,
     *,
     gap: Gap,
+    headroom: float,
     laws: tuple[str, ...],
     n: int,
     attempt: int,
     beta: float,
 ) -> Verification:
-    """Verification on `gap` under a profile, in a worker process: the controller's code runs confined, silenced, and for a limited time.
+    """Verification at the largest radius from the gap's to `headroom` times it at which the controller passes. In a worker process: the
+    controller's code runs confined, silenced, and for a limited time.
 
     A controller that ends the worker or outlasts `verification.timeout` has not passed, with that as the reason.
     """
@@ -214,19 +232,23 @@ def run_verification(
     from s2r_runtime import verify as verification
     from s2r_runtime.bounds import sample_size
     from s2r_runtime.daemon.worker import VerifyJob
+    from s2r_runtime.headroom import grid
 
     # laws asked for by name are what the question is about, even where the profile does not require them
     required = tuple(law for law in profile.verification.required if law in laws) or laws
-    needed = sample_size(profile.verification.epsilon, beta)
+    most = headroom * gap.radius
+    share = beta / len(grid(gap.radius, most))
+    needed = sample_size(profile.verification.epsilon, share)
     if 0 < n < needed:
         raise NotEnoughEvidence(
-            f"-n {n}: {needed} scenarios are needed for epsilon {profile.verification.epsilon:g} and beta {beta:.4g}: {needed - n} more",
+            f"-n {n}: {needed} scenarios are needed for epsilon {profile.verification.epsilon:g} and beta {share:.4g}: {needed - n} more",
             needed - n,
         )
     settings = msgspec.structs.replace(profile.verification, laws=laws, required=required, n=n or profile.verification.n)
     asked = msgspec.structs.replace(profile, model=model.spec, verification=settings)
     seed = verification.seed_for(controller.digest, model.spec.digest(), profile.task_digest(), attempt)
-    done = _work(VerifyJob(asked, controller, gap, gap.radius, gap.hold_radius, attempt, seed, beta), settings.timeout)
+    job = VerifyJob(asked, controller, gap, most, headroom * gap.hold_radius, attempt, seed, beta, gap.radius)
+    done = _work(job, settings.timeout)
     if isinstance(done, messages.Verification):
         return done
     return messages.Verification(
@@ -271,6 +293,8 @@ def print_verification(answer: dict[str, Any]) -> None:
     """The account that a person reads."""
     why = f": {answer['reason']}" if answer.get("reason") else ""
     output.out(output.styled("passed", "green") if answer["passed"] else output.styled("not passed", "red") + why)
+    if answer["passed"] and "gap_radius" in answer and answer["split"] > 1:
+        output.out(f"gap {answer['gap_radius']:.4g}, verified to {answer['radius']:.4g}")
     for law, r in answer["laws"].items():
         failures = f"failures {r['failures']} (at most {r['failure_upper']:.2%})"
         note = "" if r["required"] else "  (reported, not required)"

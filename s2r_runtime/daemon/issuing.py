@@ -62,6 +62,8 @@ def load(daemon: Daemon, text: str, where: str, controller: str, request_id: int
             f"{error}; put the signer's public key (.pub) into {folder / 'trusted'}/, or run the daemon with the signer's key"
             f" (s2r run --key FILE), or certify with this daemon's (s2r certify --key {folder / 'key.pem'}, if run without --key)"
         ) from None
+    if problem := certificates.assumption_problem(certificate, daemon.profile):
+        raise ConfigError(f"{where}: {problem}")
     if certificate.controller_digest != controller:
         raise ConfigError(f"{where}: is of the controller {certificate.controller_digest}; the one to deploy is {controller}")
     stored = _store(daemon, certificate, data, certificate.gap, request_id)
