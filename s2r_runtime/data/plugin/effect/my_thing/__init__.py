@@ -1,0 +1,1 @@
+"""Effect my_thing for s2r_runtime."""

@@ -1,0 +1,1 @@
+"""Model my_thing for s2r_runtime."""

@@ -1,0 +1,1 @@
+"""Recording my_thing for s2r_runtime."""

@@ -1,0 +1,1 @@
+"""Task my_thing for s2r_runtime."""
