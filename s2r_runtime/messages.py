@@ -105,8 +105,21 @@ class LawResult(Struct, frozen=True):
     passed: bool
 
 
+class RadiusTried(Struct, frozen=True):
+    """One of the radii that were fixed beforehand, ascending by `index`, and what came of it. s_star: the least under any required law
+    that was run there; they end at the first that fails.
+    """
+
+    index: int
+    radius: float
+    passed: bool
+    s_star: float
+
+
 class Verification(Struct, frozen=True, tag="verification"):
-    """Rollouts of the uncertain model and what they show (guarantee G2, G8)."""
+    """Rollouts of the uncertain model and what they show (guarantee G2, G8). radius: the largest at which it passed, of `split` radii fixed
+    beforehand, each with 1 / `split` of `beta` (`headroom`); `tried`: those that were looked at, in that order.
+    """
 
     passed: bool
     radius: float
@@ -121,6 +134,8 @@ class Verification(Struct, frozen=True, tag="verification"):
     model_digest: str
     task_digest: str
     reason: str = ""
+    split: int = 1
+    tried: tuple[RadiusTried, ...] = ()
 
 
 class CertificateFacts(Struct, frozen=True):
@@ -542,7 +557,8 @@ class StopController(Struct, frozen=True, tag="stop_controller"):
 class StartJob(Struct, frozen=True, tag="start_job"):
     """What the worker is to do.
 
-    gap: of campaign `epoch` at `beta`. verify: controller `digest` at `radius`, `hold_radius`, attempt, seed, `beta`.
+    gap: of campaign `epoch` at `beta`. verify: controller `digest` at up to `radius`, `hold_radius`, at `least_radius` at least (0: at
+    `radius`), attempt, seed, `beta`.
     trace: the residual of the model `digest` in the newest `rows` observations of `stretch` before this record; `epoch`: of the gap then
     in force (0: none).
     """
@@ -559,6 +575,7 @@ class StartJob(Struct, frozen=True, tag="start_job"):
     beta: float = 0.0
     stretch: Literal["", "campaign", "drive", "inputs"] = ""
     rows: int = 0
+    least_radius: float = 0.0
 
 
 class IssueCertificate(Struct, frozen=True, tag="issue_certificate"):

@@ -81,7 +81,8 @@ class Guarantee(_Table, frozen=True):
 
 
 class VerificationSettings(_Table, frozen=True):
-    """`headroom`: verification runs at headroom times the gap's radius, so that growth below it costs nothing.
+    """`headroom`: verification finds the largest radius at which the controller passes, up to headroom times the gap's, so that growth
+    below it costs nothing.
 
     `n` 0: as many as the attempt's share of beta asks for. `required`: the laws that must pass; the others are reported.
     """
@@ -89,7 +90,7 @@ class VerificationSettings(_Table, frozen=True):
     epsilon: float = 0.01
     n: int = 0
     threshold: float = 0.0
-    headroom: float = 1.5
+    headroom: float = 3.0
     laws: tuple[Literal["uniform", "persistent", "adversarial"], ...] = ("uniform", "persistent", "adversarial")
     required: tuple[Literal["uniform", "persistent", "adversarial"], ...] = ("uniform", "persistent")
     timeout: float = 60.0

@@ -7,21 +7,26 @@ the uncertain model under the same disturbance law scores below s* with probabil
 
 Every required law must pass, so no share of beta is lost to their number. Beside s* stands the Clopper-Pearson upper bound on
 P(s < threshold). The seed is a function of the digests and the attempt number: nobody can shop for one.
+
+A range of radii may be asked for: then the result is of the largest at which the controller passes, out of radii fixed beforehand that
+share beta (`headroom`). At each of them the scenarios and draws are those of the same seed.
 """
 
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from s2r_runtime.bounds import clopper_pearson_upper, sample_size, scenario_confidence
 from s2r_runtime.errors import ControllerError, NotEnoughEvidence, UsageError
+from s2r_runtime.headroom import grid, search
 from s2r_runtime.hookspecs import Task
-from s2r_runtime.messages import LawResult, Verification
+from s2r_runtime.messages import LawResult, RadiusTried, Verification
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.statements import confidence, worst
 from s2r_runtime.uncertain import LAWS, Array, Control, GapSet, Rollouts, roll_out
@@ -64,54 +69,127 @@ def verify_in_detail(
     controller_digest: str,
     task_digest: str,
     attempt: int = 1,
+    least_radius: float = 0.0,
     keep: int = 0,
     progress: Progress | None = None,
 ) -> tuple[Verification, list[Detail]]:
     """n scenarios for each law (0: as many as epsilon and beta ask for). keep: so many paths a law are kept for plots.
 
+    least_radius: the largest radius between this and gap_set's at which the controller passes is looked for (0: at gap_set's only).
     A controller that raises or answers with anything but finite (n, nu) inputs has failed, with the reason in the result. Raises
     UsageError for laws that make no sense, NotEnoughEvidence if n is too small for epsilon and beta.
     """
     _check(laws, required)
-    needed = sample_size(epsilon, beta)
+    radii = grid(least_radius, gap_set.radius)
+    share = beta / len(radii)
+    needed = sample_size(epsilon, share)
     n = n or needed
     if n < needed:
         raise NotEnoughEvidence(
-            f"{n} scenarios, {needed} are needed for epsilon {epsilon:g} and beta {beta:.4g}: {needed - n} more", needed - n
+            f"{n} scenarios, {needed} are needed for epsilon {epsilon:g} and beta {share:.4g}: {needed - n} more", needed - n
         )
-    results: list[LawResult] = []
-    details: list[Detail] = []
-    reason = ""
-    for index, law in enumerate(laws):
-        rng = np.random.default_rng([seed, list(LAWS).index(law)])
-        told = None if progress is None else _tell(progress, law, index * n, len(laws) * n)
-        try:
-            rollouts = roll_out(control, task, model, gap_set, law, rng, n, keep=keep, progress=told)
-        except ControllerError as error:
-            # a controller's own failure is a verdict on the controller, under whichever law it shows; nothing was shown under this one
-            reason = f"under {law}: {error}"
-            break
-        details.append(Detail(law, rollouts))
-        results.append(_judge(law, rollouts, task, threshold, beta, law in required))
-    reason = reason or _why_not(results, threshold)
+    runs = _Runs(control, task, model, n, threshold, share, seed, required, keep, progress, 1 + math.ceil(math.log2(len(radii))), laws)
+    tried: list[RadiusTried] = []
+    at: dict[int, _Run] = {}
+
+    def passes(index: int) -> bool:
+        scaled = replace(gap_set, radius=radii[index], hold_radius=gap_set.hold_radius * _share(radii[index], gap_set.radius))
+        at[index] = run = runs.run(scaled, only_required=index > 0)
+        least = min((r.s_star for r in run.results if r.required), default=-np.finfo(np.float64).max)
+        tried.append(RadiusTried(index, scaled.radius, not run.reason, float(least)))
+        return not run.reason
+
+    best = at[search(len(radii), passes) or 0]
+    runs.complete(best)
     return (
         Verification(
-            passed=not reason,
-            radius=gap_set.radius,
-            hold_radius=gap_set.hold_radius,
+            passed=not best.reason,
+            radius=best.gap_set.radius,
+            hold_radius=best.gap_set.hold_radius,
             threshold=threshold,
             epsilon=epsilon,
             beta=beta,
             attempt=attempt,
             seed=seed,
-            laws=tuple(results),
+            laws=tuple(sorted(best.results, key=lambda r: list(laws).index(r.law))),
             controller_digest=controller_digest,
             model_digest=model.spec.digest(),
             task_digest=task_digest,
-            reason=reason,
+            reason=best.reason,
+            split=len(radii),
+            tried=tuple(tried) if len(radii) > 1 else (),
         ),
-        details,
+        best.details,
     )
+
+
+def _share(radius: float, most: float) -> float:
+    return radius / most if most > 0.0 else 1.0
+
+
+@dataclass
+class _Run:
+    """Rollouts at one radius. reason: why it does not pass, or empty."""
+
+    gap_set: GapSet
+    results: list[LawResult]
+    details: list[Detail]
+    reason: str = ""
+
+
+@dataclass
+class _Runs:
+    """What is the same at every radius. share: of beta, that one radius has; most: how many radii are looked at, at most."""
+
+    control: Control
+    task: Task
+    model: ComposedModel
+    n: int
+    threshold: float
+    share: float
+    seed: int
+    required: Sequence[str]
+    keep: int
+    progress: Progress | None
+    most: int
+    laws: Sequence[str]
+    done: int = 0
+
+    def run(self, gap_set: GapSet, *, only_required: bool) -> _Run:
+        """All laws, or the required ones as far as they pass."""
+        run = _Run(gap_set, [], [])
+        for law in self.laws:
+            if only_required and law not in self.required:
+                continue
+            self._roll_out(run, law)
+            if run.reason or (only_required and _why_not(run.results, self.threshold)):
+                break
+        run.reason = run.reason or _why_not(run.results, self.threshold)
+        self.done += 1
+        return run
+
+    def complete(self, run: _Run) -> None:
+        """The laws that were left out because nothing depended on them."""
+        for law in self.laws:
+            if not run.reason and law not in {detail.law for detail in run.details}:
+                self._roll_out(run, law)
+
+    def _roll_out(self, run: _Run, law: str) -> None:
+        rng = np.random.default_rng([self.seed, list(LAWS).index(law)])
+        told = None if self.progress is None else self._tell(self.progress, run.gap_set.radius, law)
+        try:
+            rollouts = roll_out(self.control, self.task, self.model, run.gap_set, law, rng, self.n, keep=self.keep, progress=told)
+        except ControllerError as error:
+            # a controller's own failure is a verdict on the controller, under whichever law it shows; nothing was shown under this one
+            run.reason = f"under {law}: {error}"
+            return
+        run.details.append(Detail(law, rollouts))
+        run.results.append(_judge(law, rollouts, self.task, self.threshold, self.share, law in self.required))
+
+    def _tell(self, progress: Progress, radius: float, law: str) -> Callable[[float, float], None]:
+        before, whole = (self.done * len(self.laws) + list(self.laws).index(law)) * self.n, self.most * len(self.laws) * self.n
+        detail = law if self.most == 1 else f"{law}, radius {radius:.3g}"
+        return lambda done, _total: progress(before + done, whole, detail)
 
 
 def _check(laws: Sequence[str], required: Sequence[str]) -> None:
@@ -155,17 +233,13 @@ def _why_not(results: Sequence[LawResult], threshold: float) -> str:
     return "; ".join(reasons)
 
 
-def _tell(progress: Progress, law: str, before: int, total: int) -> Callable[[float, float], None]:
-    return lambda done, _total: progress(before + done, total, law)
-
-
 def statement(v: Verification) -> str:
     """What the rollouts show (G2, G8), and no more."""
     if not v.passed:
         return f"Not passed: {v.reason}. Nothing is claimed for this controller at radius {v.radius:.6g}."
     required = [r for r in v.laws if r.required]
     named = ", ".join(f"{r.law} (s* = {worst(r.s_star)}, N = {r.n})" for r in required)
-    attained = max(scenario_confidence(r.n, 0, v.epsilon) for r in required)
+    attained = min(v.split * max(scenario_confidence(r.n, 0, v.epsilon) for r in required), 1.0)
     told = [
         (
             f"Under each of the disturbance laws {named}: with confidence {confidence(attained)} a new rollout of the uncertain model "
@@ -173,6 +247,10 @@ def statement(v: Verification) -> str:
             f"s* is at least the threshold {v.threshold:g}."
         )
     ]
+    if v.split > 1:
+        told.append(
+            f"The radius is the largest of {v.split}, fixed beforehand, at which it was seen to pass; the confidence holds for all at once."
+        )
     if len(required) > 1:
         told.append("The laws were read side by side: each statement holds by itself at this confidence.")
     if [r.law for r in required] == ["uniform"]:
@@ -208,6 +286,8 @@ def verification_json(v: Verification) -> dict[str, Any]:
         "beta": v.beta,
         "attempt": v.attempt,
         "seed": v.seed,
+        "split": v.split,
+        "tried": [{"radius": one.radius, "passed": one.passed, "s_star": one.s_star} for one in v.tried],
         "laws": {
             r.law: {
                 "n": r.n,

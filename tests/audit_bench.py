@@ -31,6 +31,7 @@ from s2r_runtime.daemon.given_inputs import parse_inputs
 from s2r_runtime.daemon.model_store import parse_model
 from s2r_runtime.daemon.settings import ModelFacts, settings_of
 from s2r_runtime.daemon.worker import GapJob, TraceJob
+from s2r_runtime.headroom import grid
 from s2r_runtime.hookspecs import Offer, hookimpl
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec, dump_model
@@ -455,14 +456,17 @@ class Bench:
 
     def _verify(self, order: m.StartJob) -> m.JobFinished:
         """Numbers as a verification has them; the rollouts are not this bench's business."""
-        n = ledger.sample_size(0.3, order.beta)
+        split = len(grid(order.least_radius, order.radius))
+        n = ledger.sample_size(0.3, order.beta / split)
         values = [0.5 + i for i in range(n)]
         least = self._told("safety", 0.5, lambda s: 0.9)
-        upper = clopper_pearson_upper(0, n, order.beta)
+        upper = clopper_pearson_upper(0, n, order.beta / split)
         laws = tuple(m.LawResult(law, n, least, 0, upper, 1.0, True, True, True) for law in ("uniform", "persistent"))
         s = self.settings
         digests = (self.controller.digest, s.model_digest, s.task_digest)
         found = m.Verification(True, order.radius, order.hold_radius, 0.0, 0.3, order.beta, order.attempt, order.seed, laws, *digests)
+        tried = (m.RadiusTried(split - 1, order.radius, True, 0.5),) if split > 1 else ()
+        found = msgspec.structs.replace(found, split=split, tried=self._told("headroom", tried, lambda _: ()))
         return m.JobFinished(0, order.job_id, "verify", verification=found, safety={law.law: values for law in laws})
 
     def _issue(self, order: m.IssueCertificate) -> m.CertificateStored:

@@ -182,6 +182,7 @@ def test_whose_key_it_is_decides_only_if_one_is_asked_for(run: Any, tmp_path: Pa
         ("input law", "the campaign gives something else here"),
         ("gap", "the gap of epoch 1 is another one"),
         ("safety", "the numbers of the law uniform are not those of its scenarios"),
+        ("headroom", "the radii that were looked at are not those of the search"),
         ("certificate", "what it says is not what the evidence says"),
         ("signer", "which is not trusted here"),
         ("discrepancy", "the discrepancy (or what the watch makes of it) is another one"),
@@ -200,7 +201,7 @@ def test_a_lie_is_named_where_it_stands(tmp_path: Path, lie: str, what: str) -> 
     assert result.first_difference is not None
     assert what in result.first_difference.what
     assert result.first_difference.index == entries(path)[bench.lie_at].index
-    if lie in {"gap", "safety", "certificate", "signer"}:
+    if lie in {"gap", "safety", "headroom", "certificate", "signer"}:
         assert not result.certificates[0].valid
 
 

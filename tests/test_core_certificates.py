@@ -10,6 +10,7 @@ import pytest
 from core_rig import GAP, Rig, answers, kinds, memory, of, one
 
 from s2r_runtime import bounds
+from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
 from s2r_runtime.messages import (
     Answer,
@@ -71,6 +72,33 @@ def test_a_gap_of_zero_grows_to_all_that_the_held_periods_can_add_up_to() -> Non
     assert job.hold_radius == pytest.approx(1.5 * 50 * 0.002)
 
 
+def test_a_controller_that_passes_below_the_most_that_was_asked_for_is_certified_to_what_it_passed_at() -> None:
+    rig = Rig()
+    rig.gap()
+    job = one(rig.request("deploy", digest="controller"), StartJob)
+    assert (job.least_radius, job.radius) == (pytest.approx(0.01), pytest.approx(0.015))
+    n = ledger.sample_size(0.03, ledger.share(0.05, 1) / 8)
+    laws = tuple(LawResult(law, n, 0.1, 0, 0.01, 1.0, True, True, True) for law in ("uniform", "persistent"))
+    rig.verified(radius=0.012, hold_radius=job.hold_radius * 0.8, split=8, laws=laws)
+    assert one(rig.stored(), CertificateInstalled).facts.verified_radius == 0.012
+
+
+def test_radii_that_share_beta_need_the_scenarios_for_their_shares() -> None:
+    rig = Rig()
+    rig.gap()
+    rig.request("deploy", digest="controller")
+    assert "too few" in one(rig.verified(split=8), AttemptEnded).reason
+
+
+def test_a_radius_that_was_outgrown_while_it_was_verified_is_verified_once_more() -> None:
+    rig = Rig()
+    rig.gap()
+    rig.request("verify", digest="controller")
+    rig.measure(0.0125)
+    again = one(rig.verified(radius=0.012), StartJob)
+    assert again.least_radius == pytest.approx(0.0125)
+
+
 def test_seeds_follow_from_digests_and_attempt_so_that_nobody_shops_for_one() -> None:
     def seed(digest: str, attempts: int, **changes: Any) -> int:
         rig = Rig(memory(attempts=attempts, certificates=()), **changes)
@@ -101,7 +129,7 @@ _LAW = LawResult("uniform", 160, 0.1, 0, 0.01, 1.0, progress_ok=True, required=T
     "changes",
     [
         {"passed": False},
-        {"radius": 0.0149},
+        {"radius": 0.0099},
         {"radius": math.nan},
         {"hold_radius": 0.0},
         {"controller_digest": "another"},

@@ -16,6 +16,7 @@ from s2r_runtime.core import ledger
 from s2r_runtime.daemon import jobs
 from s2r_runtime.daemon.worker import Failed, GapJob, Progress, Result, VerifyJob, Worker
 from s2r_runtime.errors import S2RError
+from s2r_runtime.headroom import follows, grid
 from s2r_runtime.messages import (
     AttemptSpent,
     EpochChanged,
@@ -162,7 +163,7 @@ class Evidence:
             self._findings.cannot(f"verification attempt {job.attempt}: the controller is not attached")
             return
         self._progress(f"verification attempt {job.attempt}")
-        order = VerifyJob(profile, controller, gap, job.radius, job.hold_radius, job.attempt, job.seed, job.beta)
+        order = VerifyJob(profile, controller, gap, job.radius, job.hold_radius, job.attempt, job.seed, job.beta, job.least_radius)
         again = _work(order, profile.verification.timeout, self._progress)
         if isinstance(again, Failed) or again.verification is None:
             self._findings.cannot(f"verification attempt {job.attempt}: {again.text if isinstance(again, Failed) else 'no result'}")
@@ -192,8 +193,10 @@ class Evidence:
 
 def _contradiction(v: Verification, job: StartJob, safety: dict[str, list[float]], profile: Profile) -> str:
     """What in a verification contradicts its order, the profile, or its scenarios' safety values, or empty."""
-    if (v.attempt, v.seed, v.radius, v.hold_radius, v.beta) != (job.attempt, job.seed, job.radius, job.hold_radius, job.beta):
+    if (v.attempt, v.seed, v.beta) != (job.attempt, job.seed, job.beta):
         return "the verification is not the one that was ordered"
+    if problem := _radii_problem(v, job):
+        return problem
     wanted = profile.verification
     if (v.threshold, v.epsilon) != (wanted.threshold, wanted.epsilon):
         return "the verification has another threshold or epsilon than the profile"
@@ -211,12 +214,28 @@ def _contradiction(v: Verification, job: StartJob, safety: dict[str, list[float]
     return ""
 
 
+def _radii_problem(v: Verification, job: StartJob) -> str:
+    """What is wrong with the radii that were looked at, or empty: they are those of the order, in the order of the search, and the one
+    reported is what the search ends with.
+    """
+    radii = grid(job.least_radius, job.radius)
+    least = job.hold_radius * (v.radius / job.radius if job.radius > 0.0 else 1.0)
+    if v.split != len(radii) or v.radius not in radii or not close(v.hold_radius, least):
+        return "the verification is not at the radii that were ordered"
+    if len(radii) == 1:
+        return ""
+    passed = [one.radius for one in v.tried if one.passed]
+    if not follows(v.tried, len(radii)) or any(one.radius != radii[one.index] for one in v.tried):
+        return "the radii that were looked at are not those of the search"
+    return "" if v.radius == max(passed, default=radii[0]) else "the radius reported is not the largest that passed"
+
+
 def _numbers_fit(law: LawResult, values: Sequence[float], v: Verification) -> bool:
     """values are logged rounded, so a failure may lie on either side of the threshold by that."""
     if len(values) != law.n or not values:
         return False
     surely, at_most = (sum(value < v.threshold + side for value in values) for side in (-ROUNDED, ROUNDED))
-    upper = clopper_pearson_upper(law.failures, law.n, v.beta)
+    upper = clopper_pearson_upper(law.failures, law.n, v.beta / v.split)
     return abs(min(values) - law.s_star) <= ROUNDED and surely <= law.failures <= at_most and close(law.failure_upper, upper)
 
 

@@ -208,6 +208,8 @@ def run_status(args: argparse.Namespace) -> int:
         return int(answer["exit_code"])
     gate = str(data.pop("gate", "?"))
     output.out(f"gate        {output.styled(gate, 'green' if gate == 'open' else 'yellow')}  ({data.pop('reason', '')})")
+    if data.get("radius") and data.get("verified_radius"):
+        output.out(f"covered     gap {data['radius']:.4g}, certified to {data['verified_radius']:.4g}")
     for key, value in data.items():
         output.out(f"{key.replace('_', ' '):11s} {_plain(value)}")
     return int(answer["exit_code"])

@@ -60,13 +60,15 @@ def begin_verification(
     certificate_id: str = "",
     again: bool = False,
 ) -> None:
-    """Spends an attempt, durably, and has the controller verified at `headroom` times the grown radius. There must be a gap."""
+    """Spends an attempt, durably, and has the controller verified: at the grown radius at least, at up to `headroom` times that. There must
+    be a gap.
+    """
     memory, settings, gap = turn.memory, turn.settings, turn.memory.gap
     if gap is None:
         raise AssertionError("a verification without a gap")  # callers have asked refusal_to_verify
     attempt, grown = memory.attempts + 1, max(memory.radius, gap.radius)
     radius, hold = settings.headroom * grown, settings.headroom * grown_hold(gap, grown)
-    one = Job(turn.state.next_job, purpose, request_id, gap.epoch, digest, attempt, radius, hold, certificate_id, again)
+    one = Job(turn.state.next_job, purpose, request_id, gap.epoch, digest, attempt, radius, hold, certificate_id, again, least_radius=grown)
     turn.add_job(one)
     turn.remember(attempts=attempt)
     turn.persist()
@@ -75,7 +77,7 @@ def begin_verification(
     seed = ledger.seed(
         "verification", digest, memory.model_digest, settings.task_digest, settings.profile_digest, gap.transitions_digest, attempt
     )
-    turn.emit(StartJob(turn.now, one.id, "verify", gap.epoch, digest, radius, hold, attempt, seed, share))
+    turn.emit(StartJob(turn.now, one.id, "verify", gap.epoch, digest, radius, hold, attempt, seed, share, least_radius=grown))
     regate(turn)
 
 
@@ -103,15 +105,15 @@ def verification_finished(turn: Turn, done: Job, event: JobFinished) -> None:
     turn.emit(AttemptEnded(turn.now, done.attempt, not problem, reason))
     gap = usable_gap(turn.state)
     if result is None or problem:
-        _refuse(turn, done, f"verification attempt {done.attempt} at radius {done.radius:.6g} failed: {reason}")
+        _refuse(turn, done, f"verification attempt {done.attempt} at radius {_least(done):.6g} failed: {reason}")
     elif gap is None or gap.epoch != done.epoch:
         _refuse(turn, done, f"the gap of epoch {done.epoch} does not hold any more")
     elif lacking := _needs_more_laws(turn, gap, tuple(law.law for law in result.laws if law.required)):
         _refuse(turn, done, lacking)
-    elif done.radius < turn.memory.radius:
-        _outgrown(turn, done)
+    elif result.radius < turn.memory.radius:
+        _outgrown(turn, done, result.radius)
     else:
-        turn.set(issuing=done)
+        turn.set(issuing=msgspec.structs.replace(done, least_radius=result.radius))
         turn.emit(IssueCertificate(turn.now, gap, result, done.request_id, turn.settings.certificate_lifetime_s))
     reverify_if_due(turn)
 
@@ -122,7 +124,9 @@ def _result_problem(turn: Turn, done: Job, v: Verification) -> str:
         return "the result is of another controller, model or task"
     if v.attempt != done.attempt:
         return f"the result is of attempt {v.attempt}"
-    for value, asked in ((v.radius, done.radius), (v.hold_radius, done.hold_radius)):
+    least, share = _least(done), ledger.share(turn.settings.beta, done.attempt) * (1.0 + ROUNDING)
+    hold = done.hold_radius * (least / done.radius if done.radius > 0.0 else 1.0)
+    for value, asked in ((v.radius, least), (v.hold_radius, hold)):
         if not (gate.finite(value) and value >= asked * (1.0 - ROUNDING)):
             return f"it was verified at {value}, less than {asked}"
     required = [law for law in v.laws if law.required]
@@ -131,10 +135,16 @@ def _result_problem(turn: Turn, done: Job, v: Verification) -> str:
     failed = [law.law for law in required if not (law.passed and law.progress_ok and law.s_star >= v.threshold)]
     if failed or not required or not v.passed:
         return v.reason or (f"the law {failed[0]} did not pass" if failed else "it did not pass")
-    share = ledger.share(turn.settings.beta, done.attempt) * (1.0 + ROUNDING)
-    if not 0.0 < v.epsilon < 1.0 or any(law.n < 1 or ledger.binomial_tail(law.n, 0, v.epsilon) > share for law in required):
+    if v.split < 1 or not 0.0 < v.epsilon < 1.0:
+        return "its numbers make no sense"
+    if any(law.n < 1 or ledger.binomial_tail(law.n, 0, v.epsilon) > share / v.split for law in required):
         return f"{min(law.n for law in required)} scenarios are too few for the share of attempt {done.attempt}"
     return ""
+
+
+def _least(done: Job) -> float:
+    """The least radius that will do for this job."""
+    return done.least_radius or done.radius
 
 
 def _needs_more_laws(turn: Turn, gap: Gap, required: tuple[str, ...]) -> str:
@@ -148,7 +158,7 @@ def _needs_more_laws(turn: Turn, gap: Gap, required: tuple[str, ...]) -> str:
     return ""
 
 
-def _outgrown(turn: Turn, done: Job) -> None:
+def _outgrown(turn: Turn, done: Job, verified: float) -> None:
     """It passed at a radius that the stream has left meanwhile. Once more, paying again; then that is that."""
     if not _wanted(turn, done):
         return
@@ -156,7 +166,7 @@ def _outgrown(turn: Turn, done: Job) -> None:
         _refuse(
             turn,
             done,
-            f"the radius grew to {turn.memory.radius:.6g} while attempt {done.attempt} verified {done.radius:.6g}, twice in a row",
+            f"the radius grew to {turn.memory.radius:.6g} while attempt {done.attempt} verified {verified:.6g}, twice in a row",
         )
     elif done.purpose != "trace" and done.purpose != "gap":
         turn.answer(done.request_id, 0, f"the radius grew to {turn.memory.radius:.6g} meanwhile; verifying again", final=False)
@@ -204,7 +214,7 @@ def certificate_stored(turn: Turn, event: CertificateStored) -> None:
     if gap is None or gap.epoch != done.epoch or turn.memory.model_digest != facts.model_digest:
         revoke(turn, [facts.id], "gap_void")
         _refuse(turn, done, f"the gap of epoch {done.epoch} does not hold any more")
-    elif problem := facts_problem(turn, facts, done.digest, done.radius):
+    elif problem := facts_problem(turn, facts, done.digest, _least(done)):
         _refuse(turn, done, f"the certificate is not the one that was asked for: {problem}")
     else:
         install(turn, facts)
@@ -265,7 +275,7 @@ def _go_on(turn: Turn, done: Job, facts: CertificateFacts) -> None:
         turn.answer(done.request_id, 0, text)
     elif deployment is not None and _wanted(turn, done):
         if facts.verified_radius < turn.memory.radius:
-            _outgrown(turn, done)
+            _outgrown(turn, done, facts.verified_radius)
         else:
             turn.answer(done.request_id, 0, text, final=False)
             start_controller(turn, deployment, facts)

@@ -67,6 +67,8 @@ class Deployment(Struct, frozen=True):
 class Job(Struct, frozen=True):
     """What the worker does. `again`: the radius outgrew a verification of the same request before.
 
+    radius: the most that is asked for; least_radius: the least that will do.
+
     reverify: of the driving controller, whose certificate `certificate_id` the radius has outgrown. trace: of the model `digest`
     in `stretch`.
     """
@@ -82,6 +84,7 @@ class Job(Struct, frozen=True):
     certificate_id: str = ""
     again: bool = False
     stretch: Stretch = "campaign"
+    least_radius: float = 0.0
 
 
 VERIFYING = ("deploy", "verify", "reverify")

@@ -192,7 +192,8 @@ class Actions:
             file = self._controllers.get(order.digest)
             if file is None or memory.gap is None:
                 return "its file is not loaded; deploy it again" if file is None else "there is no gap in force"
-            return VerifyJob(d.profile, file, memory.gap, order.radius, order.hold_radius, order.attempt, order.seed, order.beta)
+            radii = order.radius, order.hold_radius
+            return VerifyJob(d.profile, file, memory.gap, *radii, order.attempt, order.seed, order.beta, order.least_radius)
         if d.sampler.epoch != order.epoch or not samples:
             return f"the samples of epoch {order.epoch} are not here any more"
         return GapJob(d.profile, samples, d.sampler.rejected, order.epoch, order.beta)

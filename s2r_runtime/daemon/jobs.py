@@ -83,6 +83,7 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
         task,
         model,
         gap_set=GapSet(job.gap.set, job.gap.weights, job.radius, job.hold_radius, job.gap.hold_periods),
+        least_radius=job.least_radius,
         laws=settings.laws,
         required=settings.required,
         n=settings.n,

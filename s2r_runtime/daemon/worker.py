@@ -42,7 +42,7 @@ class LoadJob(msgspec.Struct, frozen=True, tag="load"):
 
 
 class VerifyJob(msgspec.Struct, frozen=True, tag="verify"):
-    """Roll the controller out on the uncertain model. gap: whose set and norm."""
+    """Roll the controller out on the uncertain model. gap: whose set and norm. least_radius: as in `StartJob`."""
 
     profile: Profile
     controller: ControllerFile
@@ -52,6 +52,7 @@ class VerifyJob(msgspec.Struct, frozen=True, tag="verify"):
     attempt: int
     seed: int
     beta: float
+    least_radius: float = 0.0
 
 
 class TraceJob(msgspec.Struct, frozen=True, tag="trace"):
