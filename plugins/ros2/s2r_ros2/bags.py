@@ -116,11 +116,11 @@ def read(path: Path, states: tuple[str, ...], inputs: tuple[str, ...], options: 
     origin = found.poses[0][1]
     delays = np.array([log - stamp for log, stamp, _ in found.poses])
     cuts = [0, *(np.flatnonzero(np.abs(np.diff(delays)) > JUMP_NS) + 1).tolist(), len(delays)]
+    # a command between two stretches is of the nearer one
+    edges = [-np.inf, *((found.poses[cut - 1][0] + found.poses[cut][0]) / 2 for cut in cuts[1:-1]), np.inf]
     stretches = []
-    for begin, end in pairwise(cuts):
-        until = found.poses[end][0] if end < len(found.poses) else None
-        since = found.poses[begin][0] if begin else None
-        commands = [row for row in found.commands if (since is None or row[0] >= since) and (until is None or row[0] < until)]
+    for (begin, end), (since, until) in zip(pairwise(cuts), pairwise(edges), strict=True):
+        commands = [row for row in found.commands if since <= row[0] < until]
         stretches.append(_stretch(found.poses[begin:end], commands, origin, known.command_timeout, (len(states), len(inputs))))
     return stretches
 

@@ -105,6 +105,7 @@ def _session(mode: str, connect: str = "", listen: str = "") -> Iterator[zenoh.S
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
         "open/return_conditions": {"connect_scouted": False, "declares": False},
         "scouting/multicast/enabled": False,
+        "scouting/delay": 0,
         "transport/link/tx/lease": 2000,
     }
     for key, value in settings.items():

@@ -58,6 +58,7 @@ def session_config(listen: str, connect: str, lease_s: float, rules: list[dict[s
         # nobody is introduced to anybody: a robot that learned of a controller would link with it directly
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        "scouting/delay": 0,  # ms that a router waits for whom it finds, before open() returns
         "adminspace/enabled": False,
         "transport/link/tx/lease": round(1000 * lease_s),
         "access_control": access,

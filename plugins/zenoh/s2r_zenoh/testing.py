@@ -45,6 +45,7 @@ def session(mode: str, connect: str = "", listen: str = "", **settings: Any) -> 
         "connect/exit_on_failure": False,
         "connect/retry": {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,
+        "scouting/delay": 0,
         **{key.replace("__", "/"): value for key, value in settings.items()},
     }
     for key, value in chosen.items():
