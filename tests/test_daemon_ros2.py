@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from daemon_rig import Rig
 
-from s2r_runtime.messages import Send
+from s2r_runtime.messages import Decided, LinkChanged, Observed, OverrideChanged, Proposed, Send
 
 pytest.importorskip("s2r_ros2")
 
 from s2r_ros2.keys import Layout
+from s2r_ros2.payloads import encode_twist_stamped
+from s2r_ros2.testing import Node
 from s2r_zenoh.testing import free_endpoint
 
 ROOT = Path(__file__).parent.parent
 QUICK = {
     "hold_periods = 20": "hold_periods = 5",
     "stop_periods = 4": "stop_periods = 4\nwaypoint_radius = 0.3\nposition_gain = 3.0",
-    "x = [-1.6, 1.6]\ny = [-1.0, 1.0]": "x = [-1.0, 1.0]\ny = [-1.0, 1.0]",
     "epsilon = 0.03\nbeta = 0.05": "epsilon = 0.3\nbeta = 0.5",
     "[verification]\nepsilon = 0.03": "[verification]\nepsilon = 0.3",
     "controller_deadline = 0.04": "controller_deadline = 0.5",
@@ -43,7 +46,8 @@ QUICK = {
 class Ros2Rig(Rig):
     """As `Rig`, with the stand-in and the profile `turtlebot-ros2-zenoh`, on ports of the test's own."""
 
-    def __init__(self, folder: Path, layout: str = "bridge", command: str = "twist") -> None:
+    def __init__(self, folder: Path, layout: str = "bridge", command: str = "twist", half: float = 1.0) -> None:
+        """half: of the region's sides, m; in real time a small one is soon crossed."""
         super().__init__(folder, clock="realtime")
         self.layout, self.command = Layout(layout), command
         self.near, self.far = free_endpoint(), free_endpoint()
@@ -54,6 +58,7 @@ class Ros2Rig(Rig):
             "tcp/127.0.0.1:7447": self.near,
             "tcp/127.0.0.1:7448": self.far,
             "# emergency_stop =": "emergency_stop =",
+            "x = [-1.6, 1.6]\ny = [-1.0, 1.0]": f"x = [-{half}, {half}]\ny = [-{half}, {half}]",
         }
         for old, put in {**QUICK, **new}.items():
             assert text.count(old) == 1, old
@@ -78,6 +83,9 @@ class Ros2Rig(Rig):
         path = self.folder / "law.py"
         path.write_text(text.replace('"body": 0.055', '"body": 0.105'))
         return path
+
+    def messages_of_overrides(self) -> set[str]:
+        return {m.kind for m in self.messages("event/override_changed") if isinstance(m, OverrideChanged)}
 
     def close(self) -> None:
         super().close()
@@ -111,3 +119,84 @@ def test_campaign_certificate_drive_and_audit_over_ros2(rig: Ros2Rig) -> None:
     found = json.loads(rig.s2r("audit", str(log), "--key", str(rig.state / "key.pub"), "--rerun-controllers", "--json").stdout)
     assert (found["ok"], found["first_difference"], found["chain"]) == (True, None, "intact"), found
     assert [certificate["valid"] for certificate in found["certificates"]]
+
+
+@pytest.mark.slow
+def test_campaign_outlives_a_robot_that_falls_silent_starts_anew_and_sets_its_clock(tmp_path: Path) -> None:
+    """And nobody else gets to command it: not from the controllers' side, and from its own side only with the gate closed."""
+    with contextlib.closing(Ros2Rig(tmp_path, "rmw", "twist_stamped", 0.25)) as rig:
+        survive(rig)
+
+
+def survive(rig: Ros2Rig) -> None:
+    rig.start_robot("--lose", "0.02")
+    rig.start()
+    rig.until(lambda: rig.status()["observation"])
+    rig.ask("permit", duration_s=3600.0)
+    campaign = subprocess.Popen(
+        [sys.executable, "-m", "s2r_runtime.cli.main", "sample", str(rig.profile), "--socket", str(rig.socket), "--json"],
+        stdout=subprocess.PIPE,
+        env=rig.environment,
+    )
+    for wanted, line in ((1, "silent 0.8"), (2, "reboot 0.7"), (3, "clock -30")):
+        rig.until(lambda n=wanted: (rig.status()["campaign"] or {}).get("taken", 0) >= n)
+        rig.tell(line)
+        if line.startswith("clock"):
+            rig.until(lambda: rig.status()["counters"]["restarts"])
+        else:
+            rig.until_status(link=False)
+        rig.until_status(link=True)
+    out, _ = campaign.communicate(timeout=90.0)
+    answer = json.loads(out)
+    assert answer["exit_code"] == 0, answer
+    proposed(rig)
+    stopped(rig)
+    counters = rig.status()["counters"]
+    rig.stop()
+    assert counters["lost"] > 0
+    assert counters["restarts"] >= 1
+    assert counters["malformed"] == counters["dropped_out"] == 0
+    assert [m.up for m in rig.messages("event/link_changed") if isinstance(m, LinkChanged)].count(False) >= 3
+    good = [m.observation for m in rig.messages("event/observed") if isinstance(m, Observed) and not m.observation.fault]
+    assert all(b.stamp_ns > a.stamp_ns and b.seq > a.seq for a, b in itertools.pairwise(good))
+    assert all(abs(b.x[0] - a.x[0]) < 0.05 for a, b in itertools.pairwise(good) if b.seq - a.seq == 1)
+    decided = [m for m in rig.messages("out/decided") if isinstance(m, Decided) and m.source == "external"]
+    assert {(m.allow, m.reason) for m in decided} == {(False, "source_not_allowed")}
+    assert {m.source for m in rig.messages("out/send") if isinstance(m, Send)} == {"recovery", "sampler"}
+    (log,) = rig.log_files()
+    found = json.loads(rig.s2r("audit", str(log), "--key", str(rig.state / "key.pub"), "--json").stdout)
+    assert (found["ok"], found["first_difference"]) == (True, None), found
+
+
+def proposed(rig: Ros2Rig) -> None:
+    """Somebody's Nav2 on the controllers' side."""
+    node = Node(rig.layout, "odometry", rig.command, connect=rig.far, gid=b"a navigator's id")
+    with contextlib.closing(node):
+        before = rig.status()["observation"]["x"]
+
+        def propose() -> bool:
+            for _ in range(10):
+                node.put(node.command_key, encode_twist_stamped(1, "base_link", (0.2, 0.0, 0.0, 0.0, 0.0, 2.0)))
+                time.sleep(0.01)
+            return bool(rig.status()["counters"]["proposals"] >= 50)
+
+        rig.until(propose)
+        after = rig.status()["observation"]["x"]
+    assert abs(_first(after) - _first(before)) < 0.05, "the robot hears nobody there"
+    assert "manual_override" not in rig.status()["reason"]
+    uninvited = [m.command for m in rig.messages("event/proposed") if isinstance(m, Proposed) and m.command.source == "external"]
+    assert uninvited[0].u == (0.2, 2.0)
+
+
+def stopped(rig: Ros2Rig) -> None:
+    """The robot's button, and another node that commands it on its own side."""
+    rig.tell("emergency_stop")
+    rig.until(lambda: "emergency_stop" in rig.status()["reason"])
+    rig.tell("release")
+    node = Node(rig.layout, "odometry", rig.command, connect=rig.near, gid=b"a joystick's id!")
+    with contextlib.closing(node):
+        rig.until(lambda: node.put(node.command_key, b"anything") or bool(rig.messages_of_overrides() & {"manual_override"}))
+
+
+def _first(x: object) -> float:
+    return float(x["x"] if isinstance(x, dict) else x[0])  # type: ignore[index]

@@ -91,6 +91,8 @@ class Standin:
         lost = self._loss.random() < self._options.lose
         if time.monotonic() < self._silent_until or lost:
             self.tally["withheld"] += 1
+            if lost:
+                self._link.lose("pose")
             return
         stamp_ns = EPOCH_NS + self._offset_ns + round(self._body.k * self._body.sheet.dt * 1e9)
         if self._body.k % BUTTON_EVERY == 0:

@@ -58,6 +58,10 @@ class Link:
         extra = attachment(self._counts[name], stamp_ns, self._gid) if self._layout.kind == "rmw" else None
         self._publishers[name].put(payload, attachment=extra)
 
+    def lose(self, name: str) -> None:
+        """One that gets lost on its way."""
+        self._counts[name] += 1
+
     def _take(self, sample: zenoh.Sample) -> None:
         extra = sample.attachment
         self._latest = (b"" if extra is None else extra.to_bytes(), sample.payload.to_bytes())
