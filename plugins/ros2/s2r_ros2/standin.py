@@ -15,7 +15,10 @@ import time
 from types import FrameType
 from typing import Any
 
-from s2r_standins.body import Body, DataSheet
+try:
+    from s2r_standins.body import Body, DataSheet
+except ImportError:
+    sys.exit("standin: its body is in the package s2r_standins, which is not installed")
 
 from s2r_ros2.keys import Layout
 from s2r_ros2.options import COMMANDS, POSES

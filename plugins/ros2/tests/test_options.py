@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -61,3 +62,9 @@ def test_files_that_cannot_be_used_are_named() -> None:
     transport = Ros2Transport({**HERE, "robot_config": "/nowhere.json5"}, ("x", "y", "theta"), ("v", "w"))
     with pytest.raises(ConfigError, match=r"nowhere\.json5"):
         transport.open()
+
+
+def test_page_explains_every_option_and_every_counter() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "ros2.md").read_text(encoding="utf-8")
+    transport = Ros2Transport(HERE, ("x", "y", "theta"), ("v", "w"))
+    assert [name for name in (*transport.OPTIONS, *transport.counters()) if f"`{name}`" not in page] == []
