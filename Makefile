@@ -3,13 +3,14 @@
 # make test-long  the tests that need minutes each: measured recordings, ties broken by suggested drives
 # make check  format, lint, types, import walls, docs
 # make bench  the figures that the docs state, as ratios in one run
+# make robotarium-experiment  the paper's experiment, reading by reading, with its figures on one page (robotarium-experiment.html)
 # make bench-trace  the tracer on seeded recordings that it has never seen, in some 15 minutes; SETS="--seeds 0:5 --failures" for others
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: run test test-long check bench bench-trace format clean wheels setup
+.PHONY: run test test-long check bench bench-trace robotarium-experiment format clean wheels setup
 
 run: $(STAMP)
 	$(BIN)/s2r demo
@@ -35,6 +36,9 @@ bench: $(STAMP)
 	-@$(BIN)/python -c 'import importlib.util, sys; sys.exit(importlib.util.find_spec("rtamt") is None)' || \
 	    $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
 	$(BIN)/python tools/bench.py
+
+robotarium-experiment: $(STAMP)
+	$(BIN)/python tools/robotarium_experiment.py -o robotarium-experiment.html --json robotarium-experiment.json
 
 SETS ?= --seeds 1000000:1000020 --jobs 2
 
