@@ -21,7 +21,7 @@ from s2r_runtime.bounds import check_probability, sample_size, scenario_confiden
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, UsageError
 from s2r_runtime.messages import SERIAL, Gap
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.whiteness import DEPENDENT, SERIAL_ALPHA, Whiteness, serial_p, whiteness
+from s2r_runtime.whiteness import DEPENDENT, SERIAL_ALPHA, Whiteness, body_axes, serial_p, whiteness
 
 Array = NDArray[np.float64]
 Kind = Literal["ball", "box"]
@@ -126,8 +126,9 @@ def estimate_gap(
     paid = e_hold is not None and (not tr.independent or scenario_confidence(n, discard, epsilon) <= split(beta, (1, 1))[0])
     white = whiteness(model, tr.x0, tr.u, e, first_lag=1 if tr.independent else 2)
     if tr.independent:
-        found = [discrepancy(one, w, kind) for one in (e, e_hold) if one is not None]
-        white = _in_order(found) or white
+        both = [one for one in (e, e_hold) if one is not None]
+        series = [*(discrepancy(one, w, kind) for one in both), *(c for one in both for c in body_axes(model, tr.x0, one).T)]
+        white = _in_order(series) or white
     return Gap(
         radius=radius,
         radius_literal=_largest(discrepancy(e, np.ones_like(w), kind), discard),
@@ -149,9 +150,9 @@ def estimate_gap(
     )
 
 
-def _in_order(found: list[Array]) -> Whiteness | None:
-    """What speaks against the independence of the samples, if it speaks clearly: the order of these discrepancies (each (n,))."""
-    p = len(found) * min(serial_p(d) for d in found)
+def _in_order(series: list[Array]) -> Whiteness | None:
+    """What speaks clearly against the independence of the samples: the order of their discrepancies and residuals, each (n,)."""
+    p = min(serial_p(one, clear=SERIAL_ALPHA / len(series)) for one in series) * len(series)
     return Whiteness(False, f"{SERIAL} (p = {p:.1g})") if p < SERIAL_ALPHA else None
 
 

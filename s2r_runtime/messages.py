@@ -60,7 +60,7 @@ class Command(Struct, frozen=True, tag="command"):
 
 # ---------------------------------------------------------------- results that events carry
 
-SERIAL = "the discrepancy of a sample depends on the one before"
+SERIAL = "the error of a sample depends on the one before"
 """`Gap.white_reason` begins with this where the samples were not independent: such a campaign founds no gap (guarantee G1)."""
 
 

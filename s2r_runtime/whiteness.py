@@ -11,8 +11,9 @@ has no mean in the world's axes). Three questions, each by a rank or normal stat
 The smallest p-value counts, times the number of tests (Bonferroni): noise alone is called structured with probability <= ALPHA.
 
 Whether samples were independent is a question by itself (`serial_p`), about the discrepancy, which is what the gap bounds (guarantee
-G1): the same statistic of order, with ranks shared among ties, for half of the discrepancies may be the same number. Where the limit law
-says that it is rare, its place among PERMUTATIONS seeded permutations counts, which is exact for any law of the discrepancy.
+G1), and the residual, which has signs and so shows it sooner: the same statistic of order, with ranks shared among ties, for half of the
+discrepancies may be the same number. Where the limit law leaves it open, its place among PERMUTATIONS seeded permutations counts, which is
+exact for any law.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ SERIAL_ALPHA = 5e-3
 """Of campaigns whose samples are independent, this share is refused. Small enough to be rare; large enough that whoever repeats campaigns
 with dependent samples until one is accepted still gets a wrong gap with probability below beta = 5 %, for autoregressions of any
 strength (tools/bench_missions.py)."""
-PERMUTATIONS = 9999
+PERMUTATIONS = 1999
 PERMUTED_AT_ONCE = 1_000_000
 """Numbers, 8 MB."""
-RARE = 0.02
-"""A p-value by the limit law below which the permutations are made."""
+CERTAIN, RARE = 1e-3, 5.0
+"""Times what matters: p-values by the limit law between which the permutations are made."""
 DEPENDENT = "depends on the one before"
 """Stands in the reason where the order of the samples matters: they were hardly drawn independently."""
 
@@ -75,19 +76,22 @@ def whiteness(model: ComposedModel, x0: Array, u: Array, e: Array, *, first_lag:
     return Whiteness(False, structure[0][2]) if structure else Whiteness(True, "")
 
 
-def serial_p(d: Array, *, first_lag: int = 1) -> float:
-    """How likely a statistic of order as large as that of d (n,), in the order of the samples, is among independent ones; 1 for too few."""
+def serial_p(d: Array, *, clear: float = SERIAL_ALPHA) -> float:
+    """How likely a statistic of order as large as that of d (n,), in the order of the samples, is among independent ones; 1 for too few.
+
+    clear: what matters is whether it is below this; far on either side of it the limit law is good enough.
+    """
     n = len(d)
     ranks = _ranks(d)
     if n < FEWEST + LAGS or np.ptp(ranks) == 0.0:
         return 1.0
-    limit = _serial_p(ranks, first_lag)
-    if limit > RARE:
+    limit = _serial_p(ranks, 1)
+    if not CERTAIN * clear <= limit <= RARE * clear:
         return limit
-    observed, larger, rng = _serial_statistic(ranks[None, :], first_lag)[0], 0, np.random.default_rng(0)
+    observed, larger, rng = _serial_statistic(ranks[None, :], 1)[0], 0, np.random.default_rng(0)
     for size in np.diff(np.linspace(0, PERMUTATIONS, 2 + PERMUTATIONS * n // PERMUTED_AT_ONCE).astype(int)):
         shuffled = rng.permuted(np.broadcast_to(ranks, (size, n)), axis=1)
-        larger += int(np.count_nonzero(_serial_statistic(shuffled, first_lag) >= observed * (1.0 - 1e-12)))
+        larger += int(np.count_nonzero(_serial_statistic(shuffled, 1) >= observed * (1.0 - 1e-12)))
     return (1.0 + larger) / (1.0 + PERMUTATIONS)
 
 
