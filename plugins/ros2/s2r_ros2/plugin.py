@@ -15,3 +15,9 @@ def s2r_transports() -> list[Offer]:
 def s2r_recordings() -> list[Offer]:
     """Bags."""
     return [Offer(f"ros2.{suffix}", "s2r_ros2.bags:read", "rosbag2 bags in MCAP files") for suffix in ("mcap", "zstd")]
+
+
+@hookimpl
+def s2r_kits() -> list[Offer]:
+    """How the transport is tried."""
+    return [Offer("transports.ros2", "s2r_ros2.kits:BridgeKit"), Offer("transports.ros2.rmw", "s2r_ros2.kits:RmwKit")]

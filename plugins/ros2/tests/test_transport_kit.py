@@ -1,20 +1,13 @@
-"""The ROS 2 transport is what the runtime relies on, in both layouts and with every kind of pose."""
+"""The ROS 2 transport is what the runtime relies on, in both layouts."""
 
 from __future__ import annotations
 
-from functools import partial
-
-from s2r_ros2.testing import Ros2Rig
-
-from s2r_runtime.testing import TransportKit
+from s2r_ros2.kits import BridgeKit, RmwKit
 
 
-class TestBridge(TransportKit):
-    rig = Ros2Rig
-    carries = ()
-    numbered = False
-    tolerance = 1e-12
+class TestBridge(BridgeKit):
+    pass
 
 
-class TestRmw(TestBridge):
-    rig = partial(Ros2Rig, "rmw", "tf", "twist_stamped")
+class TestRmw(RmwKit):
+    pass
