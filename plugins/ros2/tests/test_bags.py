@@ -253,3 +253,28 @@ def test_transitions_of_a_bag_follow_the_model(tmp_path: Path) -> None:
     assert not found.independent, "ordinary driving is no campaign"
     turned = np.abs(found.x1[:, 2] - found.x0[:, 2] - DT * found.u[:, 1])
     assert np.max(np.abs(np.remainder(turned + np.pi, 2.0 * np.pi) - np.pi)) < 1e-6
+
+
+@pytest.mark.parametrize("form", ["plain", "zstd", "lz4", "unchunked"])
+def test_spoilt_bags_are_read_in_part_or_refused_and_nothing_else(tmp_path: Path, form: str) -> None:
+    draw = random.Random(11)
+    whole = write(tmp_path / "a.mcap", driven(30), **{"chunk_size": 3000, **FORMS[form]}).read_bytes()
+    path, refused = tmp_path / "b.mcap", 0
+    for _ in range(120):
+        data = bytearray(whole)
+        for _ in range(draw.randint(1, 6)):
+            data[draw.randrange(8, len(data))] = draw.randrange(256)
+        if draw.random() < 0.3:
+            del data[draw.randrange(8, len(data)) :]
+        path.write_bytes(data)
+        try:
+            stretches = read(path, *NAMES, {})
+        except RecordingError:
+            refused += 1
+            continue
+        for (t, x), (tu, u) in stretches:
+            assert np.all(np.diff(t) > 0.0)
+            assert np.all(np.diff(tu) >= 0.0)
+            assert np.all(np.isfinite(x))
+            assert np.all(np.isfinite(u))
+    assert refused < 120

@@ -53,7 +53,7 @@ def session_config(listen: str, connect: str, lease_s: float, rules: list[dict[s
         # whoever is not there yet, or went away, is sought again soon; open() does not wait for it
         "connect/timeout_ms": -1,
         "connect/exit_on_failure": False,
-        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
         "open/return_conditions": {"connect_scouted": False, "declares": False},
         # nobody is introduced to anybody: a robot that learned of a controller would link with it directly
         "scouting/multicast/enabled": False,
