@@ -11,14 +11,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from s2r_runtime.bounds import (
+    anytime_discards,
+    anytime_evidence,
+    anytime_sample_size,
+    anytime_upper,
     attempt_beta,
     clopper_pearson_lower,
     clopper_pearson_upper,
     epoch_beta,
     sample_size,
     scenario_confidence,
+    split,
 )
-from s2r_runtime.core import ledger
+from s2r_runtime.core import ledger, stream
 from s2r_runtime.errors import UsageError
 
 SIZES = (1, 2, 7, 50, 99, 299)
@@ -116,6 +121,102 @@ def test_clopper_pearson_covers_at_least_its_confidence_for_every_rate() -> None
         assert chance <= Fraction(beta)
 
 
+# ---------------------------------------------------------------- shares
+
+
+def test_split_shares_are_in_proportion_and_never_more_than_the_whole() -> None:
+    assert split(0.05, (1, 1)) == (0.025, 0.025)
+    assert split(0.06, (1, 2, 3)) == pytest.approx((0.01, 0.02, 0.03))
+    for parts in range(1, 60):
+        assert sum(map(Fraction, split(0.05, (1.0,) * parts))) <= Fraction(0.05) * (1 + Fraction(1, 10**15))
+
+
+def test_a_pass_that_needs_every_law_is_no_likelier_wrong_than_one_law_alone() -> None:
+    """Intersection-union, exactly: laws that are independent, and laws that are the same; one of them too bad by a hair."""
+    eps, n, beta = Fraction(1, 10), sample_size(0.1, 0.05), Fraction(1, 20)
+    one = (1 - eps) ** n
+    for other in (Fraction(0), Fraction(1, 50), eps):
+        assert one * (1 - other) ** n <= one <= beta
+
+
+# ---------------------------------------------------------------- at all times
+
+
+def exact_evidence(k: int, n: int, p: Fraction) -> Fraction:
+    """E_n(p) = (1/p) int_0^p t^k (1-t)^(n-k) dt / (p^k (1-p)^(n-k)), the polynomial integrated term by term."""
+    integral = sum((math.comb(n - k, i) * (-1) ** i * p ** (k + i + 1) / (k + i + 1) for i in range(n - k + 1)), Fraction(0))
+    return integral / (p ** (k + 1) * (1 - p) ** (n - k))
+
+
+@pytest.mark.parametrize("p", [Fraction(1, 100), Fraction(3, 100), Fraction(1, 4), Fraction(9, 10)])
+@pytest.mark.parametrize("n", [0, 1, 7, 60])
+def test_anytime_evidence_is_the_mixture_integrated_exactly(n: int, p: Fraction) -> None:
+    for k in {0, 1, n // 3, n} & set(range(n + 1)):
+        assert anytime_evidence(k, n, float(p)) == pytest.approx(math.log(exact_evidence(k, n, p)), rel=1e-8, abs=1e-9)
+
+
+@pytest.mark.parametrize("p", [Fraction(1, 100), Fraction(1, 4)])
+def test_mean_of_the_anytime_evidence_is_one_where_the_probability_is_p_and_less_above_it(p: Fraction) -> None:
+    n = 40
+    for q, mean in ((p, 1), (2 * p, None)):
+        total = sum((exact_evidence(k, n, p) * math.comb(n, k) * q**k * (1 - q) ** (n - k) for k in range(n + 1)), Fraction(0))
+        assert total == mean if mean else total < 1
+
+
+def test_anytime_bound_read_after_every_sample_is_wrong_with_probability_beta_at_most_exactly() -> None:
+    """The chance that at most k_n of n are above the quantile at any n up to 3000, by adding up all paths; and of the fixed-size bound."""
+    eps, beta, last = 0.03, 0.05, 3000
+
+    def ever_wrong(discards: object) -> float:
+        assert callable(discards)
+        chance, wrong = [1.0], 0.0  # of each count, none wrong so far
+        for n in range(1, last + 1):
+            grown = [0.0, *[c * eps for c in chance]]
+            for i, c in enumerate(chance):
+                grown[i] += c * (1.0 - eps)
+            k = discards(n)
+            wrong += math.fsum(grown[: k + 1])
+            chance = [0.0] * (k + 1) + grown[k + 1 :] if k >= 0 else grown
+            chance = chance[: int(eps * last + 120)]
+        return wrong
+
+    assert ever_wrong(lambda n: anytime_discards(n, eps, beta)) <= beta
+    assert ever_wrong(_fixed_size(eps, beta)) > 2 * beta
+
+
+def _fixed_size(eps: float, beta: float) -> object:
+    """n -> k of the bound for a size fixed beforehand, which is read as if each n had been; to be asked in order."""
+    reached = [-1]
+
+    def discards(n: int) -> int:
+        while reached[0] + 1 < n and scenario_confidence(n, reached[0] + 1, eps) <= beta:
+            reached[0] += 1
+        return reached[0]
+
+    return discards
+
+
+@pytest.mark.parametrize(("eps", "beta"), [(0.005, 0.05), (0.01, 0.05), (0.03, 0.01)])
+def test_anytime_sample_size_is_the_smallest_that_gives_a_bound_and_dearer_than_a_size_fixed_beforehand(eps: float, beta: float) -> None:
+    n = anytime_sample_size(eps, beta)
+    assert anytime_discards(n, eps, beta) == 0
+    assert anytime_discards(n - 1, eps, beta) == -1
+    assert sample_size(eps, beta) < n < 3 * sample_size(eps, beta)
+    assert float(exact_evidence(0, n, Fraction(eps).limit_denominator(1000))) >= 1 / beta
+
+
+@pytest.mark.parametrize(("exceedances", "n"), [(0, 0), (0, 500), (3, 500), (20, 5000), (2000, 200_000), (90_000, 10**7), (5, 5)])
+def test_anytime_upper_limit_is_where_the_evidence_reaches_its_bar_and_the_core_s_own_is_no_smaller(exceedances: int, n: int) -> None:
+    beta = 0.01
+    upper, cores = anytime_upper(exceedances, n, beta), stream.share_above(exceedances, n, beta)
+    assert upper <= cores * (1 + 1e-9) <= upper * 1.1 + 1e-9
+    if exceedances < n:
+        assert anytime_evidence(exceedances, n, upper) == pytest.approx(math.log(1 / beta), abs=1e-4)
+        assert clopper_pearson_upper(exceedances, n, beta) < upper  # looking at all times costs something
+    else:
+        assert upper == 1.0
+
+
 @pytest.mark.parametrize(
     "call",
     [
@@ -129,6 +230,16 @@ def test_clopper_pearson_covers_at_least_its_confidence_for_every_rate() -> None
         lambda: epoch_beta(0.05, 0),
         lambda: clopper_pearson_upper(6, 5, 0.05),
         lambda: clopper_pearson_lower(-1, 5, 0.05),
+        lambda: split(0.05, ()),
+        lambda: split(0.05, (1.0, 0.0)),
+        lambda: split(0.05, (1.0, math.inf)),
+        lambda: split(1.5, (1.0,)),
+        lambda: anytime_evidence(3, 2, 0.1),
+        lambda: anytime_evidence(1, 2, 1.0),
+        lambda: anytime_upper(3, 2, 0.05),
+        lambda: anytime_discards(10, 0.0, 0.05),
+        lambda: anytime_discards(-1, 0.1, 0.05),
+        lambda: anytime_sample_size(1e-12, 0.05),
     ],
 )
 def test_numbers_out_of_range_are_refused(call: object) -> None:

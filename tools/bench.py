@@ -10,7 +10,16 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
-ORDER = ("bench_verify.py", "bench_stl.py", "bench_daemon.py", "bench_can.py", "fuzz_can.py", "bench_mavlink.py", "bench_coverage.py")
+ORDER = (
+    "bench_verify.py",
+    "bench_stl.py",
+    "bench_daemon.py",
+    "bench_can.py",
+    "fuzz_can.py",
+    "bench_mavlink.py",
+    "bench_coverage.py",
+    "bench_missions.py",
+)
 
 
 def main() -> int:

@@ -2,17 +2,17 @@
 
     tools/bench_missions.py [--missions 2000] [--samples 60000] [--seed 1] [--quick] [--json]
 
-A mission: a campaign, controllers of which most are just too bad, the good one at last, and then driving, at which the watch and the core look
-after every sample; the radius grows, verification runs again, an alarm calls for another campaign. The discrepancies are |z|, z an
-autoregression of order 1 that runs through campaign and driving alike: independent draws at rho = 0, anything but at rho = .98. The
-core, the gap and the watch are the real ones, through their public functions; the e-values of all missions side by side are those of
-`watch.EProcess` vectorised, and compared with it.
+A mission: a campaign, controllers most of which are just too bad, the good one at last, then driving, at which watch and core look after
+every sample; the radius grows, verification runs again, an alarm calls for another campaign. The discrepancies are |z|, z an autoregression
+of order 1 that runs through campaign and driving alike: independent draws at rho = 0, anything but at rho = .98. The core, the gap and the
+watch are the real ones, through their public functions; the e-values of all missions side by side are those of `watch.EProcess` vectorised,
+and compared with it.
 
-The planted faults are what naive versions do; each must be caught by the same count. Then: how soon a change is noticed and how seldom falsely,
-what the watch costs, how soon growth closes the gate, what a re-verification costs.
+The planted faults are what naive versions do; each must be caught by the same count. Then: how soon a change is noticed and how seldom
+falsely, what the watch costs, how soon growth closes the gate, what a re-verification costs.
 
-A promise is broken if the exact 99.9 % lower limit of the rate of missions with a false certificate exceeds beta. Exit 1 if a promise is broken,
-a fault is not caught or a figure is missed.
+A promise is broken if the exact 99.9 % lower limit of the rate of missions with a false certificate exceeds beta. Exit 1 if a promise is
+broken, a fault is not caught or a figure is missed.
 """
 
 from __future__ import annotations
@@ -438,9 +438,7 @@ def main(arguments: list[str]) -> int:
     given = parser.parse_args(arguments)
     m, samples = (40, 2000) if given.quick else (given.missions, given.samples)
     began = time.process_time()
-    rows: list[Row] = []
-    for rho in RHOS:
-        rows.append(told(missions(m, samples, rho, given.seed, change=False), given))
+    rows = [told(missions(m, samples, rho, given.seed, change=False), given) for rho in RHOS]
     rows.append(told(missions(m, samples, 0.0, given.seed, change=True), given))
     rows.append(told(ten_controllers(m, given.seed), given))
     rows += [told(one, given) for one in naive(m, samples, given.seed)]

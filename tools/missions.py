@@ -1,6 +1,7 @@
-"""One robot's life through the core's public door, without a robot: `handle(state, event)`, with a campaign, worker and signer that answer at once.
+"""One robot's life through the core's public door, without a robot: `handle(state, event)`, and a worker and signer that answer at once.
 
-A controller is the probability with which a rollout of the uncertain model fails; verification draws as many scenarios as its share asks for.
+A controller is the probability with which a rollout of the uncertain model fails; verification draws as many scenarios as its share asks
+for.
 """
 
 from __future__ import annotations
