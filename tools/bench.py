@@ -17,6 +17,8 @@ ORDER = (
     "bench_can.py",
     "fuzz_can.py",
     "bench_mavlink.py",
+    "bench_ros2.py",
+    "fuzz_ros2.py",
     "bench_coverage.py",
     "bench_missions.py",
 )

@@ -4,7 +4,7 @@ A message counts if it is exactly of its type, of the frames that the profile na
 listened to (rmw: its gid; another one is a fault as long as the first is heard), stamped, in order, and a pose on the plane; otherwise
 nothing of it counts, and a faulty observation says why. One that is older than the newest is dropped and counted, one that took longer
 than `max_age` beyond the fastest is faulty. Observations are numbered here: by one, and by one more for each that was lost (rmw: by the
-sequence number; bridge: by the stamps, if the profile says how far they are apart).
+sequence number; bridge, and transforms: by the stamps, if the profile says how far they are apart).
 """
 
 from __future__ import annotations
@@ -59,6 +59,7 @@ class Observer:
     def __init__(self, options: Options) -> None:
         self._told = Told(options)
         self._rmw = options.layout == "rmw"
+        self._counted = self._rmw and options.pose != "tf"  # who publishes transforms counts those of other frames too
         self._arrival = options.stamp == "arrival"
         self._silence_ns = round(options.observation_timeout * 1e9)
         self._max_age_ns = options.max_age * 1e9
@@ -109,12 +110,10 @@ class Observer:
         return Observation(max(self._seq, 0), stamp, (), fault=why)
 
     def _observed(self, s: int, a: int, x: tuple[float, ...], publisher: Attached | None) -> list[Observation | LinkChanged]:
-        before, known = self.clock.newest, self._publisher
-        if publisher is not None and known is not None and publisher.gid == known.gid and before is not None:
-            quiet = a - before[1] >= self._silence_ns
-            if s > before[0] and publisher.sequence <= known.sequence and not quiet:
-                self.malformed += 1
-                return [self._fault("malformed pose: its sequence number does not rise with its stamp")]
+        before = self.clock.newest
+        if before is not None and s > before[0] and self._stands(publisher, a - before[1]):
+            self.malformed += 1
+            return [self._fault("malformed pose: its sequence number does not rise with its stamp")]
         verdict = self.clock.take(s, a)
         if verdict in ("old", "ahead"):
             return []
@@ -135,12 +134,20 @@ class Observer:
             return [*said, self._fault(f"came {late * 1e-9:.2f} s later than the fastest")]
         return [*said, Observation(self._seq, self.clock.stamp(), x)]
 
+    def _stands(self, publisher: Attached | None, silent_ns: int) -> bool:
+        """Whether a publisher that is known, and was not silent, counted no further. Two poses of one message have one number."""
+        known = self._publisher
+        if publisher is None or known is None or publisher is known or publisher.gid != known.gid:
+            return False
+        return publisher.sequence <= known.sequence and silent_ns < self._silence_ns
+
     def _gap(self, s: int, before: int, publisher: Attached | None) -> int:
         """How many were lost between two that came."""
         known = self._publisher
         lost = 0
-        if publisher is not None and known is not None and publisher.gid == known.gid:
-            lost = publisher.sequence - known.sequence - 1
-        elif publisher is None and self._period_ns:
+        if self._counted:
+            if publisher is not None and known is not None and publisher.gid == known.gid:
+                lost = publisher.sequence - known.sequence - 1
+        elif self._period_ns:
             lost = round((s - before) / self._period_ns) - 1
         return lost if 0 < lost <= LOST_MOST else 0

@@ -99,7 +99,7 @@ MEANINGS: dict[str, str] = {
     "child_frame": "child_frame_id that the pose must be of (likewise)",
     "states": "model state -> x, y, theta, speed, vx, vy or w, where the model has other names; the last four come from odometry's twist",
     "stamp": "header (the default): header.stamp is the robot's clock; arrival: for robots that do not stamp",
-    "period": "bridge: s between two poses as the robot publishes them, so that lost ones are counted (default: they are not)",
+    "period": "bridge, and tf: s between two poses as the robot publishes them, so that lost ones are counted (default: they are not)",
     "max_age": "s; a pose that was longer on its way than the fastest by more than this is faulty (default 0.3)",
     "max_tilt": "rad; a robot that is tilted more is not on its plane: a fault (default 0.2)",
     "command": "what the robot is commanded by: twist (the default) or twist_stamped",

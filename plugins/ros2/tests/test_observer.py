@@ -7,7 +7,15 @@ from typing import Any
 
 import pytest
 from s2r_ros2.keys import attached, attachment, envelope, opened
-from s2r_ros2.payloads import decode_twist, decode_twist_stamped, encode_bool, encode_twist, encode_twist_stamped
+from s2r_ros2.payloads import (
+    Located,
+    decode_twist,
+    decode_twist_stamped,
+    encode_bool,
+    encode_transforms,
+    encode_twist,
+    encode_twist_stamped,
+)
 from s2r_ros2.testing import message
 from s2r_ros2.transport import Ros2Transport
 
@@ -59,6 +67,20 @@ def test_lost_ones_are_counted_by_sequence_or_by_period_and_leave_a_hole_in_the_
         assert t.counters()["lost"] == 2
     silent = transport()
     assert [o.seq for o in good([m for k in (0, 4) for m in silent.decode(frame(k))])] == [0, 1]
+
+
+def test_publisher_of_other_transforms_too_loses_nothing_by_its_count() -> None:
+    t = transport(layout="rmw", pose="tf", frame="odom", child_frame="base_footprint", period=0.05)
+    said = [m for k in (0, 1, 2, 5) for m in t.decode(frame(k, gid=A, seq=7 * k + 1, pose="tf"))]
+    assert [o.seq for o in good(said)] == [0, 1, 2, 5]
+    assert t.counters()["lost"] == 2, "by the stamps"
+
+
+def test_two_poses_of_one_message_are_two_observations() -> None:
+    t = transport(layout="rmw", pose="tf", frame="odom", child_frame="base_footprint")
+    ours = [Located(START + k * MS, "odom", "base_footprint", (0.1 * k, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)) for k in (1, 2)]
+    said = t.decode(Frame(5, "pose", envelope(attachment(1, 1, A), encode_transforms(ours))))
+    assert [o.x[0] for o in good(said)] == [0.1, 0.2]
 
 
 def test_another_publisher_is_a_fault_while_the_first_is_heard_and_the_robot_once_it_is_not() -> None:
