@@ -15,7 +15,7 @@ from s2r_runtime.errors import NotEnoughEvidence, UsageError
 
 if TYPE_CHECKING:
     from s2r_runtime.controllers.hosted import ControllerFile
-    from s2r_runtime.daemon.worker import Failed, VerifyJob
+    from s2r_runtime.daemon.worker import Failed, Job, Result
     from s2r_runtime.messages import Gap, Verification
     from s2r_runtime.models.composed import ComposedModel
     from s2r_runtime.profile import Profile
@@ -129,7 +129,7 @@ def run_verify(args: argparse.Namespace) -> int:
     model = profile_model(args, profile)
     epoch_gap = gap_of(args.recording, model, profile)[0] if args.recording else None
     laws = tuple(args.law) if args.law else profile.verification.laws
-    gap = epoch_gap or _gap_at(args.radius, args.hold_radius, model, profile)
+    gap = epoch_gap or gap_at(args.radius, args.hold_radius, model, profile)
     headroom = args.headroom or (profile.verification.headroom if epoch_gap else 1.0)
     if headroom < 1.0:
         raise UsageError(f"--headroom {headroom:g}: must be >= 1")
@@ -145,7 +145,7 @@ def run_verify(args: argparse.Namespace) -> int:
     return 0 if result.passed else 1
 
 
-def _gap_at(radius: float, hold_radius: float | None, model: ComposedModel, profile: Profile) -> Gap:
+def gap_at(radius: float, hold_radius: float | None, model: ComposedModel, profile: Profile) -> Gap:
     """A gap of that radius that nobody measured: for `--radius`."""
     from s2r_runtime.messages import Gap
 
@@ -231,7 +231,7 @@ def run_verification(
     from s2r_runtime import messages
     from s2r_runtime import verify as verification
     from s2r_runtime.bounds import sample_size
-    from s2r_runtime.daemon.worker import VerifyJob
+    from s2r_runtime.daemon.worker import Failed, Result, VerifyJob
     from s2r_runtime.headroom import grid
 
     # laws asked for by name are what the question is about, even where the profile does not require them
@@ -248,9 +248,9 @@ def run_verification(
     asked = msgspec.structs.replace(profile, model=model.spec, verification=settings)
     seed = verification.seed_for(controller.digest, model.spec.digest(), profile.task_digest(), attempt)
     job = VerifyJob(asked, controller, gap, most, headroom * gap.hold_radius, attempt, seed, beta, gap.radius)
-    done = _work(job, settings.timeout)
-    if isinstance(done, messages.Verification):
-        return done
+    done = work(job, settings.timeout, "verifying")
+    if isinstance(done, Result) and done.verification is not None:
+        return done.verification
     return messages.Verification(
         passed=False,
         radius=gap.radius,
@@ -264,25 +264,23 @@ def run_verification(
         controller_digest=controller.digest,
         model_digest=model.spec.digest(),
         task_digest=profile.task_digest(),
-        reason=done.text,
+        reason=done.text if isinstance(done, Failed) else "the worker gave no verification",
     )
 
 
-def _work(job: VerifyJob, timeout_s: float) -> Verification | Failed:
-    """The job's verification, or why there is none; progress on a terminal."""
-    from s2r_runtime.daemon.worker import Failed, Progress, Worker
+def work(job: Job, timeout_s: float, label: str) -> Result | Failed:
+    """What a worker process makes of the job; progress on a terminal."""
+    from s2r_runtime.daemon.worker import Progress, Worker
 
-    bar = output.Progress("verifying")
+    bar = output.Progress(label)
     worker = Worker(job, timeout_s)
     try:
         while True:
             for message in worker.poll(time.monotonic_ns()):
                 if isinstance(message, Progress):
                     bar(message.done, message.total, message.detail)
-                elif isinstance(message, Failed):
-                    return message
                 else:
-                    return message.verification or Failed("the worker gave no verification")
+                    return message
             time.sleep(0.01)
     finally:
         worker.stop()

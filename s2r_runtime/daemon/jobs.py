@@ -12,7 +12,7 @@ from s2r_runtime.controllers.confinement import confine
 from s2r_runtime.controllers.file import load
 from s2r_runtime.daemon.given_inputs import BYTES_MAX, GivenInputs, parse_inputs
 from s2r_runtime.daemon.settings import ModelFacts, settings_of
-from s2r_runtime.daemon.worker import GapJob, InputsJob, Job, LoadJob, Result, TraceJob, VerifyJob
+from s2r_runtime.daemon.worker import GapJob, InputsJob, Job, LoadJob, Result, SynthesisJob, TraceJob, VerifyJob
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import Gap
 
@@ -39,6 +39,8 @@ def run(job: Job, progress: Progress) -> Result:
             return Result(trace=trace(job, progress))
         case InputsJob():
             return Result(inputs=inputs(job))
+        case SynthesisJob():
+            return synthesize(job, progress)
 
 
 def gap(job: GapJob) -> Gap:
@@ -99,6 +101,39 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
     lowest = -np.finfo(np.float64).max  # what `verify` counts a value that is no number as
     safety = {one.law: np.nan_to_num(one.rollouts.safety, nan=lowest, neginf=lowest, posinf=-lowest).tolist() for one in details}
     return Result(verification=result, safety=safety)
+
+
+def synthesize(job: SynthesisJob, progress: Progress) -> Result:
+    """A search over the controller's parameters; confined, as a verification is."""
+    import scipy.optimize  # noqa: F401 - before nothing can be loaded any more
+
+    from s2r_runtime.controllers.hosted import batch_control
+    from s2r_runtime.models.composed import compose
+    from s2r_runtime.plugins import registry
+    from s2r_runtime.synthesize import search, search_seed
+    from s2r_runtime.uncertain import GapSet
+
+    profile, settings = job.profile, job.profile.verification
+    model = compose(profile.model)
+    task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
+    gap_set = GapSet(job.gap.set, job.gap.weights, job.radius, job.hold_radius, job.gap.hold_periods)
+    _discard_prints()
+    confine(MEMORY_BYTES)
+    found = search(
+        job.controller,
+        job.bounds,
+        lambda file: batch_control(file, len(model.inputs)),
+        task,
+        model,
+        gap_set=gap_set,
+        laws=settings.required,
+        threshold=settings.threshold,
+        n=job.scenarios,
+        evaluations=job.evaluations,
+        seed=search_seed(job.controller, gap_set, model, profile.task_digest(), job.number),
+        progress=progress,
+    )
+    return Result(synthesis=found)
 
 
 def _discard_prints() -> None:

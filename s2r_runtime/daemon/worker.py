@@ -16,6 +16,7 @@ from typing import Any
 import msgspec
 
 from s2r_runtime.child import Child, die_with_parent, say, take_stdout
+from s2r_runtime.controllers.candidates import Synthesis
 from s2r_runtime.controllers.file import ControllerFile
 from s2r_runtime.daemon.given_inputs import GivenInputs
 from s2r_runtime.errors import S2RError
@@ -86,7 +87,21 @@ class InputsJob(msgspec.Struct, frozen=True, tag="inputs"):
     x: tuple[float, ...]
 
 
-Job = LoadJob | GapJob | VerifyJob | TraceJob | InputsJob
+class SynthesisJob(msgspec.Struct, frozen=True, tag="synthesis"):
+    """Search the controller's parameters within bounds, on the uncertain model, under the profile's required laws (offline only)."""
+
+    profile: Profile
+    controller: ControllerFile
+    bounds: dict[str, tuple[float, float]]
+    gap: Gap
+    radius: float
+    hold_radius: float
+    evaluations: int
+    scenarios: int
+    number: int
+
+
+Job = LoadJob | GapJob | VerifyJob | TraceJob | InputsJob | SynthesisJob
 
 
 class Progress(msgspec.Struct, frozen=True, tag="progress"):
@@ -106,6 +121,7 @@ class Result(msgspec.Struct, frozen=True, tag="result"):
     safety: dict[str, list[float]] = {}
     controller: ControllerFile | None = None
     inputs: GivenInputs | None = None
+    synthesis: Synthesis | None = None
 
 
 class Failed(msgspec.Struct, frozen=True, tag="failed"):
