@@ -354,5 +354,5 @@ class TransportKit:
         make: Any = type(bench.transport)
         before = _descriptors()
         kept = [make(bench.options, bench.states, bench.inputs) for _ in range(20)]
-        assert _descriptors() == before
+        assert _descriptors() <= before  # what an earlier test closed may go only now
         assert len(kept) == 20
