@@ -11,17 +11,17 @@ keys those are: `keys`. What a gate can't keep off a ROS 2 graph: docs/ros2.md.
 
 from __future__ import annotations
 
-import threading
 import time
-from collections import deque
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from s2r_zenoh.sessions import Doorbell, Inbox, allow, session_config
 
-from s2r_ros2.cdr import PAYLOAD_MAX, Malformed
+from s2r_ros2.cdr import Malformed
 from s2r_ros2.commander import Commander
-from s2r_ros2.keys import ATTACHMENT_MAX, envelope, opened
+from s2r_ros2.graph import declare, rules
+from s2r_ros2.inboxes import PER_SECOND, Ears, Mail
+from s2r_ros2.keys import opened
 from s2r_ros2.observer import Observer
 from s2r_ros2.options import MEANINGS, Options, checked
 from s2r_ros2.payloads import decode_bool
@@ -33,43 +33,8 @@ if TYPE_CHECKING:
 
 Decoded = Observation | Command | LinkChanged | OverrideChanged
 
-PER_SECOND = 32
-"""Commands of others that are logged."""
 OVERRIDES_WAITING = 16
-COMMANDS_KEPT = 256
-"""Sent commands that are known again when the ears hear them: seconds at any rate."""
 LOOK_NS = 1_000_000_000
-
-
-class Mail(Inbox):
-    """An inbox of frames: attachment and payload; one that is cut is malformed."""
-
-    def content(self, sample: zenoh.Sample) -> bytes:
-        """See `keys.envelope`."""
-        extra = sample.attachment
-        return envelope(b"" if extra is None else extra.to_bytes()[:ATTACHMENT_MAX], sample.payload.to_bytes()[: PAYLOAD_MAX + 1])
-
-
-class Ears(Mail):
-    """An inbox for others' commands: what left here is known again, and not taken in."""
-
-    def __init__(self, bell: Doorbell) -> None:
-        super().__init__(bell, PER_SECOND, PER_SECOND)
-        self._own: deque[bytes] = deque(maxlen=COMMANDS_KEPT)
-        self._mutex = threading.Lock()
-
-    def sent(self, data: bytes) -> None:
-        """This frame is about to leave."""
-        with self._mutex:
-            self._own.append(data)
-
-    def put(self, sample: zenoh.Sample) -> None:
-        """Callback of the subscription, on Zenoh's thread."""
-        data = self.content(sample)
-        with self._mutex:
-            own = data in self._own
-        if not own:
-            super().put(sample)
 
 
 class Ros2Transport:
@@ -87,7 +52,7 @@ class Ros2Transport:
         self._proposals = Mail(self._bell, PER_SECOND, PER_SECOND)
         self._strangers = Ears(self._bell)
         self._overrides = {kind: Mail(self._bell, OVERRIDES_WAITING) for kind in self._options.overrides}
-        self._wanted = self._options.child_frame.encode() if self._options.pose == "tf" else b""
+        self._wanted = self._options.child_frame.lstrip("/").encode() if self._options.pose == "tf" else b""
         self._sessions: list[zenoh.Session] = []
         self._tokens: list[zenoh.LivelinessToken] = []
         self._command: zenoh.Publisher | None = None
@@ -106,7 +71,7 @@ class Ros2Transport:
         pose, command = keys.key(o.pose_topic, o.pose_type), keys.key(o.command_topic, o.command_type)
         stops = {kind: keys.key(topic, "std_msgs/msg/Bool") for kind, topic in o.overrides.items()}
         incoming = [pose, *stops.values()]
-        graph = self._graph_rules()
+        graph = rules(o)
         self._bell.open()
         try:
             robot = self._session("robot", o.robot_listen, o.robot_connect, [
@@ -120,7 +85,7 @@ class Ros2Transport:
             for kind, key in stops.items():
                 _subscribe(robot, key, self._overrides[kind])
             self._command = _publisher(robot, command)
-            self._declare(robot)
+            self._tokens += declare(robot, o, o.command_topic, o.pose_topic)
             if o.robot_connect:
                 ears = self._session("robot", "", o.robot_connect, [
                     allow("others_command", "ingress", ["put"], [command]),
@@ -133,42 +98,22 @@ class Ros2Transport:
                     allow("runtime_hears", "egress", ["declare_subscriber"], [command]),
                     allow("others_hear", "ingress", ["declare_subscriber"], ["**"]),
                     allow("runtime_shows", "egress", ["put"], [pose]),
+                    *graph,
                 ])  # fmt: skip
                 _subscribe(others, command, self._proposals)
                 self._onlookers = _publisher(others, pose)
+                self._tokens += declare(others, o, o.pose_topic, o.command_topic)
         except BaseException:
             self.close()
             raise
         self._heard_ns = time.monotonic_ns()
 
-    def _graph_rules(self) -> list[dict[str, Any]]:
-        """What lets the runtime be seen in the graph of rmw_zenoh."""
-        if self._options.layout != "rmw" or not self._options.node:
-            return []
-        graph = [f"@ros2_lv/{self._options.domain}/**"]
-        return [
-            allow("runtime_is_there", "egress", ["liveliness_token"], graph),
-            allow("robot_looks", "ingress", ["declare_liveliness_subscriber", "liveliness_query"], graph),
-        ]
-
-    def _declare(self, robot: zenoh.Session) -> None:
-        o = self._options
-        if o.layout != "rmw" or not o.node:
-            return
-        own, keys = str(robot.zid()), o.keys
-        tokens = [
-            keys.node_token(own, o.node),
-            keys.token(own, o.node, 1, "MP", o.command_topic, o.command_type, 1),
-            keys.token(own, o.node, 2, "MS", o.pose_topic, o.pose_type, o.queue),
-        ]
-        self._tokens = [robot.liveliness().declare_token(token) for token in tokens]
-
-    def _session(self, side: str, listen: str, connect: str, rules: list[dict[str, Any]]) -> zenoh.Session:
+    def _session(self, side: str, listen: str, connect: str, allowed: list[dict[str, Any]]) -> zenoh.Session:
         import zenoh
 
         file = self._options.robot_config if side == "robot" else self._options.controller_config
         try:
-            session = zenoh.open(session_config(listen, connect, self._options.lease, rules, file))
+            session = zenoh.open(session_config(listen, connect, self._options.lease, allowed, file))
         except zenoh.ZError as error:
             raise ConfigError(f"transport.{side}_listen {listen!r}, {side}_connect {connect!r}: {error}") from None
         self._sessions.append(session)

@@ -11,11 +11,12 @@ from typing import Any
 
 import pytest
 import zenoh
+from s2r_ros2.inboxes import PER_SECOND
 from s2r_ros2.interfaces import BOOL
 from s2r_ros2.keys import Layout, attached, attachment
 from s2r_ros2.payloads import encode_bool, encode_twist
 from s2r_ros2.testing import CHILD, FRAME, INPUTS, STATES, Node, Ros2Rig
-from s2r_ros2.transport import PER_SECOND, Ros2Transport
+from s2r_ros2.transport import Ros2Transport
 from s2r_zenoh.testing import free_endpoint, session
 
 from s2r_runtime.messages import Command, Observation, OverrideChanged
@@ -118,16 +119,19 @@ def test_journal_says_whether_the_robot_takes_commands(robots: Robots) -> None:
     assert robots.line.until(lambda: said.extend(robots.transport.lines()) or any("robot subscribes to" in line for line in said))
 
 
-def test_runtime_is_seen_in_the_graph_of_rmw_zenoh() -> None:
-    with Robots("rmw", node="gate_keeper") as robots:
+@pytest.mark.parametrize("side", ["robot", "controllers"])
+def test_runtime_is_seen_in_the_graph_of_rmw_zenoh(side: str) -> None:
+    with Robots("rmw", node="gate_keeper") as robots, session("client", connect=robots.others) as onlooker:
         seen: set[str] = set()
+        asking = robots.robot.session if side == "robot" else onlooker
         end = time.monotonic() + 10.0
         while len(seen) < 3 and time.monotonic() < end:
-            seen |= {str(reply.ok.key_expr) for reply in robots.robot.session.liveliness().get("@ros2_lv/0/**") if reply.ok}
-        kinds = sorted(token.split("/")[5] for token in seen)
-        assert kinds == ["MP", "MS", "NN"]
+            seen |= {str(reply.ok.key_expr) for reply in asking.liveliness().get("@ros2_lv/0/**") if reply.ok}
+        told = {token.split("/")[5]: token for token in seen}
+        assert sorted(told) == ["MP", "MS", "NN"]
         assert all("/%/%/gate_keeper" in token for token in seen)
-        assert any("%cmd_vel/geometry_msgs::msg::dds_::Twist_" in token for token in seen)
+        assert ("%cmd_vel/geometry_msgs::msg::dds_::Twist_" in told["MP"]) == (side == "robot")
+        assert ("%cmd_vel/geometry_msgs::msg::dds_::Twist_" in told["MS"]) == (side == "controllers")
 
 
 def test_attachment_counts_commands_for_a_node_of_rmw_zenoh() -> None:

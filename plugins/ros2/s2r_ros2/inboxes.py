@@ -1,0 +1,51 @@
+"""Queues behind the transport's subscriptions: frames, and commands of others without those of its own."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from typing import TYPE_CHECKING
+
+from s2r_zenoh.sessions import Doorbell, Inbox
+
+from s2r_ros2.cdr import PAYLOAD_MAX
+from s2r_ros2.keys import ATTACHMENT_MAX, envelope
+
+if TYPE_CHECKING:
+    import zenoh
+
+PER_SECOND = 32
+"""Commands of others that are logged."""
+COMMANDS_KEPT = 256
+"""Sent commands that are known again when the ears hear them: seconds at any rate."""
+
+
+class Mail(Inbox):
+    """An inbox of frames: attachment and payload; one that is cut is malformed."""
+
+    def content(self, sample: zenoh.Sample) -> bytes:
+        """See `keys.envelope`."""
+        extra = sample.attachment
+        return envelope(b"" if extra is None else extra.to_bytes()[:ATTACHMENT_MAX], sample.payload.to_bytes()[: PAYLOAD_MAX + 1])
+
+
+class Ears(Mail):
+    """An inbox for others' commands: what left here is known again, and not taken in."""
+
+    def __init__(self, bell: Doorbell) -> None:
+        super().__init__(bell, PER_SECOND, PER_SECOND)
+        self._own: deque[bytes] = deque(maxlen=COMMANDS_KEPT)
+        self._mutex = threading.Lock()
+
+    def sent(self, data: bytes) -> None:
+        """This frame is about to leave."""
+        with self._mutex:
+            self._own.append(data)
+
+    def put(self, sample: zenoh.Sample) -> None:
+        """Callback of the subscription, on Zenoh's thread."""
+        data = self.content(sample)
+        with self._mutex:
+            own = data in self._own
+        if not own:
+            super().put(sample)
