@@ -17,6 +17,8 @@ import pytest
 from s2r_runtime.cli.plugin_files import KINDS, TEMPLATES
 
 ROOT = Path(__file__).parent.parent
+PAGE = (ROOT / "docs" / "plugin-author.md").read_text(encoding="utf-8")
+FOLLOWS = re.findall(r"^```python[^\n]*\n(.*?)^```$", PAGE[PAGE.index("## Something that follows the log") :], re.MULTILINE | re.DOTALL)[0]
 PACKAGES = [kind for kind in KINDS if kind != "controller"]
 
 
@@ -110,7 +112,7 @@ def port() -> int:
         return int(s.getsockname()[1])
 
 
-def test_the_new_transport_is_sampled_with_the_robot_that_comes_with_it(site: Site) -> None:
+def test_the_new_transport_is_sampled_with_the_robot_that_comes_with_it_and_its_log_followed(site: Site) -> None:
     project, (ours, robots) = site.folder / "a_transport", (port(), port())
     profile = project / "a_transport.toml"
     profile.write_text(profile.read_text().replace("7481", str(ours)).replace("7482", str(robots)))
@@ -125,6 +127,16 @@ def test_the_new_transport_is_sampled_with_the_robot_that_comes_with_it(site: Si
         done = site.s2r("sample", "a_transport.toml", "--json", cwd=project)
         assert done.returncode == 0, done.stdout + done.stderr
         status = json.loads(site.s2r("status", "--json").stdout)
+        (site.folder / "follow.py").write_text(FOLLOWS)
+        with subprocess.Popen(
+            [sys.executable, "follow.py", status["log"]], cwd=site.folder, env=site.env(), stdout=subprocess.PIPE
+        ) as follows:
+            assert site.s2r("stop").returncode == 0
+            told = []
+            while told[-1:] != [b"closed emergency_stop\n"]:
+                told.append(follows.stdout.readline())  # type: ignore[union-attr]
+            follows.kill()
+        assert b"closed no_controller\n" in told
     finally:
         daemon.terminate()
         ended = daemon.wait(30.0)
