@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
+from collections import Counter, deque
 from typing import TYPE_CHECKING
 
 from s2r_zenoh.sessions import Doorbell, Inbox
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 PER_SECOND = 32
 """Commands of others that are logged."""
-COMMANDS_KEPT = 256
-"""Sent commands that are known again when the ears hear them: seconds at any rate."""
+COMMANDS_KEPT = 4096
+"""Sent commands that are known again when the ears hear them: 40 s at 100 Hz, when a link that stalled has long been given up."""
 
 
 class Mail(Inbox):
@@ -34,13 +34,20 @@ class Ears(Mail):
 
     def __init__(self, bell: Doorbell) -> None:
         super().__init__(bell, PER_SECOND, PER_SECOND)
-        self._own: deque[bytes] = deque(maxlen=COMMANDS_KEPT)
+        self._order: deque[bytes] = deque()
+        self._own: Counter[bytes] = Counter()
         self._mutex = threading.Lock()
 
     def sent(self, data: bytes) -> None:
         """This frame is about to leave."""
         with self._mutex:
-            self._own.append(data)
+            self._order.append(data)
+            self._own[data] += 1
+            if len(self._order) > COMMANDS_KEPT:
+                oldest = self._order.popleft()
+                self._own[oldest] -= 1
+                if not self._own[oldest]:
+                    del self._own[oldest]
 
     def put(self, sample: zenoh.Sample) -> None:
         """Callback of the subscription, on Zenoh's thread."""

@@ -2,9 +2,10 @@
 
 `bridge`, zenoh-bridge-ros2dds: the topic's name without its first slash, behind the bridge's namespace if it has one (absolute names too).
   The payload is the DDS sample as it is, encapsulation and all; nothing comes with it. A publisher's data flow as soon as somebody
-  subscribes to the key, whatever is put on the key is written to DDS where a node of the robot's subscribes to the topic.
+  subscribes to the key; whatever is put on the key is written to DDS where a node of the robot's subscribes to the topic, and does not come
+  back (a bridge's readers ignore its own writers).
   eclipse-zenoh/zenoh-plugin-ros2dds, zenoh-plugin-ros2dds/src: ros2_name_to_key_expr in ros2_utils.rs, route_publisher.rs,
-  route_subscriber.rs; DEFAULT_CONFIG.json5 (namespace).
+  route_subscriber.rs, qos_helpers.rs (ignore_local); DEFAULT_CONFIG.json5 (namespace).
 
 `rmw`, rmw_zenoh: DOMAIN/TOPIC/TYPE/HASH, with the type's name in DDS and its type hash (`TypeHashNotSupported` in Humble). With every
   payload comes an attachment of 33 bytes: sequence number (int64, from 1), source time stamp (int64, ns since 1970), both little endian,

@@ -7,16 +7,18 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import zenoh
-from s2r_ros2.inboxes import PER_SECOND
+from s2r_ros2.inboxes import COMMANDS_KEPT, PER_SECOND, Ears
 from s2r_ros2.interfaces import BOOL
-from s2r_ros2.keys import Layout, attached, attachment
+from s2r_ros2.keys import Layout, attached, attachment, envelope
 from s2r_ros2.payloads import encode_bool, encode_twist
 from s2r_ros2.testing import CHILD, FRAME, INPUTS, STATES, Node, Ros2Rig
 from s2r_ros2.transport import Ros2Transport
+from s2r_zenoh.sessions import Doorbell
 from s2r_zenoh.testing import free_endpoint, session
 
 from s2r_runtime.messages import Command, Observation, OverrideChanged
@@ -273,3 +275,20 @@ def test_closing_twice_and_opening_again_works(robots: Robots) -> None:
         robots.transport.open()
     robots.line.link((0.0, 0.0, 0.0))
     assert partial(robots.line.heard, STOP)()
+
+
+def test_own_commands_are_known_again_and_forgotten_after_thousands() -> None:
+    ears = Ears(Doorbell())
+
+    def heard(data: bytes) -> bool:
+        before = ears.received
+        ears.put(cast("Any", SimpleNamespace(attachment=None, payload=SimpleNamespace(to_bytes=lambda: data))))
+        return ears.received > before
+
+    for k in range(COMMANDS_KEPT):
+        ears.sent(envelope(b"", b"%d" % (k % 10)))
+    assert not heard(b"3")
+    assert heard(b"somebody else's")
+    for k in range(COMMANDS_KEPT):
+        ears.sent(envelope(b"", b"other %d" % k))
+    assert heard(b"3"), "long ago"
