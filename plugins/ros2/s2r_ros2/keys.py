@@ -14,7 +14,7 @@
   rmw_zenoh_cpp/src/detail: TopicInfo, Entity, qos_to_keyexpr in liveliness_utils.cpp, qos.cpp, attachment_helpers.cpp,
   rmw_subscription_data.cpp (init, add_new_message), rmw_publisher_data.cpp; the length byte: eclipse-zenoh/zenoh-cpp,
   include/zenoh/api/ext/serialization.hxx. Before rmw_zenoh 0.2.4 (April 2025) the attachment named its fields; that form is not spoken
-  here.
+  here. (Humble's word stands here as others that speak to it have it: jerry73204/nano-ros, ZettaScaleLabs/ros-z.)
 
 A token is @ros2_lv/DOMAIN/ZENOH_ID/NODE/ENTITY/KIND/ENCLAVE/NAMESPACE/NAME, for a publisher (MP) or subscription (MS) followed by
 /TOPIC/TYPE/HASH/QOS; slashes within a part become %, and QoS is empty where it is the default.

@@ -1,4 +1,4 @@
-"""How `s2r plugin check ros2` tries the transport: in both layouts, with a robot's node on loopback."""
+"""How `s2r plugin check ros2` tries the transport: in both layouts, with different kinds of pose and command."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from s2r_runtime.testing import TransportKit
 
 
 class BridgeKit(TransportKit):
-    """Odometry and Twist, in the keys of zenoh-bridge-ros2dds. A Twist carries nothing but itself; the heading is a quaternion's."""
+    """Odometry and Twist through zenoh-bridge-ros2dds. A Twist has no time to live, an odometry message no count."""
 
     rig = Ros2Rig
     carries = ()
@@ -17,10 +17,7 @@ class BridgeKit(TransportKit):
     tolerance = 1e-12
 
 
-class RmwKit(TransportKit):
-    """TF and TwistStamped, in the keys of rmw_zenoh."""
+class RmwKit(BridgeKit):
+    """Transforms and TwistStamped through rmw_zenoh."""
 
     rig = partial(Ros2Rig, "rmw", "tf", "twist_stamped")
-    carries = ()
-    numbered = False
-    tolerance = 1e-12

@@ -35,6 +35,8 @@ Decoded = Observation | Command | LinkChanged | OverrideChanged
 
 OVERRIDES_WAITING = 16
 LOOK_NS = 1_000_000_000
+FIRST_LOOK_NS = 3_000_000_000
+"""After opening: sooner, a robot that is there may not have said so yet."""
 
 
 class Ros2Transport:
@@ -58,7 +60,7 @@ class Ros2Transport:
         self._command: zenoh.Publisher | None = None
         self._onlookers: zenoh.Publisher | None = None
         self._sent = self._dropped_out = self._malformed = self._unheard = 0
-        self._heard_ns = self._looked_ns = 0
+        self._heard_ns = self._looked_ns = self._opened_ns = 0
         self._to_show = b""
         self._up: bool | None = None
         self._matched: bool | None = None
@@ -106,7 +108,7 @@ class Ros2Transport:
         except BaseException:
             self.close()
             raise
-        self._heard_ns = time.monotonic_ns()
+        self._heard_ns = self._opened_ns = time.monotonic_ns()
 
     def _session(self, side: str, listen: str, connect: str, allowed: list[dict[str, Any]]) -> zenoh.Session:
         import zenoh
@@ -205,7 +207,7 @@ class Ros2Transport:
         self._looked_ns = now_ns
         status: Any = self._command.matching_status  # its stub says bool
         matched = bool(status.matching)
-        if matched == self._matched:
+        if matched == self._matched or (not matched and self._matched is None and now_ns - self._opened_ns < FIRST_LOOK_NS):
             return []
         self._matched = matched
         o = self._options
