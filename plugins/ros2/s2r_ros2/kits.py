@@ -17,7 +17,10 @@ class BridgeKit(TransportKit):
     tolerance = 1e-12
 
 
-class RmwKit(BridgeKit):
+class RmwKit(TransportKit):
     """Transforms and TwistStamped through rmw_zenoh."""
 
     rig = partial(Ros2Rig, "rmw", "tf", "twist_stamped")
+    carries = ()
+    numbered = False
+    tolerance = 1e-12

@@ -21,9 +21,3 @@ def s2r_recordings() -> list[Offer]:
 def s2r_kits() -> list[Offer]:
     """How the transport is tried."""
     return [Offer("transports.ros2", "s2r_ros2.kits:BridgeKit"), Offer("transports.ros2.rmw", "s2r_ros2.kits:RmwKit")]
-
-
-@hookimpl
-def s2r_kits() -> list[Offer]:
-    """How the transport is tried."""
-    return [Offer("transports.ros2", "s2r_ros2.kits:BridgeKit"), Offer("transports.ros2.rmw", "s2r_ros2.kits:RmwKit")]
