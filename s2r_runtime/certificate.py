@@ -21,14 +21,14 @@ from s2r_runtime.canonical import canonical, digest
 from s2r_runtime.controllers.file import ControllerFile, Identity
 from s2r_runtime.core.ledger import binomial_tail, campaign_size, sample_size, share
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
-from s2r_runtime.messages import SERIAL, CertificateFacts, Gap, Struct, Verification
+from s2r_runtime.messages import SERIAL, CertificateFacts, Gap, Struct, Trials, Verification
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Profile, TaskValue
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-SCHEMA = 1
+SCHEMA = 2
 FILE_MAX = 1 << 20
 """Bytes. A certificate has about 6000."""
 CLOCKS_APART_S = 60
@@ -62,6 +62,7 @@ class Certificate(Struct, frozen=True):
     not_shown: tuple[str, ...]
     issued_unix_s: int
     expires_unix_s: int
+    trials: Trials | None = None
 
     @property
     def id(self) -> str:
@@ -87,10 +88,12 @@ def issue(
     horizon: int = 0,
     assumption: str = "",
     traced_not_adopted: bool = False,
+    trials: Trials | None = None,
 ) -> Certificate:
     """Writes down what gap and verification show, if they show it. profile: with the model in force.
 
     lifetime_s: the profile's unless given. horizon: the task's, for the sentences. assumption: one the user made about independence.
+    trials: closed-loop runs, if there were any.
     Raises NotEnoughEvidence if the evidence doesn't carry a certificate, ConfigError if its parts don't belong together.
     """
     identity = controller.identity if isinstance(controller, ControllerFile) else controller
@@ -112,10 +115,11 @@ def issue(
         verified_hold_radius=verification.hold_radius,
         verification=verification,
         budget=budget,
-        shown=statements.shown(profile.robot.name, profile.model, profile.task.name, gap, verification, budget, assumption),
-        not_shown=statements.not_shown(gap, verification, horizon),
+        shown=statements.shown(profile.robot.name, profile.model, profile.task.name, gap, verification, budget, assumption, trials),
+        not_shown=statements.not_shown(gap, verification, horizon, trials=trials is not None),
         issued_unix_s=issued_unix_s,
         expires_unix_s=issued_unix_s + lifetime,
+        trials=trials,
     )
     for what, ok in (*_bindings(certificate), *_asked_for(profile, gap, verification)):
         if not ok:
@@ -235,6 +239,12 @@ def _bindings(c: Certificate) -> list[tuple[str, bool]]:
         ("the verification is of another model", v.model_digest == c.model_digest),
         ("the verification is of another task", v.task_digest == c.task_digest),
         ("its verified radius is not that of the verification", c.verified_radius == v.radius and c.verified_hold_radius == v.hold_radius),
+        (
+            "the trials are of another controller, task or model",
+            c.trials is None
+            or (c.trials.controller_digest, c.trials.task_digest, c.trials.model_digest)
+            == (c.controller_digest, c.task_digest, c.model_digest),
+        ),
         ("it expires before it is issued", c.issued_unix_s < c.expires_unix_s),
     ]
 
@@ -286,5 +296,16 @@ def _evidence(c: Certificate, *, traced_not_adopted: bool) -> list[tuple[str, bo
             gap.white or not alone,
             0,
         ),
+        ("the trials do not carry their statement", c.trials is None or _carried(c.trials, slack), 0),
         ("only the law uniform was required, and an effect was traced that the model lacks", not (alone and traced_not_adopted), 0),
     ]
+
+
+def _carried(trials: Trials, slack: float) -> bool:
+    """Whether the numbers of trials are bounds at their beta (guarantee G9)."""
+    if not (0 <= trials.unsafe <= trials.n and trials.n >= 1 and 0.0 < trials.beta < 1.0 and trials.radius >= 0.0):
+        return False
+    unsafe = trials.unsafe == trials.n or (
+        0.0 < trials.unsafe_upper < 1.0 and binomial_tail(trials.n, trials.unsafe, trials.unsafe_upper) <= trials.beta * slack
+    )
+    return unsafe and 0.0 < trials.epsilon < 1.0 and binomial_tail(trials.n, 0, trials.epsilon) <= trials.beta * slack

@@ -138,6 +138,29 @@ class Verification(Struct, frozen=True, tag="verification"):
     tried: tuple[RadiusTried, ...] = ()
 
 
+class Trials(Struct, frozen=True):
+    """Closed-loop runs of a controller on the robot, from its logs (guarantee G9, `trials`). worst: least safety value.
+
+    unsafe_upper: Clopper-Pearson bound on the probability of an unsafe run; radius: the largest discrepancy in any of the runs, which a
+    new run exceeds with probability at most epsilon; each at `beta`. fixed: n was fixed beforehand. left_out: why -> runs.
+    logs: heads of the chains of the logs that they were taken from.
+    """
+
+    n: int
+    unsafe: int
+    unsafe_upper: float
+    worst: float
+    radius: float
+    epsilon: float
+    beta: float
+    fixed: bool
+    left_out: dict[str, int]
+    logs: tuple[str, ...]
+    controller_digest: str
+    task_digest: str
+    model_digest: str
+
+
 class CertificateFacts(Struct, frozen=True):
     """What the gate compares. Taken from a certificate whose signature was verified when it was loaded."""
 

@@ -9,7 +9,7 @@ import math
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 
 from s2r_runtime.core.ledger import spent
-from s2r_runtime.messages import Gap, LawResult, Verification
+from s2r_runtime.messages import Gap, LawResult, Trials, Verification
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Driving
 
@@ -17,7 +17,14 @@ ASSUMED = "rests on an assumption that the user made"
 
 
 def shown(
-    robot: str, model: ModelSpec, task: str, gap: Gap, verification: Verification, budget: float, assumption: str = ""
+    robot: str,
+    model: ModelSpec,
+    task: str,
+    gap: Gap,
+    verification: Verification,
+    budget: float,
+    assumption: str = "",
+    trials: Trials | None = None,
 ) -> tuple[str, ...]:
     """The statements G1 to G4 and G8 of this evidence. budget: beta of the robot's life. assumption: one that the user made.
 
@@ -35,6 +42,21 @@ def shown(
             f"{bound(verification.beta)} of beta = {budget:g}; the epochs and attempts up to these spent "
             f"{bound(spent(budget, gap.epoch, verification.attempt))} of it, and all there will ever be spend no more than all of it."
         ),
+        *(() if trials is None else (of_trials(trials),)),
+    )
+
+
+def of_trials(t: Trials) -> str:
+    """The statement G9."""
+    number = "their number was fixed beforehand" if t.fixed else "their number counts as fixed without looking at what came of them"
+    out = sum(t.left_out.values())
+    return (
+        f"Trials (G9). Of {t.n} closed-loop runs of this controller on the robot, each scenario drawn from where the one before had ended, "
+        f"{t.unsafe or 'none'} were unsafe (the least safety value {worst(t.worst)}); {number}, and {out or 'no'} others were left out. If "
+        f"they are independent draws of one law, then with confidence {confidence(t.beta)} a new run is unsafe with probability at most "
+        f"{bound(t.unsafe_upper)} (Clopper-Pearson), and with confidence {confidence(t.beta)} its largest discrepancy "
+        f"exceeds {bound(t.radius)} with probability at most {bound(t.epsilon)}. These confidences are no part of the budget above; with "
+        "the others they add."
     )
 
 
@@ -47,8 +69,8 @@ def assumption(driving: Driving) -> str:
     )
 
 
-def not_shown(gap: Gap, verification: Verification, horizon: int = 0) -> tuple[str, ...]:
-    """What nobody may read into it. horizon: steps of the task (0: not said)."""
+def not_shown(gap: Gap, verification: Verification, horizon: int = 0, *, trials: bool = False) -> tuple[str, ...]:
+    """What nobody may read into it. horizon: steps of the task (0: not said). trials: whether there were any."""
     run = ""
     if horizon > 1:
         once = 1.0 - (1.0 - gap.epsilon) ** horizon
@@ -86,7 +108,11 @@ def not_shown(gap: Gap, verification: Verification, horizon: int = 0) -> tuple[s
             "The controller is taken to be a function of the state, the scenario and its parameters: what depends on time, memory, data "
             "files or how many rollouts it is shown at once is not covered."
         ),
-        "No closed-loop trials of this controller on the robot (G9) are part of it.",
+        (
+            "The trials (G9) are of the robot as it was then, in the scenarios that it met: nothing is said of other starts, or of later."
+            if trials
+            else "No closed-loop trials of this controller on the robot (G9) are part of it."
+        ),
     )
 
 

@@ -21,6 +21,7 @@ from s2r_runtime.core.ledger import binomial_tail, campaign_size, sample_size, s
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, S2RError
 from s2r_runtime.messages import Gap, LawResult, Verification
 from s2r_runtime.profile import Profile, parse_profile
+from s2r_runtime.trials import Found, Run, trials
 
 PROFILE = """
 [robot]
@@ -249,11 +250,11 @@ def test_expired_and_not_yet_issued_are_refused_with_the_seconds(good: Evidence)
 
 
 def test_another_schema_is_said_to_be_one(good: Evidence) -> None:
-    newer = certificate.sign(msgspec.structs.replace(good.issue(), schema=2), KEY)
-    with pytest.raises(ConfigError, match="certificate schema 2, this version reads 1"):
+    newer = certificate.sign(msgspec.structs.replace(good.issue(), schema=3), KEY)
+    with pytest.raises(ConfigError, match="certificate schema 3, this version reads 2"):
         certificate.load(newer, [PUBLIC])
-    with_new_field = newer.replace(b'"schema":2', b'"schema":2,"weather":"fine"')
-    with pytest.raises(ConfigError, match="certificate schema 2, this version reads 1"):
+    with_new_field = newer.replace(b'"schema":3', b'"schema":3,"weather":"fine"')
+    with pytest.raises(ConfigError, match="certificate schema 3, this version reads 2"):
         certificate.load(with_new_field, [PUBLIC])
 
 
@@ -400,3 +401,19 @@ def test_the_counts_that_pass_are_the_least_that_carry_the_statement(good: Evide
     good.with_gap(hold_periods=1, n=sample_size(0.03, good.gap.beta)).issue()  # without a hold gap r has the whole share
     with pytest.raises(S2RError):
         good.with_gap(hold_periods=1, n=sample_size(0.03, good.gap.beta) - 1).issue()
+
+
+def test_a_certificate_carries_trials_of_its_own_controller_only_and_says_them(good: Evidence) -> None:
+    without = good.issue()
+    digests = {"controller_digest": without.controller_digest, "task_digest": without.task_digest, "model_digest": without.model_digest}
+    told = trials(Found([(Run(0, 0, 3, 0.5, discrepancy=0.001), True)] * 299), **digests, beta=0.05)
+    carrying = good.issue(trials=told)
+    assert any(line.startswith("Trials (G9)") for line in carrying.shown)
+    assert not any("No closed-loop trials" in line for line in carrying.not_shown)
+    assert any("No closed-loop trials" in line for line in without.not_shown)
+    assert carrying.id != without.id
+    with pytest.raises(ConfigError, match="the trials are of another controller"):
+        good.issue(trials=msgspec.structs.replace(told, controller_digest="other"))
+    for wrong in ({"unsafe_upper": 0.001}, {"epsilon": 0.001}, {"unsafe": 300}, {"n": 0}, {"radius": -1.0}):
+        with pytest.raises(NotEnoughEvidence, match="the trials do not carry their statement"):
+            good.issue(trials=msgspec.structs.replace(told, **wrong))

@@ -26,6 +26,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         help="a campaign's MCAP; or a drive, if the profile vouches for blocks of it ([driving])",
     )
     verb.add_argument("-o", "--output", type=Path, required=True, metavar="CERT")
+    verb.add_argument(
+        "--trials", type=Path, action="append", default=[], metavar="LOG", help="closed-loop runs of it, from this log; may be repeated"
+    )
     verb.add_argument("--model", metavar="MODEL.toml", help="a repaired model instead of the profile's")
     verb.add_argument("--key", type=Path, metavar="FILE", help="signing key (default: the user's; make one with s2r keys new)")
     verb.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the controller; may be repeated")
@@ -40,6 +43,7 @@ def run(args: argparse.Namespace) -> int:
     from s2r_runtime.bounds import attempt_beta, epoch_beta
     from s2r_runtime.canonical import digest
     from s2r_runtime.cli.evidence import gap_of, print_verification, profile_model, run_verification
+    from s2r_runtime.cli.trials_verb import trials_of
     from s2r_runtime.daemon import persistence
     from s2r_runtime.plugins import registry
 
@@ -52,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
         recording = digest(args.recording.read_bytes())
     except OSError as error:
         raise UsageError(f"{args.recording}: cannot be read: {error.strerror}") from None
+    trials = trials_of(args.trials, controller, model, profile) if args.trials else None
     ledger = offline_ledger.open_ledger(key_path, profile.robot.name)
     epoch = ledger.epoch_for(recording, model.spec.digest(), profile.digest())
     gap, assumption = gap_of(args.recording, model, profile, beta=epoch_beta(profile.guarantee.beta, epoch), epoch=epoch)
@@ -69,6 +74,7 @@ def run(args: argparse.Namespace) -> int:
             verification=result,
             issued_unix_s=int(time.time()),
             horizon=task.horizon,
+            trials=trials,
             assumption=assumption,
         )
         persistence.replace(args.output, certificate.sign(issued, key))
@@ -79,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
                 **answer,
                 "certificate": str(args.output) if result.passed else None,
                 "gap": gap,
+                "trials": trials,
                 "verified_radius": result.radius if result.passed else None,
                 "epoch": epoch,
                 "attempt": attempt,

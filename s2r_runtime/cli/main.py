@@ -20,7 +20,18 @@ from s2r_runtime.errors import NotEnoughEvidence, S2RError
 for _library in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_library, "1")  # the matrices here are small: threads of a linear algebra library only wait for each other
 
-GROUPS = ("demo", "daemon_verbs", "evidence", "trace_verb", "synthesize_verb", "certify", "log_verbs", "plugin_verb", "setup_verbs")
+GROUPS = (
+    "demo",
+    "daemon_verbs",
+    "evidence",
+    "trace_verb",
+    "synthesize_verb",
+    "certify",
+    "trials_verb",
+    "log_verbs",
+    "plugin_verb",
+    "setup_verbs",
+)
 """Modules of this package, each with `add(verbs)` and its functions `run(args) -> int`. Nothing heavy is imported at the top."""
 
 

@@ -1,0 +1,185 @@
+"""Closed-loop runs on the robot: which count, how safe they were, what their number shows, and that a certificate can carry it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from daemon_rig import Rig
+
+from s2r_runtime import messages as m
+from s2r_runtime.bounds import clopper_pearson_upper
+from s2r_runtime.controllers.episodes import Episodes
+from s2r_runtime.errors import NotEnoughEvidence
+from s2r_runtime.models.unicycle import MODEL as UNICYCLE
+from s2r_runtime.statements import of_trials
+from s2r_runtime.tasks.stl_task import StlTask
+from s2r_runtime.trials import Found, Run, _Deployment, _judged, _left_out, _within, trials
+
+TASK = """name = "stl"
+episodes = 6
+[task.parameters]
+horizon = 0.99
+metric = "always (abs(theta) < 1.5)"
+progress = "none"
+"""
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    """Six scenarios of a controller that turns on the spot, and too far in the last ones."""
+    rig = Rig(tmp_path_factory.mktemp("trials"))
+    rig.profile.write_text(rig.profile.read_text().replace('name = "grid_world"\n', TASK))
+    try:
+        rig.start_robot()
+        rig.start()
+        rig.until(lambda: rig.status()["observation"])
+        assert rig.deploy(rig.controller())["exit_code"] == 0
+        rig.until(lambda: rig.status()["scenarios"] >= 6)
+        assert rig.stop() == 0
+        yield rig
+    finally:
+        rig.close()
+
+
+def trials_of(rig: Rig, *more: str) -> Any:
+    return rig.s2r("trials", "controller.py", *map(str, rig.log_files()), "--profile", "rig.toml", "--json", *more)
+
+
+def test_runs_are_judged_from_the_log_alone(driven: Rig) -> None:
+    done = trials_of(driven)
+    told = json.loads(done.stdout)
+    seen = {o.observation.seq: o.observation.x for o in driven.messages("event/observed") if isinstance(o, m.Observed)}
+    ended = [e for e in driven.messages("event/episode_ended") if isinstance(e, m.EpisodeEnded)]
+    sends = {s.obs_seq: s.source for s in driven.messages("out/send") if isinstance(s, m.Send)}
+    first = min(seq for seq, source in sends.items() if source == "controller")
+    asked = min(a.obs_seq for a in driven.messages("out/ask") if isinstance(a, m.Ask) and a.source == "controller")
+    starts = [asked + sum(e.steps for e in ended[:k]) for k in range(6)]
+    whole = [k for k in range(6) if starts[k] >= first]
+    safety = [min(1.5 - abs(seen[seq][2]) for seq in range(starts[k], starts[k] + ended[k].steps + 1)) for k in whole]
+    assert len(ended) == 6
+    assert told["n"] == len(whole) >= 5
+    assert told["worst"] == pytest.approx(min(safety))
+    assert told["unsafe"] == sum(value < 0.0 for value in safety) > 0
+    assert done.returncode == 1
+    assert [e.safety for e in ended][whole[0] :] == pytest.approx(safety)
+    measured = {x.obs_seq: x.discrepancy for x in driven.messages("event/measured") if isinstance(x, m.Measured) and not x.fault}
+    assert told["radius"] == max(d for seq, d in measured.items() if starts[whole[0]] < seq <= starts[5] + ended[5].steps)
+    assert told["unsafe_upper"] == pytest.approx(clopper_pearson_upper(told["unsafe"], told["n"], 0.5))
+    assert told["epsilon"] == pytest.approx(1.0 - 0.5 ** (1.0 / told["n"]))
+
+
+def test_a_number_that_was_fixed_beforehand_is_held(driven: Rig) -> None:
+    told = json.loads(trials_of(driven, "-n", "2").stdout)
+    assert (told["n"], told["fixed"], told["unsafe"]) == (2, True, 0)
+    assert "their number was fixed beforehand" in told["statement"]
+    short = trials_of(driven, "-n", "50")
+    assert short.returncode == 3
+    assert "50 are needed" in short.stdout + short.stderr
+
+
+def test_runs_of_another_controller_count_for_nothing(driven: Rig) -> None:
+    driven.controller("    return np.tile([0.0, 0.4], (len(x), 1))\n", "other.py")
+    done = driven.s2r("trials", "other.py", *map(str, driven.log_files()), "--profile", "rig.toml")
+    assert done.returncode == 3
+    assert "0 runs of this controller count" in done.stderr
+
+
+def test_a_log_that_was_changed_gives_no_trials(driven: Rig, tmp_path: Path) -> None:
+    data = bytearray(driven.log_files()[0].read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "changed.mcap").write_bytes(data)
+    done = driven.s2r("trials", "controller.py", str(tmp_path / "changed.mcap"), "--profile", "rig.toml")
+    assert done.returncode == 78
+    assert "does not hold, so no trials are taken from it" in done.stderr
+
+
+# ---------------------------------------------------------------- what counts
+
+
+def deployment(seed: int = 1) -> _Deployment:
+    one = StlTask({"horizon": 0.3, "metric": "always (x < 1)", "progress": "none"}, UNICYCLE, 0.1)
+    return _Deployment("controller", seed, "model", Episodes(one, seed))
+
+
+def drive(now: _Deployment, sources: list[str], x: float = 0.0, first: int = 0) -> None:
+    """One observation a step; the source that answers each."""
+    for seq, source in enumerate(sources, first):
+        command = m.Command(seq, seq, "controller", (0.0, 0.0), seq, 1)
+        _within(now, m.Proposed(seq, command), {seq: (x, 0.0, 0.0)})
+        _within(now, m.Send(seq, seq, source, (0.0, 0.0), seq, 1), {})  # type: ignore[arg-type]
+
+
+def judged(now: _Deployment, used: set[tuple[int, int]] | None = None) -> list[tuple[str, bool]]:
+    taken = set[tuple[int, int]]() if used is None else used
+    return [(_left_out(run, now, "controller", "model", taken), run.closed or run.safety < 0.0) for run in _judged(now)]
+
+
+def test_a_run_in_which_the_gate_closed_is_unsafe_and_one_that_began_closed_is_left_out() -> None:
+    now = deployment()
+    drive(now, ["controller"] * 3 + ["controller", "recovery", "recovery"] + ["recovery", "controller", "controller"] + ["controller"])
+    assert judged(now) == [
+        ("", False),
+        ("", True),
+        ("not driven by the controller from its start", False),
+        ("cut short by a person or the end of the log, safe so far", False),
+    ]
+
+
+def test_a_run_that_is_cut_short_counts_if_it_was_unsafe_or_the_controller_failed() -> None:
+    now = deployment()
+    drive(now, ["controller"] * 2, x=2.0)
+    assert judged(now) == [("", True)]
+    now = deployment()
+    drive(now, ["controller"] * 2)
+    _within(now, m.SourceStopped(9, "controller", "raised", "no idea"), {})
+    assert judged(now) == [("", True)]
+    now = deployment()
+    drive(now, ["controller"] * 2)
+    _within(now, m.SourceStopped(9, "controller", "stopped"), {})
+    assert judged(now) == [("cut short by a person or the end of the log, safe so far", False)]
+
+
+def test_scenarios_of_one_seed_count_once() -> None:
+    used: set[tuple[int, int]] = set()
+    again = []
+    for seed in (1, 1, 2):
+        now = deployment(seed)
+        drive(now, ["controller"] * 4)
+        again.append(judged(now, used)[0][0])
+    assert again == ["", "the same scenario as an earlier run (same seed)", ""]
+
+
+def test_299_safe_runs_show_one_percent_at_most() -> None:
+    found = Found([(Run(i, 4 * i, 4 * i + 3, 0.5 + i, discrepancy=0.001 * (i % 7)), True) for i in range(299)])
+    digests = {"controller_digest": "c", "task_digest": "t", "model_digest": "m"}
+    told = trials(found, **digests, beta=0.05)
+    assert told.unsafe_upper <= 0.01
+    assert told.epsilon == pytest.approx(told.unsafe_upper)
+    assert (told.worst, told.radius) == (0.5, 0.006)
+    assert "Of 299 closed-loop runs" in of_trials(told)
+    with pytest.raises(NotEnoughEvidence, match="1 are needed"):
+        trials(Found(), **digests, beta=0.05)
+
+
+def test_both_bounds_of_trials_keep_their_confidence() -> None:
+    """n runs from a known law, 4000 times: misses at most beta (exact lower limit of 99.9 %)."""
+    from s2r_runtime.bounds import clopper_pearson_lower
+
+    rng, repetitions, n, beta, p = np.random.default_rng(5), 4000, 60, 0.1, 0.07
+    digests = {"controller_digest": "c", "task_digest": "t", "model_digest": "m"}
+    missed = np.zeros(2, dtype=int)
+    for _ in range(repetitions):
+        unsafe, d = rng.random(n) < p, rng.random(n)
+        found = Found(
+            [(Run(i, i, i, -1.0 if bad else 1.0, discrepancy=float(v)), not bad) for i, (bad, v) in enumerate(zip(unsafe, d, strict=True))]
+        )
+        told = trials(found, **digests, beta=beta)
+        missed += [told.unsafe_upper < p, 1.0 - told.radius > told.epsilon]
+    for count in missed:
+        assert clopper_pearson_lower(int(count), repetitions, 1e-3) <= beta
+    assert missed[1] > 0.5 * beta * repetitions
