@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from s2r_runtime.bounds import anytime_upper
+from s2r_runtime.core import stream
 from s2r_runtime.gap import discrepancy, residuals, statement
 from s2r_runtime.messages import Gap, Settings
 from s2r_runtime.modelspec import ModelSpec
@@ -226,11 +228,39 @@ def _driving(page: Page, story: Story) -> None:
             plots.series({"e-value": (t, np.maximum(rows[:, 2], 1e-12), plots.INK)}, "s", "e-value", "e-value over time", log=True),
             "Evidence that the gap is exceeded too often; an alarm at 1/α.",
         )
+        _watched(page, story)
     if story.episodes:
         page.table(
             ("scenario", "steps", "safety value", "progress", ""),
             [(e.index, e.steps, f"{e.safety:+.3f}", f"{e.progress:.3f}", e.detail) for e in story.episodes],
         )
+
+
+def _watched(page: Page, story: Story) -> None:
+    """What driving shows of itself, by bounds that hold however often one looks (guarantee G5)."""
+    seen = [(epoch, gap, stood) for epoch, (gap, stood) in story.watched.items() if stood.n]
+    if not seen or story.settings is None:
+        return
+    alpha = story.settings.alpha
+    quantiles = {epoch: stream.quantile(stood.counts, gap.radius, gap.epsilon, alpha) for epoch, gap, stood in seen}
+    page.table(
+        ("epoch", "discrepancies", "above r", "share above r is at most", "all but ε are at most", "change", "of one law"),
+        [
+            (
+                epoch,
+                stood.n,
+                stood.exceedances,
+                f"{anytime_upper(stood.exceedances, stood.n, alpha):.3g}",
+                "-" if quantiles[epoch] is None else f"{quantiles[epoch]:.4g} ({gap.epsilon:g})",
+                f"{stood.change:.3g} of {story.settings.run_length:g}",
+                "refuted" if stood.exchange >= 1.0 / alpha else f"{stood.exchange:.3g} of {1.0 / alpha:g}",
+            )
+            for epoch, gap, stood in seen
+        ],
+    )
+    page.text(
+        f"The two bounds hold with confidence {1.0 - alpha:g} each, at all times at once. They found no gap: driving is not independent."
+    )
 
 
 def _path(page: Page, story: Story, settings: Settings) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from s2r_runtime import messages as m
+from s2r_runtime.core import stream
 
 KEPT_POINTS = 60_000
 """Path and discrepancy points kept; a longer log is thinned by halves, so memory stays flat."""
@@ -60,6 +61,8 @@ class Story:
     """(t, state, whether the certified controller drives)"""
     discrepancies: Thinned = field(default_factory=Thinned)
     """(t, discrepancy, e-value, radius in force, verified radius)"""
+    watched: dict[int, tuple[m.Gap, m.WatchStood]] = field(default_factory=dict)
+    """epoch -> its gap, and where its watch stands at the end"""
     answers: list[tuple[float, str]] = field(default_factory=list)
     records: int = 0
     _driving: bool = False
@@ -96,12 +99,17 @@ def _take(story: Story, message: Any) -> None:
                 story.sources.append((story.seconds(t), source))
         case m.Measured(t_ns=t, fault="", discrepancy=d, e_value=e):
             story.discrepancies.add((story.seconds(t), d, e, story._radius, story._verified))
+            if message.epoch in story.watched:
+                gap, stood = story.watched[message.epoch]
+                story.watched[message.epoch] = (gap, stream.after(stood, message, gap.radius))
         case m.Decided(allow=False, reason=reason):
             story.refusals[reason] = story.refusals.get(reason, 0) + 1
         case m.SampleTaken(epoch=epoch):
             story.samples.setdefault(epoch, []).append(message)
         case m.Started(unix_s=unix_s, settings=settings, memory=memory):
             story.settings, story.started_unix_s, story._radius = settings, unix_s, memory.radius
+            if memory.gap is not None:
+                story.watched[memory.gap.epoch] = (memory.gap, stream.stood(memory))
         case m.GateChanged(t_ns=t, open=is_open, reason=reason):
             story.gate.append((story.seconds(t), is_open, reason))
         case m.EpisodeEnded():
@@ -119,6 +127,7 @@ def _take_decision(story: Story, message: Any) -> None:
             mark(f"campaign of epoch {epoch} begins")
         case m.EpochChanged(epoch=epoch, gap=m.Gap() as gap):
             story.gaps.append(gap)
+            story.watched[epoch] = (gap, m.WatchStood())
             story._radius = gap.radius
             mark(f"gap of epoch {epoch}: {gap.radius:.4g}")
         case m.AttemptSpent(attempt=attempt, radius=radius):
