@@ -7,9 +7,8 @@ Order  taken if 0 < s - S <= AHEAD + PACE (a - A). Lower: old (late, repeated, r
        stamps, one second at least.
 Age    s was made at the host's time base + rate s, at the latest; age = a - (base + rate s) is what the message took beyond the fastest.
        Of every moment (0.4 s) the least delayed (s, a) is kept. rate: median slope between the last six of them; 1 where it is within 2 %
-       of that, a simulator's otherwise. base: the least a - rate s of the last minute (of the last six moments for a simulator's, whose
-       rate wanders). No clocks are set against each other: a delay that all messages share, and one that lasts for a minute, can't be
-       seen.
+       of that, a simulator's otherwise. base: the least a - rate s of the last ten seconds (of the last six moments for a simulator's,
+       whose rate wanders). No clocks are set against each other: a delay that all messages share, and one that lasts, can't be seen.
 """
 
 from __future__ import annotations
@@ -30,7 +29,8 @@ MOMENT_NS = 400_000_000
 FOR_RATE = 6
 FEWEST = 3
 """Moments before ages are judged."""
-MOMENTS = 150
+MOMENTS = 25
+"""Ten seconds: a stall that is longer is a lost link, and a simulator that was paused is believed again after as long."""
 SAME = 0.02
 
 

@@ -132,3 +132,25 @@ def test_ages_are_not_judged_before_there_is_something_to_compare_with() -> None
     clock.take(0, 0)
     clock.take(1, 900_000_000)
     assert clock.age_ns(1, 900_000_000) == 0.0
+
+
+def test_burst_after_a_stall_is_told_from_fresh_poses_and_a_pause_is_believed_after_ten_seconds() -> None:
+    clock = RobotClock(SECOND // 2)
+    for k in range(200):
+        clock.take(k * SECOND // 20, k * SECOND // 20 + 2_000_000)
+    now = 10 * SECOND + 800_000_000  # nothing came for 0.8 s, then all at once
+    ages = []
+    for k in range(200, 216):
+        assert clock.take(k * SECOND // 20, now + k) == "taken"
+        ages.append(clock.age_ns(k * SECOND // 20, now + k))
+    assert ages[0] == pytest.approx(800e6, abs=5e6)
+    assert ages[-1] == pytest.approx(50e6, abs=5e6)
+    paused = 5 * SECOND
+    late = []
+    for k in range(216, 600):
+        a = k * SECOND // 20 + paused + 2_000_000
+        assert clock.take(k * SECOND // 20, a) == "taken"
+        late.append(clock.age_ns(k * SECOND // 20, a) > 300e6)
+    assert late[0]
+    assert 8.0 < sum(late) / 20 < 12.0
+    assert not any(late[-100:])
