@@ -26,6 +26,10 @@ NEAREST = 0.08
 """Of the recording: slides by less than this leave slow things in place."""
 
 
+TWICE = 2.0
+"""Times the evidence of the best slide: where slides have much, so has whatever wanders, and the next slide may have more."""
+
+
 @dataclass(frozen=True)
 class Evidence:
     """log: largest log evidence; ridge: the 1/tau^2 that has it."""
@@ -42,8 +46,9 @@ def evidence(product: Array, slope: Array) -> Evidence:
 
 
 def margin(white: Array, z: Array, weight: Array, least: float) -> float:
-    """Nats by which the evidence exceeds that of every slide of the residual; 0 if it is below `least`. white: (n, nx, m) whitened
-    terms; z, weight: (n, nx).
+    """Nats by which the evidence exceeds that of every slide of the residual; 0 if it is below `least`, or not clearly above.
+
+    white: (n, nx, m) whitened terms; z, weight: (n, nx).
     """
     n, m = len(z), white.shape[2]
     x, push = white.reshape(-1, m), z * weight
@@ -53,7 +58,8 @@ def margin(white: Array, z: Array, weight: Array, least: float) -> float:
     slid = np.stack([push.ravel(), *(np.roll(push, int(k), axis=0).ravel() for k in shifts)], axis=1)
     values, vectors = np.linalg.eigh(product)
     told, _ = _evidences(values, vectors.T @ (x.T @ slid), product)
-    return float(told[0] - max(float(np.max(told[1:])), 0.0)) if told[0] > least else 0.0
+    chance = max(float(np.max(told[1:])), 0.0)
+    return float(told[0] - chance) if told[0] > max(least, TWICE * chance) else 0.0
 
 
 def _evidences(values: Array, along: Array, product: Array) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.evidence import evidence, margin
 from s2r_runtime.trace.fitting import Fit, Problem
+from s2r_runtime.trace.fitting import gain as explained
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
 from s2r_runtime.trace.residual import acting, residual, rms, rollout, rollout_starts, state_jacobian
 from s2r_runtime.trace.residual_noise import Colour, Whitener
@@ -52,17 +53,28 @@ ADDS = 0.1
 MATTERS = 0.05
 """Structure counts if taking it up lowers some rollout error by this share."""
 
-SLIDING = ("constant", "time")
+SLIDING = ("constant", "time", "wave")
 """What slides along with the residual, so that sliding tells nothing."""
 
-SLOW = 3.0
-"""Times the usual nats for those: noise that wanders foretells the next second well, whatever its cause."""
+SLOWLY, SLOW = ("constant", "time"), 3.0
+"""Times the usual nats for those that are slow: noise that wanders foretells the next second well, whatever its cause."""
+
+CLIPPED = 10.0
+"""Standard deviations at which a wild value is cut off where it is not taken for an outlier."""
+
+MORE = 1.1
+"""Times what effects explain that a dictionary must explain, for them to be the wrong ones: with noise of its own, each is a little off."""
 
 BEYOND = 8.0
 """Nats by which the evidence must exceed that of every slide."""
 
+TOKENS = {"wave": "time"}
+
 MOST_GROUPS = 3
 """Groups that are named at most."""
+
+SKIPPED = 3
+"""Steps without a measured end over which structure is taken to be that of the last step before."""
 
 COLOURED = 0.2
 """Autoregression coefficient from which noise is called coloured."""
@@ -100,37 +112,76 @@ class _Judged:
 
 @dataclass(frozen=True)
 class _Left:
-    """What is to be explained. r: (n, nx); f: (n, nx, nx); block: (n,)."""
+    """What is to be explained. r: (n, nx); f: (n, nx, nx); block: (n,). clipped: (n, nx), whitened, wild values cut off but with the
+    weight of any other; None if there are none.
+
+    What shows only when an input jumps is wild, and few: weights would take it for outliers. Whether outliers have to do with the inputs
+    is told by sliding.
+    """
 
     given: Problem
     fit: Fit
     r: Array
     f: Array
     block: NDArray[np.int64]
+    clipped: Array | None
 
 
 def lack_of_fit(given: Problem, fit: Fit, nominal: Fit, horizon: int) -> Structure:
     """Structure left by `fit`; how much of what `nominal` leaves that is."""
-    act = acting(fit.model, given.data)
-    n = len(given.steps)
-    block = np.minimum(np.arange(n) * BLOCKS // n, BLOCKS - 1)
-    left = _Left(given, fit, residual(fit.model, given.steps, act), state_jacobian(fit.model, given.steps, act), block)
-    found = [(token, _columns(terms)) for token, terms in dictionaries(given, fit.model, act)]
-    found = [(token, x) for token, x in found if x.shape[2]]
+    left, found = _left_by(given, fit)
     chosen, gains = _forward(left, found) if found else ([], {})
     coloured = ("noise",) if np.any(fit.colour.strength > COLOURED) else ()
     if not chosen:
         return Structure(coloured, False, 0.0, gains)
     matters, share = _weight_of(left, nominal, chosen[-1], horizon)
-    tokens = tuple(dict.fromkeys(judged.token for judged in chosen))
+    tokens = tuple(dict.fromkeys(TOKENS.get(judged.token, judged.token) for judged in chosen))
     return Structure(tokens if matters else coloured, matters, share, gains)
+
+
+def explains_more(given: Problem, fit: Fit, nominal: Fit) -> tuple[str, ...]:
+    """What the nominal model's residual depends on, if a dictionary explains clearly more of it than the effects of `fit` do: then these
+    took up structure that is not theirs. Empty otherwise.
+    """
+    left, found = _left_by(given, nominal)
+    looked = _best_of_each(sorted(((_first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True), found)
+    judged = [_judge(left, found[i][0], _leading(left, found[i][1])) for _, i in looked[:FEW]]
+    best = max(judged, key=lambda j: j.gain)
+    return (best.token,) if best.gain > MORE * explained(fit, nominal) + ALIKE else ()
+
+
+def _left_by(given: Problem, fit: Fit) -> tuple[_Left, list[tuple[str, Array]]]:
+    """What a model leaves, and the dictionaries for it."""
+    act = acting(fit.model, given.data)
+    n = len(given.steps)
+    block = np.minimum(np.arange(n) * BLOCKS // n, BLOCKS - 1)
+    wild = np.any(np.abs(fit.z) > noises.OUTLIER)
+    left = _Left(
+        given,
+        fit,
+        residual(fit.model, given.steps, act),
+        state_jacobian(fit.model, given.steps, act),
+        block,
+        _clipped(fit.z) if wild else None,
+    )
+    found = [(token, _columns(terms)) for token, terms in dictionaries(given, fit.model, act, fit.noise)]
+    return left, [(token, x) for token, x in found if x.shape[2]]
+
+
+def _clipped(z: Array) -> Array:
+    """Cut off at CLIPPED, on a scale of at least 1."""
+    cut = np.clip(z, -CLIPPED, CLIPPED)
+    return np.asarray(cut / np.maximum(np.sqrt(np.mean(cut**2, axis=0)), 1.0))
 
 
 def _columns(terms: Sequence[Array]) -> Array:
     """Terms (n, nx) side by side on a scale of 1, (n, nx, m); those that vanish are dropped."""
-    x = np.stack(terms, axis=2)
-    size = np.sqrt(np.mean(x**2, axis=(0, 1)))
-    return np.asarray(x[:, :, size > 1e-12] / size[size > 1e-12])
+    table = np.array(terms)  # a column after the other in memory: whitening and products run along columns
+    size = np.sqrt(np.einsum("mki,mki->m", table, table) / table[0].size)
+    if np.any(size <= 1e-12):
+        table, size = table[size > 1e-12], size[size > 1e-12]
+    table /= size[:, None, None]
+    return np.asarray(table.transpose(1, 2, 0))
 
 
 def _forward(left: _Left, found: Sequence[tuple[str, Array]]) -> tuple[list[_Judged], dict[str, float]]:
@@ -142,7 +193,7 @@ def _forward(left: _Left, found: Sequence[tuple[str, Array]]) -> tuple[list[_Jud
     judged = [_judge(left, token, x) for token, x in terms]
     for j in judged:
         gains[j.token] = max(gains[j.token], j.gain)
-    strengths = [(_strength(left, j, threshold), j) for j in judged]
+    strengths = [_strength(left, j, threshold) for j in judged]
     strongest = max(strength for strength, _ in strengths)
     if strongest <= 0.0:
         return [], gains
@@ -159,14 +210,30 @@ def _forward(left: _Left, found: Sequence[tuple[str, Array]]) -> tuple[list[_Jud
     return chosen, gains
 
 
-def _strength(left: _Left, j: _Judged, threshold: float) -> float:
-    """Nats by which a dictionary is beyond chance, of whichever test shows it more clearly; 0 if neither does."""
-    needed = threshold * j.scatter * (SLOW if j.token in SLIDING else 1.0)
+def _strength(left: _Left, j: _Judged, threshold: float) -> tuple[float, _Judged]:
+    """Nats by which a dictionary is beyond chance, of whichever test shows it most clearly; 0 if none does. Where it is only sliding that
+    shows it, with its betas on all rows: what happens once, or in one place, is not foretold from elsewhere.
+    """
+    needed = threshold * j.scatter * (SLOW if j.token in SLOWLY else 1.0)
     foretold = j.gain if j.gain > needed else 0.0
     if j.token in SLIDING:
-        return foretold
-    out_of_reach = margin(left.fit.whiten(j.x), left.fit.z, noises.weight(left.fit.z), threshold)
-    return max(foretold, out_of_reach if out_of_reach > BEYOND else 0.0)
+        return foretold, j
+    white = left.fit.whiten(j.x)
+    ways = [(left.fit.z, noises.weight(left.fit.z))]
+    if left.clipped is not None:
+        ways.append((left.clipped, np.ones_like(left.clipped)))
+    beyond = [margin(white, z, weight, threshold) for z, weight in ways]
+    best = int(np.argmax(beyond))
+    if beyond[best] <= max(BEYOND, foretold):
+        return foretold, j
+    if foretold:
+        return beyond[best], j
+    weight = ways[best][1]
+    x, z = white.reshape(-1, white.shape[2]), np.clip(left.fit.z, -CLIPPED, CLIPPED).ravel()
+    weighted = x * weight.reshape(-1, 1)
+    product, slope = x.T @ weighted, weighted.T @ z
+    beta = np.linalg.solve(product + evidence(product, slope).ridge * np.eye(len(slope)), slope)
+    return beyond[best], replace(j, betas=np.tile(beta, (BLOCKS, 1)))
 
 
 def _best_of_each(looked: list[tuple[float, int]], found: Sequence[tuple[str, Array]]) -> list[tuple[float, int]]:
@@ -186,7 +253,8 @@ def _first_look(left: _Left, x: Array) -> float:
     white = left.fit.whiten(x).reshape(-1, x.shape[2])
     z = left.fit.z.ravel()
     weighted = white * noises.weight(z)[:, None]
-    return evidence(white.T @ weighted, weighted.T @ z).log
+    told = evidence(white.T @ weighted, weighted.T @ z).log
+    return told if left.clipped is None else max(told, evidence(white.T @ white, white.T @ left.clipped.ravel()).log)
 
 
 def _leading(left: _Left, x: Array) -> Array:
@@ -260,10 +328,11 @@ def _weight_of(left: _Left, nominal: Fit, judged: _Judged, horizon: int) -> tupl
     """Whether the structure shows in rollouts, and what share of all that the nominal model lacks it is."""
     data, steps, model = left.given.data, left.given.steps, left.fit.model
     act, act_nominal = acting(model, data), acting(nominal.model, data)
-    extra = np.zeros((len(act.mean), left.r.shape[1]))
-    extra[steps.place] = np.einsum("kim,km->ki", judged.x, judged.betas[left.block])
-    there = np.zeros(len(act.mean), dtype=bool)
-    there[steps.place] = True
+    last = np.maximum(
+        np.searchsorted(steps.place, np.arange(len(act.mean)), side="right") - 1, 0
+    )  # the step itself, or the last one before
+    extra = np.einsum("kim,km->ki", judged.x, judged.betas[left.block])[last]
+    there = np.arange(len(act.mean)) - steps.place[last] <= SKIPPED
     matters, worst, share = False, 1.0 + MATTERS, 0.0
     for ahead in sorted({1, max(1, horizon // 4), horizon}):
         starts = rollout_starts(data, ahead, within=there)

@@ -7,14 +7,17 @@ Small dictionaries stand beside larger ones of the same group: with few data the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.fitting import Problem
-from s2r_runtime.trace.residual import Acting
+from s2r_runtime.trace.residual import Acting, Steps, residual
+from s2r_runtime.trace.residual_noise import Noise
 
 Array = NDArray[np.float64]
 Terms = list[Array]
@@ -31,11 +34,26 @@ LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)
 PATCHES = 5
 """Along each axis of the region: what lies on a part of the floor is then seen if the part is a fifth of it."""
 
+LONGEST = 65_536
+"""Steps up to which a spectrum is looked at."""
+
+FINER, FLOOR = 4, 25
+"""Points of a spectrum for each of its own; how many of these make a neighbourhood."""
+
+LINE = 25.0
+"""Times its neighbourhood by which a line must stand out: of 10 000 points of white noise, the highest is about 10."""
+
+WIDEST = 30
+"""Steps to each side over which states are averaged at most."""
+
+PLAYS = (0.05, 0.1, 0.2, 0.4, 0.8)
+"""Widths of plays, as shares of the largest input."""
+
 VELOCITIES = ("speed", "vx", "vy", "qd", "wheel_left", "wheel_right")
 
 
-def dictionaries(given: Problem, model: ComposedModel, act: Acting) -> Iterator[tuple[str, Terms]]:
-    """(token, terms (n, nx) each)."""
+def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise) -> Iterator[tuple[str, Terms]]:
+    """(token, terms (n, nx) each); `wave`: a line in the spectrum, which depends on time, and does not wander."""
     steps = given.steps
     body, world = _directions(given, model, act)
     u = act.mean[steps.place]
@@ -47,6 +65,7 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting) -> Iterator[
     for j, name in enumerate(model.inputs):
         yield from ((name, _push(terms, body)) for terms in _static(u[:, j]))
         yield from ((f"memory({name})", _push(terms, body)) for terms in _memory(act.mean[:, j] / size[j], steps.place))
+        yield from ((f"memory({name})", _push(terms, body)) for terms in _bent_memory(act.mean[:, j] / size[j], steps.place))
         yield f"time*{name}", _push([t * u[:, j]], body)
         slow = [f(np.pi * k * t) * u[:, j] for k in range(1, 7) for f in (np.sin, np.cos)]
         yield f"time*{name}", _push([t * u[:, j], *slow], body)
@@ -55,11 +74,62 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting) -> Iterator[
             pair = [u[:, i] * u[:, j], np.abs(u[:, i]) * u[:, j], u[:, i] * np.abs(u[:, j]), np.abs(u[:, i] * u[:, j])]
             yield f"{model.inputs[i]}*{name}", _push(pair, body)
     pushes = [u[:, j][:, None] * own for j, own in enumerate(_own(given, model, act))]
-    for name, terms, directions in _of_states(model, steps.y0, u, body, world, pushes):
+    for name, terms, directions in _of_states(model, quieter(steps, noise), u, body, world, pushes):
         yield name, terms if directions is None else _push(terms, directions)
     yield "time", _push([one, t], [*body, *world])
     yield "time", _push([one, *(f(2.0 * np.pi * k * t) for k in (0.5, 1.0, 1.5, 2.0) for f in (np.sin, np.cos))], [*body, *world])
     yield "time", _push([one, *(np.where(t > s, one, 0.0) for s in np.linspace(0.1, 0.9, 9))], body)
+    r = residual(model, steps, act)
+    for directions in (body, world):
+        yield from (("wave", _push(terms, directions)) for terms in _hum(r, given, directions))
+
+
+def quieter(steps: Steps, noise: Noise) -> Array:
+    """(n, nx) states at the start of steps, each the mean of its neighbours over the time in which noise of the process grows to that of
+    the measurement. A residual has the error of its own first state in it, with the other sign: terms in that very state would find it.
+    """
+    first = np.flatnonzero(~steps.joined)
+    edges = np.append(first, len(steps))
+    number = np.repeat(first, np.diff(edges)), np.repeat(edges[1:], np.diff(edges))
+    y = steps.y0.copy()
+    for i, wide in enumerate(np.sqrt(noise.r / noise.q)):
+        half = int(min(wide, WIDEST))
+        if half:
+            total = np.concatenate([[0.0], np.cumsum(steps.y0[:, i])])
+            reach = np.minimum(np.minimum(np.arange(len(y)) - number[0], number[1] - 1 - np.arange(len(y))), half)
+            at = np.arange(len(y))
+            y[:, i] = (total[at + reach + 1] - total[at - reach]) / (2 * reach + 1)
+    return y
+
+
+def _hum(r: Array, given: Problem, directions: Terms) -> Iterator[Terms]:
+    """A wave of the one frequency at which the residual has a line in its spectrum, if it has one. r: (n, nx)."""
+    dt, steps = given.data.dt, given.steps
+    place = np.rint((steps.t - steps.t[0]) / dt).astype(np.int64)
+    if not directions or place[-1] >= LONGEST:
+        return
+    series = np.zeros((int(place[-1]) + 1, len(directions)))
+    series[place] = np.stack([np.sum(r * d, axis=1) / np.maximum(np.sum(d * d, axis=1), 1e-300) for d in directions], axis=1)
+    frequency, height = line(series, dt)
+    if height > LINE:
+        yield [f(2.0 * np.pi * frequency * steps.t) for f in (np.sin, np.cos)]
+
+
+def line(series: Array, dt: float) -> tuple[float, float]:
+    """Frequency (Hz) at which the spectrum of a column of (n, c) stands out most from its neighbourhood, and how many times that is."""
+    padded = FINER * len(series)
+    power = np.abs(np.fft.rfft(series - series.mean(axis=0), padded, axis=0)) ** 2
+    first, wide = 2 * FINER, FLOOR * FINER
+    if len(power) < 2 * wide:
+        return 0.0, 0.0
+    edges = np.linspace(first, len(power), max((len(power) - first) // wide, 1) + 1).astype(int)
+    middles = 0.5 * (edges[:-1] + edges[1:])
+    levels = np.array([np.median(power[a:b], axis=0) for a, b in pairwise(edges.tolist())]) / math.log(2.0)
+    at = np.arange(first, len(power))
+    floor = np.stack([np.interp(at, middles, column) for column in levels.T], axis=1)
+    ratio = power[first:] / np.maximum(floor, 1e-300)
+    k, c = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
+    return float((k + first) / (padded * dt)), float(ratio[k, c])
 
 
 def _static(u: Array) -> Iterator[Terms]:
@@ -79,6 +149,23 @@ def _memory(u: Array, place: NDArray[np.int64]) -> Iterator[Terms]:
     yield [*terms, *means]
     heat = [_mean_before(u * u, place, width) for width in (30, 100, 300, 1000)]
     yield [*(h * u[place] for h in heat), *(h * u[place] ** 3 for h in heat[:1])]
+
+
+def _bent_memory(u: Array, place: NDArray[np.int64]) -> Iterator[Terms]:
+    """Memory that is not linear: slower one way than the other, slower when there is more of it; and play, which holds where it is."""
+    behind = [u[np.maximum(place - lag, 0)] - u[place] for lag in (1, 2, 4, 8, 16, 32)]
+    yield [*behind, *(np.abs(d) for d in behind), *(d * np.abs(u[place]) for d in behind)]
+    yield [(_play(u, width) - u)[place] for width in PLAYS]
+
+
+def _play(u: Array, width: float) -> Array:
+    """u behind a play of this width: it follows only when it is taken along."""
+    behind, half = [], 0.5 * width
+    now = 0.0
+    for value in u.tolist():
+        now = min(max(now, value - half), value + half)
+        behind.append(now)
+    return np.array(behind)
 
 
 def _mean_before(u: Array, place: NDArray[np.int64], width: int) -> Array:

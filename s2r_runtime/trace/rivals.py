@@ -19,7 +19,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset, Run
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, scatter, without
 from s2r_runtime.trace.residual import acting, steps_of
-from s2r_runtime.trace.scores import Scored, best_candidates, name_of
+from s2r_runtime.trace.scores import Scored, best_candidates, limited, name_of
 
 Array = NDArray[np.float64]
 
@@ -49,8 +49,8 @@ def rivals(given: Problem, fit: Fit) -> list[Scored]:
         mine = name_of(fit.model.effects[place])
         base = fitted(given, fit, without(fit.model, place), 1)
         here = gain(fit, base)
-        for s in best_candidates(given, base, FITTED)[0]:
-            if s.fit is None or (s.name, s.channel) == mine or gain(s.fit, base) < here - close:
+        for s in best_candidates(given, base, FITTED, against=here - close)[0]:
+            if s.fit is None or (s.name, s.channel) == mine or not limited(s.fit) or gain(s.fit, base) < here - close:
                 continue
             if s.fit.k <= fit.k or rich is None or rich.apart(s.fit.model, fit.model) > ALIKE * rich.apart(fit.model, base.model):
                 found.append(s)

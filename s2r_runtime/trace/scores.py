@@ -16,7 +16,7 @@ from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain
 from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.screening import Screened, screen
-from s2r_runtime.trace.slots import Added
+from s2r_runtime.trace.slots import Added, bounds_of, values_of
 
 FEW = 10
 """Effects that are fitted as composed models, after screening."""
@@ -24,8 +24,16 @@ FEW = 10
 PLACES = 2
 """Places in the list of effects that are fitted of one candidate."""
 
-HOPELESS, HOPELESS_SHARE = 2.0, 0.05
+HOPELESS, HOPELESS_SHARE = 2.0, 0.2
 """A candidate that screening gives fewer nats, or less than this share of the best one's, is not fitted."""
+
+FAR = 100.0
+"""Bounds beyond it are there for form's sake: no robot's parameter is near them."""
+
+REACHES = 0.3
+"""Of what another model explains: a candidate that screening gives less will not come up to it. Of 114 that did best once they were
+fitted, one had been given less than this share of what the best at first sight had.
+"""
 
 
 @dataclass(frozen=True)
@@ -61,11 +69,13 @@ LENIENT = Bar(0.3, 1.5)
 """For where structure is shown already."""
 
 
-def best_candidates(given: Problem, base: Fit, few: int = FEW, bar: Bar = STRICT) -> tuple[list[Scored], int]:
-    """The candidates for one more effect, fitted, best score first; and how many starts were looked at."""
+def best_candidates(given: Problem, base: Fit, few: int = FEW, bar: Bar = STRICT, against: float = 0.0) -> tuple[list[Scored], int]:
+    """The candidates for one more effect, fitted, best score first; and how many starts were looked at. against: nats of gain that
+    they must come up to.
+    """
     screened, tried = screen(given, base, candidates(base.model, given.data, Leftover(given, base)))
     scored: dict[tuple[str, str], Scored] = {}
-    promising = _promising(screened, few)
+    promising = _promising(screened, few, REACHES * against)
     for s in promising:
         fit = fitted(given, base, s.start, 2)
         value = gain(fit, base) - bar.price(fit.k - base.k, len(given.steps))
@@ -83,18 +93,33 @@ def rescored(found: Sequence[Scored], base: Fit, n: int, bar: Bar) -> list[Score
     return sorted(again, key=lambda s: (s.fit is None, -s.score))
 
 
-def _promising(screened: Sequence[Screened], few: int) -> list[Screened]:
-    """The best of so many (effect, channel), each at its two best places in the list."""
+def _promising(screened: Sequence[Screened], few: int, least: float) -> list[Screened]:
+    """The best of so many (effect, channel), each at its two best places in the list; least: nats."""
     kept: list[Screened] = []
     places: dict[tuple[str, str], int] = {}
     for s in screened:
         key = s.candidate.name, s.candidate.channel
-        if s.value <= max(HOPELESS, HOPELESS_SHARE * screened[0].value) or (key not in places and len(places) == few):
+        if s.value <= max(HOPELESS, least, HOPELESS_SHARE * screened[0].value) or (key not in places and len(places) == few):
             break
         places[key] = places.get(key, 0) + 1
         if places[key] <= PLACES:
             kept.append(s)
     return kept
+
+
+def limited(fit: Fit) -> bool:
+    """False if a number has run off to its bound: friction without limit says that nothing moves, not why; and a curve of several
+    numbers, one of which it had to give up, is not that curve.
+    """
+    ends = [bounds_of(fit.model, slot) for slot in fit.free]
+    for slot, v, p in zip(fit.free, values_of(fit.model, fit.free).tolist(), ends, strict=True):
+        if (v >= 0.99 * p.high and p.high >= FAR) or (v <= 0.99 * p.low and p.low <= -FAR):
+            return False
+        effect = fit.model.effects[slot.place].effect
+        several = sum(other.place == slot.place for other in fit.free) > 1
+        if several and v == p.neutral and v in (p.low, p.high) and not getattr(effect, "additive", False):
+            return False
+    return True
 
 
 def names(model: ComposedModel) -> tuple[tuple[str, str], ...]:

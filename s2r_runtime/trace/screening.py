@@ -64,7 +64,7 @@ def screen(given: Problem, base: Fit, found: Sequence[Candidate]) -> tuple[list[
     best: dict[tuple[str | int, ...], Screened] = {}  # one for each set of parameters: more of them may do no better at the start
     for chunk in _chunks(probes):
         moved = [predicted(m, given.steps, acting(m, given.data)) - before for probe in chunk for m in probe.models]
-        columns = base.whiten(np.stack(moved, axis=2)).reshape(aside.z.size, -1)
+        columns = base.whiten(np.array(moved).transpose(1, 2, 0)).reshape(aside.z.size, -1)
         at = 0
         for probe in chunk:
             c = columns[:, at : at + len(probe.models)]

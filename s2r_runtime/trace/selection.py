@@ -30,7 +30,7 @@ from s2r_runtime.trace.fitting import (
 )
 from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
 from s2r_runtime.trace.rivals import CLOSE, rivals
-from s2r_runtime.trace.scores import STRICT, Bar, Scored, best_candidates, name_of, names, rescored
+from s2r_runtime.trace.scores import STRICT, Bar, Scored, best_candidates, limited, name_of, names, rescored
 from s2r_runtime.trace.slots import bounds_of, values_of, with_values
 
 Array = NDArray[np.float64]
@@ -38,14 +38,14 @@ Array = NDArray[np.float64]
 RELEVANT = 0.05
 """An effect that lowers no rollout error by this share is left out: nobody would notice it."""
 
-FAR = 100.0
-"""Bounds beyond it are there for form's sake: no robot's parameter is near them."""
-
 WITHIN = 0.4
 """Of a step: what stamps off the grid can look like."""
 
 MOST = 5
 """Effects that are looked for at most."""
+
+EXCHANGED = 3
+"""Effects up to which earlier ones are asked again whether another would do better: that takes a round for each."""
 
 BLOCKS = 5
 """Of the cross-validation."""
@@ -75,24 +75,23 @@ def select(
     bar: Bar = STRICT,
     before: Selection | None = None,
 ) -> Selection:
-    """The effects that the transitions call for. before: what was selected with another bar; its first round is not fitted again."""
+    """The effects that the transitions call for. before: what was selected with another bar, from which it goes on."""
     nominal = evaluate(given, model) if before is None else before.nominal
-    fit, tried = nominal, 0
-    ranking: list[Scored] = []
-    for step in range(MOST):
-        if before is not None and not step:
-            found, columns = rescored(before.ranking, nominal, len(given.steps), bar), before.tried
+    fit, tried = (nominal, 0) if before is None else (before.fit, before.tried)
+    ranking = [] if before is None else list(before.ranking)
+    for step in range(MOST - len(fit.added)):
+        if ranking and not fit.added:
+            found, columns = rescored(ranking, nominal, len(given.steps), bar), tried
         else:
             found, columns = best_candidates(given, fit, bar=bar)
         tried = max(tried, columns)
-        if not ranking:
-            ranking = found
+        ranking = ranking or found
         progress(0.1 + 0.6 * (step + 1) / (MOST + 1))
         chosen = next((s.fit for s in found if s.fit is not None and accepted(given, s.fit, fit, tried, horizon, bar)), None)
         if chosen is None:
             break
         chosen = fitted(given, chosen, chosen.model)
-        fit = exchanged(given, chosen, bar) if len(chosen.added) > 1 else chosen
+        fit = exchanged(given, chosen, bar) if 1 < len(chosen.added) <= EXCHANGED else chosen
     fit = pruned(given, fit, tried, horizon, bar)
     progress(0.8)
     return Selection(nominal, fit, tried, tuple(ranking), tuple(rivals(given, fit)))
@@ -101,19 +100,10 @@ def select(
 def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int, bar: Bar = STRICT) -> bool:
     """Significant and relevant."""
     return (
-        _limited(fit)
+        limited(fit)
         and significant(given, fit, base, tried, bar)
         and _told_by_stamps(given, fit, base)
         and relevant(given, fit, base, horizon)
-    )
-
-
-def _limited(fit: Fit) -> bool:
-    """False if a number has run off to its bound: friction without limit says that nothing moves, not why."""
-    ends = [bounds_of(fit.model, slot) for slot in fit.free]
-    return all(
-        (v < 0.99 * p.high or p.high < FAR) and (v > 0.99 * p.low or p.low > -FAR)
-        for v, p in zip(values_of(fit.model, fit.free).tolist(), ends, strict=True)
     )
 
 
@@ -191,7 +181,7 @@ def exchanged(given: Problem, fit: Fit, bar: Bar) -> Fit:
     """Replaces an earlier effect where another one does better beside the later ones: the first choice was made without them."""
     for place in fit.added[:-1]:
         base = fitted(given, fit, without(fit.model, place), 1)
-        found, _ = best_candidates(given, base, 4, bar)
+        found, _ = best_candidates(given, base, 4, bar, gain(fit, base))
         best = found[0].fit if found else None
         if best is not None and gain(best, fit) > bar.price(best.k - fit.k, len(given.steps)) + CLOSE:
             fit = fitted(given, best, best.model)

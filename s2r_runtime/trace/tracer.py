@@ -30,7 +30,7 @@ from s2r_runtime.trace.faults import Checked, check
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, problem
 from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.intervals import intervals
-from s2r_runtime.trace.lack_of_fit import Structure, lack_of_fit
+from s2r_runtime.trace.lack_of_fit import Structure, explains_more, lack_of_fit
 from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.residual import Mask, first_steps, rms, steps_of
@@ -216,7 +216,10 @@ def _structure(checked: Checked, chosen: Selection, horizon: int) -> Structure:
     """Of what the chosen model leaves, over all of the recording: a test needs no data that the fit never saw."""
     everything = part(checked.data, checked.left_out, np.ones(first_steps(checked.data)[-1], dtype=bool), STRUCTURE_STEPS)
     given = problem(everything.data, everything.steps)
-    return lack_of_fit(given, evaluate(given, chosen.fit.model), evaluate(given, chosen.nominal.model), horizon)
+    fit, nominal = evaluate(given, chosen.fit.model), evaluate(given, chosen.nominal.model)
+    found = lack_of_fit(given, fit, nominal, horizon)
+    instead = explains_more(given, fit, nominal) if found.matters and fit.added else ()
+    return replace(found, tokens=instead, share=1.0) if instead else found
 
 
 def _new(fit: Fit, other: Fit) -> list[int]:
