@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Protocol, Self
 
 import pytest
 
+from s2r_runtime.daemon import transport_values
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import Transport
 from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
@@ -21,6 +22,8 @@ PATIENCE_S = 10.0
 """How long anything may take that takes milliseconds on an idle machine."""
 PERIOD_NS = 10_000_000
 """Between two observations of the kit's robot, by its own clock."""
+CALL_S = 0.005
+"""Half of a 100 Hz robot's period."""
 COUNTERS = ("received", "sent", "dropped_in", "dropped_out", "malformed", "lost")
 
 
@@ -329,6 +332,36 @@ class TransportKit:
         counters = bench.transport.counters()
         assert set(COUNTERS) <= set(counters)
         assert all(isinstance(value, int) and value >= 0 for value in counters.values())
+
+    # ------------------------------------------------------------------ the daemon's door
+
+    def test_what_it_gives_is_what_the_daemon_takes(self, bench: Rig, line: Line) -> None:
+        """Of the right types, not stamped in the future: anything else closes the gate and names the plug-in."""
+        transport_values.descriptor(line.transport.fileno())
+        transport_values.frames(line.frames, time.monotonic_ns())
+        transport_values.link_changes(line.transport.poll(time.monotonic_ns()))
+        make: Any = type(bench.transport)
+        again = make(bench.options, bench.states, bench.inputs)
+        assert any(transport_values.decoded(again, frame, len(bench.states)) for frame in line.frames)
+        command = Command(1, line.good[-1].stamp_ns, "recovery", (0.0,) * len(bench.inputs), line.good[-1].seq, 80_000_000)
+        transport_values.outbound(line.transport.encode(command))
+        assert transport_values.counters(line.transport.counters()) == line.transport.counters()
+
+    def test_no_call_waits(self, bench: Rig, line: Line) -> None:
+        """They are called from the loop that runs the gate. The median, as this machine may be busy."""
+        command = Command(1, line.good[-1].stamp_ns, "recovery", (0.0,) * len(bench.inputs), line.good[-1].seq, 80_000_000)
+        took: dict[str, list[float]] = {"receive": [], "poll": [], "send": []}
+        for _ in range(50):
+            begin = time.monotonic()
+            line.transport.receive()
+            received = time.monotonic()
+            line.transport.poll(time.monotonic_ns())
+            polled = time.monotonic()
+            line.transport.send(line.transport.encode(command))
+            sent = time.monotonic()
+            for name, seconds in zip(took, (received - begin, polled - received, sent - polled), strict=True):
+                took[name].append(seconds)
+        assert {name: sorted(all_)[25] for name, all_ in took.items() if sorted(all_)[25] > CALL_S} == {}
 
     # ------------------------------------------------------------------ the end
 
