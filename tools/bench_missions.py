@@ -24,6 +24,7 @@ import resource
 import sys
 import time
 from collections.abc import Iterator
+from copy import copy
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,7 +48,7 @@ from s2r_runtime.profile import load_profile
 from s2r_runtime.uncertain import GapSet
 from s2r_runtime.verify import verify_in_detail
 from s2r_runtime.watch import ChangeDetector, ConformalTest, EProcess
-from s2r_runtime.watch.exceedance import GRID, grid, stake, unstaked
+from s2r_runtime.watch.exceedance import GRID, grid
 
 Array = NDArray[np.float64]
 
@@ -116,15 +117,31 @@ class Watches:
     def __init__(self, m: int, epsilon: float) -> None:
         p = np.array(grid(epsilon))
         self._factors = np.array([(1.0 - p) / (1.0 - epsilon), p / epsilon])
-        self.won, self.n = np.zeros((m, GRID)), 0
+        self.won, self.n, self.exceedances = np.zeros((m, GRID)), np.zeros(m, dtype=np.int64), np.zeros(m, dtype=np.int64)
+
+    def begin(self, row: int) -> None:
+        """A gap came into force there."""
+        self.won[row], self.n[row], self.exceedances[row] = 0.0, 0, 0
+
+    def of(self, rows: NDArray[np.int64]) -> Watches:
+        """Those of some missions, to go on with; `put` brings them back."""
+        some = copy(self)
+        some.won, some.n, some.exceedances = self.won[rows], self.n[rows], self.exceedances[rows]
+        return some
+
+    def put(self, rows: NDArray[np.int64], some: Watches) -> None:
+        """Takes them back."""
+        self.won[rows], self.n[rows], self.exceedances[rows] = some.won, some.n, some.exceedances
 
     def update(self, exceeds: NDArray[np.bool_]) -> Array:
         """(m,) e-values after one more sample each."""
         self.n += 1
-        self.won += stake(self.n) / GRID
+        self.exceedances += exceeds
+        log_n, log_next = np.log(self.n), np.log1p(self.n)
+        self.won += (np.log1p(1.0 / self.n) / ((1.0 + log_n) * (1.0 + log_next)) / GRID)[:, None]
         self.won *= self._factors[exceeds.astype(np.intp)]
         np.minimum(self.won, self.LIMIT, out=self.won)
-        return np.asarray(unstaked(self.n) + self.won.sum(axis=1))
+        return np.asarray(1.0 / (1.0 + log_next) + self.won.sum(axis=1))
 
 
 # ---------------------------------------------------------------- missions
@@ -138,19 +155,17 @@ def missions(m: int, samples: int, rho: float, seed: int, *, change: bool) -> Ro
     failure = {"bad 1": TOO_BAD * settings.epsilon, "bad 2": TOO_BAD * settings.epsilon, "good": 0.0}
     lives = [Life(settings, model, rng, dict(failure)) for _ in range(m)]
     scales: list[dict[int, float]] = [{} for _ in lives]
-    for index, life in enumerate(lives):
-        certify(life, z, index, 1.0, scales[index])
+    watches = Watches(m, settings.epsilon)
+    for index in range(m):
+        certify(lives, z, watches, index, 1.0, scales[index])
     certified = sum(life.certified for life in lives)
-    drive(lives, z, samples // 2, 1.0, settings)
-    scale = GROWN if change else 1.0
+    drive(lives, z, watches, samples // 2, 1.0, settings)
     if change:
-        drive(lives, z, samples // 4, scale, settings)
+        drive(lives, z, watches, samples // 4, GROWN, settings)
         for index, life in enumerate(lives):
             if life.gap is None:
-                certify(life, z, index, scale, scales[index])
-        drive(lives, z, samples - samples // 2 - samples // 4, scale, settings)
-    else:
-        drive(lives, z, samples - samples // 2, scale, settings)
+                certify(lives, z, watches, index, GROWN, scales[index])
+    drive(lives, z, watches, samples - samples // 2 - (samples // 4 if change else 0), GROWN if change else 1.0, settings)
     false = sum(
         life.false_certificates(lambda r, epoch, own=own: violation(r, own[epoch])) > 0 for life, own in zip(lives, scales, strict=True)
     )
@@ -168,9 +183,9 @@ def missions(m: int, samples: int, rho: float, seed: int, *, change: bool) -> Ro
     )
 
 
-def certify(life: Life, z: Autoregression, index: int, scale: float, scales: dict[int, float]) -> None:
+def certify(lives: list[Life], z: Autoregression, watches: Watches, index: int, scale: float, scales: dict[int, float]) -> None:
     """Campaigns until one founds a gap, then controllers until one passes."""
-    row = np.array([index])
+    life, row = lives[index], np.array([index])
     for _ in range(CAMPAIGNS):
         n = life.begin_campaign()
         scales[life.state.memory.epochs] = scale
@@ -178,10 +193,11 @@ def certify(life: Life, z: Autoregression, index: int, scale: float, scales: dic
             break
     else:
         return
+    watches.begin(index)
     any(life.deploy(controller) for controller in CONTROLLERS)
 
 
-def drive(lives: list[Life], z: Autoregression, samples: int, scale: float, settings: Settings) -> None:
+def drive(lives: list[Life], z: Autoregression, watches: Watches, samples: int, scale: float, settings: Settings) -> None:
     """All that hold a certificate drive; whatever changes something for a core is told to it when it happens."""
     driving = [index for index, life in enumerate(lives) if life.certified and life.gap is not None]
     if not driving:
@@ -189,17 +205,16 @@ def drive(lives: list[Life], z: Autoregression, samples: int, scale: float, sett
     rows = np.array(driving)
     r = np.array([lives[i].gap.radius for i in driving])  # type: ignore[union-attr]
     top = np.array([lives[i].state.memory.radius for i in driving])
-    watches, exceeded, alive = Watches(len(driving), settings.epsilon), np.zeros(len(driving), dtype=np.int64), np.ones(len(driving), bool)
-    bar = 1.0 / settings.alpha
+    some, alive, bar = watches.of(rows), np.ones(len(driving), dtype=bool), 1.0 / settings.alpha
     for begin in range(0, samples, BLOCK):
         d = np.abs(z.draw(min(BLOCK, samples - begin), rows)) * scale
         above = d > r[:, None]
         for k in range(d.shape[1]):
-            e = watches.update(above[:, k])
-            exceeded += above[:, k]
+            e = some.update(above[:, k])
             for j in np.flatnonzero(alive & ((d[:, k] > top) | (e >= bar))):
-                lives[driving[j]].measured(float(d[j, k]), float(e[j]), begin + k + 1, int(exceeded[j]))
+                lives[driving[j]].measured(float(d[j, k]), float(e[j]), int(some.n[j]), int(some.exceedances[j]))
                 top[j], alive[j] = max(top[j], d[j, k]), e[j] < bar
+    watches.put(rows, some)
 
 
 # ---------------------------------------------------------------- naive versions, which must be caught
