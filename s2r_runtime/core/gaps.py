@@ -214,11 +214,18 @@ def _counted(turn: Turn, event: Measured, gap: Gap) -> None:
     doubled since, so that a daemon that is killed forgets less than a factor of two of it.
     """
     now = stream.after(stream.stood(turn.memory), event, gap.radius)
-    changes = {f"watch_{name}": value for name, value in msgspec.structs.asdict(now).items()}
+    changed = msgspec.structs.replace(
+        turn.memory,
+        watch_n=now.n,
+        watch_exceedances=now.exceedances,
+        watch_e_value=now.e_value,
+        watch_change=now.change,
+        watch_exchange=now.exchange,
+        watch_counts=now.counts,
+    )
+    turn.set(memory=changed)
     if event.e_value >= 2.0 * max(1.0, turn.state.saved_e_value):
-        turn.remember(**changes)
-    else:
-        turn.set(memory=msgspec.structs.replace(turn.memory, **changes))
+        turn.remember()
 
 
 def _alarm(turn: Turn, event: Measured, gap: Gap) -> None:
