@@ -6,9 +6,9 @@ most k of the N are >= q, and each of them is so with probability at least eps:
 
     P[V(r) > eps] <= P(Bin(N, eps) <= k) = sum_{i<=k} C(N, i) eps^i (1-eps)^(N-i) = betainc(N-k, k+1, 1-eps)        (G1)
 
-with equality where the law is continuous; for k = 0 it is (1-eps)^N (paper, theorem 2). For other k these are Wilks' tolerance limits (1941),
-and the scenario approach with discarded constraints for one decision variable (Campi & Garatti 2011) without its combinatorial factor, since
-which are discarded is no choice here. The least of N safety values is the same bound with the sign turned round (G2; paper, corollary 2).
+with equality where the law is continuous; for k = 0 it is (1-eps)^N (paper, theorem 2). For other k these are Wilks' tolerance limits
+(1941), and the scenario approach with k discarded constraints for one decision variable, where its factor C(k+d-1, k) is 1 (Campi & Garatti
+2011). The least of N safety values is the same bound with the sign turned round (G2; paper, corollary 2).
 
 Clopper-Pearson (1934). f failures in n independent runs: the failure probability is at most u with confidence 1-beta, where u solves
 P(Bin(n, u) <= f) = beta; so u = betaincinv(f+1, n-f, 1-beta), and 1 if every run failed. The lower limit mirrors it.
