@@ -198,6 +198,25 @@ def test_an_impossible_law_is_refused_where_it_is_drawn() -> None:
         task(scenario={"goal_x": "1 / (x - x)", "post_x": 1.0}).draw(np.random.default_rng(1), 3)
 
 
+@pytest.mark.parametrize("law", ["uniform", "persistent", "adversarial"])
+@pytest.mark.parametrize("name", ["unicycle", "differential_drive", "bicycle", "double_integrator", "joint"])
+def test_every_law_disturbs_every_model_within_the_gap(name: str, law: str) -> None:
+    """Without an input the model's own motion is known, so what is left is the disturbance."""
+    model = compose(ModelSpec(name, DT))
+    first, nx = model.states[0], len(model.states)
+    one = StlTask({"horizon": 2.0, "metric": f"always ({first} < 5)", "progress": "none"}, model.nominal, DT)
+    gap = GapSet("box" if name == "joint" else "ball", tuple(1.0 + 0.5 * k for k in range(nx)), 0.02, 0.1, 10)
+    found = roll_out(lambda x, theta: np.zeros((len(x), len(model.inputs))), one, model, gap, law, np.random.default_rng(4), 30, keep=30)
+    for path in found.paths:
+        foretold = np.array([model.step(x[None], np.zeros((1, len(model.inputs))), model.at_rest(1))[0][0] for x in path[:-1]])
+        d = path[1:] - foretold
+        for column in model.angle_columns:
+            d[:, column] = (d[:, column] + np.pi) % (2.0 * np.pi) - np.pi
+        assert np.max(gap.norm(d)) <= 0.02 * (1.0 + 1e-9)
+    drift = np.abs([path[-1] - path[0] for path in found.paths]).max()
+    assert drift > 0.02
+
+
 # ---------------------------------------------------------------- in a profile
 
 

@@ -117,6 +117,11 @@ def positive(text: str) -> float:
     return value
 
 
+def not_negative(text: str) -> float:
+    """argparse type: a finite number >= 0."""
+    return 0.0 if text.strip("0.") == "" and "0" in text else positive(text)
+
+
 def count(text: str) -> int:
     """argparse type: a whole number >= 0."""
     if not text.isdecimal():

@@ -10,7 +10,17 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import add_model_options, chosen_model, controller_at, count, load_checked, positive, probability, weights_of
+from s2r_runtime.cli.choices import (
+    add_model_options,
+    chosen_model,
+    controller_at,
+    count,
+    load_checked,
+    not_negative,
+    positive,
+    probability,
+    weights_of,
+)
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
 
 if TYPE_CHECKING:
@@ -49,7 +59,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     verify.add_argument("--profile", type=Path, required=True, metavar="P")
     verify.add_argument("--model", metavar="MODEL.toml", help="a repaired model instead of the profile's")
     size = verify.add_mutually_exclusive_group(required=True)
-    size.add_argument("--radius", type=positive, metavar="R", help="radius of the gap set")
+    size.add_argument("--radius", type=not_negative, metavar="R", help="radius of the gap set (0: the model as it is)")
     size.add_argument("--recording", type=Path, metavar="REC", help="take radius and hold gap from this campaign")
     verify.add_argument(
         "--hold-radius",
