@@ -122,6 +122,11 @@ BROKEN = {
         "@hookimpl\ndef s2r_transports():\n    return [Offer('bare', 'bare.plugin:Bare')]\n"
         "class Bare:\n    OPTIONS = {}\n    def __init__(self, options, states, inputs): pass"
     ),
+    "halves": (
+        "from s2r_runtime.hookspecs import Offer, hookimpl\n"
+        "@hookimpl\ndef s2r_models():\n    return [Offer('half', 'halves.plugin:NOWHERE')]\n"
+        "@hookimpl\ndef s2r_effects():\n    return [Offer('other_half', 'no_such_package:EFFECT')]"
+    ),
     "dies": (
         "from s2r_runtime.hookspecs import Offer, hookimpl\nimport os\n"
         "@hookimpl\ndef s2r_models():\n    return [Offer('dies', 'dies.plugin:MODEL')]\n"
@@ -176,6 +181,8 @@ def test_list_says_what_is_wrong_with_each_and_the_others_are_in_use(site: Path)
         ("zenho", 78, "did you mean 'zenoh'?"),
         ("exits", 78, "plug-in 'exits' of exits-dist is not in use: SystemExit: I am a script"),
         ("bare", 1, "no kit is offered for it, so nothing was checked"),
+        ("halves", 1, "model 'half' of halves-dist cannot be loaded: AttributeError: module 'halves.plugin' has no attribute 'NOWHERE'"),
+        ("halves", 1, "effect 'other_half' of halves-dist cannot be loaded: ModuleNotFoundError: No module named 'no_such_package'"),
         ("dies", 1, "the kits did not come to an end (models dies: "),
     ],
 )

@@ -15,6 +15,10 @@ from typing import Any, NamedTuple
 from s2r_runtime.cli import output, plugin_files
 from s2r_runtime.errors import PluginError, UsageError, one_line
 
+TEST_FILE = """
+from s2r_runtime.testing.offered import kits
+globals().update({f"TestOffer{number}": kit for number, kit in enumerate(kits(%r))})
+"""
 CHECK_S = 900.0
 """For a plug-in with many offers on a busy machine; the built-in ones take a tenth of a minute."""
 
@@ -107,25 +111,27 @@ def plugin_check(args: argparse.Namespace) -> int:
 def _checked(plugin: str) -> tuple[list[Row], str]:
     """What the kits found, and why they did not come to an end (empty if they did). Raises UsageError without pytest."""
     with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder, "found.jsonl")
+        out, tests = Path(folder, "found.jsonl"), Path(folder, "test_offers.py")
         out.touch()
+        tests.write_text(TEST_FILE % plugin, encoding="utf-8")
+        argv = [sys.executable, "-m", "pytest", "-q", "-c", "/dev/null", "-p", "no:cacheprovider", "-p", "s2r_runtime.testing.offered"]
+        argv += ["--rootdir", folder, "--basetemp", str(Path(folder, "tmp")), str(tests)]
         environment = {name: value for name, value in os.environ.items() if name != "PYTEST_ADDOPTS"}
-        argv = [sys.executable, "-m", "s2r_runtime.testing.offered", plugin, str(out)]
         try:
             ran = subprocess.run(
                 argv,
-                env={**environment, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"},
+                env={**environment, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "S2R_CHECK_OUT": str(out)},
                 capture_output=True,
                 text=True,
                 timeout=CHECK_S,
                 check=False,
                 stdin=subprocess.DEVNULL,
             )
-            code, said = ran.returncode, ran.stderr
+            code, said = ran.returncode, ran.stderr or ran.stdout
         except subprocess.TimeoutExpired:
             code, said = -1, f"the kits did not end within {CHECK_S:g} s"
         lines = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]
-    if not lines and "No module named 'pytest'" in said:
+    if not lines and "No module named pytest" in said.replace("'", ""):
         raise UsageError("s2r plugin check needs pytest: pip install pytest")
     why = one_line(said.strip().splitlines()[-1] if said.strip() else f"exit code {code}")
     end = "" if code in (0, 1) and lines else f"the kits did not come to an end{_open(lines)}: {why}"

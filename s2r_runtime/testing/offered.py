@@ -1,5 +1,6 @@
-"""Runs the kit of everything that one plug-in offers: `python -m s2r_runtime.testing.offered PLUGIN OUT`, a process of its own, as what is
-tried may crash or hang. OUT gets one JSON line a test, so that what was found is there however it ends.
+"""Tries everything that one plug-in offers: a pytest plug-in, for the process that `s2r plugin check` starts, as it may crash or hang.
+
+S2R_CHECK_OUT names a file that gets one JSON line a test, so that what was found is there however it ends.
 
     transports             the kits that the plug-in offers (hook `s2r_kits`): nobody else has its robot's end
     models, effects, tasks the same, or a kit on values of its own
@@ -9,9 +10,7 @@ tried may crash or hang. OUT gets one JSON line a test, so that what was found i
 from __future__ import annotations
 
 import json
-import re
-import sys
-import tempfile
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -46,10 +45,18 @@ class _NothingChecked:
         pytest.fail(NO_KIT, pytrace=False)
 
 
-def kits(plugin: str) -> dict[str, type]:
-    """Row of the table (`transports my_bus`) -> the class that tries it. Raises what a broken plug-in raises."""
+class _Cannot:
+    why: str
+
+    def test_its_kit_can_be_made(self) -> None:
+        """Nothing checked is no pass."""
+        pytest.fail(self.why, pytrace=False)
+
+
+def kits(plugin: str) -> list[type]:
+    """The classes that try what it offers, each with its `row` of the table (`transports my_bus`). Raises what a broken plug-in raises."""
     (loaded,) = (p for p in registry().loaded if p.name == plugin)
-    found: dict[str, type] = {}
+    found: list[type] = []
     given = loaded.offers.get("kits", ())
     for kind, names in loaded.offers.items():
         if kind == "kits":
@@ -57,11 +64,13 @@ def kits(plugin: str) -> dict[str, type]:
         for name in names:
             loads = type("Loads", (_Loads,), {"kind": kind, "offered": name})
             own = [kit for kit in given if kit == f"{kind}.{name}" or kit.startswith(f"{kind}.{name}.")]
-            for kit in own:
-                row = " ".join([kind, name, *kit[len(f"{kind}.{name}") :].split(".")]).rstrip()
-                found[re.sub(" +", " ", row)] = type("Kit", (loads, registry().get("kits", kit)), {})
-            if not own:
-                found[f"{kind} {name}"] = type("Kit", (loads, *_default(kind, name)), {})
+            rows = [" ".join([kind, name, *filter(None, kit[len(f"{kind}.{name}") :].split("."))]) for kit in own] or [f"{kind} {name}"]
+            for row, kit in zip(rows, own or [""], strict=True):
+                try:
+                    bases = (registry().get("kits", kit),) if kit else _default(kind, name)
+                    found.append(type("Kit", (loads, *bases), {"row": row}))
+                except Exception as error:  # noqa: BLE001 - what an author's modules raise is what there is to say
+                    found.append(type("Kit", (loads, _Cannot), {"row": row, "why": f"{type(error).__name__}: {error}"}))
     return found
 
 
@@ -115,11 +124,22 @@ def _third(effect: Any, without: tuple[str, ...]) -> dict[str, Any]:
     return values
 
 
-class _Reports:
-    """Writes a line as soon as a test is over."""
+def pytest_configure(config: pytest.Config) -> None:
+    """Registers the reports, if somebody wants them."""
+    if out := os.environ.get("S2R_CHECK_OUT"):
+        config.pluginmanager.register(_Reports(Path(out)))
 
-    def __init__(self, rows: list[str], out: Path) -> None:
-        self._rows, self._out = rows, out.open("w", encoding="utf-8")
+
+class _Reports:
+    """Writes a line as soon as a test begins, and one when it is over."""
+
+    def __init__(self, out: Path) -> None:
+        self._out = out.open("w", encoding="utf-8")
+        self._rows: dict[str, str] = {}
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        """The row of the table to which each belongs."""
+        self._rows = {item.nodeid: item.parent.obj.row for item in items if item.parent is not None}  # type: ignore[attr-defined]
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
         """It begins: if nothing follows, this is where it hung or crashed."""
@@ -132,38 +152,11 @@ class _Reports:
             self._say(report.nodeid, report.outcome, text)
 
     def _say(self, nodeid: str, outcome: str, text: str) -> None:
-        found = re.search(r"::TestOffer(\d+)::test_(.*)$", nodeid)
-        if found is not None:
-            what = found.group(2).replace("_", " ")
-            print(
-                json.dumps({"offer": self._rows[int(found.group(1))], "what": what, "outcome": outcome, "why": text}),
-                file=self._out,
-                flush=True,
-            )
+        what = nodeid.rpartition("::test_")[2].replace("_", " ")
+        print(json.dumps({"offer": self._rows[nodeid], "what": what, "outcome": outcome, "why": text}), file=self._out, flush=True)
 
 
 def _why(text: str) -> str:
-    """The line of a report that says what was wrong."""
+    """What a report says was wrong, in its first lines."""
     lines = [line[1:].strip() for line in text.splitlines() if line.startswith("E ")]
-    return (lines or text.strip().splitlines()[-1:] or [""])[0]
-
-
-TEST_FILE = """
-import sys
-from s2r_runtime.testing.offered import kits
-globals().update({f"TestOffer{number}": kit for number, kit in enumerate(kits(%r).values())})
-"""
-
-
-def main(plugin: str, out: str) -> int:
-    """Exit 0 if all passed."""
-    rows = list(kits(plugin))
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder, "test_offers.py")
-        file.write_text(TEST_FILE % plugin, encoding="utf-8")
-        quiet = ["-q", "-c", "/dev/null", "-p", "no:cacheprovider", "--rootdir", folder, "--basetemp", str(Path(folder, "tmp"))]
-        return int(pytest.main([*quiet, str(file)], plugins=[_Reports(rows, Path(out))]))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main(*sys.argv[1:3]))
+    return " ".join(lines[:3]) or (text.strip().splitlines() or [""])[-1]
