@@ -58,6 +58,25 @@ def test_states_on_rows_of_their_own_meet_on_those_of_the_rarest_but_not_across_
     assert not np.any((met.t > t[60]) & (met.t < t[79]))
 
 
+def test_a_state_between_the_others_stamps_is_brought_there_as_the_inputs_moved_it():
+    rng = np.random.default_rng(3)
+    t = 0.05 * np.arange(201)
+    w = rng.uniform(-2.0, 2.0, 101)  # held for a tenth of a second each, from the stamps of the position on
+    heading = np.interp(t, 0.1 * np.arange(102), np.concatenate([[0.0], np.cumsum(0.1 * w)]))
+    values = np.column_stack([np.cos(t), np.sin(t), heading])
+    values[1::2, :2] = np.nan
+    values[::2, 2] = np.nan
+    inputs = Stream(0.1 * np.arange(101), np.column_stack([np.zeros(101), w]))
+    straight, bent = (
+        complete(Stream(t, values)),
+        complete(Stream(t, values), inputs, lambda x, u: np.column_stack([u[:, 0], u[:, 0], u[:, 1]])),
+    )
+    assert np.allclose(bent.t, t[2:-1:2]), "on the stamps of two states, not of one"
+    true = np.interp(bent.t, t, heading)
+    assert np.allclose(bent.values[:, 2], true, atol=1e-9)
+    assert np.max(np.abs(straight.values[:, 2] - true)) > 0.01
+
+
 def test_steps_between_rows_that_are_rarer_than_the_model_s_are_taken_together():
     t = 0.1 * np.arange(300)
     data = from_streams(_model(0.05), [(Stream(t, _pose(t)), Stream(t, np.ones((300, 2))))], "here")

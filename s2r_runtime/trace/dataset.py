@@ -153,7 +153,7 @@ def from_streams(
     for states, inputs in segments:
         _check_same_clock(states, inputs, source)
     dt = model.dt
-    stretches = [part for states, inputs in segments for part in _split(states, inputs, dt)]
+    stretches = [part for states, inputs in segments for part in _split(states, inputs, model)]
     stretches = [part for part in stretches if len(part[0].t) >= 2]
     if not stretches:
         raise RecordingError(f"{source}: has no two rows on which a state was measured")
@@ -244,16 +244,24 @@ def _check_same_clock(states: Stream, inputs: Stream, source: str) -> None:
         )
 
 
-def _split(states: Stream, inputs: Stream, dt: float) -> list[tuple[Stream, Stream]]:
+def _split(states: Stream, inputs: Stream, model: ComposedModel) -> list[tuple[Stream, Stream]]:
     """At long silences."""
-    states = complete(fresh(states))
-    cut = np.flatnonzero(np.diff(states.t) > max(PAUSE_S, 200.0 * dt)) + 1
+    states = complete(fresh(states), inputs, lambda x, u: _rates(model, x, u))
+    cut = np.flatnonzero(np.diff(states.t) > max(PAUSE_S, 200.0 * model.dt)) + 1
     given = []
     for rows in np.split(np.arange(len(states.t)), cut):
         t = states.t[rows]
         if len(t):
             given.append((Stream(t, states.values[rows]), _received(inputs, t)))
     return given
+
+
+def _rates(model: ComposedModel, x: Array, u: Array) -> Array:
+    """What the nominal model makes of states (N, nx) and inputs, per s; zero for states that are set at once."""
+    nominal, h = model.nominal, 1e-3 * model.dt
+    rates = (nominal.step(x, u, h, nominal.parameters) - x) / h
+    rates[:, [model.states.index(name) for name in getattr(nominal, "reached", {})]] = 0.0
+    return rates
 
 
 def _received(inputs: Stream, t: Array) -> Stream:

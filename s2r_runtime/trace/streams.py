@@ -7,6 +7,7 @@ An input holds until the next one and is zero before the first. A value that is 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Rates = Callable[[Array, Array], Array]
+"""States (N, nx) and inputs (N, nu) -> what a model says of their change, per s."""
 
 ALIGNED = 0.02
 """A stamp this part of dt away from the grid counts as on it: stamps are printed with a few digits."""
@@ -42,16 +45,22 @@ class Stream:
     values: Array
 
 
-def complete(states: Stream) -> Stream:
-    """Rows on which every state is known, one a stamp (the last)."""
+def complete(states: Stream, inputs: Stream | None = None, rates: Rates | None = None) -> Stream:
+    """Rows on which every state is known, one a stamp (the last). rates: how fast states are to change under the inputs that are held; a
+    state on stamps of its own is then interpolated along that. A straight line would smooth what the inputs do, which looks like a delay.
+    """
     there = ~np.isnan(states.values)
     whole = there.all(axis=1)
     counts = there.sum(axis=0)
     if not counts.min(initial=len(states.t)) or np.count_nonzero(whole) >= TOGETHER * counts.min():
         return last_of_each(Stream(states.t[whole], states.values[whole]))
-    slow = there[:, int(np.argmin(counts))]
+    rare = np.flatnonzero(counts <= 1.1 * counts.min())
+    together = [np.count_nonzero((there[:, [j]] == there).mean(axis=0) > TOGETHER) for j in rare]
+    slow = there[:, int(rare[int(np.argmax(together))])]  # the stamps of most states, if several groups are about as rare
     t = states.t[slow]
     values = np.column_stack([_between(t, states.t[m], states.values[m, j]) for j, m in enumerate(there.T)])
+    if inputs is not None and rates is not None and len(inputs.t):
+        values = np.column_stack([_along(t, states.t[m], values, j, inputs, rates) for j, m in enumerate(there.T)])
     whole = ~np.isnan(values).any(axis=1)
     return last_of_each(Stream(t[whole], values[whole]))
 
@@ -65,6 +74,35 @@ def _between(at: Array, t: Array, values: Array) -> Array:
     usual = float(np.median(np.diff(t)))
     far = (apart > REACH * usual) & ~np.isin(at, t)
     return np.where(far | (at < t[0]) | (at > t[-1]), np.nan, np.interp(at, t, values))
+
+
+def _along(at: Array, t: Array, values: Array, j: int, inputs: Stream, rates: Rates) -> Array:
+    """Column j of values (N, c), interpolated linearly at `at` (N,) between its own stamps t (M,), bent as the inputs bend it.
+
+    Of neighbours a <= s <= b with w = (b - s)/(b - a): + w (what the inputs do from a to s) - (1 - w) (what they do from s to b).
+    """
+    right = np.clip(np.searchsorted(t, at), 1, max(len(t) - 1, 1))
+    if len(t) < 2:
+        return values[:, j]
+    before, after = at - t[right - 1], t[right] - at
+    own = (before <= 0.0) | (after <= 0.0)
+    edges = np.stack([at - np.maximum(before, 1e-9), at, at + np.maximum(after, 1e-9)], axis=1)
+    area = _area(inputs, edges.ravel()).reshape(*edges.shape, -1)
+    first, second = (area[:, k + 1] - area[:, k] for k in (0, 1))
+    known = np.nan_to_num(values)
+    moved_before = rates(known, first / np.maximum(before, 1e-9)[:, None])[:, j] * before
+    moved_after = rates(known, second / np.maximum(after, 1e-9)[:, None])[:, j] * after
+    share = after / np.maximum(before + after, 1e-300)
+    return np.where(own, values[:, j], values[:, j] + share * moved_before - (1.0 - share) * moved_after)
+
+
+def _area(inputs: Stream, at: Array) -> Array:
+    """Integral of what is held, up to each stamp, (N, nu)."""
+    values = held(inputs.values)
+    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values[:-1] * np.diff(inputs.t)[:, None], axis=0)])
+    last = np.searchsorted(inputs.t, at, side="right") - 1
+    i = np.maximum(last, 0)
+    return np.asarray(np.where(last[:, None] >= 0, total[i] + values[i] * (at - inputs.t[i])[:, None], 0.0))
 
 
 def last_of_each(stream: Stream) -> Stream:
@@ -216,11 +254,7 @@ def held_between(inputs: Stream, at: Array, parts: int) -> Array:
     if not len(values):
         return np.zeros(((len(at) - 1) * parts, values.shape[1]))
     edges = np.interp(np.arange((len(at) - 1) * parts + 1) / parts, np.arange(len(at)), at)
-    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values[:-1] * np.diff(inputs.t)[:, None], axis=0)])
-    last = np.searchsorted(inputs.t, edges, side="right") - 1
-    i = np.maximum(last, 0)
-    area = np.where(last[:, None] >= 0, total[i] + values[i] * (edges - inputs.t[i])[:, None], 0.0)
-    return np.asarray(np.diff(area, axis=0) / np.diff(edges)[:, None])
+    return np.asarray(np.diff(_area(inputs, edges), axis=0) / np.diff(edges)[:, None])
 
 
 def interpolated(states: Stream, dt: float, angles: list[int], spacing: float) -> Array:
