@@ -22,6 +22,7 @@ from s2r_runtime.daemon import hang_guard, robot_link
 from s2r_runtime.daemon.hang_guard import HangGuard, Hung
 from s2r_runtime.daemon.robot_link import RobotLink
 from s2r_runtime.daemon.transport_values import FRAMES_AT_ONCE
+from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged, Send
 
 GOOD = Observation(1, 1, (0.0, 0.0, 0.0))
@@ -187,6 +188,19 @@ def test_nothing_more_is_asked_of_a_transport_that_hung(
     assert (link.counters(), len(fake.asked)) == ({}, asked)
     assert link.lines() == [f"transport 'odd' of odd-dist 1.2: {call} did not return within 0.2 s; out of use until the daemon starts anew"]
     assert said == []
+
+
+def test_a_transport_that_cannot_be_opened_is_out_of_use_but_a_wrong_option_is_the_users(
+    link: RobotLink, fake: Fake, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake.given["open"] = ConfigError("transport.port is 0")
+    with pytest.raises(ConfigError, match="port is 0"):
+        link.open()
+    monkeypatch.setattr(robot_link, "OPEN_S", 0.2)
+    fake.given["open"] = lambda: time.sleep(60)
+    link.open()
+    assert [(m.up, m.detail) for m in link.poll(0)] == [(False, "transport: open did not return within 0.2 s")]
+    assert (link.fileno(), turn(link)) == (-1, [])
 
 
 def test_a_loop_in_python_is_interrupted_and_a_call_in_time_never_is(guard: HangGuard) -> None:

@@ -103,6 +103,8 @@ def test_check_runs_the_kit_of_what_is_offered(site: Site, kind: str) -> None:
     assert (done.returncode, found["ok"], found["error"]) == (0, True, ""), done.stdout
     (row,) = found["offers"]
     assert row["failed"] == []
+    if kind == "transport":
+        assert re.search(rf"^transports my_bus +{row['passed']} +{row['skipped']} +0$", PAGE, re.MULTILINE), "the page shows other numbers"
     assert row["passed"] >= {"transport": 20, "effect": 8, "model": 10, "task": 10}.get(kind, 1)
 
 
