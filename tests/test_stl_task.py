@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -165,6 +167,8 @@ def test_standing_still_is_no_pass() -> None:
         ({"metric": "not eventually (x > 5)"}, "progress is missing"),
         ({"metric": "always (z < 5)"}, "metric, column 9: 'z' is not known; there are: x, y, theta, goal_x, post_x, t"),
         ({"metric": "eventually[0,5] (x > 1)"}, "metric looks 5 s ahead, the horizon is 4 s"),
+        ({"metric": "eventually (x > 0) and always (x != 3)"}, "column 34: that two numbers differ never has a robustness below 0"),
+        ({"metric": "always not (x == 3) and eventually (x > 0)"}, "that two numbers differ never"),
         ({"metric": 3.0}, "metric is 3.0, must be a text"),
         ({"horizon": 0.01}, "horizon is 0.01 s, must be at least a step"),
         ({"horizon": "long"}, "horizon is 'long', must be a number"),
@@ -226,6 +230,28 @@ def test_a_profile_binds_every_word_of_the_task() -> None:
     other = parse_profile(text.replace("altitude > 0", "altitude > 1"), "other", ROOT / "profiles")
     assert profile.task_digest() != other.task_digest()
     assert msgspec.json.decode(msgspec.json.encode(profile), type=Profile) == profile
+
+
+def test_a_robot_that_nobody_can_reach_is_not_driven(tmp_path: Path) -> None:
+    for verb in (("run",), ("sample",)):
+        done = subprocess.run(
+            [sys.executable, "-m", "s2r_runtime.cli.main", *verb, str(ROOT / "profiles" / "ground-avoidance.toml")],
+            capture_output=True,
+            text=True,
+            check=False,
+            cwd=tmp_path,
+        )
+        assert done.returncode == 78
+        assert "transport is missing; to drive a robot" in done.stderr
+
+
+def test_a_state_that_is_called_t_is_meant_by_t() -> None:
+    class Clock:
+        states, angles = ("t", "x"), ()
+
+    one = StlTask({"metric": "always (t < 5)", "progress": "none"}, Clock(), DT)  # type: ignore[arg-type]
+    s = one.draw(np.random.default_rng(1), 1) | {"step": np.array([30])}
+    assert one.safety(one.observe(one.begin(s), np.array([[4.0, 0.0]]), s)).tolist() == [1.0]
 
 
 def test_a_benchmark_ported_from_the_docs_is_told_from_one_that_crashes() -> None:

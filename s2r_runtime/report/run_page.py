@@ -179,6 +179,13 @@ def _verifications(page: Page, story: Story) -> None:
             verification.reason or f"Every required law passed at radius {verification.radius:.4g}.",
             "good" if verification.passed else "bad",
         )
+        if verification.tried:
+            page.text(
+                f"Looked at, of {verification.split} radii that were fixed beforehand and share the attempt's beta: "
+                + "; ".join(f"{one.radius:.4g} {'passed' if one.passed else 'failed'}" for one in verification.tried)
+                + ".",
+                "soft",
+            )
         page.table(
             ("law", "scenarios", "s*", "failures", "P(failure) at most", "progress", ""),
             [

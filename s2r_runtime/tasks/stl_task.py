@@ -109,7 +109,13 @@ class StlTask:
         if bool(p["metric"]) == bool(p["barrier"]):
             raise ConfigError('task stl: must have either metric, a formula such as "always (x < 2)", or barrier, an expression')
         if p["metric"]:
-            return Formula.parse(p["metric"], self._names, self._dt, "task stl: metric")
+            formula = Formula.parse(p["metric"], self._names, self._dt, "task stl: metric")
+            if never := _never_fails(positive(formula.truth)):
+                raise ConfigError(
+                    f"task stl: metric, column {never.column}: that two numbers differ never has a robustness below 0, so it could "
+                    "not fail; write it with < and >, as in gear < 2.5 or gear > 3.5"
+                )
+            return formula
         barrier = parse_expression(p["barrier"], self._names, "task stl: barrier")
         return Formula(Always(0, None, Compare(">=", barrier, Number(0.0))), p["barrier"])
 
@@ -173,8 +179,8 @@ class StlTask:
     # ---------------------------------------------------------------- safety
 
     def _signals(self, x: Array, scenario: Scenario) -> dict[str, Any]:
-        told = {name: scenario[name] for name in self._law.names}
-        return {**told, **{name: x[:, column] for column, name in enumerate(self._states)}, "t": scenario["step"] * self._dt}
+        states = {name: x[:, column] for column, name in enumerate(self._states)}  # a state that is called t is meant by t
+        return {"t": scenario["step"] * self._dt, **{name: scenario[name] for name in self._law.names}, **states}
 
     def clearance(self, x: Array, scenario: Scenario) -> Array | None:
         """See the module's docstring, (n,)."""
@@ -233,6 +239,17 @@ class StlTask:
     def progress_ok(self, progress: Array) -> bool:
         """Whether the median is at least `min_progress`."""
         return self._progress is None or bool(np.median(progress) >= self._least_progress)
+
+
+def _never_fails(truth: Truth, *, negated: bool = False) -> Compare | None:
+    """A comparison that says `differs`, whatever the numbers. truth: in positive form."""
+    match truth:
+        case Compare():
+            return truth if truth.operator == ("==" if negated else "!=") else None
+        case Not():
+            return _never_fails(truth.part, negated=not negated)
+        case _:
+            return next((found for part in parts(truth) if (found := _never_fails(part, negated=negated))), None)
 
 
 def _asks_for_something(truth: Truth) -> bool:
