@@ -286,7 +286,7 @@ def test_all_of_it_stays_as_small_as_it_began() -> None:
     tracemalloc.stop()
     assert after - before < 4096
     assert stood.n == sum(stood.counts) == 60_000
-    assert len(tests[0]._log_won) == len(tests[1]._sums) == GRID
+    assert len(tests[0]._won) == len(tests[1]._sums) == GRID
     assert sys.getsizeof(tests[2].counts) < 1000
 
 

@@ -14,7 +14,8 @@ T(n) is the part not staked yet. E_0 = 1 and the mean of E_n is at most 1, so by
 alarm at 1/alpha is false with probability at most alpha, over the whole epoch. A start after n good steps costs ln n + 2 ln ln n nats.
 A discrepancy that a measurement-fault rule rejects is no X_i; a rule that rejects only exceedances keeps the null hypothesis true.
 
-One number a p: memory and work an update are constant. Everything in logarithms: no overflow, no NaN.
+One number a p: memory and work an update are constant. Each is about what was staked last or more, so none vanishes, and at most LARGEST,
+by which nothing is lost that an alarm would need.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ GRID = 8
 """Values of p, geometrically between eps and 1; the best of them loses a few per cent of the growth of the best p."""
 
 LARGEST = 1e300
-"""What an e-value above it is reported as."""
+"""What an e-value above it, or beyond all floats, is taken for."""
 
 
 def grid(epsilon: float) -> list[float]:
@@ -56,31 +57,22 @@ class EProcess:
         p = grid(epsilon)
         if not 0 <= exceedances <= n:
             raise ValueError(f"{exceedances} exceedances of {n}: must be between 0 and their number")
-        self._if_exceeds = [math.log(q / epsilon) for q in p]
-        self._if_not = [math.log1p(-q) - math.log1p(-epsilon) for q in p]
-        won = max(0.0, e_value - unstaked(n)) if e_value is not None else 0.0
-        self._log_won = [math.log(won / GRID) if won > 0.0 else -math.inf] * GRID
+        self._if_exceeds = [q / epsilon for q in p]
+        self._if_not = [(1.0 - q) / (1.0 - epsilon) for q in p]
+        self._won = [max(0.0, e_value - unstaked(n)) / GRID if e_value is not None else 0.0] * GRID
         self.n, self.exceedances = n, exceedances
-
-    @property
-    def e_value(self) -> float:
+        self.e_value = min(LARGEST, unstaked(n) + sum(self._won))
         """E_n, at most LARGEST."""
-        most = max(self._log_won)
-        if most > math.log(LARGEST / GRID):
-            return LARGEST
-        return unstaked(self.n) + sum(math.exp(log_won) for log_won in self._log_won)
 
     def update(self, exceeds: bool) -> float:
         """One more counted discrepancy; gives the e-value after it."""
         self.n += 1
         self.exceedances += exceeds
-        staked = math.log(stake(self.n) / GRID)
-        growth = self._if_exceeds if exceeds else self._if_not
-        self._log_won = [_log_add(won, staked) + g for won, g in zip(self._log_won, growth, strict=True)]
+        staked = stake(self.n) / GRID
+        factors = self._if_exceeds if exceeds else self._if_not
+        self._won = [(won + staked) * factor for won, factor in zip(self._won, factors, strict=True)]
+        won = sum(self._won)
+        if won > LARGEST:
+            self._won, won = [min(one, LARGEST) for one in self._won], LARGEST
+        self.e_value = min(LARGEST, unstaked(self.n) + won)
         return self.e_value
-
-
-def _log_add(a: float, b: float) -> float:
-    """log(exp(a) + exp(b)); b is finite."""
-    high, low = max(a, b), min(a, b)
-    return high + math.log1p(math.exp(low - high))
