@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,31 +15,36 @@ from daemon_rig import Rig
 from s2r_runtime import messages as m
 from s2r_runtime.bounds import clopper_pearson_upper
 from s2r_runtime.controllers.episodes import Episodes
+from s2r_runtime.controllers.file import load
 from s2r_runtime.errors import NotEnoughEvidence
+from s2r_runtime.models.composed import compose
 from s2r_runtime.models.unicycle import MODEL as UNICYCLE
+from s2r_runtime.profile import load_profile
 from s2r_runtime.statements import of_trials
 from s2r_runtime.tasks.stl_task import StlTask
-from s2r_runtime.trials import Found, Run, _Deployment, _judged, _left_out, _within, trials
+from s2r_runtime.trials import Found, Run, _Deployment, _judged, _left_out, _within, read_runs, trials
 
 TASK = """name = "stl"
 episodes = 6
 [task.parameters]
 horizon = 0.99
-metric = "always (abs(theta) < 1.5)"
+metric = "always (cos(theta) > 0)"
 progress = "none"
+start = { theta = { normal = [0.0, 0.1] } }
 """
 
 
 @pytest.fixture(scope="module")
 def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
-    """Six scenarios of a controller that turns on the spot, and too far in the last ones."""
+    """Six scenarios of a controller that turns on the spot: half a turn in all, through headings that it was never verified at."""
     rig = Rig(tmp_path_factory.mktemp("trials"))
     rig.profile.write_text(rig.profile.read_text().replace('name = "grid_world"\n', TASK))
     try:
         rig.start_robot()
         rig.start()
-        rig.until(lambda: rig.status()["observation"])
-        assert rig.deploy(rig.controller())["exit_code"] == 0
+        assert rig.sample()["exit_code"] == 0
+        deployed = rig.ask("deploy", path=str(rig.controller()))
+        assert deployed["exit_code"] == 0, deployed
         rig.until(lambda: rig.status()["scenarios"] >= 6)
         assert rig.stop() == 0
         yield rig
@@ -60,11 +66,12 @@ def test_runs_are_judged_from_the_log_alone(driven: Rig) -> None:
     asked = min(a.obs_seq for a in driven.messages("out/ask") if isinstance(a, m.Ask) and a.source == "controller")
     starts = [asked + sum(e.steps for e in ended[:k]) for k in range(6)]
     whole = [k for k in range(6) if starts[k] >= first]
-    safety = [min(1.5 - abs(seen[seq][2]) for seq in range(starts[k], starts[k] + ended[k].steps + 1)) for k in whole]
+    safety = [min(math.cos(seen[seq][2]) for seq in range(starts[k], starts[k] + ended[k].steps + 1)) for k in whole]
     assert len(ended) == 6
     assert told["n"] == len(whole) >= 5
     assert told["worst"] == pytest.approx(min(safety))
-    assert told["unsafe"] == sum(value < 0.0 for value in safety) > 0
+    assert told["unsafe"] == sum(value < 0.0 for value in safety)
+    assert 0 < told["unsafe"] < 6
     assert done.returncode == 1
     assert [e.safety for e in ended][whole[0] :] == pytest.approx(safety)
     measured = {x.obs_seq: x.discrepancy for x in driven.messages("event/measured") if isinstance(x, m.Measured) and not x.fault}
@@ -73,20 +80,28 @@ def test_runs_are_judged_from_the_log_alone(driven: Rig) -> None:
     assert told["epsilon"] == pytest.approx(1.0 - 0.5 ** (1.0 / told["n"]))
 
 
+def found_in(rig: Rig, controller_digest: str) -> Found:
+    profile = load_profile(rig.profile)
+    model = compose(profile.model)
+    task = StlTask(profile.task.parameters, model.nominal, model.dt)
+    return read_runs(rig.log_files(), profile, task, controller_digest, model.spec.digest())
+
+
 def test_a_number_that_was_fixed_beforehand_is_held(driven: Rig) -> None:
-    told = json.loads(trials_of(driven, "-n", "2").stdout)
-    assert (told["n"], told["fixed"], told["unsafe"]) == (2, True, 0)
-    assert "their number was fixed beforehand" in told["statement"]
-    short = trials_of(driven, "-n", "50")
-    assert short.returncode == 3
-    assert "50 are needed" in short.stdout + short.stderr
+    digest = load(driven.folder / "controller.py").digest
+    found = found_in(driven, digest)
+    digests = {"controller_digest": digest, "task_digest": "t", "model_digest": "m"}
+    told = trials(found, **digests, beta=0.5, fixed=2)
+    assert (told.n, told.fixed, told.unsafe) == (2, True, sum(not safe for _, safe in found.counted[:2]))
+    assert "their number was fixed beforehand" in of_trials(told)
+    with pytest.raises(NotEnoughEvidence, match="50 are needed"):
+        trials(found, **digests, beta=0.5, fixed=50)
 
 
 def test_runs_of_another_controller_count_for_nothing(driven: Rig) -> None:
-    driven.controller("    return np.tile([0.0, 0.4], (len(x), 1))\n", "other.py")
-    done = driven.s2r("trials", "other.py", *map(str, driven.log_files()), "--profile", "rig.toml")
-    assert done.returncode == 3
-    assert "0 runs of this controller count" in done.stderr
+    found = found_in(driven, "sha256:another")
+    assert found.counted == []
+    assert found.left_out == {"of another controller": 6}
 
 
 def test_a_log_that_was_changed_gives_no_trials(driven: Rig, tmp_path: Path) -> None:
@@ -96,6 +111,32 @@ def test_a_log_that_was_changed_gives_no_trials(driven: Rig, tmp_path: Path) -> 
     done = driven.s2r("trials", "controller.py", str(tmp_path / "changed.mcap"), "--profile", "rig.toml")
     assert done.returncode == 78
     assert "does not hold, so no trials are taken from it" in done.stderr
+
+
+def test_a_certificate_of_this_controller_says_what_it_did_on_the_robot(driven: Rig) -> None:
+    (log,) = map(str, driven.log_files())
+    assert driven.s2r("keys", "new", "own.pem").returncode == 0
+    done = driven.s2r(
+        "certify",
+        "controller.py",
+        "--profile",
+        "rig.toml",
+        "--recording",
+        log,
+        "--trials",
+        log,
+        "--key",
+        "own.pem",
+        "-o",
+        "own.cert",
+        "--json",
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    counted = json.loads(done.stdout)["trials"]
+    assert counted["unsafe"] > 0
+    signed = json.loads((driven.folder / "own.cert").read_bytes())["certificate"]
+    assert signed["trials"] == counted
+    assert any(f"{counted['unsafe']} were unsafe" in line for line in signed["shown"])
 
 
 # ---------------------------------------------------------------- what counts
