@@ -193,11 +193,13 @@ def test_check_of_what_cannot_pass_says_why(site: Path, name: str, code: int, wo
     assert "keeps its interface" not in done.stdout
 
 
-def test_daemon_says_in_one_line_that_a_transport_is_none(site: Path) -> None:
+def test_daemon_says_which_plug_ins_are_broken_and_in_one_line_that_a_transport_is_none(site: Path) -> None:
     text = (ROOT / "profiles" / "robotarium.toml").read_text()
     (site / "p.toml").write_text(text[: text.index("[transport]")] + '[transport]\nname = "bare"\n')
     done = s2r(site, "run", str(site / "p.toml"))
     assert done.returncode == 78
     last = done.stderr.strip().splitlines()[-1]
+    assert "s2r: plug-in 'exits' of exits-dist not in use: SystemExit: I am a script" in done.stderr
+    assert "s2r: plug-in 'copies' of copies-dist in part not in use: model 'unicycle' of copies-dist is refused" in done.stderr
     methods = "open, fileno, receive, decode, poll, encode, send, counters, close"
     assert last == f"s2r: transport 'bare' of bare-dist lacks {methods}: see Transport in s2r_runtime/hookspecs.py"

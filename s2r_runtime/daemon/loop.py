@@ -157,6 +157,11 @@ class Daemon:
         self.key = issuing.signing_key(self._key_path, self.folder.path, self.say)
         self.watcher = Watcher(self.selector, profile, str(self._profile_path), self.feed, self._analytics)
         stack.callback(self.watcher.close)
+        for plugin in registry().loaded:
+            if plugin.error:
+                self.say(
+                    f"plug-in {plugin.name!r} of {plugin.distribution} {'in part ' if plugin.offers else ''}not in use: {plugin.error}"
+                )
         registry().get("transports", str(profile.transport.get("name")))  # loaded here, while analytics loads the model
         self.workshop = Workshop(self.selector)
         stack.callback(self.workshop.close)
