@@ -49,6 +49,15 @@ def test_random_formulas_have_the_values_that_rtamt_gives() -> None:
         np.testing.assert_allclose(found, stl_random.rtamt_robustness(node, one(signals, 0)), rtol=1e-12, atol=1e-12)
 
 
+def test_many_runs_have_the_values_of_each_by_itself() -> None:
+    rng = np.random.default_rng(8)
+    signals = {name: rng.standard_normal((20, 613)) for name in NAMES}
+    for text in ("always (x > -3) and eventually[2,9] always[0,3] (y > 0)", "x > -2 until[1,8] y > 1", "x > y"):
+        formula = Formula.parse(text, NAMES, 1.0)
+        alone = [formula.robustness({name: v[:, k : k + 1] for name, v in signals.items()}, whole=True) for k in range(613)]
+        assert np.array_equal(formula.robustness(signals, whole=True), np.concatenate(alone, axis=1))
+
+
 def test_the_form_without_not_above_intervals_has_the_same_values() -> None:
     rng = random.Random(3)
     for _ in range(300):

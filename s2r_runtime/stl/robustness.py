@@ -48,6 +48,9 @@ Evaluate = Callable[[Signals], Any]
 OfTrace = Callable[[list[Array], int], Array]
 """(leaves, (T, n) each; for how many samples from the first) -> (that many, n)."""
 
+TOGETHER = 250
+"""Runs at a time: what an operator leaves for the next then stays in a core's second-level cache."""
+
 
 class Formula:
     """A formula over named signals, for samples dt s apart."""
@@ -56,6 +59,7 @@ class Formula:
         self.truth, self.text = truth, text
         self.reach = reach(truth)
         """Samples ahead of the first that its bounded intervals look."""
+        self._instant = is_instant(truth)
         self._leaves: list[Evaluate] = []
         self._above = self._of_trace(truth)
 
@@ -76,8 +80,12 @@ class Formula:
 
     def of_leaves(self, leaves: list[Array], count: int = 1) -> Array:
         """Robustness at the first `count` samples, (count, n). leaves: (T, n) each."""
+        count, n = min(count, len(leaves[0])), leaves[0].shape[1]
         with np.errstate(all="ignore"):
-            return self._above(leaves, min(count, len(leaves[0])))
+            if n <= TOGETHER or self._instant:
+                return self._above(leaves, count)
+            parts = [self._above([leaf[:, k : k + TOGETHER] for leaf in leaves], count) for k in range(0, n, TOGETHER)]
+        return np.concatenate(parts, axis=1)
 
     def robustness(self, signals: Signals, *, whole: bool = False) -> Array:
         """Of traces: name -> (T, n), (n,) or a number, at least one of them (T, n). At the first sample, (n,); whole: at all, (T, n)."""
