@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 from pathlib import Path
 
@@ -54,6 +55,13 @@ def test_a_robot_that_arrives_is_at_a_waypoint_and_drives() -> None:
     taken = campaign(500, "arriving", np.random.default_rng(4), periods=1)
     assert np.all(np.abs(taken.path[0, :, 0]) < 1.6)
     assert np.median(np.hypot(*(taken.path[1] - taken.path[0])[:, :2].T)) > 0.001
+
+
+def test_a_reading_is_five_words_in_order() -> None:
+    assert experiment.reading_of("stopped,free,weighted,unwrapped,all") == experiment.Reading("stopped", False, "weighted", False, -1)
+    for wrong in ("stopped", "free,stopped,weighted,wrapped,all", "stopped,free,weighted,wrapped,third"):
+        with pytest.raises(argparse.ArgumentTypeError, match="must be one of each, in this order"):
+            experiment.reading_of(wrong)
 
 
 def test_the_whole_experiment_runs_and_tells_what_came_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,10 +1,11 @@
 """The paper's Robotarium experiment as one command: gap, uncertain model, controllers, verification, runs on the true system, its figures.
 
-    tools/robotarium_experiment.py [-o FILE.html] [--json FILE] [--seed 1] [--quick]       (make robotarium-experiment)
+    tools/robotarium_experiment.py [-o FILE.html] [--json FILE] [--seed 1] [--quick] [--reading WORDS]...   (make robotarium-experiment)
 
 What the paper leaves open is a setting, and every reading is reported: the norm (literal, mixing metres and radians, or a radian counted
 as half the wheel base), whether headings are wrapped, which of the 50 held periods is the sample, what still acts when it begins, whether
-the wheels saturate, 300 or 500 scenarios, which disturbance law. The numbers of samples and scenarios are the paper's (600 of 2400,
+the wheels saturate, 300 or 500 scenarios, which disturbance law. --reading random,clipped,literal,wrapped,first adds one of your own, and
+verifies the controllers against the ball that it gives. The numbers of samples and scenarios are the paper's (600 of 2400,
 300 and 500 of 20 000, 40 runs). It reproduces the experiment: no certificate comes of it, because a method that tries controllers until
 one passes has to pay for every try (docs/guarantee.md, G4). The true system is the built-in robot's data sheet (`robotarium_truth`).
 """
@@ -15,8 +16,9 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import robotarium_figures as figures
@@ -94,6 +96,24 @@ READINGS = (
 )
 
 
+WORDS = (
+    ("random", "stopped", "arriving"),
+    ("clipped", "free"),
+    ("literal", "weighted"),
+    ("wrapped", "unwrapped"),
+    ("first", "last", "all"),
+)
+
+
+def reading_of(text: str) -> Reading:
+    """argparse type: one word of each kind, in their order."""
+    words = text.split(",")
+    if len(words) != len(WORDS) or any(word not in known for word, known in zip(words, WORDS, strict=True)):
+        raise argparse.ArgumentTypeError(f"{text!r} must be one of each, in this order: " + "; ".join("|".join(known) for known in WORDS))
+    step = {"first": 0, "last": HOLD - 1, "all": -1}[words[4]]
+    return Reading(cast("Before", words[0]), words[1] == "clipped", words[2], words[3] == "wrapped", step)
+
+
 def discrepancies(errors: Array, norm: str, *, wrapped: bool) -> Array:
     """(n,) from errors (n, 3). Not wrapped: headings as they are read in [0, 2 pi], so that one that passes 0 is wrong by 6.28."""
     e = errors.copy()
@@ -144,8 +164,8 @@ class Setting(NamedTuple):
     gap: GapSet
 
 
-def settings(rng: np.random.Generator) -> list[Setting]:
-    """The paper's literal one; the paper's model in a norm that means something; and the model that knows the data sheet."""
+def settings(rng: np.random.Generator, asked: Sequence[Reading]) -> list[Setting]:
+    """The paper's literal one; the paper's model in a norm that means something; the model that knows the data sheet; those asked for."""
     taken = campaign(FIRST, "stopped", rng)
     known = _data_sheet_errors(taken)
     held = taken.held_errors()
@@ -153,7 +173,16 @@ def settings(rng: np.random.Generator) -> list[Setting]:
         Setting("paper's model, literal r", PAPER_MODEL, GapSet("ball", LITERAL, PAPER_R, PAPER_R, HOLD)),
         Setting("paper's model, weighted", PAPER_MODEL, _gap_set(taken.errors(), held)),
         Setting("data sheet's model, weighted", TRUTH, _gap_set(*known)),
+        *(Setting(f"paper's model, {reading.words}", PAPER_MODEL, _gap_set_of(reading, rng)) for reading in asked),
     ]
+
+
+def _gap_set_of(reading: Reading, rng: np.random.Generator) -> GapSet:
+    """The ball of a reading; its hold gap is that of the same holds, in the same norm."""
+    weights = LITERAL if reading.norm == "literal" else HALF_TRACK
+    held = campaign(FIRST, reading.before, rng, saturated=reading.saturated).held_errors()
+    r, r_h = float(sampled(reading, FIRST, rng).max()), float(discrepancies(held, reading.norm, wrapped=True).max())
+    return GapSet("ball", weights, r, r_h, HOLD)
 
 
 def _gap_set(errors: Array, held: Array) -> GapSet:
@@ -228,12 +257,12 @@ def final(setting: Setting, law: str, number: int, large: int, seed: int) -> dic
     return told
 
 
-def experiment(seed: int, *, quick: bool) -> dict[str, Any]:
-    """All of it. quick: a hundredth of the rollouts, and every fifth controller."""
+def experiment(seed: int, *, quick: bool, asked: Sequence[Reading] = ()) -> dict[str, Any]:
+    """All of it. quick: a hundredth of the rollouts, and every fifth controller. asked: further readings."""
     rng = np.random.default_rng(seed)
     repetitions, large, counts, every = (0, 200, (60, 100), 5) if quick else (300, LARGE, SCENARIOS, 1)
-    found: dict[str, Any] = {"gaps": [gap_row(reading, repetitions, rng) for reading in READINGS], "models": []}
-    literal, *usable = settings(rng)
+    found: dict[str, Any] = {"gaps": [gap_row(reading, repetitions, rng) for reading in (*READINGS, *asked)], "models": []}
+    literal, *usable = settings(rng, asked)
     reckless = roll_out(control_of("grid.py", {}), GridWorld({}, PAPER_MODEL.nominal, DT), PAPER_MODEL, literal.gap, "uniform", rng, large)
     found["literal"] = {"r": PAPER_R, "n": large, "crashed": float(np.mean(reckless.safety < 0.0))}
     for setting in usable:
@@ -300,10 +329,11 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("-o", "--output", type=Path, metavar="FILE.html", help="the figures on one page (needs matplotlib)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="all numbers")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--reading", type=reading_of, action="append", default=[], metavar="WORDS", help="one more; may be repeated")
     parser.add_argument("--quick", action="store_true", help="a hundredth of the rollouts, for a smoke run")
     given = parser.parse_args(arguments)
     start = time.process_time()
-    found = experiment(given.seed, quick=given.quick)
+    found = experiment(given.seed, quick=given.quick, asked=given.reading)
     seconds = time.process_time() - start
     print("\n".join(told(found)))
     print(f"{seconds:.0f} s of CPU")
