@@ -65,7 +65,9 @@ class Hub:
                     if key.fileobj is self._server:
                         self._welcome()
                     else:
-                        self._attend(self._clients[key.fileobj], mask)  # type: ignore[index]
+                        client = self._clients.get(key.fileobj)  # type: ignore[call-overload]
+                        if client is not None:  # else it was dropped since, when another one's frame could not be sent to it
+                            self._attend(client, mask)
         finally:
             for client in list(self._clients.values()):
                 self._drop(client)

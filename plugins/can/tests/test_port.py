@@ -371,3 +371,23 @@ def test_error_frames_of_a_bus_are_told_in_their_place_and_a_storm_of_them_is_cu
         assert not [m for m in line.messages if isinstance(m, Observation) and m.fault]
         assert line.transport.counters()["error_frames"] <= 1 + 64
         raw.close()
+
+
+def test_hub_outlives_a_client_that_hangs_up_while_another_sends() -> None:
+    """Both are in one look at the sockets: what is sent to the one that is gone drops it before its own turn comes."""
+    hub = Hub().start()
+    try:
+        for _ in range(30):
+            sender, gone = (socket.create_connection(("127.0.0.1", hub.port)) for _ in range(2))
+            for one in (sender, gone):
+                one.sendall(b"< open can0 >< rawmode >")
+                until(lambda one=one: one.recv(4096).endswith(b"< ok >"))
+            time.sleep(0.06)
+            sender.sendall(b"< send 5 1 aa >" * 200)
+            gone.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\x01\0\0\0\0\0\0\0")  # hangs up with a reset
+            gone.close()
+            sender.close()
+        with socket.create_connection(("127.0.0.1", hub.port), timeout=PATIENCE_S) as last:
+            assert last.recv(64) == b"< hi >"
+    finally:
+        hub.close()
