@@ -65,6 +65,7 @@ class Asking:
 
     def gate(self, reason: str) -> None:
         """Why the gate is closed; empty while it is open."""
+        self._look_at_robot()  # first what it did: a stop that is looked at only after it was cleared would hold for good
         reason = reason.removeprefix("latched:")
         if self._reason in STOPS and reason not in STOPS and self._take_over != "never":
             self._may_take, self._orders = True, 0  # a person cleared the stop

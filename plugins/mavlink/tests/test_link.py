@@ -18,8 +18,12 @@ from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
+from s2r_mavlink import dialect
+from s2r_mavlink.asking import Asking
+from s2r_mavlink.options import checked
 from s2r_mavlink.rover_lines import UdpLine
-from s2r_mavlink.testing import PATIENCE_S, Robot, RoverHere, RoverProcess, Runtime, free_port, rover
+from s2r_mavlink.testing import INPUTS, PATIENCE_S, STATES, Robot, RoverHere, RoverProcess, Runtime, free_port, rover
+from s2r_mavlink.wire import Wire as Reading
 
 from s2r_runtime.messages import Command, Decided, GateChanged, Observation
 
@@ -556,3 +560,21 @@ def test_headings_wrap() -> None:
         runtime.command = (0.0, -0.8)  # clockwise: past south
         assert runtime.until(lambda: runtime.good[-1].x[2] > 2.5)
         assert all(-math.pi <= o.x[2] <= math.pi for o in runtime.good)
+
+
+def test_stop_that_was_cleared_before_the_loop_came_round_is_not_remembered_after_it() -> None:
+    """On a busy machine a person's clear can come in the same turn as the robot's news."""
+    options = checked({"robot": "udp:127.0.0.1:14551", "take_over": "arm"}, STATES, INPUTS)
+    wire, ordered, now_ns = Reading(options, STATES, INPUTS), [], 10 * 10**9
+
+    def send(number: int, content: bytes) -> bool:
+        if number == dialect.COMMAND_LONG:
+            ordered.append(dialect.MESSAGES[number].unpack(content)[7])
+        return True
+
+    asking = Asking(options, wire, {}, send)
+    wire.robot.mode, wire.robot.armed, wire.robot.heard_ns, wire.robot.overrides = 0, True, now_ns, 1
+    asking.gate("manual_override")
+    asking.gate("no_controller")
+    asking.tick(now_ns)
+    assert dialect.DO_SET_MODE in ordered
