@@ -128,7 +128,7 @@ def estimate_gap(
     if tr.independent:
         both = [one for one in (e, e_hold) if one is not None]
         series = [*(discrepancy(one, w, kind) for one in both), *(c for one in both for c in body_axes(model, tr.x0, one).T)]
-        white = _in_order(series) or white
+        white = _in_order(series, 1e-12 * max(1.0, float(np.max(np.abs(tr.x0))))) or white
     return Gap(
         radius=radius,
         radius_literal=_largest(discrepancy(e, np.ones_like(w), kind), discard),
@@ -150,9 +150,13 @@ def estimate_gap(
     )
 
 
-def _in_order(series: list[Array]) -> Whiteness | None:
-    """What speaks clearly against the independence of the samples: the order of their discrepancies and residuals, each (n,)."""
-    p = min(serial_p(one, clear=SERIAL_ALPHA / len(series)) for one in series) * len(series)
+def _in_order(series: list[Array], rounding: float) -> Whiteness | None:
+    """What speaks clearly against the independence of the samples: the order of their discrepancies and residuals, each (n,).
+
+    rounding: of a state, which follows the state; so does a part in 1e9 of a value.
+    """
+    steps = [max(rounding, 1e-9 * float(np.max(np.abs(one)))) for one in series]
+    p = min(serial_p(np.round(one / step), clear=SERIAL_ALPHA / len(series)) for one, step in zip(series, steps, strict=True)) * len(series)
     return Whiteness(False, f"{SERIAL} (p = {p:.1g})") if p < SERIAL_ALPHA else None
 
 

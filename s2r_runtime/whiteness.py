@@ -41,6 +41,8 @@ strength (tools/bench_missions.py)."""
 PERMUTATIONS = 1999
 PERMUTED_AT_ONCE = 1_000_000
 """Numbers, 8 MB."""
+MANY = 20_000
+"""Samples with which the limit law is as good as the permutations."""
 CERTAIN, RARE = 1e-3, 5.0
 """Times what matters: p-values by the limit law between which the permutations are made."""
 DEPENDENT = "depends on the one before"
@@ -86,7 +88,7 @@ def serial_p(d: Array, *, clear: float = SERIAL_ALPHA) -> float:
     if n < FEWEST + LAGS or np.ptp(ranks) == 0.0:
         return 1.0
     limit = _serial_p(ranks, 1)
-    if not CERTAIN * clear <= limit <= RARE * clear:
+    if n > MANY or not CERTAIN * clear <= limit <= RARE * clear:
         return limit
     observed, larger, rng = _serial_statistic(ranks[None, :], 1)[0], 0, np.random.default_rng(0)
     for size in np.diff(np.linspace(0, PERMUTATIONS, 2 + PERMUTATIONS * n // PERMUTED_AT_ONCE).astype(int)):

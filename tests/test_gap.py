@@ -392,6 +392,14 @@ def test_autoregressive_discrepancies_are_refused(rho: float, zeros: bool) -> No
         assert serial_p(np.where(z < np.quantile(z, 0.58), 0.0, z) if zeros else z) < SERIAL_ALPHA
 
 
+def test_rounding_in_the_order_of_the_states_is_no_dependence() -> None:
+    rng = np.random.default_rng(22)
+    tr = transitions(np.full((300, 3), 0.01), rng)
+    tr = replace(tr, x0=tr.x0 + np.arange(300)[:, None], x1=tr.x1 + np.arange(300)[:, None])
+    gap = estimate_gap(UNICYCLE, tr, **SETTINGS)
+    assert not gap.white_reason.startswith(SERIAL)
+
+
 def test_few_or_equal_discrepancies_say_nothing_of_their_order() -> None:
     assert serial_p(np.zeros(500)) == 1.0
     assert serial_p(np.arange(20.0)) == 1.0
