@@ -28,6 +28,9 @@ Progress = Callable[[float, float], None]
 BATCH = 5000
 """Rollouts at a time: their arrays stay in a core's second-level cache. Part of what a seed means: another value, other draws."""
 
+LOOK_EVERY = 8
+"""Steps between two looks at whether to give up."""
+
 
 @dataclass(frozen=True)
 class Rollouts:
@@ -52,8 +55,12 @@ def roll_out(
     *,
     keep: int = 0,
     progress: Progress | None = None,
+    give_up_below: float = -np.inf,
 ) -> Rollouts:
     """n scenarios drawn independently, each driven once. keep: so many paths are kept; progress: called with done, total.
+
+    give_up_below: once a rollout is over with a safety value below this, all of them are left where they are (for who only asks whether
+    there is one).
 
     Raises UsageError for an unknown law or weights that don't fit the model, ControllerError if the controller's answer is not a
     finite (n, nu) array or the state gets out of all bounds. What the controller itself raises passes through.
@@ -66,7 +73,9 @@ def roll_out(
     for first in range(0, n, BATCH):
         size = min(BATCH, n - first)
         told = None if progress is None else lambda share, first=first, size=size: progress(first + share * size, n)
-        parts.append(_batch(control, task, model, gap, LAWS[law], rng, size, max(0, min(size, keep - first)), told))
+        parts.append(_batch(control, task, model, gap, LAWS[law], rng, size, max(0, min(size, keep - first)), told, give_up_below))
+        if np.any(parts[-1].safety < give_up_below):
+            break
     return Rollouts(
         np.concatenate([p.safety for p in parts]),
         np.concatenate([p.progress for p in parts]),
@@ -85,6 +94,7 @@ def _batch(
     n: int,
     keep: int,
     progress: Callable[[float], None] | None,
+    give_up_below: float,
 ) -> Rollouts:
     scenario = first = task.draw(rng, n)
     # columns contiguous: a state of all rollouts is one run of memory
@@ -112,7 +122,7 @@ def _batch(
         if progress is not None:
             progress((k + 1) / task.horizon)
         over = task.done(tally)
-        if over.all():
+        if over.all() or (k % LOOK_EVERY == 0 and np.any(over) and np.any(np.asarray(task.safety(tally))[over] < give_up_below)):
             break
     kept = [np.array([states[i] for states in paths[: ends[i] + 1]]) for i in range(keep)]
     scenarios = [{name: value[i : i + 1] for name, value in first.items()} for i in range(keep)]

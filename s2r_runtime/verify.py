@@ -156,12 +156,12 @@ class _Runs:
     done: int = 0
 
     def run(self, gap_set: GapSet, *, only_required: bool) -> _Run:
-        """All laws, or the required ones as far as they pass."""
+        """All laws, or the required ones as far as they pass: where the answer is no, only that is of interest."""
         run = _Run(gap_set, [], [])
         for law in self.laws:
             if only_required and law not in self.required:
                 continue
-            self._roll_out(run, law)
+            self._roll_out(run, law, self.threshold if only_required else -np.inf)
             if run.reason or (only_required and _why_not(run.results, self.threshold)):
                 break
         run.reason = run.reason or _why_not(run.results, self.threshold)
@@ -174,11 +174,22 @@ class _Runs:
             if not run.reason and law not in {detail.law for detail in run.details}:
                 self._roll_out(run, law)
 
-    def _roll_out(self, run: _Run, law: str) -> None:
+    def _roll_out(self, run: _Run, law: str, give_up_below: float = -np.inf) -> None:
         rng = np.random.default_rng([self.seed, list(LAWS).index(law)])
         told = None if self.progress is None else self._tell(self.progress, run.gap_set.radius, law)
         try:
-            rollouts = roll_out(self.control, self.task, self.model, run.gap_set, law, rng, self.n, keep=self.keep, progress=told)
+            rollouts = roll_out(
+                self.control,
+                self.task,
+                self.model,
+                run.gap_set,
+                law,
+                rng,
+                self.n,
+                keep=self.keep,
+                progress=told,
+                give_up_below=give_up_below,
+            )
         except ControllerError as error:
             # a controller's own failure is a verdict on the controller, under whichever law it shows; nothing was shown under this one
             run.reason = f"under {law}: {error}"

@@ -18,7 +18,7 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.statements import confidence
 from s2r_runtime.tasks.stl_task import StlTask
-from s2r_runtime.uncertain import GapSet
+from s2r_runtime.uncertain import GapSet, roll_out
 from s2r_runtime.verify import statement, verify
 
 MODEL = compose(ModelSpec("double_integrator", 0.1))
@@ -157,3 +157,31 @@ def test_an_audit_finds_radii_that_are_not_those_of_the_search() -> None:
     assert "radii that were ordered" in _radii_problem(msgspec.structs.replace(found, radius=found.radius * 1.001), job)
     assert "not those of the search" in _radii_problem(msgspec.structs.replace(found, tried=found.tried[1:]), job)
     assert _radii_problem(run(0.3), msgspec.structs.replace(job, least_radius=0.0)) == ""
+
+
+def test_rollouts_are_given_up_once_one_has_failed_for_good_and_never_otherwise() -> None:
+    def crossing(x: np.ndarray, theta: dict[str, Any]) -> np.ndarray:
+        return np.full((len(x), 2), 1.0)
+
+    settled = StlTask({"metric": "always (x < 0.5)", "progress": "none", "horizon": 3.0, "ends": "x > 0.5"}, MODEL.nominal, MODEL.dt)
+    gap = GapSet("ball", (1.0,) * 4, 0.001)
+    seen = []
+    for below in (-np.inf, 0.0, -9.0):
+        steps: list[int] = []
+
+        def counted(x: np.ndarray, theta: dict[str, Any], steps: list[int] = steps) -> np.ndarray:
+            steps.append(len(x))
+            return crossing(x, theta) * np.linspace(0.2, 1.0, len(x))[:, None]
+
+        found = roll_out(counted, settled, MODEL, gap, "uniform", np.random.default_rng(1), 20, give_up_below=below)
+        seen.append((len(steps), bool(np.any(found.safety < 0.0))))
+    assert seen[0][1]
+    assert seen[1][1]
+    assert seen[2] == seen[0]
+    assert seen[1][0] < seen[0][0] - 5
+    waiting = StlTask({"metric": "always (x < 0.5)", "progress": "none", "horizon": 3.0}, MODEL.nominal, MODEL.dt)
+    whole = [
+        roll_out(crossing, waiting, MODEL, gap, "uniform", np.random.default_rng(1), 20, give_up_below=below).safety
+        for below in (-np.inf, 0.0)
+    ]
+    assert np.array_equal(*whole)

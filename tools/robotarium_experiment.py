@@ -244,7 +244,7 @@ def on_the_truth(number: int, runs: int, seed: int, keep: int) -> Rollouts:
 
 
 def final(setting: Setting, law: str, number: int, large: int, seed: int) -> dict[str, Any]:
-    """The winner's s* of 300 and 500 fresh scenarios against the cutoffs that `large` of them show."""
+    """The winner's s* of 300 and 500 fresh scenarios against the cutoffs that `large` others show, and how often that holds in these."""
     control, task = control_of(*CONTROLLERS[number]), GridWorld({}, setting.model.nominal, DT)
     safety = roll_out(control, task, setting.model, setting.gap, law, np.random.default_rng([seed, 7, number]), large).safety
     told: dict[str, Any] = {"safety": safety, "crashes": int(np.sum(safety < 0.0)), "n": large, "claims": []}
@@ -252,8 +252,12 @@ def final(setting: Setting, law: str, number: int, large: int, seed: int) -> dic
         fresh = roll_out(control, task, setting.model, setting.gap, law, np.random.default_rng([seed, 8, number, n]), n).safety
         cutoff = float(np.quantile(safety, epsilon, method="lower"))
         below = float(np.mean(safety < fresh.min()))
+        groups = safety[: large // n * n].reshape(-1, n).min(axis=1) if large >= n else np.empty(0)
+        kept = float(np.mean([np.mean(safety < least) <= epsilon for least in groups])) if len(groups) else None
         claim = {"n": n, "epsilon": epsilon, "s_star": float(fresh.min()), "cutoff": cutoff, "below": below, "holds": below <= epsilon}
-        told["claims"].append({**claim, "confidence": 1.0 - float(scenario_confidence(n, 0, epsilon))})
+        told["claims"].append(
+            {**claim, "groups": len(groups), "groups_hold": kept, "confidence": 1.0 - float(scenario_confidence(n, 0, epsilon))}
+        )
     return told
 
 
@@ -315,7 +319,8 @@ def told(found: dict[str, Any]) -> list[str]:
                 verdict = "holds" if claim["holds"] else "FAILS"
                 star = f"s* of {claim['n']}: {claim['s_star']:.2f}"
                 cutoff = f"{claim['epsilon']:.1%} cutoff of {one['final']['n']}: {claim['cutoff']:.2f}"
-                lines.append(f"  {star}, {cutoff}; {claim['below']:.2%} score below s*: {verdict}")
+                groups = f"; it holds in {claim['groups_hold']:.0%} of {claim['groups']} groups of them" if claim["groups"] else ""
+                lines.append(f"  {star}, {cutoff}; {claim['below']:.2%} score below s*: {verdict}{groups}")
             lines.append(f"  {one['final']['crashes']} of {one['final']['n']} rollouts crash")
             runs = one["true_runs"]
             crashed = f"{runs['crashes']} of {runs['n']} runs crash (at most {runs['crash_upper']:.1%}, 95 %)"
