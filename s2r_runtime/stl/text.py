@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import difflib
 import math
-import re
 from collections.abc import Collection
-from typing import Literal, NamedTuple, cast
+from typing import Literal, cast
 
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.stl.functions import FUNCTIONS
 from s2r_runtime.stl.syntax import Always, And, Apply, Compare, Eventually, Expression, Name, Not, Number, Or, Truth, Until, operands
+from s2r_runtime.stl.tokens import WORDS, Token, cut
 
 LENGTH_MAX = 20_000
 DEPTH_MAX = 40
@@ -32,24 +32,8 @@ TREE_MAX = 200
 ROUNDING = 1e-6
 """Of a step: decimal seconds are not exact multiples of dt."""
 
-WORDS = ("implies", "or", "and", "until", "not", "always", "eventually")
 CONSTANTS = {"pi": math.pi}
-_SAME = {"->": "implies", "||": "or", "|": "or", "&&": "and", "&": "and", "!": "not", "**": "^"}
-_TOKEN = re.compile(
-    r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_][A-Za-z_0-9]*)"
-    r"|(?P<sign>->|<=|>=|==|!=|&&|\|\||\*\*|[-+*/^()\[\],:<>!&|]))"
-)
 _COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
-
-
-class _Token(NamedTuple):
-    kind: Literal["number", "name", "sign", "word", "end"]
-    text: str
-    column: int
-
-    @property
-    def said(self) -> str:
-        return "the end" if self.kind == "end" else repr(self.text)
 
 
 def parse_truth(text: str, names: Collection[str], dt: float, where: str) -> Truth:
@@ -75,7 +59,7 @@ class _Parser:
         self._depth = 0
         if len(text) > LENGTH_MAX:
             raise ConfigError(f"{where}: has {len(text)} characters, a formula has at most {LENGTH_MAX}")
-        self._tokens = self._cut(text)
+        self._tokens = cut(text, where)
         self._at = 0
 
     def whole(self) -> Truth | Expression:
@@ -112,26 +96,11 @@ class _Parser:
 
     # ---------------------------------------------------------------- tokens
 
-    def _cut(self, text: str) -> list[_Token]:
-        tokens, at = [], 0
-        end = len(text.rstrip())
-        while at < end:
-            found = _TOKEN.match(text, at)
-            if found is None:
-                at += len(text[at:]) - len(text[at:].lstrip())
-                raise self._error(at + 1, f"{text[at]!r} means nothing in a formula")
-            kind = cast("Literal['number', 'name', 'sign']", found.lastgroup)
-            word = found.group(kind)
-            word, column = _SAME.get(word, word), found.start(kind) + 1
-            tokens.append(_Token("word" if word in WORDS else kind, word, column))
-            at = found.end()
-        return [*tokens, _Token("end", "", len(text.rstrip()) + 1)]
-
     @property
-    def _now(self) -> _Token:
+    def _now(self) -> Token:
         return self._tokens[self._at]
 
-    def _take(self, *texts: str) -> _Token | None:
+    def _take(self, *texts: str) -> Token | None:
         if self._now.kind != "end" and self._now.text in texts and self._now.kind != "name":
             self._at += 1
             return self._tokens[self._at - 1]
@@ -141,7 +110,7 @@ class _Parser:
         if self._take(text) is None:
             raise self._wrong(self._now, f"expected {text!r} {why}, found {self._now.said}")
 
-    def _wrong(self, token: _Token, what: str) -> ConfigError:
+    def _wrong(self, token: Token, what: str) -> ConfigError:
         return self._error(token.column, what)
 
     def _error(self, column: int, what: str) -> ConfigError:
@@ -193,7 +162,7 @@ class _Parser:
         self._depth -= 1
         return node
 
-    def _interval(self, of: _Token) -> tuple[int, int | None]:
+    def _interval(self, of: Token) -> tuple[int, int | None]:
         """[a, b] in s as samples; without one: from now to the end."""
         opened = self._take("[")
         if opened is None:
@@ -209,7 +178,7 @@ class _Parser:
             raise self._error(opened.column, f"the interval [{a:g}, {b:g}] s of {of.text} holds no sample of a step of {self._dt:g} s")
         return first, last
 
-    def _bound(self, of: _Token) -> tuple[float, int]:
+    def _bound(self, of: Token) -> tuple[float, int]:
         token = self._now
         if token.kind != "number":
             raise self._wrong(token, f"the bounds of {of.text} are seconds, numbers >= 0; found {token.said}")
@@ -285,7 +254,7 @@ class _Parser:
             return node
         raise self._wrong(token, f"expected a name, a number or '(', found {token.said}")
 
-    def _named(self, token: _Token) -> Expression:
+    def _named(self, token: Token) -> Expression:
         if token.text in self._names:
             return Name(token.text, token.column)
         if token.text in CONSTANTS:
@@ -296,7 +265,7 @@ class _Parser:
         hint = f"did you mean {near[0]!r}?" if near else f"there are: {', '.join(self._names)}"
         raise self._wrong(token, f"{token.text!r} is not known; {hint}")
 
-    def _call(self, token: _Token) -> Expression:
+    def _call(self, token: Token) -> Expression:
         function = FUNCTIONS.get(token.text)
         if function is None:
             near = difflib.get_close_matches(token.text, [*FUNCTIONS, *WORDS], 1, 0.6)
@@ -315,7 +284,7 @@ class _Parser:
             raise self._wrong(token, f"{token.text} has {len(arguments)} arguments, must have {must}")
         return Apply(token.text, tuple(arguments), token.column)
 
-    def _enter(self, token: _Token) -> None:
+    def _enter(self, token: Token) -> None:
         self._depth += 1
         if self._depth > DEPTH_MAX:
             raise self._wrong(token, f"is nested deeper than {DEPTH_MAX} levels")
