@@ -143,6 +143,12 @@ def poses(pose: str, payload: bytes) -> list[tuple[float, ...]]:
     return found
 
 
+def payload_of(data: bytes) -> bytes:
+    """What is behind the attachment; empty if there is none."""
+    length = int.from_bytes(data[:2], "little")
+    return data[2 + length :] if len(data) >= 2 + length else b""
+
+
 class Source:
     """Inputs: a robot's own frames, and what becomes of them."""
 
@@ -176,8 +182,8 @@ class Source:
             return encode_pose_stamped(at, big=big)
         return encode_transforms([at._replace(child=f"wheel_{i}") for i in range(draw.randrange(3))] + [at], big=big)
 
-    def frame(self) -> tuple[Frame, bytes]:
-        """One input, and the payload in it."""
+    def frame(self) -> Frame:
+        """One input."""
         draw = self._draw
         payload = self.payload() if draw.random() < 0.8 else draw.choice(self._pool)
         self._pool = [*self._pool[-50:], payload]
@@ -189,16 +195,16 @@ class Source:
         data = envelope(extra if draw.random() < 0.98 else draw.randbytes(draw.randrange(60)), payload)
         roll = draw.random()
         if roll < 0.02:
-            data, payload = data[: draw.randrange(len(data) + 1)], b""
+            data = data[: draw.randrange(len(data) + 1)]
         elif roll < 0.03:
-            data, payload = draw.randbytes(draw.randrange(200)), b""
+            data = draw.randbytes(draw.randrange(200))
         self.now_ns += draw.choice((PERIOD_NS, PERIOD_NS, PERIOD_NS, 10, 20 * PERIOD_NS))
         channel = "pose" if draw.random() < 0.97 else draw.choice(CHANNELS)
         if channel == "proposal" and draw.random() < 0.5:
             data = envelope(extra, encode_twist(tuple(draw.choice((*SPECIAL, 0.5)) for _ in range(6))))
         elif channel == "emergency_stop" and draw.random() < 0.5:
             data = envelope(extra, encode_bool(draw.random() < 0.5))
-        return Frame(self.now_ns, channel, data), payload
+        return Frame(self.now_ns, channel, data)
 
     def _spoilt(self, payload: bytes) -> bytes:
         draw, data = self._draw, bytearray(payload)
@@ -252,7 +258,7 @@ def fuzz(inputs: int, seed: int, pose: str, *, rmw: bool) -> Result:
     for number in range(inputs):
         if number and number % ANEW == 0:
             transport, source, newest = Ros2Transport(options_of(pose, rmw=rmw), states, INPUTS), Source(pose, draw, rmw=rmw), -1
-        frame, payload = source.frame()
+        frame = source.frame()
         told = transport.decode(frame)
         silent += not told
         for message in told:
@@ -260,7 +266,7 @@ def fuzz(inputs: int, seed: int, pose: str, *, rmw: bool) -> Result:
                 faults += 1
             elif isinstance(message, Observation):
                 observations += 1
-                if not _is_said(message.x, poses(pose, payload)):
+                if not _is_said(message.x, poses(pose, payload_of(frame.data))):
                     lies.append(f"{pose} input {number}: {message.x} was not said")
                 if message.stamp_ns <= newest:
                     lies.append(f"{pose} input {number}: the stamp fell to {message.stamp_ns}")
