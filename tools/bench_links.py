@@ -5,7 +5,8 @@
 cuts    a certified controller drives; the link is cut and restored (really: the way between the two processes is gone, or silent). When the
         gate was closed after the last observation, and when the robot was heard again after the link's return. From the log's own stamps
 rate    the daemon drives half of the time and samples the other half, with a robot at 100 Hz: what the robot sent is an observation, or
-        counted as lost with a cause; commands that were decided are sent, or counted as dropped; the daemon's share of a core
+        counted as lost (in the runtime's queue, or before it came: a robot's publisher drops what a congested link does not take);
+        commands that were decided are sent, or counted as dropped; the daemon's share of a core
 
 The robots are the stand-ins, processes of their own: Zenoh and ROS 2 over a TCP hop that closes its connections (even cuts) or passes
 nothing (odd cuts), MAVLink over a UDP hop that passes nothing, CAN over a network interface that is taken down. One transport after the
@@ -251,16 +252,19 @@ def rate(transport: str, seconds: float) -> dict[str, Any]:
         time.sleep(1.0)
         counters, then_ns = bench.status()["counters"], time.monotonic_ns()
         bench.rig.stop()
-        seqs = [m.observation.seq for m in bench.rig.messages("event/observed") if isinstance(m, Observed) and not m.observation.fault]
+        observed = [m.observation for m in bench.rig.messages("event/observed") if isinstance(m, Observed)]
         sends = sum(isinstance(m, Send) and m.t_ns < then_ns for m in bench.rig.messages("out/send"))
-    missing = seqs[-1] - seqs[0] + 1 - len(seqs)
+    numbers = {o.seq for o in observed}  # late ones are faulty, and numbered
+    missing = max(numbers) - min(numbers) + 1 - len(numbers) - counters.get("restarts", 0)
     return {
         "seconds": seconds,
-        "observations": len(seqs),
+        "observations": sum(not o.fault for o in observed),
+        "faulty": sum(bool(o.fault) for o in observed),
         "missing_by_their_count": missing,
         "lost_and_counted": counters["lost"],
         "dropped_and_counted": counters["dropped_in"],
-        "unexplained": abs(missing - counters["lost"]) + max(0, counters["lost"] - counters["dropped_in"]),
+        "lost_before_it_came": counters["lost"] - counters["dropped_in"],
+        "unexplained": abs(missing - counters["lost"]),
         "commands": sends,
         "commands_dropped_and_counted": counters["dropped_out"],
         "commands_unexplained": abs(sends - counters["sent"] - counters["dropped_out"]),
