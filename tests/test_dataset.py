@@ -206,6 +206,17 @@ def test_what_was_before_a_run_is_told_from_its_first_steps():
     assert len(steps_of(data)) == 80
 
 
+def test_a_wheel_that_was_turning_when_the_run_began_says_what_it_was_told_before():
+    model = compose(ModelSpec("differential_drive", 0.1))
+    still, coasting = np.zeros((41, 5)), np.zeros((41, 5))
+    coasting[:, 3] = 4.0 * np.exp(-0.1 * np.arange(41))
+    u = np.tile([[2.0, 3.0]], (40, 1))
+    runs = with_history(model, from_arrays(model, [(coasting, u), (still, u)])).runs
+    assert np.all(runs[0].u[: -40 * 5] == [4.0, 0.0]), "the left wheel's own speed, and nothing of the right one"
+    assert np.isnan(runs[0].y[:-41]).all()
+    assert len(runs[1].y) == 41
+
+
 def test_a_silence_in_which_inputs_went_on_is_not_silent():
     t = 0.1 * np.arange(60)
     keep = (t < 3.0) | (t > 4.0)

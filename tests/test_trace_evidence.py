@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 from trace_robots import DT, NOISE, ROBOTARIUM, declared, drive, recordings
 
+from s2r_runtime.models.composed import AppliedEffect, compose
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.evidence import RIDGES, evidence, margin
+from s2r_runtime.trace.fitting import evaluate, insert, problem
+from s2r_runtime.trace.lack_of_fit_terms import LINE, line, quieter
+from s2r_runtime.trace.residual import Steps, steps_of
+from s2r_runtime.trace.residual_noise import Noise
+from s2r_runtime.trace.scores import limited
 from s2r_runtime.trace.tracer import trace
 
 
@@ -69,3 +77,41 @@ def test_inputs_that_never_change_could_not_have_shown_a_coupling_of_what_is_zer
     sizes = {(v.name, v.channel): v.size for v in told.could_see}
     assert sizes["input_gain", "w"] is None
     assert sizes["input_gain", "v"] is not None
+
+
+def test_a_line_in_the_spectrum_is_found_where_it_is_and_noise_has_none():
+    rng = np.random.default_rng(5)
+    t = 0.05 * np.arange(900)
+    wave = 0.4 * np.sin(2.0 * np.pi * 0.37 * t + 1.0)
+    frequency, height = line(np.stack([rng.normal(size=900), wave + rng.normal(size=900)], axis=1), 0.05)
+    assert frequency == pytest.approx(0.37, abs=0.25 / 45.0)
+    assert height > LINE
+    highest = [line(np.cumsum(rng.normal(size=(900, 2)), axis=0) if k % 2 else rng.normal(size=(900, 2)), 0.05)[1] for k in range(200)]
+    assert sum(h > LINE for h in highest) <= 2, "neither in white noise nor in what wanders"
+
+
+def test_states_are_averaged_over_the_time_in_which_noise_of_the_process_grows_to_that_of_the_measurement():
+    rng = np.random.default_rng(6)
+    true = np.column_stack([np.linspace(0.0, 1.0, 400), np.zeros(400)])
+    measured = true + rng.normal(size=(400, 2)) * [0.01, 0.0]
+    joined = np.ones(400, dtype=bool)
+    joined[[0, 200]] = False
+    steps = Steps(np.arange(400), np.zeros(400, dtype=np.int64), 0.1 * np.arange(400.0), measured, measured, joined)
+    calm = quieter(steps, Noise(np.array([1e-6, 1e-4]), np.array([1e-4, 1e-6])))
+    assert np.std(calm[20:-20, 0] - true[20:-20, 0]) < 0.01 / np.sqrt(15.0)
+    assert np.array_equal(calm[:, 1], measured[:, 1]), "where measurements are better than the process there is nothing to average"
+    assert np.allclose(calm[[0, 199, 200, 399]], measured[[0, 199, 200, 399]], atol=1e-12), "never across a gap"
+
+
+def test_a_curve_that_gave_up_one_of_its_numbers_is_not_named():
+    model = compose(ModelSpec("joint", 0.01, {"mass": 1.0}))
+    effect = registry().get("effects", "stribeck_friction")
+    for force, named in ((0.3, True), (0.0, False)):
+        added = insert(model, AppliedEffect(effect, "qd", {"force": force, "static_force": 0.5, "velocity": 0.1}), 0)
+        u = np.repeat(np.random.default_rng(7).uniform(-1.0, 1.0, 40), 5)[:, None]
+        x, rows = np.zeros((1, 2)), [np.zeros(2)]
+        for k in range(200):
+            x = added.advance(x, u[k : k + 1], u[k : k + 1])
+            rows.append(x[0])
+        data = from_arrays(model, [(np.array(rows), u)])
+        assert limited(evaluate(problem(data, steps_of(data)), added)) is named

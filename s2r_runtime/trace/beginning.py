@@ -2,6 +2,9 @@
 
 A run whose first steps are foretold clearly better if its first input had been acting before was under way; that input is then taken to
 have been held before the run, long enough for hidden states to settle. Otherwise the robot stood, and everything before is zero.
+
+A state that the model sets to an input at once (a wheel's speed) says itself what had been acting when the run began: what was measured
+first is taken to have been commanded before, whatever the first command is. A wheel that is still coasting down is then no riddle.
 """
 
 from __future__ import annotations
@@ -24,6 +27,9 @@ FIRST = 2
 CLEARLY = 0.25
 """Ratio of squared errors below which it counts as clear; where noise hides it, the robot stood."""
 
+MOVING = 0.05
+"""Of the largest command: what was measured first counts as standing still below it."""
+
 HELD_S = 3.0
 """For how long the first input is taken to have been held, s (30 to 300 steps)."""
 
@@ -32,8 +38,17 @@ def with_history(model: ComposedModel, data: Dataset) -> Dataset:
     """The dataset, its runs that began under way with what is taken to have been before: rows without a measurement."""
     steps = int(np.clip(HELD_S / data.dt, 30, 300))
     usual = _usual(model, data)
-    runs = tuple(_preceded(data, run, steps) if _under_way(model, data, run, steps, usual) else run for run in data.runs)
-    return replace(data, runs=runs)
+    reached = [(model.states.index(x), model.inputs.index(u)) for x, u in getattr(model.nominal, "reached", {}).items()]
+    size = np.max(np.abs(np.concatenate([run.u for run in data.runs])), axis=0)
+    runs = []
+    for run in data.runs:
+        under_way = _under_way(model, data, run, steps, usual)
+        before = run.u[0].copy() if under_way else np.zeros(run.u.shape[1])
+        if not np.isnan(run.y[0]).any():
+            for x, u in reached:
+                before[u] = run.y[0, x] if abs(run.y[0, x]) > MOVING * size[u] else 0.0
+        runs.append(_preceded(data, run, steps, before) if np.any(before) else run)
+    return replace(data, runs=tuple(runs))
 
 
 def _usual(model: ComposedModel, data: Dataset) -> Array:
@@ -71,8 +86,9 @@ def _errors(model: ComposedModel, run: Run, u: Array) -> Array:
     return model.difference(run.y[1 : FIRST + 1], foretold)
 
 
-def _preceded(data: Dataset, run: Run, steps: int) -> Run:
+def _preceded(data: Dataset, run: Run, steps: int, before: Array) -> Run:
+    """The run after so many steps of an input (nu,)."""
     y = np.concatenate([np.full((steps, run.y.shape[1]), np.nan), run.y])
-    first = np.tile(run.u[:1], (steps * data.substeps, 1))
+    first = np.tile(before, (steps * data.substeps, 1))
     lasts = None if run.lasts is None else np.concatenate([np.full(steps, data.dt), run.lasts])
     return Run(run.start_s - steps * data.dt, y, np.concatenate([first, run.u]), lasts)

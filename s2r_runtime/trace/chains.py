@@ -61,9 +61,25 @@ class Inputs:
             now = [_with(table, touched, columns) for table, columns in zip(now, found, strict=True)]
             for c in touched:
                 links[c] = key
-        if self._rows is not None:
-            return np.asarray(now[0].reshape(-1, now[0].shape[2])[self._rows])
-        return np.concatenate(now)
+        return self._laid(("laid", *links), now)
+
+    def _laid(self, key: Key, tables: list[Array]) -> Array:
+        """The runs laid end to end."""
+        found = self._kept.get(key)
+        if found is None:
+            table = tables[0]
+            if self._rows is None:
+                laid = table if len(tables) == 1 else np.concatenate(tables)
+            elif len(self._rows) == table.shape[0] * table.shape[1]:  # all of one length
+                laid = table.transpose(1, 0, 2).reshape(-1, table.shape[2])
+            else:
+                laid = table.reshape(-1, table.shape[2])[self._rows]
+            found = [laid.view()]
+            found[0].flags.writeable = False  # it is handed out again
+            self._keep(key, found)
+        else:
+            self._kept.move_to_end(key)
+        return found[0]
 
     def _touched(self, a: AppliedEffect, model: ComposedModel) -> list[int]:
         """Columns that the effect changes or reads."""

@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,20 +25,14 @@ from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.evidence import evidence, margin
 from s2r_runtime.trace.fitting import Fit, Problem
 from s2r_runtime.trace.fitting import gain as explained
+from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left, first_look, judge, leading
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
 from s2r_runtime.trace.residual import acting, residual, rms, rollout, rollout_starts, state_jacobian
-from s2r_runtime.trace.residual_noise import Colour, Whitener
 
 Array = NDArray[np.float64]
 
 ALPHA = 1e-3
 """Chance that clean data show structure, as far as the likelihood is right."""
-
-BLOCKS = 8
-"""Of the cross-validation."""
-
-LEADING = 48
-"""Columns of a dictionary that are judged at most."""
 
 FEW = 6
 """Dictionaries that are judged with their own noise, after a first look under the model's."""
@@ -79,12 +72,6 @@ SKIPPED = 3
 COLOURED = 0.2
 """Autoregression coefficient from which noise is called coloured."""
 
-MOST_SCATTER = 5.0
-"""Scatter counts up to this: a dictionary that fits the structure only roughly leaves scores that scatter too."""
-
-PASSES = 3
-"""Of terms and noise in turn."""
-
 
 @dataclass(frozen=True)
 class Structure:
@@ -97,34 +84,6 @@ class Structure:
     matters: bool
     share: float
     gains: dict[str, float]
-
-
-@dataclass(frozen=True)
-class _Judged:
-    """A dictionary X (n, nx, m) with its held-out gain and beta (BLOCKS, m) without each block. scatter: see `_scatter`."""
-
-    token: str
-    x: Array
-    gain: float
-    scatter: float
-    betas: Array
-
-
-@dataclass(frozen=True)
-class _Left:
-    """What is to be explained. r: (n, nx); f: (n, nx, nx); block: (n,). clipped: (n, nx), whitened, wild values cut off but with the
-    weight of any other; None if there are none.
-
-    What shows only when an input jumps is wild, and few: weights would take it for outliers. Whether outliers have to do with the inputs
-    is told by sliding.
-    """
-
-    given: Problem
-    fit: Fit
-    r: Array
-    f: Array
-    block: NDArray[np.int64]
-    clipped: Array | None
 
 
 def lack_of_fit(given: Problem, fit: Fit, nominal: Fit, horizon: int) -> Structure:
@@ -144,19 +103,19 @@ def explains_more(given: Problem, fit: Fit, nominal: Fit) -> tuple[str, ...]:
     took up structure that is not theirs. Empty otherwise.
     """
     left, found = _left_by(given, nominal)
-    looked = _best_of_each(sorted(((_first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True), found)
-    judged = [_judge(left, found[i][0], _leading(left, found[i][1])) for _, i in looked[:FEW]]
+    looked = _best_of_each(sorted(((first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True), found)
+    judged = [judge(left, found[i][0], leading(left, found[i][1])) for _, i in looked[:FEW]]
     best = max(judged, key=lambda j: j.gain)
     return (best.token,) if best.gain > MORE * explained(fit, nominal) + ALIKE else ()
 
 
-def _left_by(given: Problem, fit: Fit) -> tuple[_Left, list[tuple[str, Array]]]:
+def _left_by(given: Problem, fit: Fit) -> tuple[Left, list[tuple[str, Array]]]:
     """What a model leaves, and the dictionaries for it."""
     act = acting(fit.model, given.data)
     n = len(given.steps)
     block = np.minimum(np.arange(n) * BLOCKS // n, BLOCKS - 1)
     wild = np.any(np.abs(fit.z) > noises.OUTLIER)
-    left = _Left(
+    left = Left(
         given,
         fit,
         residual(fit.model, given.steps, act),
@@ -184,13 +143,13 @@ def _columns(terms: Sequence[Array]) -> Array:
     return np.asarray(table.transpose(1, 2, 0))
 
 
-def _forward(left: _Left, found: Sequence[tuple[str, Array]]) -> tuple[list[_Judged], dict[str, float]]:
+def _forward(left: Left, found: Sequence[tuple[str, Array]]) -> tuple[list[Judged], dict[str, float]]:
     """The best group, then those that add to it; the last one holds the columns of all."""
     threshold = math.log(len(found) / ALPHA)
-    looked = _best_of_each(sorted(((_first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True), found)
+    looked = _best_of_each(sorted(((first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True), found)
     gains = {token: 0.0 for token, _ in found}
-    terms = [(found[i][0], _leading(left, found[i][1])) for _, i in looked[:FEW]]
-    judged = [_judge(left, token, x) for token, x in terms]
+    terms = [(found[i][0], leading(left, found[i][1])) for _, i in looked[:FEW]]
+    judged = [judge(left, token, x) for token, x in terms]
     for j in judged:
         gains[j.token] = max(gains[j.token], j.gain)
     strengths = [_strength(left, j, threshold) for j in judged]
@@ -201,7 +160,7 @@ def _forward(left: _Left, found: Sequence[tuple[str, Array]]) -> tuple[list[_Jud
     rest = [(j.token, j.x) for j in judged if gains[j.token] > threshold and j.token != chosen[0].token]
     while rest and len(chosen) < MOST_GROUPS:
         before = chosen[-1]
-        judged = [_judge(left, token, np.concatenate([before.x, x], axis=2)) for token, x in rest]
+        judged = [judge(left, token, np.concatenate([before.x, x], axis=2)) for token, x in rest]
         best = max(judged, key=lambda j: j.gain)
         if best.gain - before.gain < max(threshold * best.scatter, ADDS * before.gain):
             break
@@ -210,7 +169,7 @@ def _forward(left: _Left, found: Sequence[tuple[str, Array]]) -> tuple[list[_Jud
     return chosen, gains
 
 
-def _strength(left: _Left, j: _Judged, threshold: float) -> tuple[float, _Judged]:
+def _strength(left: Left, j: Judged, threshold: float) -> tuple[float, Judged]:
     """Nats by which a dictionary is beyond chance, of whichever test shows it most clearly; 0 if none does. Where it is only sliding that
     shows it, with its betas on all rows: what happens once, or in one place, is not foretold from elsewhere.
     """
@@ -248,83 +207,7 @@ def _best_of_each(looked: list[tuple[float, int]], found: Sequence[tuple[str, Ar
     return kept
 
 
-def _first_look(left: _Left, x: Array) -> float:
-    """Log evidence of the dictionary under the model's own noise."""
-    white = left.fit.whiten(x).reshape(-1, x.shape[2])
-    z = left.fit.z.ravel()
-    weighted = white * noises.weight(z)[:, None]
-    told = evidence(white.T @ weighted, weighted.T @ z).log
-    return told if left.clipped is None else max(told, evidence(white.T @ white, white.T @ left.clipped.ravel()).log)
-
-
-def _leading(left: _Left, x: Array) -> Array:
-    """The combinations of the columns that move the residual most, (n, nx, at most LEADING): the others are what a ridge would suppress."""
-    if x.shape[2] <= LEADING:
-        return x
-    white = left.fit.whiten(x).reshape(-1, x.shape[2])
-    _, vectors = np.linalg.eigh(white.T @ white)
-    return np.asarray(x @ vectors[:, -LEADING:])
-
-
-def _judge(left: _Left, token: str, x: Array) -> _Judged:
-    """Held-out gain. Several passes: what is left after one has less noise, under which the next one sees more. The first one takes
-    no colour into account: the colour that is there may well be the structure.
-    """
-    whiten: Whitener = left.fit.whiten
-    colour: Colour | None = None
-    joined = left.given.steps.joined
-    betas: Array | None = None
-    gain, scatter = 0.0, 1.0
-    for _ in range(PASSES):
-        betas_now = _betas(left, x, whiten, colour)
-        betas = betas_now if betas is None else betas
-        rest = left.r - np.einsum("kim,km->ki", x, betas_now[left.block])
-        level = noises.estimate(rest, left.f, joined, left.given.floor)
-        whiten = Whitener(level, left.f, joined)
-        z = whiten(rest)
-        colour = noises.colour(z, joined)
-        reached = _likelihood(z, whiten, colour, joined)
-        # without the terms, under the same noise: a better estimate of the noise alone is no structure
-        bare = max(left.fit.coloured, *(_likelihood(whiten(left.r), whiten, c, joined) for c in (colour, left.fit.colour)))
-        if reached - bare > gain:
-            push = colour(whiten(left.r - rest), joined)
-            z = colour(z, joined)
-            gain, betas = reached - bare, betas_now
-            scatter = _scatter(push * z * noises.weight(z), push, left.block)
-    return _Judged(token, x, gain, scatter, betas_now if betas is None else betas)
-
-
-def _likelihood(z: Array, whiten: Whitener, colour: Colour, joined: NDArray[np.bool_]) -> float:
-    """Log likelihood of a whitened residual, coloured."""
-    return float(np.sum(noises.log_density(colour(z, joined)))) - whiten.logdet - len(z) * float(np.sum(np.log(colour.scale)))
-
-
-def _scatter(scores: Array, push: Array, block: NDArray[np.int64]) -> float:
-    """How much more the scores of blocks scatter than white noise would let them, as a ratio of variances, at least 1: noise that
-    wanders slowly looks like much else."""
-    sums = np.bincount(block, scores.sum(axis=1), BLOCKS)
-    return min(max(1.0, float(np.sum(sums**2) / max(float(np.sum(push**2)), 1e-300))), MOST_SCATTER)
-
-
-def _betas(left: _Left, x: Array, whiten: Whitener, colour: Colour | None) -> Array:
-    """(BLOCKS, m) ridge solutions without each block."""
-    joined = left.given.steps.joined
-    m = x.shape[2]
-    white, z = whiten(x), whiten(left.r)
-    if colour is not None:
-        white, z = colour(white, joined), colour(z, joined)
-    white, z = white.reshape(-1, m), z.ravel()
-    weighted = white * noises.weight(z)[:, None]
-    edges = np.searchsorted(left.block, np.arange(BLOCKS + 1)) * left.r.shape[1]
-    products, slopes = np.zeros((BLOCKS, m, m)), np.zeros((BLOCKS, m))
-    for b, here in enumerate(slice(p, q) for p, q in pairwise(edges.tolist())):
-        products[b], slopes[b] = white[here].T @ weighted[here], weighted[here].T @ z[here]
-    product, slope = products.sum(axis=0), slopes.sum(axis=0)
-    ridge = evidence(product, slope).ridge * np.eye(m)
-    return np.stack([np.linalg.solve(product - products[b] + ridge, slope - slopes[b]) for b in range(BLOCKS)])
-
-
-def _weight_of(left: _Left, nominal: Fit, judged: _Judged, horizon: int) -> tuple[bool, float]:
+def _weight_of(left: Left, nominal: Fit, judged: Judged, horizon: int) -> tuple[bool, float]:
     """Whether the structure shows in rollouts, and what share of all that the nominal model lacks it is."""
     data, steps, model = left.given.data, left.given.steps, left.fit.model
     act, act_nominal = acting(model, data), acting(nominal.model, data)

@@ -40,6 +40,9 @@ LONGEST = 65_536
 FINER, FLOOR = 4, 25
 """Points of a spectrum for each of its own; how many of these make a neighbourhood."""
 
+ROUNDS = 4
+"""Periods that a line must have gone through."""
+
 LINE = 25.0
 """Times its neighbourhood by which a line must stand out: of 10 000 points of white noise, the highest is about 10."""
 
@@ -105,8 +108,8 @@ def quieter(steps: Steps, noise: Noise) -> Array:
 def _hum(r: Array, given: Problem, directions: Terms) -> Iterator[Terms]:
     """A wave of the one frequency at which the residual has a line in its spectrum, if it has one. r: (n, nx)."""
     dt, steps = given.data.dt, given.steps
-    place = np.rint((steps.t - steps.t[0]) / dt).astype(np.int64)
-    if not directions or place[-1] >= LONGEST:
+    place = np.floor((steps.t - steps.t[0]) / dt + 0.01).astype(np.int64)
+    if not directions or place[-1] >= LONGEST or np.any(np.diff(place) <= 0):  # runs that each begin at zero have no common phase
         return
     series = np.zeros((int(place[-1]) + 1, len(directions)))
     series[place] = np.stack([np.sum(r * d, axis=1) / np.maximum(np.sum(d * d, axis=1), 1e-300) for d in directions], axis=1)
@@ -117,9 +120,12 @@ def _hum(r: Array, given: Problem, directions: Terms) -> Iterator[Terms]:
 
 def line(series: Array, dt: float) -> tuple[float, float]:
     """Frequency (Hz) at which the spectrum of a column of (n, c) stands out most from its neighbourhood, and how many times that is."""
+    series = series - series.mean(axis=0)
+    kept = np.sum(series[1:] * series[:-1], axis=0) / np.maximum(np.sum(series**2, axis=0), 1e-300)
+    series = series[1:] - np.clip(kept, 0.0, 1.0) * series[:-1]  # the spectrum of what wanders falls steeply: that is no line
     padded = FINER * len(series)
-    power = np.abs(np.fft.rfft(series - series.mean(axis=0), padded, axis=0)) ** 2
-    first, wide = 2 * FINER, FLOOR * FINER
+    power = np.abs(np.fft.rfft(series, padded, axis=0)) ** 2
+    first, wide = ROUNDS * FINER, FLOOR * FINER
     if len(power) < 2 * wide:
         return 0.0, 0.0
     edges = np.linspace(first, len(power), max((len(power) - first) // wide, 1) + 1).astype(int)

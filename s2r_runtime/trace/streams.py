@@ -67,6 +67,8 @@ def complete(states: Stream, inputs: Stream | None = None, rates: Rates | None =
 
 def _between(at: Array, t: Array, values: Array) -> Array:
     """Linear between neighbours that are not far apart; NaN elsewhere."""
+    if len(t) == len(at) and np.array_equal(t, at):
+        return values
     right = np.clip(np.searchsorted(t, at), 1, max(len(t) - 1, 1))
     if len(t) < 2:
         return np.where(np.isin(at, t), values[0] if len(values) else np.nan, np.nan)
@@ -81,9 +83,9 @@ def _along(at: Array, t: Array, values: Array, j: int, inputs: Stream, rates: Ra
 
     Of neighbours a <= s <= b with w = (b - s)/(b - a): + w (what the inputs do from a to s) - (1 - w) (what they do from s to b).
     """
-    right = np.clip(np.searchsorted(t, at), 1, max(len(t) - 1, 1))
-    if len(t) < 2:
+    if len(t) < 2 or (len(t) == len(at) and np.array_equal(t, at)):
         return values[:, j]
+    right = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
     before, after = at - t[right - 1], t[right] - at
     own = (before <= 0.0) | (after <= 0.0)
     edges = np.stack([at - np.maximum(before, 1e-9), at, at + np.maximum(after, 1e-9)], axis=1)

@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.errors import Held, Judged, better, displacement
@@ -22,6 +23,8 @@ from s2r_runtime.trace.fitting import Fit, Problem, fitted, without
 from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import rms
 from s2r_runtime.trace.selection import Selection
+
+Array = NDArray[np.float64]
 
 Verdict = Literal["none", "traced", "ambiguous", "unexplained", "sensor_fault"]
 
@@ -65,14 +68,27 @@ def verdict_of(chosen: Selection, structure: Structure, faults: tuple[Fault, ...
 
 def foretells(judged: Judged, given: Held) -> bool:
     """Whether rollouts end nearer to the measurement than the state was from which they began: clearly in some state, and in every one that
-    goes somewhere (much farther in the horizon than in a step, which noise does not).
+    goes somewhere (much farther in the horizon than in a step, which noise does not). A position counts as one: a robot that drives
+    straight on goes nowhere sideways.
     """
     if not len(judged.ends):
         return True
-    gone, step = rms(displacement(given)), rms(given.steps.y1 - given.steps.y0)
-    share = rms(judged.ends) / np.maximum(gone, 1e-300)
+    columns = _together(given.data.states)
+    gone, step, off = (_lengths(e, columns) for e in (displacement(given), given.steps.y1 - given.steps.y0, judged.ends))
+    share = off / np.maximum(gone, 1e-300)
     goes = gone > min(5.0, 0.5 * given.horizon) * step
     return not goes.any() or bool(np.any(share[goes] < FORETELLS) and np.all(share[goes] < NEARER))
+
+
+def _together(states: tuple[str, ...]) -> list[list[int]]:
+    """Columns of what is one thing: the position, and each other state."""
+    position = [i for i, name in enumerate(states) if name in {"x", "y", "z"}]
+    return [*([position] if position else []), *([i] for i in range(len(states)) if i not in position)]
+
+
+def _lengths(e: Array, columns: list[list[int]]) -> Array:
+    """(groups,) rms of what columns of e (n, nx) make together."""
+    return np.array([float(np.sqrt(np.sum(rms(e[:, group]) ** 2))) for group in columns])
 
 
 def final_fit(chosen: Selection, verdict: Verdict) -> Fit:

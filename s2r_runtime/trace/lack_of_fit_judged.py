@@ -1,0 +1,136 @@
+"""How a dictionary of terms is judged on what a model leaves (`lack_of_fit` says of which, and what follows from it).
+
+r = sum_j beta_j X_j + noise        beta by ridge, its strength by the evidence; without the block of time that is judged
+gain                                log likelihood of what is left, noise and colour re-estimated, less that without the terms
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.evidence import evidence
+from s2r_runtime.trace.fitting import Fit, Problem
+from s2r_runtime.trace.residual_noise import Colour, Whitener
+
+Array = NDArray[np.float64]
+
+BLOCKS = 8
+"""Of the cross-validation."""
+
+LEADING = 48
+"""Columns of a dictionary that are judged at most."""
+
+MOST_SCATTER = 5.0
+"""Scatter counts up to this: a dictionary that fits the structure only roughly leaves scores that scatter too."""
+
+PASSES = 3
+"""Of terms and noise in turn."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A dictionary X (n, nx, m) with its held-out gain and beta (BLOCKS, m) without each block. scatter: see `_scatter`."""
+
+    token: str
+    x: Array
+    gain: float
+    scatter: float
+    betas: Array
+
+
+@dataclass(frozen=True)
+class Left:
+    """What is to be explained. r: (n, nx); f: (n, nx, nx); block: (n,). clipped: (n, nx), whitened, wild values cut off but with the
+    weight of any other; None if there are none.
+
+    What shows only when an input jumps is wild, and few: weights would take it for outliers. Whether outliers have to do with the inputs
+    is told by sliding.
+    """
+
+    given: Problem
+    fit: Fit
+    r: Array
+    f: Array
+    block: NDArray[np.int64]
+    clipped: Array | None
+
+
+def first_look(left: Left, x: Array) -> float:
+    """Log evidence of the dictionary under the model's own noise."""
+    white = left.fit.whiten(x).reshape(-1, x.shape[2])
+    z = left.fit.z.ravel()
+    weighted = white * noises.weight(z)[:, None]
+    told = evidence(white.T @ weighted, weighted.T @ z).log
+    return told if left.clipped is None else max(told, evidence(white.T @ white, white.T @ left.clipped.ravel()).log)
+
+
+def leading(left: Left, x: Array) -> Array:
+    """The combinations of the columns that move the residual most, (n, nx, at most LEADING): the others are what a ridge would suppress."""
+    if x.shape[2] <= LEADING:
+        return x
+    white = left.fit.whiten(x).reshape(-1, x.shape[2])
+    _, vectors = np.linalg.eigh(white.T @ white)
+    return np.asarray(x @ vectors[:, -LEADING:])
+
+
+def judge(left: Left, token: str, x: Array) -> Judged:
+    """Held-out gain. Several passes: what is left after one has less noise, under which the next one sees more. The first one takes
+    no colour into account: the colour that is there may well be the structure.
+    """
+    whiten: Whitener = left.fit.whiten
+    colour: Colour | None = None
+    joined = left.given.steps.joined
+    betas: Array | None = None
+    gain, scatter = 0.0, 1.0
+    for _ in range(PASSES):
+        betas_now = _betas(left, x, whiten, colour)
+        betas = betas_now if betas is None else betas
+        rest = left.r - np.einsum("kim,km->ki", x, betas_now[left.block])
+        level = noises.estimate(rest, left.f, joined, left.given.floor)
+        whiten = Whitener(level, left.f, joined)
+        z = whiten(rest)
+        colour = noises.colour(z, joined)
+        reached = _likelihood(z, whiten, colour, joined)
+        # without the terms, under the same noise: a better estimate of the noise alone is no structure
+        bare = max(left.fit.coloured, *(_likelihood(whiten(left.r), whiten, c, joined) for c in (colour, left.fit.colour)))
+        if reached - bare > gain:
+            push = colour(whiten(left.r - rest), joined)
+            z = colour(z, joined)
+            gain, betas = reached - bare, betas_now
+            scatter = _scatter(push * z * noises.weight(z), push, left.block)
+    return Judged(token, x, gain, scatter, betas_now if betas is None else betas)
+
+
+def _likelihood(z: Array, whiten: Whitener, colour: Colour, joined: NDArray[np.bool_]) -> float:
+    """Log likelihood of a whitened residual, coloured."""
+    return float(np.sum(noises.log_density(colour(z, joined)))) - whiten.logdet - len(z) * float(np.sum(np.log(colour.scale)))
+
+
+def _scatter(scores: Array, push: Array, block: NDArray[np.int64]) -> float:
+    """How much more the scores of blocks scatter than white noise would let them, as a ratio of variances, at least 1: noise that
+    wanders slowly looks like much else."""
+    sums = np.bincount(block, scores.sum(axis=1), BLOCKS)
+    return min(max(1.0, float(np.sum(sums**2) / max(float(np.sum(push**2)), 1e-300))), MOST_SCATTER)
+
+
+def _betas(left: Left, x: Array, whiten: Whitener, colour: Colour | None) -> Array:
+    """(BLOCKS, m) ridge solutions without each block."""
+    joined = left.given.steps.joined
+    m = x.shape[2]
+    white, z = whiten(x), whiten(left.r)
+    if colour is not None:
+        white, z = colour(white, joined), colour(z, joined)
+    white, z = white.reshape(-1, m), z.ravel()
+    weighted = white * noises.weight(z)[:, None]
+    edges = np.searchsorted(left.block, np.arange(BLOCKS + 1)) * left.r.shape[1]
+    products, slopes = np.zeros((BLOCKS, m, m)), np.zeros((BLOCKS, m))
+    for b, here in enumerate(slice(p, q) for p, q in pairwise(edges.tolist())):
+        products[b], slopes[b] = white[here].T @ weighted[here], weighted[here].T @ z[here]
+    product, slope = products.sum(axis=0), slopes.sum(axis=0)
+    ridge = evidence(product, slope).ridge * np.eye(m)
+    return np.stack([np.linalg.solve(product - products[b] + ridge, slope - slopes[b]) for b in range(BLOCKS)])
