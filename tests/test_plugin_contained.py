@@ -281,8 +281,10 @@ def test_daemon_outlives_whatever_its_transport_does_and_the_audit_agrees(rig: R
         ("receive hang", "receive did not return within 2 s"),
     ):
         odd(rig, text)
-        found = rig.until(lambda words=words: (s := rig.status())["gate"] == "closed" and words in s["link_trouble"] and s)
-        assert found["reason"] == "link_down", text
+        found = rig.until(
+            lambda words=words: words in (status := rig.status())["link_trouble"] and status["reason"] == "link_down" and status
+        )
+        assert found["gate"] == "closed", text
         rig.until(lambda words=words: f"s2r: transport 'loop' of tests: {words}" in rig.said())
         odd(rig, "")
         if text != "receive hang":
