@@ -143,7 +143,7 @@ def test_campaign_certificate_drive_and_audit_over_can(rig: CanRig) -> None:
         if answer["exit_code"] == 0:
             break
         assert "watch_alarm" in answer["text"], answer
-        rig.ask("clear", reason="watch_alarm")
+        rig.ask("clear", text="watch_alarm")
     assert answer["exit_code"] == 0, answer
     rig.until(lambda: rig.status()["scenarios"] >= 1)
     counters = rig.status()["counters"]
