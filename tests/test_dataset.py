@@ -224,3 +224,24 @@ def test_a_silence_in_which_inputs_went_on_is_not_silent():
     for stamps, silent in ((t, False), (t[keep], True)):
         data = from_streams(_model(), [(states, Stream(stamps, np.zeros((len(stamps), 2))))], "here")
         assert [p.silent for p in data.pauses] == [silent]
+
+
+def test_a_heading_on_rows_of_its_own_does_not_turn_back_where_it_wraps():
+    t = 0.05 * np.arange(201)
+    heading = 2.5 + 0.4 * t
+    values = np.column_stack([np.cos(t), np.sin(t), (heading + np.pi) % (2.0 * np.pi) - np.pi])
+    values[1::2, :2] = np.nan
+    values[::2, 2] = np.nan
+    inputs = Stream(t[::2], np.tile([0.0, 0.4], (101, 1)))
+    (run,) = from_streams(_model(0.1), [(Stream(t, values), inputs)], "here").runs
+    there = ~np.isnan(run.y[:, 2])
+    assert np.count_nonzero(there) > 90
+    assert np.max(np.abs(np.diff(run.y[there, 2]) - 0.04)) < 1e-6
+
+
+def test_a_stretch_without_a_step_is_none():
+    t = np.concatenate([0.1 * np.arange(80), 60.0 + np.array([0.0, 0.01])])
+    data = from_streams(_model(0.1), [(Stream(t, np.tile(t[:, None], (1, 3))), Stream(t, np.ones((82, 2))))], "here")
+    assert len(data.runs) == 1
+    with pytest.raises(RecordingError, match="no two rows"):
+        from_streams(_model(0.1), [(Stream(t[-2:], np.zeros((2, 3))), Stream(t[-2:], np.ones((2, 2))))], "here")

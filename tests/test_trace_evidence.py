@@ -115,3 +115,25 @@ def test_a_curve_that_gave_up_one_of_its_numbers_is_not_named():
             rows.append(x[0])
         data = from_arrays(model, [(np.array(rows), u)])
         assert limited(evaluate(problem(data, steps_of(data)), added)) is named
+
+
+def test_a_model_in_a_file_of_the_user_s_own_is_traced(tmp_path):
+    path = tmp_path / "cart.py"
+    path.write_text(
+        'STATES = ("p", "s")\nINPUTS = ("push",)\nPARAMS = {"weight": 2.0}\n\n\n'
+        "def step(x, u, dt, params):\n"
+        "    import numpy as np\n\n"
+        '    a = u[:, 0] / params["weight"]\n'
+        "    return np.stack([x[:, 0] + dt * x[:, 1] + 0.5 * dt * dt * a, x[:, 1] + dt * a], axis=1)\n"
+    )
+    model = compose(ModelSpec(str(path), 0.05))
+    rng = np.random.default_rng(8)
+    u = np.repeat(rng.uniform(-1.0, 1.0, 60), 10)[:, None]
+    x, rows = np.zeros((1, 2)), [np.zeros(2)]
+    for k in range(600):
+        x = model.advance(x, 0.8 * u[k : k + 1], 0.8 * u[k : k + 1])
+        rows.append(x[0])
+    y = np.array(rows) + rng.normal(size=(601, 2)) * [0.002, 0.004]
+    found = trace(from_arrays(model, [(y, u)]), model)
+    assert [(e.name, e.channel) for e in found.effects] == [("input_gain", "push")]
+    assert found.effects[0].parameters["gain"][0] == pytest.approx(0.8, abs=0.01)

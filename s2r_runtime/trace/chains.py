@@ -24,6 +24,19 @@ KEPT = 24_000_000
 """Bytes of results that are kept; the longest unused go first."""
 
 
+class _Same:
+    """Equal only to itself: models and effects of others need not be hashable. It is kept, so that no other object takes its place."""
+
+    def __init__(self, thing: object) -> None:
+        self._thing = thing
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self._thing is other._thing
+
+    def __hash__(self) -> int:
+        return id(self._thing)
+
+
 class Inputs:
     """Held inputs of runs, (T_i, nu) each, in rows of dt; starts: of the runs, s."""
 
@@ -46,12 +59,12 @@ class Inputs:
     def through(self, model: ComposedModel, chain: Sequence[AppliedEffect]) -> Array:
         """What acts after the chain, from rest: the runs laid end to end, (sum T_i, nu)."""
         nominal = model.nominal
-        who: Key = (nominal.shared, *sorted(nominal.parameters.items()))
+        who: Key = (_Same(nominal.shared), *sorted(nominal.parameters.items()))
         links: list[Key] = [(who, name) for name in nominal.inputs]
         now = self._tables
         for a in chain:
             touched = self._touched(a, model)
-            key: Key = (a.effect, a.channel, _values(a), *(links[c] for c in touched))
+            key: Key = (_Same(a.effect), a.channel, _values(a), *(links[c] for c in touched))
             found = self._kept.get(key)
             if found is None:
                 found = [table[..., touched] for table in self._apply(a, now, model)]

@@ -154,7 +154,7 @@ def from_streams(
         _check_same_clock(states, inputs, source)
     dt = model.dt
     stretches = [part for states, inputs in segments for part in _split(states, inputs, model)]
-    stretches = [part for part in stretches if len(part[0].t) >= 2]
+    stretches = [part for part in stretches if len(part[0].t) >= 2 and part[0].t[-1] - part[0].t[0] > 0.5 * dt]
     if not stretches:
         raise RecordingError(f"{source}: has no two rows on which a state was measured")
     spacing = float(np.median([float(np.median(np.diff(states.t))) for states, _ in stretches]))
@@ -246,7 +246,9 @@ def _check_same_clock(states: Stream, inputs: Stream, source: str) -> None:
 
 def _split(states: Stream, inputs: Stream, model: ComposedModel) -> list[tuple[Stream, Stream]]:
     """At long silences."""
-    states = complete(fresh(states), inputs, lambda x, u: _rates(model, x, u))
+    states = fresh(states)
+    states = Stream(states.t, unwrapped(states.values, model.angle_columns))  # what lies between two headings is no turn back
+    states = complete(states, inputs, lambda x, u: _rates(model, x, u))
     cut = np.flatnonzero(np.diff(states.t) > max(PAUSE_S, 200.0 * model.dt)) + 1
     given = []
     for rows in np.split(np.arange(len(states.t)), cut):

@@ -105,8 +105,9 @@ def explains_more(given: Problem, fit: Fit, nominal: Fit) -> tuple[str, ...]:
     left, found = _left_by(given, nominal)
     looked = _best_of_each(sorted(((first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True), found)
     judged = [judge(left, found[i][0], leading(left, found[i][1])) for _, i in looked[:FEW]]
-    best = max(judged, key=lambda j: j.gain)
-    return (best.token,) if best.gain > MORE * explained(fit, nominal) + ALIKE else ()
+    most = max(j.gain for j in judged)
+    best = min((j for j in judged if j.gain >= most - ALIKE), key=lambda j: (j.x.shape[2], -j.gain))
+    return (TOKENS.get(best.token, best.token),) if most > MORE * explained(fit, nominal) + ALIKE else ()
 
 
 def _left_by(given: Problem, fit: Fit) -> tuple[Left, list[tuple[str, Array]]]:

@@ -62,7 +62,7 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
     u = act.mean[steps.place]
     size = np.maximum(np.max(np.abs(u), axis=0), 1e-12)
     u = u / size
-    t = (steps.t - steps.t[0]) / max(steps.t[-1] - steps.t[0], 1e-9)
+    t = (steps.t - np.min(steps.t)) / max(float(np.ptp(steps.t)), 1e-9)
     one = np.ones(len(u))
     yield "constant", _push([one], [*body, *world])
     for j, name in enumerate(model.inputs):
@@ -112,7 +112,8 @@ def _hum(r: Array, given: Problem, directions: Terms) -> Iterator[Terms]:
     if not directions or place[-1] >= LONGEST or np.any(np.diff(place) <= 0):  # runs that each begin at zero have no common phase
         return
     series = np.zeros((int(place[-1]) + 1, len(directions)))
-    series[place] = np.stack([np.sum(r * d, axis=1) / np.maximum(np.sum(d * d, axis=1), 1e-300) for d in directions], axis=1)
+    seen = np.stack([np.sum(r * d, axis=1) / np.maximum(np.sum(d * d, axis=1), 1e-300) for d in directions], axis=1)
+    series[place] = seen - seen.mean(axis=0)  # and none where nothing was measured
     frequency, height = line(series, dt)
     if height > LINE:
         yield [f(2.0 * np.pi * frequency * steps.t) for f in (np.sin, np.cos)]

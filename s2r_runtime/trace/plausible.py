@@ -88,8 +88,9 @@ def check_plausible(model: ComposedModel, data: Dataset) -> None:
 
 def _few(data: Dataset) -> Dataset:
     """The beginning of each segment, of many every so many."""
-    every = max(1, len(data.segments) // SEGMENTS)
-    cut = tuple((Stream(s.t[:ROWS], s.values[:ROWS]), _until(i, s.t[:ROWS])) for s, i in data.segments[::every])
+    some = [pair for pair in data.segments if len(pair[0].t) > 1]
+    every = max(1, len(some) // SEGMENTS)
+    cut = tuple((Stream(s.t[:ROWS], s.values[:ROWS]), _until(i, s.t[:ROWS])) for s, i in some[::every])
     return replace(data, segments=cut)
 
 

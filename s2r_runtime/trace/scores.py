@@ -30,6 +30,9 @@ HOPELESS, HOPELESS_SHARE = 2.0, 0.2
 FAR = 100.0
 """Bounds beyond it are there for form's sake: no robot's parameter is near them."""
 
+GIVEN_UP = 1e-3
+"""Of the largest number of its kind: one that is so small is none."""
+
 REACHES = 0.3
 """Of what another model explains: a candidate that screening gives less will not come up to it. Of 114 that did best once they were
 fitted, one had been given less than this share of what the best at first sight had.
@@ -111,15 +114,27 @@ def limited(fit: Fit) -> bool:
     """False if a number has run off to its bound: friction without limit says that nothing moves, not why; and a curve of several
     numbers, one of which it had to give up, is not that curve.
     """
+    return not any(unlimited(fit, place) for place in fit.added)
+
+
+def unlimited(fit: Fit, place: int) -> bool:
+    """Whether that is so of the effect at this place."""
     ends = [bounds_of(fit.model, slot) for slot in fit.free]
-    for slot, v, p in zip(fit.free, values_of(fit.model, fit.free).tolist(), ends, strict=True):
+    values = values_of(fit.model, fit.free).tolist()
+    largest = max(
+        (abs(v) for slot, v, p in zip(fit.free, values, ends, strict=True) if slot.place == place and p.neutral == 0.0), default=0.0
+    )
+    for slot, v, p in zip(fit.free, values, ends, strict=True):
+        if slot.place != place:
+            continue
         if (v >= 0.99 * p.high and p.high >= FAR) or (v <= 0.99 * p.low and p.low <= -FAR):
-            return False
+            return True
         effect = fit.model.effects[slot.place].effect
         several = sum(other.place == slot.place for other in fit.free) > 1
-        if several and v == p.neutral and v in (p.low, p.high) and not getattr(effect, "additive", False):
-            return False
-    return True
+        given_up = p.neutral is not None and p.neutral in (p.low, p.high) and abs(v - p.neutral) <= GIVEN_UP * largest
+        if several and given_up and not getattr(effect, "additive", False):
+            return True
+    return False
 
 
 def names(model: ComposedModel) -> tuple[tuple[str, str], ...]:

@@ -30,7 +30,7 @@ from s2r_runtime.trace.fitting import (
 )
 from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
 from s2r_runtime.trace.rivals import CLOSE, rivals
-from s2r_runtime.trace.scores import STRICT, Bar, Scored, best_candidates, limited, name_of, names, rescored
+from s2r_runtime.trace.scores import STRICT, Bar, Scored, best_candidates, limited, name_of, names, rescored, unlimited
 from s2r_runtime.trace.slots import bounds_of, values_of, with_values
 
 Array = NDArray[np.float64]
@@ -189,11 +189,11 @@ def exchanged(given: Problem, fit: Fit, bar: Bar) -> Fit:
 
 
 def pruned(given: Problem, fit: Fit, tried: int, horizon: int, bar: Bar) -> Fit:
-    """Drops every effect that the others make superfluous."""
+    """Drops every effect that the others make superfluous; first of all one that is not what it is called."""
     again = True
     while again and fit.added:
         again = False
-        for place in fit.added:
+        for place in sorted(fit.added, key=lambda place, fit=fit: not unlimited(fit, place)):  # type: ignore[misc]
             less = fitted(given, fit, without(fit.model, place), 1)
             if not accepted(given, fit, less, tried, horizon, bar):
                 fit, again = less, True

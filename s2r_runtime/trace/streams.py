@@ -55,7 +55,7 @@ def complete(states: Stream, inputs: Stream | None = None, rates: Rates | None =
     if not counts.min(initial=len(states.t)) or np.count_nonzero(whole) >= TOGETHER * counts.min():
         return last_of_each(Stream(states.t[whole], states.values[whole]))
     rare = np.flatnonzero(counts <= 1.1 * counts.min())
-    together = [np.count_nonzero((there[:, [j]] == there).mean(axis=0) > TOGETHER) for j in rare]
+    together = [np.count_nonzero((there & there[:, [j]]).sum(axis=0) > TOGETHER * counts[j]) for j in rare]
     slow = there[:, int(rare[int(np.argmax(together))])]  # the stamps of most states, if several groups are about as rare
     t = states.t[slow]
     values = np.column_stack([_between(t, states.t[m], states.values[m, j]) for j, m in enumerate(there.T)])
