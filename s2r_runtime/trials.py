@@ -7,9 +7,12 @@
 each with confidence 1 - beta, if the runs are independent draws of one law. Everything is judged from the log: a scenario is drawn again
 from the run's seed, its safety recomputed from the observations; the controller's own word counts for nothing.
 
-A run is a scenario of a deployment. It is left out, whatever came of it, where the controller did not drive from its first step, or where
-an earlier deployment had the same seed and so the same scenario. It counts as unsafe where the gate closed in it, where the controller
-ended in it, or where it scores below the threshold. One that a person or the log's end cut short is left out while it was safe.
+A run is a scenario of a deployment. It is left out, whatever came of it, where the controller met the same scenario before (an earlier
+deployment had the same seed), be it that that run was left out itself. It counts as unsafe where the controller failed in it, where the
+gate closed in it or refused its first command, or where it scores below the profile's threshold. It is left out where it began while the
+gate had not opened yet, and where a person or the log's end cut it short, no recovery command sent, while it was not below the threshold.
+
+Logs are taken in the order of their own start times, so that the first n runs are the same however the files are given.
 """
 
 from __future__ import annotations
@@ -37,6 +40,8 @@ CHANNELS = (
     "event/proposed",
     "event/measured",
     "event/source_stopped",
+    "out/gate_changed",
+    "out/decided",
     "out/start_controller",
     "out/stop_controller",
     "out/model_adopted",
@@ -49,7 +54,9 @@ KEPT = 1000
 
 @dataclass
 class Run:
-    """One scenario. first, last: numbers of its first and last observation; driven: by the controller from the first step on."""
+    """One scenario. first, last: numbers of its first and last observation; driven: by the controller from the first step on; closed: the
+    gate closed in it or refused its first command, or the controller failed in it; over: it came to its own end.
+    """
 
     index: int
     first: int
@@ -63,7 +70,9 @@ class Run:
 
 @dataclass
 class _Deployment:
-    """A controller under way."""
+    """A controller under way. asked: about which observation; looked: at which of them, since it was asked; open: the gate is; settled: the
+    gate was open when the controller was asked.
+    """
 
     digest: str
     seed: int
@@ -72,9 +81,24 @@ class _Deployment:
     runs: list[Run] = field(default_factory=list)
     measured: list[tuple[int, float]] = field(default_factory=list)
     asked: int | None = None
+    looked: int | None = None
+    open: bool = False
+    settled: bool = False
+
+    def ask(self, seq: int) -> None:
+        """The controller is asked about this."""
+        self.asked, self.looked, self.settled = seq, None, self.open
+
+    def look_at_asked(self, seen: dict[int, tuple[float, ...]]) -> None:
+        """What the controller was asked about and has not answered: a scenario may have ended or begun there all the same."""
+        if self.asked is not None and self.asked in seen:
+            self.look(self.asked, seen[self.asked])
 
     def look(self, seq: int, x: tuple[float, ...]) -> None:
-        """The controller was shown this."""
+        """The controller was shown this. Once a question: its answer may come after somebody else's command."""
+        if seq == self.looked:
+            return
+        self.looked, self.asked = seq, None
         try:
             seen, now, ended = self.episodes.look(np.array(x))
         except NotEnoughEvidence:  # no scenario begins there: the controller was not asked on
@@ -99,8 +123,19 @@ class _Deployment:
         run, mine = self.runs[-1], send.source == "controller"
         if run.driven is None:
             run.driven = mine
+            run.closed |= not mine and self.settled
         elif not mine and run.driven:
             run.closed = True
+
+    def failed(self) -> None:
+        """The controller is gone, by its own fault."""
+        if self.runs and not self.runs[-1].over:
+            self.runs[-1].closed = True
+
+    def refused(self) -> None:
+        """The gate refused a command, for another reason than that it had not opened yet."""
+        if self.runs and not self.runs[-1].over and self.runs[-1].driven is not False:
+            self.runs[-1].closed = True
 
 
 @dataclass
@@ -113,33 +148,47 @@ class Found:
 
 
 def read_runs(paths: Sequence[Path], profile: Profile, task: Task, controller_digest: str, model_digest: str) -> Found:
-    """Runs of this controller in these logs, in their order. Raises ConfigError for a log of another robot, task or profile."""
-    found, used = Found(), set[tuple[int, int]]()
-    for parts in logged_runs(paths, CHANNELS):
+    """Runs of this controller in these logs, in the order of the logs' start times, however they are given. Raises ConfigError for a log of
+    another robot, task or profile.
+    """
+    found, used, threshold = Found(), set[tuple[int, int]](), profile.verification.threshold
+    for parts in sorted(logged_runs(paths, CHANNELS), key=_began):
         for deployment in _deployments(parts, profile, task):
             for run in _judged(deployment):
-                reason = _left_out(run, deployment, controller_digest, model_digest, used)
+                reason = _left_out(run, deployment, controller_digest, model_digest, used, threshold)
                 if reason:
                     found.left_out[reason] = found.left_out.get(reason, 0) + 1
                 else:
-                    found.counted.append((run, not run.closed and run.safety >= profile.verification.threshold))
+                    found.counted.append((run, not run.closed and run.safety >= threshold))
         found.heads += [parts[-1].head.hex()]
     return found
 
 
-def _left_out(run: Run, deployment: _Deployment, controller: str, model: str, used: set[tuple[int, int]]) -> str:
-    """Why this run does not count, or empty."""
+def _began(parts: Sequence[Reading]) -> tuple[float, str]:
+    """When a run of the daemon began, s since 1970, and its name, which settles ties. A log without its beginning comes last: nothing in it
+    can be judged.
+    """
+    for entry in Reading(parts[0].path, ("event/started",)):
+        message: Any = entry.message
+        return float(message.unix_s), parts[0].run
+    return math.inf, parts[0].run
+
+
+def _left_out(run: Run, deployment: _Deployment, controller: str, model: str, used: set[tuple[int, int]], threshold: float) -> str:
+    """Why this run does not count, or empty. used: the scenarios that this controller has met; this one is added."""
     if deployment.digest != controller:
         return "of another controller"
-    if deployment.model_digest != model:
-        return "measured against another model"
-    if not run.driven:
-        return "not driven by the controller from its start"
     scenario = (deployment.seed, run.index)
     if scenario in used:
         return "the same scenario as an earlier run (same seed)"
     used.add(scenario)
-    return "cut short by a person or the end of the log, safe so far" if not run.over and not run.closed and run.safety >= 0.0 else ""
+    if deployment.model_digest != model:
+        return "measured against another model"
+    if run.closed:
+        return ""
+    if not run.driven:
+        return "not driven by the controller from its start"
+    return "cut short by a person or the end of the log, safe so far" if not run.over and run.safety >= threshold else ""
 
 
 def _judged(deployment: _Deployment) -> Iterator[Run]:
@@ -188,16 +237,21 @@ def _within(now: _Deployment, message: Any, seen: dict[int, tuple[float, ...]]) 
     """What happens while a controller is under way."""
     match message:
         case m.Ask(source="controller", obs_seq=seq):
-            now.asked = seq
+            now.ask(seq)
         case m.Proposed(command=command) if command.source == "controller" and command.obs_seq in seen:
             now.look(command.obs_seq, seen[command.obs_seq])
-            now.asked = None
         case m.SourceStopped(source="controller", reason=reason):
-            if reason == "finished" and now.asked in seen:
-                now.look(now.asked, seen[now.asked])
-            elif reason not in {"finished", "stopped"} and now.runs and not now.runs[-1].over:
-                now.runs[-1].closed = True
+            if reason != "stopped":
+                now.look_at_asked(seen)
+            if reason not in {"finished", "stopped"}:
+                now.failed()
+        case m.GateChanged():
+            now.open = message.open
+        case m.Decided(source="controller", allow=False, reason=reason) if reason != "settling":
+            now.refused()
         case m.Send():
+            if message.source != "controller":
+                now.look_at_asked(seen)
             now.sent(message)
         case m.Measured(fault="") if math.isfinite(message.discrepancy):
             now.measured.append((message.obs_seq, message.discrepancy))

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from daemon_rig import Rig
+from msgspec.structs import replace
 
 from s2r_runtime import messages as m
 from s2r_runtime.bounds import clopper_pearson_upper
@@ -20,6 +22,9 @@ from s2r_runtime.errors import NotEnoughEvidence
 from s2r_runtime.models.composed import compose
 from s2r_runtime.models.unicycle import MODEL as UNICYCLE
 from s2r_runtime.profile import load_profile
+from s2r_runtime.recording.logs import read_all
+from s2r_runtime.recording.reading import read
+from s2r_runtime.recording.writer import Writer
 from s2r_runtime.statements import of_trials
 from s2r_runtime.tasks.stl_task import StlTask
 from s2r_runtime.trials import Found, Run, _Deployment, _judged, _left_out, _within, read_runs, trials
@@ -98,6 +103,32 @@ def test_a_number_that_was_fixed_beforehand_is_held(driven: Rig) -> None:
         trials(found, **digests, beta=0.5, fixed=50)
 
 
+def test_which_runs_are_the_first_does_not_depend_on_the_order_of_the_files(driven: Rig, tmp_path: Path) -> None:
+    entries = [entry for path in driven.log_files() for entry in read(path)]
+    paths = []
+    for name, later, seed in (("z", 0, 11), ("a", 100, 12), ("m", 50, 13)):
+        writer = Writer(tmp_path / f"{name}.mcap", run=name, timed=False)
+        for entry in entries:
+            message: Any = entry.message
+            if isinstance(message, m.Started):
+                settings = replace(message.settings, seed=seed)
+                message = replace(message, unix_s=message.unix_s + later, settings=settings)
+            writer.write(message, entry.log_time_ns)
+        writer.close()
+        paths.append(tmp_path / f"{name}.mcap")
+    profile = load_profile(driven.profile)
+    model = compose(profile.model)
+    task = StlTask(profile.task.parameters, model.nominal, model.dt)
+    digest, by_start = load(driven.folder / "controller.py").digest, [paths[0], paths[2], paths[1]]
+    expected = read_runs(by_start, profile, task, digest, model.spec.digest())
+    ends = [read_all([path]).readings[0] for path in by_start]
+    assert [end.to_the_end().kind for end in ends] == ["closed"] * 3
+    assert expected.heads == [end.head.hex() for end in ends]
+    assert len(expected.counted) >= 6
+    for given in permutations(paths):
+        assert read_runs(given, profile, task, digest, model.spec.digest()) == expected
+
+
 def test_runs_of_another_controller_count_for_nothing(driven: Rig) -> None:
     found = found_in(driven, "sha256:another")
     assert found.counted == []
@@ -155,9 +186,39 @@ def drive(now: _Deployment, sources: list[str], x: float = 0.0, first: int = 0) 
         _within(now, m.Send(seq, seq, source, (0.0, 0.0), seq, 1), {})  # type: ignore[arg-type]
 
 
-def judged(now: _Deployment, used: set[tuple[int, int]] | None = None) -> list[tuple[str, bool]]:
+def judged(now: _Deployment, used: set[tuple[int, int]] | None = None, threshold: float = 0.0) -> list[tuple[str, bool]]:
     taken = set[tuple[int, int]]() if used is None else used
-    return [(_left_out(run, now, "controller", "model", taken), run.closed or run.safety < 0.0) for run in _judged(now)]
+    return [(_left_out(run, now, "controller", "model", taken, threshold), run.closed or run.safety < threshold) for run in _judged(now)]
+
+
+CUT_SHORT = "cut short by a person or the end of the log, safe so far"
+BEGAN_CLOSED = "not driven by the controller from its start"
+AGAIN = "the same scenario as an earlier run (same seed)"
+SEEN = dict.fromkeys(range(20), (0.0, 0.0, 0.0))
+
+
+def told(now: _Deployment, *messages: Any) -> None:
+    for message in messages:
+        _within(now, message, SEEN)
+
+
+def ask(seq: int) -> m.Ask:
+    return m.Ask(seq, "controller", seq)
+
+
+def answer(seq: int, refused: str = "") -> list[Any]:
+    """The controller's answer, the gate's verdict on it, and what the robot is told."""
+    command = m.Command(seq, seq, "controller", (0.0, 0.0), seq, 1)
+    verdict = m.Decided(seq, "controller", seq, seq, not refused, refused or "allowed", 0.0)
+    return [m.Proposed(seq, command), verdict, send(seq, "recovery" if refused else "controller")]
+
+
+def send(seq: int, source: Any) -> m.Send:
+    return m.Send(seq, seq, source, (0.0, 0.0), seq, 1)
+
+
+def gate(*, is_open: bool) -> m.GateChanged:
+    return m.GateChanged(0, is_open, "allowed" if is_open else "radius_above_verified")
 
 
 def test_a_run_in_which_the_gate_closed_is_unsafe_and_one_that_began_closed_is_left_out() -> None:
@@ -185,6 +246,49 @@ def test_a_run_that_is_cut_short_counts_if_it_was_unsafe_or_the_controller_faile
     assert judged(now) == [("cut short by a person or the end of the log, safe so far", False)]
 
 
+@pytest.mark.parametrize(
+    ("threshold", "x", "expected"),
+    [(0.2, 0.9, ("", True)), (-0.1, 1.05, (CUT_SHORT, False)), (-0.1, 1.2, ("", True)), (0.2, 0.7, (CUT_SHORT, False))],
+)
+def test_a_run_that_is_cut_short_is_held_against_the_threshold_of_the_profile(
+    threshold: float, x: float, expected: tuple[str, bool]
+) -> None:
+    now = deployment()  # safety 1 - x so far
+    drive(now, ["controller"] * 2, x=x)
+    assert judged(now, threshold=threshold) == [expected]
+
+
+@pytest.mark.parametrize("reason", ["raised", "died", "deadline", "malformed"])
+@pytest.mark.parametrize("gate_open", [True, False])
+def test_a_controller_that_fails_at_the_first_step_has_an_unsafe_run(reason: Any, gate_open: bool) -> None:
+    now = deployment()
+    told(now, gate(is_open=gate_open), ask(0), m.SourceStopped(0, "controller", reason, "no idea"), send(0, "recovery"))
+    assert judged(now) == [("", True)]
+
+
+def test_a_failure_at_the_first_step_is_of_that_run_and_not_of_the_one_before() -> None:
+    now = deployment()
+    told(now, gate(is_open=True))
+    for seq in range(3):
+        told(now, ask(seq), *answer(seq))
+    told(now, ask(3), m.SourceStopped(3, "controller", "died"), send(3, "recovery"))
+    assert judged(now) == [("", False), ("", True)]
+
+
+def test_a_first_command_that_the_gate_refuses_makes_an_unsafe_run_unless_the_gate_had_not_opened() -> None:
+    for why, expected in (("input_out_of_bounds", ("", True)), ("outside_region", ("", True)), ("settling", (BEGAN_CLOSED, False))):
+        now = deployment()
+        told(now, ask(0), *answer(0, refused=why))
+        assert judged(now) == [expected], why
+
+
+def test_a_gate_that_closes_before_the_first_answer_makes_an_unsafe_run_and_the_late_answer_is_no_step() -> None:
+    now = deployment()
+    told(now, gate(is_open=True), ask(0), gate(is_open=False), send(0, "recovery"), *answer(0, refused="command_out_of_order")[:2])
+    assert judged(now) == [("", True)]
+    assert now.episodes.look(np.zeros(3))[1].k == 1
+
+
 def test_scenarios_of_one_seed_count_once() -> None:
     used: set[tuple[int, int]] = set()
     again = []
@@ -193,6 +297,23 @@ def test_scenarios_of_one_seed_count_once() -> None:
         drive(now, ["controller"] * 4)
         again.append(judged(now, used)[0][0])
     assert again == ["", "the same scenario as an earlier run (same seed)", ""]
+
+
+def test_a_scenario_whose_first_run_was_left_out_is_not_run_again_until_it_counts() -> None:
+    for first, why in ((["controller"] * 2, CUT_SHORT), (["recovery"] * 2, BEGAN_CLOSED)):
+        used: set[tuple[int, int]] = set()
+        now = deployment()
+        drive(now, first)
+        assert judged(now, used) == [(why, False)]
+        now = deployment()
+        drive(now, ["controller"] * 4)
+        assert judged(now, used)[0] == (AGAIN, False)
+    used = set()
+    now = deployment()
+    drive(now, ["controller"] * 4)
+    assert _left_out(next(_judged(now)), now, "controller", "another model", used, 0.0) == "measured against another model"
+    assert judged(now, used)[0] == (AGAIN, False)
+    assert not _left_out(next(_judged(now)), now, "controller", "model", set(), 0.0)
 
 
 def test_299_safe_runs_show_one_percent_at_most() -> None:

@@ -29,7 +29,13 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     verb.add_argument("--profile", type=Path, required=True, metavar="P")
     verb.add_argument("--model", metavar="MODEL.toml", help="a repaired model instead of the profile's")
     verb.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the controller; may be repeated")
-    verb.add_argument("-n", type=count, default=0, metavar="N", help="how many runs were fixed beforehand: the first N count")
+    verb.add_argument(
+        "-n",
+        type=count,
+        default=0,
+        metavar="N",
+        help="how many runs were fixed beforehand: the first N count, in the order in which the logs began",
+    )
     verb.add_argument("--beta", type=probability, metavar="B", help="one minus the confidence of each bound (default: the profile's)")
     verb.add_argument("--json", action="store_true", help="print one JSON object")
     verb.set_defaults(run=run)

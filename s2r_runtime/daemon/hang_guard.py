@@ -9,7 +9,8 @@ A transport is called from the loop that runs the gate, so a call that hangs wou
     STUCK          nothing in Python runs, not even this guard (C code that waits and keeps the interpreter's lock): the kernel's timer,
                    which the guard else sets anew, ends the process by SIGALRM, and the stack on stderr says where it was
 
-A look counts for LOOK_S however long ago the last one was: a machine that slept or a process that was stopped has not hung.
+A look counts for LOOK_S however long ago the last one was: a machine that slept, or a process that was stopped for less than STUCK, has
+not hung. The kernel's timer runs on in a stopped process, so one that is stopped (SIGSTOP) for longer ends when it goes on.
 """
 
 from __future__ import annotations
