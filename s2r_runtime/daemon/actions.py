@@ -3,8 +3,9 @@
     opened, certificate installed, memory, beta spent      on the disk before the next action
     closed                                                 the commands of that event go out first, then everything is logged
 
-If the disk does not take what must be durable, what would have rested on it does not happen: each refused action becomes
-the event that says so, and the gate hears that the recorder failed.
+If the disk does not take what must be durable, the log or the state, what would have rested on it does not happen: each refused
+action becomes the event that says so, and the gate hears that the recorder failed. While the state is unsaved nothing new begins at
+all: an attempt whose beta a kill would give back is none.
 """
 
 from __future__ import annotations
@@ -29,6 +30,10 @@ KEPT_CONTROLLERS = 8
 KEPT_EPISODES = 1000
 SAVE_AGAIN_NS = 1_000_000_000
 GAP_TIMEOUT_S = 300.0
+
+
+RESTS = m.StartJob | m.StartCampaign | m.StartInputs | m.StartController | m.IssueCertificate
+"""What rests on the saved state, whichever event saved it."""
 
 
 def must_be_durable(output: m.Output) -> bool:
@@ -80,9 +85,9 @@ class Actions:
         waiting = False  # something logged must reach the disk before the next action
         for index, output in enumerate(outputs):
             do = self._do.get(type(output))
-            if waiting and do is not None:
+            if do is not None and (waiting or (self.unsaved and isinstance(output, RESTS))):
                 waiting = False
-                if not self._d.logbook.durable():
+                if self.unsaved or not self._d.logbook.durable():
                     self._refuse(outputs[index:], sent)
                     return
             if isinstance(output, m.Send) and not sent:
@@ -252,7 +257,7 @@ class Actions:
             self._d.folder.save(memory)
             self.unsaved = ""
         except OSError as error:
-            self.unsaved = f"the state cannot be saved: {error.strerror}"
+            self.unsaved = f"the state cannot be saved: {error.strerror or error}"
 
     def _issue(self, order: m.IssueCertificate) -> None:
         from s2r_runtime.daemon.issuing import issue
@@ -272,14 +277,15 @@ class Actions:
 
     def _refuse(self, outputs: Sequence[m.Output], sent: bool) -> None:
         """These would have rested on something that isn't on the disk. Stopping is always possible; nothing else happens."""
-        self._d.log_changed(False, self._d.logbook.health().detail or "the disk does not take the log")
-        why = "the log cannot be written"
+        if not self.unsaved:  # otherwise the gate heard it when the saving failed
+            self._d.log_changed(False, self._d.logbook.health().detail or "the disk does not take the log")
+        why = self.unsaved or "the log cannot be written"
         for output in outputs:
             self._d.logbook.put(output, output.t_ns)
             match output:
                 case m.Send(source="recovery") if not sent:
                     self._send(output)
-                case m.StopController() | m.StopCampaign() | m.Answer() | m.Persist() | m.Decided():
+                case m.StopController() | m.StopCampaign() | m.Answer() | m.Persist() | m.Decided() | m.ModelAdopted():
                     self._do[type(output)](output)
                 case m.StartController():
                     self._d.feed(m.SourceStopped(0, "controller", "start_failed", why))
