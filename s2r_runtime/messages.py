@@ -230,6 +230,9 @@ class Settings(Struct, frozen=True):
     """Of what a gap rests on besides the model: region, inputs, norm, sampling, guarantee. Another one voids the gap."""
     run_length: float = 1e5
     """Discrepancies between two false notices of change, at least, on average (guarantee G5)."""
+    norm_set: Literal["", "ball", "box"] = ""
+    norm_weights: tuple[float, ...] = ()
+    """The norm that every gap here is measured in: its set, and a weight for each state; empty: not said."""
 
 
 MEMORY_SCHEMA = 1
@@ -293,6 +296,8 @@ class Memory(Struct, frozen=True):
     """An effect was traced in the residual and no model that has it was adopted since (guarantee G8)."""
     proposal: Proposal | None = None
     """The newest repaired model that waits to be adopted."""
+    refuted: tuple[str, ...] = ()
+    """Digests of the transitions whose gaps ended refuted or outgrown: they found no later epoch."""
 
 
 # ---------------------------------------------------------------- events: into the core

@@ -10,6 +10,7 @@ import msgspec
 from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
 from s2r_runtime.core.state import State
+from s2r_runtime.headroom import grid
 from s2r_runtime.messages import (
     MEMORY_SCHEMA,
     Answer,
@@ -76,6 +77,8 @@ SETTINGS = Settings(
     seed=1,
     required_laws=("uniform", "persistent"),
     campaign_digest="campaign",
+    norm_set="ball",
+    norm_weights=(1.0, 1.0, 0.05),
 )
 GAP = Gap(0.01, 0.1, 0.1, 50, "ball", (1.0, 1.0, 0.05), 160, 0, 0.03, 0.0152, 1, "model", "transitions")
 
@@ -149,10 +152,23 @@ class Rig:
     def verified(self, *, names: tuple[str, ...] = ("uniform", "persistent"), passed: bool = True, **changes: Any) -> list[Output]:
         """The running verification ends."""
         job = one(self.outputs, StartJob, last=True)
-        n = ledger.sample_size(0.03, ledger.share(0.05, job.attempt))
+        split = len(grid(job.least_radius, job.radius))
+        n = ledger.sample_size(0.03, ledger.share(0.05, job.attempt) / split)
         results = tuple(LawResult(law, n, 0.1 if passed else -1.0, 0, 0.01, 1.0, True, True, passed) for law in names)
         result = Verification(
-            passed, job.radius, job.hold_radius, 0.0, 0.03, job.beta, job.attempt, job.seed, results, job.digest, "model", "task"
+            passed,
+            job.radius,
+            job.hold_radius,
+            0.0,
+            0.03,
+            job.beta,
+            job.attempt,
+            job.seed,
+            results,
+            job.digest,
+            "model",
+            "task",
+            split=split,
         )
         return self.feed(JobFinished(self.t, job.job_id, "verify", verification=msgspec.structs.replace(result, **changes)))
 

@@ -14,6 +14,7 @@ from core_rig import GAP, S
 
 from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
+from s2r_runtime.headroom import grid
 from s2r_runtime.messages import (
     MEMORY_SCHEMA,
     AnalyticsChanged,
@@ -293,7 +294,8 @@ class World:
                 raise AssertionError(duty)
 
     def verification(self, duty: StartJob, bad: bool) -> Verification:
-        n = ledger.sample_size(0.2, duty.beta)
+        split = len(grid(duty.least_radius, duty.radius))
+        n = ledger.sample_size(0.2, duty.beta / split)
         law = LawResult("uniform", n, -1.0 if bad else 0.1, int(bad), 0.5, 1.0, True, True, not bad)
         return Verification(
             not bad,
@@ -308,6 +310,7 @@ class World:
             duty.digest,
             self.state.memory.model_digest,
             "task",
+            split=split,
         )
 
     def chaos(self) -> None:

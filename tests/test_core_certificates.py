@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from typing import Any
 
 import msgspec
@@ -87,7 +88,59 @@ def test_radii_that_share_beta_need_the_scenarios_for_their_shares() -> None:
     rig = Rig()
     rig.gap()
     rig.request("deploy", digest="controller")
-    assert "too few" in one(rig.verified(split=8), AttemptEnded).reason
+    n = ledger.sample_size(0.03, ledger.share(0.05, 1))  # enough for one radius
+    laws = tuple(LawResult(law, n, 0.1, 0, 0.01, 1.0, True, True, True) for law in ("uniform", "persistent"))
+    assert "too few" in one(rig.verified(laws=laws), AttemptEnded).reason
+
+
+def test_a_result_that_leaves_out_that_its_beta_was_split_is_no_pass() -> None:
+    for split in (1, 0, -1, 7, 9):
+        rig = Rig()
+        rig.gap()
+        rig.request("deploy", digest="controller")
+        outputs = rig.verified(split=split)
+        assert "8 were fixed beforehand" in one(outputs, AttemptEnded).reason
+        assert of(outputs, IssueCertificate) == []
+    rig = Rig(headroom=1.0)
+    rig.gap()
+    rig.request("deploy", digest="controller")
+    assert of(rig.verified(split=1), IssueCertificate)  # nothing was searched for
+
+
+def test_a_gap_that_grew_beyond_all_numbers_is_not_paid_for() -> None:
+    largest = sys.float_info.max
+    for verb in ("deploy", "verify"):
+        rig = Rig(memory(radius=largest, certificates=()))
+        outputs = rig.request(verb, digest="controller")
+        assert kinds(outputs) == ["Answer"]
+        assert "no finite number" in one(outputs, Answer).text
+        assert rig.state.memory.attempts == 1
+    rig = Rig(memory(gap=msgspec.structs.replace(GAP, hold_radius=1.0), radius=largest / 10, certificates=()))  # its hold gap would be
+    assert "no finite number" in one(rig.request("verify", digest="controller"), Answer).text
+
+
+def test_a_discrepancy_beyond_all_numbers_ends_the_certificate_that_drives() -> None:
+    rig = Rig()
+    rig.driving()
+    outputs = rig.measure(sys.float_info.max)
+    assert of(outputs, StartJob) == of(outputs, AttemptSpent) == []
+    assert one(outputs, Revoked).reason == "verification_failed_at_grown_radius"
+    assert of(outputs, StopController)
+    assert not rig.state.gate_open
+    assert core.status(rig.state)["headroom_used"] is None
+
+
+def test_a_discrepancy_beyond_all_numbers_during_a_verification_refuses_it() -> None:
+    for verb in ("deploy", "verify"):
+        rig = Rig()
+        rig.gap()
+        rig.request(verb, digest="controller")
+        rig.measure(sys.float_info.max)
+        outputs = rig.verified()
+        assert of(outputs, StartJob) == of(outputs, IssueCertificate) == []
+        answer = one(outputs, Answer)
+        assert (answer.exit_code, answer.final) == (1, True)
+        assert "no finite number" in answer.text
 
 
 def test_a_radius_that_was_outgrown_while_it_was_verified_is_verified_once_more() -> None:
@@ -140,6 +193,8 @@ _LAW = LawResult("uniform", 160, 0.1, 0, 0.01, 1.0, progress_ok=True, required=T
         {"epsilon": 1e-3},
         {"laws": ()},
         {"laws": (_LAW,)},
+        {"laws": (msgspec.structs.replace(_LAW, law="adversarial", n=500),)},
+        {"laws": tuple(msgspec.structs.replace(_LAW, law=law, n=500) for law in ("uniform", "adversarial"))},
         {"threshold": 0.2},
         {"laws": tuple(msgspec.structs.replace(_LAW, law=law, n=100) for law in ("uniform", "persistent"))},
         {"laws": tuple(msgspec.structs.replace(_LAW, law=law, n=0) for law in ("uniform", "persistent"))},

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -9,6 +11,7 @@ import pytest
 from core_rig import GAP, Rig, S, kinds, memory, of, one
 
 from s2r_runtime.core import ledger
+from s2r_runtime.core.gaps import REFUTED
 from s2r_runtime.messages import (
     Answer,
     CertificateFacts,
@@ -19,7 +22,9 @@ from s2r_runtime.messages import (
 )
 
 
-def loaded(epoch: int = 1, transitions: str = "transitions", **changes: Any) -> CertificateStored:
+def loaded(epoch: int = 1, transitions: str = "", **changes: Any) -> CertificateStored:
+    """Of the gap in force in `memory()`, or of one from a later campaign."""
+    transitions = transitions or ("transitions" if epoch == 1 else f"transitions-{epoch}")
     facts = CertificateFacts("offline", "controller", "model", "task", "profile", epoch, 0.01, 0.02, 1500, 2500, 7)
     gap = msgspec.structs.replace(
         GAP, epoch=epoch, transitions_digest=transitions, n=ledger.campaign_size(0.03, ledger.share(0.05, epoch), 0)
@@ -44,6 +49,12 @@ def test_a_loaded_certificate_on_the_gap_in_force_is_installed_beside_it() -> No
     assert [facts.id for facts in rig.state.memory.certificates] == ["c1", "offline"]
 
 
+def of_another_norm(**norm: Any) -> CertificateStored:
+    event = loaded(2)
+    assert event.gap is not None
+    return msgspec.structs.replace(event, gap=msgspec.structs.replace(event.gap, **norm))
+
+
 @pytest.mark.parametrize(
     ("event", "kept", "word"),
     [
@@ -52,6 +63,16 @@ def test_a_loaded_certificate_on_the_gap_in_force_is_installed_beside_it() -> No
         (loaded(2, model_digest="another"), memory(), "another epoch or model"),
         (loaded(2, task_digest="another"), memory(), "task"),
         (loaded(profile_digest="another"), memory(), "profile"),
+        (loaded(2, profile_digest="of another robot"), memory(), "profile"),
+        (loaded(2, verified_radius=math.nan), memory(), "verified to nan"),
+        (loaded(2), memory(certificates=(), revoked={"offline": "by_operator"}), "revoked"),
+        (of_another_norm(weights=(1e-6, 1e-6, 1e-6), radius=1e-9, hold_radius=5e-8), memory(), "norm"),
+        (of_another_norm(weights=(1.0, 1.0)), memory(), "norm"),
+        (of_another_norm(set="box"), memory(), "norm"),
+        (loaded(2, "transitions"), memory(), "samples of epoch 1"),
+        (loaded(2, "transitions"), memory(radius=0.014), "samples of epoch 1"),
+        (loaded(2, "transitions"), memory(alarm_epoch=1), "samples of epoch 1"),
+        (loaded(2), memory(refuted=("transitions-0", "transitions-2")), "refuted"),
         (loaded(), memory(certificates=(), revoked={"offline": "by_operator"}), "revoked"),
         (msgspec.structs.replace(loaded(3), gap=msgspec.structs.replace(GAP, epoch=3, n=99)), memory(), "too few"),
     ],
@@ -63,6 +84,51 @@ def test_a_loaded_certificate_that_does_not_fit_is_refused(event: CertificateSto
     assert of(outputs, CertificateInstalled) == []
     assert word in one(outputs, Answer).text
     assert not one(outputs, Answer).final
+    assert kinds(outputs) == ["Answer"]
+    assert rig.state.memory == kept  # gap, grown radius, epochs, certificates, and what is revoked
+
+
+def _refuted_by_the_watch(rig: Rig) -> None:
+    rig.measure(0.001, e_value=1e3, epoch=1)
+
+
+def _outgrown(rig: Rig) -> None:
+    rig.measure(0.014, epoch=1)
+
+
+@pytest.mark.parametrize("seen", [_refuted_by_the_watch, _outgrown])
+def test_samples_that_were_seen_not_to_hold_found_no_later_epoch_however_many_came_since(seen: Callable[[Rig], None]) -> None:
+    rig = Rig(memory())
+    seen(rig)
+    rig.feed(loaded(2, id="second"))
+    assert rig.state.memory.gap is not None
+    assert rig.state.memory.gap.epoch == 2
+    rig = Rig(msgspec.json.decode(msgspec.json.encode(rig.state.memory), type=Memory))  # what a restart remembers
+    before = rig.state.memory
+    assert "refuted or outgrown" in one(rig.feed(loaded(3, "transitions")), Answer).text
+    assert rig.state.memory == before
+    assert of(rig.feed(loaded(3)), CertificateInstalled)
+
+
+def test_the_samples_of_a_refuted_gap_are_remembered_with_its_alarm_when_the_profile_changes() -> None:
+    rig = Rig(memory())
+    _refuted_by_the_watch(rig)
+    assert rig.state.memory.refuted == ("transitions",)
+    rig = Rig(rig.state.memory, campaign_digest="another profile's")
+    assert rig.state.memory.gap is None
+    assert "refuted or outgrown" in one(rig.feed(loaded(2, "transitions")), Answer).text
+
+
+def test_what_is_remembered_of_refuted_gaps_is_bounded_and_the_newest() -> None:
+    rig = Rig(memory(refuted=tuple(f"old-{i}" for i in range(REFUTED))))
+    _refuted_by_the_watch(rig)
+    assert rig.state.memory.refuted == (*(f"old-{i}" for i in range(1, REFUTED)), "transitions")
+
+
+def test_a_gap_that_held_makes_way_and_its_samples_are_no_worse_for_it() -> None:
+    rig = Rig(memory())
+    rig.feed(loaded(2))
+    assert rig.state.memory.refuted == ()
 
 
 def test_a_loaded_gap_does_not_come_between_a_campaign() -> None:

@@ -19,6 +19,7 @@ from s2r_runtime.core.state import State, certificate, usable_gap
 from s2r_runtime.daemon.settings import ModelFacts, settings_of
 from s2r_runtime.errors import NotEnoughEvidence
 from s2r_runtime.gap import Transitions, estimate_gap
+from s2r_runtime.headroom import grid, search
 from s2r_runtime.messages import (
     MEMORY_SCHEMA,
     CampaignFinished,
@@ -187,14 +188,24 @@ class Life:
         return sum(facts.epoch in wrong_gaps or self.failure[facts.controller_digest] > bad for facts in self.installed)
 
     def _verified(self, job: StartJob) -> JobFinished:
-        n = sample_size(self.settings.epsilon, job.beta)
-        failures = int(self.rng.binomial(n, self.failure[job.digest]))
+        """As the worker searches: among radii that share beta, each here with scenarios of its own, which fail no less at lesser radii."""
+        radii = grid(job.least_radius, job.radius)
+        share = job.beta / len(radii)
+        n = sample_size(self.settings.epsilon, share)
+        drawn: dict[int, int] = {}
+
+        def passes(index: int) -> bool:
+            drawn[index] = int(self.rng.binomial(n, self.failure[job.digest]))
+            return drawn[index] == 0
+
+        best = search(len(radii), passes) or 0
+        failures, part = drawn[best], radii[best] / job.radius if job.radius > 0.0 else 1.0
         passed, s_star = failures == 0, 1.0 if failures == 0 else -1.0
-        upper = clopper_pearson_upper(failures, n, job.beta)
+        upper = clopper_pearson_upper(failures, n, share)
         laws = tuple(LawResult(law, n, s_star, failures, upper, 1.0, True, True, passed) for law in self.settings.required_laws)
-        numbers = (job.radius, job.hold_radius, 0.0, self.settings.epsilon, job.beta, job.attempt, job.seed)
+        numbers = (radii[best], job.hold_radius * part, 0.0, self.settings.epsilon, job.beta, job.attempt, job.seed)
         digests = (job.digest, self.settings.model_digest, self.settings.task_digest)
-        return JobFinished(self.t, job.job_id, "verify", verification=Verification(passed, *numbers, laws, *digests))
+        return JobFinished(self.t, job.job_id, "verify", verification=Verification(passed, *numbers, laws, *digests, split=len(radii)))
 
     def _stored(self, order: IssueCertificate) -> CertificateStored:
         v, gap = order.verification, order.gap

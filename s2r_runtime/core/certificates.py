@@ -16,6 +16,7 @@ from s2r_runtime.core import ledger
 from s2r_runtime.core.drive import regate
 from s2r_runtime.core.sources import end_deployment
 from s2r_runtime.core.state import VERIFYING, Deployment, Job, Turn, certificate, job, situation, usable_gap
+from s2r_runtime.headroom import grid
 from s2r_runtime.messages import (
     AttemptEnded,
     AttemptSpent,
@@ -48,6 +49,8 @@ def refusal_to_verify(turn: Turn) -> str:
         return f"watch_alarm: the watch refuted the gap of epoch {gap.epoch}; sample anew: s2r sample"
     if job(turn.state, *VERIFYING) is not None:
         return "a verification is under way; wait for its end"
+    if boundless := _boundless(turn, gap):
+        return boundless
     return _needs_more_laws(turn, gap, turn.settings.required_laws)
 
 
@@ -61,13 +64,12 @@ def begin_verification(
     again: bool = False,
 ) -> None:
     """Spends an attempt, durably, and has the controller verified: at the grown radius at least, at up to `headroom` times that. There must
-    be a gap.
+    be a gap, and not a boundless one.
     """
     memory, settings, gap = turn.memory, turn.settings, turn.memory.gap
     if gap is None:
         raise AssertionError("a verification without a gap")  # callers have asked refusal_to_verify
-    attempt, grown = memory.attempts + 1, max(memory.radius, gap.radius)
-    radius, hold = settings.headroom * grown, settings.headroom * grown_hold(gap, grown)
+    attempt, (grown, radius, hold) = memory.attempts + 1, _radii(turn, gap)
     one = Job(turn.state.next_job, purpose, request_id, gap.epoch, digest, attempt, radius, hold, certificate_id, again, least_radius=grown)
     turn.add_job(one)
     turn.remember(attempts=attempt)
@@ -79,6 +81,20 @@ def begin_verification(
     )
     turn.emit(StartJob(turn.now, one.id, "verify", gap.epoch, digest, radius, hold, attempt, seed, share, least_radius=grown))
     regate(turn)
+
+
+def _radii(turn: Turn, gap: Gap) -> tuple[float, float, float]:
+    """The grown radius, the most that an attempt is made at, and the hold gap that goes with that."""
+    grown = max(turn.memory.radius, gap.radius)
+    return grown, turn.settings.headroom * grown, turn.settings.headroom * grown_hold(gap, grown)
+
+
+def _boundless(turn: Turn, gap: Gap) -> str:
+    """Why the gap has grown too large for any attempt, or empty: what is no finite number can be neither verified nor recorded."""
+    grown, *asked = _radii(turn, gap)
+    if all(gate.finite(value) for value in asked):
+        return ""
+    return f"the gap has grown to {grown:.6g}, and what would have to be verified is no finite number; sample anew: s2r sample"
 
 
 def grown_hold(gap: Gap, radius: float) -> float:
@@ -93,7 +109,12 @@ def reverify_if_due(turn: Turn) -> None:
     deployment, facts = turn.state.deployment, certificate(turn.state)
     if deployment is None or deployment.stage != "running" or facts is None or job(turn.state, *VERIFYING) is not None:
         return
-    if turn.memory.radius > facts.verified_radius and usable_gap(turn.state) is not None:
+    gap = usable_gap(turn.state)
+    if gap is None or turn.memory.radius <= facts.verified_radius:
+        return
+    if _boundless(turn, gap):
+        revoke(turn, [facts.id], "verification_failed_at_grown_radius")
+    else:
         begin_verification(turn, "reverify", deployment.digest, 0, certificate_id=facts.id)
 
 
@@ -130,12 +151,14 @@ def _result_problem(turn: Turn, done: Job, v: Verification) -> str:
         if not (gate.finite(value) and value >= asked * (1.0 - ROUNDING)):
             return f"it was verified at {value}, less than {asked}"
     required = [law for law in v.laws if law.required]
-    if {law.law for law in required} < set(turn.settings.required_laws):
+    if not set(turn.settings.required_laws) <= {law.law for law in required}:
         return "a required law was not run"
     failed = [law.law for law in required if not (law.passed and law.progress_ok and law.s_star >= v.threshold)]
     if failed or not required or not v.passed:
         return v.reason or (f"the law {failed[0]} did not pass" if failed else "it did not pass")
-    if v.split < 1 or not 0.0 < v.epsilon < 1.0:
+    if v.split != (radii := len(grid(least, done.radius))):
+        return f"its beta is split among {v.split} radii, {radii} were fixed beforehand"
+    if not 0.0 < v.epsilon < 1.0:
         return "its numbers make no sense"
     if any(law.n < 1 or ledger.binomial_tail(law.n, 0, v.epsilon) > share / v.split for law in required):
         return f"{min(law.n for law in required)} scenarios are too few for the share of attempt {done.attempt}"
@@ -169,6 +192,10 @@ def _outgrown(turn: Turn, done: Job, verified: float) -> None:
             f"the radius grew to {turn.memory.radius:.6g} while attempt {done.attempt} verified {verified:.6g}, twice in a row",
         )
     elif done.purpose != "trace" and done.purpose != "gap":
+        gap = turn.memory.gap
+        if gap is None or (boundless := _boundless(turn, gap)):
+            _refuse(turn, done, boundless if gap is not None else "there is no gap any more")
+            return
         turn.answer(done.request_id, 0, f"the radius grew to {turn.memory.radius:.6g} meanwhile; verifying again", final=False)
         begin_verification(turn, done.purpose, done.digest, done.request_id, certificate_id=done.certificate_id, again=True)
 
@@ -214,7 +241,7 @@ def certificate_stored(turn: Turn, event: CertificateStored) -> None:
     if gap is None or gap.epoch != done.epoch or turn.memory.model_digest != facts.model_digest:
         revoke(turn, [facts.id], "gap_void")
         _refuse(turn, done, f"the gap of epoch {done.epoch} does not hold any more")
-    elif problem := facts_problem(turn, facts, done.digest, _least(done)):
+    elif problem := facts_problem(turn, facts, done.digest, gap.epoch, _least(done)):
         _refuse(turn, done, f"the certificate is not the one that was asked for: {problem}")
     else:
         install(turn, facts)
@@ -233,17 +260,16 @@ def certificate_failed(turn: Turn, event: CertificateFailed) -> None:
     reverify_if_due(turn)
 
 
-def facts_problem(turn: Turn, facts: CertificateFacts, digest: str, radius: float) -> str:
-    """Why these facts do not certify this controller here to this radius, or empty."""
+def facts_problem(turn: Turn, facts: CertificateFacts, digest: str, epoch: int, radius: float) -> str:
+    """Why these facts do not certify this controller here, on the gap of that epoch, to this radius, or empty."""
     if facts.id in turn.memory.revoked:
         return f"it was revoked: {turn.memory.revoked[facts.id]}"
-    gap = turn.memory.gap
     for name, value, wanted in (
         ("controller", facts.controller_digest, digest),
         ("model", facts.model_digest, turn.memory.model_digest),
         ("task", facts.task_digest, turn.settings.task_digest),
         ("profile", facts.profile_digest, turn.settings.profile_digest),
-        ("epoch", facts.epoch, 0 if gap is None else gap.epoch),
+        ("epoch", facts.epoch, epoch),
     ):
         if value != wanted:
             return f"its {name} is {value}, here it is {wanted}"

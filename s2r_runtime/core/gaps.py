@@ -29,6 +29,11 @@ from s2r_runtime.messages import (
     StartJob,
 )
 
+REFUTED = 100
+"""Gaps that ended refuted or outgrown, whose samples are remembered, the newest. Each took a campaign at a share of beta that falls as
+1 / i^2, so a robot has few; 100 of them are 7 KB of what is persisted.
+"""
+
 # ---------------------------------------------------------------- campaigns
 
 
@@ -115,6 +120,8 @@ def _gap_problem(turn: Turn, gap: Gap, epoch: int) -> str:
         return "its radius is not a finite number >= 0"
     if gap.epsilon != settings.epsilon or gap.discarded != settings.discard:
         return "its epsilon or discards are not the profile's"
+    if settings.norm_weights and (gap.set, gap.weights) != (settings.norm_set, settings.norm_weights):
+        return f"its norm is a {gap.set} with weights {gap.weights}, the profile's a {settings.norm_set} with {settings.norm_weights}"
     if gap.white_reason.startswith(SERIAL):
         return f"its samples were not drawn independently: {gap.white_reason}"
     half = 0.5 * ledger.share(settings.beta, epoch)
@@ -125,12 +132,21 @@ def _gap_problem(turn: Turn, gap: Gap, epoch: int) -> str:
 
 def _enforce(turn: Turn, gap: Gap) -> None:
     old = [facts.id for facts in turn.memory.certificates]
+    before = turn.memory.gap
+    if before is not None and (usable_gap(turn.state) is None or turn.memory.radius > before.radius):
+        _distrust(turn, before)
     epochs = max(turn.memory.epochs, gap.epoch)
     turn.remember(gap=gap, radius=gap.radius, epochs=epochs, alarm_epoch=0, campaign_digest=turn.settings.campaign_digest)
     _watch_anew(turn)
     revoke(turn, old, "new_epoch")
     turn.persist()
     turn.emit(EpochChanged(turn.now, gap.epoch, ledger.share(turn.settings.beta, gap.epoch), gap))
+
+
+def _distrust(turn: Turn, gap: Gap) -> None:
+    """What the gap's samples said was seen not to hold: they found no later epoch."""
+    known = tuple(digest for digest in turn.memory.refuted if digest != gap.transitions_digest)
+    turn.remember(refuted=(*known, gap.transitions_digest)[-REFUTED:])
 
 
 def void_gap(turn: Turn, reason: str) -> None:
@@ -158,18 +174,28 @@ def certificate_loaded(turn: Turn, event: CertificateStored, gap: Gap) -> None:
     elif turn.state.campaign is not None or job(turn.state, "gap") is not None:
         problem = "a campaign is under way"
     else:
-        problem = _gap_problem(turn, gap, gap.epoch)
+        problem = _gap_problem(turn, gap, gap.epoch) or _samples_problem(turn, gap)
     if not problem:
         grounded = facts.epoch == gap.epoch and facts.model_digest == gap.model_digest
         problem = "" if grounded else "its gap is of another epoch or model"
-    if not problem and not same:
-        _enforce(turn, gap)
-    problem = problem or facts_problem(turn, facts, facts.controller_digest, 0.0)
+    problem = problem or facts_problem(turn, facts, facts.controller_digest, gap.epoch, 0.0)
     if problem:
         turn.answer(event.request_id, 1, f"certificate {facts.id} refused: {problem}", final=False)
         return
+    if not same:
+        _enforce(turn, gap)  # only now: a certificate that is refused changes nothing
     install(turn, facts)
     turn.answer(event.request_id, 0, f"certificate {facts.id} loaded", final=False)
+
+
+def _samples_problem(turn: Turn, gap: Gap) -> str:
+    """Why this gap's samples found no later epoch here, or empty: under another number they would forget what was seen since."""
+    now = turn.memory.gap
+    if now is not None and now.transitions_digest == gap.transitions_digest:
+        return f"its gap rests on the samples of epoch {now.epoch}; a later epoch needs samples of its own"
+    if gap.transitions_digest in turn.memory.refuted:
+        return "its gap rests on samples whose gap was refuted or outgrown here; sample anew: s2r sample"
+    return ""
 
 
 # ---------------------------------------------------------------- the watch
@@ -231,6 +257,7 @@ def _counted(turn: Turn, event: Measured, gap: Gap) -> None:
 def _alarm(turn: Turn, event: Measured, gap: Gap) -> None:
     """The gap is refuted: everything that rests on it ends."""
     latch(turn, "watch_alarm")
+    _distrust(turn, gap)
     turn.emit(AlarmRaised(turn.now, event.e_value, turn.settings.alpha, gap.epoch))
     old = [facts.id for facts in turn.memory.certificates if facts.epoch == gap.epoch]
     end_deployment(turn, "watch_alarm", f"refused: watch_alarm: the gap of epoch {gap.epoch} was refuted")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 
 from s2r_runtime.core import ledger, stream
@@ -24,7 +26,7 @@ def status(state: State) -> dict[str, object]:
         "radius": None if memory.gap is None else memory.radius,
         "gap_radius": None if memory.gap is None else memory.gap.radius,
         "verified_radius": None if facts is None else facts.verified_radius,
-        "headroom_used": None if facts is None or not facts.verified_radius > 0.0 else memory.radius / facts.verified_radius,
+        "headroom_used": None if facts is None else _ratio(memory.radius, facts.verified_radius),
         "samples_to_certificate": samples_to_certificate(state),
         "stream": _stream(state),
         "e_value": state.e_value,
@@ -54,6 +56,12 @@ def status(state: State) -> dict[str, object]:
         "traced": memory.traced,
         "link": state.link_up,
     }
+
+
+def _ratio(part: float, whole: float) -> float | None:
+    """None where it is no finite number."""
+    found = part / whole if whole > 0.0 else math.inf
+    return found if math.isfinite(found) else None
 
 
 def samples_to_certificate(state: State) -> int | None:

@@ -76,6 +76,8 @@ def settings_of(profile: Profile, model: ModelSpec, facts: ModelFacts, seed: int
         required_laws=profile.verification.required,
         campaign_digest=campaign_digest(profile),
         run_length=profile.watch.run_length,
+        norm_set=profile.norm.set,
+        norm_weights=tuple(profile.norm.weights.get(name, 1.0) for name in facts.states),
     )
 
 
