@@ -12,18 +12,21 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import daemon_rig
 import pytest
 from daemon_rig import Rig
 
+from s2r_runtime.audit.findings import Findings
+from s2r_runtime.audit.frames import Frames
 from s2r_runtime.daemon import hang_guard, robot_link
 from s2r_runtime.daemon.hang_guard import HangGuard, Hung
 from s2r_runtime.daemon.robot_link import RobotLink
 from s2r_runtime.daemon.transport_values import FRAMES_AT_ONCE
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged, Send
+from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, Observed, OverrideChanged, Send
 
 GOOD = Observation(1, 1, (0.0, 0.0, 0.0))
 SEND = Send(0, 1, "recovery", (0.0, 0.0), 1, 1)
@@ -145,19 +148,46 @@ def test_what_a_transport_may_not_give_is_a_lost_link_once_until_it_works_again(
 def test_a_flood_is_dropped_and_the_link_stays_down_until_it_is_calm(link: RobotLink, fake: Fake, monkeypatch: pytest.MonkeyPatch) -> None:
     turn(link)
     monkeypatch.setattr(robot_link, "CALM_NS", 50_000_000)
+    monkeypatch.setattr(robot_link, "TOLD_AGAIN_NS", 10_000_000)
     fake.given["receive"] = [Frame(1, "o", b"")] * (FRAMES_AT_ONCE + 1)
-    heard = [message for _ in range(10) for message in turn(link)]
-    assert [(m.up, m.detail) for m in heard] == [
-        (False, f"transport: receive gave {FRAMES_AT_ONCE + 1} frames at once, at most 4096 are taken")
-    ]
+    stop, *heard = [message for _ in range(10) for message in turn(link)]
+    said = f"transport: receive gave {FRAMES_AT_ONCE + 1} frames at once, at most 4096 are taken"
+    assert (stop.kind, stop.detail) == ("emergency_stop", f"{said}; what was dropped may have been a stop")
+    assert [(m.up, m.detail) for m in heard if isinstance(m, LinkChanged)] == [(False, said)]
     assert link.counters() == {"flooded": 10}
     del fake.given["receive"]
+    time.sleep(0.01)
+    (again,) = link.poll(time.monotonic_ns())
+    assert isinstance(again, OverrideChanged), "the newest drop was not told yet: after a person cleared the first, it must stop again"
+    monkeypatch.setattr(link, "_calm_ns", time.monotonic_ns() + 50_000_000)
     assert turn(link) == [GOOD], "one quiet turn is not calm"
     fake.given["decode"] = [LinkChanged(1, up=True), GOOD]
     assert [m.up for m in turn(link) if isinstance(m, LinkChanged)] == [True, False], "whatever it says of itself"
     fake.given["decode"] = [GOOD]
     time.sleep(0.06)
     assert [m.up for m in turn(link) if isinstance(m, LinkChanged)] == [True]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        [OverrideChanged(1, "emergency_stop", "x" * 5000)],
+        [OverrideChanged(1, "emergency_stop", "\ud800")],
+        [OverrideChanged(1.5, "emergency_stop", None)],  # type: ignore[arg-type]
+        [GOOD, OverrideChanged(1, "emergency_stop"), 7],
+        [Observation(1, 1, (math.nan,)), OverrideChanged(1, "emergency_stop")],
+        [GOOD] * 1000 + [OverrideChanged(1, "emergency_stop")] * 1000,
+        (OverrideChanged(1, "emergency_stop"),),
+        OverrideChanged(1, "emergency_stop"),
+    ],
+)
+def test_a_stop_is_heard_whatever_comes_with_it(link: RobotLink, fake: Fake, given: Any) -> None:
+    turn(link)
+    fake.given["decode"] = given
+    for _ in range(2):
+        (stop,) = [m for m in turn(link) if isinstance(m, OverrideChanged)]
+        assert stop.kind == "emergency_stop"
+        assert len(stop.detail.encode()) <= 1000
 
 
 @pytest.mark.parametrize("what", ["counters", "lines", "inform", "close"])
@@ -272,9 +302,6 @@ def test_daemon_outlives_whatever_its_transport_does_and_the_audit_agrees(rig: R
     rig.until_status(gate="open", link_trouble="")
     for text, words in (
         ("receive exit", "receive raised SystemExit: 3"),
-        ("decode [Observation(1, 1, (float('nan'),) * 3)]", "decode raised TypeError: gave an Observation with x (nan, nan, nan)"),
-        ("receive [Frame(1 << 62, 'observation', b'')]", "receive raised TypeError: gave a frame with arrival_ns 4611686018427387904"),
-        ("receive [Frame(1, 'observation', b'')] * 5000", "receive gave 5000 frames at once, at most 4096 are taken"),
         ("encode 'what'", "encode raised TypeError: gave str, must be Frame"),
         ("send exit", "send raised SystemExit: 3"),
         ("poll 1", "poll raised TypeError: gave int, must be a list of LinkChanged"),
@@ -296,6 +323,65 @@ def test_daemon_outlives_whatever_its_transport_does_and_the_audit_agrees(rig: R
     (log,) = rig.log_files()
     found = json.loads(rig.s2r("audit", str(log), "--key", str(rig.state / "key.pub"), "--json").stdout)
     assert (found["ok"], found["first_difference"], found["chain"]) == (True, None, "intact"), found
+
+
+def audited(rig: Rig) -> Any:
+    """What an audit says of the newest log."""
+    return json.loads(rig.s2r("audit", str(rig.log_files()[-1]), "--key", str(rig.state / "key.pub"), "--json").stdout)
+
+
+def test_input_that_was_dropped_latches_a_stop_and_the_audit_agrees(rig: Rig) -> None:
+    rig.start_robot()
+    rig.start()
+    for text, words in (
+        ("receive [Frame(1 << 62, 'observation', b'')]", "receive raised TypeError: gave a frame with arrival_ns 4611686018427387904"),
+        ("receive [Frame(1, 'observation', b'')] * 5000", "receive gave 5000 frames at once, at most 4096 are taken"),
+    ):
+        answer = rig.deploy()
+        assert answer["exit_code"] == 0, answer
+        rig.until_status(gate="open", link_trouble="")
+        odd(rig, text)
+        rig.until_status(gate="closed", reason="emergency_stop")
+        rig.until(lambda words=words: words in rig.status()["link_trouble"])
+        odd(rig, "")
+        rig.until_status(link_trouble="", link=True)
+        assert rig.status()["latched"] == ["emergency_stop"]
+        time.sleep(0.2)  # by now it stands for the last drop too
+        assert rig.ask("clear", text="emergency_stop")["exit_code"] == 0
+    assert rig.stop() == 0
+    found = audited(rig)
+    assert (found["ok"], found["first_difference"], found["chain"]) == (True, None, "intact"), found
+
+
+def test_what_could_not_be_decoded_then_and_can_be_now_is_no_pass(rig: Rig) -> None:
+    rig.start_robot()
+    rig.start()
+    rig.until_status(link_trouble="", link=True)
+    odd(rig, "decode [Observation(1, 1, (float('nan'),) * 3)]")
+    rig.until(lambda: "gave an Observation with x (nan, nan, nan)" in rig.status()["link_trouble"])
+    odd(rig, "")
+    rig.until_status(link_trouble="", link=True)
+    assert rig.stop() == 0
+    assert not audited(rig)["ok"]
+
+
+class Says:
+    """A transport whose frames say what they are called."""
+
+    def decode(self, frame: Frame) -> list[Any]:
+        return {b"stop": [OverrideChanged(0, "emergency_stop", "button")], b"good": [GOOD], b"": []}[frame.data]
+
+
+@pytest.mark.parametrize(("data", "differences", "unchecked"), [(b"stop", 1, 0), (b"good", 0, 1), (b"", 0, 0)])
+def test_a_log_cannot_claim_that_a_stop_was_not_to_be_read(data: bytes, differences: int, unchecked: int) -> None:
+    findings = Findings()
+    frames = Frames(Says(), 3, findings)  # type: ignore[arg-type]
+    entry: Any = SimpleNamespace(index=1, channel="frame/in", raw=b"")
+    frames.inbound(entry, Frame(1, "o", data))
+    frames.event(entry, LinkChanged(1, up=False, detail="transport: decode raised RuntimeError: forged"))
+    frames.inbound(entry, Frame(2, "o", b"good"))
+    frames.event(entry, Observed(2, GOOD))
+    assert (findings.differences, len(findings.unchecked)) == (differences, unchecked)
 
 
 def test_daemon_whose_transport_cannot_be_opened_serves_and_one_whose_send_cannot_be_ended_ends(rig: Rig) -> None:

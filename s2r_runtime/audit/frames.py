@@ -34,7 +34,7 @@ class Frames:
         self._events_are_there(entry)
         self._source = entry.index
         try:
-            self._due.extend(transport_values.decoded(self._transport, frame, self._nx))
+            self._due.extend(transport_values.decoded(self._transport, frame, self._nx).messages)
         except Exception:  # noqa: BLE001 - a plug-in's defect; the daemon took it for a lost link and went on, and so does this
             self._due.clear()
         self._findings.count("frames")
@@ -46,8 +46,8 @@ class Frames:
         if isinstance(event, LinkChanged):
             if isinstance(due, LinkChanged) and (due.up, due.detail) == (event.up, event.detail):
                 self._due.popleft()
-            elif not event.up and event.detail.startswith(DECODE_FAILED):
-                self._due.clear()  # then, it did not answer, or not with what it says now
+            elif not event.up and event.detail.startswith(DECODE_FAILED) and due is not None:
+                self._said_nothing(entry)
             return  # otherwise it is the daemon's own: a time-out
         told = _message(event)
         if told is None:
@@ -56,12 +56,29 @@ class Frames:
             due = msgspec.structs.replace(due, t_ns=0)
         elif isinstance(due, Command):
             due = msgspec.structs.replace(due, source="external")
+        if (
+            told != due
+            and isinstance(told, OverrideChanged)
+            and told.kind == "emergency_stop"
+            and told.detail.startswith(transport_values.DROPPED)
+        ):
+            return  # the daemon's own, for what it could not take: it stops more than the frames say, never less
         if told != due:
             what = f"this is not what frame {self._source} says"
             self._findings.differ(entry.index, entry.channel, what, entry.raw, due)
             self._due.clear()
             return
         self._due.popleft()
+
+    def _said_nothing(self, entry: Entry) -> None:
+        """The log says that a frame could not be decoded, and now it can: a call that hung then, or a lie. It hides no stop."""
+        stop = next((one for one in self._due if isinstance(one, OverrideChanged)), None)
+        if stop is not None:
+            what = f"frame {self._source} could not be decoded, says this, and it is a stop"
+            self._findings.differ(entry.index, entry.channel, what, entry.raw, stop)
+        else:
+            self._findings.cannot(f"frame {self._source}: it could not be decoded, says the log, and now it can")
+        self._due.clear()
 
     def send(self, send: Send) -> None:
         """The core had this sent."""

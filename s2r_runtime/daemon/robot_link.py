@@ -1,6 +1,8 @@
 """The daemon's side of the transport: frames in, messages out; commands in, frames out. What a transport raises, or gives that it may not,
 ends here: a link that is down, with the plug-in and the call named. A call that hangs puts the transport out of use (`hang_guard`).
 
+What `receive` gave and nobody can take may have held an emergency stop, so it counts as one: it latches, until a person clears it.
+
 Also the daemon's clock: the host's monotonic one in real time; in lockstep the robot's own, as its newest observation shows it.
 """
 
@@ -16,7 +18,7 @@ from s2r_runtime.daemon.settings import ModelFacts
 from s2r_runtime.daemon.transport_values import Inbound
 from s2r_runtime.errors import ConfigError, PluginError, S2RError, one_line
 from s2r_runtime.hookspecs import Transport
-from s2r_runtime.messages import Command, Decided, Frame, GateChanged, LinkChanged, Observation, Send
+from s2r_runtime.messages import Command, Decided, Frame, GateChanged, LinkChanged, Observation, OverrideChanged, Send
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import Profile
 
@@ -24,6 +26,8 @@ Result = TypeVar("Result")
 
 CALM_NS = 1_000_000_000
 """Without a flood, after which a link that was flooded is used again."""
+TOLD_AGAIN_NS = 100_000_000
+"""Between two stops for dropped input: a transport that floods at every call must not fill the log."""
 METHODS = ("open", "fileno", "receive", "decode", "poll", "encode", "send", "counters", "close")
 
 
@@ -66,6 +70,8 @@ class RobotLink:
         self._down = False
         self._calm_ns = 0
         self._flooded = 0
+        self._dropped = ""
+        self._tell_ns = 0
         self._fileno = -1
         self._news: list[LinkChanged] = []
         self._journal: list[str] = []
@@ -101,9 +107,15 @@ class RobotLink:
         """(arrival on the host's clock, ns; what came), in order. The caller acts on each before it takes the next."""
         if self.out_of_use:
             return
+        given: object = None
         try:
-            frames = values.frames(self._ask("receive", self.transport.receive), time.monotonic_ns())
+            given = self._ask("receive", self.transport.receive)
+            frames = values.frames(given, time.monotonic_ns())
         except BaseException as error:  # noqa: BLE001 - a plug-in's defect must not stop the gate
+            if given is not None:
+                self._dropped = one_line(f"{values.DROPPED}{error}; what was dropped may have been a stop")
+                for stop in self._dropped_input():
+                    yield stop.t_ns, stop
             for change in self._failed("receive", error):
                 yield change.t_ns, change
             return
@@ -111,12 +123,16 @@ class RobotLink:
             self._faults.pop("receive", None)
         for frame in frames:
             self._record(frame)
+            messages: list[Inbound] = []
             try:
-                messages = self._ask("decode", values.decoded, self.transport, frame, self._nx)
+                messages, fault = self._ask("decode", values.decoded, self.transport, frame, self._nx)
             except BaseException as error:  # noqa: BLE001 - as above
-                messages = list(self._failed("decode", error))
+                messages += self._failed("decode", error)
             else:
-                self._faults.pop("decode", None)
+                if fault is None:
+                    self._faults.pop("decode", None)
+                else:
+                    messages += self._failed("decode", fault)
             for message in messages:
                 if self._down and not self._faults and isinstance(message, Observation):
                     self._down = False
@@ -128,10 +144,11 @@ class RobotLink:
             if self.out_of_use:
                 return
 
-    def poll(self, now_ns: int) -> Iterator[LinkChanged]:
-        """Link lost or back, by the transport's own time-outs. now_ns: the host's clock."""
+    def poll(self, now_ns: int) -> Iterator[LinkChanged | OverrideChanged]:
+        """Link lost or back, by the transport's own time-outs; and a stop for input that was dropped. now_ns: the host's clock."""
         news, self._news = self._news, []
         yield from news
+        yield from self._dropped_input()
         if self.out_of_use:
             return
         try:
@@ -207,6 +224,14 @@ class RobotLink:
         else:
             return given
         return None
+
+    def _dropped_input(self) -> Iterator[OverrideChanged]:
+        """The stop that stands for all that was dropped since the last one."""
+        now_ns = time.monotonic_ns()
+        if self._dropped and now_ns >= self._tell_ns:
+            detail, self._dropped = self._dropped, ""
+            self._tell_ns = now_ns + TOLD_AGAIN_NS
+            yield OverrideChanged(now_ns, "emergency_stop", detail)
 
     def _failed(self, what: str, error: BaseException) -> Iterator[LinkChanged]:
         """One event a fault, not one a call: a transport that fails at 100 Hz must not fill the log."""

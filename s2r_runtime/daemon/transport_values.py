@@ -3,18 +3,22 @@
 A plug-in is somebody else's code. What it gives is logged, hashed, compared and decided on, and none of that may meet a value that isn't
 of its type, not finite, or stamped with a time that has not come yet: an arrival in the future would keep an observation fresh for ever.
 The audit asks the same of what it decodes again.
+
+A stop is never refused for the company that it came in: whatever else a frame says, however long the stop's text is, `decoded` gives it.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TypeGuard, cast, get_args, get_type_hints
+from typing import NamedTuple, TypeGuard, cast, get_args, get_type_hints
 
 from s2r_runtime.hookspecs import Transport
 from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
 
 Inbound = Observation | Command | LinkChanged | OverrideChanged
 
+DROPPED = "transport: receive "
+"""How the text of the stop begins that the daemon takes dropped input for."""
 FRAMES_AT_ONCE = 4096
 """Ten times what the transports here keep at most for a loop that is late; deciding on so many takes a good part of a second."""
 MESSAGES_A_FRAME = 256
@@ -47,14 +51,27 @@ def frames(given: object, now_ns: int) -> list[Frame]:
     return given
 
 
-def decoded(transport: Transport, frame: Frame, nx: int) -> list[Inbound]:
-    """What the transport makes of a frame. Raises TypeError, or what the transport raises."""
+class Decoded(NamedTuple):
+    """What a frame says. fault: why all of it but the overrides was refused, one of each kind at most; or None."""
+
+    messages: list[Inbound]
+    fault: Exception | None
+
+
+def decoded(transport: Transport, frame: Frame, nx: int) -> Decoded:
+    """What the transport makes of a frame. Raises what the transport raises."""
     given: object = transport.decode(frame)
-    if not isinstance(given, list) or len(given) > MESSAGES_A_FRAME:
-        raise TypeError(f"gave {_kind(given)}, must be a list of at most {MESSAGES_A_FRAME} messages")
-    for message in given:
-        _message(message, nx)
-    return given
+    try:
+        if not isinstance(given, list) or len(given) > MESSAGES_A_FRAME:
+            raise TypeError(f"gave {_kind(given)}, must be a list of at most {MESSAGES_A_FRAME} messages")
+        messages = [_override(message) or message for message in given]
+        for message in messages:
+            _message(message, nx)
+    except Exception as fault:  # noqa: BLE001 - somebody else's values may raise anything when they are looked at
+        said = cast("list[object]", given) if isinstance(given, list | tuple) else [given]
+        stops = {stop.kind: stop for stop in map(_override, said) if stop is not None}
+        return Decoded(list(stops.values()), fault)
+    return Decoded(messages, None)
 
 
 def link_changes(given: object) -> list[LinkChanged]:
@@ -128,6 +145,15 @@ def _message(given: object, nx: int) -> None:
             raise TypeError("gave an OverrideChanged whose kind, detail or t_ns is not what it may be")
     else:
         raise TypeError(f"gave {_kind(given)}, must be Observation, Command, LinkChanged or OverrideChanged")
+
+
+def _override(given: object) -> OverrideChanged | None:
+    """An override as it may be: a text that is too long is cut, one that is none is left out, for a person's stop must not hang on it."""
+    if not isinstance(given, OverrideChanged) or type(given.kind) is not str or given.kind not in KINDS:
+        return None
+    detail = given.detail[:TEXT] if type(given.detail) is str else ""
+    t_ns = given.t_ns if _whole(given.t_ns) else 0
+    return OverrideChanged(t_ns, given.kind, detail if _text(detail) else ascii(detail)[:TEXT])
 
 
 def _whole(value: object) -> TypeGuard[int]:
