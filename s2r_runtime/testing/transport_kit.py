@@ -342,7 +342,9 @@ class TransportKit:
         transport_values.link_changes(line.transport.poll(time.monotonic_ns()))
         make: Any = type(bench.transport)
         again = make(bench.options, bench.states, bench.inputs)
-        assert any(transport_values.decoded(again, frame, len(bench.states)) for frame in line.frames)
+        decoded = [transport_values.decoded(again, frame, len(bench.states)) for frame in line.frames]
+        assert [said.fault for said in decoded if said.fault is not None] == []
+        assert any(said.messages for said in decoded)
         command = Command(1, line.good[-1].stamp_ns, "recovery", (0.0,) * len(bench.inputs), line.good[-1].seq, 80_000_000)
         transport_values.outbound(line.transport.encode(command))
         assert transport_values.counters(line.transport.counters()) == line.transport.counters()
