@@ -261,9 +261,12 @@ def made_up_certificate(
     radius: float,
     verified: float,
     epoch: int,
-    weights: tuple[float, ...] = (1.0, 1.0, 0.0525),
+    weights: tuple[float, ...] | None = None,
 ) -> str:
-    """A certificate for a controller. Its evidence is made up: nothing was sampled or verified. weights: one a state."""
+    """A certificate for a controller. Its evidence is made up: nothing was sampled or verified, and every epoch has samples of its own.
+
+    weights: one a state; if not said, the profile's for (x, y, theta).
+    """
     profile, file = load_profile(profile_path), load(controller)
     beta, epsilon = profile.guarantee.beta, profile.guarantee.epsilon
     gap = Gap(
@@ -272,14 +275,14 @@ def made_up_certificate(
         hold_radius=radius,
         hold_periods=5,
         set="ball",
-        weights=weights,
+        weights=tuple(profile.norm.weights.get(name, 1.0) for name in ("x", "y", "theta")) if weights is None else weights,
         n=campaign_size(epsilon, share(beta, epoch), 0),
         discarded=0,
         epsilon=epsilon,
         beta=share(beta, epoch),
         epoch=epoch,
         model_digest=profile.model.digest(),
-        transitions_digest="sha256:" + "0" * 64,
+        transitions_digest=f"sha256:{epoch:064x}",
     )
     n = sample_size(profile.verification.epsilon, share(beta, 1))
     laws = tuple(
