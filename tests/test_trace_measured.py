@@ -1,7 +1,9 @@
-"""The tracer on a measured recording (MRCLAM: an iRobot Create, commands and Vicon poses on stamps of their own).
+"""The tracer on measured recordings: MRCLAM (an iRobot Create, commands and Vicon poses on stamps of their own), EMPS (an arm's
+prismatic joint, force and position only) and F1TENTH (a car, 41 runs).
 
-K. Leung et al., The UTIAS multi-robot cooperative localization and mapping dataset, IJRR 30(8), 2011. The data are not part of this
-project: the tests run where S2R_DATA, or a folder beside the repository, holds them.
+K. Leung et al., The UTIAS multi-robot cooperative localization and mapping dataset, IJRR 30(8), 2011. A. Janot, M. Gautier, M. Brunot,
+Data set and reference models of EMPS, 2019. N. Kochdumper, S. Bak, Conformant synthesis for Koopman operator linearized control
+systems, 2022. The data are not part of this project: the tests run where S2R_DATA, or a folder beside the repository, holds them.
 """
 
 import os
@@ -35,3 +37,33 @@ def test_the_delay_of_a_real_robot_is_found_and_its_heading_is_foretold_as_well_
     assert after < 0.62 * before
     assert not {f.kind for f in found.faults} - {"dropout"}
     assert len(found.spec.fitted_on) == 2  # the bytes, and what they say
+
+
+@pytest.mark.skipif(not (FOLDER / "emps_pulses.csv.gz").exists(), reason="the measured recordings are not here")
+@pytest.mark.long
+def test_the_friction_of_a_real_joint_is_named_with_the_published_numbers():
+    """Published: Coulomb 20.14 and 20.63 N, viscous 166.7 and 240.4 N s/m by direction; relative force error 5.98 % on the pulses."""
+    model = compose(ModelSpec("joint", 0.01, {"mass": 95.1}))
+    fitted, pulses = (load_dataset(FOLDER / f"emps_{name}.csv.gz", model) for name in ("estimation", "pulses"))
+    found = trace(fitted, model, test=pulses)
+    assert found.verdict == "traced"
+    values = {e.name: {name: value[0] for name, value in e.parameters.items()} for e in found.effects}
+    assert set(values) == {"coulomb_friction", "viscous_friction"}
+    assert values["coulomb_friction"] == pytest.approx({"force_positive": 20.14, "force_negative": 20.63}, rel=0.01)
+    assert values["viscous_friction"] == pytest.approx({"coefficient_positive": 166.7, "coefficient_negative": 240.4}, rel=0.01)
+    error = found.to_json()["error"]
+    assert error["before"]["input_relative"] > 0.6
+    assert error["after"]["input_relative"] < 0.0598
+
+
+@pytest.mark.skipif(not (FOLDER / "f1tenth.csv.gz").exists(), reason="the measured recordings are not here")
+@pytest.mark.long
+def test_a_real_car_is_foretold_three_seconds_ahead():
+    """By others, on another split: 0.036 m over rollouts of 3 s, with a speed lag of 0.14 s and a steering delay of 0.10 s."""
+    model = compose(ModelSpec("bicycle", 0.025, {"wheel_base": 0.33}))
+    found = trace(load_dataset(FOLDER / "f1tenth.csv.gz", model), model, horizon=3.0)
+    values = {(e.name, e.channel): {name: value[0] for name, value in e.parameters.items()} for e in found.effects}
+    assert values["input_lag", "speed_cmd"]["time_constant"] == pytest.approx(0.14, abs=0.03)
+    assert values["input_delay", "steer_cmd"]["delay"] == pytest.approx(0.10, abs=0.02)
+    after = found.to_json()["error"]["after"]["rollout_rms"]
+    assert (after["x"] ** 2 + after["y"] ** 2) ** 0.5 < 0.036

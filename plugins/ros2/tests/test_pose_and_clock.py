@@ -52,7 +52,9 @@ def test_robot_that_is_tilted_beyond_the_limit_is_a_fault(tilt: tuple[float, flo
 
 
 def test_robot_that_is_tilted_within_the_limit_is_taken() -> None:
-    ALL.states(at(quaternion(0.19, 0.0, 0.4)))
+    x, y, theta, *_ = ALL.states(at(quaternion(0.19, 0.0, 0.4)))
+    assert (x, y) == (1.0, 2.0)
+    assert theta == pytest.approx(0.4, abs=0.19**2), "tilted by less than the limit, the yaw stays what it is to second order"
 
 
 @pytest.mark.parametrize("length", [0.0, 0.5, 0.98, 1.02, 100.0])
