@@ -7,11 +7,12 @@ from trace_robots import DT, NOISE, ROBOTARIUM, declared, drive, recordings
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.candidates import candidates
+from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
 from s2r_runtime.trace.evidence import RIDGES, evidence, margin
 from s2r_runtime.trace.fitting import evaluate, insert, problem
-from s2r_runtime.trace.lack_of_fit_terms import LINE, line, quieter
-from s2r_runtime.trace.residual import Steps, steps_of
+from s2r_runtime.trace.lack_of_fit_terms import LINE, dictionaries, line, quieter
+from s2r_runtime.trace.residual import Steps, acting, residual, steps_of
 from s2r_runtime.trace.residual_noise import Noise
 from s2r_runtime.trace.scores import limited
 from s2r_runtime.trace.tracer import trace
@@ -137,3 +138,23 @@ def test_a_model_in_a_file_of_the_user_s_own_is_traced(tmp_path):
     found = trace(from_arrays(model, [(y, u)]), model)
     assert [(e.name, e.channel) for e in found.effects] == [("input_gain", "push")]
     assert found.effects[0].parameters["gain"][0] == pytest.approx(0.8, abs=0.01)
+
+
+def test_runs_that_each_begin_at_zero_are_not_asked_when_something_happened():
+    model = compose(ModelSpec("double_integrator", 0.05))
+    rng = np.random.default_rng(9)
+    for apart, in_order in ((20.0, True), (0.0, False)):
+        runs = []
+        for k in range(4):
+            t = apart * k + 0.05 * np.arange(200)
+            runs.append((Stream(t, rng.normal(size=(200, 4))), Stream(t, rng.normal(size=(200, 2)))))
+        data = from_streams(model, runs, "here")
+        assert data.in_order is in_order
+        asked = {c.name for c in candidates(model, data)}
+        assert ("regime_change" in asked) is in_order
+        assert "input_delay" in asked
+        given = problem(data, steps_of(data))
+        fit, act = evaluate(given, model), acting(model, data)
+        tokens = {token for token, _ in dictionaries(given, model, act, fit.noise, residual(model, given.steps, act))}
+        assert ({"time", "time*ax"} <= tokens) is in_order
+        assert {"speed", "memory(ax)"} <= tokens

@@ -7,7 +7,6 @@ a gain before a limit is another thing than one behind it, and a limit before a 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,10 +51,9 @@ def candidates(model: ComposedModel, data: Dataset, left: Leftover | None = None
     taken = {(a.effect.name, a.channel) for a in model.effects if isinstance(a, Added)}
     t = times(data)
     given: dict[int, Array] = {}
-    known_when = _one_after_the_other(data)
     for name in registry().names("effects"):
         effect = registry().get("effects", name)
-        if getattr(effect, "timed", False) and not known_when:
+        if getattr(effect, "timed", False) and not data.in_order:
             continue
         for channel in effect.channels(model.nominal):
             if canonical(model.for_effects, name, channel) != (name, channel):
@@ -75,16 +73,6 @@ def candidates(model: ComposedModel, data: Dataset, left: Leftover | None = None
                 if starts:
                     found.append(Candidate(name, channel, place, tuple(AppliedEffect(effect, channel, p) for p in starts)))
     return found
-
-
-def _one_after_the_other(data: Dataset) -> bool:
-    """Whether runs have times of their own: where each begins at zero, nobody knows when what happened."""
-    spans = []
-    for run in data.runs:
-        there = np.flatnonzero(~np.isnan(run.y).any(axis=1))
-        if len(there):
-            spans.append((run.start_s + data.dt * int(there[0]), run.start_s + data.dt * int(there[-1])))
-    return all(later[0] > earlier[1] - 1.5 * data.dt for earlier, later in pairwise(sorted(spans)))
 
 
 def _input_effects(model: ComposedModel, place: int) -> list[AppliedEffect]:

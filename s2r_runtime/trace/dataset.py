@@ -18,6 +18,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +125,16 @@ class Dataset:
     def chains(self) -> Inputs:
         """The inputs of its runs, for chains of effects."""
         return Inputs([run.u for run in self.runs], self.dt / self.substeps, [run.start_s for run in self.runs])
+
+    @cached_property
+    def in_order(self) -> bool:
+        """Whether runs have times of their own: where each begins at zero, nobody knows when what happened."""
+        spans = []
+        for run in self.runs:
+            there = np.flatnonzero(~np.isnan(run.y).any(axis=1))
+            if len(there):
+                spans.append((run.start_s + self.dt * int(there[0]), run.start_s + self.dt * int(there[-1])))
+        return all(later[0] > earlier[1] - 1.5 * self.dt for earlier, later in pairwise(sorted(spans)))
 
 
 def from_arrays(model: ComposedModel, runs: Sequence[tuple[Array, Array]], source: str = "arrays") -> Dataset:

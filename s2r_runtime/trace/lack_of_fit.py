@@ -98,33 +98,30 @@ def lack_of_fit(given: Problem, fit: Fit, nominal: Fit, horizon: int) -> Structu
     return Structure(tokens if matters else coloured, matters, share, gains)
 
 
-def explains_more(given: Problem, fit: Fit, nominal: Fit) -> tuple[str, ...]:
-    """What the nominal model's residual depends on, if a dictionary explains clearly more of it than the effects of `fit` do: then these
-    took up structure that is not theirs. Empty otherwise.
-    """
+def best_unnamed(given: Problem, nominal: Fit) -> tuple[str, float]:
+    """What the nominal model's residual depends on most, and the nats that a dictionary of that explains without any effect's name."""
     left, found = _left_by(given, nominal)
     looked = _best_of_each(sorted(((first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True), found)
     judged = [judge(left, found[i][0], leading(left, found[i][1])) for _, i in looked[:FEW]]
     most = max(j.gain for j in judged)
     best = min((j for j in judged if j.gain >= most - ALIKE), key=lambda j: (j.x.shape[2], -j.gain))
-    return (TOKENS.get(best.token, best.token),) if most > MORE * explained(fit, nominal) + ALIKE else ()
+    return TOKENS.get(best.token, best.token), most
+
+
+def explains_more(nats: float, fit: Fit, nominal: Fit) -> bool:
+    """Whether a dictionary that explains so much beats the effects of `fit` clearly: these took up structure that is not theirs."""
+    return nats > MORE * explained(fit, nominal) + ALIKE
 
 
 def _left_by(given: Problem, fit: Fit) -> tuple[Left, list[tuple[str, Array]]]:
     """What a model leaves, and the dictionaries for it."""
     act = acting(fit.model, given.data)
+    r = residual(fit.model, given.steps, act)
     n = len(given.steps)
     block = np.minimum(np.arange(n) * BLOCKS // n, BLOCKS - 1)
     wild = np.any(np.abs(fit.z) > noises.OUTLIER)
-    left = Left(
-        given,
-        fit,
-        residual(fit.model, given.steps, act),
-        state_jacobian(fit.model, given.steps, act),
-        block,
-        _clipped(fit.z) if wild else None,
-    )
-    found = [(token, _columns(terms)) for token, terms in dictionaries(given, fit.model, act, fit.noise)]
+    left = Left(given, fit, r, state_jacobian(fit.model, given.steps, act), block, _clipped(fit.z) if wild else None)
+    found = [(token, _columns(terms)) for token, terms in dictionaries(given, fit.model, act, fit.noise, r)]
     return left, [(token, x) for token, x in found if x.shape[2]]
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.fitting import Problem
-from s2r_runtime.trace.residual import Acting, Steps, residual
+from s2r_runtime.trace.residual import Acting, Steps
 from s2r_runtime.trace.residual_noise import Noise
 
 Array = NDArray[np.float64]
@@ -55,8 +55,8 @@ PLAYS = (0.05, 0.1, 0.2, 0.4, 0.8)
 VELOCITIES = ("speed", "vx", "vy", "qd", "wheel_left", "wheel_right")
 
 
-def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise) -> Iterator[tuple[str, Terms]]:
-    """(token, terms (n, nx) each); `wave`: a line in the spectrum, which depends on time, and does not wander."""
+def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise, r: Array) -> Iterator[tuple[str, Terms]]:
+    """(token, terms (n, nx) each); `wave`: a line in the spectrum of r (n, nx), which depends on time, and does not wander."""
     steps = given.steps
     body, world = _directions(given, model, act)
     u = act.mean[steps.place]
@@ -69,20 +69,19 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
         yield from ((name, _push(terms, body)) for terms in _static(u[:, j]))
         yield from ((f"memory({name})", _push(terms, body)) for terms in _memory(act.mean[:, j] / size[j], steps.place))
         yield from ((f"memory({name})", _push(terms, body)) for terms in _bent_memory(act.mean[:, j] / size[j], steps.place))
-        yield f"time*{name}", _push([t * u[:, j]], body)
-        slow = [f(np.pi * k * t) * u[:, j] for k in range(1, 7) for f in (np.sin, np.cos)]
-        yield f"time*{name}", _push([t * u[:, j], *slow], body)
-        yield f"time*{name}", _push([np.where(t > s, u[:, j], 0.0) for s in np.linspace(0.1, 0.9, 9)], body)
+        if given.data.in_order:
+            yield from ((f"time*{name}", _push(terms, body)) for terms in _over_time(t, u[:, j]))
         for i in range(j):
             pair = [u[:, i] * u[:, j], np.abs(u[:, i]) * u[:, j], u[:, i] * np.abs(u[:, j]), np.abs(u[:, i] * u[:, j])]
             yield f"{model.inputs[i]}*{name}", _push(pair, body)
     pushes = [u[:, j][:, None] * own for j, own in enumerate(_own(given, model, act))]
     for name, terms, directions in _of_states(model, quieter(steps, noise), u, body, world, pushes):
         yield name, terms if directions is None else _push(terms, directions)
+    if not given.data.in_order:
+        return
     yield "time", _push([one, t], [*body, *world])
     yield "time", _push([one, *(f(2.0 * np.pi * k * t) for k in (0.5, 1.0, 1.5, 2.0) for f in (np.sin, np.cos))], [*body, *world])
     yield "time", _push([one, *(np.where(t > s, one, 0.0) for s in np.linspace(0.1, 0.9, 9))], body)
-    r = residual(model, steps, act)
     for directions in (body, world):
         yield from (("wave", _push(terms, directions)) for terms in _hum(r, given, directions))
 
@@ -105,11 +104,18 @@ def quieter(steps: Steps, noise: Noise) -> Array:
     return y
 
 
+def _over_time(t: Array, u: Array) -> Iterator[Terms]:
+    """An input that does more or less as time goes on (t from 0 to 1): steadily, slowly up and down, from some time on."""
+    yield [t * u]
+    yield [t * u, *(f(np.pi * k * t) * u for k in range(1, 7) for f in (np.sin, np.cos))]
+    yield [np.where(t > s, u, 0.0) for s in np.linspace(0.1, 0.9, 9)]
+
+
 def _hum(r: Array, given: Problem, directions: Terms) -> Iterator[Terms]:
     """A wave of the one frequency at which the residual has a line in its spectrum, if it has one. r: (n, nx)."""
     dt, steps = given.data.dt, given.steps
     place = np.floor((steps.t - steps.t[0]) / dt + 0.01).astype(np.int64)
-    if not directions or place[-1] >= LONGEST or np.any(np.diff(place) <= 0):  # runs that each begin at zero have no common phase
+    if not directions or place[-1] >= LONGEST or np.any(np.diff(place) <= 0):
         return
     series = np.zeros((int(place[-1]) + 1, len(directions)))
     seen = np.stack([np.sum(r * d, axis=1) / np.maximum(np.sum(d * d, axis=1), 1e-300) for d in directions], axis=1)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 
 import msgspec
 import numpy as np
@@ -30,7 +31,7 @@ from s2r_runtime.trace.faults import Checked, check
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, problem
 from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.intervals import intervals
-from s2r_runtime.trace.lack_of_fit import Structure, explains_more, lack_of_fit
+from s2r_runtime.trace.lack_of_fit import Structure, best_unnamed, explains_more, lack_of_fit
 from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.residual import Mask, first_steps, rms, steps_of
@@ -112,11 +113,12 @@ def _traced(
     chosen = select(given, model, ahead, lambda share: say(5.0 + 75.0 * share, 100.0, "looking for effects"))
     chosen = confirmed(given, chosen, judged_on)
     say(80.0, 100.0, "testing what is left")
-    structure = _structure(checked, chosen, ahead)
+    whole = _Whole(checked, model)
+    structure = whole.structure(chosen, ahead)
     if structure.matters:  # something is there: which name it has may be asked with a lower bar, if that leaves nothing
         other = confirmed(given, select(given, model, ahead, lambda share: None, LENIENT, chosen), judged_on)
         if names(other.fit.model) != names(chosen.fit.model):
-            rest = _structure(checked, other, ahead)
+            rest = whole.structure(other, ahead)
             chosen, structure = (chosen, structure) if rest.matters else (other, rest)
     say(90.0, 100.0, "judging on held-out data")
     w = np.ones(len(model.states)) if weights is None else np.asarray(weights, dtype=np.float64)
@@ -212,14 +214,26 @@ def _enough(data: Dataset, model: ComposedModel, fit_part: Part, judged_on: Held
         raise NotEnoughEvidence(f"{data.source}: the robot stood still although it was asked to move; nothing can be traced until it moves")
 
 
-def _structure(checked: Checked, chosen: Selection, horizon: int) -> Structure:
-    """Of what the chosen model leaves, over all of the recording: a test needs no data that the fit never saw."""
-    everything = part(checked.data, checked.left_out, np.ones(first_steps(checked.data)[-1], dtype=bool), STRUCTURE_STEPS)
-    given = problem(everything.data, everything.steps)
-    fit, nominal = evaluate(given, chosen.fit.model), evaluate(given, chosen.nominal.model)
-    found = lack_of_fit(given, fit, nominal, horizon)
-    instead = explains_more(given, fit, nominal) if found.matters and fit.added else ()
-    return replace(found, tokens=instead, share=1.0) if instead else found
+class _Whole:
+    """All of a recording, and what the nominal model leaves of it: a test for structure needs no data that the fit never saw."""
+
+    def __init__(self, checked: Checked, nominal: ComposedModel) -> None:
+        everything = part(checked.data, checked.left_out, np.ones(first_steps(checked.data)[-1], dtype=bool), STRUCTURE_STEPS)
+        self.given = problem(everything.data, everything.steps)
+        self.nominal = evaluate(self.given, nominal)
+
+    @cached_property
+    def unnamed(self) -> tuple[str, float]:
+        """`best_unnamed`, for whatever was selected."""
+        return best_unnamed(self.given, self.nominal)
+
+    def structure(self, chosen: Selection, horizon: int) -> Structure:
+        """What the chosen model leaves."""
+        fit = evaluate(self.given, chosen.fit.model)
+        found = lack_of_fit(self.given, fit, self.nominal, horizon)
+        if found.matters and fit.added and explains_more(self.unnamed[1], fit, self.nominal):
+            return replace(found, tokens=self.unnamed[:1], share=1.0)
+        return found
 
 
 def _new(fit: Fit, other: Fit) -> list[int]:
