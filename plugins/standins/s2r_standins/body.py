@@ -53,6 +53,16 @@ class Body:
         """The robot's clock, s."""
         return self.k * self.sheet.dt
 
+    @property
+    def period_s(self) -> float:
+        """The period of its link, s."""
+        return self.sheet.dt
+
+    @property
+    def trouble(self) -> str:
+        """Nothing can befall two wheels on a flat floor."""
+        return ""
+
     def observe(self) -> Pose:
         """The pose as measured now; call once a period."""
         x, y, theta = self.pose if self._library is None else self._library.measured(self.pose)
@@ -76,6 +86,10 @@ class Body:
         self.k += 1
 
     # ------------------------------------------------------------------ what is wrong with it
+
+    def check(self, text: str) -> None:
+        """Raises ConfigError if this is no effect that it can have."""
+        parse_effect(text)
 
     def switch_on(self, text: str) -> str:
         """Begins an effect now; one of the same name and channel is replaced. Returns what it is. Raises ConfigError."""

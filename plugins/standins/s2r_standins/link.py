@@ -22,13 +22,14 @@ from s2r_runtime.errors import ConfigError
 SILENCE_NS = 1_000_000_000
 
 
-class Payload(msgspec.Struct):
-    """An observation as on the wire."""
+class Payload(msgspec.Struct, omit_defaults=True):
+    """An observation as on the wire. `trouble`: why there is no state."""
 
     seq: int
     stamp_ns: int
     state: dict[str, float]
     boot: int
+    trouble: str = ""
 
 
 class CommandPayload(msgspec.Struct):
@@ -83,9 +84,9 @@ class Link:
         """Readable when a command waits."""
         return self._bell
 
-    def encode(self, seq: int, stamp_ns: int, state: dict[str, float]) -> bytes:
+    def encode(self, seq: int, stamp_ns: int, state: dict[str, float], trouble: str = "") -> bytes:
         """Payload of an observation."""
-        return self._encoder.encode(Payload(seq, stamp_ns, state, self._boot))
+        return self._encoder.encode(Payload(seq, stamp_ns, state, self._boot, trouble))
 
     def publish(self, data: bytes) -> None:
         """Sends an observation; drops it where the link is congested."""
