@@ -16,27 +16,26 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 import robotarium_figures as figures
 from numpy.typing import NDArray
+from paper_experiment import LARGE, SCENARIOS, Setting, claim_lines, claims, control_of, named, plain, verified
 from robotarium_truth import HOLD, NOISE, TRACK, Before, Samples, campaign
 
-from s2r_runtime.bounds import clopper_pearson_upper, scenario_confidence
-from s2r_runtime.controllers.hosted import batch_control, load
-from s2r_runtime.models.composed import ComposedModel, compose, wrap
+from s2r_runtime.bounds import clopper_pearson_upper
+from s2r_runtime.models.composed import compose, wrap
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.tasks.grid_world import GridWorld
 from s2r_runtime.uncertain import Control, GapSet, Rollouts, roll_out
 
 Array = NDArray[np.float64]
 
-ROOT = Path(__file__).parent.parent
 DT, EPSILON, PAPER_R = 0.033, 0.005, 0.198
-SAMPLES, FIRST, SCENARIOS, LARGE, RUNS = 2400, 600, (300, 500), 20_000, 40
+SAMPLES, FIRST, RUNS = 2400, 600, 40
 LITERAL, HALF_TRACK = (1.0, 1.0, 1.0), (1.0, 1.0, TRACK / 2.0)
 DATA_SHEET = (
     EffectSpec("input_delay", "*", {"delay": DT}),
@@ -156,14 +155,6 @@ def _first_and_cutoff(d: Array) -> tuple[float, float]:
     return float(d[:FIRST].max()), float(np.quantile(d, 1.0 - EPSILON))
 
 
-class Setting(NamedTuple):
-    """An uncertain model: the model, and the gap set that a reading gives."""
-
-    name: str
-    model: ComposedModel
-    gap: GapSet
-
-
 def settings(rng: np.random.Generator, asked: Sequence[Reading]) -> list[Setting]:
     """The paper's literal one; the paper's model in a norm that means something; the model that knows the data sheet; those asked for."""
     taken = campaign(FIRST, "stopped", rng)
@@ -200,37 +191,6 @@ def _data_sheet_errors(taken: Samples) -> tuple[Array, Array]:
     return taken.path[1] - one, taken.path[-1] - x
 
 
-def verified(setting: Setting, law: str, counts: tuple[int, ...], seed: int, every: int) -> list[dict[str, Any]]:
-    """Controllers against one uncertain model: s* of the first 300 and of 500 scenarios, and whether it passes (paper, corollary 2)."""
-    rows = []
-    task = GridWorld({}, setting.model.nominal, DT)
-    for number, (name, parameters) in list(enumerate(CONTROLLERS))[::every]:
-        rollouts = roll_out(
-            control_of(name, parameters), task, setting.model, setting.gap, law, np.random.default_rng([seed, number]), max(counts)
-        )
-        stars = {str(n): float(rollouts.safety[:n].min()) for n in counts}
-        rows.append(
-            {
-                "controller": _named(name, parameters),
-                "number": number,
-                "s_star": stars,
-                "crashes": int(np.sum(rollouts.safety < 0.0)),
-                "progress": float(np.median(rollouts.progress)),
-                "passed": min(stars.values()) >= 0.0 and task.progress_ok(rollouts.progress),
-            }
-        )
-    return rows
-
-
-def control_of(name: str, parameters: dict[str, float]) -> Control:
-    """A controller of the project's, with parameters."""
-    return batch_control(load(ROOT / "controllers" / name, parameters), 2)
-
-
-def _named(name: str, parameters: dict[str, float]) -> str:
-    return name.removesuffix(".py") + "".join(f" {key}={value:g}" for key, value in parameters.items())
-
-
 def seen(control: Control, rng: np.random.Generator) -> Control:
     """The controller sees measured poses."""
     return lambda x, theta: control(x + NOISE * rng.standard_normal(x.shape), theta)
@@ -243,22 +203,9 @@ def on_the_truth(number: int, runs: int, seed: int, keep: int) -> Rollouts:
     return roll_out(control, GridWorld({}, TRUTH.nominal, DT), TRUTH, nothing, "uniform", rng, runs, keep=keep)
 
 
-def final(setting: Setting, law: str, number: int, large: int, seed: int) -> dict[str, Any]:
-    """The winner's s* of 300 and 500 fresh scenarios against the cutoffs that `large` others show, and how often that holds in these."""
-    control, task = control_of(*CONTROLLERS[number]), GridWorld({}, setting.model.nominal, DT)
-    safety = roll_out(control, task, setting.model, setting.gap, law, np.random.default_rng([seed, 7, number]), large).safety
-    told: dict[str, Any] = {"safety": safety, "crashes": int(np.sum(safety < 0.0)), "n": large, "claims": []}
-    for n, epsilon in ((SCENARIOS[0], 0.01), (SCENARIOS[1], 0.006)):
-        fresh = roll_out(control, task, setting.model, setting.gap, law, np.random.default_rng([seed, 8, number, n]), n).safety
-        cutoff = float(np.quantile(safety, epsilon, method="lower"))
-        below = float(np.mean(safety < fresh.min()))
-        groups = safety[: large // n * n].reshape(-1, n).min(axis=1) if large >= n else np.empty(0)
-        kept = float(np.mean([np.mean(safety < least) <= epsilon for least in groups])) if len(groups) else None
-        claim = {"n": n, "epsilon": epsilon, "s_star": float(fresh.min()), "cutoff": cutoff, "below": below, "holds": below <= epsilon}
-        told["claims"].append(
-            {**claim, "groups": len(groups), "groups_hold": kept, "confidence": 1.0 - float(scenario_confidence(n, 0, epsilon))}
-        )
-    return told
+def _draws(seed: int, number: int) -> Callable[[int, int], np.random.Generator]:
+    """Random numbers of the winner's 20 000 rollouts, and of the fresh ones."""
+    return lambda kind, n: np.random.default_rng([seed, 8, number, n] if kind else [seed, 7, number])
 
 
 def experiment(seed: int, *, quick: bool, asked: Sequence[Reading] = ()) -> dict[str, Any]:
@@ -271,7 +218,8 @@ def experiment(seed: int, *, quick: bool, asked: Sequence[Reading] = ()) -> dict
     found["literal"] = {"r": PAPER_R, "n": large, "crashed": float(np.mean(reckless.safety < 0.0))}
     for setting in usable:
         for law in ("uniform", "persistent"):
-            rows = verified(setting, law, counts, seed, every)
+            task = GridWorld({}, setting.model.nominal, DT)
+            rows = verified(setting, law, CONTROLLERS, task, seed, counts=counts, every=every)
             passing = [row["number"] for row in rows if row["passed"]]
             one: dict[str, Any] = {
                 "name": setting.name,
@@ -286,18 +234,14 @@ def experiment(seed: int, *, quick: bool, asked: Sequence[Reading] = ()) -> dict
                 bad = int(np.sum(truth.safety < 0.0))
                 arrived = int(np.sum(truth.progress > 0.0))
                 upper = float(clopper_pearson_upper(bad, RUNS, 0.05))
-                one |= {"winner": _named(*CONTROLLERS[best]), "winner_number": best, "final": final(setting, law, best, large, seed)}
+                control = control_of(*CONTROLLERS[best])
+                draws = _draws(seed, best)
+                one |= {"winner": named(*CONTROLLERS[best]), "winner_number": best}
+                one["final"] = claims(setting, law, control, task, large, draws)
                 one |= {"true_runs": {"n": RUNS, "crashes": bad, "made_progress": arrived, "crash_upper": upper, "rollouts": truth}}
-                one["reach"] = figures.reach(setting, law, control_of(*CONTROLLERS[best]), seed)
+                one["reach"] = figures.reach(setting, law, control, seed)
             found["models"].append(one)
     return found
-
-
-def plain(found: Any) -> Any:
-    """Without arrays and rollouts, for JSON."""
-    if isinstance(found, dict):
-        return {k: plain(v) for k, v in found.items() if k not in {"discrepancies", "safety", "rollouts", "reach"}}
-    return [plain(v) for v in found] if isinstance(found, list) else found
 
 
 def told(found: dict[str, Any]) -> list[str]:
@@ -315,13 +259,7 @@ def told(found: dict[str, Any]) -> list[str]:
         )
         if passed:
             lines.append(f"  winner: {one['winner']}")
-            for claim in one["final"]["claims"]:
-                verdict = "holds" if claim["holds"] else "FAILS"
-                star = f"s* of {claim['n']}: {claim['s_star']:.2f}"
-                cutoff = f"{claim['epsilon']:.1%} cutoff of {one['final']['n']}: {claim['cutoff']:.2f}"
-                groups = f"; it holds in {claim['groups_hold']:.0%} of {claim['groups']} groups of them" if claim["groups"] else ""
-                lines.append(f"  {star}, {cutoff}; {claim['below']:.2%} score below s*: {verdict}{groups}")
-            lines.append(f"  {one['final']['crashes']} of {one['final']['n']} rollouts crash")
+            lines += claim_lines(one["final"])
             runs = one["true_runs"]
             crashed = f"{runs['crashes']} of {runs['n']} runs crash (at most {runs['crash_upper']:.1%}, 95 %)"
             lines.append(f"  true system: {crashed}, {runs['made_progress']} make progress")
