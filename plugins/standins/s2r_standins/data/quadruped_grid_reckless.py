@@ -1,0 +1,1 @@
+../../../../controllers/quadruped_grid_reckless.py
