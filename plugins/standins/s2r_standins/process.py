@@ -46,9 +46,11 @@ realtime   a period lasts a period; the robot stops when its last command is old
 
 
 class Body(Protocol):
-    """What moves. `k`: periods since it was switched on; its clock is k period_s."""
+    """What moves."""
 
-    k: int
+    @property
+    def k(self) -> int:
+        """Periods since it was switched on; its clock is k period_s."""
 
     @property
     def period_s(self) -> float:
