@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import zlib
 from array import array
 from pathlib import Path
 
@@ -39,10 +38,10 @@ def test_a_head_is_the_hash_of_the_one_before_the_seal_and_the_records() -> None
 
 
 def test_a_signature_is_over_every_field_and_for_this_purpose_only() -> None:
-    seal = signed(Seal(1, 2, b"h" * 32, 4), KEY)
+    seal = signed(Seal(1, 2, b"h" * 32, b"f" * 32), KEY)
     assert is_signed_by(seal, KEY.public_key())
     assert not is_signed_by(seal, OTHER.public_key())
-    for field, value in (("t_ns", 2), ("count", 3), ("head", b"g" * 32), ("crc", 5), ("end", "closed")):
+    for field, value in (("t_ns", 2), ("count", 3), ("head", b"g" * 32), ("file", b"g" * 32), ("end", "closed")):
         assert not is_signed_by(msgspec.structs.replace(seal, **{field: value}), KEY.public_key()), field
     bare = msgspec.json.encode(msgspec.structs.replace(seal, signature=b""))
     assert not is_signed_by(msgspec.structs.replace(seal, signature=KEY.sign(bare)), KEY.public_key())
@@ -69,9 +68,9 @@ def forge(path: Path, key: Ed25519PrivateKey | None, change: int, *, rechain: bo
 
     rechain: all heads fit too; the seals from there on are signed with `key`, or keep the old signatures.
     """
-    data, head, crc, seal_record = b"", GENESIS, 0, b""
+    data, head, seal_record = b"", GENESIS, b""
     for number, (prefix, messages, declarations) in enumerate(blocks(path)):
-        content, index, before = bytearray(declarations), {}, len(data)
+        content, index = bytearray(declarations), {}
         for position, (channel, sequence, t_ns, raw) in enumerate(messages):
             if number == change and position == 3:
                 raw = raw.replace(b"3", b"7")
@@ -79,7 +78,7 @@ def forge(path: Path, key: Ed25519PrivateKey | None, change: int, *, rechain: bo
                 if rechain:
                     head = advance(head, seal_record, [prefix, content])
                     old = msgspec.json.decode(raw, type=Seal)
-                    seal = msgspec.structs.replace(old, head=head, crc=crc)
+                    seal = msgspec.structs.replace(old, head=head, file=hashlib.sha256(data).digest())
                     if number >= change:
                         seal = signed(msgspec.structs.replace(seal, signature=b""), key) if key else seal
                     raw = msgspec.json.encode(seal)
@@ -87,8 +86,8 @@ def forge(path: Path, key: Ed25519PrivateKey | None, change: int, *, rechain: bo
             index.setdefault(channel, array("Q")).extend((t_ns, len(content)))
             content += MESSAGE.pack(5, 22 + len(raw), channel, sequence, t_ns, t_ns) + raw
         seal_record = bytes(content[seal_at:])
-        data += prefix + chunk(bytes(content), index, messages[0][2], messages[-1][2], zstandard.ZstdCompressor(level=1))
-        crc = zlib.crc32(data[before:], crc)
+        compressor = zstandard.ZstdCompressor(level=1) if len(messages) > 1 else None
+        data += prefix + chunk(bytes(content), index, messages[0][2], messages[-1][2], compressor)
     path.write_bytes(data)
 
 

@@ -13,12 +13,14 @@ from typing import BinaryIO, NamedTuple
 import zstandard
 from mcap.opcode import Opcode
 
-from s2r_runtime.recording.layout import CHUNK, CHUNK_FIELDS, MAX_CHUNK, MESSAGE, MESSAGE_FIELDS, RECORD, declared, index_records
+from s2r_runtime.recording.layout import CHUNK, CHUNK_FIELDS, MAX_CHUNK, MESSAGE, MESSAGE_FIELDS, RECORD, declared, index_records, stored
 
 _DECOMPRESSOR = zstandard.ZstdDecompressor()
 _MARK = (4).to_bytes(4, "little") + b"zstd"
 """What the middle of every chunk's head looks like."""
 _MARK_AT = CHUNK.size - 8 - len(_MARK)
+ZEROS = 16
+"""A block ends with the place of its seal (8 bytes, not 0), so it has no more than 7 zeros at its end."""
 
 
 class Damage(Exception):
@@ -43,7 +45,7 @@ class Block(NamedTuple):
     """A block in the file: bytes offset..end are all of it. messages: the seal is the last one.
 
     `last`: it ends with a data end, not a chunk (then there are no messages). `lacking`: what the file does not have of its
-    message index.
+    message index. `plain`: its chunk has the one form that anybody can make of its content (`layout.stored`).
     """
 
     offset: int
@@ -54,10 +56,11 @@ class Block(NamedTuple):
     messages: list[Part]
     last: bool = False
     lacking: bytes = b""
+    plain: bool = False
 
 
 def take(file: BinaryIO, offset: int, size: int, start: bytes = b"", *, strict: bool = True) -> Block | None:
-    """The block at `offset` of a file of `size` bytes that stands there; None at the end of the file.
+    """The block at `offset` of a file that ends at `size`; None if it ends there.
 
     start: what the block begins with and has been read already (of the first one). strict: a wrong message index counts; else
     the block ends before it. Raises Damage.
@@ -65,8 +68,8 @@ def take(file: BinaryIO, offset: int, size: int, start: bytes = b"", *, strict: 
     prefix = [start] if start else []
     at = offset + len(start)
     while True:
-        head = file.read(RECORD.size)
-        if not head and at == size:
+        head = file.read(max(0, min(RECORD.size, size - at)))
+        if not head:
             if prefix:
                 raise Damage(offset, "the records at the end were not sealed", cut=True)
             return None
@@ -90,22 +93,24 @@ def take(file: BinaryIO, offset: int, size: int, start: bytes = b"", *, strict: 
 
 def _chunk_block(file: BinaryIO, offset: int, at: int, size: int, prefix: list[bytes], head: bytes) -> tuple[Block, bool]:
     """The block whose chunk stands at `at`, and whether its index is wrong (then it ends before the index)."""
-    head += file.read(CHUNK_FIELDS)
-    if len(head) < CHUNK.size:
+    if at + CHUNK.size > size:
         raise Damage(at, "the file ends inside a chunk", cut=True)
+    head += file.read(CHUNK_FIELDS)
     _, length, first, last, content_size, crc, name_size, name, data_size = CHUNK.unpack(head)
     if (name_size, name, data_size + CHUNK_FIELDS) != (4, b"zstd", length) or content_size > MAX_CHUNK:
         raise Damage(at, "a chunk's head contradicts itself")
     if at + CHUNK.size + data_size > size:
         raise Damage(at, "the file ends inside a chunk", cut=True)
-    content = _content(file.read(data_size), content_size, crc, at)
+    data = file.read(data_size)
+    content = _content(data, content_size, crc, at)
     declarations, messages, index = _walk(content, at)
     if (first, last) != (messages[0].log_time_ns, messages[-1].log_time_ns):
         raise Damage(at, "a chunk's times are not those of its messages")
     expected = index_records(index)
     index_at = at + CHUNK.size + data_size
-    found = file.read(len(expected))
-    block = Block(offset, index_at + len(found), prefix, content, declarations, messages, lacking=expected[len(found) :])
+    found = file.read(min(len(expected), size - index_at))
+    plain = data_size > content_size and len(messages) == 1 and data == stored(content)
+    block = Block(offset, index_at + len(found), prefix, content, declarations, messages, lacking=expected[len(found) :], plain=plain)
     if found == expected or (index_at + len(found) == size and expected.startswith(found)):
         return block, False
     return block._replace(end=index_at, lacking=expected), True
@@ -115,7 +120,7 @@ def _content(data: bytes, size: int, crc: int, at: int) -> bytes:
     try:
         if zstandard.get_frame_parameters(data).content_size != size:
             raise Damage(at, "a chunk's size is not that of its content")
-        content = _DECOMPRESSOR.decompress(data, max_output_size=size)
+        content = _DECOMPRESSOR.decompress(data, max_output_size=size, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise Damage(at, f"a chunk cannot be decompressed: {error}") from None
     if len(content) != size or zlib.crc32(content) != crc:
@@ -160,6 +165,23 @@ def _walk(content: bytes, at: int) -> tuple[list[bytes], list[Part], dict[int, a
     except ValueError as error:
         raise Damage(at, str(error)) from None
     return declarations, messages, index
+
+
+def extent(file: BinaryIO, size: int) -> int:
+    """Bytes of a file of `size` bytes without the zeros at its end: a file system may leave those of a write that a power cut stopped.
+
+    Fewer than ZEROS may be its own.
+    """
+    end = size
+    while end > 0:
+        start = max(0, end - (1 << 20))
+        file.seek(start)
+        kept = file.read(end - start).rstrip(b"\0")
+        if kept:
+            end = start + len(kept)
+            break
+        end = start
+    return end if size - end >= ZEROS else size
 
 
 def find(file: BinaryIO, offset: int, size: int) -> int | None:

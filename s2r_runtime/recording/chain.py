@@ -7,8 +7,10 @@ header too). With s(n) the seal record that closed block n:
     head(n) = SHA-256( head(n-1) || s(n-1) || records before the chunk || schema, channel and message records of the chunk )
 
 The seal holds head(n); it is the last message of its chunk, and signed where the log has a key. Since each block begins with the
-seal before it, the last good signature vouches for every bit that was recorded up to it, signatures included. What no chain
-can show is a tail that is not there: that is what printing the head is for.
+seal before it, the last good signature vouches for every bit that was recorded up to it, signatures included. The seal also holds
+the SHA-256 of the file up to its block, so that of all the forms in which the blocks before could lie in the file (zstd can say
+the same in many ways) only one is good; the block of the last seal holds nothing else, in the one form that anybody can make anew.
+What no chain can show is a tail that is not there: that is what publishing the head is for.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 from s2r_runtime.recording.channels import Seal
 
 GENESIS = bytes(32)
-DOMAIN = b"s2r log chain 1\n"
+DOMAIN = b"s2r log chain 2\n"
 """What is signed begins with it, so that no signature made for another purpose counts here."""
 
 

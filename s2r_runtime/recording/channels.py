@@ -27,14 +27,14 @@ FRAME_IN, FRAME_OUT, CHAIN, UNRECORDED = "frame/in", "frame/out", "log/chain", "
 class Seal(Struct, frozen=True, tag="chain"):
     """Closes a chunk: all before it is what `head` says (see `chain`).
 
-    `count`: messages of the run before this one, which is its index. `crc`: CRC-32 of the file up to this chunk's records.
+    `count`: messages of the run before this one, which is its index. `file`: SHA-256 of the file up to this block.
     `end`: why nothing follows in this file. `signature`: Ed25519 over the other fields; empty in an unsigned log.
     """
 
     t_ns: int
     count: int
     head: bytes
-    crc: int
+    file: bytes
     end: Literal["", "rotated", "closed"] = ""
     signature: bytes = b""
 

@@ -31,7 +31,7 @@ from mcap.records import (
 from s2r_runtime.recording.channels import CHANNELS, schema
 
 MAGIC = b"\x89MCAP0\r\n"
-LIBRARY = "s2r-runtime log 1"
+LIBRARY = "s2r-runtime log 2"
 ABOUT = "s2r"
 """Name of the first metadata record: run, part, key, versions."""
 RECOVERED = "s2r.recovered"
@@ -39,6 +39,9 @@ RECOVERED = "s2r.recovered"
 
 MAX_CHUNK = 64 << 20
 """Bytes of a chunk's content at most: what a reader is ready to allocate for a file it doesn't trust."""
+
+STORED_MAX = 128 << 10
+"""Bytes of a zstd block at most (RFC 8878, 3.1.1.2.4)."""
 
 RECORD = struct.Struct("<BQ")
 """Opcode and length of what follows."""
@@ -67,11 +70,25 @@ def declaration(number: int) -> tuple[bytes, bytes]:
     return pack(kind), pack(Channel(id=number, schema_id=number, topic=name, message_encoding="json", metadata={}))
 
 
-def chunk(content: bytes, index: Mapping[int, array[int]], first_ns: int, last_ns: int, compressor: zstandard.ZstdCompressor) -> bytes:
-    """A chunk record and its message indexes. index: channel -> log time, offset, log time, offset, ..."""
-    data = compressor.compress(content)
+def chunk(
+    content: bytes, index: Mapping[int, array[int]], first_ns: int, last_ns: int, compressor: zstandard.ZstdCompressor | None
+) -> bytes:
+    """A chunk record and its message indexes. index: channel -> log time, offset, log time, offset, ... compressor: None: `stored`."""
+    data = stored(content) if compressor is None else compressor.compress(content)
     head = CHUNK.pack(Opcode.CHUNK, CHUNK_FIELDS + len(data), first_ns, last_ns, len(content), zlib.crc32(content), 4, b"zstd", len(data))
     return b"".join((head, data, index_records(index)))
+
+
+def stored(content: bytes) -> bytes:
+    """Content as a zstd frame of one raw block (RFC 8878, 3.1.1): of all the frames that mean the same, the one that anybody makes.
+
+    Raises ValueError for content that does not fit into one.
+    """
+    n = len(content)
+    if n > STORED_MAX:
+        raise ValueError(f"{n} bytes cannot be stored as one block, must be at most {STORED_MAX}")
+    code, size = (0, struct.pack("<B", n)) if n < 256 else (1, struct.pack("<H", n - 256)) if n < 65792 else (2, struct.pack("<I", n))
+    return b"\x28\xb5\x2f\xfd" + bytes([code << 6 | 0x20]) + size + (1 | n << 3).to_bytes(3, "little") + content
 
 
 def index_records(index: Mapping[int, array[int]]) -> bytes:
@@ -146,6 +163,8 @@ def declared(records: Iterable[bytes]) -> tuple[dict[int, bytes], dict[int, byte
         elif record[0] == Opcode.CHANNEL and cursor.number("<H") in schemas:
             channels[number] = record
             topics[number] = cursor.text()
+            if record != pack(Channel(number, topics[number], "json", {}, struct.unpack_from("<H", record, RECORD.size + 2)[0])):
+                raise ValueError(f"channel {topics[number]!r} is not declared as this software does")
         else:
             raise ValueError("a chunk holds something that is neither schema, channel nor message")
     return schemas, channels, topics

@@ -6,6 +6,7 @@ After an error of the operating system the file is as it was, and the same call 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import time
 import zlib
@@ -30,7 +31,7 @@ _CHAIN = NUMBERS[CHAIN]
 
 
 class Pending:
-    """What gathers between two seals: records outside the chunk, then the chunk's messages.
+    """What gathers between two seals: records outside the chunk, then the chunk's messages. The last one of a file has no messages.
 
     `seal_index`: the number reserved for its seal; `end`: whether the file ends with it; `held`: its bytes as accounted for.
     """
@@ -76,6 +77,7 @@ class LogFile:
         self._path, self._run, self._signer, self._about = path, run, signer, dict(about)
         self._fd = -1
         self._crc = self._sealed_ns = 0
+        self._file = hashlib.sha256()
         self._seal = self._unwritten = b""
         self._schemas: dict[int, bytes] = {}
         self._channels: dict[int, bytes] = {}
@@ -100,6 +102,7 @@ class LogFile:
         self._fd = fd
         self.parts.append(path)
         self.size = self._crc = self.chunks = 0
+        self._file = hashlib.sha256()
         self.opened_s = time.monotonic()
         self._schemas, self._channels, self._seal = {}, {}, b""
         key = b"" if self._signer is None else self._signer.public_key().public_bytes_raw()
@@ -111,6 +114,7 @@ class LogFile:
             self._unwritten = self._sealed(block)
         self._append(self._unwritten)
         self._crc = zlib.crc32(self._unwritten, self._crc)
+        self._file.update(self._unwritten)
         self._unwritten = b""
         self.chunks += 1
         self.recorded = block.seal_index + 1
@@ -150,11 +154,12 @@ class LogFile:
         first = next(iter(block.index.values()))[0] if block.index else self._sealed_ns
         last = max((pairs[-2] for pairs in block.index.values()), default=self._sealed_ns)
         head = advance(self.head, self._seal, [*block.prefix, block.content])
-        seal = signed(Seal(last, block.seal_index, head, self._crc, block.end), self._signer)
+        seal = signed(Seal(last, block.seal_index, head, self._file.digest(), block.end), self._signer)
         start = len(block.content)
         block.add(_CHAIN, block.seal_index, last, msgspec.json.encode(seal))
         self.head, self._seal, self._sealed_ns = head, bytes(block.content[start:]), last
-        return b"".join([*block.prefix, chunk(bytes(block.content), block.index, first, last, self._compressor)])
+        compressor = None if block.end else self._compressor
+        return b"".join([*block.prefix, chunk(bytes(block.content), block.index, first, last, compressor)])
 
     def _read_at(self, length: int, offset: int) -> bytes:
         return os.pread(self._fd, length, offset)

@@ -7,6 +7,7 @@ there, with the place named.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import zlib
 from collections.abc import Iterable, Iterator
@@ -18,7 +19,7 @@ from mcap.opcode import Opcode
 
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.messages import Struct
-from s2r_runtime.recording.blocks import Block, Damage, find, take
+from s2r_runtime.recording.blocks import Block, Damage, extent, find, take
 from s2r_runtime.recording.chain import advance, is_signed_by
 from s2r_runtime.recording.channels import CHAIN, CHANNELS, Seal, decoder
 from s2r_runtime.recording.layout import (
@@ -32,8 +33,6 @@ from s2r_runtime.recording.layout import (
 )
 from s2r_runtime.recording.start import read_start
 from s2r_runtime.recording.summary import tail
-
-_ZEROS = 16
 
 
 class Entry(msgspec.Struct, frozen=True, gc=False):
@@ -81,7 +80,9 @@ class Reading:
         try:
             with path.open("rb") as file:
                 self.size = os.fstat(file.fileno()).st_size
-                start = read_start(file, path, self.size)
+                self._until = extent(file, self.size)
+                file.seek(0)
+                start = read_start(file, path, self._until)
         except OSError as error:
             raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
         self.start = start.raw
@@ -100,11 +101,13 @@ class Reading:
         self._ending: Ending | None = None
         self._index = self.first_index
         self._at = self._crc = self._log_time = 0
+        self._sha = hashlib.sha256()
         self._seal, self._final = b"", ""
         self._schemas: dict[int, bytes] = {}
         self._channels: dict[int, bytes] = {}
         self._topics: dict[int, str] = {}
         self.first_ns: int | None = None
+        self._digests: dict[str, bytes] = {}
 
     @property
     def over(self) -> bool:
@@ -181,15 +184,17 @@ class Reading:
     def _take(self) -> Block | None:
         start = b"" if self._at else self.start
         self._file.seek(self._at + len(start))
-        return take(self._file, self._at, self.size, start)
+        return take(self._file, self._at, self._until, start)
 
     def _check(self, block: Block) -> None:
         """Sequence, times, chain and signature of a block."""
         if self._final:
             raise Damage(block.offset, "something follows the last seal")
         schemas, declarations, topics = declared(block.declarations)
-        self._schemas |= schemas
-        self._channels |= declarations
+        for known, new in ((self._schemas, schemas), (self._channels, declarations)):
+            if any(known.get(number, record) != record for number, record in new.items()):
+                raise Damage(block.offset, "a channel is declared once more, and otherwise")
+            known.update(new)
         self._topics |= topics
         if self.first_ns is None:
             self.first_ns = block.messages[0].log_time_ns
@@ -210,26 +215,33 @@ class Reading:
         seal_at = last.start - MESSAGE.size
         head = advance(self.head, self._seal, [*block.prefix, memoryview(block.content)[:seal_at]])
         count = self._index + len(block.messages) - 1
-        if msgspec.json.encode(Seal(last.log_time_ns, count, head, self._crc, seal.end, seal.signature)) != raw:
+        if msgspec.json.encode(Seal(last.log_time_ns, count, head, self._sha.digest(), seal.end, seal.signature)) != raw:
             raise Damage(block.offset, "the chain does not hold: this is not what was sealed")
         if self._key is None:
             if seal.signature:
                 raise Damage(block.offset, "a seal is signed in a log that has no key")
         elif not is_signed_by(seal, self._key):
             raise Damage(block.offset, "a seal's signature is not that of the log's key")
+        if seal.end and not block.plain:
+            raise Damage(block.offset, "the last seal does not stand alone, as it is written")
         self.head, self.signed, self._final = head, self._key is not None, seal.end
         self._seal = block.content[seal_at:]
-        self._crc = self._crc_until(block.end)
+        self._digest_until(block.end)
 
-    def _crc_until(self, end: int) -> int:
+    def _digest_until(self, end: int) -> None:
         self._file.seek(self._at)
-        return zlib.crc32(self._file.read(end - self._at), self._crc)
+        data = self._file.read(end - self._at)
+        self._crc = zlib.crc32(data, self._crc)
+        self._sha.update(data)
 
     def _note(self, block: Block) -> None:
         for record in block.prefix:
             data = record[len(self.start) :] if record is block.prefix[0] and block.offset == 0 else record
             if data and data[0] == Opcode.ATTACHMENT:
-                self.attachments.append(_attached(data, block.offset))
+                attached = _attached(data, block.offset)
+                if self._digests.setdefault(attached.name, digest := hashlib.sha256(attached.data).digest()) != digest:
+                    raise Damage(block.offset, f"there are two attachments {attached.name!r}, and they differ")
+                self.attachments.append(attached)
             elif data:
                 name, fields = _metadata(data, block.offset)
                 self.metadata[name] = fields
@@ -252,13 +264,13 @@ class Reading:
             if record[0] != Opcode.METADATA or _metadata(record, block.offset)[0] != RECOVERED:
                 raise Damage(block.offset, "a record at the end was not sealed")
             self.metadata[RECOVERED] = _metadata(record, block.offset)[1]
-        self._crc = self._crc_until(block.end)
+        self._digest_until(block.end)
         at = self._at = block.end
         self._file.seek(at)
         for piece in tail(self._read_at, block.end, self._crc, self._schemas, self._channels):
-            found = self._file.read(len(piece))
+            found = self._file.read(min(len(piece), max(0, self._until - at)))
             if found != piece:
-                if at + len(found) == self.size and piece.startswith(found):
+                if at + len(found) == self._until and piece.startswith(found):
                     self._end("cut", "the file ends inside its index")
                     return
                 raise Damage(at, "the index at the end is not that of the messages")
@@ -275,13 +287,8 @@ class Reading:
         return os.pread(self._file.fileno(), length, offset)
 
     def _damaged(self, damage: Damage) -> None:
-        """A cut tail has nothing good after it; if there is something, a record in the middle was damaged.
-
-        Zeros at the end are what a file system may leave of a write that a power cut stopped: a cut too.
-        """
-        self._file.seek(max(0, self.size - _ZEROS))
-        cut = damage.cut or self._file.read() == bytes(_ZEROS)
-        if cut and find(self._file, self._at + 1, self.size) is None:
+        """A cut tail has nothing good after it; if there is something, a record in the middle was damaged."""
+        if damage.cut and find(self._file, self._at, self._until) is None:
             self._end("cut", damage.detail)
         else:
             self._end("broken", f"at byte {damage.offset}: {damage.detail}")

@@ -142,7 +142,7 @@ def _copy(good: _Good, source: BinaryIO, target: BinaryIO, name: str) -> Account
         return Account(name, ending.kind, good.records, good.records, [], 0, "" if good.complete else ending.detail)
     holes: list[Hole] = []
     records, kept_bytes, expected = good.records, max(good.end, len(good.start)), ending.index
-    for block in _sound(source, good.end + 1, size) if ending.kind == "broken" else ():
+    for block in _sound(source, good.end, size) if ending.kind == "broken" else ():
         first = block.messages[0].sequence + (expected & ~0xFFFFFFFF)
         holes += [Hole(expected, first - expected)] if first > expected else []
         expected = first + len(block.messages)

@@ -44,13 +44,13 @@ def make_start(
 
 def read_start(file: BinaryIO, path: Path, size: int) -> Start:
     """Reads the start of a file of `size` bytes. Raises RecordingError if it is no log, or its start is damaged."""
-    found = file.read(len(FIRST))
+    found = file.read(min(len(FIRST), size))
     if found != FIRST[: len(found)]:
         if other := other_writer(path):
             raise RecordingError(f"{path}: is an MCAP file of others ({other}), not a log of s2r")
         raise RecordingError(f"{path}: is not a log of this version of s2r (its first bytes are not those of one)")
     head = file.read(RECORD.size)
-    if len(head) < RECORD.size or len(FIRST) + RECORD.size + RECORD.unpack(head)[1] > size:
+    if len(FIRST) + RECORD.size > size or len(FIRST) + RECORD.size + RECORD.unpack(head)[1] > size:
         return Start()
     record = head + file.read(RECORD.unpack(head)[1])
     try:

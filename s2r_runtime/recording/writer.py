@@ -168,7 +168,7 @@ class Writer:
             self._drain()
             if self._full():
                 with self._adding:
-                    self._turn("rotated")
+                    self._turn_for_good("rotated")
                 self._drain()
 
     def durable(self) -> None:
@@ -188,7 +188,7 @@ class Writer:
             with self._adding:
                 if not self._closing:
                     self._closing = True
-                    self._turn("closed")
+                    self._turn_for_good("closed")
             self._drain()
         return self.head
 
@@ -207,6 +207,12 @@ class Writer:
         self._held_bytes += block.held
         self._waiting.append(block)
         self._block = Pending()
+
+    def _turn_for_good(self, end: End) -> None:
+        """As `_turn`, and the file ends with a block that holds its seal and nothing else."""
+        if self._block.content or self._block.prefix:
+            self._turn("")
+        self._turn(end)
 
     def _drain(self) -> None:
         """Writes the blocks that wait; goes on where an error stopped it."""
