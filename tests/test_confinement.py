@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import platform
 import subprocess
 import sys
@@ -13,10 +14,17 @@ from s2r_runtime.controllers import confinement
 
 pytestmark = pytest.mark.skipif(platform.machine() not in {"x86_64", "aarch64"}, reason="system calls are filtered on these processors")
 
+LANDLOCK = ctypes.CDLL(None).syscall(444, None, ctypes.c_size_t(0), 1) >= 1
+
 CONFINED = """
 import os, sys
+exec(sys.argv[3])
 from s2r_runtime.controllers.confinement import confine
-PATH = sys.argv[1]
+import ctypes, platform
+PATH, ARM = sys.argv[1], platform.machine() == "aarch64"
+def call(*arguments):
+    if ctypes.CDLL(None, use_errno=True).syscall(*arguments) < 0:
+        raise OSError(ctypes.get_errno(), "system call")
 in_force = confine(1 << 28)
 try:
     exec(sys.argv[2])
@@ -27,9 +35,9 @@ else:
 """
 
 
-def confined(code: str, path: Path) -> str:
+def confined(code: str, path: Path, before: str = "") -> str:
     """What a process prints that confines itself and then runs the code."""
-    command = [sys.executable, "-c", CONFINED, str(path), code]
+    command = [sys.executable, "-c", CONFINED, str(path), code, before]
     return subprocess.run(command, capture_output=True, text=True, check=True, cwd=path.parent, timeout=60).stdout
 
 
@@ -71,6 +79,14 @@ def target(tmp_path: Path) -> Path:
         "import os; os.setsid()",
         "import time; time.clock_settime(time.CLOCK_REALTIME, 0)",
         "import os; os.pidfd_open(os.getppid())",
+        "import socket; socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)[0].sendto(b'READY=1', PATH)",
+        "import fcntl, os; fcntl.fcntl(os.pipe()[0], 8, os.getppid())",  # F_SETOWN: whom data in the pipe will signal
+        "import fcntl, os; fcntl.fcntl(os.pipe()[0], 10, 9)",  # F_SETSIG: with what
+        "import fcntl, os; fcntl.fcntl(os.pipe()[0], 15, bytes(8))",  # F_SETOWN_EX
+        "import fcntl, os; fcntl.ioctl(os.pipe()[0], 0x5452, bytes(4))",  # FIOASYNC
+        "call(30 if ARM else 251, 1, os.getppid(), 0)",  # ioprio_set
+        "call(463, 0, 0, 0, 0, 0, 0)",  # setxattrat: newer than the list
+        "call(511, 0)",  # a system call that is yet to be invented
     ],
 )
 def test_what_reaches_out_of_the_process_is_refused(target: Path, code: str) -> None:
@@ -83,7 +99,8 @@ def test_what_reaches_out_of_the_process_is_refused(target: Path, code: str) -> 
     "code",
     [
         "import threading; t = threading.Thread(target=print); t.start(); t.join()",
-        "open(PATH).read()",
+        "import json.tool, sqlite3, zoneinfo; zoneinfo.ZoneInfo('UTC')",
+        "import fcntl, os; fcntl.fcntl(os.pipe()[0], fcntl.F_GETFL)",
         "import numpy as np; np.linalg.solve(np.eye(50), np.ones(50))",
         "import resource; resource.getrlimit(resource.RLIMIT_AS)",
         "import time; time.sleep(0.001)",
@@ -91,7 +108,31 @@ def test_what_reaches_out_of_the_process_is_refused(target: Path, code: str) -> 
     ],
 )
 def test_computing_reading_and_threads_go_on(target: Path, code: str) -> None:
-    assert confined(code, target).splitlines()[-1] == "done memory files privileges system_calls"
+    assert confined(code, target).splitlines()[-1] == f"done memory files privileges {'reading ' if LANDLOCK else ''}system_calls"
+
+
+@pytest.mark.skipif(not LANDLOCK, reason="this kernel has no Landlock")
+@pytest.mark.parametrize(
+    "code",
+    [
+        "open(PATH).read()",
+        "os.listdir(os.path.dirname(PATH))",
+        "os.listdir('.')",
+        "os.chdir('/proc/self/root'); open('etc/passwd').read()",
+        "open('/proc/self/environ').read()",
+        "open('/proc/%d/environ' % os.getppid()).read()",
+        "ctypes.CDLL(PATH)",
+        "import mmap; mmap.mmap(os.open(PATH, os.O_RDONLY), 0, prot=mmap.PROT_READ)",
+    ],
+)
+def test_what_is_no_code_cannot_be_read(target: Path, code: str) -> None:
+    assert "ermission denied" in confined(code, target)
+
+
+def test_reading_stays_free_where_the_kernel_cannot_contain_it_and_that_is_said(target: Path) -> None:
+    code = "print(open(PATH).read())"
+    said = confined(code, target, before="from s2r_runtime.controllers import reading; reading.restrict = lambda places: False")
+    assert said == "kept\ndone memory files privileges system_calls\n"
 
 
 def test_memory_beyond_the_limit_is_refused(target: Path) -> None:

@@ -158,6 +158,8 @@ def _describe(error: BaseException) -> str:
         where = f" ({(error.filename or '').strip('<>')} line {error.lineno})"
     try:
         text = str(error.msg if isinstance(error, SyntaxError) else error)
+        if isinstance(error, PermissionError):
+            text += "; a controller opens no files: what it needs stands in its PARAMETERS, or in a module beside it"
     except Exception:  # noqa: BLE001 - an exception class of its own whose text raises
         text = "no text"
     return one_line(f"{type(error).__name__}: {text}", DETAIL_MAX - len(where)) + where

@@ -7,15 +7,17 @@ What it can no longer do, from `confine` on, for good and in every thread:
 - start a process or replace its own (fork, exec); threads are allowed
 - signal, trace or write into another process; raise its limits; gain privileges
 - hold more memory than it may, dump core, have more than 64 files open
+- read a file, unless it is code or something that libraries look up (`reading`; where the kernel has Landlock)
 
-What is **not** contained: it reads every file that its user can read (also private keys; what it reads can leave only through its
-commands and its printed lines, and both are logged); it uses processor time until its deadline passes; it shares the kernel
-with everything else; where the kernel has no seccomp, or on a processor other than x86-64 and 64-bit ARM, the first four lines
-do not hold and `confine` says so. For more, run the daemon in a container or a virtual machine.
+What is **not** contained: it uses processor time until its deadline passes, and between deadlines in threads of its own; it learns
+whether a file exists and how long it is; it shares the kernel with everything else. Where the kernel has no Landlock it reads every file
+that its user can read, also private keys (what it reads can leave only through its commands and its printed lines, and both are
+logged). Where it has no seccomp, or on a processor other than x86-64 and 64-bit ARM, the first four lines do not hold. `confine`
+says what is in force. For more, run the daemon in a container or a virtual machine.
 
-The mechanism is a seccomp filter (seccomp(2)) that makes the system calls below fail with EPERM, which Python turns into
-PermissionError: a controller that tries is stopped with a reason. It is a list of what is denied, and not of what is allowed,
-because numerical libraries differ in what they need.
+The mechanism of the first four is a seccomp filter (seccomp(2)) that makes the system calls below fail with EPERM, which Python turns
+into PermissionError: a controller that tries is stopped with a reason. It is a list of what is denied, and not of what is allowed,
+because numerical libraries differ in what they need; but system calls that are newer than the list do not exist for it.
 """
 
 from __future__ import annotations
@@ -27,6 +29,8 @@ import os
 import platform
 import resource
 import struct
+
+from s2r_runtime.controllers import reading
 
 FILES_MAX = 64
 
@@ -42,12 +46,15 @@ _AUDIT_ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 # System call numbers: (x86-64, 64-bit ARM); None where it doesn't exist. From asm/unistd_64.h and asm-generic/unistd.h.
 _DENIED: dict[str, tuple[int | None, int | None]] = {
     # sockets
-    "socket": (41, 198), "connect": (42, 203), "bind": (49, 200), "listen": (50, 201), "accept": (43, 202), "accept4": (288, 242),
+    # (a pair as well: one of datagrams may be told to send to any address)
+    "socket": (41, 198), "socketpair": (53, 199), "connect": (42, 203), "bind": (49, 200), "listen": (50, 201),
+    "accept": (43, 202), "accept4": (288, 242),
     # processes
     "fork": (57, None), "vfork": (58, None), "execve": (59, 221), "execveat": (322, 281), "kill": (62, 129), "tkill": (200, 130),
     "tgkill": (234, 131), "rt_sigqueueinfo": (129, 138), "rt_tgsigqueueinfo": (297, 240), "pidfd_open": (434, 434),
     "pidfd_getfd": (438, 438), "pidfd_send_signal": (424, 424), "ptrace": (101, 117), "process_vm_readv": (310, 270),
     "process_vm_writev": (311, 271), "process_madvise": (440, 440), "kcmp": (312, 272), "setpgid": (109, 154), "setsid": (112, 157),
+    "ioprio_set": (251, 30), "move_pages": (279, 239), "migrate_pages": (256, 238),
     "setpriority": (141, 140), "sched_setaffinity": (203, 122), "sched_setscheduler": (144, 119), "sched_setparam": (142, 118),
     "sched_setattr": (314, 274), "setrlimit": (160, 164), "prctl": (157, 167), "setns": (308, 268), "unshare": (272, 97),
     # files
@@ -69,6 +76,13 @@ _DENIED: dict[str, tuple[int | None, int | None]] = {
     "clock_adjtime": (305, 266), "sethostname": (170, 161), "setdomainname": (171, 162), "iopl": (172, None), "ioperm": (173, None),
 }  # fmt: skip
 
+_NEWER = 463
+"""The first system call that is newer than this list (setxattrat, Linux 6.13); the same number on both processors."""
+_OWNERS = (8, 10, 15)
+"""fcntl(2): F_SETOWN, F_SETSIG, F_SETOWN_EX. A pipe that has data for somebody sends him a signal of one's choice."""
+_IOCTL_OWNERS = (0x5452, 0x8901, 0x8902)
+"""ioctl(2): FIOASYNC, FIOSETOWN, SIOCSPGRP, which do the same."""
+
 # Their arguments are in memory, where a filter cannot look; the C library falls back to clone and openat.
 _UNKNOWN = {"clone3": (435, 435), "openat2": (437, 437)}
 
@@ -76,8 +90,9 @@ _UNKNOWN = {"clone3": (435, 435), "openat2": (437, 437)}
 def confine(memory_bytes: int) -> tuple[str, ...]:
     """Confines this process; `memory_bytes` is what it may have beyond the address space it has now.
 
-    Returns what is in force: `memory`, `files` (limits), `privileges` (no_new_privs), `system_calls` (the filter).
+    Returns what is in force: `memory`, `files` (limits), `privileges` (no_new_privs), `reading` (Landlock), `system_calls` (the filter).
     """
+    readable = reading.places()
     _limit(resource.RLIMIT_AS, _address_space() + memory_bytes)
     _limit(resource.RLIMIT_NOFILE, FILES_MAX)
     _limit(resource.RLIMIT_FSIZE, 0)
@@ -86,6 +101,9 @@ def confine(memory_bytes: int) -> tuple[str, ...]:
     with contextlib.suppress(OSError):
         _prctl(_PR_SET_NO_NEW_PRIVS, 1)
         in_force.append("privileges")
+        if reading.restrict(readable):
+            in_force.append("reading")
+    with contextlib.suppress(OSError):
         if program := _filter(platform.machine()):
             _prctl(_PR_SET_SECCOMP, _SECCOMP_MODE_FILTER, program)
             in_force.append("system_calls")
@@ -131,6 +149,7 @@ def _filter(machine: str) -> bytes | None:
     ]
     if machine == "x86_64":
         code += [_op(_JUMP_ABOVE, 0x40000000, 0, 1), _op(_RETURN, deny)]  # the x32 numbers of the same calls
+    code += [_op(_JUMP_ABOVE, _NEWER, 0, 1), _op(_RETURN, unknown)]
     for calls, answer in ((_DENIED, deny), (_UNKNOWN, unknown)):
         for numbers in calls.values():
             if (number := numbers[column]) is not None:
@@ -140,6 +159,8 @@ def _filter(machine: str) -> bytes | None:
     if machine == "x86_64":
         code += _when(2, _low(1), [_op(_JUMP_BITS, _WRITING, 0, 1), _op(_RETURN, deny)])
     code += _when((257, 56)[column], _low(2), [_op(_JUMP_BITS, _WRITING, 0, 1), _op(_RETURN, deny)])
+    code += _when((72, 25)[column], _low(1), _none_of(_OWNERS, deny))
+    code += _when((16, 29)[column], _low(1), _none_of(_IOCTL_OWNERS, deny))
     zero = [_op(_JUMP_EQUAL, 0, 1, 0), _op(_RETURN, deny)]
     code += _when((302, 261)[column], _low(2), [*zero, _op(_LOAD, _low(2) + 4), *zero])
     code.append(_op(_RETURN, _ALLOW))
@@ -149,6 +170,11 @@ def _filter(machine: str) -> bytes | None:
 def _when(number: int, argument: int, then: list[bytes]) -> list[bytes]:
     """If the call has this number: load that argument, run `then`, and allow what it didn't deny."""
     return [_op(_JUMP_EQUAL, number, 0, len(then) + 2), _op(_LOAD, argument), *then, _op(_RETURN, _ALLOW)]
+
+
+def _none_of(values: tuple[int, ...], deny: int) -> list[bytes]:
+    """What is loaded is none of these."""
+    return [part for value in values for part in (_op(_JUMP_EQUAL, value, 0, 1), _op(_RETURN, deny))]
 
 
 def _low(argument: int) -> int:

@@ -4,12 +4,11 @@ inputs' of their files too), so that an audit can repeat it.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
-from s2r_runtime.controllers.confinement import confine
-from s2r_runtime.controllers.file import load
+from s2r_runtime.controllers.file import ControllerFile, load
 from s2r_runtime.daemon.given_inputs import BYTES_MAX, GivenInputs, parse_inputs
 from s2r_runtime.daemon.settings import ModelFacts, settings_of
 from s2r_runtime.daemon.worker import GapJob, InputsJob, Job, LoadJob, Result, SynthesisJob, TraceJob, VerifyJob
@@ -64,12 +63,12 @@ def gap(job: GapJob) -> Gap:
 
 
 def verify(job: VerifyJob, progress: Progress) -> Result:
-    """Rollouts of the controller on the uncertain model, under the profile's laws. From here on this process runs code that nobody
-    has read, so it is confined first.
+    """Rollouts of the controller on the uncertain model, under the profile's laws. The controller, code that nobody has read, answers from
+    a confined process of its own.
     """
     import numpy as np
 
-    from s2r_runtime.controllers.hosted import batch_control
+    from s2r_runtime.controllers.batches import BatchController
     from s2r_runtime.models.composed import compose
     from s2r_runtime.plugins import registry
     from s2r_runtime.uncertain import GapSet
@@ -78,36 +77,34 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
     profile, settings = job.profile, job.profile.verification
     model = compose(profile.model)
     task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
-    _discard_prints()
-    confine(MEMORY_BYTES)
-    result, details = verify_in_detail(
-        batch_control(job.controller, len(model.inputs)),
-        task,
-        model,
-        gap_set=GapSet(job.gap.set, job.gap.weights, job.radius, job.hold_radius, job.gap.hold_periods),
-        least_radius=job.least_radius,
-        laws=settings.laws,
-        required=settings.required,
-        n=settings.n,
-        epsilon=settings.epsilon,
-        beta=job.beta,
-        threshold=settings.threshold,
-        seed=job.seed,
-        attempt=job.attempt,
-        controller_digest=job.controller.digest,
-        task_digest=profile.task_digest(),
-        progress=progress,
-    )
+    gap_set = GapSet(job.gap.set, job.gap.weights, job.radius, job.hold_radius, job.gap.hold_periods)
+    with BatchController(job.controller, len(model.inputs), MEMORY_BYTES) as control:
+        result, details = verify_in_detail(
+            control,
+            task,
+            model,
+            gap_set=gap_set,
+            least_radius=job.least_radius,
+            laws=settings.laws,
+            required=settings.required,
+            n=settings.n,
+            epsilon=settings.epsilon,
+            beta=job.beta,
+            threshold=settings.threshold,
+            seed=job.seed,
+            attempt=job.attempt,
+            controller_digest=job.controller.digest,
+            task_digest=profile.task_digest(),
+            progress=progress,
+        )
     lowest = -np.finfo(np.float64).max  # what `verify` counts a value that is no number as
     safety = {one.law: np.nan_to_num(one.rollouts.safety, nan=lowest, neginf=lowest, posinf=-lowest).tolist() for one in details}
     return Result(verification=result, safety=safety)
 
 
 def synthesize(job: SynthesisJob, progress: Progress) -> Result:
-    """A search over the controller's parameters; confined, as a verification is."""
-    import scipy.optimize  # noqa: F401 - before nothing can be loaded any more
-
-    from s2r_runtime.controllers.hosted import batch_control
+    """A search over the controller's parameters; each candidate answers from a confined process of its own, as in a verification."""
+    from s2r_runtime.controllers.batches import BatchController
     from s2r_runtime.models.composed import compose
     from s2r_runtime.plugins import registry
     from s2r_runtime.synthesize import search, search_seed
@@ -117,33 +114,27 @@ def synthesize(job: SynthesisJob, progress: Progress) -> Result:
     model = compose(profile.model)
     task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
     gap_set = GapSet(job.gap.set, job.gap.weights, job.radius, job.hold_radius, job.gap.hold_periods)
-    _discard_prints()
-    confine(MEMORY_BYTES)
-    found = search(
-        job.controller,
-        job.bounds,
-        lambda file: batch_control(file, len(model.inputs)),
-        task,
-        model,
-        gap_set=gap_set,
-        laws=settings.required,
-        threshold=settings.threshold,
-        n=job.scenarios,
-        evaluations=job.evaluations,
-        seed=search_seed(job.controller, gap_set, model, profile.task_digest(), job.number),
-        progress=progress,
-    )
+    with ExitStack() as running:
+
+        def answering(file: ControllerFile) -> BatchController:
+            running.close()  # one candidate after the other
+            return running.enter_context(BatchController(file, len(model.inputs), MEMORY_BYTES))
+
+        found = search(
+            job.controller,
+            job.bounds,
+            answering,
+            task,
+            model,
+            gap_set=gap_set,
+            laws=settings.required,
+            threshold=settings.threshold,
+            n=job.scenarios,
+            evaluations=job.evaluations,
+            seed=search_seed(job.controller, gap_set, model, profile.task_digest(), job.number),
+            progress=progress,
+        )
     return Result(synthesis=found)
-
-
-def _discard_prints() -> None:
-    """What the controller prints goes nowhere. Confined, this process may not make a file longer: were stderr one, a print would raise
-    OSError, and a controller that prints would not pass.
-    """
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    for stream in (1, 2):
-        os.dup2(nowhere, stream)
-    os.close(nowhere)
 
 
 def inputs(job: InputsJob) -> GivenInputs:
