@@ -46,9 +46,9 @@ REASONS: tuple[str, ...] = (
     "radius_above_verified",
     "measurement_faults",
     # ------------------------------ where the robot is
-    "observation_missing",
     "observation_invalid",
     "observation_out_of_order",
+    "observation_missing",
     "observation_stale",
     "outside_region",
     "outside_geofence",

@@ -55,9 +55,12 @@ class Law:
     permit: int | None = None
     sampling: bool = False
     inputs: str = ""
+    campaign: int = 0
     latest: m.Observation | None = None
     good: m.Observation | None = None
     good_ns: int = -(10**18)
+    odd: int | None = None
+    anew: bool = False
     usable: bool = False
     asked: m.Ask | None = None
     asked_ns: int = 0
@@ -87,7 +90,7 @@ class Law:
             self.permit = None
         if anew:
             self._forget()
-        self.now, self.refused = event.t_ns, False
+        self.now, self.refused, self.anew = event.t_ns, False, anew
         before = self._instant(event)
         self._facts(event, outputs)
         self._clear(event)
@@ -128,7 +131,7 @@ class Law:
                 self.running = None
             case m.SourceStopped(source="sampler") if event.reason != "finished":
                 self.sampling = False
-            case m.CampaignFinished() if not self.inputs:
+            case m.CampaignFinished() if not self.inputs and event.epoch == self.campaign:
                 self.sampling = False
             case m.InputsFinished() if event.digest == self.inputs:
                 self.sampling = False
@@ -160,6 +163,7 @@ class Law:
                     self.sampling = False
                 case m.StartCampaign() | m.StartInputs():
                     self.inputs = output.digest if isinstance(output, m.StartInputs) else ""
+                    self.campaign = 0 if isinstance(output, m.StartInputs) else output.epoch
                 case m.IssueCertificate():
                     self.issuing |= {output.request_id}
                 case _:
@@ -167,7 +171,7 @@ class Law:
 
     def _forget(self) -> None:
         """The robot's sequence begins anew."""
-        self.usable, self.latest, self.good, self.instant_stamp = False, None, None, None
+        self.usable, self.latest, self.good, self.odd, self.instant_stamp = False, None, None, None, None
 
     def _up(self, what: str, up: bool) -> None:
         self.up = self.up | {what} if up else self.up - {what}
@@ -175,11 +179,13 @@ class Law:
     def _measured(self, event: m.Measured) -> None:
         if self.gap is None or self.alarmed or event.epoch not in (0, self.gap.epoch):
             return
-        if event.fault or not (math.isfinite(event.discrepancy) and math.isfinite(event.e_value)):
-            self.faults += self.running is not None
+        told = all(math.isfinite(value) and value >= 0.0 for value in (event.e_value, event.change, event.exchange))
+        counts = not event.fault and math.isfinite(event.discrepancy) and event.discrepancy >= 0.0
+        self.faults += self.running is not None and not (told and counts)
+        if not counts:
             return
         self.radius = max(self.radius, event.discrepancy)
-        if event.e_value >= 1.0 / self.settings.alpha:
+        if told and event.e_value >= 1.0 / self.settings.alpha:
             self.alarmed = True
             self.latched |= {"watch_alarm"}
             self.revoked |= {facts.id for facts in self.stored if facts.epoch == self.gap.epoch}
@@ -194,8 +200,10 @@ class Law:
             return
         valid = not seen.fault and len(seen.x) == 3 and all(map(math.isfinite, seen.x))
         ordered = self.good is None or (seen.seq > self.good.seq and seen.stamp_ns > self.good.stamp_ns)
-        again = lockstep or self.now - self.good_ns > self.settings.observation_timeout_ns
+        again = seen.seq == self.odd if lockstep else self.now - self.good_ns > self.settings.observation_timeout_ns
         self.usable = valid and (ordered or again)
+        if valid:
+            self.odd = None if self.usable else seen.seq
         if self.usable or not valid:
             self.latest = seen
         if self.usable:
@@ -277,7 +285,7 @@ class Law:
         """Whether this event begins a control instant: an observation in order, at least 0.9 dt after that of the last one. An
         unusable one can be an instant too, but what stamp it has is believed for one period only.
         """
-        if not isinstance(event, m.Observed) or self.asked is not None:
+        if not isinstance(event, m.Observed) or (self.asked is not None and not self.anew):
             return False
         seen, last = event.observation, self.instant_stamp
         if seen == self.good or (self.latest is not None and seen.seq == self.latest.seq):
@@ -293,8 +301,9 @@ class Law:
     def _sends(self, event: m.Event, outputs: tuple[m.Output, ...], instant: bool) -> None:
         lockstep, sends = self.settings.lockstep, of(list(outputs), m.Send)
         if instant and isinstance(event, m.Observed):
-            assert self.answered or lockstep, "an instant before this one got no command"
+            assert self.answered or lockstep or self.anew, "an instant before this one got no command"
             self.instant, self.instant_stamp, self.answered = event.observation.seq, event.observation.stamp_ns, False
+            self.last = None  # whatever number it has, nothing was sent for it yet
         for output in outputs:
             if isinstance(output, m.GateChanged):
                 self.gate = output.open
@@ -303,11 +312,13 @@ class Law:
                 self.asked, self.asked_ns = output, event.t_ns
             elif isinstance(output, m.Send):
                 self._send(event, output)
-        assert len({send.obs_seq for send in sends}) == len(sends) <= 2, "two commands for one observation"
+        once = len({send.obs_seq for send in sends}) == len(sends)
+        assert len(sends) <= 2, "more commands than instants"
+        assert once or (self.anew and {send.source for send in sends} == {"recovery"}), "two commands for one observation"
         if instant and not lockstep:
             assert self.answered or self.asked is not None, "an instant without command or question"
         if isinstance(event, m.Proposed) and event.command.source == "external":
-            assert not sends
+            assert not sends or (self.anew and {send.source for send in sends} == {"recovery"})
         if isinstance(event, m.Requested) and event.verb == "stop" and not lockstep:
             assert sends or event.t_ns < 0
 
@@ -342,7 +353,7 @@ class Law:
         else:
             assert send.source == "recovery", send.source
         if self.last is not None and self.last.obs_seq == send.obs_seq:
-            assert again or (not s.lockstep and send.source == "recovery"), "a second command for one instant"
+            assert again or ((not s.lockstep or self.anew) and send.source == "recovery"), "a second command for one instant"
         self.asked, self.answered, self.last = None, True, send
 
     def _allowed(self, command: m.Command, send: m.Send) -> None:

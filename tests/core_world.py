@@ -78,6 +78,8 @@ class World:
         self.duties: tuple[Output, ...] = ()
         self.memory = Memory("r", MEMORY_SCHEMA)
         self.recent: Observation | None = None
+        self.repeats = 0
+        """How often the robot has repeated it, waiting for its command."""
         self.events: list[tuple[Event, tuple[Output, ...]]] = []
         self.seen: Counter[str] = Counter()
         self.lost: frozenset[int] = frozenset()

@@ -5,6 +5,7 @@ The table in docs/guarantee.md is this one; a test compares them.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -12,13 +13,14 @@ from typing import NamedTuple
 
 import msgspec
 import pytest
-from core_rig import GAP, Rig, kinds, memory, of, one, reopen
+from core_rig import GAP, Rig, kinds, memory, of, one, reason, reopen
 
 from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
 from s2r_runtime.core.stream import BINS
 from s2r_runtime.messages import (
     SERIAL,
+    AlarmRaised,
     Answer,
     CampaignFinished,
     CertificateFacts,
@@ -242,13 +244,27 @@ def test_a_notice_of_change_is_a_reason_to_trace_where_growth_is() -> None:
     assert of(rig.measure(0.001, change=1e6), StartJob) == []
 
 
-def test_values_of_the_new_tests_that_are_no_numbers_are_faults_of_measurement() -> None:
+@pytest.mark.parametrize(
+    "broken", [{"change": math.nan}, {"exchange": math.inf}, {"change": -1.0}, {"e_value": math.nan}, {"e_value": -1.0}]
+)
+def test_evidence_that_is_no_number_is_a_fault_of_measurement_and_its_discrepancy_counts_all_the_same(broken: dict[str, float]) -> None:
     rig = Rig()
     rig.driving()
-    for broken in ({"change": float("nan")}, {"exchange": float("inf")}, {"change": -1.0}):
-        rig.measure(0.5, **broken)
-    assert rig.state.faults == 3
-    assert rig.state.memory.radius == 0.01
+    n = rig.state.measured
+    outputs = rig.measure(0.5, **broken)
+    assert (rig.state.faults, rig.state.memory.radius, rig.state.measured, rig.state.e_value) == (1, 0.5, n, 1.0)
+    assert not rig.state.gate_open
+    assert of(outputs, ChangeNoticed) == of(outputs, AlarmRaised) == []
+
+
+def test_a_discrepancy_that_is_no_number_or_was_rejected_moves_nothing_but_the_count_of_faults() -> None:
+    rig = Rig()
+    rig.driving()
+    for count, wrong in enumerate(({"discrepancy": math.nan}, {"discrepancy": -0.5}, {"discrepancy": 0.5, "fault": "jump"}), 1):
+        outputs = rig.measure(**{"discrepancy": 0.001, "e_value": 1e9, **wrong})  # type: ignore[arg-type]
+        assert (rig.state.faults, rig.state.memory.radius, rig.state.memory.alarm_epoch) == (count, 0.01, 0)
+        assert of(outputs, AlarmRaised) == []
+    assert reason(rig) == "measurement_faults" or rig.state.faults <= rig.settings.max_measurement_faults
 
 
 # ---------------------------------------------------------------- status

@@ -49,6 +49,20 @@ def test_a_loaded_certificate_on_the_gap_in_force_is_installed_beside_it() -> No
     assert [facts.id for facts in rig.state.memory.certificates] == ["c1", "offline"]
 
 
+def test_a_second_certificate_under_the_id_of_one_in_force_changes_nothing() -> None:
+    """An id is the digest of the content, so one of the two is false; the driving controller keeps what it had."""
+    rig = Rig(memory())
+    rig.observe()
+    rig.request("deploy", digest="controller")
+    for change in ({"controller_digest": "another"}, {"verified_radius": 1e-5}, {"expires_unix_s": 9000}):
+        before = rig.state.memory
+        event = loaded(id="c1", **{"verified_radius": 0.015, "attempt": 1, **change})
+        outputs = rig.feed(msgspec.structs.replace(event, t_ns=rig.t))
+        assert kinds(outputs) == ["Answer"]
+        assert "another certificate in force has its id" in one(outputs, Answer).text
+        assert rig.state.memory == before
+
+
 def of_another_norm(**norm: Any) -> CertificateStored:
     event = loaded(2)
     assert event.gap is not None

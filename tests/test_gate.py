@@ -11,70 +11,12 @@ from typing import Any
 
 import msgspec
 import pytest
+from gate_law import CERTIFICATE, COMMAND, MAX, NOW, OPEN, SETTINGS, S
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from s2r_runtime import gate
-from s2r_runtime.messages import CertificateFacts, Command, Observation, Settings
-
-S = 1_000_000_000
-NOW = 100 * S
-MAX = 1.7976931348623157e308
-
-SETTINGS = Settings(
-    robot="r",
-    states=("x", "y", "theta"),
-    inputs=("v", "w"),
-    angles=("theta",),
-    dt_ns=33_000_000,
-    lockstep=False,
-    region=((-1.6, 1.6), (-1.0, 1.0), (-math.pi, math.pi)),
-    geofence=((-2.0, 2.0), (-1.5, 1.5), (-math.pi, math.pi)),
-    input_bounds=((-0.2, 0.2), (-3.0, 3.0)),
-    observation_timeout_ns=S // 5,
-    command_ttl_ns=S // 10,
-    hysteresis_ns=S // 10,
-    settle_periods=30,
-    latching=("controller_fault", "watch_alarm"),
-    recovery="stop",
-    recovery_input=(0.0, 0.0),
-    home=(0.0, 0.0, 0.0),
-    model_name="unicycle",
-    model_digest="model",
-    task_digest="task",
-    profile_digest="profile",
-    epsilon=0.03,
-    beta=0.05,
-    discard=0,
-    campaign_n=0,
-    headroom=1.5,
-    alpha=0.01,
-    max_measurement_faults=3,
-    certificate_lifetime_s=1000,
-    seed=1,
-)
-CERTIFICATE = CertificateFacts("c1", "controller", "model", "task", "profile", 1, 0.01, 0.015, issued_unix_s=1000, expires_unix_s=2000)
-OPEN = gate.Situation(
-    clock_ns=NOW,
-    unix_s=1500,
-    recorder_ok=True,
-    link_up=True,
-    permit_until_ns=NOW + S,
-    campaign_running=True,
-    controller_digest="controller",
-    analytics_up=True,
-    certificate=CERTIFICATE,
-    model_digest="model",
-    epoch=1,
-    radius=0.012,
-    observation=Observation(7, 7, (1.0, 0.5, 1.0)),
-    observation_ns=NOW - S // 100,
-    asked_seq=7,
-    asked_ns=NOW - S // 100,
-    last_command_seq=3,
-    clear_since_ns=NOW - S,
-)
-COMMAND = Command(4, NOW, "controller", (0.1, -1.0), 7, S // 10)
+from s2r_runtime.messages import Observation
 
 
 @dataclass

@@ -264,6 +264,8 @@ def facts_problem(turn: Turn, facts: CertificateFacts, digest: str, epoch: int, 
     """Why these facts do not certify this controller here, on the gap of that epoch, to this radius, or empty."""
     if facts.id in turn.memory.revoked:
         return f"it was revoked: {turn.memory.revoked[facts.id]}"
+    if any(other.id == facts.id and other != facts for other in turn.memory.certificates):
+        return "another certificate in force has its id"
     for name, value, wanted in (
         ("controller", facts.controller_digest, digest),
         ("model", facts.model_digest, turn.memory.model_digest),

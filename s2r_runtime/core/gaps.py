@@ -206,17 +206,20 @@ def measured(turn: Turn, event: Measured) -> None:
     gap = usable_gap(turn.state)
     if gap is None or event.epoch not in (0, gap.epoch):
         return
-    numbers = (event.discrepancy, event.e_value, event.change, event.exchange)
-    if event.fault or not all(gate.finite(value) and value >= 0.0 for value in numbers):
+    told = all(gate.finite(value) and value >= 0.0 for value in (event.e_value, event.change, event.exchange))
+    counts = not event.fault and gate.finite(event.discrepancy) and event.discrepancy >= 0.0
+    if not (told and counts):
         turn.set(faults=turn.state.faults + 1)  # a deployment that begins counts from 0
+    if not counts:
         regate(turn)
         return
     noticed = turn.memory.watch_exchange
-    _counted(turn, event, gap)
-    grew = event.discrepancy > turn.memory.radius
+    if told:
+        _counted(turn, event, gap)
+    grew = event.discrepancy > turn.memory.radius  # whatever became of the evidence: no rule rejected this discrepancy
     if grew:
         turn.remember(radius=event.discrepancy)
-    alarm = event.e_value >= 1.0 / turn.settings.alpha
+    alarm = told and event.e_value >= 1.0 / turn.settings.alpha
     if alarm:
         turn.remember(alarm_epoch=gap.epoch)
     facts = certificate(turn.state)
@@ -224,10 +227,10 @@ def measured(turn: Turn, event: Measured) -> None:
     if grew:
         verified = facts.verified_radius if facts is not None else 0.0
         turn.emit(RadiusGrew(turn.now, turn.memory.radius, verified, event.obs_seq))
-    if event.change >= turn.settings.run_length:
+    if told and event.change >= turn.settings.run_length:
         turn.emit(ChangeNoticed(turn.now, "change", event.change, turn.settings.run_length, gap.epoch, event.obs_seq))
     bar = 1.0 / turn.settings.alpha
-    if noticed < bar <= event.exchange:
+    if told and noticed < bar <= event.exchange:
         turn.emit(ChangeNoticed(turn.now, "exchangeability", event.exchange, bar, gap.epoch, event.obs_seq))
     if alarm:
         _alarm(turn, event, gap)
