@@ -46,6 +46,8 @@ def batch_control(file: ControllerFile, nu: int | None = None) -> Control:
     if (here := file.as_found_here()).digest != file.digest:
         raise ControllerError(f"{file.path}: {_difference(file, here)}; verify it again as it is now")
     entry = _execute(file)
+    if (here := file.as_found_here()).digest != file.digest:  # what is not in memory was read from the disk in between
+        raise ControllerError(f"{file.path}: while it was started, {_difference(file, here)}; verify it again as it is now")
 
     def control(x: Array, theta: Scenario) -> Array:
         try:

@@ -11,6 +11,7 @@ import os
 import select
 import shutil
 import signal
+import site
 import socket
 import subprocess
 import sys
@@ -197,7 +198,14 @@ def _environment() -> dict[str, str]:
         "OMP_NUM_THREADS": "1",
         "MKL_NUM_THREADS": "1",
         "PYTHONHASHSEED": "0",  # one order of sets in every run
+        **({} if _in_user_site() else {"PYTHONNOUSERSITE": "1"}),  # where a `usercustomize` would run first, before it is confined
     }
+
+
+def _in_user_site() -> bool:
+    """Whether the runtime itself is installed in the user's own site-packages: then they are needed."""
+    folder = site.getusersitepackages()
+    return Path(__file__).is_relative_to(folder)
 
 
 def _signal_name(number: int) -> str:

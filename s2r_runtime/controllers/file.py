@@ -7,7 +7,7 @@
 The digest covers the source, every module beside it that it imports (and that those import), the versions of the installed
 distributions they import, the version of Python, the parameter values and the entry's name. The file is read once: what was
 digested is what runs, whatever happens to the file afterwards. `control` must be a function of its arguments. What it
-gets by other means than an import statement (data files, `importlib`, the environment, the clock) is not in the digest.
+gets by other means than an import statement (`importlib`, the clock; data files where its process can open any) is not in the digest.
 """
 
 from __future__ import annotations

@@ -3,21 +3,32 @@
 Import statements are followed through the syntax tree, in every module beside the file, without running anything. A name that means
 two things (a file beside the controller and an installed module, or a module of Python) is refused: which of them ran would depend on
 the process.
+
+A distribution that is installed where it is developed ("editable") changes without a new version, so its version here has the digest of its
+code behind it: `0.3.1 sha256:...`.
 """
 
 from __future__ import annotations
 
 import ast
 import importlib.machinery
+import json
+import os
+import site
+import stat
 import sys
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 
+from s2r_runtime.canonical import digest, digest_of
 from s2r_runtime.errors import ConfigError
 
 SOURCE_MAX = 4 << 20
 """Bytes of source in all. They are attached to every log and handed to every process that runs them."""
+CODE = {".py", ".so", ".pyd"}
+FILES_MAX = 5000
+"""Files of an editable distribution that are looked at, at every start of a controller."""
 
 
 class Imports:
@@ -103,11 +114,15 @@ class Imports:
 def read_source(path: Path) -> bytes:
     """A source file's bytes. Raises ConfigError if it can't be read or is too big."""
     try:
-        source = path.read_bytes()
+        # not blocking: a pipe that nobody writes to has no end either
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise ConfigError(f"{path}: is no file")
+            source = file.read(SOURCE_MAX + 1)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     if len(source) > SOURCE_MAX:
-        raise ConfigError(f"{path}: has {len(source)} bytes, a controller with its modules may have {SOURCE_MAX}")
+        raise ConfigError(f"{path}: has more than {SOURCE_MAX} bytes, all that a controller with its modules may have")
     return source
 
 
@@ -134,11 +149,46 @@ def installed(top: str, folder: Path | None = None) -> str | None:
 
 
 def version(distribution: str) -> str | None:
-    """The installed version, or None."""
+    """The installed version, with the digest of its code if it is installed where it is developed; or None. Raises ConfigError if that code
+    can't be read.
+    """
     try:
-        return metadata.version(distribution)
+        found = metadata.distribution(distribution)
     except metadata.PackageNotFoundError:
         return None
+    return f"{found.version} {_code_digest(found)}" if _editable(found) else found.version
+
+
+def _editable(found: metadata.Distribution) -> bool:
+    """By PEP 610, or because it lies outside of where packages are installed; a record that can't be understood counts as one."""
+    about = found.read_text("direct_url.json")
+    if about is None:
+        place = Path(str(found.locate_file(""))).resolve()
+        return not any(place.is_relative_to(Path(prefix).resolve()) for prefix in (sys.prefix, sys.base_prefix, site.getusersitepackages()))
+    try:
+        return bool(json.loads(about).get("dir_info", {}).get("editable", False))
+    except (ValueError, AttributeError):
+        return True
+
+
+def _code_digest(found: metadata.Distribution) -> str:
+    """Digest of the names and bytes of all code in the distribution's packages."""
+    tops = (found.read_text("top_level.txt") or "").split()
+    tops = tops or [top for top, names in metadata.packages_distributions().items() if found.name in names]
+    code: dict[str, str] = {}
+    for top in tops:
+        if (origin := installed(top)) is None:
+            continue
+        base = Path(origin)
+        folder = base.parent if base.name == "__init__.py" else base
+        files = [base] if folder.is_file() else [path for path in folder.rglob("*") if path.suffix in CODE and path.is_file()]
+        if len(files) > FILES_MAX:
+            raise ConfigError(f"{folder}: has more than {FILES_MAX} files of code; install {found.name} as a wheel, not editable")
+        try:
+            code.update({f"{top}/{path.relative_to(base.parent)}": digest(path.read_bytes()) for path in files})
+        except OSError as error:
+            raise ConfigError(f"{folder}: cannot be read: {error.strerror}") from None
+    return digest_of(code)
 
 
 def _distribution(top: str, origin: str) -> str | None:
