@@ -68,6 +68,8 @@ class Transport(Protocol):
     It may also have
     - `inform(record)`: takes every change of the gate (`GateChanged`) and every refused command (`Decided`), for people who watch on the
       robot's side. Nothing that an audit repeats may depend on it;
+    - `anchor(head)`: takes the head of the log's chain (`LogHead`) when the disk has more of it, at most once a second, and the last
+      one: to publish, so that somebody else knows where the log must reach;
     - `lines() -> list[str]`: since the last call, for the daemon's journal: what a person should know of the robot.
     """
 

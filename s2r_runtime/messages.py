@@ -633,6 +633,16 @@ class Answer(Struct, frozen=True, tag="answer"):
     final: bool = True
 
 
+class LogHead(Struct, frozen=True, tag="log_head"):
+    """Not logged, but told to whoever keeps it: so far the log of this run is on the disk (docs/log-format.md). head, public_key: hex."""
+
+    run: str
+    part: int
+    records: int
+    head: str
+    public_key: str
+
+
 # ---------------------------------------------------------------- outputs: records
 
 

@@ -106,6 +106,9 @@ def test_parts_of_a_rotated_log_are_audited_as_one_in_any_order(run: Any, tmp_pa
     later = audit(parts[:-1])
     assert not later.ok
     assert "without the parts before it" in later.unchecked[0]
+    sooner = audit(parts[1:])
+    assert sooner.ok
+    assert sooner.missing[0] == f"what came after {parts[1].name}: it goes on in part {len(parts)}, which was not given"
 
 
 def test_a_log_that_a_crash_cut_anywhere_holds_and_says_what_is_missing(run: Any, tmp_path: Path) -> None:
@@ -168,6 +171,19 @@ def test_whose_key_it_is_decides_only_if_one_is_asked_for(run: Any, tmp_path: Pa
     unsigned = audit([run.write(tmp_path / "b.mcap", key=None)], PUBLIC)
     assert not unsigned.ok
     assert unsigned.chain == "unsigned tail"
+
+
+def test_a_head_that_was_published_must_be_reached(run: Any, tmp_path: Path) -> None:
+    path = run.write(tmp_path / "a.mcap")
+    head = bytes.fromhex(read_head(path))
+    assert audit([path], heads=[head]).recomputed["published heads"] == 1
+    data = path.read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
+    cut = audit([tmp_path / "cut.mcap"], heads=[head])
+    assert not cut.ok
+    assert cut.first_difference is not None
+    assert "its tail was cut off, or it is another log" in cut.first_difference.what
+    assert cut.first_difference.index == cut.records
 
 
 # ---------------------------------------------------------------- lies

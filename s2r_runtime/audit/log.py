@@ -87,12 +87,14 @@ def audit(
     public_key: bytes | None = None,
     rerun_controllers: bool = False,
     rerun_traces: bool = False,
+    heads: Sequence[bytes] = (),
     progress: Callable[[float, float, str], None] | None = None,
 ) -> AuditResult:
     """Audits the files of one or more runs of a robot. public_key: the Ed25519 key that must have signed them, 32 bytes.
 
     rerun_controllers: run the attached controllers' code, confined, to repeat the verifications. rerun_traces: run traces again however
-    long they take (else those that are done within `traces.SECONDS`). progress: (done, total, what).
+    long they take (else those that are done within `traces.SECONDS`). heads: that the daemon published: the logs must reach them.
+    progress: (done, total, what).
     Raises RecordingError for a file that is no log, NotEnoughEvidence if no record can be read,
     ConfigError or PluginError where this machine lacks what the log needs.
     """
@@ -109,11 +111,14 @@ def audit(
         return _damaged(paths, error)
     for parts in grouped:
         readings += parts
+        for reading in parts:
+            reading.sought = frozenset(heads)
         _run(RunAudit(across), parts, findings, tell)
     records = sum(sum(reading.counts.values()) for reading in readings)
     if not records and findings.first is None and _chain(readings) != "broken":
         raise NotEnoughEvidence(f"{', '.join(str(path) for path in paths)}: no record could be read, so there is nothing to audit")
     across.campaigns.end()
+    _anchored(readings, heads, findings)
     signed_by, trusted_all = _signers(readings, public_key)
     chain = _chain(readings)
     valid = all(one.valid for one in findings.certificates.values())
@@ -175,6 +180,9 @@ def _run(run: RunAudit, parts: list[Reading], findings: Findings, tell: _Progres
         before = reading
         if not _ended(reading, findings):
             break
+    else:
+        if before is not None and before.ending.kind == "rotated":
+            findings.lack(f"what came after {before.path.name}: it goes on in part {before.part + 1}, which was not given")
     last = parts[-1] if before is None else before
     run.end(clean=last.over and last.ending.kind == "closed" and not lost)
     for reading in parts:
@@ -206,10 +214,24 @@ def _ended(reading: Reading, findings: Findings) -> bool:
         lost = f" ({end.lost_bytes} bytes could not be used)" if end.lost_bytes else ""
         what = "nothing but the index" if reading.sealed_for_good else "what came after"
         if (known := reading.metadata.get(RECOVERED)) is not None:
-            findings.lack(f"{reading.path.name} was recovered; it lacks {known['missing']}")
+            told = known.get("missing", "nothing, says the recovery")
+            findings.lack(f"{reading.path.name} was recovered; it lacks, as the recovery says and nothing vouches for: {told}")
             return False
         findings.lack(f"{what}: {reading.path.name} was cut after {end.index} messages: {end.detail}{lost}")
     return end.kind == "rotated" or (end.kind == "cut" and reading.sealed_for_good)
+
+
+def _anchored(readings: Sequence[Reading], heads: Sequence[bytes], findings: Findings) -> None:
+    """Every head that was published must be one that the chain came by: it was on the disk when it was published."""
+    met = set[bytes]().union(*(reading.met for reading in readings))
+    last = readings[-1]
+    for head in heads:
+        if head not in met:
+            findings.file = last.path.name
+            what = "the log does not come to a head that was published: its tail was cut off, or it is another log"
+            findings.differ(last.ending.index, "log/chain", what, last.head.hex(), head.hex())
+        else:
+            findings.count("published heads")
 
 
 def _unrecorded(message: msgspec.Struct, findings: Findings) -> None:

@@ -63,6 +63,9 @@ if TYPE_CHECKING:
     from s2r_runtime.models.composed import ComposedModel
 
 
+_ENCODE = msgspec.json.Encoder().encode
+
+
 class Across(NamedTuple):
     """What goes on from run to run. trusted: keys of the person who audits. rerun: whether attached code may run."""
 
@@ -95,8 +98,10 @@ class RunAudit:
         self._profile: Profile | None = None
         self._reading: Reading | None = None
         self._attachments: dict[str, Attached] = {}
+        self._taken = 0
         self._models: dict[str, ComposedModel | None] = {}
         self._sent_seq = self._seen_seq = -1
+        self._now_ns: int | None = None
         self._event: Event | None = None
         self._entry: Entry | None = None
         self._campaigns.begin_run()
@@ -105,12 +110,18 @@ class RunAudit:
     def part(self, reading: Reading) -> None:
         """The next file."""
         self._attached()
-        self._reading = reading
+        self._reading, self._taken = reading, 0
 
     def entry(self, entry: Entry) -> None:
         """The next message."""
         self._entry = entry
         message = entry.message if entry.channel in RELEVANT or entry.channel.startswith(("event/", "frame/")) else None
+        if message is not None and not entry.channel.startswith("out/") and _ENCODE(message) != entry.raw:
+            self._findings.differ(entry.index, entry.channel, "this is not how a recorder writes it", entry.raw, message)
+        if entry.channel.startswith("event/"):
+            self._now_ns = message.t_ns  # type: ignore[union-attr]
+        if self._now_ns is not None and entry.log_time_ns != self._now_ns:
+            self._findings.differ(entry.index, entry.channel, "it stands at another time than it is of", entry.log_time_ns, self._now_ns)
         if message is not None and entry.channel in RELEVANT:
             self._traces.take(entry, message)
         family = entry.channel.partition("/")[0]
@@ -275,7 +286,12 @@ class RunAudit:
     def _attached(self) -> dict[str, Attached]:
         """By name; those of earlier parts count."""
         if self._reading is not None:
-            self._attachments.update((one.name, one) for one in self._reading.attachments)
+            for one in self._reading.attachments[self._taken :]:
+                before = self._attachments.setdefault(one.name, one)
+                if before.data != one.data:
+                    index = -1 if self._entry is None else self._entry.index
+                    self._findings.differ(index, "attachment", f"there are two attachments {one.name!r}, and they differ", None, None)
+            self._taken = len(self._reading.attachments)
         return self._attachments
 
     def _with_model(self, profile: Profile, wanted: str) -> Profile:

@@ -9,6 +9,8 @@ from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import writable
 from s2r_runtime.errors import UsageError
 
+HEAD_BYTES = 32
+
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verbs of this module."""
@@ -24,6 +26,14 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--rerun-traces",
         action="store_true",
         help="run every trace again, however long it takes (default: those within a minute of the processor; the others are named)",
+    )
+    audit.add_argument(
+        "--head",
+        type=_head,
+        action="append",
+        default=[],
+        metavar="HEX",
+        help="a head of the chain that was printed, shown in the status or published: the log must reach it, or its tail is missing",
     )
     audit.add_argument("--json", action="store_true", help="print one JSON object")
     audit.set_defaults(run=run_audit)
@@ -60,6 +70,7 @@ def run_audit(args: argparse.Namespace) -> int:
             public_key=keys.load_public(args.key) if args.key else None,
             rerun_controllers=args.rerun_controllers,
             rerun_traces=args.rerun_traces,
+            heads=args.head,
             progress=bar,
         )
     finally:
@@ -120,6 +131,16 @@ def run_info(args: argparse.Namespace) -> int:
             else:
                 output.out(f"{key.replace('_', ' '):18s} {value}")
     return 0
+
+
+def _head(text: str) -> bytes:
+    try:
+        head = bytes.fromhex(text)
+    except ValueError:
+        head = b""
+    if len(head) != HEAD_BYTES:
+        raise argparse.ArgumentTypeError(f"{text!r} is no head of a log's chain, must be {2 * HEAD_BYTES} hexadecimal digits")
+    return head
 
 
 def _need(paths: list[Path]) -> None:

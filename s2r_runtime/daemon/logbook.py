@@ -13,7 +13,7 @@ from pathlib import Path
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from s2r_runtime.errors import ConfigError, RecordingError
-from s2r_runtime.messages import Struct
+from s2r_runtime.messages import LogHead, Struct
 from s2r_runtime.modelspec import ModelSpec, dump_model
 from s2r_runtime.profile import Recording
 from s2r_runtime.recording.recorder import Health, Recorder
@@ -146,6 +146,11 @@ class Logbook:
             if self._recorder is not None
             else Health(ok=False, detail="no log", unrecorded=0, pending_bytes=0, recorded=0)
         )
+
+    def anchor(self) -> LogHead | None:
+        """How far the log is on the disk, and the head of its chain there; None before the first of it is."""
+        found = None if self._recorder is None else self._recorder.anchor
+        return found if found is not None and found.records else None
 
     def close(self) -> tuple[Health, str]:
         """Ends the log; (how it ended, head of its chain)."""

@@ -49,6 +49,7 @@ from s2r_runtime.messages import (
     Event,
     Frame,
     LinkChanged,
+    LogHead,
     Memory,
     Observation,
     Observed,
@@ -68,6 +69,9 @@ from s2r_runtime.profile import Profile
 TICK_NS = 20_000_000
 ROUND_NS = 100_000_000
 WALL_CLOCK_NS = 1_000_000_000
+HEAD_NS = 1_000_000_000
+HEAD_LINE_NS = 600_000_000_000
+"""Between two heads of the log's chain on the robot's side, and in the journal."""
 NEW_LOG_NS = 1_000_000_000
 """Between two looks whether a new log can begin after the old one lost a message."""
 
@@ -114,6 +118,9 @@ class Daemon:
         self._numbers = 0
         self._recorder_ok = True
         self._next_tick_ns = self._next_round_ns = self._next_wall_ns = self._next_log_ns = 0
+        self._anchored: LogHead | None = None
+        self._next_head_ns = self._next_head_line_ns = 0
+        self._log_closed = False
         self._ended = ""
 
     # ------------------------------------------------------------------ life
@@ -271,6 +278,7 @@ class Daemon:
             self.feed(WallClockRead(0, int(time.time())))
         self.desk.tick(now_ns)
         self.notifier.alive(now_ns)
+        self._publish_head(now_ns)
         self.notifier.status(f"gate {'open' if self.state.gate_open else 'closed'} ({self.state.gate_reason})")
 
     def _robot_ready(self, _mask: int) -> None:
@@ -371,6 +379,17 @@ class Daemon:
         self._begin_run()
         self._open_link()
 
+    def _publish_head(self, now_ns: int) -> None:
+        """Tells the robot's side, and now and then the journal, how far the log is on the disk."""
+        anchor = self.logbook.anchor()
+        if anchor is None or anchor == self._anchored or now_ns < self._next_head_ns:
+            return
+        self._anchored, self._next_head_ns = anchor, now_ns + HEAD_NS
+        self.link.anchor(anchor)
+        if now_ns >= self._next_head_line_ns:
+            self._next_head_line_ns = now_ns + HEAD_LINE_NS
+            self.say(f"log of run {anchor.run}, {anchor.records} records: head {anchor.head}")
+
     def log_changed(self, ok: bool, detail: str) -> None:
         """The recorder failed, or works again."""
         self._recorder_ok = ok
@@ -390,6 +409,9 @@ class Daemon:
         """An orderly end: the recovery command is out and the memory is kept before anything is closed."""
         self.notifier.stopping()
         self._end_sources(self._signals.name or self._ended)
+        self._close_log()
+        if (anchor := self.logbook.anchor()) is not None:
+            self.link.anchor(anchor)
 
     def _last_act(self) -> None:
         """Something here broke. Nothing is asked any more, nothing decided: the robot is told to recover, as its profile says."""
@@ -403,6 +425,9 @@ class Daemon:
             self.driver.stop()
 
     def _close_log(self) -> None:
+        if self._log_closed:
+            return
+        self._log_closed = True
         health, head = self.logbook.close()
         if not health.ok:
             self.say(f"the log lacks {health.unrecorded} messages: {health.detail}")

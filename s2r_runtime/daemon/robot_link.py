@@ -18,7 +18,7 @@ from s2r_runtime.daemon.settings import ModelFacts
 from s2r_runtime.daemon.transport_values import Inbound
 from s2r_runtime.errors import ConfigError, PluginError, S2RError, one_line
 from s2r_runtime.hookspecs import Transport
-from s2r_runtime.messages import Command, Decided, Frame, GateChanged, LinkChanged, Observation, OverrideChanged, Send
+from s2r_runtime.messages import Command, Decided, Frame, GateChanged, LinkChanged, LogHead, Observation, OverrideChanged, Send
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import Profile
 
@@ -181,6 +181,10 @@ class RobotLink:
     def inform(self, record: GateChanged | Decided) -> None:
         """For people on the robot's side, if the transport tells them anything."""
         self._aside("inform", record)
+
+    def anchor(self, head: LogHead) -> None:
+        """The head of the log's chain, for whoever keeps it."""
+        self._aside("anchor", head)
 
     def lines(self) -> list[str]:
         """For the journal: what became of the transport, and what it has to say itself."""

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 def status(daemon: Daemon) -> dict[str, Any]:
     """Plain data: what the core says (docs/json.md), and beside it the campaign under way, the scenarios driven, the log, the processes."""
-    trace = daemon.actions.last_trace
+    trace, anchor = daemon.actions.last_trace, daemon.logbook.anchor()
     found: dict[str, Any] = core.status(daemon.state)
     sampling, health = daemon.sampler.progress(), daemon.logbook.health()
     memory, observation = daemon.state.memory, daemon.observation
@@ -38,6 +38,7 @@ def status(daemon: Daemon) -> dict[str, Any]:
         "analytics": "up" if daemon.watcher.up else "down",
         "recorder": "ok" if health.ok else health.detail,
         "log": str(daemon.logbook.paths[-1]),
+        "log_head": None if anchor is None else {"run": anchor.run, "part": anchor.part, "records": anchor.records, "head": anchor.head},
         "recorded": health.recorded,
         "link_trouble": daemon.link.trouble,
         "counters": daemon.link.counters(),

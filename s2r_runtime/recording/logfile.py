@@ -69,7 +69,9 @@ class LogFile:
 
     def __init__(self, path: Path, run: str, signer: Ed25519PrivateKey | None, about: Mapping[str, str]) -> None:
         self.parts: list[Path] = []
-        self.head = GENESIS
+        self.head = self._written = GENESIS
+        self.anchor: tuple[bytes, int, int] = (GENESIS, 0, 0)
+        """Head of the chain, part and messages as far as the disk is known to have them: whoever lacks these later has cut them off."""
         self.recorded = 0
         """Messages of the run that are in the files and sealed."""
         self.size = self.chunks = 0
@@ -117,12 +119,14 @@ class LogFile:
         self._file.update(self._unwritten)
         self._unwritten = b""
         self.chunks += 1
-        self.recorded = block.seal_index + 1
+        self.recorded, self._written = block.seal_index + 1, self.head
 
     def sync(self, *, all_of_it: bool) -> None:
         """Returns once what was written is on the disk; all_of_it: the file's own times too."""
         if self._fd >= 0:
+            reached = self._written, len(self.parts), self.recorded
             (os.fsync if all_of_it else os.fdatasync)(self._fd)
+            self.anchor = reached
 
     def complete(self) -> None:
         """Writes what follows the data, and closes the part. After an error the file ends with the data, as before."""
@@ -132,6 +136,7 @@ class LogFile:
                 self._append(piece)
                 time.sleep(0)  # the index of a long log takes a second: other threads get their turn
             os.fsync(self._fd)
+            self.anchor = self._written, len(self.parts), self.recorded
         except OSError:
             self.size = data_end
             with contextlib.suppress(OSError):

@@ -96,6 +96,9 @@ class Reading:
         self.signed = False
         self.lacking = b""
         """What a cut file does not have of its last chunk's index."""
+        self.sought: frozenset[bytes] = frozenset()
+        """Heads to look out for; `met`: those that the chain came by."""
+        self.met: set[bytes] = set()
         self.indexed = False
         """Whether the index at the end is there, and right."""
         self._ending: Ending | None = None
@@ -226,6 +229,8 @@ class Reading:
             raise Damage(block.offset, "the last seal does not stand alone, as it is written")
         self.head, self.signed, self._final = head, self._key is not None, seal.end
         self._seal = block.content[seal_at:]
+        if head in self.sought:
+            self.met.add(head)
         self._digest_until(block.end)
 
     def _digest_until(self, end: int) -> None:

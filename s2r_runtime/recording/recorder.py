@@ -13,7 +13,7 @@ import threading
 import time
 from typing import NamedTuple
 
-from s2r_runtime.messages import Struct
+from s2r_runtime.messages import LogHead, Struct
 from s2r_runtime.recording.channels import Unrecorded
 from s2r_runtime.recording.writer import Writer
 
@@ -97,6 +97,11 @@ class Recorder:
     def head(self) -> str:
         """Head of the chain, in hex; the last one once closed."""
         return self._head or self._writer.head
+
+    @property
+    def anchor(self) -> LogHead:
+        """Head of the chain as far as the disk has it."""
+        return self._writer.anchor
 
     def close(self, timeout_s: float = 10.0) -> Health:
         """Writes what is there, seals the log for good, and ends the thread. Not ok: what was not recorded, and why."""

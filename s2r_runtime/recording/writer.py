@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from s2r_runtime.canonical import canonical
 from s2r_runtime.errors import RecordingError
-from s2r_runtime.messages import Frame, Struct
+from s2r_runtime.messages import Frame, LogHead, Struct
 from s2r_runtime.recording.channels import BY_TYPE, FRAME_IN, FRAME_OUT, NUMBERS
 from s2r_runtime.recording.layout import MAX_CHUNK, attachment_record
 from s2r_runtime.recording.logfile import End, LogFile, Pending
@@ -90,6 +90,7 @@ class Writer:
         self._next = self._last_ns = self._held_bytes = 0
         self._ended: End = ""
         self._closing = False
+        self._run, self._public_key = run, b"" if signer is None else signer.public_key().public_bytes_raw()
         self._file = LogFile(path, run, signer, {**environment(), **(metadata or {})})
         try:
             self._open()
@@ -151,6 +152,12 @@ class Writer:
     def head(self) -> str:
         """Head of the chain after the last seal, in hex: print it, so that a missing tail shows."""
         return self._file.head.hex()
+
+    @property
+    def anchor(self) -> LogHead:
+        """The newest head that is on the disk, whatever happens now: publish it, so that a missing tail shows."""
+        head, part, records = self._file.anchor
+        return LogHead(self._run, part, records, head.hex(), self._public_key.hex())
 
     @property
     def parts(self) -> list[Path]:

@@ -16,8 +16,10 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import msgspec
+
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.messages import Command, Frame, LinkChanged
+from s2r_runtime.messages import Command, Frame, LinkChanged, LogHead
 from s2r_zenoh.sessions import Doorbell, Inbox, allow, session_config
 from s2r_zenoh.wire import Decoded, Wire
 
@@ -70,6 +72,7 @@ class ZenohTransport:
         self._sessions: list[zenoh.Session] = []
         self._command: zenoh.Publisher | None = None
         self._onlookers: zenoh.Publisher | None = None
+        self._heads: list[zenoh.Publisher] = []
         self._sent = self._dropped_out = self._repeated = self._resent = 0
         self._newest, self._answer, self._to_show = b"", b"", b""
         self._encoded: tuple[bytes, int] = (b"", -1)
@@ -83,7 +86,7 @@ class ZenohTransport:
         import zenoh
 
         prefix, lease = self._options["key_prefix"], self._options["lease"]
-        keys = {name: f"{prefix}/{name}" for name in ("observation", "command", "proposal", "override")}
+        keys = {name: f"{prefix}/{name}" for name in ("observation", "command", "proposal", "override", "log_head")}
         incoming = [keys["observation"], keys["override"]]
         drop = zenoh.CongestionControl.DROP  # a frozen robot must not stall us; BLOCK waits for it
         self._bell.open()
@@ -91,21 +94,23 @@ class ZenohTransport:
             robot = self._session("robot", [
                 allow("robot_speaks", "ingress", ["put"], incoming),
                 allow("runtime_hears", "egress", ["declare_subscriber"], incoming),
-                allow("robot_hears", "ingress", ["declare_subscriber"], [keys["command"]]),
-                allow("runtime_commands", "egress", ["put"], [keys["command"]]),
+                allow("robot_hears", "ingress", ["declare_subscriber"], [keys["command"], keys["log_head"]]),
+                allow("runtime_commands", "egress", ["put"], [keys["command"], keys["log_head"]]),
             ], lease)  # fmt: skip
             robot.declare_subscriber(keys["observation"], zenoh.handlers.Callback(self._observations.put, indirect=False))
             robot.declare_subscriber(keys["override"], zenoh.handlers.Callback(self._overrides.put, indirect=False))
             self._command = robot.declare_publisher(keys["command"], congestion_control=drop, express=True)
+            self._heads.append(robot.declare_publisher(keys["log_head"], congestion_control=drop))
             if self._options["controller_listen"] or self._options["controller_connect"]:
                 others = self._session("controller", [
                     allow("others_propose", "ingress", ["put"], [keys["proposal"]]),
                     allow("runtime_hears", "egress", ["declare_subscriber"], [keys["proposal"]]),
                     allow("others_hear", "ingress", ["declare_subscriber"], ["**"]),
-                    allow("runtime_shows", "egress", ["put"], [keys["observation"]]),
+                    allow("runtime_shows", "egress", ["put"], [keys["observation"], keys["log_head"]]),
                 ], lease)  # fmt: skip
                 others.declare_subscriber(keys["proposal"], zenoh.handlers.Callback(self._proposals.put, indirect=False))
                 self._onlookers = others.declare_publisher(keys["observation"], congestion_control=drop, express=True)
+                self._heads.append(others.declare_publisher(keys["log_head"], congestion_control=drop))
         except BaseException:
             self.close()
             raise
@@ -127,6 +132,7 @@ class ZenohTransport:
         """Closes both sessions (a process that leaves one open hangs at its end); may be called twice."""
         sessions, self._sessions = self._sessions, []
         self._command = self._onlookers = None
+        self._heads = []
         for session in sessions:
             with suppress(Exception):  # the others must be closed all the same
                 session.close()  # type: ignore[no-untyped-call]
@@ -214,6 +220,13 @@ class ZenohTransport:
             with suppress(Exception):  # nobody's safety hangs on it
                 self._onlookers.put(self._to_show)
         self._to_show = b""
+
+    def anchor(self, head: LogHead) -> None:
+        """The head of the log's chain, to both sides: whoever keeps it knows later whether the log lacks its tail."""
+        data = msgspec.json.encode(head)
+        for publisher in self._heads:
+            with suppress(Exception):  # it is on the daemon's journal too
+                publisher.put(data)
 
     def counters(self) -> dict[str, int]:
         """Since construction. repeated: keep-alives; resent: commands sent again for them; old: observations behind a newer one."""

@@ -3,6 +3,7 @@
     robot -> runtime     observation  {"seq": 12, "stamp_ns": 396000000, "state": {"x": 0.1, "y": 0.2, "theta": 0.3}, "boot": 7}
                          override     {"kind": "emergency_stop" | "manual_override", "detail": "..."}
     runtime -> robot     command      {"seq", "t_ns", "obs_seq", "ttl_ns", "source", "input": {"v": 0.1, "w": 0.0}}
+    runtime -> everybody log_head     {"type", "run", "part", "records", "head", "public_key"}: how far the log is on the disk
     anybody -> runtime   proposal     {"input": {"v": 0.1, "w": 0.0}, "seq": 0, "obs_seq": 0}; logged, never obeyed
 
 Order. A robot's `seq` and `stamp_ns` rise within one boot. The same bytes again are a keep-alive and mean nothing new; an older

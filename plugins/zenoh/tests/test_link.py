@@ -14,12 +14,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from s2r_zenoh.testing import INPUTS, STATES, ZenohRig, free_endpoint, session
 from s2r_zenoh.transport import ZenohTransport
 
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.messages import Command, LinkChanged, Observation
+from s2r_runtime.messages import Command, LinkChanged, LogHead, Observation
 
 PATIENCE_S = 15.0
 
@@ -266,3 +267,19 @@ def test_bad_configuration_file_is_refused(tmp_path: Path) -> None:
     path.write_text("{mode: ", encoding="utf-8")
     with pytest.raises(ConfigError, match=r"zenoh\.json5"):
         ZenohTransport(options, STATES, INPUTS).open()
+
+
+def test_the_logs_head_reaches_the_robots_side_and_the_others() -> None:
+    rig, head = ZenohRig(), LogHead("run", 1, 12, "ab" * 32, "cd" * 32)
+    rig.transport.open()
+    with rig, session("client", connect=rig.others) as other:
+        heard: dict[str, list[bytes]] = {"robot": [], "others": []}
+        other.declare_subscriber("s2r/robot/log_head", lambda sample: heard["others"].append(sample.payload.to_bytes()))
+        with session("client", connect=rig.endpoint) as robot_side:
+            robot_side.declare_subscriber("s2r/robot/log_head", lambda sample: heard["robot"].append(sample.payload.to_bytes()))
+            deadline = time.monotonic() + PATIENCE_S
+            while not all(heard.values()) and time.monotonic() < deadline:
+                rig.transport.anchor(head)
+                time.sleep(0.05)
+    assert all(heard.values())
+    assert {msgspec.json.decode(data, type=LogHead) for said in heard.values() for data in said} == {head}

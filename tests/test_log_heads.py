@@ -1,0 +1,65 @@
+"""A head that a daemon published is one that its log reaches, whatever happened since; who cuts the tail off is found out by it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from daemon_rig import Rig
+
+from s2r_runtime.recording.reading import read
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    opened = Rig(tmp_path)
+    yield opened
+    opened.close()
+
+
+def audit(rig: Rig, path: Path, *heads: str) -> tuple[int, dict[str, Any]]:
+    """Exit code and account of `s2r audit`."""
+    done = rig.s2r("audit", str(path), *(part for head in heads for part in ("--head", head)), "--json")
+    return done.returncode, json.loads(done.stdout)
+
+
+def test_a_killed_daemons_log_reaches_every_head_that_it_published_and_a_shortened_one_does_not(rig: Rig) -> None:
+    rig.start_robot()
+    rig.start()
+    heads: list[dict[str, Any]] = []
+    for _ in range(3):
+        known = len(heads)
+        rig.ask("permit", duration_s=10.0 + known)  # persisted, so the disk has the log after it
+        rig.until(lambda: heads.append(rig.status()["log_head"]) or (heads[-1] and heads[-1] not in heads[:-1]))
+    rig.kill()
+    (path,) = rig.log_files()
+    published = list(dict.fromkeys(head["head"] for head in heads if head))
+    code, whole = audit(rig, path, *published)
+    assert (code, whole["ok"]) == (0, True), whole
+    assert whole["recomputed"]["published heads"] == len(published) >= 3
+    assert heads[-1]["run"] == path.stem
+    assert heads[-1]["records"] <= whole["records"]
+    data = path.read_bytes()
+    reading = read(path)
+    reading.sought = frozenset(map(bytes.fromhex, published))
+    ends = [(set(reading.met), reading.offset) for _ in reading]
+    before_last = next(offset for met, offset in ends if len(met) == len(published) - 1)
+    (rig.folder / "short.mcap").write_bytes(data[:before_last])
+    assert audit(rig, rig.folder / "short.mcap")[0] == 0, "alone it cannot be told from a crash"
+    code, short = audit(rig, rig.folder / "short.mcap", *published)
+    assert (code, short["ok"]) == (1, False)
+    assert "head that was published" in short["first_difference"]["what"]
+
+
+def test_the_last_head_in_the_journal_is_that_of_the_closed_log(rig: Rig) -> None:
+    rig.start_robot()
+    rig.start()
+    rig.until(lambda: rig.status()["observation"])
+    assert rig.stop() == 0
+    (path,) = rig.log_files()
+    said = next(line.split()[-1] for line in rig.said().splitlines() if " ends at " in line)
+    code, result = audit(rig, path, said)
+    assert (code, result["head"], result["missing"]) == (0, said, [])
