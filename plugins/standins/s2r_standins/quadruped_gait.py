@@ -5,11 +5,13 @@ rest it stands. With (v, w) the command, slewed, and (V, U, W) forward, sideways
 (`quadruped_odometry`), W from the gyro, smoothed over about a third of a stride:
 
     trim       (a, b, c) = integral of KI (v - V, 0 - U, w - W), bounded
-    stance     foot in the trunk's axes: dp/dt = -(v + a, b) - (w + c) x p, at the trunk's height below the hip
+    feet       (f, g, h) = (FEET_V v + FEET_OFFSET + a, b, FEET_W w + c): speeds of the stance feet under the trunk
+    stance     foot in the trunk's axes: dp/dt = -(f, g) - h x p, at the trunk's height below the hip
     swing      from lift-off to touch-down on a cubic that leaves and arrives with the ground's speed, lifted by CLEARANCE sin^2;
-               touch-down at neutral + ((v + a, b) + (w + c) x neutral) T_stance/2 + KP (V - v, U)      (Raibert's rule)
+               touch-down at neutral + ((f, g) + h x neutral) T_stance/2 + KP (V - v, U)      (Raibert's rule)
     load       the weight and a moment -K (roll, pitch) - D (rates), shared by the stance legs through their distance from the middle;
                a leg takes its share up and gives it off over the first and last RAMP of its stance
+    slope      a lean that lasts is the floor's: it is not fought, and feet touch down that much downhill, plumb under the trunk
 
 (0, 0) for a whole stride: all four feet stay down at the next double support, and the phase waits. Scalars only: at 1 kHz an array of four
 costs more than its four numbers. Every stride has a period and a touch-down error of its own, drawn from `rng`.
@@ -41,12 +43,18 @@ HOME_X = tuple(end * HIP_X - BACK for end in ENDS)
 """Front left, front right, rear left, rear right: lag of the phase; where a foot stands."""
 WEIGHT = 11.38 * 9.81
 """N, of the robot as it is known."""
-SLEW_V, SLEW_W = 0.6, 1.5
-"""m/s^2 and rad/s^2: a command is a wish, legs need a step to follow."""
-SMOOTHING = 0.15
-"""s, of the measured speeds."""
-KI_V, KI_W, TRIM_V, TRIM_W = 0.8, 1.0, 0.12, 0.25
-"""1/s, and bounds in m/s and rad/s."""
+SLEW_V, SLEW_W = 1.5, 3.0
+"""m/s^2 and rad/s^2: faster changes of a command would be asked of the feet's grip."""
+SMOOTHING, LEVELLING = 0.15, 0.5
+"""s, of the measured speeds, and of the lean that is taken for the floor's."""
+FEET_V, FEET_W, FEET_OFFSET = 0.84, 0.92, 0.007
+"""How fast the stance feet go for a speed that is wanted (ratios, m/s): an unloaded robot whose feet go at the speed itself, without a
+trim, walks 1.19 v - 0.008 m/s and turns 1.09 w, since swung legs pull the trunk along.
+"""
+KI_V, KI_W, TRIM_V, TRIM_W = 0.8, 1.0, 0.015, 0.05
+"""1/s, and bounds in m/s and rad/s: a trim is for wear and the like. What is more is left to whoever steers, lest an odometry that is
+wrong run away with it.
+"""
 KP = 0.12
 """s: how much farther a foot is put per m/s of speed in excess."""
 K_TILT, D_TILT = 60.0, 5.0
@@ -92,7 +100,7 @@ class Gait:
         self._still = math.inf
         self._moving = False
         self._c = [0.0] * 5  # slewed v, w; trims a, b, c
-        self._smooth = [0.0] * 3
+        self._smooth = [0.0] * 5  # speeds forward, sideways, of yaw; lean
         self._foot = [[HOME_X[i], SIDES[i] * FOOT_Y] for i in range(4)]
         self._lift = [[0.0, 0.0] for _ in range(4)]
         self._error = [[0.0, 0.0] for _ in range(4)]
@@ -144,11 +152,15 @@ class Gait:
             c[2] = min(max(c[2] + KI_V * DT * (c[0] - smooth[0]), -TRIM_V), TRIM_V)
             c[3] = min(max(c[3] - KI_V * DT * smooth[1], -TRIM_V), TRIM_V)
             c[4] = min(max(c[4] + KI_W * DT * (c[1] - smooth[2]), -TRIM_W), TRIM_W)
-            vx, vy, turn = c[0] + c[2], c[3], c[1] + c[4]
+            vx, vy, turn = FEET_V * c[0] + FEET_OFFSET + c[2], c[3], FEET_W * c[1] + c[4]
         else:
             vx = vy = turn = 0.0
-        moment_x = -K_TILT * up_y - D_TILT * roll_rate
-        moment_y = K_TILT * up_x - D_TILT * pitch_rate
+        lean = DT / LEVELLING
+        smooth[3] += lean * (up_x - smooth[3])
+        smooth[4] += lean * (up_y - smooth[4])
+        moment_x = K_TILT * (smooth[4] - up_y) - D_TILT * roll_rate
+        moment_y = K_TILT * (up_x - smooth[3]) - D_TILT * pitch_rate
+        plumb_x, plumb_y = -HEIGHT * smooth[3], -HEIGHT * smooth[4]
 
         places: list[tuple[float, float, float]] = []
         shares = [0.0] * 4
@@ -162,8 +174,8 @@ class Gait:
                     self._lift_off(i)
                 home_x, home_y = HOME_X[i], SIDES[i] * FOOT_Y
                 error = self._error[i]
-                land_x = home_x + 0.5 * stance_s * (vx - turn * home_y) + KP * (smooth[0] - c[0]) + error[0]
-                land_y = home_y + 0.5 * stance_s * (vy + turn * home_x) + KP * smooth[1] + error[1]
+                land_x = home_x + plumb_x + 0.5 * stance_s * (vx - turn * home_y) + KP * (smooth[0] - c[0]) + error[0]
+                land_y = home_y + plumb_y + 0.5 * stance_s * (vy + turn * home_x) + KP * smooth[1] + error[1]
                 # cubic from lift-off to landing, both with the ground's speed g seen from the trunk
                 s, span = leg / SWING, SWING * self._period
                 g_x, g_y = -span * (vx - turn * home_y), -span * (vy + turn * home_x)
