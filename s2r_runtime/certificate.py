@@ -162,6 +162,18 @@ def load(data: bytes, trusted_keys: Iterable[bytes], now_unix_s: int | None = No
     return signed.certificate
 
 
+def signer(data: bytes) -> bytes:
+    """The public key that stands in a certificate's file, which says nothing yet; empty if there is none to be seen."""
+
+    class Key(msgspec.Struct):
+        public_key: bytes = b""
+
+    try:
+        return msgspec.json.decode(data, type=Key).public_key
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return b""
+
+
 def assumption_problem(certificate: Certificate, profile: Profile) -> str:
     """Why this profile does not vouch for the assumption that the certificate's gap rests on, or empty. (Its key vouches for the rest.)"""
     rests = [line for line in certificate.shown if statements.ASSUMED in line]

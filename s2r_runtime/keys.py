@@ -3,10 +3,16 @@
 Private: PEM (PKCS8, not encrypted), readable by its owner only; public: PEM beside it, `<name>.pub`. Both are what `openssl` reads
 and writes. The private key stays on the machine that signs; whoever checks needs the public one. A new pair comes with
 an empty ledger of offline certification (guarantee G4): a key without its ledger certifies nothing.
+
+A file that says whom to believe (a private key, a trusted public one, a list of revoked ones) must be this user's or root's, no symlink,
+and in a folder where nobody else can put another in its place; a private key can be read by nobody else.
+
+Rotation puts a new pair in the place of the old one and goes on in its ledger: what was spent stays spent. Revocation: `revocations`.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import stat
@@ -45,8 +51,7 @@ def new(path: Path) -> Path:
 
     public = public_path(path)
     key = Ed25519PrivateKey.generate()
-    private_pem = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
-    public_pem = key.public_key().public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
+    private_pem, public_pem = _pems(key)
     if public == path:
         raise ConfigError(f"{path}: a private key's file cannot end in .pub")
     for taken in (path, public, offline_ledger.path_beside(path)):
@@ -64,22 +69,35 @@ def new(path: Path) -> Path:
     return public
 
 
-def load(path: Path) -> Ed25519PrivateKey:
-    """The private key. Raises ConfigError if it can't be read, others could read it, or it is no Ed25519 key."""
+def load(path: Path, *, revoked: bool = False) -> Ed25519PrivateKey:
+    """The private key. Raises ConfigError if it can't be read, others could read or replace it, it is no Ed25519 key, or, unless asked for,
+    one that was revoked (on the user's list, or one beside it).
+    """
+    pem = _read_private(path)
+    key = _parsed(pem, path)
+    if not revoked:
+        from s2r_runtime import revocations
+
+        name = fingerprint(public_bytes(key))
+        if (entry := revocations.known(revocations.places(path.parent)).get(name)) is not None:
+            raise ConfigError(f"{path}: the key {name} was {entry}; it signs nothing any more: s2r keys rotate {path}")
+    return key
+
+
+def _read_private(path: Path) -> bytes:
     try:
-        with path.open("rb") as file:
-            status = os.fstat(file.fileno())
-            if not stat.S_ISREG(status.st_mode):
-                raise ConfigError(f"{path}: is no file")
-            if status.st_mode & 0o077:
-                raise ConfigError(
-                    f"{path}: others than its owner can use this private key (mode {status.st_mode & 0o777:o}); chmod 600 {path}"
-                )
-            pem = file.read(FILE_MAX)
+        with os.fdopen(_open_own(path, "a private key"), "rb") as file:
+            mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
+            if mode & 0o077:
+                raise ConfigError(f"{path}: others than its owner can use this private key (mode {mode:o}); chmod 600 {path}")
+            return file.read(FILE_MAX)
     except FileNotFoundError:
         raise ConfigError(f"{path}: there is no signing key; make one with: s2r keys new {path}") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _parsed(pem: bytes, path: Path) -> Ed25519PrivateKey:
     try:
         key = serialization.load_pem_private_key(pem, password=None)
     except TypeError:
@@ -109,9 +127,75 @@ def load_public(path: Path) -> bytes:
 
 
 def load_trusted(paths: Iterable[Path]) -> tuple[bytes, ...]:
-    """The public keys in these files, and in the `*.pub` files of these folders. A path that is not there is no key."""
+    """The public keys in these files, and in the `*.pub` files of these folders. A path that is not there is no key. Raises ConfigError for
+    one that others could have put there.
+    """
     files = [file for path in paths for file in (sorted(path.glob("*.pub")) if path.is_dir() else [path]) if file.exists()]
+    for file in files:
+        check_own(file, "a trusted key")
     return tuple(dict.fromkeys(load_public(file) for file in files))
+
+
+def check_own(path: Path, what: str) -> None:
+    """Raises ConfigError unless the file is this user's or root's, no symlink, and nobody else can write or replace it; OSError never."""
+    try:
+        descriptor = _open_own(path, what)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    try:
+        mode = stat.S_IMODE(os.fstat(descriptor).st_mode)
+    finally:
+        os.close(descriptor)
+    if mode & 0o022:
+        raise ConfigError(f"{path}: others than its owner can write {what} (mode {mode:o}); look whose it is, then chmod go-w {path}")
+
+
+def _open_own(path: Path, what: str) -> int:
+    """A descriptor of the file. Raises ConfigError for a symlink, what is no file, or what is, or can be replaced by, somebody else's."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise ConfigError(f"{path}: is a symlink; {what} must be a file of its own") from None
+        raise
+    try:
+        status, folder = os.fstat(descriptor), path.resolve().parent.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise ConfigError(f"{path}: is no file")
+        for owner, whose in ((status.st_uid, f"{path}:"), (folder.st_uid, f"{path}: its folder")):
+            if owner not in (0, os.geteuid()):
+                raise ConfigError(f"{whose} belongs to user {owner}; {what} must be this user's ({os.geteuid()}) own")
+        if folder.st_mode & 0o022 and not folder.st_mode & stat.S_ISVTX:
+            mode = stat.S_IMODE(folder.st_mode)
+            raise ConfigError(
+                f"{path}: others can put another file in its place (folder's mode {mode:o}); chmod go-w {path.resolve().parent}"
+            )
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def rotate(path: Path) -> tuple[Path, Path]:
+    """A new pair in the place of this one; the ledger goes on. Returns the new public file, and where the old public key is kept, under a
+    name that nobody takes for a trusted key's. Raises ConfigError if the old one is no key, or nothing can be written.
+    """
+    from s2r_runtime import offline_ledger
+    from s2r_runtime.daemon.persistence import replace
+
+    old = load(path, revoked=True)
+    if not offline_ledger.path_beside(path).exists():
+        raise ConfigError(f"{offline_ledger.path_beside(path)}: is missing, so nobody knows what this key has spent; put it back first")
+    public = public_path(path)
+    kept = public.with_name(f"{public.name}.{fingerprint(public_bytes(old)).partition(':')[2][:8]}")
+    private_pem, public_pem = _pems(Ed25519PrivateKey.generate())
+    try:
+        replace(kept, _pems(old)[1], 0o644)
+        replace(path, private_pem)
+        replace(public, public_pem, 0o644)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
+    return public, kept
 
 
 def public_bytes(key: Ed25519PrivateKey) -> bytes:
@@ -131,6 +215,12 @@ def fits(public: bytes, signature: bytes, message: bytes) -> bool:
     except (InvalidSignature, ValueError):
         return False
     return True
+
+
+def _pems(key: Ed25519PrivateKey) -> tuple[bytes, bytes]:
+    """Both halves, private first."""
+    private = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    return private, key.public_key().public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
 
 
 def _create(path: Path, data: bytes, mode: int) -> None:

@@ -500,6 +500,13 @@ class CertificateFailed(Struct, frozen=True, tag="certificate_failed"):
     request_id: int = 0
 
 
+class CertificatesDistrusted(Struct, frozen=True, tag="certificates_distrusted"):
+    """Certificates (by id) that are not believed any more: their key was revoked or is not trusted now, or their file was changed."""
+
+    t_ns: int
+    reasons: dict[str, str]
+
+
 class Requested(Struct, frozen=True, tag="requested"):
     """An operator's decision, from the control socket. `by`: user id of the peer. Unused fields are at their defaults.
 
@@ -521,7 +528,7 @@ class Requested(Struct, frozen=True, tag="requested"):
 Event = (
     Started | Observed | Proposed | Ticked | WallClockRead | LinkChanged | RecorderChanged | AnalyticsChanged | OverrideChanged | Measured
     | EpisodeEnded | SourceStarted | SourceStopped | SampleTaken | CampaignFinished | InputsFinished | JobFinished | CertificateStored
-    | CertificateFailed | Requested | Stopping
+    | CertificateFailed | CertificatesDistrusted | Requested | Stopping
 )  # fmt: skip
 
 

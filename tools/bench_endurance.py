@@ -43,6 +43,13 @@ PUNCTUAL_NS = 500_000
 """What a kernel that is no real-time one, and an interpreter, need to wake up; above 200 Hz it is more than a tenth of a period."""
 LOOK_S = 5.0
 """Between two looks at memory and counters."""
+PATIENT = """
+[gate]
+controller_deadline = 2.0
+observation_timeout = 1.0
+command_ttl = 1.0
+"""
+"""What is measured is how late things come, not what becomes of them: with the profile's 50 ms, one turn of a busy machine ends the run."""
 FLAT_MB_PER_HOUR = 8.0
 """A leak of one page an observation at 100 Hz would be 1500 MB an hour; allocators breathe by a few."""
 
@@ -106,6 +113,7 @@ def endure(rate: float, minutes: float) -> dict[str, Any]:
     dt = 1.0 / rate
     with tempfile.TemporaryDirectory(prefix="s2r-endurance-") as name:
         bench = Bench(Path(name), "realtime", dt)
+        bench.profile.write_text(bench.profile.read_text() + PATIENT)
         robot = Robot(bench.endpoint(0), dt)
         robot.start()
         try:
@@ -120,7 +128,10 @@ def endure(rate: float, minutes: float) -> dict[str, Any]:
                 answer = bench.ask("deploy", path=str(controller), certificate=text)
                 if answer["exit_code"]:
                     raise SystemExit(f"not deployed: {answer['text']}")
-                bench.until("gate", "open")
+                try:
+                    bench.until("gate", "open")
+                except SystemExit:
+                    raise SystemExit(f"the gate does not open: {bench.status()['reason']}; {ends(bench)}") from None
                 robot.noting.set()
                 found = watched(bench, minutes * 60.0)
                 robot.noting.clear()

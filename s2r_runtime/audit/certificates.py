@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import msgspec
-
 from s2r_runtime import certificate as certificates
 from s2r_runtime import keys
 from s2r_runtime.audit.evidence import Evidence, attached_controller
@@ -19,12 +17,15 @@ from s2r_runtime.recording.reading import Entry
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from s2r_runtime.revocations import Revocation
+
 
 class Certificates:
     """Of all runs."""
 
-    def __init__(self, findings: Findings, evidence: Evidence) -> None:
-        self._findings, self._evidence = findings, evidence
+    def __init__(self, findings: Findings, evidence: Evidence, revoked: Mapping[str, Revocation] | None = None) -> None:
+        """revoked: keys that are not believed, by fingerprint."""
+        self._findings, self._evidence, self._revoked = findings, evidence, revoked or {}
         self._orders: dict[int, tuple[IssueCertificate, bool]] = {}
 
     def begin_run(self) -> None:
@@ -82,7 +83,9 @@ class Certificates:
         if data is None:
             raise ConfigError("is not attached to the log")
         elsewhere = event.gap is not None
-        signer = _signer(data.data)
+        signer = certificates.signer(data.data)
+        if (revocation := self._revoked.get(keys.fingerprint(signer))) is not None:
+            raise ConfigError(f"is signed with the key {keys.fingerprint(signer)}, which was {revocation}")
         certificate = certificates.load(data.data, {*trusted, signer} if elsewhere else trusted[:1], None, "certificate")
         if certificates.facts(certificate) != event.facts or event.gap not in (None, certificate.gap):
             raise ConfigError("what the gate was told is not what it says")
@@ -115,15 +118,3 @@ class Certificates:
             raise ConfigError("what it says is not what the evidence says")
         self._findings.count("certificates")
         return self._evidence.support(order)
-
-
-def _signer(data: bytes) -> bytes:
-    """The public key that stands in a certificate's file; empty if there is none to be seen."""
-
-    class Key(msgspec.Struct):
-        public_key: bytes = b""
-
-    try:
-        return msgspec.json.decode(data, type=Key).public_key
-    except (msgspec.DecodeError, UnicodeDecodeError):
-        return b""

@@ -7,7 +7,7 @@ constant memory but for attachments and campaign samples.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from s2r_runtime.recording.layout import ABOUT, RECOVERED
 from s2r_runtime.recording.logs import is_log, runs
 from s2r_runtime.recording.reading import Reading
 from s2r_runtime.recording.writer import environment
+from s2r_runtime.revocations import Revocation
 
 PROGRESS_EVERY = 2000
 """Messages between two looks at how far it is."""
@@ -88,12 +89,14 @@ def audit(
     rerun_controllers: bool = False,
     rerun_traces: bool = False,
     heads: Sequence[bytes] = (),
+    revoked: Mapping[str, Revocation] | None = None,
     progress: Callable[[float, float, str], None] | None = None,
 ) -> AuditResult:
     """Audits the files of one or more runs of a robot. public_key: the Ed25519 key that must have signed them, 32 bytes.
 
     rerun_controllers: run the attached controllers' code, confined, to repeat the verifications. rerun_traces: run traces again however
     long they take (else those that are done within `traces.SECONDS`). heads: that the daemon published: the logs must reach them.
+    revoked: keys that are not believed, by fingerprint.
     progress: (done, total, what).
     Raises RecordingError for a file that is no log, NotEnoughEvidence if no record can be read,
     ConfigError or PluginError where this machine lacks what the log needs.
@@ -103,7 +106,9 @@ def audit(
     trusted = () if public_key is None else (public_key,)
     traces = Traces(findings, seconds=None if rerun_traces else SECONDS, progress=tell.detail)
     evidence = Evidence(findings, traces, rerun=rerun_controllers, progress=tell.detail)
-    across = Across(findings, CampaignReplay(findings), evidence, Certificates(findings, evidence), traces, trusted, rerun_controllers)
+    across = Across(
+        findings, CampaignReplay(findings), evidence, Certificates(findings, evidence, revoked), traces, trusted, rerun_controllers
+    )
     readings: list[Reading] = []
     try:
         grouped = runs(paths)
@@ -119,7 +124,7 @@ def audit(
         raise NotEnoughEvidence(f"{', '.join(str(path) for path in paths)}: no record could be read, so there is nothing to audit")
     across.campaigns.end()
     _anchored(readings, heads, findings)
-    signed_by, trusted_all = _signers(readings, public_key)
+    signed_by, trusted_all = _signers(readings, public_key, revoked or {})
     chain = _chain(readings)
     valid = all(one.valid for one in findings.certificates.values())
     return AuditResult(
@@ -244,10 +249,13 @@ def _chain(readings: Sequence[Reading]) -> str:
     return next((state for state in ("broken", "unsigned tail") if state in states), "intact")
 
 
-def _signers(readings: Sequence[Reading], wanted: bytes | None) -> tuple[str, bool]:
-    """Who signed, in words; and whether that is who was asked for (or nobody was)."""
+def _signers(readings: Sequence[Reading], wanted: bytes | None, revoked: Mapping[str, Revocation]) -> tuple[str, bool]:
+    """Who signed, in words; and whether that is who was asked for (or nobody was), and nobody who is not believed any more."""
     found = list(dict.fromkeys(reading.public_key for reading in readings))
     names = ", ".join(keys.fingerprint(key) if key else "nobody" for key in found)
+    for key in found:
+        if key and (revocation := revoked.get(keys.fingerprint(key))) is not None:
+            return f"signed by {names}, of which {keys.fingerprint(key)} was {revocation}: nothing shows that this is no forgery", False
     if wanted is None:
         return f"signed by {names}, not compared with a trusted key", True
     if found == [wanted]:

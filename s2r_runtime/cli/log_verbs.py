@@ -59,7 +59,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run_audit(args: argparse.Namespace) -> int:
     """Exit 0 if all that is there holds, 1 if something does not."""
-    from s2r_runtime import keys
+    from s2r_runtime import keys, revocations
     from s2r_runtime.audit.log import audit
 
     _need(args.log)
@@ -71,6 +71,7 @@ def run_audit(args: argparse.Namespace) -> int:
             rerun_controllers=args.rerun_controllers,
             rerun_traces=args.rerun_traces,
             heads=args.head,
+            revoked=revocations.known(revocations.places()),
             progress=bar,
         )
     finally:

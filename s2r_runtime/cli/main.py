@@ -30,6 +30,7 @@ GROUPS = (
     "trials_verb",
     "log_verbs",
     "plugin_verb",
+    "keys_verb",
     "setup_verbs",
 )
 """Modules of this package, each with `add(verbs)` and its functions `run(args) -> int`. Nothing heavy is imported at the top."""

@@ -1,4 +1,4 @@
-"""Verbs that set things up and look at them: profile, keys, doctor."""
+"""Verbs that set things up and look at them: profile, doctor."""
 
 from __future__ import annotations
 
@@ -32,11 +32,6 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     check.add_argument("--json", action="store_true", help="print one JSON object")
     check.set_defaults(run=profile_check)
 
-    keys = verbs.add_parser("keys", help="signing keys").add_subparsers(dest="what", metavar="WHAT", required=True)
-    new = keys.add_parser("new", help="make a key pair that signs certificates and logs")
-    new.add_argument("path", type=Path, nargs="?", metavar="FILE", help="where (default: the user's configuration folder)")
-    new.set_defaults(run=keys_new)
-
     doctor = verbs.add_parser("doctor", help="what is missing on this machine, and what to do about it")
     doctor.add_argument("--json", action="store_true", help="print one JSON object")
     doctor.set_defaults(run=doctor_run)
@@ -63,17 +58,6 @@ def profile_check(args: argparse.Namespace) -> int:
     if args.defaults:
         for table, values in msgspec.to_builtins(profile).items():
             output.out(f"{table} = {msgspec.json.encode(values).decode()}")
-    return 0
-
-
-def keys_new(args: argparse.Namespace) -> int:
-    """Makes a key pair; refuses to overwrite one."""
-    from s2r_runtime import keys
-
-    path = args.path or keys.default_path()
-    public = keys.new(path)
-    output.out(f"private key  {path}  (keep it on the machine that signs; readable by its owner only)")
-    output.out(f"public key   {public}  (give it to whoever checks: s2r audit LOG --key {public})")
     return 0
 
 

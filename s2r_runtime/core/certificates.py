@@ -23,6 +23,7 @@ from s2r_runtime.messages import (
     CertificateFacts,
     CertificateFailed,
     CertificateInstalled,
+    CertificatesDistrusted,
     CertificateStored,
     Gap,
     IssueCertificate,
@@ -314,6 +315,13 @@ def start_controller(turn: Turn, deployment: Deployment, facts: CertificateFacts
     turn.set(deployment=msgspec.structs.replace(deployment, stage="starting", certificate_id=facts.id), ended="")
     turn.emit(StartController(turn.now, deployment.digest, facts.id))
     regate(turn)
+
+
+def distrusted(turn: Turn, event: CertificatesDistrusted) -> None:
+    """Whoever signed these is not believed any more, so they end for good. An unknown one is none that could drive here."""
+    for facts in turn.memory.certificates:
+        if facts.id in event.reasons:
+            revoke(turn, [facts.id], f"key: {event.reasons[facts.id]}")
 
 
 def revoke(turn: Turn, ids: Sequence[str], reason: str) -> None:

@@ -30,6 +30,7 @@ from s2r_runtime.messages import (
     Answer,
     CampaignFinished,
     CertificateFailed,
+    CertificatesDistrusted,
     CertificateStored,
     EpisodeEnded,
     Event,
@@ -163,6 +164,8 @@ def _noted(turn: Turn, event: Event) -> None:
             certificates.certificate_stored(turn, event)
         case CertificateStored(gap=gap) if gap is not None:
             gaps.certificate_loaded(turn, event, gap)
+        case CertificatesDistrusted():
+            certificates.distrusted(turn, event)
         case CertificateFailed():
             certificates.certificate_failed(turn, event)
         case _:

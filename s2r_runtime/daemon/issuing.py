@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from s2r_runtime import certificate as certificates
 from s2r_runtime import keys
 from s2r_runtime.daemon.persistence import replace
+from s2r_runtime.daemon.trust import certificate_file
 from s2r_runtime.errors import ConfigError, S2RError
 from s2r_runtime.messages import CertificateFailed, CertificateStored, Gap, IssueCertificate
 
@@ -32,6 +33,8 @@ def signing_key(path: Path | None, state: Path, say: Callable[[str], None]) -> E
 def issue(daemon: Daemon, order: IssueCertificate) -> CertificateStored | CertificateFailed:
     """Signs what was shown and stores it."""
     file = daemon.actions.controller(order.verification.controller_digest)
+    if problem := daemon.trust.own_objection():
+        return CertificateFailed(0, problem, order.request_id)
     if file is None:
         return CertificateFailed(0, "the controller's file is not loaded any more; deploy it again", order.request_id)
     try:
@@ -53,10 +56,11 @@ def issue(daemon: Daemon, order: IssueCertificate) -> CertificateStored | Certif
 def load(daemon: Daemon, text: str, where: str, controller: str, request_id: int) -> CertificateStored:
     """A certificate that a person brings for this controller (digest), made elsewhere. Raises ConfigError with what is wrong with it."""
     folder = daemon.folder.path
-    trusted = (keys.public_bytes(daemon.key), *keys.load_trusted([folder / "trusted"]))
     data = text.encode()
+    if (problem := daemon.trust.objection(certificates.signer(data))) and "revoked" in problem:
+        raise ConfigError(f"{where}: is {problem}; certify again with another key")
     try:
-        certificate = certificates.load(data, trusted, int(time.time()), where)
+        certificate = certificates.load(data, daemon.trust.keys(), int(time.time()), where)
     except certificates.UntrustedKey as error:
         raise ConfigError(
             f"{error}; put the signer's public key (.pub) into {folder / 'trusted'}/, or run the daemon with the signer's key"
@@ -87,8 +91,3 @@ def _store(
     if not daemon.logbook.durable():
         return CertificateFailed(0, "the certificate cannot be logged: the disk does not take the log", request_id)
     return CertificateStored(0, facts, gap, request_id)
-
-
-def certificate_file(folder: Path, identity: str) -> Path:
-    """Where a certificate of that id is."""
-    return folder / f"{identity.removeprefix('sha256:')}.json"

@@ -22,6 +22,7 @@ from pathlib import Path
 
 import msgspec
 
+from s2r_runtime import keys
 from s2r_runtime.child import Child
 from s2r_runtime.core import reducer as core
 from s2r_runtime.core.state import State
@@ -40,6 +41,7 @@ from s2r_runtime.daemon.settings import ModelFacts, settings_of
 from s2r_runtime.daemon.stop_signals import StopSignals
 from s2r_runtime.daemon.systemd import Notifier
 from s2r_runtime.daemon.transport_values import Inbound
+from s2r_runtime.daemon.trust import Trust
 from s2r_runtime.daemon.workshop import Watcher, Workshop
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import (
@@ -162,6 +164,7 @@ class Daemon:
         self.models = ModelStore(self.folder.path, profile.model.digest())
         self.profile = profile = self.models.in_force(profile, self.memory)
         self.key = issuing.signing_key(self._key_path, self.folder.path, self.say)
+        self.trust = Trust(self.folder.path, keys.public_bytes(self.key))
         self.watcher = Watcher(self.selector, profile, str(self._profile_path), self.feed, self._analytics)
         stack.callback(self.watcher.close)
         for plugin in registry().loaded:
@@ -236,6 +239,7 @@ class Daemon:
         """First events of a log, and what the core cannot know of from before."""
         self.state = core.initial()
         self.feed(Started(0, int(time.time()), self.settings, self.memory))
+        self.feed(*self.trust.look(self.state.memory))
         if not self.watcher.up:
             self.feed(AnalyticsChanged(0, up=False, detail="still down"))
 
@@ -275,7 +279,7 @@ class Daemon:
         self.actions.tick(now_ns)
         if now_ns >= self._next_wall_ns:
             self._next_wall_ns = now_ns + WALL_CLOCK_NS
-            self.feed(WallClockRead(0, int(time.time())))
+            self.feed(WallClockRead(0, int(time.time())), *self.trust.look(self.state.memory))
         self.desk.tick(now_ns)
         self.notifier.alive(now_ns)
         self._publish_head(now_ns)

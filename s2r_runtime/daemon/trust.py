@@ -1,0 +1,90 @@
+"""Whom the daemon believes: its own key and those in `trusted/`, less the revoked ones; and which certificates that leaves.
+
+A certificate in force stays in force only while a file of its own in `certificates/` says what the memory says, signed by such a key. That
+is looked at when the daemon starts, so that a memory that was written by somebody else carries no certificate that nobody signed; and
+within a second of every change of a list of revoked keys or of `trusted/`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+from s2r_runtime import certificate as certificates
+from s2r_runtime import keys, revocations
+from s2r_runtime.daemon.persistence import read
+from s2r_runtime.errors import ConfigError
+from s2r_runtime.messages import CertificateFacts, CertificatesDistrusted, Memory
+
+_Seen = tuple[tuple[str, int, int, int], ...]
+
+
+class Trust:
+    """folder: the robot's state. own: the public half of the key that the daemon signs with."""
+
+    def __init__(self, folder: Path, own: bytes) -> None:
+        """Raises ConfigError if a list of revoked keys or a trusted key can't be read, or could be somebody else's work."""
+        self._own, self._trusted, self._certificates = own, folder / "trusted", folder / "certificates"
+        self._lists = revocations.places(folder)
+        self._seen: _Seen | None = None
+        self._looked_at: tuple[str, ...] = ()
+        self.keys()
+
+    def keys(self) -> tuple[bytes, ...]:
+        """Public keys whose signature counts. Raises ConfigError as above."""
+        revoked = revocations.known(self._lists)
+        return tuple(key for key in (self._own, *keys.load_trusted([self._trusted])) if keys.fingerprint(key) not in revoked)
+
+    def objection(self, key: bytes) -> str:
+        """Why a signature by this key is not believed, or empty. Raises ConfigError as above."""
+        name = keys.fingerprint(key)
+        if (entry := revocations.known(self._lists).get(name)) is not None:
+            return f"signed with the key {name}, which was {entry}"
+        return "" if key in self.keys() else f"signed with the key {name}, which is not trusted here"
+
+    def own_objection(self) -> str:
+        """Why this daemon signs nothing any more, or empty."""
+        try:
+            entry = revocations.known(self._lists).get(keys.fingerprint(self._own))
+        except ConfigError as error:
+            return str(error)
+        return "" if entry is None else f"this daemon's own key was {entry}; s2r keys rotate, and start it anew"
+
+    def look(self, memory: Memory) -> tuple[CertificatesDistrusted, ...]:
+        """What is not believed any more, if anything has changed since the last look."""
+        now, ids = self._state(), tuple(facts.id for facts in memory.certificates)
+        if now == self._seen and set(ids) <= set(self._looked_at):
+            return ()
+        self._seen, self._looked_at = now, ids
+        reasons = {facts.id: why for facts in memory.certificates if (why := self._problem(facts))}
+        return (CertificatesDistrusted(0, reasons),) if reasons else ()
+
+    def _problem(self, facts: CertificateFacts) -> str:
+        file = certificate_file(self._certificates, facts.id)
+        try:
+            data = read(file)
+            if why := self.objection(certificates.signer(data)):
+                return why
+            found = certificates.facts(certificates.load(data, self.keys(), None, str(file)))
+        except ConfigError as error:
+            return str(error)
+        return "" if found == facts else f"{file}: says something else than the robot's state"
+
+    def _state(self) -> _Seen:
+        files = [*self._lists, self._trusted]
+        with contextlib.suppress(OSError):
+            files += sorted(self._trusted.glob("*.pub"))
+        found = []
+        for file in files:
+            try:
+                status = file.lstat()
+            except OSError:
+                found.append((str(file), 0, 0, 0))
+            else:
+                found.append((str(file), status.st_mtime_ns, status.st_size, status.st_ino))
+        return tuple(found)
+
+
+def certificate_file(folder: Path, identity: str) -> Path:
+    """Where a certificate of that id is."""
+    return folder / f"{identity.removeprefix('sha256:')}.json"
