@@ -4,7 +4,7 @@
     M_x      (x, y, theta) of the trunk, theta = atan2 of its forward axis on the floor, in (-pi, pi]
     M_u      `quadruped_gait`: forward speed and yaw rate to twelve servo commands, once a millisecond
     slope    gravity is tilted instead of the floor: floor coordinates lie in the slope
-    fallen   the trunk is lower than FALLEN_M, or its up axis leans by more than 53 degrees (cosine below FALLEN_UP)
+    fallen   the trunk is lower than FALLEN_M, or its up axis leans by more than 37 degrees (cosine below FALLEN_UP): it lies, or sits
 
 One seed gives one robot: gait phase, stride jitter, sensor noise and shoves have generators of their own. Physics by MuJoCo (extra `sim`);
 the same bits on one machine and version of it.
@@ -28,7 +28,7 @@ from s2r_standins.quadruped_sheet import QuadrupedSheet
 XML = Path(__file__).parent / "data" / "quadruped.xml"
 STEP_NS = 1_000_000
 GRAVITY = 9.81
-FALLEN_M, FALLEN_UP = 0.15, 0.6
+FALLEN_M, FALLEN_UP = 0.18, 0.8
 LOOK_EVERY = 10
 """ms between looks whether it fell."""
 SHOVE_MS = 100
