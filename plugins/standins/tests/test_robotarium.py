@@ -4,100 +4,26 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
-import queue
 import signal
-import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
 import pytest
-import zenoh
+import standin_talk
 from s2r_standins.robotarium import ROBOT
+from standin_talk import PATIENCE_S, Talk, drive
 
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.profile import parse_profile
 
-PATIENCE_S = 15.0
-
-
-class Talk:
-    """A runtime's end of the link, written from the wire format."""
-
-    def __init__(self, *arguments: str) -> None:
-        with socket.socket() as s:
-            s.bind(("127.0.0.1", 0))
-            endpoint = f"tcp/127.0.0.1:{s.getsockname()[1]}"
-        config = zenoh.Config()
-        config.insert_json5("listen/endpoints", json.dumps([endpoint]))
-        config.insert_json5("scouting/multicast/enabled", "false")
-        self.session = zenoh.open(config)
-        self.inbox: queue.Queue[bytes] = queue.Queue()
-        self.overrides: queue.Queue[bytes] = queue.Queue()
-        self.session.declare_subscriber("s2r/robot/observation", lambda s: self.inbox.put(s.payload.to_bytes()))
-        self.session.declare_subscriber("s2r/robot/override", lambda s: self.overrides.put(s.payload.to_bytes()))
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "s2r_standins.robotarium", "--connect", endpoint, "--parent", str(os.getpid()), *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        self.last = -1
-        self.seq = 0
-
-    def close(self) -> None:
-        self.process.terminate()
-        self.process.communicate(timeout=PATIENCE_S)
-        self.session.close()
-
-    def observe(self) -> dict[str, Any]:
-        """The next new observation."""
-        while True:
-            got: dict[str, Any] = json.loads(self.inbox.get(timeout=PATIENCE_S))
-            if got["seq"] > self.last:
-                self.last = got["seq"]
-                return got
-
-    def command(self, seen: dict[str, Any], v: float, w: float, **other: Any) -> None:
-        self.seq += 1
-        fields = {"seq": self.seq, "t_ns": seen["stamp_ns"], "obs_seq": seen["seq"], "ttl_ns": 10**8, "source": "sampler"}
-        self.session.put("s2r/robot/command", json.dumps({**fields, "input": {"v": v, "w": w}, **other}))
-
-    def say(self, line: str) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.write(line + "\n")
-        self.process.stdin.flush()
-
-    def reply(self) -> dict[str, Any]:
-        assert self.process.stdout is not None
-        told: dict[str, Any] = json.loads(self.process.stdout.readline())
-        return told
-
-
-@contextmanager
-def talk(*arguments: str) -> Iterator[Talk]:
-    made = Talk(*arguments)
-    try:
-        yield made
-    finally:
-        made.close()
-
-
 QUIET = ("--sigma-position", "0", "--sigma-heading", "0")
 
 
-def drive(t: Talk, periods: int, v: float, w: float) -> list[dict[str, Any]]:
-    """Answers every observation with (v, w); returns the observations, the one after the last answer included."""
-    seen = [t.observe()]
-    for _ in range(periods):
-        t.command(seen[-1], v, w)
-        seen.append(t.observe())
-    return seen
+def talk(*arguments: str) -> AbstractContextManager[Talk]:
+    return standin_talk.talk("robotarium", *arguments)
 
 
 def test_lockstep_moves_one_period_for_each_answer_and_repeats_itself_while_it_waits() -> None:
