@@ -26,6 +26,7 @@ from s2r_runtime.messages import (
     AnalyticsChanged,
     CampaignFinished,
     CertificateFailed,
+    CertificatesDistrusted,
     CertificateStored,
     Command,
     EpisodeEnded,
@@ -224,6 +225,12 @@ def _certificate(world: World, rng: random.Random) -> None:
         world.feed(CertificateStored(world.t, spoiled(rng, facts) if rng.random() < 0.7 else facts, changed, requests))
 
 
+def _distrusted(world: World, rng: random.Random) -> None:
+    """The key of a certificate in force is revoked; or of one that nobody knows."""
+    known = [facts.id for facts in world.state.memory.certificates]
+    world.feed(CertificatesDistrusted(world.t, {rng.choice([*known, "nobody's"]): "revoked"}))
+
+
 def _impostor(world: World, rng: random.Random) -> None:
     """A command from somebody who was not asked, with everything right but that."""
     seq = world.seq if world.ask is None else world.ask.obs_seq
@@ -245,6 +252,7 @@ FAULTS: dict[str, Callable[[World, random.Random], None]] = {
     "the wall clock steps": _wall_clock,
     "a result of another attempt": _of_another_attempt,
     "another certificate": _certificate,
+    "a key is revoked": _distrusted,
     "an impostor commands": _impostor,
 } | {name: _letter(name) for name in ALPHABET if name not in ("see", "duty", "answer", "deploy", "sample", "permit", "clear", "repeat")}
 NAMES = ["an event spoiled"] * 12 + ["another certificate", "an event repeated", "a result of another attempt"] * 3 + list(FAULTS)

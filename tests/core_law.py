@@ -1,6 +1,7 @@
 """docs/gate.md written down once more, without the gate and without the core's state: what must never have happened.
 
-`Law` sees nothing but events and outputs. It is no rule for how the core goes about it, only for what moves the robot.
+`Law` sees nothing but events and outputs, made up or from a log. It is no rule for how the core goes about it, only for
+what moves the robot. Angles are taken to be free, as they are in the profiles of these tests.
 """
 
 from __future__ import annotations
@@ -106,7 +107,8 @@ class Law:
     def _facts(self, event: m.Event, outputs: tuple[m.Output, ...]) -> None:
         match event:
             case m.Started():
-                self.started, self.model, self.unix = True, event.settings.model_digest, (event.unix_s, event.t_ns)
+                self.started, self.settings = True, event.settings
+                self.model, self.unix = event.settings.model_digest, (event.unix_s, event.t_ns)
                 self.up = frozenset({"recorder", "analytics"})
                 self.running, self.sampling, self.permit, self.asked = None, False, None, None
                 self.gate, self.answered, self.last = False, True, None
@@ -141,6 +143,8 @@ class Law:
                 self.sampling = True
             case m.CertificateStored() if event.gap is not None or event.request_id in self.issuing:
                 self.stored = (*self.stored, event.facts)
+            case m.CertificatesDistrusted():
+                self.revoked |= {facts.id for facts in self.stored if facts.id in event.reasons}
             case m.Proposed():
                 self._proposed(event.command, outputs)
             case m.Requested():
@@ -256,9 +260,13 @@ class Law:
             "alarm": self.alarmed,
             "faults": self.faults > s.max_measurement_faults,
             "not seen": not self.usable or not 0 <= self.now - self.good_ns <= s.observation_timeout_ns,
-            "outside": not (len(x) == 3 and abs(x[0]) <= 1.6 and abs(x[1]) <= 1.0),
+            "outside": not self._inside(x, s.region),
         }
         return ", ".join(name for name, so in wrong.items() if so)
+
+    def _inside(self, x: tuple[float, ...], bounds: tuple[tuple[float, float], ...]) -> bool:
+        rows = zip(self.settings.states, x, bounds, strict=False)
+        return len(x) == len(bounds) and all(name in self.settings.angles or low <= value <= high for name, value, (low, high) in rows)
 
     def _against_sampler(self) -> str:
         x = self.good.x if self.good else ()
@@ -268,7 +276,7 @@ class Law:
             "no permit": self.permit is None or self.now >= self.permit,
             "no campaign": not self.sampling,
             "not seen": not self.usable or not 0 <= self.now - self.good_ns <= self.settings.observation_timeout_ns,
-            "outside": not (len(x) == 3 and abs(x[0]) <= 2.0 and abs(x[1]) <= 1.5),
+            "outside": not self._inside(x, self.settings.geofence),
         }
         return ", ".join(name for name, so in wrong.items() if so)
 
@@ -290,10 +298,11 @@ class Law:
         seen, last = event.observation, self.instant_stamp
         if seen == self.good or (self.latest is not None and seen.seq == self.latest.seq):
             return False
-        due = last is None or seen.stamp_ns - last >= 0.9 * DT
+        dt = self.settings.dt_ns
+        due = last is None or 10 * (seen.stamp_ns - last) >= 9 * dt
         if seen.fault or len(seen.x) != 3 or not all(map(math.isfinite, seen.x)):
             if due:
-                self.instant_stamp = seen.stamp_ns if last is None else min(seen.stamp_ns, last + DT)
+                self.instant_stamp = seen.stamp_ns if last is None else min(seen.stamp_ns, last + dt)
             return False
         fresh = self.good is None or (seen.seq > self.good.seq and seen.stamp_ns > self.good.stamp_ns)
         return fresh and (due or (last is not None and seen.stamp_ns < last))

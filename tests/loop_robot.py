@@ -28,10 +28,34 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from s2r_runtime.hookspecs import Offer, hookimpl
-from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
+from s2r_runtime.messages import Command, Decided, Frame, GateChanged, LinkChanged, Observation, OverrideChanged
 
 LINK_LOST_NS = 1_000_000_000
 ROBOT, DAEMON = "robot.sock", "daemon.sock"
+
+
+def sabotage(sabotage: str, value: float = 0.0) -> None:
+    """What no datagram could do: the process in which the transport lives is changed from within. value 0 undoes it."""
+    import ctypes
+    import threading
+
+    if sabotage == "recorder dead":
+        for thread in threading.enumerate():
+            if thread.name == "recorder" and thread.ident is not None:
+                ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread.ident), ctypes.py_object(SystemExit))
+    elif sabotage == "monotonic clock":
+        real = CLOCKS["monotonic"]
+        time.monotonic_ns = lambda: real() + round(value * 1e9)
+    elif sabotage == "wall clock":
+        wall = CLOCKS["wall"]
+        time.time = lambda: wall() / 1e9 + value
+    elif sabotage == "slow disk":
+        os.fsync = os.fdatasync = lambda number: (time.sleep(value), CLOCKS["fsync"](number))[1]  # type: ignore[func-returns-value]
+    elif sabotage == "hang":
+        time.sleep(value)
+
+
+CLOCKS = {"monotonic": time.monotonic_ns, "wall": time.time_ns, "fsync": os.fsync}
 
 
 class LoopTransport:
@@ -76,6 +100,11 @@ class LoopTransport:
             plain = json.loads(frame.data)
             if "raise" in plain:
                 raise RuntimeError(plain["raise"])
+            if "sabotage" in plain:
+                sabotage(**plain)
+                return found
+            if "command" in plain:
+                return [*found, Command(self._counters["received"], frame.arrival_ns, "external", tuple(plain["command"]), 0, 10**9)]
             if plain.get("estop"):
                 return [*found, OverrideChanged(frame.arrival_ns, "emergency_stop", "button")]
             x = tuple(float(v) for v in plain["x"])
@@ -104,6 +133,12 @@ class LoopTransport:
             self._counters["sent"] += 1
         except OSError:
             self._counters["dropped_out"] += 1
+
+    def inform(self, record: GateChanged | Decided) -> None:
+        """Notes what the gate says, for tests that follow it."""
+        if isinstance(record, GateChanged):
+            with (self._folder / "said.jsonl").open("a") as said:
+                said.write(json.dumps({"open": record.open, "reason": record.reason}) + "\n")
 
     def counters(self) -> dict[str, int]:
         return dict(self._counters)
