@@ -79,6 +79,33 @@ def _lagged(x, time_constant, part):
     return y
 
 
+def _uneven(x, out, back, part):
+    """Follows faster away from zero than back to it."""
+    y, s = np.empty_like(x), np.zeros_like(x[:, 0])
+    for i in range(x.shape[1]):
+        s_next = x[:, i] + (s - x[:, i]) * np.exp(-part / np.where(np.abs(x[:, i]) > np.abs(s), out, back))
+        y[:, i], s = 0.5 * (s + s_next), s_next
+    return y
+
+
+def _ringing(x, rate, damping, part):
+    y, s, v = np.empty_like(x), np.zeros_like(x[:, 0]), np.zeros_like(x[:, 0])
+    for i in range(x.shape[1]):
+        v = v + part * (rate**2 * (x[:, i] - s) - 2.0 * damping * rate * v)
+        s_next = s + part * v
+        y[:, i], s = 0.5 * (s + s_next), s_next
+    return y
+
+
+def _warming(x, loss, time_constant, part):
+    """Gives less the more was asked lately."""
+    y, z = np.empty_like(x), np.zeros_like(x[:, 0])
+    for i in range(x.shape[1]):
+        z = z + part / time_constant * ((x[:, i] / np.pi) ** 2 - z)
+        y[:, i] = x[:, i] / (1.0 + loss * z)
+    return y
+
+
 def _wheels(u, speed, track):
     left = np.clip(u[..., 0] - u[..., 1] * track / 2, -speed, speed)
     right = np.clip(u[..., 0] + u[..., 1] * track / 2, -speed, speed)
@@ -92,6 +119,10 @@ _ACTS = {
     "input_lag": lambda x, p, part: _lagged(x, p["time_constant"], part),
     "input_saturation": lambda x, p, part: np.clip(x, p["low"], p["high"]),
     "deadband": lambda x, p, part: np.sign(x) * np.maximum(np.abs(x) - p["width"], 0.0),
+    "uneven_lag": lambda x, p, part: _uneven(x, p["out"], p["back"], part),
+    "ringing": lambda x, p, part: _ringing(x, p["rate"], p["damping"], part),
+    "warming": lambda x, p, part: _warming(x, p["loss"], p["time_constant"], part),
+    "cubic": lambda x, p, part: x + p["share"] * x * ((x / np.pi) ** 2 - 0.6),
     "wavy": lambda x, p, part: x + p["height"] * np.sin(3.0 * x),
 }
 

@@ -20,7 +20,7 @@ from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.residual import Steps, acting, predicted, residual, state_jacobian
 from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
-from s2r_runtime.trace.slots import Added, Free, bounds_of, free_of, inside, values_of, with_values
+from s2r_runtime.trace.slots import Added, Free, Slot, bounds_of, free_of, inside, values_of, with_values
 
 Array = NDArray[np.float64]
 
@@ -67,14 +67,21 @@ class Fit:
 
     @property
     def k(self) -> int:
-        """Number of fitted parameters, also of those that these data hardly feel; an effect without any counts as one."""
+        """Number of fitted parameters, also of those that these data hardly feel; an effect without any counts as one, and where in time or
+        in frequency something is counts as two: it was looked for everywhere (N. Zhang, D. Siegmund, Biometrics 63, 2007: log n).
+        """
         named = {slot.place for slot in self.free}
-        return len(self.free) + sum(1 for i in self.added if i not in named)
+        return len(self.free) + sum(1 for i in self.added if i not in named) + sum(_sought(self.model, slot) for slot in self.free)
 
     @property
     def added(self) -> tuple[int, ...]:
         """Places of the effects that the data, not the user, put there."""
         return tuple(i for i, a in enumerate(self.model.effects) if isinstance(a, Added))
+
+
+def _sought(model: ComposedModel, slot: Slot) -> bool:
+    """Whether a number says when, or how often, something happens that does not happen under the model without it."""
+    return getattr(model.effects[slot.place].effect, "timed", False) and bounds_of(model, slot).unit in {"s", "Hz"}
 
 
 def gain(fit: Fit, base: Fit) -> float:

@@ -55,8 +55,10 @@ SLOWLY, SLOW = ("constant", "time"), 3.0
 CLIPPED = 10.0
 """Standard deviations at which a wild value is cut off where it is not taken for an outlier."""
 
-MORE = 1.1
-"""Times what effects explain that a dictionary must explain, for them to be the wrong ones: with noise of its own, each is a little off."""
+MORE, MUCH_MORE = 1.1, 1.15
+"""Times what effects explain that a dictionary must explain, for them to be the wrong ones: with noise of its own, each is a little off.
+The second one where the effects seem to leave nothing.
+"""
 
 BEYOND = 8.0
 """Nats by which the evidence must exceed that of every slide."""
@@ -77,13 +79,15 @@ COLOURED = 0.2
 class Structure:
     """tokens: docs/json.md's `depends_on`, most important first. matters: it shows in rollouts.
 
-    share: part of all that the nominal model lacks which is still left (0 where there is nothing). gains: nats by group.
+    share: part of all that the nominal model lacks which is still left (0 where there is nothing). gains: nats by group. nameless: what
+    was named looks more like something that has no name (`challenge`).
     """
 
     tokens: tuple[str, ...]
     matters: bool
     share: float
     gains: dict[str, float]
+    nameless: bool = False
 
 
 def lack_of_fit(given: Problem, fit: Fit, nominal: Fit, horizon: int) -> Structure:
@@ -108,9 +112,11 @@ def best_unnamed(given: Problem, nominal: Fit) -> tuple[str, float]:
     return TOKENS.get(best.token, best.token), most
 
 
-def explains_more(nats: float, fit: Fit, nominal: Fit) -> bool:
-    """Whether a dictionary that explains so much beats the effects of `fit` clearly: these took up structure that is not theirs."""
-    return nats > MORE * explained(fit, nominal) + ALIKE
+def explains_more(nats: float, fit: Fit, nominal: Fit, *, left: bool) -> bool:
+    """Whether a dictionary that explains so much beats the effects of `fit` clearly: these took up structure that is not theirs. left:
+    whether they leave some that matters.
+    """
+    return nats > (MORE * explained(fit, nominal) + ALIKE if left else MUCH_MORE * explained(fit, nominal) + 2.0 * ALIKE)
 
 
 def _left_by(given: Problem, fit: Fit) -> tuple[Left, list[tuple[str, Array]]]:

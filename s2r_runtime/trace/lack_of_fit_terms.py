@@ -72,18 +72,21 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
         if given.data.in_order:
             yield from ((f"time*{name}", _push(terms, body)) for terms in _over_time(t, u[:, j]))
         for i in range(j):
-            pair = [u[:, i] * u[:, j], np.abs(u[:, i]) * u[:, j], u[:, i] * np.abs(u[:, j]), np.abs(u[:, i] * u[:, j])]
-            yield f"{model.inputs[i]}*{name}", _push(pair, body)
+            a, b = u[:, i], u[:, j]
+            yield f"{model.inputs[i]}*{name}", _push([a * b, np.abs(a) * b, a * np.abs(b), np.abs(a * b)], body)
+            yield f"{model.inputs[i]}*{name}", _push([a * b, a * a * b, a * b * b], body)
     pushes = [u[:, j][:, None] * own for j, own in enumerate(_own(given, model, act))]
     for name, terms, directions in _of_states(model, quieter(steps, noise), u, body, world, pushes):
         yield name, terms if directions is None else _push(terms, directions)
     if not given.data.in_order:
         return
+    for name, push in zip(model.inputs, pushes, strict=True):
+        yield from ((f"time*{name}", [push, *(wave[:, None] * push for wave in waves)]) for waves in _hum(r, given, [push]))
     yield "time", _push([one, t], [*body, *world])
     yield "time", _push([one, *(f(2.0 * np.pi * k * t) for k in (0.5, 1.0, 1.5, 2.0) for f in (np.sin, np.cos))], [*body, *world])
     yield "time", _push([one, *(np.where(t > s, one, 0.0) for s in np.linspace(0.1, 0.9, 9))], body)
     for directions in (body, world):
-        yield from (("wave", _push(terms, directions)) for terms in _hum(r, given, directions))
+        yield from (("wave", _push(waves, directions)) for waves in _hum(r, given, directions))
 
 
 def quieter(steps: Steps, noise: Noise) -> Array:
@@ -118,7 +121,7 @@ def _hum(r: Array, given: Problem, directions: Terms) -> Iterator[Terms]:
     if not directions or place[-1] >= LONGEST or np.any(np.diff(place) <= 0):
         return
     series = np.zeros((int(place[-1]) + 1, len(directions)))
-    seen = np.stack([np.sum(r * d, axis=1) / np.maximum(np.sum(d * d, axis=1), 1e-300) for d in directions], axis=1)
+    seen = np.stack([np.sum(r * d, axis=1) for d in directions], axis=1)  # where nothing pushes, nothing is seen
     series[place] = seen - seen.mean(axis=0)  # and none where nothing was measured
     frequency, height = line(series, dt)
     if height > LINE:

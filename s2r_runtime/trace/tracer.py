@@ -23,6 +23,7 @@ from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.beginning import with_history
+from s2r_runtime.trace.challenge import best_shape, better_shape
 from s2r_runtime.trace.dataset import Dataset, thinned
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge, noise_floor
@@ -31,7 +32,7 @@ from s2r_runtime.trace.faults import Checked, check
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, problem
 from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.intervals import intervals
-from s2r_runtime.trace.lack_of_fit import Structure, best_unnamed, explains_more, lack_of_fit
+from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, Structure, best_unnamed, explains_more, lack_of_fit
 from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.residual import Mask, first_steps, rms, steps_of
@@ -115,7 +116,7 @@ def _traced(
     say(80.0, 100.0, "testing what is left")
     whole = _Whole(checked, model)
     structure = whole.structure(chosen, ahead)
-    if structure.matters:  # something is there: which name it has may be asked with a lower bar, if that leaves nothing
+    if structure.matters and not structure.nameless:  # something is there: its name may be asked with a lower bar, if that leaves nothing
         other = confirmed(given, select(given, model, ahead, lambda share: None, LENIENT, chosen), judged_on)
         if names(other.fit.model) != names(chosen.fit.model):
             rest = whole.structure(other, ahead)
@@ -231,9 +232,19 @@ class _Whole:
         """What the chosen model leaves."""
         fit = evaluate(self.given, chosen.fit.model)
         found = lack_of_fit(self.given, fit, self.nominal, horizon)
-        if found.matters and fit.added and explains_more(self.unnamed[1], fit, self.nominal):
-            return replace(found, tokens=self.unnamed[:1], share=1.0)
-        return found
+        if fit.added and explains_more(self.unnamed[1], fit, self.nominal, left=found.matters):
+            return replace(found, tokens=self._looks_like, matters=True, share=1.0)
+        if found.matters and not fit.added:
+            return replace(found, tokens=tuple(dict.fromkeys((*self._looks_like, *found.tokens))))
+        better = better_shape(self.given, fit, horizon) if fit.added else None
+        return found if better is None else replace(found, tokens=(better.token,), matters=True, share=1.0, nameless=True)
+
+    @cached_property
+    def _looks_like(self) -> tuple[str, ...]:
+        """What all that the nominal model lacks depends on most: by the best dictionary, or by a shape that does better."""
+        token, nats = self.unnamed
+        shape = best_shape(self.given, self.nominal)
+        return (token,) if shape is None or shape.nats < MORE * nats + ALIKE else (shape.token,)
 
 
 def _new(fit: Fit, other: Fit) -> list[int]:

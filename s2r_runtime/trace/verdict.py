@@ -59,11 +59,16 @@ def verdict_of(chosen: Selection, structure: Structure, faults: tuple[Fault, ...
     faulty = any(fault.kind != "dropout" for fault in faults)
     if not chosen.fit.added:
         return "unexplained" if structure.matters else "sensor_fault" if faulty else "none"
-    about = {token for place in chosen.fit.added for token in _about(chosen.fit.model, place)}
-    limit = SAME_KIND if about & set(structure.tokens) else LARGE
-    if not foretold or (structure.matters and structure.share > limit):
+    if not foretold or _withdrawn(chosen.fit, structure):
         return "unexplained"
     return "ambiguous" if chosen.rivals else "traced"
+
+
+def _withdrawn(fit: Fit, structure: Structure) -> bool:
+    """Whether what is left takes the names away from the effects that were found."""
+    about = {token for place in fit.added for token in _about(fit.model, place)}
+    limit = SAME_KIND if about & set(structure.tokens) else LARGE
+    return structure.matters and structure.share > limit
 
 
 def foretells(judged: Judged, given: Held) -> bool:

@@ -1,0 +1,141 @@
+"""Does what was named look more like something that has no name?
+
+The effects that were found on an input are taken out, and each shape (`shapes`) is put in their place and fitted. With L the log likelihood
+of the recording, noise re-estimated for each, the smaller of white and coloured, and a price per number,
+
+    shape wins     L(shape) - price > L(named) - price + log(tried / ALPHA),   by MORE of all that the named effects explain,
+                   and some rollout's error is lower by LOWER
+
+A name that loses is not given: the recording does not look like what it means. A shape that has the named effect in it (two lags that are
+alike) costs a name nothing, as it explains no more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from s2r_runtime.hookspecs import Effect
+from s2r_runtime.models.composed import AppliedEffect, ComposedModel
+from s2r_runtime.trace.candidates import Candidate
+from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, without
+from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
+from s2r_runtime.trace.screening import screen
+from s2r_runtime.trace.shapes import SHAPES
+from s2r_runtime.trace.slots import bounds_of
+
+ALPHA = 1e-3
+"""Chance that a shape wins against the truth, as far as the likelihood is right."""
+
+MORE = 0.05
+"""Of what is explained: less than this is how any model differs from any robot."""
+
+LOWER = 0.05
+"""As for effects: what lowers no rollout's error by this share, nobody would notice."""
+
+REACHES = 0.3
+"""Of what is explained by name: a shape that screening gives less does not come up to it."""
+
+FITTED = 4
+"""Shapes of an input that are fitted, after screening."""
+
+STARTS = 600
+"""Rollouts that errors are compared on at most."""
+
+
+@dataclass(frozen=True)
+class Better:
+    """A shape that does. nats: beyond the model without anything on that input, its numbers paid for."""
+
+    token: str
+    nats: float
+
+
+def better_shape(given: Problem, fit: Fit, horizon: int) -> Better | None:
+    """The shape that explains most beyond the effects named on its input; None if none wins."""
+    won = [found for channel in _inputs(fit) for found in [_challenge(given, fit, channel, horizon)] if found is not None]
+    return max(won, key=lambda better: better.nats, default=None)
+
+
+def best_shape(given: Problem, base: Fit) -> Better | None:
+    """The shape that explains most of what a model leaves, on whichever input; None if none explains anything."""
+    found = [(gain(fit, base) - _price(given, fit, base), fit) for channel in base.model.inputs for fit in _fits(given, base, channel)]
+    nats, fit = max(found, key=lambda pair: pair[0], default=(0.0, base))
+    return Better(_token(fit), nats) if nats > 0.0 else None
+
+
+def _inputs(fit: Fit) -> list[str]:
+    """Inputs on which effects were named."""
+    named = [fit.model.effects[i] for i in fit.added if fit.model.effects[i].effect.stage == "input"]
+    channels = [c for a in named for c in (fit.model.inputs if a.channel == "*" else (a.channel,))]
+    return [c for c in dict.fromkeys(channels) if c in fit.model.inputs]  # drag may act on a speed
+
+
+def _challenge(given: Problem, fit: Fit, channel: str, horizon: int) -> Better | None:
+    bare = fit.model
+    for i in reversed(fit.added):
+        a = bare.effects[i]
+        if a.effect.stage == "input" and a.channel in {channel, "*"}:
+            bare = without(bare, i)
+    base = fitted(given, fit, bare, 1)
+    here = gain(fit, base)
+    for shape in _fits(given, base, channel, REACHES * here, _times(fit, channel)):
+        ahead = gain(shape, base) - here
+        needed = max(_price(given, shape, fit), 0.0) + math.log(len(SHAPES) / ALPHA)
+        if ahead > max(needed, MORE * here) and _lower(given, fit.model, shape.model, horizon):
+            return Better(_token(shape), gain(shape, base) - _price(given, shape, base))
+    return None
+
+
+def _price(given: Problem, fit: Fit, base: Fit) -> float:
+    """Of the numbers that a model has beyond another one (Schwarz)."""
+    return 0.5 * math.log(max(len(given.steps), 2)) * (fit.k - base.k)
+
+
+def _times(fit: Fit, channel: str) -> list[float]:
+    """What the effects named on an input take, s."""
+    there = [
+        slot for slot in fit.free if fit.model.effects[slot.place].channel in {channel, "*"} and bounds_of(fit.model, slot).unit == "s"
+    ]
+    return [float(fit.model.effects[slot.place].p[slot.name]) for slot in there if bounds_of(fit.model, slot).neutral == 0.0]
+
+
+def _fits(given: Problem, base: Fit, channel: str, least: float = 0.0, near: Sequence[float] = ()) -> list[Fit]:
+    """Shapes on one input, beside what the model has, that do best, the best first. least: nats that screening must give them; near:
+    times from which some begin, s.
+    """
+    model = base.model
+    u = given.data.chains.through(model, [a for a in model.effects if a.effect.stage == "input"])
+    end = len(model.effects)
+    offered = [
+        Candidate(shape.name, channel, end, tuple(AppliedEffect(cast(Effect, shape), channel, p) for p in starts))
+        for shape in SHAPES
+        if (starts := shape.starts(u, model.nominal, channel, given.data.dt, near))
+    ]
+    screened, _ = screen(given, base, offered) if offered else ([], 0)
+    fits = [fitted(given, base, s.start, 2) for s in screened[:FITTED] if s.value > max(least, 0.0)]
+    return sorted(fits, key=lambda fit: -gain(fit, base))
+
+
+def _token(fit: Fit) -> str:
+    """What the last effect of a model, a shape, depends on."""
+    last = fit.model.effects[-1]
+    memory = last.effect.hidden(1, fit.model.nominal, last.channel, fit.model.dt, last.p).size > 0
+    return f"memory({last.channel})" if memory else last.channel
+
+
+def _lower(given: Problem, named: ComposedModel, shape: ComposedModel, horizon: int) -> bool:
+    """Whether some rollout's error is lower under the shape."""
+    for ahead in sorted({1, max(1, horizon // 4), horizon}):
+        starts = rollout_starts(given.data, ahead)
+        starts = starts[:: max(1, len(starts) // STARTS)]
+        if len(starts) < 10:
+            continue
+        before, after = (rms(rollout(m, given.data, acting(m, given.data), starts, ahead).error) for m in (named, shape))
+        if np.any(before > (1.0 + LOWER) * after):
+            return True
+    return False

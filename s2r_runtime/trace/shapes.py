@@ -1,0 +1,272 @@
+"""Shapes that what acts on an input can have, and that no effect has a name for.
+
+A name says what happens, and a recording can only say that what happens looks like it. Whether it would look more like something else is
+asked of shapes that stand near the named ones, each with numbers that are fitted like an effect's:
+
+    memory      two lags (out and back, up and down), a lag or a delay that goes with the input's size, an actuator that rings, one that
+                boosts what changes, one that sticks and jumps, a loop, a gain that fades with what was asked lately, or ever
+    the input   a bend (cubic), steps
+
+A shape is never handed on: it has no name, belongs to no model that is saved, and runs over whole recordings only. Its scale is `most`, the
+largest size of its input, among its values.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.effects.input_effect import InputEffect
+from s2r_runtime.hookspecs import NominalModel, Parameter
+
+Array = NDArray[np.float64]
+Values = dict[str, float]
+Numbers = list[float]
+
+TIMES = (1.5, 4.0, 12.0, 40.0)
+"""Steps of the time constants from which a fit begins."""
+
+SMALL = 1e-6
+
+
+class Shape(InputEffect):
+    """An input (T,) -> what acts, (T,): `over`. memory: it depends on what was asked before."""
+
+    side_by_side = True
+
+    def __init__(
+        self,
+        name: str,
+        memory: bool,
+        parameters: tuple[Parameter, ...],
+        over: Callable[[Array, float, Values], Array | Numbers],
+        starts: Callable[[float, Sequence[float]], list[Values]],
+    ) -> None:
+        self.name = name
+        self.memory = memory
+        self.parameters = parameters
+        self._over = over
+        self._starts = starts
+
+    def within_step(self, dt: float, p: Values) -> bool:
+        """Memory goes on over the step."""
+        return self.memory
+
+    def hidden(self, n: int, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+        """(n, 1) with memory, (n, 0) without."""
+        return np.zeros((n, 1 if self.memory else 0))
+
+    def starts(self, u: Array, model: NominalModel, channel: str, dt: float, near: Sequence[float] = ()) -> list[Values]:
+        """Values from which a fit begins. u: (T, nu); near: times (s) that named effects on the channel take."""
+        most = float(np.max(np.abs(u[:, model.inputs.index(channel)]), initial=0.0))
+        times = [*(k * dt for k in TIMES), *(s for s in near if s > SMALL)]
+        return [{**p, "most": most} for p in self._starts(dt, times)] if most > 0.0 else []
+
+    def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+        """u (T, nu) or (T, runs, nu), from rest."""
+        j = model.inputs.index(channel)
+        after = u.copy()
+        if u.ndim == 2:
+            after[:, j] = self._over(u[:, j], dt, p)
+        else:
+            for run in range(u.shape[1]):
+                after[:, run, j] = self._over(u[:, run, j], dt, p)
+        return after
+
+
+def _two_lags(u: Array, dt: float, one: float, other: float, first: Callable[[float, float], bool]) -> Numbers:
+    """A first-order lag z with two time constants: the first one where first(u, z)."""
+    keep, keep_other = (math.exp(-dt / max(time_constant, SMALL)) for time_constant in (one, other))
+    z, acts = 0.0, []
+    for v in u.tolist():
+        before = z
+        z = v + (z - v) * (keep if first(v, z) else keep_other)
+        acts.append(0.5 * (before + z))
+    return acts
+
+
+def _mean(u: Array, dt: float, time_constant: float) -> Array:
+    """The same lag for all, averaged over each step: z_{k+1} - a z_k = (1 - a) u_k as one banded triangular solve."""
+    from scipy.linalg import lapack
+
+    keep = math.exp(-dt / max(time_constant, SMALL))
+    band = np.empty((2, len(u)))
+    band[0], band[1] = 1.0, -keep
+    after, _ = lapack.dtbtrs(band, ((1.0 - keep) * u)[:, None], uplo="L", diag="U")
+    z: Array = after[:, 0]
+    return np.asarray(0.5 * (z + np.append(0.0, z[:-1])))
+
+
+def _out_and_back(u: Array, dt: float, p: Values) -> Numbers:
+    return _two_lags(u, dt, p["out"], p["back"], lambda v, z: abs(v) > abs(z))
+
+
+def _up_and_down(u: Array, dt: float, p: Values) -> Numbers:
+    return _two_lags(u, dt, p["up"], p["down"], lambda v, z: v > z)
+
+
+def _lag_by_size(u: Array, dt: float, p: Values) -> Numbers:
+    time_constants = p["small"] + (p["large"] - p["small"]) * np.abs(u) / p["most"]
+    keeps = np.exp(-dt / np.maximum(time_constants, SMALL))
+    z, acts = 0.0, []
+    for v, keep in zip(u.tolist(), keeps.tolist(), strict=True):
+        before = z
+        z = v + (z - v) * keep
+        acts.append(0.5 * (before + z))
+    return acts
+
+
+def _delay_by_size(u: Array, dt: float, p: Values) -> Array:
+    at = np.arange(len(u)) - (p["small"] + (p["large"] - p["small"]) * np.abs(u) / p["most"]) / dt
+    low = np.floor(at)
+    part = at - low
+    first, second = (np.where(k >= 0, u[np.clip(k, 0, len(u) - 1).astype(int)], 0.0) for k in (low, low + 1.0))
+    return np.asarray((1.0 - part) * first + part * second)
+
+
+def _rings(u: Array, dt: float, p: Values) -> Numbers:
+    """z'' = w² (u - z) - 2 d w z', exact for a held u."""
+    w, d = p["rate"], p["damping"]
+    s = w * math.sqrt(max(1.0 - d * d, SMALL))
+    decay, c, sn = math.exp(-d * w * dt), math.cos(s * dt), math.sin(s * dt)
+    a11, a12 = decay * (c + d * w / s * sn), decay * sn / s
+    a21, a22 = -decay * w * w / s * sn, decay * (c - d * w / s * sn)
+    z, v, acts = 0.0, 0.0, []
+    for asked in u.tolist():
+        off = z - asked
+        before = z
+        z, v = asked + a11 * off + a12 * v, a21 * off + a22 * v
+        acts.append(0.5 * (before + z))
+    return acts
+
+
+def _boosts(u: Array, dt: float, p: Values) -> Array:
+    """u + share (u - its slow mean)."""
+    return np.asarray(u + p["share"] * (u - _mean(u, dt, p["time_constant"])))
+
+
+def _sticks(u: Array, dt: float, p: Values) -> Numbers:
+    reach = p["reach"] * p["most"]
+    z, acts = 0.0, []
+    for v in u.tolist():
+        if abs(v - z) > reach:
+            z = v
+        acts.append(z)
+    return acts
+
+
+def _loop(u: Array, dt: float, p: Values) -> Numbers:
+    """u less a part that follows its changes and saturates: h' = u'/w - |u'/w| h, exact for a change at a constant rate."""
+    share, width = p["share"] * p["most"], p["width"] * p["most"]
+    h, before, acts = 0.0, 0.0, []
+    for v in u.tolist():
+        d = (v - before) / width
+        before = v
+        side = 1.0 if d > 0.0 else -1.0
+        h = side + (h - side) * math.exp(-abs(d))
+        acts.append(v - share * h)
+    return acts
+
+
+def _fades(u: Array, dt: float, p: Values) -> Array:
+    warm = _mean((u / p["most"]) ** 2, dt, p["time_constant"])
+    return np.asarray(u / (1.0 + max(p["loss"], -0.9) * warm))
+
+
+def _tires(u: Array, dt: float, p: Values) -> Array:
+    spent = dt * (np.cumsum(np.abs(u)) - 0.5 * np.abs(u)) / p["most"]
+    return np.asarray(u * (1.0 - p["loss"] * np.tanh(spent / p["time_constant"])))
+
+
+def _bends(u: Array, dt: float, p: Values) -> Array:
+    return np.asarray(u * (p["gain"] + p["cubic"] * (u / p["most"]) ** 2))
+
+
+def _steps(u: Array, dt: float, p: Values) -> Array:
+    step = p["step"] * p["most"]
+    return np.asarray(step * np.rint(u / step))
+
+
+def _second(name: str, *, kink: bool = False) -> Parameter:
+    return Parameter(name, "s", 1e-6, 1e3, neutral=0.0, kink=kink)
+
+
+def _number(name: str, low: float, high: float, neutral: float | None = None, *, kink: bool = False) -> Parameter:
+    return Parameter(name, "", low, high, neutral=neutral, kink=kink)
+
+
+def _pairs(one: str, two: str) -> Callable[[float, Sequence[float]], list[Values]]:
+    return lambda dt, times: [{one: a * s, two: b * s} for s in times for a, b in ((0.6, 1.8), (1.8, 0.6))]
+
+
+SHAPES = (
+    Shape("two lags, out and back", True, (_second("out"), _second("back")), _out_and_back, _pairs("out", "back")),
+    Shape("two lags, up and down", True, (_second("up"), _second("down")), _up_and_down, _pairs("up", "down")),
+    Shape("a lag that goes with the size", True, (_second("small"), _second("large")), _lag_by_size, _pairs("small", "large")),
+    Shape(
+        "a delay that goes with the size",
+        True,
+        (_second("small", kink=True), _second("large", kink=True)),
+        _delay_by_size,
+        _pairs("small", "large"),
+    ),
+    Shape(
+        "an actuator that rings",
+        True,
+        (_number("rate", 1e-2, 1e4), _number("damping", 0.01, 0.999)),
+        _rings,
+        lambda dt, times: [{"rate": 1.0 / s, "damping": d} for s in times for d in (0.2, 0.7)],
+    ),
+    Shape(
+        "a boost of what changes",
+        True,
+        (_number("share", -1.0, 10.0, 0.0), _second("time_constant")),
+        _boosts,
+        lambda dt, times: [{"share": share, "time_constant": s} for s in times for share in (-0.4, 0.4)],
+    ),
+    Shape(
+        "sticking",
+        True,
+        (_number("reach", 0.0, 2.0, 0.0, kink=True),),
+        _sticks,
+        lambda dt, times: [{"reach": r} for r in (0.1, 0.2, 0.4, 0.7)],
+    ),
+    Shape(
+        "a loop",
+        True,
+        (_number("share", -1.0, 1.0, 0.0), _number("width", 0.02, 10.0)),
+        _loop,
+        lambda dt, times: [{"share": 0.2, "width": w} for w in (0.1, 0.3, 1.0)],
+    ),
+    Shape(
+        "fading with what was asked lately",
+        True,
+        (_number("loss", -0.9, 20.0, 0.0), _second("time_constant")),
+        _fades,
+        lambda dt, times: [{"loss": 0.5, "time_constant": k * dt} for k in (10.0, 40.0, 160.0, 640.0)],
+    ),
+    Shape(
+        "tiring with all that was asked",
+        True,
+        (_number("loss", -5.0, 1.0, 0.0), _second("time_constant")),
+        _tires,
+        lambda dt, times: [{"loss": 0.3, "time_constant": k * dt} for k in (100.0, 300.0, 1000.0)],
+    ),
+    Shape(
+        "a bend",
+        False,
+        (_number("gain", -2.0, 5.0, 1.0), _number("cubic", -5.0, 5.0, 0.0)),
+        _bends,
+        lambda dt, times: [{"gain": 1.0, "cubic": -0.2}],
+    ),
+    Shape(
+        "steps",
+        False,
+        (_number("step", 1e-3, 3.0, kink=True),),
+        _steps,
+        lambda dt, times: [{"step": s} for s in (0.1, 0.2, 0.35, 0.5, 0.8)],
+    ),
+)

@@ -1,0 +1,172 @@
+"""Names are challenged by shapes that have none: each shape is what it says, takes false names away, and costs true ones nothing."""
+
+import math
+
+import numpy as np
+import pytest
+from trace_robots import declared, recordings
+
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.trace.shapes import SHAPES
+from s2r_runtime.trace.tracer import trace
+
+DT = 0.02
+UNICYCLE = compose(ModelSpec("unicycle", DT))
+BY_NAME = {shape.name: shape for shape in SHAPES}
+
+
+def _asked(rows=400, runs=None):
+    rng = np.random.default_rng(3)
+    size = (rows // 20, *(() if runs is None else (runs,)), 2)
+    return np.repeat(rng.uniform(-0.8, 0.8, size), 20, axis=0)
+
+
+def _acts(name, u, **p):
+    return BY_NAME[name].input_sequence(u, UNICYCLE.nominal, "w", DT, {**p, "most": 0.8})
+
+
+def _library(name, u, **p):
+    model = compose(ModelSpec("unicycle", DT, {}, (EffectSpec(name, "w", p),)))
+    return model.effects[0].effect.input_sequence(u, model.nominal, "w", DT, p)
+
+
+@pytest.mark.parametrize(
+    ("name", "alike", "effect", "p"),
+    [
+        ("two lags, out and back", {"out": 0.3, "back": 0.3}, "input_lag", {"time_constant": 0.3}),
+        ("two lags, up and down", {"up": 0.3, "down": 0.3}, "input_lag", {"time_constant": 0.3}),
+        ("a lag that goes with the size", {"small": 0.3, "large": 0.3}, "input_lag", {"time_constant": 0.3}),
+        ("a boost of what changes", {"share": -1.0, "time_constant": 0.3}, "input_lag", {"time_constant": 0.3}),
+        ("a delay that goes with the size", {"small": 0.13, "large": 0.13}, "input_delay", {"delay": 0.13}),
+        ("a bend", {"gain": 0.7, "cubic": 0.0}, "input_gain", {"gain": 0.7}),
+    ],
+    ids=["out and back", "up and down", "by size", "boost", "delay", "bend"],
+)
+def test_a_shape_that_has_a_named_effect_in_it_is_that_effect_there(name, alike, effect, p):
+    """The mean of a lag over a step by the trapezium: off by (dt/T)²/12 of a change, at most 1.6 here."""
+    u = _asked()
+    off = np.abs(_acts(name, u, **alike) - _library(effect, u, **p))
+    assert np.max(off) <= 1.6 * (DT / 0.3) ** 2 / 12.0 + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("name", "p"),
+    [
+        ("two lags, out and back", {"out": 0.0, "back": 0.0}),
+        ("a boost of what changes", {"share": 0.0, "time_constant": 0.3}),
+        ("sticking", {"reach": 0.0}),
+        ("a loop", {"share": 0.0, "width": 0.3}),
+        ("fading with what was asked lately", {"loss": 0.0, "time_constant": 1.0}),
+        ("tiring with all that was asked", {"loss": 0.0, "time_constant": 1.0}),
+        ("a bend", {"gain": 1.0, "cubic": 0.0}),
+    ],
+)
+def test_a_shape_of_no_size_changes_nothing_but_within_a_step(name, p):
+    u = _asked()
+    off = np.flatnonzero(np.abs(_acts(name, u, **p)[:, 1] - u[:, 1]) > 1e-12)
+    assert set(off) <= set(np.flatnonzero(np.diff(u[:, 1], prepend=0.0)))
+    assert np.array_equal(_acts(name, u, **p)[:, 0], u[:, 0])
+
+
+def _fine(u, rule, parts=200):
+    """Means over steps of an actuator that a rule moves on through many parts of a step."""
+    means, state = [], {}
+    for v in u:
+        acts = [rule(v, state, DT / parts) for _ in range(parts)]
+        means.append(np.mean(acts))
+    return np.array(means)
+
+
+def _ring(v, s, h):
+    s.setdefault("z", 0.0), s.setdefault("d", 0.0)
+    s["d"] += h * (100.0 * (v - s["z"]) - 2.0 * 0.3 * 10.0 * s["d"])
+    s["z"] += h * s["d"]
+    return s["z"]
+
+
+def _fade(v, s, h):
+    s["z"] = s.get("z", 0.0) + h / 0.8 * ((v / 0.8) ** 2 - s.get("z", 0.0))
+    return v / (1.0 + 0.9 * s["z"])
+
+
+def _tire(v, s, h):
+    s["z"] = s.get("z", 0.0) + h * abs(v) / 0.8
+    return v * (1.0 - 0.4 * math.tanh(s["z"] / 3.0))
+
+
+def _back(v, s, h):
+    z = s.get("z", 0.0)
+    s["z"] = z + h * (v - z) / (0.1 if abs(v) > abs(z) else 0.4)
+    return s["z"]
+
+
+@pytest.mark.parametrize(
+    ("name", "p", "rule", "tolerance"),
+    [
+        ("an actuator that rings", {"rate": 10.0, "damping": 0.3}, _ring, 0.02),  # (w dt)²/12 of 1.6 a step, rung up by 1/(2 d)
+        ("fading with what was asked lately", {"loss": 0.9, "time_constant": 0.8}, _fade, 0.005),
+        ("tiring with all that was asked", {"loss": 0.4, "time_constant": 3.0}, _tire, 0.001),
+        ("two lags, out and back", {"out": 0.1, "back": 0.4}, _back, 0.12),  # |v| and |z| may cross within a step: dt (1/.1 - 1/.4) |v - z|
+    ],
+)
+def test_a_shape_is_what_many_small_steps_make_of_it(name, p, rule, tolerance):
+    u = _asked(200)
+    assert np.max(np.abs(_acts(name, u, **p)[:, 1] - _fine(u[:, 1], rule))) < tolerance
+
+
+def test_a_loop_closes_on_itself_whatever_the_pace():
+    """Up and down twice, fast and slowly: the second round is the first, but for what its first rise lacked (exp(-0.8/0.32) of the share);
+    and the way back is not the way there.
+    """
+    there = np.concatenate([np.linspace(0.0, 0.8, 50), np.linspace(0.8, -0.8, 100), np.linspace(-0.8, 0.8, 100)])
+    slow = np.column_stack([0.0 * there, there])
+    acts = _acts("a loop", np.concatenate([slow, np.repeat(slow[50:], 3, axis=0)]), share=0.3, width=0.4)[:, 1]
+    first, again = acts[50:250], acts[250:][2::3]
+    assert np.max(np.abs(first - again)) < 0.3 * 0.8 * math.exp(-0.8 / 0.32)
+    middle = np.argmin(np.abs(there[50:150])), 100 + np.argmin(np.abs(there[150:250]))
+    assert first[middle[0]] - first[middle[1]] > 0.38
+
+
+@pytest.mark.parametrize("name", sorted(BY_NAME))
+def test_runs_side_by_side_are_the_runs_one_by_one(name):
+    u = _asked(200, runs=3)
+    p = BY_NAME[name].starts(u[:, 0], UNICYCLE.nominal, "w", DT, (0.1,))[-1]
+    together = BY_NAME[name].input_sequence(u, UNICYCLE.nominal, "w", DT, p)
+    for i in range(3):
+        assert np.array_equal(together[:, i], BY_NAME[name].input_sequence(u[:, i], UNICYCLE.nominal, "w", DT, p))
+
+
+@pytest.mark.parametrize(
+    ("physics", "token"),
+    [
+        (("uneven_lag", "w", {"out": 0.1, "back": 0.5}), "memory(w)"),
+        (("ringing", "w", {"rate": 9.0, "damping": 0.2}), "memory(w)"),
+        (("warming", "w", {"loss": 2.0, "time_constant": 2.0}), "memory(w)"),
+        (("cubic", "w", {"share": -0.5}), "w"),
+    ],
+    ids=["uneven lag", "ringing", "warming", "cubic"],
+)
+def test_what_only_looks_like_an_effect_gets_no_name(physics, token):
+    for data in recordings([physics], 2, steps=1200, seed=61):
+        found = trace(data, declared())
+        assert found.verdict == "unexplained"
+        assert found.depends_on[0] == token
+        assert not found.effects
+
+
+@pytest.mark.parametrize(
+    "physics",
+    [
+        ("input_lag", "w", {"time_constant": 0.25}),
+        ("input_delay", "w", {"delay": 0.12}),
+        ("input_saturation", "w", {"low": -1.5, "high": 1.8}),
+        ("deadband", "w", {"width": 0.4}),
+    ],
+    ids=["lag", "delay", "saturation", "deadband"],
+)
+def test_a_name_that_is_right_stands(physics):
+    for data in recordings([physics], 2, steps=1200, seed=62):
+        found = trace(data, declared())
+        assert found.verdict == "traced"
+        assert [(e.name.removeprefix("input_"), e.channel) for e in found.effects] == [(physics[0].removeprefix("input_"), "w")]
