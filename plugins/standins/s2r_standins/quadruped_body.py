@@ -125,7 +125,8 @@ class Quadruped:
         """Walks for `seconds` (whole ms) under this command, clipped to the sheet's limits; where it then is. What fell stays down."""
         v = min(max(v, -self.sheet.v_max), self.sheet.v_max)
         w = min(max(w, -self.sheet.w_max), self.sheet.w_max)
-        self._pending.append((self._ms + self._delay_ms, (v, w)))
+        at = self._ms + self._delay_ms
+        self._pending = [*(entry for entry in self._pending if entry[0] < at), (at, (v, w))]
         end = self._ms + round(1000.0 * seconds)
         while self._ms < end:
             if self._pending and self._pending[0][0] <= self._ms:
