@@ -108,9 +108,9 @@ def fade(rng: Rng, s: Scale, size: float) -> Drawn:
 
 
 def cross_square(rng: Rng, s: Scale, size: float) -> Drawn:
-    """The gain of one input falls with the square of the other."""
+    """The gain of one input falls with the square of the other. (A car's steering that does so understeers: that has a name.)"""
     c = an_input(rng, s)
-    other = another(s, c)
+    c, other = (another(s, c), c) if c.name == "steer_cmd" else (c, another(s, c))
     loss = min(0.6 * size, 0.95)
 
     def f(m: Moment, a: Numbers, z: Numbers) -> None:
