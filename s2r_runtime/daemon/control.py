@@ -209,7 +209,7 @@ class ControlServer:
         except OSError:  # it hung up already, or we are out of descriptors: the listener stays
             return
         sock.setblocking(False)
-        uid = struct.unpack("3i", sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i")))[1]
+        uid = _peer(sock)
         client = Connection(self, sock, uid, time.monotonic_ns() + REQUEST_WITHIN_NS)
         self._selector.register(sock, selectors.EVENT_READ, client.ready)
         self._clients.append(client)
@@ -217,6 +217,11 @@ class ControlServer:
             client.answer(2, f"user {uid} may not talk to this daemon; it belongs to user {os.getuid()}")
         elif len(self._clients) > CLIENTS_MAX:
             client.answer(70, "too many clients at once; try again")
+
+
+def _peer(sock: socket.socket) -> int:
+    """The user at the other end, as the kernel has it from when he connected, or began to listen."""
+    return int(struct.unpack("3i", sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i")))[1])
 
 
 def _check_owner(folder: Path) -> None:
@@ -261,6 +266,8 @@ def call(path: Path, request: Request, on_progress: Callable[[Request], None] | 
         sock.settimeout(FIRST_LINE_WITHIN_S)
         try:
             sock.connect(str(path))
+            if (whose := _peer(sock)) not in (0, os.geteuid()) and os.geteuid() != 0:
+                raise UsageError(f"{path}: whoever listens there is user {whose}, and no daemon of yours; nothing was said to him")
             sock.sendall(json.dumps(request).encode() + b"\n")
             with sock.makefile("rb") as lines:
                 for line in lines:

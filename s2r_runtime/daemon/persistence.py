@@ -25,6 +25,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from s2r_runtime import keys
 from s2r_runtime.canonical import canonical, digest
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import MEMORY_SCHEMA, Memory
@@ -43,7 +44,10 @@ class StateFolder:
         self.path, self.robot = path, robot
         try:
             path.mkdir(mode=0o700, parents=True, exist_ok=True)
-            if path.stat().st_mode & 0o022:
+            status = path.stat()
+            if status.st_uid not in (0, os.geteuid()):
+                raise ConfigError(f"{path}: belongs to user {status.st_uid}; a robot's state must be this user's ({os.geteuid()}) own")
+            if status.st_mode & 0o022:
                 raise ConfigError(f"{path}: others than its owner can write to it, so they could forge what was spent; chmod 700 it")
             self._lock = lock(path / "lock", wait=False)
         except BlockingIOError:
@@ -60,7 +64,7 @@ class StateFolder:
         ConfigError if the state is damaged, of another robot or schema, or missing although there are such signs.
         """
         file = self.path / "state.json"
-        if not file.exists():
+        if not (file.exists() or file.is_symlink()):
             self._refuse_a_past(signs)
             return Memory(robot=self.robot, schema=MEMORY_SCHEMA)
         memory = unseal(read(file), "state", Memory, str(file))
@@ -88,7 +92,7 @@ class StateFolder:
     def campaign(self) -> dict[str, Any] | None:
         """The unfinished campaign's snapshot, or None. Raises ConfigError if it is damaged or another robot's."""
         file = self.path / "campaign.json"
-        if not file.exists():
+        if not (file.exists() or file.is_symlink()):
             return None
         kept = unseal(read(file), "campaign", dict[str, Any], str(file))
         if kept.get("robot") != self.robot or not isinstance(kept.get("snapshot"), dict):
@@ -154,7 +158,8 @@ def unseal(data: bytes, kind: str, content: type[T], where: str) -> T:
 
 
 def read(file: Path) -> bytes:
-    """The file's bytes. Raises ConfigError if it can't be read or is far too big."""
+    """The file's bytes. Raises ConfigError if it can't be read, is far too big, no file of its own, or others could have written it."""
+    keys.check_own(file, "this")
     try:
         if (size := file.stat().st_size) > FILE_MAX:
             raise ConfigError(f"{file}: has {size} bytes, more than any file of its kind")
