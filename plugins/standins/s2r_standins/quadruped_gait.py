@@ -13,7 +13,7 @@ rest it stands. With (v, w) the command, slewed, and (V, U, W) forward, sideways
                a leg takes its share up and gives it off over the first and last RAMP of its stance
     slope      a lean that lasts is the floor's: it is not fought, and feet touch down that much downhill, plumb under the trunk
 
-(0, 0) for a whole stride: all four feet stay down at the next double support, and the phase waits. Scalars only: at 1 kHz an array of four
+(0, 0) for a whole stride: all four feet stay down at the next double support, the phase waits, and trims are forgotten. Scalars only: at 1 kHz an array of four
 costs more than its four numbers. Every stride has a period and a touch-down error of its own, drawn from `rng`.
 """
 
@@ -225,7 +225,7 @@ class Gait:
         double = SWING + 0.5 * (0.5 - SWING)
         if self._still > PERIOD and (before < double <= self._phase or before < double + 0.5 <= self._phase):
             self._moving = False
-            self._c[0] = self._c[1] = 0.0
+            self._c = [0.0] * 5  # trims too: what one walk needed says little about the next
 
     def _lift_off(self, i: int) -> None:
         self._swinging[i] = True
