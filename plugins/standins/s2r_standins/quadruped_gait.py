@@ -13,8 +13,8 @@ rest it stands. With (v, w) the command, slewed, and (V, U, W) forward, sideways
                a leg takes its share up and gives it off over the first and last RAMP of its stance
     slope      a lean that lasts is the floor's: it is not fought, and feet touch down that much downhill, plumb under the trunk
 
-(0, 0) for a whole stride: all four feet stay down at the next double support, the phase waits, and trims are forgotten. Scalars only: at 1 kHz an array of four
-costs more than its four numbers. Every stride has a period and a touch-down error of its own, drawn from `rng`.
+(0, 0) for a whole stride: all four feet stay down at the next double support, the phase waits, and trims are forgotten. Every stride has
+a period and a touch-down error of its own, drawn from `rng`. Scalars only: at 1 kHz an array of four costs more than its four numbers.
 """
 
 from __future__ import annotations
