@@ -6,6 +6,7 @@ import math
 import random
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from s2r_standins.quadruped import ROBOT
@@ -261,6 +262,16 @@ def test_a_fall_is_told_and_stays_told(robot: Quadruped) -> None:
     assert robot.trouble == robot.fallen != ""
     assert robot.joints()[2] < HEIGHT - 0.05
     robot.reset(1)
+    assert robot.fallen == ""
+
+
+def test_physics_that_fail_are_a_fall(robot: Quadruped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # the engine leaves a log of it where it runs
+    robot.data.qvel[0] = math.nan
+    robot.step(0.1, 0.0, 0.1)
+    assert robot.fallen.startswith("fell: trunk at nan m")
+    robot.reset(1)
+    assert robot.step(0.1, 0.0, 1.0)[0] > 0.0
     assert robot.fallen == ""
 
 
