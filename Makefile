@@ -5,12 +5,13 @@
 # make bench  the figures that the docs state, as ratios in one run
 # make robotarium-experiment  the paper's experiment, reading by reading, with its figures on one page (robotarium-experiment.html)
 # make bench-trace  the tracer on seeded recordings that it has never seen, in some 15 minutes; SETS="--seeds 0:5 --failures" for others
+# make bench-quadruped  two and a half simulated hours of walking: falls, tracking, and how fast the simulation is
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: run test test-long check bench bench-trace robotarium-experiment format clean wheels setup
+.PHONY: run test test-long check bench bench-trace bench-quadruped robotarium-experiment format clean wheels setup
 
 run: $(STAMP)
 	$(BIN)/s2r demo
@@ -46,6 +47,9 @@ bench-trace: $(STAMP)
 	@$(BIN)/python -c 'import importlib.util, sys; sys.exit(importlib.util.find_spec("pysindy") is None)' || \
 	    $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
 	$(BIN)/python tools/bench_trace.py $(SETS)
+
+bench-quadruped: $(STAMP)
+	$(BIN)/python tools/bench_quadruped.py
 
 format: $(STAMP)
 	$(BIN)/ruff format .
