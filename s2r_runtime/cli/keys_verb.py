@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from s2r_runtime.cli import output
+from s2r_runtime.cli.choices import count
 from s2r_runtime.errors import S2RError, UsageError
 
 
@@ -35,6 +36,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--state", type=Path, metavar="DIR", help="on the list of this robot only (default: the user's, for all his robots)"
     )
     revoke.set_defaults(run=keys_revoke)
+    tls = keys.add_parser("tls", help="certificates for links: an authority of a site's own, and one certificate for each name")
+    tls.add_argument("folder", type=Path, metavar="DIR", help="where; an authority that is there signs the new ones too")
+    tls.add_argument("names", nargs="+", metavar="NAME", help="who speaks on the network, such as runtime, robot, operator")
+    tls.add_argument("--host", action="append", default=[], metavar="H", help="address or name they are connected to at; may be repeated")
+    tls.add_argument("--days", type=count, default=365, metavar="N", help="how long they are valid (default 365)")
+    tls.set_defaults(run=keys_tls)
 
 
 def keys_new(args: argparse.Namespace) -> int:
@@ -109,6 +116,18 @@ def keys_list(args: argparse.Namespace) -> int:
         output.out(f"{one['use']:8s} {one['fingerprint'] or '?':40s} {one['path']}" + _told(one))
     if not found:
         output.out(f"no keys in {', '.join(map(str, folders))}; make one: s2r keys new")
+    return 0
+
+
+def keys_tls(args: argparse.Namespace) -> int:
+    """Exit 0 when they are there."""
+    from s2r_runtime import tls
+
+    for path in tls.make(args.folder, args.names, args.host, args.days or tls.DAYS):
+        output.out(f"{path.stem:12s} {path}, {path.with_suffix('.key').name}")
+    output.out(
+        f"authority    {args.folder / 'site.pem'}  (to everybody; keep site.key where nothing else runs: who has it makes himself anybody)"
+    )
     return 0
 
 

@@ -26,9 +26,18 @@ if TYPE_CHECKING:
     import zenoh
 
 
-def session_config(listen: str, connect: str, lease_s: float, rules: list[dict[str, Any]], file: str) -> zenoh.Config:
-    """Configuration of one side's session. rules: what may pass (see `allow`). file: a Zenoh configuration to start from (for
-    certificates and passwords); what keeps others out is set after it. Raises ConfigError if the file can't be used.
+def session_config(
+    listen: str,
+    connect: str,
+    lease_s: float,
+    rules: list[dict[str, Any]],
+    file: str,
+    subject: dict[str, Any] | None = None,
+    more: dict[str, Any] | None = None,
+) -> zenoh.Config:
+    """Configuration of one side's session. rules: what may pass (see `allow`), and subject: for whom (default: every link). file: a Zenoh
+    configuration to start from (for certificates and passwords); what keeps others out is set after it, and `more` last. Raises
+    ConfigError if the file can't be used.
 
     A session that connects is a router toward what it connects to: routers do not forward between two peers, and a client's
     open() would wait for its router.
@@ -39,12 +48,13 @@ def session_config(listen: str, connect: str, lease_s: float, rules: list[dict[s
         config = zenoh.Config.from_file(file) if file else zenoh.Config()
     except zenoh.ZError as error:
         raise ConfigError(f"{Path(file)}: not a Zenoh configuration: {error}") from None
+    whom = subject or {"id": "every_link"}
     access = {
         "enabled": True,
         "default_permission": "deny",
         "rules": rules,
-        "subjects": [{"id": "every_link"}],
-        "policies": [{"rules": [rule["id"] for rule in rules], "subjects": ["every_link"]}],
+        "subjects": [whom],
+        "policies": [{"rules": [rule["id"] for rule in rules], "subjects": [whom["id"]]}],
     }
     settings = {
         "mode": "router" if connect else "peer",
@@ -62,6 +72,7 @@ def session_config(listen: str, connect: str, lease_s: float, rules: list[dict[s
         "adminspace/enabled": False,
         "transport/link/tx/lease": round(1000 * lease_s),
         "access_control": access,
+        **(more or {}),
     }
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))

@@ -20,6 +20,7 @@ import msgspec
 
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import Command, Frame, LinkChanged, LogHead
+from s2r_zenoh import tls
 from s2r_zenoh.sessions import Doorbell, Inbox, allow, session_config
 from s2r_zenoh.wire import Decoded, Wire
 
@@ -41,6 +42,11 @@ DEFAULTS: dict[str, Any] = {
     "queue": 64,
     "robot_config": "",
     "controller_config": "",
+    "tls_ca": "",
+    "tls_certificate": "",
+    "tls_key": "",
+    "robot_names": [],
+    "controller_names": [],
 }
 
 
@@ -58,6 +64,7 @@ class ZenohTransport:
         "queue": f"observations kept for a runtime that is late; older ones are dropped and counted (default {DEFAULTS['queue']})",
         "robot_config": "Zenoh configuration file to start from on the robot's side (certificates, passwords)",
         "controller_config": "the same on the other side",
+        **tls.OPTIONS,
     }
 
     def __init__(self, options: dict[str, Any], states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
@@ -120,7 +127,8 @@ class ZenohTransport:
         import zenoh
 
         listen, connect = self._options[f"{side}_listen"], self._options[f"{side}_connect"]
-        config = session_config(listen, connect, lease_s, rules, self._options[f"{side}_config"])
+        whom, secured = tls.subject(self._options[f"{side}_names"]), tls.settings(self._options)
+        config = session_config(listen, connect, lease_s, rules, self._options[f"{side}_config"], whom, secured)
         try:
             session = zenoh.open(config)
         except zenoh.ZError as error:
@@ -254,7 +262,7 @@ def _checked(given: dict[str, Any]) -> dict[str, Any]:
             raise ConfigError(f"transport.{name} is not an option of the zenoh transport; {hint}")
         wanted = (int, float) if isinstance(DEFAULTS[name], float) else type(DEFAULTS[name])
         if isinstance(value, bool) or not isinstance(value, wanted):
-            kind = {str: "text", int: "a whole number", float: "a number"}[type(DEFAULTS[name])]
+            kind = {str: "text", int: "a whole number", float: "a number", list: "a list of text"}[type(DEFAULTS[name])]
             raise ConfigError(f"transport.{name} is {value!r}, must be {kind}")
     options = {**DEFAULTS, **given}
     for name in ("robot_listen", "robot_connect", "controller_listen", "controller_connect"):
@@ -275,4 +283,5 @@ def _checked(given: dict[str, Any]) -> dict[str, Any]:
             f"transport: robot and controllers share {shared.pop()}; whoever reaches both carries commands past the gate, "
             "so each side needs an endpoint or router of its own"
         )
+    tls.check(options)
     return options
