@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from s2r_runtime.revocations import Revocation
 
 
+CLOCK_S = 60
+"""By which a certificate's time of issue may differ from the newest reading of the wall clock; readings come every second."""
+
+
 class Certificates:
     """Of all runs."""
 
@@ -51,11 +55,12 @@ class Certificates:
         horizon: Callable[[], int],
         attachments: Mapping[str, Attached],
         trusted: tuple[bytes, ...],
+        unix_s: int,
     ) -> None:
-        """A certificate is in force. trusted: keys whose signature counts; the log's own first."""
+        """A certificate is in force. trusted: keys whose signature counts; the log's own first. unix_s: the log's wall clock."""
         identity = event.facts.id
         try:
-            note = self._judged(event, profile, settings, horizon, attachments, trusted)
+            note = self._judged(event, profile, settings, horizon, attachments, trusted, unix_s)
             valid = True
         except (ConfigError, NotEnoughEvidence) as error:
             note, valid = str(error), False
@@ -77,6 +82,7 @@ class Certificates:
         horizon: Callable[[], int],
         attachments: Mapping[str, Attached],
         trusted: tuple[bytes, ...],
+        unix_s: int,
     ) -> str:
         """Why it stands. Raises ConfigError with why it doesn't."""
         data = attachments.get(f"certificate/{event.facts.id}")
@@ -93,6 +99,7 @@ class Certificates:
             raise ConfigError(problem)
         if elsewhere:
             known = "a trusted key" if signer in trusted else f"key {keys.fingerprint(signer)}, not compared with a trusted one"
+            self._findings.lack(f"the evidence of certificate {event.facts.id}, which was made elsewhere")
             return f"signed elsewhere by {known}; its evidence is not in this log"
         order, traced = self._orders.get(event.request_id, (None, False))
         if order is None:
@@ -104,6 +111,8 @@ class Certificates:
             raise ConfigError("the controller that it is of is not attached")
         if certificate.profile_digest != settings.profile_digest:
             raise ConfigError("it is of another profile")
+        if abs(certificate.issued_unix_s - unix_s) > CLOCK_S:
+            raise ConfigError(f"it says that it was issued at {certificate.issued_unix_s} s, and the log's clock was at {unix_s} s")
         again = certificates.issue(
             profile=profile,
             controller=controller,

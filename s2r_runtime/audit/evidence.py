@@ -13,6 +13,7 @@ from s2r_runtime.bounds import clopper_pearson_upper
 from s2r_runtime.canonical import digest_of
 from s2r_runtime.controllers.file import ControllerFile
 from s2r_runtime.core import ledger
+from s2r_runtime.core.gaps import REFUTED
 from s2r_runtime.daemon import jobs
 from s2r_runtime.daemon.worker import Failed, GapJob, Progress, Result, VerifyJob, Worker
 from s2r_runtime.errors import S2RError
@@ -51,8 +52,22 @@ class Evidence:
         self._verifications: dict[str, str] = {}
         self._in_force: dict[int, Gap] = {}
         self._epochs = self._attempts = 0
+        self._kept: Memory | None = None
+        self._saving: Memory | None = None
 
-    # ---- what is spent
+    # ---- what lasts, and what is spent
+
+    def persisted(self, memory: Memory) -> None:
+        """This is saved, and what a later run may not forget; as soon as another event shows that the daemon got that far."""
+        self._saving = memory
+
+    def settled(self) -> None:
+        """An event is recorded."""
+        self._kept, self._saving = self._saving or self._kept, None
+
+    def doubted(self) -> None:
+        """The disk did not take the log or the state: what the log says was kept may not have been."""
+        self._kept = self._saving = None
 
     def begin_run(self, entry: Entry, memory: Memory) -> None:
         """A run begins with this memory: it may not forget what an earlier run spent."""
@@ -63,7 +78,11 @@ class Evidence:
             self._findings.differ(
                 entry.index, entry.channel, "the memory forgets epochs or attempts that an earlier log spent", found, told
             )
-        self._epochs, self._attempts = memory.epochs, memory.attempts
+        elif forgotten := _forgotten(self._kept, memory):
+            self._findings.differ(entry.index, entry.channel, f"the memory forgets {forgotten}", memory, self._kept)
+        elif self._kept is not None and (cleared := set(self._kept.latched) - set(memory.latched)):
+            self._findings.lack(f"who cleared {', '.join(sorted(cleared))}, in a log between two of those that were given")
+        self._epochs, self._attempts, self._kept = memory.epochs, memory.attempts, memory
         gap = memory.gap
         if gap is None:
             return
@@ -189,6 +208,25 @@ class Evidence:
 
     def _differ(self, entry: Entry, what: str, recorded: object, recomputed: object) -> None:
         self._findings.differ(entry.index, entry.channel, what, recorded, recomputed)
+
+
+def _forgotten(before: Memory | None, now: Memory) -> str:
+    """What an earlier run kept and this one does not know, of what only ever grows, or empty. Runs between may be missing."""
+    if before is None or before.robot != now.robot:
+        return ""
+    if lost := before.revoked.keys() - now.revoked.keys():
+        return f"that certificate {min(lost)} was revoked"
+    if len(now.refuted) < REFUTED and not set(before.refuted) <= set(now.refuted):
+        return "samples whose gap was refuted or outgrown"
+    if before.gap is None or now.gap is None or before.gap.epoch != now.gap.epoch:
+        return ""
+    if before.alarm_epoch == before.gap.epoch != now.alarm_epoch:
+        return f"that the watch refuted the gap of epoch {now.gap.epoch}"
+    if now.radius < before.radius:
+        return f"that the gap grew to {before.radius}"
+    if now.watch_n < before.watch_n or now.watch_exceedances < before.watch_exceedances:
+        return f"discrepancies of epoch {now.gap.epoch}: {before.watch_n} were counted"
+    return ""
 
 
 def _contradiction(v: Verification, job: StartJob, safety: dict[str, list[float]], profile: Profile) -> str:

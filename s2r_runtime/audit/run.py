@@ -17,6 +17,7 @@ from s2r_runtime.audit.inputs import InputsReplay
 from s2r_runtime.audit.traces import RELEVANT, Traces
 from s2r_runtime.audit.watch import WatchReplay
 from s2r_runtime.canonical import digest
+from s2r_runtime.core.state import unix_now
 from s2r_runtime.daemon.model_store import parse_model
 from s2r_runtime.daemon.settings import ModelFacts, settings_of
 from s2r_runtime.errors import ConfigError
@@ -38,6 +39,7 @@ from s2r_runtime.messages import (
     Observation,
     Observed,
     Output,
+    Persist,
     Proposed,
     RecorderChanged,
     Revoked,
@@ -147,6 +149,7 @@ class RunAudit:
 
     def _take(self, entry: Entry, event: Event) -> None:
         self._event = event
+        self._evidence.settled()
         if isinstance(event, Started):
             self._begin(entry, event)
         if self._frames is not None:
@@ -194,6 +197,7 @@ class RunAudit:
                 self._watch.analytics(up=up)
             case RecorderChanged(ok=False):
                 self._campaigns.doubted()
+                self._evidence.doubted()
             case CertificateStored():
                 self._stored(entry, event)
             case _:
@@ -231,7 +235,8 @@ class RunAudit:
         if self._profile is None or settings is None or self._reading is None:
             return
         trusted = (self._reading.public_key, *self._trusted)
-        self._certificates.stored(entry, event, self._profile, settings, self._horizon, self._attached(), trusted)
+        now = unix_now(self._core.state)
+        self._certificates.stored(entry, event, self._profile, settings, self._horizon, self._attached(), trusted, now)
 
     # ---- outputs, as they take effect
 
@@ -270,6 +275,8 @@ class RunAudit:
                 self._certificates.issuing(output, traced=state.memory.traced)
             case EpochChanged() | AttemptSpent():
                 self._evidence.spent(entry, output, settings.beta)
+            case Persist():
+                self._evidence.persisted(output.memory)
             case Revoked():
                 self._certificates.revoked(output)
             case ModelAdopted(digest=adopted):

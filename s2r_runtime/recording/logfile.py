@@ -8,9 +8,11 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import threading
 import time
 import zlib
 from array import array
+from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -78,6 +80,8 @@ class LogFile:
         self.opened_s = 0.0
         self._path, self._run, self._signer, self._about = path, run, signer, dict(about)
         self._fd = -1
+        self._aside: deque[_Part] = deque()
+        self._completing = threading.Lock()
         self._crc = self._sealed_ns = 0
         self._file = hashlib.sha256()
         self._seal = self._unwritten = b""
@@ -121,31 +125,50 @@ class LogFile:
         self.chunks += 1
         self.recorded, self._written = block.seal_index + 1, self.head
 
-    def sync(self, *, all_of_it: bool) -> None:
-        """Returns once what was written is on the disk; all_of_it: the file's own times too."""
+    def sync(self) -> None:
+        """Returns once what was written is on the disk, in the parts that were set aside too."""
+        for part in tuple(self._aside):
+            part.sync()
         if self._fd >= 0:
-            reached = self._written, len(self.parts), self.recorded
-            (os.fsync if all_of_it else os.fdatasync)(self._fd)
+            reached = self._reached()
+            os.fsync(self._fd)
+            self.synced(reached)
+
+    def unsynced(self) -> tuple[int, tuple[bytes, int, int]] | None:
+        """A descriptor of its own, and how far the disk has the log once that is synced; None if the disk has all of it."""
+        reached = self._reached()
+        return None if self._fd < 0 or reached == self.anchor else (os.dup(self._fd), reached)
+
+    def synced(self, reached: tuple[bytes, int, int]) -> None:
+        """The disk has the log so far, at least."""
+        if reached[2] >= self.anchor[2]:
             self.anchor = reached
 
+    def all_synced(self) -> None:
+        """Every part is whole, and on the disk."""
+        self.synced(self._reached())
+
+    def _reached(self) -> tuple[bytes, int, int]:
+        return self._written, len(self.parts), self.recorded
+
+    def set_aside(self) -> None:
+        """The part holds all its data. What follows, an index that may take a second, is left to `complete`: the next part can begin."""
+        self._aside.append(_Part(self._fd, self.size, self._crc, self._schemas, self._channels))
+        self._fd = -1
+
     def complete(self) -> None:
-        """Writes what follows the data, and closes the part. After an error the file ends with the data, as before."""
-        data_end = self.size
-        try:
-            for piece in tail(self._read_at, data_end, self._crc, self._schemas, self._channels):
-                self._append(piece)
-                time.sleep(0)  # the index of a long log takes a second: other threads get their turn
-            os.fsync(self._fd)
-            self.anchor = self._written, len(self.parts), self.recorded
-        except OSError:
-            self.size = data_end
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._fd, data_end)
-            raise
-        self.abandon()
+        """Writes what follows the data of parts that were set aside, and closes them. After an error a file ends with its data."""
+        with self._completing:
+            while self._aside:
+                part = self._aside[0]
+                part.complete()
+                self._aside.popleft()
 
     def abandon(self) -> None:
-        """Closes the part as it is."""
+        """Closes everything as it is."""
+        for part in self._aside:
+            os.close(part.fd)
+        self._aside.clear()
         if self._fd >= 0:
             os.close(self._fd)
         self._fd = -1
@@ -166,21 +189,57 @@ class LogFile:
         compressor = None if block.end else self._compressor
         return b"".join([*block.prefix, chunk(bytes(block.content), block.index, first, last, compressor)])
 
-    def _read_at(self, length: int, offset: int) -> bytes:
-        return os.pread(self._fd, length, offset)
-
     def _append(self, data: bytes) -> None:
         """All of it or nothing: after an error the file is cut back to where it was."""
-        view, at = memoryview(data), self.size
         try:
-            while view:
-                written = os.pwrite(self._fd, view, at)
-                view, at = view[written:], at + written
+            self.size = _write(self._fd, data, self.size)
         except OSError:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._fd, self.size)
             raise
-        self.size = at
+
+
+class _Part:
+    """A part whose data are all there. `closed`: and it is whole, and on the disk."""
+
+    def __init__(self, fd: int, end: int, crc: int, schemas: Mapping[int, bytes], channels: Mapping[int, bytes]) -> None:
+        self.fd, self.closed = fd, False
+        self._end, self._crc, self._schemas, self._channels = end, crc, schemas, channels
+
+    def complete(self) -> None:
+        """Writes what follows the data."""
+        at = self._end
+        try:
+            for piece in tail(self._read_at, self._end, self._crc, self._schemas, self._channels):
+                at = _write(self.fd, piece, at)
+                time.sleep(0)  # the index of a long log takes a second: other threads get their turn
+            os.fsync(self.fd)
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self.fd, self._end)
+            raise
+        self.closed = True
+        os.close(self.fd)
+
+    def sync(self) -> None:
+        """Returns once the data are on the disk."""
+        try:
+            os.fsync(self.fd)
+        except OSError:
+            if not self.closed:  # by another thread, between two lines; then they are
+                raise
+
+    def _read_at(self, length: int, offset: int) -> bytes:
+        return os.pread(self.fd, length, offset)
+
+
+def _write(fd: int, data: bytes, at: int) -> int:
+    """Writes all of it; where it ends."""
+    view = memoryview(data)
+    while view:
+        written = os.pwrite(fd, view, at)
+        view, at = view[written:], at + written
+    return at
 
 
 def _sync_folder(path: Path) -> None:

@@ -23,8 +23,8 @@ RETRY_S = 0.2
 """After a failed write."""
 STALLED_S = 0.5
 """Older than that and not in the file: the disk (or the thread) hangs."""
-SYNC_S = 5.0
-"""How much of the log a power cut may take, where nothing asked for more."""
+SYNC_S = 0.05
+"""Between two syncs, by a thread of their own: with a chunk's time what a power cut may take, where nothing asked for more."""
 
 
 class Health(NamedTuple):
@@ -39,25 +39,28 @@ class Health(NamedTuple):
 
 class Recorder:
     """Owns a `Writer` made with `timed=False`. limit_bytes: what may wait in memory. block_s: how long `put` may wait for
-    room (lockstep, where the robot waits too); 0: it never waits.
+    room (lockstep, where the robot waits too); 0: it never waits. sync_s: between two syncs.
     """
 
-    def __init__(self, writer: Writer, *, limit_bytes: int = LIMIT_BYTES, block_s: float = 0.0) -> None:
-        self._writer = writer
+    def __init__(self, writer: Writer, *, limit_bytes: int = LIMIT_BYTES, block_s: float = 0.0, sync_s: float = SYNC_S) -> None:
+        self._writer, self._sync_s = writer, sync_s
+        writer.deferring = True
         self._limit_bytes, self._block_s = limit_bytes, block_s
         self._wake = threading.Event()
         self._room = threading.Condition()
         self._lock = threading.Lock()
         self._fault = ""
-        self._trouble = ""
+        self._trouble = self._sync_trouble = ""
         self._unrecorded = 0
         self._last_ns = 0
         self._flushed_s = time.monotonic()
         self._requested = self._granted = 0
         self._ending = self._over = False
         self._head = ""
+        self._stop_syncing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
+        threading.Thread(target=self._keep_synced, name="log-sync", daemon=True).start()
 
     # ---- the gate's thread: nothing here waits for the disk, but `durable` and `close`
 
@@ -86,7 +89,7 @@ class Recorder:
     def health(self) -> Health:
         """How it is; never waits."""
         pending = self._writer.pending_bytes
-        detail = self._fault or self._trouble
+        detail = self._fault or self._trouble or self._sync_trouble
         if not detail and not self._thread.is_alive() and not self._ending:
             detail = "the recorder's thread is dead"
         if not detail and pending and (late := time.monotonic() - self._flushed_s) > STALLED_S + self._writer.chunk_s:
@@ -145,22 +148,29 @@ class Recorder:
 
     def _run(self) -> None:
         try:
-            synced_s = time.monotonic()
             while not self._ending:
                 self._wake.wait(RETRY_S if self._trouble else self._writer.chunk_s)
                 self._wake.clear()
-                sync = time.monotonic() - synced_s >= SYNC_S
-                if self._write(sync=sync) and sync:
-                    synced_s = time.monotonic()
+                self._write()
             self._finish()
         except BaseException as error:  # noqa: BLE001 - whatever ends the thread must be seen as bad health, not as a trace on stderr
             self._fault = self._fault or f"the recorder's thread died: {type(error).__name__}: {error}"
         finally:
+            self._stop_syncing.set()
             with self._room:
                 self._over = True
                 self._room.notify_all()
 
-    def _write(self, *, sync: bool) -> bool:
+    def _keep_synced(self) -> None:
+        """The other thread. What it cannot sync is bad health, until it can: the log is then not what it promises after a power cut."""
+        while not self._stop_syncing.wait(RETRY_S if self._sync_trouble else self._sync_s):
+            try:
+                self._writer.sync()
+                self._sync_trouble = ""
+            except OSError as error:
+                self._sync_trouble = f"the log cannot be synced: {error.strerror}"
+
+    def _write(self) -> None:
         with self._room:
             ticket = self._requested
         try:
@@ -168,17 +178,14 @@ class Recorder:
                 self._writer.durable()
             else:
                 self._writer.flush()
-                if sync:
-                    self._writer.sync()
         except OSError as error:
             self._trouble = f"the log cannot be written: {error.strerror}"
-            return False
+            return
         self._trouble = ""
         self._flushed_s = time.monotonic()
         with self._room:
             self._granted = ticket
             self._room.notify_all()
-        return True
 
     def _finish(self) -> None:
         """Last words and the final seal; tries again for as long as `close` waits, which is for the caller to bound."""

@@ -9,6 +9,7 @@ memory holds it. The format: docs/log-format.md.
 from __future__ import annotations
 
 import contextlib
+import os
 import platform
 import sys
 import threading
@@ -90,6 +91,8 @@ class Writer:
         self._next = self._last_ns = self._held_bytes = 0
         self._ended: End = ""
         self._closing = False
+        self.deferring = False
+        """Whether `sync` writes the index of a part that is full, not `flush`: where `sync` has a thread of its own."""
         self._run, self._public_key = run, b"" if signer is None else signer.public_key().public_bytes_raw()
         self._file = LogFile(path, run, signer, {**environment(), **(metadata or {})})
         try:
@@ -182,12 +185,22 @@ class Writer:
         """As `flush`, and returns once it is on the disk (fsync)."""
         with self._writing:
             self.flush()
-            self._file.sync(all_of_it=True)
+            self._file.sync()
 
     def sync(self) -> None:
-        """What was handed to the operating system goes to the disk; seals nothing."""
+        """What was handed to the operating system goes to the disk. Seals nothing; the next chunk is written meanwhile."""
+        self._file.complete()
         with self._writing:
-            self._file.sync(all_of_it=False)
+            todo = self._file.unsynced()
+        if todo is None:
+            return
+        fd, reached = todo
+        try:
+            os.fdatasync(fd)
+        finally:
+            os.close(fd)
+        with self._writing:
+            self._file.synced(reached)
 
     def close(self) -> str:
         """Seals for good, writes the index, and returns the head. Raises OSError; then call again, or leave it as a cut file."""
@@ -197,6 +210,7 @@ class Writer:
                     self._closing = True
                     self._turn_for_good("closed")
             self._drain()
+            self._file.all_synced()
         return self.head
 
     def abandon(self) -> None:
@@ -225,7 +239,10 @@ class Writer:
         """Writes the blocks that wait; goes on where an error stopped it."""
         while True:
             if self._ended:
-                self._file.complete()
+                if self._file.is_open:
+                    self._file.set_aside()
+                if self._closing or not self.deferring:
+                    self._file.complete()
                 self._ended = ""
             if not self._waiting and self._closing:
                 return
