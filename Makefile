@@ -3,6 +3,7 @@
 # make test-long  the tests that need minutes each: measured recordings, ties broken by suggested drives
 # make check  format, lint, types, import walls, docs
 # make bench  the figures that the docs state, as ratios in one run
+# make mutation  does a test notice every small change of the gate, the certificate and the core, and is every line of them run
 # make robotarium-experiment  the paper's experiment, reading by reading, with its figures on one page (robotarium-experiment.html)
 # make bench-trace  the tracer on seeded recordings that it has never seen, in some 15 minutes; SETS="--seeds 0:5 --failures" for others
 # make bench-quadruped  two and a half simulated hours of walking: falls, tracking, and how fast the simulation is
@@ -11,7 +12,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: run test test-long check bench bench-trace bench-quadruped robotarium-experiment format clean wheels setup
+.PHONY: run test test-long check mutation bench bench-trace bench-quadruped robotarium-experiment format clean wheels setup
 
 run: $(STAMP)
 	$(BIN)/s2r demo
@@ -32,6 +33,9 @@ check: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/pytest tests/test_docs.py
+
+mutation: $(STAMP)
+	PYTHONHASHSEED=0 nice -n 19 $(BIN)/python tools/mutation.py
 
 bench: $(STAMP)
 	-@$(BIN)/python -c 'import importlib.util, sys; sys.exit(importlib.util.find_spec("rtamt") is None)' || \

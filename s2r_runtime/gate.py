@@ -231,7 +231,7 @@ def _about_observation(settings: Settings, s: Situation, source: Source, now_ns:
         return _refuse("observation_invalid")
     age_ns = now_ns - s.observation_ns
     if not 0 <= age_ns <= settings.observation_timeout_ns:
-        return _refuse("observation_stale", (settings.observation_timeout_ns - age_ns) * 1e-9 if age_ns > 0 else age_ns * 1e-9)
+        return _refuse("observation_stale", _late(age_ns, settings.observation_timeout_ns))
     bounds, reason = (settings.region, "outside_region") if source == "controller" else (settings.geofence, "outside_geofence")
     margin = inside(settings, observation.x, bounds)
     return None if margin >= 0.0 else _refuse(reason, margin)
@@ -240,13 +240,13 @@ def _about_observation(settings: Settings, s: Situation, source: Source, now_ns:
 def _about_command(settings: Settings, s: Situation, command: Command, now_ns: int) -> Verdict | None:
     if command.fault or len(command.u) != len(settings.inputs) or not all(map(finite, command.u)):
         return _refuse("command_invalid")
-    if s.asked_seq is None or command.obs_seq != s.asked_seq or command.seq <= s.last_command_seq:
+    if command.obs_seq != s.asked_seq or command.seq <= s.last_command_seq:  # nobody asked: no number is None
         return _refuse("command_out_of_order")
     ttl_ns = min(command.ttl_ns, settings.command_ttl_ns)
     for since_ns in (command.t_ns, s.asked_ns):
         age_ns = now_ns - since_ns
         if not 0 <= age_ns <= ttl_ns:
-            return _refuse("command_stale", (ttl_ns - age_ns) * 1e-9 if age_ns > 0 else age_ns * 1e-9)
+            return _refuse("command_stale", _late(age_ns, ttl_ns))
     margin = _least([_slack(value, low, high) for value, (low, high) in zip(command.u, settings.input_bounds, strict=False)])
     if len(settings.input_bounds) != len(command.u) or margin < 0.0:
         return _refuse("input_out_of_bounds", margin)
@@ -268,6 +268,11 @@ def inside(settings: Settings, x: tuple[float, ...], bounds: tuple[tuple[float, 
             off = math.remainder(value - middle, 2.0 * math.pi) if finite(middle) else math.nan
             slacks.append(_slack(off, low - middle, high - middle))
     return _least(slacks)
+
+
+def _late(age_ns: int, limit_ns: int) -> float:
+    """Seconds beyond the limit, or from the future; negative."""
+    return (limit_ns - age_ns if age_ns >= 0 else age_ns) * 1e-9
 
 
 def _slack(value: float, low: float, high: float) -> float:

@@ -205,13 +205,59 @@ def test_a_robot_without_bounded_states_has_a_margin_of_zero() -> None:
     assert verdict == (True, "allowed", 0.0)
 
 
-def test_the_margin_says_by_how_much_it_failed_in_the_conditions_own_unit() -> None:
-    assert decide("controller", Case("", {"radius": 0.018})).margin == pytest.approx(-0.003)
-    assert decide("controller", Case("", {"observation": at(1.85, 0.0, 0.0)})).margin == pytest.approx(-0.25)
-    assert decide("controller", Case("", command={"u": (0.0, -3.5)})).margin == pytest.approx(-0.5)
-    assert decide("controller", Case("", {"observation_ns": NOW - S})).margin == pytest.approx(-0.8)
-    assert decide("controller", Case("", {"unix_s": 2010})).margin == pytest.approx(-10.0)
-    assert decide("sampler", Case("", {"permit_until_ns": NOW - 2 * S})).margin == pytest.approx(-2.0)
+@pytest.mark.parametrize(
+    ("source", "case", "margin"),
+    [
+        ("controller", Case("radius_above_verified", {"radius": 0.018}), -0.003),
+        ("controller", Case("outside_region", {"observation": at(1.85, 0.0, 0.0)}), -0.25),
+        ("controller", Case("input_out_of_bounds", command={"u": (0.0, -3.5)}), -0.5),
+        ("controller", Case("observation_stale", {"observation_ns": NOW - S}), -0.8),
+        ("controller", Case("observation_stale", {"observation_ns": NOW + 3 * S}), -3.0),
+        ("controller", Case("observation_stale", {"observation_ns": NOW}, settings={"observation_timeout_ns": -2 * S}), -2.0),
+        ("controller", Case("certificate_expired", {"unix_s": 2010}), -10.0),
+        ("controller", Case("certificate_expired", {"unix_s": 600}), -400.0),
+        ("controller", Case("measurement_faults", {"faults": 9}), -6.0),
+        ("controller", Case("clock_backwards", now=NOW - 4 * S), -4.0),
+        ("controller", Case("settling", {"clear_since_ns": NOW - S // 40}), -0.075),
+        ("controller", Case("command_stale", command={"t_ns": NOW - S}), -0.9),
+        ("controller", Case("command_stale", command={"t_ns": NOW + 2 * S}), -2.0),
+        ("controller", Case("command_stale", {"asked_ns": NOW - 3 * S}), -2.9),
+        ("controller", Case("command_stale", command={"ttl_ns": -2 * S}), -2.0),
+        ("sampler", Case("permit_expired", {"permit_until_ns": NOW - 2 * S}), -2.0),
+        ("sampler", Case("outside_geofence", {"observation": at(0.0, 1.75, 0.0)}), -0.25),
+    ],
+    ids=lambda value: name(value) if isinstance(value, Case) else str(value),
+)
+def test_the_margin_says_by_how_much_it_failed_in_the_conditions_own_unit(source: str, case: Case, margin: float) -> None:
+    verdict = decide(source, case)
+    assert verdict.reason == case.reason
+    assert verdict.margin == pytest.approx(margin)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        Case("radius_above_verified", {"radius": -math.inf}),
+        Case("radius_above_verified", certificate={"verified_radius": math.inf}),
+        Case("observation_invalid", {"observation": Observation(7, 7, (1.0, 0.5, 1.0), "marked")}),
+        Case("outside_region", {"observation": at(0.0, 0.0, 0.0)}, settings={"region": ((-1.6, 1.6), (-1.0, 1.0), (5.0, -math.inf))}),
+        Case("outside_region", {"observation": at(-1.6, 0.0, 0.0)}, settings={"region": ((-1.6, math.nan), (-1.0, 1.0), (-4.0, 4.0))}),
+        Case("outside_region", {"observation": at(-1.1, 0.0, 0.0)}, settings={"region": ((-1.6, math.nan), (-1.0, 1.0), (-4.0, 4.0))}),
+    ],
+    ids=name,
+)
+def test_what_is_no_number_or_marked_as_a_fault_is_refused_even_where_the_comparison_would_pass_it(case: Case) -> None:
+    verdict = decide("controller", case)
+    assert (verdict.allow, verdict.reason) == (False, case.reason)
+    assert verdict.margin < 0.0
+
+
+def test_a_state_of_another_length_than_its_bounds_or_names_is_outside() -> None:
+    two, three = ((-1.0, 1.0),) * 2, ((-1.0, 1.0),) * 3
+    assert gate.inside(SETTINGS, (0.0, 0.0, 0.0), two) == gate.NO_NUMBER
+    assert gate.inside(SETTINGS, (0.0, 0.0), two) == gate.NO_NUMBER
+    assert gate.inside(SETTINGS, (0.0, 0.0), three) == gate.NO_NUMBER
+    assert gate.inside(SETTINGS, (0.0, 0.25, 0.0), three) == 0.75
 
 
 def test_every_reason_the_gate_gives_is_in_the_table_and_every_one_is_reachable() -> None:

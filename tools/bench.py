@@ -14,6 +14,8 @@ ORDER = (
     "bench_verify.py",
     "bench_stl.py",
     "bench_daemon.py",
+    "bench_gate_faults.py",
+    "bench_daemon_faults.py",
     "bench_can.py",
     "fuzz_can.py",
     "bench_mavlink.py",

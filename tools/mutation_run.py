@@ -27,8 +27,10 @@ from typing import Any
 from mutants import Mutant
 
 ROOT = Path(__file__).parent.parent
-QUICK_S = 2.0
-"""Tests that take longer than this at baseline are left out: what only they would notice counts as not noticed."""
+QUICK_S = 20.0
+"""Tests that take longer than this while their lines are noted are left out: what only they would notice counts as not noticed."""
+LONG = ROOT / "tests" / "test_core_walk.py", ROOT / "tests" / "test_fault_injection.py"
+"""Files of which only single tests are run; a mutant that takes effect at import runs whole files."""
 CPU_S = 3
 """Of a mutant's tests together, beyond four times what they need without it; one that needs more hangs, and that is noticed."""
 WHOLE_S = 15.0
@@ -164,7 +166,7 @@ class Session:
         """Module -> test files that run something of it, the one with the most lines first."""
         counts: dict[str, Counter[str]] = defaultdict(Counter)
         for (name, _), tests in self.covering.items():
-            for path in {str(items[index].path) for index in tests}:
+            for path in {str(items[index].path) for index in tests if self.cost[index] < QUICK_S} - {str(one) for one in LONG}:
                 counts[name][path] += 1
         return {name: [path for path, _ in count.most_common()] for name, count in counts.items()}
 
