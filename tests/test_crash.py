@@ -1,4 +1,4 @@
-"""A process that is killed, and a power cut, cost nothing that took effect; what is left is read, and recovered. (10^4 of each: make bench.)"""
+"""A kill and a power cut cost nothing that took effect; what is left is read, and recovered. (10^4 of each: make bench.)"""
 
 from __future__ import annotations
 
