@@ -168,6 +168,18 @@ def die_with_parent(parent_pid: int) -> None:
         raise SystemExit(1)  # it died before the call
 
 
+def stand_back(levels: int | None) -> None:
+    """In a child of a daemon that has real-time priority, which it inherits: so many levels below it, or (None) none at all."""
+    with contextlib.suppress(OSError, AttributeError):  # Linux only, and where the service manager lets it; it then stays beside the daemon
+        policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+        if policy not in (os.SCHED_FIFO, os.SCHED_RR):
+            return
+        if levels is None:
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        else:
+            os.sched_setscheduler(0, policy, os.sched_param(max(1, os.sched_getparam(0).sched_priority - levels)))
+
+
 def take_stdout() -> int:
     """In a child: a descriptor for the lines to the daemon. What else is printed (a plug-in's debug output) goes to stderr."""
     channel = os.dup(1)

@@ -86,10 +86,11 @@ Message = Loaded | Up | Chosen | Ended
 
 def main(arguments: list[str]) -> int:
     """The child's life. Returns the exit code."""
-    from s2r_runtime.child import die_with_parent
+    from s2r_runtime.child import die_with_parent, stand_back
 
     descriptor, parent = (int(text) for text in arguments)
     die_with_parent(parent)
+    stand_back(1)  # one that computes without end keeps nobody from the gate
     faulthandler.enable()
     channel = socket.socket(fileno=descriptor)
     lines = channel.makefile("rb")

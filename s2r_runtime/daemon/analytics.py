@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from s2r_runtime.child import Child, die_with_parent, say, take_stdout
+from s2r_runtime.child import Child, die_with_parent, say, stand_back, take_stdout
 from s2r_runtime.daemon.settings import ModelFacts
 from s2r_runtime.errors import ConfigError, S2RError
 from s2r_runtime.messages import Gap, Measured, Observation, Send
@@ -196,6 +196,7 @@ class Analytics:
 def main(arguments: list[str]) -> int:
     """Reads messages from stdin until it closes."""
     die_with_parent(int(arguments[0]))
+    stand_back(2)  # behind the gate, and behind the controller whose answer it waits for
     channel = take_stdout()
     from s2r_runtime.models import composed  # noqa: F401 - loaded before there is anything to do
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import msgspec
 
-from s2r_runtime.child import Child, die_with_parent, say, take_stdout
+from s2r_runtime.child import Child, die_with_parent, say, stand_back, take_stdout
 from s2r_runtime.controllers.candidates import Synthesis
 from s2r_runtime.controllers.file import ControllerFile
 from s2r_runtime.daemon.given_inputs import GivenInputs
@@ -194,6 +194,7 @@ class Worker:
 def main(arguments: list[str]) -> int:
     """Does the one job on stdin."""
     die_with_parent(int(arguments[0]))
+    stand_back(None)  # a verification computes for minutes
     channel = take_stdout()
     spoken = 0.0
 
