@@ -315,8 +315,8 @@ def _evidence(c: Certificate, *, traced_not_adopted: bool) -> list[tuple[str, bo
 
 def _carried(trials: Trials, slack: float) -> bool:
     """Whether the numbers of trials are bounds at their beta (guarantee G9)."""
-    if not (0 <= trials.unsafe <= trials.n and trials.n >= 1 and 0.0 < trials.beta < 1.0 and trials.radius >= 0.0):
-        return False
+    if not (0 <= trials.unsafe <= trials.n and trials.beta < 1.0 and trials.radius >= 0.0):
+        return False  # without a run, or with a beta of 0, no tail below is small enough
     if trials.unsafe == trials.n:
         unsafe = trials.unsafe_upper == 1.0  # no smaller bound is one
     else:

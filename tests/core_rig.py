@@ -152,25 +152,17 @@ class Rig:
     def verified(self, *, names: tuple[str, ...] = ("uniform", "persistent"), passed: bool = True, **changes: Any) -> list[Output]:
         """The running verification ends."""
         job = one(self.outputs, StartJob, last=True)
+        result = msgspec.structs.replace(self.result(job, names=names, passed=passed), **changes)
+        return self.feed(JobFinished(self.t, job.job_id, "verify", verification=result))
+
+    def result(self, job: StartJob, *, names: tuple[str, ...] = ("uniform", "persistent"), passed: bool = True) -> Verification:
+        """What the worker finds, at the most that was asked for."""
         split = len(grid(job.least_radius, job.radius))
         n = ledger.sample_size(0.03, ledger.share(0.05, job.attempt) / split)
-        results = tuple(LawResult(law, n, 0.1 if passed else -1.0, 0, 0.01, 1.0, True, True, passed) for law in names)
-        result = Verification(
-            passed,
-            job.radius,
-            job.hold_radius,
-            0.0,
-            0.03,
-            job.beta,
-            job.attempt,
-            job.seed,
-            results,
-            job.digest,
-            "model",
-            "task",
-            split=split,
-        )
-        return self.feed(JobFinished(self.t, job.job_id, "verify", verification=msgspec.structs.replace(result, **changes)))
+        laws = tuple(LawResult(law, n, 0.1 if passed else -1.0, 0, 0.01, 1.0, True, True, passed) for law in names)
+        beta, attempt, seed = job.beta, job.attempt, job.seed
+        radii = job.radius, job.hold_radius
+        return Verification(passed, *radii, 0.0, 0.03, beta, attempt, seed, laws, job.digest, "model", "task", split=split)
 
     def stored(self, **changes: Any) -> list[Output]:
         """The certificate that was asked for is durable."""

@@ -31,7 +31,7 @@ from s2r_runtime.recording.reading import read
 
 GOOD_U, BAD_U, FOREIGN_U = 0.5, 0.25, 0.111
 """What turns the robot: the good controller, one that is going to fail, and one that must never drive."""
-AGAIN_S = 60.0
+AGAIN_S = 180.0
 """From the end of a cause to a controller that drives, on a busy machine."""
 
 

@@ -112,6 +112,8 @@ def test_what_stands_exactly_at_its_bound_carries(good: Evidence) -> None:
     laws = tuple(replace(one, s_star=v.threshold) for one in v.laws)
     at_bounds = replace(v, radius=gap.radius, hold_radius=gap.hold_radius, laws=laws)
     assert lacking(replace(issued, verification=at_bounds)) == []
+    two_periods = replace(issued, gap=replace(gap, hold_periods=2), verification=replace(v, hold_radius=0.0))
+    assert lacking(two_periods) == [("the verified radius is below the gap", 0)]
     one_period = replace(gap, hold_periods=1)
     assert lacking(replace(issued, gap=one_period, verification=replace(v, hold_radius=0.0))) == []
 
@@ -273,7 +275,7 @@ DRIVING = '\n[driving]\nblock = 2.0\nbecause = "the robot forgets within a secon
 def test_a_certificate_on_an_assumption_counts_where_the_profile_makes_the_same(good: Evidence) -> None:
     none = good.profile
     makes = parse_profile(PROFILE + DRIVING, "test.toml", Path())
-    another = parse_profile(PROFILE + DRIVING.replace("2.0", "3.0"), "test.toml", Path())
+    another = parse_profile(PROFILE + DRIVING.replace("2.0", "0.5"), "test.toml", Path())
     plain, resting = good.issue(), good.issue(assumption=statements.assumption(makes.driving))
     for profile in (none, makes, another):
         assert certificate.assumption_problem(plain, profile) == ""

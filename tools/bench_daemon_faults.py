@@ -24,7 +24,10 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
-from daemon_faults import FAULTS, Drill, judged  # noqa: E402
+import daemon_rig  # noqa: E402
+from daemon_faults import AGAIN_S, FAULTS, Drill, judged  # noqa: E402
+
+daemon_rig.WITHIN_S = AGAIN_S  # a bench may run beside anything
 
 IN_ONE_LIFE = len(FAULTS)
 """Faults in one robot's folder, before it is judged and a new one begins."""
@@ -51,7 +54,7 @@ def life(names: list[str], seed: int, rows: dict[str, list[float]], reasons: dic
             try:
                 outcome = drill.run(name)
             except Exception as error:  # noqa: BLE001 - whatever it is, the case does not hold, and the others go on
-                wrong.append(f"{name}: {type(error).__name__}: {str(error)[:500]}")
+                wrong.append(f"{name}: {type(error).__name__}: {str(error)[:200]} ... {str(error)[-700:]}")
                 print(wrong[-1], flush=True)
                 drill.drive()
                 continue

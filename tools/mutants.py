@@ -96,6 +96,11 @@ class Mutant:
             compiled = next(one for one in compiled.co_consts if isinstance(one, CodeType) and one.co_name == part)
         return compiled
 
+    def statement_code(self, filename: str) -> CodeType:
+        """The changed top-level statement's code, to be run in its module."""
+        future = ast.ImportFrom("__future__", [ast.alias("annotations")], 0)
+        return compile(ast.fix_missing_locations(ast.Module([future, self.mutated()], [])), filename, "exec")
+
     def module_code(self, tree: ast.Module, filename: str) -> CodeType:
         """The changed module's code."""
         body = [self.mutated() if one is self.top else one for one in tree.body]

@@ -1,8 +1,9 @@
 """Runs mutants: which tests execute their lines, one forked process for each, the tests one after the other until one fails.
 
 One process imports nothing of the project and forks. A first child collects the tests, runs each once and notes its lines, then forks for
-each mutant of a function: the grandchild gives the function the mutant's code and runs the tests (`Session`). A mutant of a constant or a
-default takes effect when its module is imported, so it has a child that imports everything anew (`constants`).
+each mutant of a function: the grandchild gives the function the mutant's code and runs the tests (`Session`). A mutant of a constant is
+tried by running its statement again; that, and a default, takes full effect only when its module is imported, so what survives has a child
+that imports everything anew (`constants`).
 """
 
 from __future__ import annotations
@@ -175,10 +176,13 @@ class Session:
         objects = {(name, where): found for name in self.plan.files for where, found in named_functions(name).items()}
         killers: dict[str, Counter[int]] = defaultdict(Counter)
         by_id = {item.nodeid: index for index, item in enumerate(items)}
-        work = [one for one in self.plan.mutants if one.where]
+        work = [one for one in self.plan.mutants if one.where or not isinstance(one.top, ast.ClassDef)]
+        whole: dict[str, set[int]] = defaultdict(set)
+        for (name, _), tests in self.covering.items():
+            whole[name] |= tests
 
         def order(one: Mutant) -> list[int]:
-            found: set[int] = set()
+            found: set[int] = set() if one.where else set(whole[one.module])
             for line in range(one.lines[0], one.lines[1] + 1):
                 found |= self.covering.get((one.module, line), set())
             quick = [index for index in found if self.cost[index] < QUICK_S]
@@ -192,7 +196,11 @@ class Session:
                 return None
 
             def child() -> tuple[str, str]:
-                objects[one.module, one.where].__code__ = one.code(str(self.plan.files[one.module]))
+                path = str(self.plan.files[one.module])
+                if one.where:
+                    objects[one.module, one.where].__code__ = one.code(path)
+                else:  # whoever imported the name before still has the original: what survives this is tried again (`constants`)
+                    exec(one.statement_code(path), vars(imported(one.module)))  # noqa: S102 - our own source
                 failed = run_tests([items[index] for index in chosen])
                 return (KILLED, failed) if failed else (SURVIVED, "")
 
@@ -207,9 +215,14 @@ class Session:
         Path(self.plan.folder / "functions").write_bytes(pickle.dumps(self.plan.results))
 
 
+def imported(name: str) -> Any:
+    """The module of this short name."""
+    return importlib.import_module("s2r_runtime." + name.removesuffix(".py").replace("/", ".").removesuffix(".__init__"))
+
+
 def named_functions(name: str) -> dict[str, FunctionType]:
     """Qualified name -> function, of one module."""
-    module = importlib.import_module("s2r_runtime." + name.removesuffix(".py").replace("/", ".").removesuffix(".__init__"))
+    module = imported(name)
     found: dict[str, FunctionType] = {}
 
     def look(value: Any) -> None:
@@ -320,7 +333,8 @@ def constants(plan: Plan, files: dict[str, list[str]]) -> None:
 
         return child, WHOLE_S
 
-    forked([one for one in plan.mutants if not one.where], start, plan.ended, plan)
+    work = [one for one in plan.mutants if not one.where and plan.results.get(one.name, ("", ""))[0] != KILLED]
+    forked(work, start, plan.ended, plan)
 
 
 def changed(one: Mutant, plan: Plan) -> None:

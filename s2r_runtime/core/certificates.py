@@ -7,7 +7,7 @@ installed and persisted before its controller starts. What the worker says is ch
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, cast
 
 import msgspec
 
@@ -34,6 +34,7 @@ from s2r_runtime.messages import (
     Verification,
 )
 
+Purpose = Literal["deploy", "verify", "reverify"]
 ROUNDING = 1e-9
 """Relative; of values that went through another process's arithmetic."""
 
@@ -57,7 +58,7 @@ def refusal_to_verify(turn: Turn) -> str:
 
 def begin_verification(
     turn: Turn,
-    purpose: Literal["deploy", "verify", "reverify"],
+    purpose: Purpose,
     digest: str,
     request_id: int,
     *,
@@ -133,7 +134,7 @@ def verification_finished(turn: Turn, done: Job, event: JobFinished) -> None:
     elif lacking := _needs_more_laws(turn, gap, tuple(law.law for law in result.laws if law.required)):
         _refuse(turn, done, lacking)
     elif result.radius < turn.memory.radius:
-        _outgrown(turn, done, result.radius)
+        _outgrown(turn, done, gap, result.radius)
     else:
         turn.set(issuing=msgspec.structs.replace(done, least_radius=result.radius))
         turn.emit(IssueCertificate(turn.now, gap, result, done.request_id, turn.settings.certificate_lifetime_s))
@@ -161,7 +162,7 @@ def _result_problem(turn: Turn, done: Job, v: Verification) -> str:
         return f"its beta is split among {v.split} radii, {radii} were fixed beforehand"
     if not 0.0 < v.epsilon < 1.0:
         return "its numbers make no sense"
-    if any(law.n < 1 or ledger.binomial_tail(law.n, 0, v.epsilon) > share / v.split for law in required):
+    if any(ledger.binomial_tail(law.n, 0, v.epsilon) > share / v.split for law in required):
         return f"{min(law.n for law in required)} scenarios are too few for the share of attempt {done.attempt}"
     return ""
 
@@ -182,7 +183,7 @@ def _needs_more_laws(turn: Turn, gap: Gap, required: tuple[str, ...]) -> str:
     return ""
 
 
-def _outgrown(turn: Turn, done: Job, verified: float) -> None:
+def _outgrown(turn: Turn, done: Job, gap: Gap, verified: float) -> None:
     """It passed at a radius that the stream has left meanwhile. Once more, paying again; then that is that."""
     if not _wanted(turn, done):
         return
@@ -192,13 +193,12 @@ def _outgrown(turn: Turn, done: Job, verified: float) -> None:
             done,
             f"the radius grew to {turn.memory.radius:.6g} while attempt {done.attempt} verified {verified:.6g}, twice in a row",
         )
-    elif done.purpose != "trace" and done.purpose != "gap":
-        gap = turn.memory.gap
-        if gap is None or (boundless := _boundless(turn, gap)):
-            _refuse(turn, done, boundless if gap is not None else "there is no gap any more")
-            return
+    elif boundless := _boundless(turn, gap):
+        _refuse(turn, done, boundless)
+    else:
         turn.answer(done.request_id, 0, f"the radius grew to {turn.memory.radius:.6g} meanwhile; verifying again", final=False)
-        begin_verification(turn, done.purpose, done.digest, done.request_id, certificate_id=done.certificate_id, again=True)
+        purpose = cast(Purpose, done.purpose)
+        begin_verification(turn, purpose, done.digest, done.request_id, certificate_id=done.certificate_id, again=True)
 
 
 def _refuse(turn: Turn, done: Job, why: str) -> None:
@@ -246,7 +246,7 @@ def certificate_stored(turn: Turn, event: CertificateStored) -> None:
         _refuse(turn, done, f"the certificate is not the one that was asked for: {problem}")
     else:
         install(turn, facts)
-        _go_on(turn, done, facts)
+        _go_on(turn, done, gap, facts)
     reverify_if_due(turn)
 
 
@@ -297,14 +297,14 @@ def install(turn: Turn, facts: CertificateFacts) -> None:
     regate(turn)
 
 
-def _go_on(turn: Turn, done: Job, facts: CertificateFacts) -> None:
+def _go_on(turn: Turn, done: Job, gap: Gap, facts: CertificateFacts) -> None:
     text = f"certificate {facts.id}: verified to radius {facts.verified_radius:.6g}"
     deployment = turn.state.deployment
     if done.purpose != "deploy":
         turn.answer(done.request_id, 0, text)
     elif deployment is not None and _wanted(turn, done):
         if facts.verified_radius < turn.memory.radius:
-            _outgrown(turn, done, facts.verified_radius)
+            _outgrown(turn, done, gap, facts.verified_radius)
         else:
             turn.answer(done.request_id, 0, text, final=False)
             start_controller(turn, deployment, facts)

@@ -125,7 +125,7 @@ def _gap_problem(turn: Turn, gap: Gap, epoch: int) -> str:
     if gap.white_reason.startswith(SERIAL):
         return f"its samples were not drawn independently: {gap.white_reason}"
     half = 0.5 * ledger.share(settings.beta, epoch)
-    if gap.n < 1 or ledger.binomial_tail(gap.n, gap.discarded, gap.epsilon) > half * (1.0 + ROUNDING):
+    if ledger.binomial_tail(gap.n, gap.discarded, gap.epsilon) > half * (1.0 + ROUNDING):
         return f"{gap.n} samples are too few for the share of epoch {epoch}"
     return ""
 
