@@ -112,6 +112,18 @@ class Transport(Protocol):
 # ---------------------------------------------------------------- models and effects
 
 
+class Story(NamedTuple):
+    """What the demo does to a built-in robot behind the runtime's back: effects from the start, as the robot names them, and one that
+    begins `change_after_s` seconds of its clock after it was told of it, as the controller is about to drive. `permit_s`: of its clock, in
+    which a campaign is over.
+    """
+
+    effects: tuple[str, ...]
+    change: str
+    change_after_s: float
+    permit_s: float = 3600.0
+
+
 class Follows(NamedTuple):
     """How a state follows from measured ones: formula(x, rates, parameters) -> (n,); x and rates (per s): name -> (n,)."""
 
@@ -329,5 +341,10 @@ def s2r_kits() -> list[Offer]:
 
 @hookspec
 def s2r_robots() -> list[Offer]:
-    """Built-in robots for `s2r demo`: objects with `command(seed, effects) -> list[str]`, the argv that starts one, and `profile`."""
+    """Built-in robots for `s2r demo`: objects with
+
+    `command(seed, effects, connect) -> list[str]`, the argv that starts one (raises ConfigError if something is not installed);
+    `profile_text(robot_listen, controller_listen) -> str`; `controller(name) -> Path` of `good` and `reckless`; `profile`, a name;
+    `story`, a `Story`.
+    """
     return []

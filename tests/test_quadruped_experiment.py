@@ -22,11 +22,12 @@ from s2r_runtime.disturbance import GapSet
 from s2r_runtime.errors import NotEnoughEvidence
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.profile import check_names
+from s2r_runtime.profile import Profile, check_names, load_profile
 from s2r_runtime.tasks.grid_world import GridWorld
 from s2r_runtime.uncertain import roll_out
 
-PROFILE, ROOT = experiment.PROFILE, Path(__file__).parent.parent
+ROOT = Path(__file__).parent.parent
+PROFILE, SECOND = experiment.PROFILE, load_profile(ROOT / "profiles" / "quadruped-second.toml")
 SIGMA = np.array([0.0005, 0.0005, 0.002])
 
 
@@ -63,16 +64,29 @@ def test_the_profile_has_the_papers_numbers() -> None:
 
 def test_what_ships_with_the_robot_is_the_profile_and_the_controllers() -> None:
     data = ROOT / "plugins" / "standins" / "s2r_standins" / "data"
-    assert (data / "quadruped.toml").read_bytes() == (ROOT / "profiles" / "quadruped.toml").read_bytes()
+    for name in ("quadruped.toml", "quadruped-second.toml"):
+        assert (data / name).read_bytes() == (ROOT / "profiles" / name).read_bytes()
     for name in ("quadruped_grid.py", "quadruped_grid_reckless.py"):
         assert (data / name).read_bytes() == (ROOT / "controllers" / name).read_bytes()
 
 
-def test_a_scenario_can_begin_wherever_a_campaign_may_have_left_the_robot() -> None:
-    """At its last waypoint's edge, a hold further out; in all of 40 directions."""
-    task = GridWorld(dict(PROFILE.task.parameters), compose(PROFILE.model).nominal, PROFILE.model.dt)
-    rng, s = np.random.default_rng(1), PROFILE.sampling
-    out = PROFILE.region["x"][1] - s.waypoint_margin + s.waypoint_radius + 0.5 * s.hold_periods * PROFILE.model.dt * PROFILE.inputs["v"][1]
+def test_the_profile_with_a_step_a_second_is_of_the_same_robot_and_task() -> None:
+    check_names(SECOND, "profiles/quadruped-second.toml")
+    assert (SECOND.model.dt, SECOND.robot.name, SECOND.norm) == (1.0, PROFILE.robot.name, PROFILE.norm)
+    assert (SECOND.region, SECOND.inputs) == (PROFILE.region, PROFILE.inputs)
+    seconds = [p.task.parameters["steps"] * p.model.dt for p in (PROFILE, SECOND)]  # type: ignore[operator]
+    assert seconds[0] == seconds[1]
+    others = [{k: v for k, v in p.task.parameters.items() if k != "steps"} for p in (PROFILE, SECOND)]
+    assert others[0] == others[1]
+
+
+@pytest.mark.parametrize("profile", [PROFILE, SECOND], ids=["tenth", "second"])
+def test_a_scenario_can_begin_wherever_a_campaign_may_have_left_the_robot(profile: Profile) -> None:
+    """At its last waypoint's edge, a hold further out; in all of 40 directions. (At .1 s: half a hold; one in 50 goes farther.)"""
+    task = GridWorld(dict(profile.task.parameters), compose(profile.model).nominal, profile.model.dt)
+    rng, s = np.random.default_rng(1), profile.sampling
+    hold = s.hold_periods * profile.model.dt * profile.inputs["v"][1] * (0.5 if profile is PROFILE else 1.0)
+    out = profile.region["x"][1] - s.waypoint_margin + s.waypoint_radius + hold
     for angle in np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False):
         square = out / max(abs(math.cos(angle)), abs(math.sin(angle)))
         task.draw_at(rng, np.array([square * math.cos(angle), square * math.sin(angle), angle]))

@@ -47,17 +47,17 @@ HOLD_S = 1.0
 STEPS = np.round(np.arange(0.1, 1.001, 0.05), 2)
 CONTROLLERS: Tries = (
     ("quadruped_grid_reckless.py", {}),
-    ("quadruped_grid.py", {"speed": 0.15, "margin": 0.0, "wall": 0.0}),
-    ("quadruped_grid.py", {"speed": 0.15, "turn": 0.3}),
+    ("quadruped_grid.py", {"margin": 0.0}),
+    ("quadruped_grid.py", {"turn": 0.2}),
     ("quadruped_grid.py", {"aligned": 0.0}),
     ("quadruped_grid.py", {"lookahead": 2.0}),
-    ("quadruped_grid.py", {"margin": 0.05, "wall": 0.05}),
-    ("quadruped_grid.py", {"fade": 0.3}),
-    ("quadruped_grid.py", {"speed": 0.15}),
+    ("quadruped_grid.py", {"speed": 0.15, "margin": 0.05}),
+    ("quadruped_grid.py", {"lookahead": 0.2}),
+    ("quadruped_grid.py", {"hold": 0.8}),
     ("quadruped_grid.py", {}),
-    ("quadruped_grid.py", {"margin": 0.17, "wall": 0.17}),
-    ("quadruped_grid.py", {"margin": 0.17, "wall": 0.17, "speed": 0.1}),
-    ("quadruped_grid.py", {"margin": 0.19, "wall": 0.19, "speed": 0.1, "fade": 0.05}),
+    ("quadruped_grid.py", {"lookahead": 0.35, "turn": 3.5, "aligned": 0.75}),
+    ("quadruped_grid.py", {"margin": 0.2, "speed": 0.1, "fade": 0.15}),
+    ("quadruped_grid.py", {"margin": 0.2, "speed": 0.1, "fade": 0.15, "lookahead": 0.35, "turn": 3.5}),
 )
 """In the order in which somebody would try them: faults first, then the controller that ships, then more careful ones."""
 
@@ -127,15 +127,9 @@ class Candidate(NamedTuple):
 
 def candidates(campaign: Holds, fresh: Holds, lacking: tuple[EffectSpec, ...], size: Size) -> list[Candidate]:
     """The paper's literal one; in a norm that means something; with longer steps; with what the tracer found, on samples it never saw."""
-    chosen = [
-        (Reading(0.1, norm="literal"), campaign),
-        (Reading(0.1), campaign),
-        (Reading(STRIDE_S), campaign),
-        (Reading(0.5), campaign),
-    ]
+    chosen = [(Reading(0.1, norm="literal"), campaign), (Reading(0.1), campaign), (Reading(0.5), campaign), (Reading(1.0), campaign)]
     if lacking:
-        known = (Reading(dt, "standing", "weighted", "ball", lacking, "with what was traced") for dt in (0.1, 0.5))
-        chosen += [(reading, fresh[: size.samples]) for reading in known]
+        chosen.append((Reading(0.1, "standing", "weighted", "ball", lacking, "with what was traced"), fresh[: size.samples]))
     return [Candidate(Setting(reading.words, reading.model, reading.gap_set(holds)), reading) for reading, holds in chosen]
 
 
@@ -250,7 +244,7 @@ def experiment(robot: Walker, seed: int, size: Size, told: Callable[[str], None]
             "text": lacking["text"],
             "effects": [f"{e.name} on {e.channel} {e.parameters}" for e in effects],
         },
-        "more": {r.words: of_more(r, fresh, MORE) for r in (Reading(0.1), Reading(0.5))},
+        "more": {r.words: of_more(r, fresh, MORE) for r in (Reading(0.1), Reading(1.0))},
         "models": [],
     }
     if effects:

@@ -19,12 +19,9 @@ from typing import Any
 from s2r_runtime.cli import output
 from s2r_runtime.daemon import control
 from s2r_runtime.errors import S2RError, UsageError
+from s2r_runtime.hookspecs import Story
 from s2r_runtime.plugins import registry
 
-EFFECT = "input_gain:w gain=0.7"
-CHANGE = "input_gain:v gain=0.25"
-CHANGE_AFTER_S = 15.0
-"""Robot seconds after the deployment: two scenarios of 6.6 s are driven before the robot changes."""
 START_S, STOP_S, CAMPAIGN_S = 20.0, 20.0, 900.0
 
 
@@ -34,10 +31,12 @@ class Demonstration:
     def __init__(self, robot: str, out: Path | None, seed: int, effects: list[str] | None, change: str | None) -> None:
         self._robot = registry().get("robots", robot)
         self._name = robot
-        self._out = _fresh(out)
         self._seed = seed
-        self._effects = [e for e in ([EFFECT] if effects is None else effects) if e != "none"]
-        self._change = None if change == "none" else change or CHANGE
+        self._story: Story = self._robot.story
+        self._effects = [e for e in (self._story.effects if effects is None else effects) if e != "none"]
+        self._change = None if change == "none" else change or self._story.change
+        self._robot.command(seed, self._effects)  # says at once if something is not installed
+        self._out = _fresh(out)
         self._begin = time.monotonic()
         self._socket = Path()
         self._hold_gap = 0.0
@@ -49,13 +48,13 @@ class Demonstration:
         with ExitStack() as stack:
             robot = stack.enter_context(self._robot_process(ports))
             daemon = stack.enter_context(self._daemon(profile))
-            held = self._story(robot, profile)
+            held = self._loop(robot, profile)
             self._end_daemon(daemon)
         return self._afterwards(held)
 
     # ------------------------------------------------------------------ the story
 
-    def _story(self, robot: subprocess.Popen[str], profile: Path) -> bool:
+    def _loop(self, robot: subprocess.Popen[str], profile: Path) -> bool:
         """Up to the last refusal. True if what was expected of the runtime happened."""
         controller = self._robot.controller("good")
         wrong = ", ".join(self._effects) or "nothing"
@@ -73,8 +72,9 @@ class Demonstration:
         return self._campaign() and self._drive(robot, controller, running=False)
 
     def _campaign(self) -> bool:
-        self._step("s2r permit 3600 && s2r sample", "drive to random states, apply random inputs, measure the gap")
-        self._ask({"verb": "permit", "duration_s": 3600.0})
+        permit = self._story.permit_s
+        self._step(f"s2r permit {permit:.0f} && s2r sample", "drive to random states, apply random inputs, measure the gap")
+        self._ask({"verb": "permit", "duration_s": permit})
         answer = self._ask({"verb": "sample", "count": 0})
         gap = answer.get("data") or {}
         if gap:
@@ -104,8 +104,9 @@ class Demonstration:
 
     def _drive(self, robot: subprocess.Popen[str], controller: Path, *, running: bool) -> bool:
         if self._change:
-            self._say(f"(in {CHANGE_AFTER_S:.0f} s of its own time the robot will change: {self._change}; nobody is told)", "dim")
-            self._to_robot(robot, f"effect {self._change} @+{CHANGE_AFTER_S}")
+            seconds = self._story.change_after_s
+            self._say(f"(in {seconds:.0f} s of its own time the robot will change: {self._change}; nobody is told)", "dim")
+            self._to_robot(robot, f"effect {self._change} @+{seconds}")
         if not running:
             self._step(f"s2r deploy {controller.name}", "verify at the new gap; a certificate lets it drive")
             if self._ask({"verb": "deploy", "path": str(controller), "parameters": {}})["exit_code"] != 0:

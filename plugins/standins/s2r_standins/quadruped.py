@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.hookspecs import Story
 from s2r_standins.process import CLOCKS, CONNECT, DOOR, add_link_options, add_trouble_options, run, start_command, with_endpoints
 from s2r_standins.quadruped_sheet import QuadrupedSheet
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 DATA = Path(__file__).parent / "data"
 CONTROLLERS = {"good": "quadruped_grid.py", "reckless": "quadruped_grid_reckless.py"}
 EPILOG = f"""{CLOCKS}
-           A period is 0.1 s, in which the walking controller makes 100 steps.
+           A period is 0.1 s (--period), in which the walking controller makes 100 steps.
 
 falls      a robot that fell presses its own red button, once, stays down, and its observations hold no state from there on.
 
@@ -34,15 +35,20 @@ effects    what is wrong with this robot, its load or its floor; ' @TIME' at the
 {DOOR}"""
 
 
+DEMO_PERIOD_S = 1.0
+"""As in quadruped-second.toml: a tenth of a second of walking says little of a robot that swings as far as it goes."""
+
+
 class BuiltIn:
     """What `s2r demo` needs to know (hook `s2r_robots`)."""
 
-    profile = "quadruped"
+    profile = "quadruped-second"
+    story = Story(("weak_leg leg=rear_right strength=0.55",), "payload mass=4", 130.0, permit_s=14_400.0)
 
     def command(self, seed: int, effects: list[str], connect: str = CONNECT) -> list[str]:
         """The argv that starts the robot; it ends with the process that starts it. Raises ConfigError where its physics are missing."""
         require_physics()
-        return start_command("s2r_standins.quadruped", seed, effects, connect)
+        return [*start_command("s2r_standins.quadruped", seed, effects, connect), "--period", f"{DEMO_PERIOD_S:g}"]
 
     def controller(self, name: str = "good") -> Path:
         """A controller that comes with the robot. Raises ConfigError for an unknown name."""
@@ -52,7 +58,7 @@ class BuiltIn:
 
     def profile_text(self, robot_listen: str, controller_listen: str) -> str:
         """The robot's profile with these endpoints in its transport."""
-        return with_endpoints((DATA / "quadruped.toml").read_text(encoding="utf-8"), robot_listen, controller_listen)
+        return with_endpoints((DATA / f"{self.profile}.toml").read_text(encoding="utf-8"), robot_listen, controller_listen)
 
 
 ROBOT = BuiltIn()
@@ -75,6 +81,7 @@ def parser() -> argparse.ArgumentParser:
     )
     add_link_options(p)
     p.add_argument("--seed", type=int, default=1, help="of gait phase, noise, shoves and losses (default %(default)s)")
+    p.add_argument("--period", type=float, default=sheet.dt, help="of its link, s, whole ms (default %(default)s)")
     p.add_argument("--sigma-position", type=float, default=sheet.sigma_position, help="noise of x and y, m (default %(default)s)")
     p.add_argument("--sigma-heading", type=float, default=sheet.sigma_heading, help="noise of theta, rad (default %(default)s)")
     add_trouble_options(p)
@@ -84,6 +91,7 @@ def parser() -> argparse.ArgumentParser:
 def _body(o: argparse.Namespace) -> Quadruped:
     for name, ok, must in (
         ("--start", all(map(math.isfinite, o.start)), "finite"),
+        ("--period", 0.001 <= o.period <= 60.0 and abs(1e3 * o.period - round(1e3 * o.period)) < 1e-6, "whole milliseconds, up to 60 s"),
         ("--sigma-position", 0.0 <= o.sigma_position < math.inf, ">= 0 m"),
         ("--sigma-heading", 0.0 <= o.sigma_heading < math.inf, ">= 0 rad"),
     ):
@@ -92,7 +100,7 @@ def _body(o: argparse.Namespace) -> Quadruped:
     require_physics()
     from s2r_standins.quadruped_body import Quadruped
 
-    sheet = QuadrupedSheet(sigma_position=o.sigma_position, sigma_heading=o.sigma_heading)
+    sheet = QuadrupedSheet(dt=o.period, sigma_position=o.sigma_position, sigma_heading=o.sigma_heading)
     return Quadruped(sheet, tuple(o.start), o.seed)
 
 

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.hookspecs import Story
 from s2r_standins.body import Body, DataSheet
 from s2r_standins.process import CLOCKS, CONNECT, DOOR, add_link_options, add_trouble_options, run, start_command, with_endpoints
 
@@ -27,6 +28,7 @@ class BuiltIn:
     """What `s2r demo` needs to know (hook `s2r_robots`)."""
 
     profile = "robotarium"
+    story = Story(("input_gain:w gain=0.7",), "input_gain:v gain=0.25", 15.0)
 
     def command(self, seed: int, effects: list[str], connect: str = CONNECT) -> list[str]:
         """The argv that starts the robot; it ends with the process that starts it."""
