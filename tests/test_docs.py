@@ -103,3 +103,13 @@ def test_the_map_of_files_names_every_module() -> None:
     root = ROOT / "s2r_runtime"
     modules = [p.stem for p in root.glob("*.py") if p.stem != "__init__"] + [p.parent.name for p in root.glob("*/__init__.py")]
     assert [name for name in modules if f"`{name}`" not in readme] == []
+
+
+def test_the_threat_model_names_tests_that_exist() -> None:
+    page = (ROOT / "docs" / "threat-model.md").read_text(encoding="utf-8")
+    named = re.findall(r"`((?:plugins/\w+/tests/)?test_\w+\.py)(?:::(test_\w+))?`", page)
+    assert len(named) > 15
+    for file, function in named:
+        path = ROOT / file if file.startswith("plugins") else ROOT / "tests" / file
+        assert path.is_file(), file
+        assert not function or f"def {function}(" in path.read_text(encoding="utf-8"), f"{file}::{function}"

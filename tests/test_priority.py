@@ -14,7 +14,8 @@ try:
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(20))
 except PermissionError:
     raise SystemExit("not permitted")
-child = "import os; from s2r_runtime.child import stand_back; stand_back({}); print(os.sched_getscheduler(0), os.sched_getparam(0).sched_priority)"
+child = "import os; from s2r_runtime.child import stand_back; stand_back({}); "
+child += "print(os.sched_getscheduler(0), os.sched_getparam(0).sched_priority)"
 for levels in (1, 2, 99, None):
     subprocess.run([sys.executable, "-c", child.format(levels)], check=True)
 """

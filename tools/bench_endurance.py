@@ -125,7 +125,7 @@ def endure(rate: float, minutes: float, fifo: int) -> dict[str, Any]:
                     "import numpy as np\n\n\ndef control(x, theta, parameters):\n    return np.tile([0.0, 0.5], (len(x), 1))\n"
                 )
                 key = bench.folder / "state" / "key.pem"
-                text = made_up_certificate(bench.profile, key, controller, radius=0.05, verified=0.1, epoch=1)
+                text = made_up_certificate(bench.profile, key, controller, radius=0.5, verified=1.0, epoch=1)
                 answer = bench.ask("deploy", path=str(controller), certificate=text)
                 if answer["exit_code"]:
                     raise SystemExit(f"not deployed: {answer['text']}")
@@ -166,7 +166,8 @@ def watched(bench: Bench, seconds: float) -> dict[str, Any]:
         if status["gate"] != "open":
             reasons[status["reason"]] = reasons.get(status["reason"], 0) + 1
         if status["pids"]["controller"] != pids["controller"]:
-            raise SystemExit(f"after {now:.0f} s the controller's process ended: {ends(bench)}")
+            why = status["reason"], status["revoked"], status["latched"]
+            raise SystemExit(f"after {now:.0f} s the controller's process ended: {why}, {ends(bench)}")
         if (again := status["pids"]["analytics"]) != pids["analytics"]:
             if not again or not Path(f"/proc/{again}/stat").exists():
                 time.sleep(1.0)

@@ -69,6 +69,7 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
     import numpy as np
 
     from s2r_runtime.controllers.batches import BatchController
+    from s2r_runtime.controllers.rehearsal import Kept
     from s2r_runtime.models.composed import compose
     from s2r_runtime.plugins import registry
     from s2r_runtime.uncertain import GapSet
@@ -79,8 +80,9 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
     task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
     gap_set = GapSet(job.gap.set, job.gap.weights, job.radius, job.hold_radius, job.gap.hold_periods)
     with BatchController(job.controller, len(model.inputs), MEMORY_BYTES) as control:
+        kept = Kept(control)
         result, details = verify_in_detail(
-            control,
+            kept,
             task,
             model,
             gap_set=gap_set,
@@ -97,6 +99,9 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
             task_digest=profile.task_digest(),
             progress=progress,
         )
+    if result.passed:
+        with BatchController(job.controller, len(model.inputs), MEMORY_BYTES) as again:
+            kept.compare(again)
     lowest = -np.finfo(np.float64).max  # what `verify` counts a value that is no number as
     safety = {one.law: np.nan_to_num(one.rollouts.safety, nan=lowest, neginf=lowest, posinf=-lowest).tolist() for one in details}
     return Result(verification=result, safety=safety)

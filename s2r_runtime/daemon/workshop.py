@@ -156,12 +156,14 @@ class Watcher:
 
     def sent(self, send: Send) -> None:
         """The robot was told this."""
-        if self._watching is not None and self._analytics is not None:
+        if self._watching is not None and self._analytics is not None and self._ready:
             self._analytics.sent(send)
 
     def observed(self, observation: Observation) -> None:
-        """The robot was seen there."""
-        if self._watching is not None and self._analytics is not None:
+        """The robot was seen there. A process that still loads its libraries is told nothing: it would be late with its answer, and ended
+        for that, again and again on a busy computer.
+        """
+        if self._watching is not None and self._analytics is not None and self._ready:
             self._analytics.observed(observation)
 
     def wait(self) -> None:

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -514,6 +515,21 @@ def test_signed_link_is_driven_also_with_a_robot_whose_signing_clock_lags(kind: 
         assert runtime.counters["rejected_bad_signature"] + runtime.counters["rejected_unsigned"] == 0
         if kind == "udp" and lag_s:  # there the robot speaks first
             assert runtime.counters["rejected_old_stamp"] > 0
+
+
+def test_the_signed_profile_drives_a_robot_with_its_key_and_no_other(key: Path, tmp_path: Path) -> None:
+    profile = Path(__file__).parents[3] / "profiles" / "rover-mavlink-signed.toml"
+    options = tomllib.loads(profile.read_text())["transport"]
+    for name in ("name", "robot", "take_over"):  # the line is the test's own, and its robot is armed
+        del options[name]
+    assert options["signing_key_file"] == "/etc/s2r/mavlink.key"
+    options |= {"signing_key_file": str(key), "signing_state": str(tmp_path / "state.json")}
+    with driven("udp", "--key-file", str(key), **options) as (runtime, _):
+        runtime.command = (0.5, 0.0)
+        assert runtime.until(lambda: runtime.good[-1].x[0] > 0.3)
+    with met("udp", "--mode", "GUIDED", "--armed", **(options | {"signing_state": str(tmp_path / "other.json")})) as (runtime, _):
+        runtime.run(1.0)
+        assert runtime.observations == []
 
 
 @pytest.mark.parametrize("theirs", ["none", "another"])
