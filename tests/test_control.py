@@ -10,6 +10,8 @@ import selectors
 import socket
 import stat
 import subprocess
+import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -253,3 +255,40 @@ def test_service_unit_calls_what_the_command_line_knows_and_waits_for_readiness(
     assert (Path(program).name, args.verb, args.state) == ("s2r", "run", Path("/var/lib/s2r"))
     assert (service["Type"], service["KillMode"], service["RestartPreventExitStatus"]) == ("notify", "mixed", "2 78")
     assert float(service["WatchdogSec"]) > 0
+
+
+SOMEBODY_LISTENS = """
+import os, socket, sys
+s = socket.socket(socket.AF_UNIX)
+os.setuid(12345)
+s.bind(sys.argv[1]); os.chmod(sys.argv[1], 0o777); s.listen()
+print("listening", flush=True)
+c, _ = s.accept()
+print(c.recv(1000).decode(), flush=True)
+"""
+CALLS = """
+import os, sys
+from pathlib import Path
+from s2r_runtime.daemon import control
+os.setuid(65534)
+try:
+    print(control.call(Path(sys.argv[1]), {"verb": "stop"}))
+except Exception as error:
+    print(type(error).__name__, error)
+"""
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can be two other people")
+def test_a_client_says_nothing_to_a_third_user_who_listens_in_the_daemons_place() -> None:
+    with tempfile.TemporaryDirectory() as name:
+        Path(name).chmod(0o777)  # somebody else is to put his socket there
+        path = f"{name}/rover.sock"
+        theirs = subprocess.Popen([sys.executable, "-c", SOMEBODY_LISTENS, path], stdout=subprocess.PIPE, text=True)
+        assert theirs.stdout is not None
+        assert theirs.stdout.readline() == "listening\n"
+        said = subprocess.run([sys.executable, "-c", CALLS, path], capture_output=True, text=True, check=True)
+        assert "UsageError" in said.stdout
+        assert "whoever listens there is user 12345, and no daemon of yours" in said.stdout
+        assert theirs.stdout.read().strip() == ""
+        theirs.wait(30)
+        theirs.stdout.close()
