@@ -4,7 +4,8 @@
 # make check  format, lint, types, import walls, docs
 # make bench  the figures that the docs state, as ratios in one run
 # make mutation  does a test notice every small change of the gate, the certificate and the core, and is every line of them run
-# make robotarium-experiment  the paper's experiment, reading by reading, with its figures on one page (robotarium-experiment.html)
+# make robotarium-experiment quadruped-experiment  the paper's experiment, reading by reading, with its figures on one page (robotarium-experiment.html)
+# make quadruped-experiment   the paper's other experiment, on a walking robot in rigid-body physics (quadruped-experiment.html)
 # make bench-trace  the tracer on seeded recordings that it has never seen, in some 15 minutes; SETS="--seeds 0:5 --failures" for others
 # make bench-quadruped  two and a half simulated hours of walking: falls, tracking, and how fast the simulation is
 PYTHON ?= python3
@@ -44,6 +45,9 @@ bench: $(STAMP)
 
 robotarium-experiment: $(STAMP)
 	$(BIN)/python tools/robotarium_experiment.py -o robotarium-experiment.html --json robotarium-experiment.json
+
+quadruped-experiment: $(STAMP)
+	$(BIN)/python tools/quadruped_experiment.py -o quadruped-experiment.html --json quadruped-experiment.json
 
 SETS ?= --seeds 1000000:1000020 --jobs 2
 
