@@ -7,6 +7,7 @@ import os
 import platform
 import shutil
 import socket
+import subprocess
 import sys
 import sysconfig
 from collections.abc import Iterator
@@ -104,6 +105,7 @@ def _findings() -> Iterator[Finding]:
         "" if free > MINIMUM_FREE_BYTES else "free some: a full disk closes the gate",
     )
     yield _key()
+    yield _confinement()
     yield _governor()
     under = bool(os.environ.get("NOTIFY_SOCKET"))
     systemd = shutil.which("systemctl") is not None
@@ -174,6 +176,19 @@ def _key() -> Finding:
     except S2RError as error:
         return Finding("signing key", False, str(error), "")
     return Finding("signing key", True, str(path))
+
+
+def _confinement() -> Finding:
+    """What a controller's process can be kept from here: tried in one."""
+    from s2r_runtime.controllers.confinement import ALL
+
+    program = "from s2r_runtime.controllers.confinement import confine; print(*confine(1 << 30))"
+    tried = subprocess.run([sys.executable, "-P", "-c", program], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, check=False)
+    lacking = [name for name in ALL if name not in tried.stdout.split()]
+    if not lacking:
+        return Finding("confinement", True, "controllers can compute, import and answer, and nothing else")
+    mend = "docs/threat-model.md says what that leaves open; reading takes Landlock, Linux 5.13 or newer"
+    return Finding("confinement", None, f"this kernel does not contain a controller's {', '.join(lacking)}", mend)
 
 
 def _governor() -> Finding:

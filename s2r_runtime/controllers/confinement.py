@@ -87,6 +87,10 @@ _IOCTL_OWNERS = (0x5452, 0x8901, 0x8902)
 _UNKNOWN = {"clone3": (435, 435), "openat2": (437, 437)}
 
 
+ALL = ("memory", "files", "privileges", "reading", "system_calls")
+"""What is in force where the kernel has it all."""
+
+
 def confine(memory_bytes: int) -> tuple[str, ...]:
     """Confines this process; `memory_bytes` is what it may have beyond the address space it has now.
 

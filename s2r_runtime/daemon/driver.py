@@ -36,6 +36,7 @@ class Driver:
         deadline_s = profile.gate.controller_deadline
         self._deadline_ns = round(1e9 * (max(deadline_s, LOCKSTEP_DEADLINE_S) if profile.clock == "lockstep" else deadline_s))
         self.latency_ns = 0
+        self._contained: tuple[str, ...] = ()
 
     @property
     def running(self) -> bool:
@@ -46,6 +47,11 @@ class Driver:
     def pid(self) -> int:
         """Its process id, or 0."""
         return self._host.pid if self._host is not None else 0
+
+    @property
+    def contained(self) -> tuple[str, ...]:
+        """What is in force in its process (see `confinement.confine`); nothing while there is none."""
+        return self._contained if self._host is not None else ()
 
     @property
     def due_ns(self) -> int | None:
@@ -96,6 +102,7 @@ class Driver:
                 self._episode(t_ns, message.ended)
                 self._end(SourceStopped(t_ns, "controller", message.reason, message.detail))
             elif isinstance(message, Ready):
+                self._contained = message.contained
                 self._emit(SourceStarted(t_ns, "controller", message.digest))
             if self._host is None:  # what an answer led to has stopped it
                 return

@@ -43,6 +43,7 @@ def status(daemon: Daemon) -> dict[str, Any]:
         "link_trouble": daemon.link.trouble,
         "counters": daemon.link.counters(),
         "controller_latency_ms": daemon.driver.latency_ns * 1e-6,
+        "controller_contained": list(daemon.driver.contained),
         "uptime_s": (time.monotonic_ns() - daemon.began_ns) * 1e-9,
         "pids": {"daemon": os.getpid(), "analytics": daemon.watcher.pid, "controller": daemon.driver.pid},
     }
