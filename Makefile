@@ -8,12 +8,13 @@
 # make quadruped-experiment   the paper's other experiment, on a walking robot in rigid-body physics (quadruped-experiment.html)
 # make bench-trace  the tracer on seeded recordings that it has never seen, in some 15 minutes; SETS="--seeds 0:5 --failures" for others
 # make bench-quadruped  two and a half simulated hours of walking: falls, tracking, and how fast the simulation is
+# make bench-endurance  the daemon for half an hour at 100 Hz and half an hour at 1 kHz: memory, latency, jitter. MINUTES=5 for less
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: run test test-long check mutation bench bench-trace bench-quadruped robotarium-experiment format clean wheels setup
+.PHONY: bench-endurance run test test-long check mutation bench bench-trace bench-quadruped robotarium-experiment format clean wheels setup
 
 run: $(STAMP)
 	$(BIN)/s2r demo
@@ -58,6 +59,11 @@ bench-trace: $(STAMP)
 
 bench-quadruped: $(STAMP)
 	$(BIN)/python tools/bench_quadruped.py
+
+MINUTES ?= 30
+
+bench-endurance: $(STAMP)
+	$(BIN)/python tools/bench_endurance.py --minutes $(MINUTES)
 
 format: $(STAMP)
 	$(BIN)/ruff format .
