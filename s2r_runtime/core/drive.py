@@ -34,9 +34,11 @@ def regate(turn: Turn) -> None:
         reason = refusal.reason
         close(turn, turn.state.ended if reason == "no_controller" and turn.state.ended else reason)
         return
-    if turn.state.clear_since_ns is None:
-        turn.set(clear_since_ns=turn.now, gate_reason="settling")
-    if turn.now - (turn.state.clear_since_ns or 0) >= turn.settings.hysteresis_ns:
+    since = turn.state.clear_since_ns
+    if since is None:
+        since = turn.now
+        turn.set(clear_since_ns=since, gate_reason="settling")
+    if turn.now - since >= turn.settings.hysteresis_ns:
         _open(turn)
 
 
@@ -74,7 +76,12 @@ def recover_now(turn: Turn) -> None:
     because there the robot takes one command per observation.
     """
     if not (turn.settings.lockstep and turn.state.answered):
-        _send_recovery(turn, -1 if turn.state.control_seq is None else turn.state.control_seq)
+        _send_recovery(turn, _instant(turn))
+
+
+def _instant(turn: Turn) -> int:
+    """Number of the newest control instant; -1: none yet, or none since the robot's sequence began anew."""
+    return -1 if turn.state.control_seq is None else turn.state.control_seq
 
 
 def _send_recovery(turn: Turn, obs_seq: int) -> None:
@@ -232,8 +239,7 @@ def active(turn: Turn) -> Literal["sampler", "controller"] | None:
 
 def _answer_instant(turn: Turn) -> None:
     state, settings = turn.state, turn.settings
-    obs_seq = -1 if state.control_seq is None else state.control_seq
-    source = active(turn)
+    obs_seq, source = _instant(turn), active(turn)
     if source is not None:
         turn.set(asked=Asked(source, obs_seq, turn.now), idle=0)
         turn.emit(Ask(turn.now, source, obs_seq))
@@ -305,4 +311,4 @@ def keep_recovering(turn: Turn) -> None:
         return
     blind = state.trouble or state.observation is None or turn.now - state.observation_ns > settings.observation_timeout_ns
     if blind and turn.now - state.sent.t_ns >= settings.dt_ns:
-        _send_recovery(turn, -1 if state.control_seq is None else state.control_seq)
+        _send_recovery(turn, _instant(turn))
