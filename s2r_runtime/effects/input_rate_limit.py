@@ -16,7 +16,7 @@ from s2r_runtime.effects.follower import Follower
 from s2r_runtime.effects.input_effect import Array, Values, columns
 from s2r_runtime.hookspecs import NominalModel, Parameter
 
-CATCHING_UP = (0.8, 1.7, 3.5, 8.0, 20.0)
+CATCHING_UP = (0.8, 1.5, 3.0, 6.0, 11.0, 20.0, 36.0)
 """Steps that a large change of the input takes at the rates from which the tracer begins."""
 
 UNLIKE = ((2.0, 5.0), (5.0, 2.0))

@@ -25,6 +25,7 @@ from s2r_runtime.trace.candidates import Candidate
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, without
 from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
 from s2r_runtime.trace.screening import screen
+from s2r_runtime.trace.selection import accepted
 from s2r_runtime.trace.shapes import SHAPES
 from s2r_runtime.trace.slots import bounds_of
 
@@ -47,6 +48,10 @@ STARTS = 600
 """Rollouts that errors are compared on at most."""
 
 
+SECONDS = ("out", "back", "up", "down", "small", "large", "time_constant")
+"""Numbers of shapes that are times."""
+
+
 @dataclass(frozen=True)
 class Better:
     """A shape that does. nats: beyond the model without anything on that input, its numbers paid for."""
@@ -61,11 +66,11 @@ def better_shape(given: Problem, fit: Fit, horizon: int) -> Better | None:
     return max(won, key=lambda better: better.nats, default=None)
 
 
-def best_shape(given: Problem, base: Fit) -> Better | None:
-    """The shape that explains most of what a model leaves, on whichever input; None if none explains anything."""
+def best_shape(given: Problem, base: Fit, horizon: int) -> Better | None:
+    """The shape that explains most of what a model leaves, on whichever input; None if none would be taken if it were an effect."""
     found = [(gain(fit, base) - _price(given, fit, base), fit) for channel in base.model.inputs for fit in _fits(given, base, channel)]
     nats, fit = max(found, key=lambda pair: pair[0], default=(0.0, base))
-    return Better(_token(fit), nats) if nats > 0.0 else None
+    return Better(_token(fit), nats) if nats > 0.0 and accepted(given, fit, base, len(SHAPES) * len(base.model.inputs), horizon) else None
 
 
 def _inputs(fit: Fit) -> list[str]:
@@ -118,7 +123,14 @@ def _fits(given: Problem, base: Fit, channel: str, least: float = 0.0, near: Seq
     ]
     screened, _ = screen(given, base, offered) if offered else ([], 0)
     fits = [fitted(given, base, s.start, 2) for s in screened[:FITTED] if s.value > max(least, 0.0)]
-    return sorted(fits, key=lambda fit: -gain(fit, base))
+    return sorted((fit for fit in fits if _outlasts(fit, given.data.dt)), key=lambda fit: -gain(fit, base))
+
+
+def _outlasts(fit: Fit, dt: float) -> bool:
+    """False for memory of less than a step: that is how steps were cut, and when things were stamped."""
+    p = fit.model.effects[-1].p
+    times = [p[name] for name in SECONDS if name in p] + ([1.0 / p["rate"]] if "rate" in p else [])
+    return not times or max(times) > dt
 
 
 def _token(fit: Fit) -> str:

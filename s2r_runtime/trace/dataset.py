@@ -52,6 +52,11 @@ Array = NDArray[np.float64]
 PARTS = (4, 6)
 """Least and most parts of a step where inputs change within steps."""
 
+MOST_ROWS, EVEN = 12, 0.02
+"""Rows of inputs in a step up to which parts are whole shares of a row, where the rows go evenly into a step: a part that lies across two
+rows has the mean of both, and its end is known no better.
+"""
+
 PAUSE_S = 20.0
 """A recording that is silent for longer than this (or 200 steps) is two runs: what the robot did meanwhile is not known."""
 
@@ -299,8 +304,11 @@ def _parts(model: ComposedModel, stretches: Sequence[tuple[Stream, Stream]], exa
         spacing += np.diff(inputs.t)[np.diff(inputs.t) > 0.0].tolist()
     if aligned:
         return least
-    usual = float(np.median(spacing)) if spacing else model.dt
-    return max(least, min(max(math.ceil(model.dt / usual - ALIGNED), PARTS[0]), PARTS[1]))
+    rows = model.dt / float(np.median(spacing)) if spacing else 1.0
+    whole = round(rows)
+    if 1 < whole <= MOST_ROWS and abs(rows - whole) < EVEN * whole:
+        return whole * math.ceil(max(least, PARTS[0]) / whole)
+    return max(least, min(max(math.ceil(rows - ALIGNED), PARTS[0]), PARTS[1]))
 
 
 def _pauses(states: Stream, stamps: Array, run: int, usual: float, origin: float, dt: float) -> list[Pause]:

@@ -52,6 +52,11 @@ SLIDING = ("constant", "time", "wave")
 SLOWLY, SLOW = ("constant", "time"), 3.0
 """Times the usual nats for those that are slow: noise that wanders foretells the next second well, whatever its cause."""
 
+SEEN = 1.25
+"""Times the evidence under the noise of the model that the gain of what is slow counts at most: where a position wanders a little, terms
+that follow it make the noise of the process look like none, and all that comes after is foretold by that.
+"""
+
 CLIPPED = 10.0
 """Standard deviations at which a wild value is cut off where it is not taken for an outlier."""
 
@@ -177,8 +182,10 @@ def _strength(left: Left, j: Judged, threshold: float) -> tuple[float, Judged]:
     """Nats by which a dictionary is beyond chance, of whichever test shows it most clearly; 0 if none does. Where it is only sliding that
     shows it, with its betas on all rows: what happens once, or in one place, is not foretold from elsewhere.
     """
-    needed = threshold * j.scatter * (SLOW if j.token in SLOWLY else 1.0)
-    foretold = j.gain if j.gain > needed else 0.0
+    slow = j.token in SLOWLY
+    needed = threshold * j.scatter * (SLOW if slow else 1.0)
+    gained = min(j.gain, SEEN * first_look(left, j.x)) if slow else j.gain
+    foretold = j.gain if gained > needed else 0.0
     if j.token in SLIDING:
         return foretold, j
     white = left.fit.whiten(j.x)
@@ -231,6 +238,6 @@ def _weight_of(left: Left, nominal: Fit, judged: Judged, horizon: int) -> tuple[
         after = rms(rollout(model, data, act, starts, ahead, extra).error)
         for b, n, a in zip(before, now, after, strict=True):
             matters = matters or bool(n > (1.0 + MATTERS) * a)
-            if max(b, n) > worst * a:
+            if a > 0.0 and max(b, n) > worst * a:
                 worst, share = max(b, n) / a, max(n * n - a * a, 0.0) / max(b * b - a * a, n * n - a * a)
     return matters, share

@@ -78,10 +78,14 @@ def screen(given: Problem, base: Fit, found: Sequence[Candidate]) -> tuple[list[
 
 
 def _moved_on(given: Problem, white: Fit, aside: _Aside, before: Array, s: Screened, level: float) -> Screened:
-    """An effect of several numbers that no scale brings in place, some steps on from its best start."""
+    """An effect of several numbers, or of one that has no neutral value, some steps on from its best start: no scale brings it in place."""
     place = s.candidate.place if s.candidate.replaced < 0 else s.candidate.replaced
     slots = tuple(slots_of(s.start.effects[place], place))
-    if len(slots) < 2 or getattr(s.start.effects[place].effect, "additive", False):
+    if (
+        not slots
+        or (len(slots) < 2 and bounds_of(s.start, slots[0]).neutral is not None)
+        or getattr(s.start.effects[place].effect, "additive", False)
+    ):
         return s
     start = refine(given, white, s.start, slots, STEPS_ON)
     column = white.whiten(predicted(start, given.steps, acting(start, given.data)) - before).reshape(-1, 1)

@@ -41,6 +41,9 @@ RELEVANT = 0.05
 WITHIN = 0.4
 """Of a step: what stamps off the grid can look like."""
 
+EDGE = 0.02
+"""Share of the steps on either side of a change that makes it one."""
+
 MOST = 5
 """Effects that are looked for at most."""
 
@@ -103,6 +106,7 @@ def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int, bar:
         limited(fit)
         and significant(given, fit, base, tried, bar)
         and _told_by_stamps(given, fit, base)
+        and _happens(given, fit)
         and relevant(given, fit, base, horizon)
     )
 
@@ -120,6 +124,16 @@ def _told_by_stamps(given: Problem, fit: Fit, base: Fit) -> bool:
         if name_of(fit.model.effects[slot.place]) not in there
     ]
     return all(p.unit != "s" or p.neutral != 0.0 or value > WITHIN * data.dt for p, value in new)
+
+
+def _happens(given: Problem, fit: Fit) -> bool:
+    """False for what changes at one time, if hardly any steps lie before it, or after it: that is no change."""
+    for slot, value in zip(fit.free, values_of(fit.model, fit.free).tolist(), strict=True):
+        if getattr(fit.model.effects[slot.place].effect, "timed", False) and bounds_of(fit.model, slot).unit == "s":
+            before = float(np.mean(given.steps.t < value))
+            if not EDGE < before < 1.0 - EDGE:
+                return False
+    return True
 
 
 def significant(given: Problem, fit: Fit, base: Fit, tried: int, bar: Bar = STRICT) -> bool:

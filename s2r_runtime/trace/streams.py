@@ -21,6 +21,9 @@ Rates = Callable[[Array, Array], Array]
 ALIGNED = 0.02
 """A stamp this part of dt away from the grid counts as on it: stamps are printed with a few digits."""
 
+ROUNDING = 1e-9
+"""Of an input's size: smaller differences come from how a mean was computed."""
+
 TOGETHER = 0.8
 """If this part of the rows with the rarest state has all states, they come on the same stamps, and the rest is left."""
 
@@ -216,8 +219,15 @@ def held_means(inputs: Stream, t0: float, steps: int, dt: float, parts: int) -> 
     last = np.searchsorted(t, edges, side="right") - 1
     i = np.maximum(last, 0)
     area = np.where(last[:, None] >= 0, total[i] + values[i] * (edges - t[i])[:, None], 0.0)
-    mean: Array = np.diff(area, axis=0) * (parts / dt)
-    return mean
+    return _held_or_mean(np.diff(area, axis=0) * (parts / dt), values, last[:-1])
+
+
+def _held_or_mean(mean: Array, values: Array, last: NDArray[np.int64]) -> Array:
+    """Means over parts, (K, nu); exactly what is held (row `last` of values) where nothing changes within a part, which an integral gives
+    but for rounding: what looks for changes would find one in every part.
+    """
+    here = np.where(last[:, None] >= 0, values[np.maximum(last, 0)], 0.0)
+    return np.asarray(np.where(np.abs(mean - here) <= ROUNDING * np.max(np.abs(values), initial=0.0), here, mean))
 
 
 def on_grid(t: Array, dt: float) -> bool:
@@ -256,7 +266,8 @@ def held_between(inputs: Stream, at: Array, parts: int) -> Array:
     if not len(values):
         return np.zeros(((len(at) - 1) * parts, values.shape[1]))
     edges = np.interp(np.arange((len(at) - 1) * parts + 1) / parts, np.arange(len(at)), at)
-    return np.asarray(np.diff(_area(inputs, edges), axis=0) / np.diff(edges)[:, None])
+    last = np.searchsorted(inputs.t, edges[:-1], side="right") - 1
+    return _held_or_mean(np.diff(_area(inputs, edges), axis=0) / np.diff(edges)[:, None], values, last)
 
 
 def interpolated(states: Stream, dt: float, angles: list[int], spacing: float) -> Array:

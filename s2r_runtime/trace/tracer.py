@@ -23,7 +23,7 @@ from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.beginning import with_history
-from s2r_runtime.trace.challenge import best_shape, better_shape
+from s2r_runtime.trace.challenge import Better, best_shape, better_shape
 from s2r_runtime.trace.dataset import Dataset, thinned
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge, noise_floor
@@ -55,6 +55,9 @@ FIT_STEPS = 4000
 
 STRUCTURE_STEPS = 4000
 """Transitions that the lack of fit is tested on at most."""
+
+MOST_ON_ONE = 3
+"""Effects on one input that are believed."""
 
 MOVED, ASKED = 1.5, 5.0
 """A robot whose measurements lie apart after the horizon as they do after one step has stood still; it was asked to move if the
@@ -114,12 +117,12 @@ def _traced(
     chosen = select(given, model, ahead, lambda share: say(5.0 + 75.0 * share, 100.0, "looking for effects"))
     chosen = confirmed(given, chosen, judged_on)
     say(80.0, 100.0, "testing what is left")
-    whole = _Whole(checked, model)
-    structure = whole.structure(chosen, ahead)
+    whole = _Whole(checked, model, ahead)
+    structure = whole.structure(chosen)
     if structure.matters and not structure.nameless:  # something is there: its name may be asked with a lower bar, if that leaves nothing
         other = confirmed(given, select(given, model, ahead, lambda share: None, LENIENT, chosen), judged_on)
         if names(other.fit.model) != names(chosen.fit.model):
-            rest = whole.structure(other, ahead)
+            rest = whole.structure(other)
             chosen, structure = (chosen, structure) if rest.matters else (other, rest)
     say(90.0, 100.0, "judging on held-out data")
     w = np.ones(len(model.states)) if weights is None else np.asarray(weights, dtype=np.float64)
@@ -218,33 +221,45 @@ def _enough(data: Dataset, model: ComposedModel, fit_part: Part, judged_on: Held
 class _Whole:
     """All of a recording, and what the nominal model leaves of it: a test for structure needs no data that the fit never saw."""
 
-    def __init__(self, checked: Checked, nominal: ComposedModel) -> None:
+    def __init__(self, checked: Checked, nominal: ComposedModel, horizon: int) -> None:
         everything = part(checked.data, checked.left_out, np.ones(first_steps(checked.data)[-1], dtype=bool), STRUCTURE_STEPS)
         self.given = problem(everything.data, everything.steps)
         self.nominal = evaluate(self.given, nominal)
+        self._horizon = horizon
 
     @cached_property
     def unnamed(self) -> tuple[str, float]:
         """`best_unnamed`, for whatever was selected."""
         return best_unnamed(self.given, self.nominal)
 
-    def structure(self, chosen: Selection, horizon: int) -> Structure:
+    def structure(self, chosen: Selection) -> Structure:
         """What the chosen model leaves."""
         fit = evaluate(self.given, chosen.fit.model)
-        found = lack_of_fit(self.given, fit, self.nominal, horizon)
-        if fit.added and explains_more(self.unnamed[1], fit, self.nominal, left=found.matters):
+        found = lack_of_fit(self.given, fit, self.nominal, self._horizon)
+        if not fit.added:
+            tokens = self._looks_like if found.matters else () if self._shape is None else (self._shape.token,)
+            return replace(found, tokens=tuple(dict.fromkeys((*tokens, *found.tokens))), matters=True, share=1.0) if tokens else found
+        if _crowded(fit) or explains_more(self.unnamed[1], fit, self.nominal, left=found.matters):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
-        if found.matters and not fit.added:
-            return replace(found, tokens=tuple(dict.fromkeys((*self._looks_like, *found.tokens))))
-        better = better_shape(self.given, fit, horizon) if fit.added else None
+        better = better_shape(self.given, fit, self._horizon)
         return found if better is None else replace(found, tokens=(better.token,), matters=True, share=1.0, nameless=True)
 
     @cached_property
     def _looks_like(self) -> tuple[str, ...]:
         """What all that the nominal model lacks depends on most: by the best dictionary, or by a shape that does better."""
         token, nats = self.unnamed
-        shape = best_shape(self.given, self.nominal)
-        return (token,) if shape is None or shape.nats < MORE * nats + ALIKE else (shape.token,)
+        return (token,) if self._shape is None or self._shape.nats < MORE * nats + ALIKE else (self._shape.token,)
+
+    @cached_property
+    def _shape(self) -> Better | None:
+        """The shape that explains most of it."""
+        return best_shape(self.given, self.nominal, self._horizon)
+
+
+def _crowded(fit: Fit) -> bool:
+    """Whether some input has so many effects that they are a curve in parts, not so many things that happen."""
+    channels = [fit.model.effects[i].channel for i in fit.added if fit.model.effects[i].effect.stage == "input"]
+    return any(channels.count(c) > MOST_ON_ONE for c in channels)
 
 
 def _new(fit: Fit, other: Fit) -> list[int]:
