@@ -129,6 +129,19 @@ def test_what_is_no_code_cannot_be_read(target: Path, code: str) -> None:
     assert "ermission denied" in confined(code, target)
 
 
+@pytest.mark.skipif(not LANDLOCK, reason="this kernel has no Landlock")
+def test_a_package_that_is_a_link_in_its_folder_can_go_on_importing_itself(target: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    real, site = tmp_path_factory.mktemp("real") / "linked", tmp_path_factory.mktemp("site")
+    real.mkdir()
+    for name in ("__init__.py", "late.py"):
+        (real / name).write_text("")
+    (real.parent / "secret.txt").write_text("kept")
+    (site / "linked").symlink_to(real)
+    before = f"sys.path.append({str(site)!r}); import linked"
+    assert confined("import linked.late", target, before).startswith("done")
+    assert "ermission denied" in confined(f"open({str(real.parent / 'secret.txt')!r})", target, before)
+
+
 def test_reading_stays_free_where_the_kernel_cannot_contain_it_and_that_is_said(target: Path) -> None:
     code = "print(open(PATH).read())"
     said = confined(code, target, before="from s2r_runtime.controllers import reading; reading.restrict = lambda places: False")

@@ -73,9 +73,14 @@ def _code() -> Iterator[Path]:
         else:
             yield from (path.parent for path in entry.glob("*/__init__.py"))
             yield from (path for path in entry.iterdir() if path.suffix in {".py", ".so"})
+    inside = [Path(os.path.realpath(prefix)) for prefix in prefixes]
     for name, module in list(sys.modules.items()):
         if name.startswith("__editable__"):
             yield from map(Path, getattr(module, "MAPPING", {}).values())
+        elif "." not in name and (file := getattr(module, "__file__", None)):
+            real = Path(os.path.realpath(file))  # a package that is a symlink in its folder
+            if not any(real.is_relative_to(prefix) for prefix in inside):
+                yield real.parent if real.name == "__init__.py" else real
 
 
 def _allow(libc: ctypes.CDLL, ruleset: int, place: Path) -> None:
