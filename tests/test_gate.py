@@ -274,6 +274,15 @@ def test_the_document_has_a_row_for_every_reason_and_no_other() -> None:
     assert sorted(rows) == sorted(gate.REASONS)
 
 
+def test_what_is_about_a_command_and_what_always_latches_are_the_documents() -> None:
+    text = (Path(__file__).parent.parent / "docs" / "gate.md").read_text(encoding="utf-8")
+    always = re.findall(r"^\| `([a-z_]+)` \|.*\| always \|", text, re.MULTILINE)
+    assert tuple(always) == gate.ALWAYS_LATCHING
+    assert gate.REASONS[-5:-1] == gate.ABOUT_COMMAND  # before `settling`, which is nobody's doing
+    assert gate.ABOUT_COMMAND == ("command_invalid", "command_out_of_order", "command_stale", "input_out_of_bounds")
+    assert gate.ALLOWED == "allowed"
+
+
 # ---------------------------------------------------------------- properties
 
 _CHANGES = [
