@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 from pathlib import Path
@@ -228,6 +229,25 @@ def test_a_file_that_is_too_long_is_refused_before_anything_is_read_of_it() -> N
         certificate.load(longest, [PUBLIC])
     with pytest.raises(ConfigError, match=f"has {len(longest) + 1} bytes, a certificate has at most {len(longest)}"):
         certificate.load(longest + b" ", [PUBLIC])
+
+
+def test_the_limits_of_a_file_and_what_is_signed_are_these(good: Evidence) -> None:
+    assert (certificate.FILE_MAX, certificate.CLOCKS_APART_S, certificate.SCHEMA) == (1_048_576, 60, 2)
+    signed = json.loads(certificate.sign(good.issue(), KEY))
+    content = canonical(signed["certificate"])
+    KEY.public_key().verify(base64.b64decode(signed["signature"]), b"s2r certificate 1\n" + content)
+    with pytest.raises(ConfigError, match=r"^certificate: is no certificate"):
+        certificate.load(b"", [PUBLIC])
+
+
+def test_what_is_not_said_when_issuing_is_not_assumed(good: Evidence) -> None:
+    n = sample_size(0.03, good.verification.beta)
+    alone = good.with_laws("uniform", "persistent", required=("uniform",), n=n)
+    issued = certificate.issue(
+        profile=alone.profile, controller=alone.controller, gap=alone.gap, verification=alone.verification, issued_unix_s=NOW
+    )  # no effect was traced
+    assert issued.not_shown == statements.not_shown(alone.gap, alone.verification, 0, trials=False)
+    assert issued.trials is None
 
 
 def test_an_id_of_another_content_is_refused_as_such(good: Evidence) -> None:

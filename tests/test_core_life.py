@@ -8,7 +8,11 @@ from typing import Any
 import msgspec
 from core_rig import GAP, Rig, S, kinds, memory, of, one, reason, sources
 
-from s2r_runtime.core.state import Turn, certificate, job, situation, unix_now
+from s2r_runtime import gate
+from s2r_runtime.core import certificates, drive, gaps, ledger, repair, requests, stream
+from s2r_runtime.core import reducer as core
+from s2r_runtime.core import sources as sources_of
+from s2r_runtime.core.state import Campaign, Deployment, Job, Turn, certificate, job, situation, unix_now
 from s2r_runtime.messages import (
     MEMORY_SCHEMA,
     SERIAL,
@@ -44,6 +48,30 @@ def remembered(rig: Rig, **changes: Any) -> None:
 
 
 # ---------------------------------------------------------------- beginning
+
+
+def test_before_anything_happened_nothing_is_so() -> None:
+    state = msgspec.to_builtins(core.initial())
+    assert state.pop("memory") == msgspec.to_builtins(Memory("", 0))
+    said = {"gate_reason": "not_started", "gate_said": "not_started"}
+    true = {"recorder_ok": True, "analytics_up": True, "answered": True}
+    numbers = {"controller_seq": -1, "sampler_seq": -1, "next_job": 1, "saved_e_value": 1.0}
+    assert {key: value for key, value in state.items() if value} == said | true | numbers
+    assert {repr(value) for key, value in state.items() if not value} == {"None", "''", "False", "0", "0.0", "()"}
+    assert Deployment("c", 1, "starting") == Deployment("c", 1, "starting", certificate_id="", running="")
+    assert Campaign(1, 2, 3) == Campaign(1, 2, 3, running=False, taken=0, inputs="")
+    plain = Job(1, "gap", 2, 3)
+    assert plain == Job(1, "gap", 2, 3, "", 0, 0.0, 0.0, "", again=False, stretch="campaign", least_radius=0.0)
+
+
+def test_the_constants_of_the_core_are_these() -> None:
+    assert (certificates.ROUNDING, drive.RETURNED_WITHIN_M, drive.LOST_AFTER_REPEATS, gaps.REFUTED) == (1e-9, 0.05, 2, 100)
+    assert (ledger.MAX_SAMPLES, repair.GROWN, repair.PROFILE, requests.LONGEST_PERMIT_S) == (10**9, 1.1, -1, 86_400.0)
+    assert repair.STRETCHES == {"": "campaign", "campaign": "campaign", "drive": "drive", "inputs": "inputs"}
+    assert set(requests.HINTS) <= {*gate.REASONS}
+    assert set(sources_of.INTERRUPTS) <= {*gate.REASONS}
+    assert sources_of.FAULTS == ("raised", "died", "deadline", "malformed")
+    assert (stream.BINS, stream.EXACT_TERMS, stream.EDGES[:3], stream.EDGES[16:18]) == (33, 30, (0.0, 0.0625, 0.125), (1.0, 1.25))
 
 
 def test_a_run_begins_at_its_own_time() -> None:

@@ -169,6 +169,36 @@ def test_nobody_else_ever_commands(source: str) -> None:
     assert decide(source, Case("")) == (False, "source_not_allowed", gate.NO_NUMBER)
 
 
+def test_a_situation_of_which_nothing_was_said_is_this_one() -> None:
+    assert msgspec.to_builtins(gate.Situation()) == {
+        "clock_ns": 0,
+        "unix_s": 0,
+        "stopping": False,
+        "latched": (),
+        "recorder_ok": False,
+        "link_up": False,
+        "permit_until_ns": None,
+        "campaign_running": False,
+        "controller_digest": None,
+        "analytics_up": False,
+        "alarmed": False,
+        "verifying": False,
+        "certificate": None,
+        "revoked": False,
+        "model_digest": "",
+        "epoch": 0,
+        "radius": math.inf,
+        "faults": 0,
+        "observation": None,
+        "observation_ns": 0,
+        "trouble": "",
+        "asked_seq": None,
+        "asked_ns": 0,
+        "last_command_seq": -1,
+        "clear_since_ns": None,
+    }
+
+
 def test_the_defaults_of_a_situation_are_closed_for_everybody() -> None:
     for source in ("controller", "sampler"):
         assert not gate.decide(SETTINGS, gate.Situation(), msgspec.structs.replace(COMMAND, source=source), NOW).allow
