@@ -63,9 +63,9 @@ def test_what_it_raises_in_one_state_keeps_it_from_no_other(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("body", "words"),
     [
-        ("os._exit(7)", r"ended in the middle of a question \(exit status 7\)"),
+        ("os._exit(7)", r"died in the middle of a question \(exit status 7\)"),
         ("import ctypes; ctypes.string_at(0)", r"killed by signal 11"),
-        ("os.closerange(3, 60); return x[:, :2]", "ended in the middle of a question"),
+        ("os.closerange(3, 60); return x[:, :2]", "died in the middle of a question"),
         ("put(b'u' + (1 << 60).to_bytes(8, 'little')); " + HOLD, "announced 1152921504606846976 bytes, at most 64"),
         ("put(b'u' + (8).to_bytes(8, 'little') + b'x' * 8); " + HOLD, "answered 8 bytes, must be 64"),
         ("put(b'u' + (64).to_bytes(8, 'little') + b'\\xff' * 64); " + HOLD, "not finite"),
@@ -90,7 +90,7 @@ def put(data):
 def test_once_gone_it_stays_gone_and_nobody_else_is_killed_for_it(tmp_path: Path) -> None:
     with running(tmp_path, "os._exit(0)") as control:
         for _ in range(3):
-            with pytest.raises(ControllerError, match="ended in the middle"):
+            with pytest.raises(ControllerError, match="died in the middle"):
                 control(np.zeros((1, 3)), {})
     control.close()
 

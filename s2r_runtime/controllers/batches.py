@@ -154,7 +154,7 @@ class BatchController:
         """It hung up. Whether it also ended is seen to."""
         status = self._end()
         how = f"killed by signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else f"exit status {os.waitstatus_to_exitcode(status)}"
-        self._ended = f"{Path(self._path).name}: its process ended in the middle of a question ({how})"
+        self._ended = f"{Path(self._path).name}: its process died in the middle of a question ({how})"
         return ControllerError(self._ended)
 
     def _error(self, kind: bytes, content: bytes) -> ControllerError:
