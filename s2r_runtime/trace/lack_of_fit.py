@@ -60,10 +60,8 @@ that follow it make the noise of the process look like none, and all that comes 
 CLIPPED = 10.0
 """Standard deviations at which a wild value is cut off where it is not taken for an outlier."""
 
-MORE, MUCH_MORE = 1.1, 1.15
-"""Times what effects explain that a dictionary must explain, for them to be the wrong ones: with noise of its own, each is a little off.
-The second one where the effects seem to leave nothing.
-"""
+MORE = 1.1
+"""Times what effects explain that a dictionary must explain, for them to be the wrong ones: with noise of its own, each is a little off."""
 
 BEYOND = 8.0
 """Nats by which the evidence must exceed that of every slide."""
@@ -121,7 +119,7 @@ def explains_more(nats: float, fit: Fit, nominal: Fit, *, left: bool) -> bool:
     """Whether a dictionary that explains so much beats the effects of `fit` clearly: these took up structure that is not theirs. left:
     whether they leave some that matters.
     """
-    return nats > (MORE * explained(fit, nominal) + ALIKE if left else MUCH_MORE * explained(fit, nominal) + 2.0 * ALIKE)
+    return nats > MORE * explained(fit, nominal) + ALIKE * (1.0 if left else 3.0)
 
 
 def _left_by(given: Problem, fit: Fit) -> tuple[Left, list[tuple[str, Array]]]:

@@ -44,8 +44,8 @@ WITHIN = 0.4
 EDGE = 0.02
 """Share of the steps on either side of a change that makes it one."""
 
-MOST = 5
-"""Effects that are looked for at most."""
+MOST, MOST_ON_ONE = 5, 3
+"""Effects that are looked for at most, and on one input: more are a curve in parts, not so many things that happen."""
 
 EXCHANGED = 3
 """Effects up to which earlier ones are asked again whether another would do better: that takes a round for each."""
@@ -95,9 +95,17 @@ def select(
             break
         chosen = fitted(given, chosen, chosen.model)
         fit = exchanged(given, chosen, bar) if 1 < len(chosen.added) <= EXCHANGED else chosen
+        if crowded(fit):
+            break
     fit = pruned(given, fit, tried, horizon, bar)
     progress(0.8)
     return Selection(nominal, fit, tried, tuple(ranking), tuple(rivals(given, fit)))
+
+
+def crowded(fit: Fit) -> bool:
+    """Whether more effects were found on some input than are believed."""
+    channels = [fit.model.effects[i].channel for i in fit.added if fit.model.effects[i].effect.stage == "input"]
+    return any(channels.count(c) > MOST_ON_ONE for c in channels)
 
 
 def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int, bar: Bar = STRICT) -> bool:
@@ -197,7 +205,10 @@ def exchanged(given: Problem, fit: Fit, bar: Bar) -> Fit:
         base = fitted(given, fit, without(fit.model, place), 1)
         found, _ = best_candidates(given, base, 4, bar, gain(fit, base))
         best = found[0].fit if found else None
-        if best is not None and gain(best, fit) > bar.price(best.k - fit.k, len(given.steps)) + CLOSE:
+        if best is None:
+            continue
+        margin = CLOSE if best.k >= fit.k else 0.0  # a simpler one that does as well needs no more than that
+        if gain(best, fit) > bar.price(best.k - fit.k, len(given.steps)) + margin:
             fit = fitted(given, best, best.model)
     return fit
 

@@ -29,7 +29,7 @@ from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge, noise_floor
 from s2r_runtime.trace.excitation import advice
 from s2r_runtime.trace.faults import Checked, check
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, problem
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, problem
 from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.intervals import intervals
 from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, Structure, best_unnamed, explains_more, lack_of_fit
@@ -38,7 +38,7 @@ from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.residual import Mask, first_steps, rms, steps_of
 from s2r_runtime.trace.result import Found, Limit, TraceResult
 from s2r_runtime.trace.scores import LENIENT, names
-from s2r_runtime.trace.selection import Selection, select
+from s2r_runtime.trace.selection import Selection, crowded, select
 from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.verdict import confirmed, final_fit, foretells, verdict_of
 
@@ -55,9 +55,6 @@ FIT_STEPS = 4000
 
 STRUCTURE_STEPS = 4000
 """Transitions that the lack of fit is tested on at most."""
-
-MOST_ON_ONE = 3
-"""Effects on one input that are believed."""
 
 MOVED, ASKED = 1.5, 5.0
 """A robot whose measurements lie apart after the horizon as they do after one step has stood still; it was asked to move if the
@@ -239,9 +236,10 @@ class _Whole:
         if not fit.added:
             tokens = self._looks_like if found.matters else () if self._shape is None else (self._shape.token,)
             return replace(found, tokens=tuple(dict.fromkeys((*tokens, *found.tokens))), matters=True, share=1.0) if tokens else found
-        if _crowded(fit) or explains_more(self.unnamed[1], fit, self.nominal, left=found.matters):
+        best = fitted(self.given, fit, fit.model, 2)  # what it is compared with is fitted to all of the recording, too
+        if crowded(fit) or explains_more(self.unnamed[1], best, self.nominal, left=found.matters):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
-        better = better_shape(self.given, fit, self._horizon)
+        better = better_shape(self.given, best, self._horizon)
         return found if better is None else replace(found, tokens=(better.token,), matters=True, share=1.0, nameless=True)
 
     @cached_property
@@ -254,12 +252,6 @@ class _Whole:
     def _shape(self) -> Better | None:
         """The shape that explains most of it."""
         return best_shape(self.given, self.nominal, self._horizon)
-
-
-def _crowded(fit: Fit) -> bool:
-    """Whether some input has so many effects that they are a curve in parts, not so many things that happen."""
-    channels = [fit.model.effects[i].channel for i in fit.added if fit.model.effects[i].effect.stage == "input"]
-    return any(channels.count(c) > MOST_ON_ONE for c in channels)
 
 
 def _new(fit: Fit, other: Fit) -> list[int]:
