@@ -103,7 +103,7 @@ def test_a_robot_that_started_anew_closes_the_gate_for_that_reason() -> None:
     rig.driving()
     rig.t += S
     outputs = see(rig, Observation(1, 1, (0.5, 0.2, 0.0)))
-    assert next(change.reason for change in of(outputs, GateChanged)) == "observation_out_of_order"
+    assert [change.reason for change in of(outputs, GateChanged)][:2] == ["observation_stale", "observation_out_of_order"]
     assert rig.state.trouble == ""
 
 
@@ -211,6 +211,21 @@ def test_a_samplers_numbers_must_grow() -> None:
 
 
 # ---------------------------------------------------------------- when nobody answers
+
+
+def test_a_daemon_that_stood_still_closes_the_gate_even_where_an_observation_comes_first() -> None:
+    """What waited in the socket meanwhile is as old as the pause, and no stamp of the robot's says so."""
+    timeout = Rig().settings.observation_timeout_ns
+    for pause, stays in ((timeout, True), (timeout + 1, False), (10 * S, False)):
+        rig = Rig()
+        rig.driving()
+        rig.observe()
+        outputs = rig.observe(after=pause)
+        assert rig.state.gate_open == stays
+        if not stays:
+            assert next(change.reason for change in of(outputs, GateChanged)) == "observation_stale"
+            assert sources(outputs)[0] == "recovery"
+            assert sources(rig.propose()) == ["recovery"]  # it settles anew
 
 
 def test_a_robot_that_is_heard_again_and_not_yet_seen_is_told_to_stop_at_its_pace() -> None:

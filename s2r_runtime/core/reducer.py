@@ -69,7 +69,10 @@ def handle(state: State, event: Event) -> tuple[State, tuple[Output, ...]]:
     turn = Turn(state, state.settings, event.t_ns)
     if event.t_ns < state.now_ns:
         sources.clock_stepped_back(turn)
+    paused = event.t_ns - state.now_ns > state.settings.observation_timeout_ns and not state.settings.lockstep
     turn.set(now_ns=event.t_ns)
+    if paused:  # the daemon stood still: what it saw last is stale, whatever this event brings
+        drive.regate(turn)
     _dispatch(turn, event)
     sources.check_campaign(turn)
     excitation.follow_inputs(turn, event)
