@@ -158,3 +158,17 @@ def test_runs_that_each_begin_at_zero_are_not_asked_when_something_happened():
         tokens = {token for token, _ in dictionaries(given, model, act, fit.noise, residual(model, given.steps, act))}
         assert ({"time", "time*ax"} <= tokens) is in_order
         assert {"speed", "memory(ax)"} <= tokens
+
+
+def test_a_heading_that_is_rounded_coarser_than_a_step_turns_it_is_noise_and_no_spikes():
+    """Most rows repeat the heading of the row before: their median residual is next to nothing, and would make every turn an outlier."""
+    data = recordings([("input_gain", "w", {"gain": 0.6})], 1, steps=1500, seed=71, noise=2.0 * NOISE)[0]
+    y = data.runs[0].y
+    step = 0.12
+    y[:, 2] = np.rint(y[:, 2] / step) * step
+    assert np.mean(np.diff(y[:, 2]) == 0.0) > 0.5
+    found = trace(data, declared())
+    assert found.outliers < 10
+    assert not found.faults
+    assert [(e.name, e.channel) for e in found.effects] == [("input_gain", "w")]
+    assert found.effects[0].parameters["gain"][0] == pytest.approx(0.6, abs=0.06)

@@ -34,9 +34,6 @@ WIDEST = 5.0
 SCORE_BLOCKS = 10
 """Blocks of time whose scores are compared: long against what noise remembers, many enough to tell."""
 
-ROUNDED = 10
-"""Changes of a state that must be whole multiples of the smallest one before it counts as rounded."""
-
 ITERATIONS = 8
 ROUNDS = 6
 SETTLED = 0.3
@@ -92,19 +89,8 @@ def gain(fit: Fit, base: Fit) -> float:
 def problem(data: Dataset, steps: Steps) -> Problem:
     """Of these transitions."""
     moved = np.std(steps.y1 - steps.y0, axis=0) + 1e-9 * np.std(steps.y0, axis=0) + 1e-12
-    rounding = np.array([_quantum(column) for column in (steps.y1 - steps.y0).T]) ** 2 / 12.0
+    rounding = np.array([noises.quantum(column) for column in (steps.y1 - steps.y0).T]) ** 2 / 12.0
     return Problem(data, steps, Noise((EXACT * moved) ** 2, np.maximum((EXACT * moved) ** 2, rounding)))
-
-
-def _quantum(change: Array) -> float:
-    """The step in which a measured state is rounded; 0 if it is not. change: (n,) from row to row."""
-    sizes = np.abs(change[change != 0.0])
-    if len(sizes) < ROUNDED:
-        return 0.0
-    quantum = float(np.min(sizes))
-    sizes = sizes[sizes < 1000.0 * quantum] / quantum
-    whole = np.abs(sizes - np.rint(sizes)) < 0.02
-    return quantum if len(sizes) >= ROUNDED and np.mean(whole) > 0.95 else 0.0
 
 
 def evaluate(given: Problem, model: ComposedModel, near: Noise | None = None) -> Fit:

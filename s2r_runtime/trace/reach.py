@@ -11,12 +11,18 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.residual import Acting, advanced, first_steps
+from s2r_runtime.trace.residual_noise import quantum
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SIGMAS = 8.0
 """Robust standard deviations from which a single residual is suspected."""
+
+ROUNDING = math.sqrt(1.0 / 6.0)
+"""Of the step in which a state is rounded, standard deviation of what that does to a residual, which has it twice. Where more than half of
+the residuals are alike, their median says nothing of noise.
+"""
 
 ONE_IN = 100.0
 """Recordings in which noise may once reach a spike's size."""
@@ -59,7 +65,9 @@ def reach_of(model: ComposedModel, data: Dataset, act: Acting) -> Reach:
         return Reach(one, one, one, instant)
     noise = np.median(np.abs(residuals[good]), axis=0) / 0.6745
     largest = np.quantile(np.abs(move[good]), 0.999, axis=0)
-    return Reach(np.maximum(noise, 1e-12), largest, _tail(residuals), instant)
+    y = [run.y[np.isfinite(run.y).all(axis=1)] for run in data.runs]
+    rounded = [quantum(np.concatenate([np.diff(rows[:, j]) for rows in y])) for j in range(len(model.states))]
+    return Reach(np.maximum(noise, ROUNDING * np.array(rounded) + 1e-12), largest, _tail(residuals), instant)
 
 
 def _tail(residuals: Array) -> Array:

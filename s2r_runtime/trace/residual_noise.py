@@ -41,6 +41,10 @@ ENOUGH = 6000
 """Steps from which Q and R are estimated at most; their relative error is then about 2 %."""
 
 
+ROUNDED = 10
+"""Changes of a state that must be whole multiples of the smallest one before it counts as rounded."""
+
+
 @dataclass(frozen=True)
 class Noise:
     """Variances by state, (nx,): q of the process a step, r of the measurement."""
@@ -243,3 +247,14 @@ def colour(z: Array, joined: Mask) -> Colour:
                 coefficients[i] = 0.0
                 coefficients[i, :order] = c
     return Colour(coefficients, scale)
+
+
+def quantum(change: Array) -> float:
+    """The step in which a measured state is rounded; 0 if it is not. change: (n,) from row to row."""
+    sizes = np.abs(change[change != 0.0])
+    if len(sizes) < ROUNDED:
+        return 0.0
+    least = float(np.min(sizes))
+    sizes = sizes[sizes < 1000.0 * least] / least
+    whole = np.abs(sizes - np.rint(sizes)) < 0.02
+    return least if len(sizes) >= ROUNDED and np.mean(whole) > 0.95 else 0.0
