@@ -66,8 +66,8 @@ class Size(NamedTuple):
     """How much of everything: the paper's numbers, or a smoke run's."""
 
     samples: int = 100
-    starts: int = 100
-    fresh: int = 600
+    starts: int = 60
+    fresh: int = 400
     large: int = LARGE
     counts: tuple[int, ...] = SCENARIOS
     every: int = 1
@@ -235,6 +235,7 @@ def experiment(robot: Walker, seed: int, size: Size, told: Callable[[str], None]
     told("what does the model lack?")
     lacking = traced(campaign, compose(PROFILE.model), size.rows)
     effects = tuple(lacking["effects"])
+    told(lacking["text"])
     found: dict[str, Any] = {
         "seed": seed,
         "walked_s": walked_s,
@@ -255,6 +256,7 @@ def experiment(robot: Walker, seed: int, size: Size, told: Callable[[str], None]
         "in stride": curve(campaign, STEPS, "in stride"),
         **({"standing start, with what was traced": curve(fresh, STEPS, "standing", effects=effects)} if effects else {}),
     }
+    told("\n".join(_gap_lines(found)))
     driven: dict[tuple[int, float], list[Run]] = {}
 
     def ran(number: int, model: ComposedModel) -> list[Run]:
@@ -267,15 +269,20 @@ def experiment(robot: Walker, seed: int, size: Size, told: Callable[[str], None]
         for law in size.laws:
             told(f"verification: {candidate.setting.name}, {law}")
             found["models"].append(judged(candidate, law, size, seed, ran))
+            told("\n".join(_model_lines(found["models"][-1])))
     return found
 
 
-MORE = ((100, 0, 0.03), (299, 0, 0.01), (598, 0, 0.005), (598, 10, 0.03))
+MORE = ((100, 0, 0.03), (299, 0, 0.01), (299, 3, 0.03))
 """N samples, k discarded, epsilon: each at 95 %."""
 
 
 def lines_of(found: dict[str, Any]) -> list[str]:
     """What came out, in lines."""
+    return [*_gap_lines(found), *(line for one in found["models"] for line in _model_lines(one))]
+
+
+def _gap_lines(found: dict[str, Any]) -> list[str]:
     lines = [f"the robot walked {found['walked_s'] / 60.0:.0f} minutes for its {found['gaps'][0]['n']} samples"]
     lines.append("gap: r, in parts (position m, heading rad), what standing still would score, r as a share of that")
     for g in [*found["gaps"], *found.get("repaired", [])]:
@@ -289,8 +296,6 @@ def lines_of(found: dict[str, Any]) -> list[str]:
                 f"  {m['n']} {m['discarded']} {m['epsilon']:.1%} {m['confidence']:.1%}: {m['r']:.4f}, {m['share']:.0%}{beyond}   {name}"
             )
     lines.append(f"traced: {found['traced']['verdict']}; in the repaired model: {', '.join(found['traced']['effects']) or 'nothing'}")
-    for one in found["models"]:
-        lines += _model_lines(one)
     return lines
 
 
