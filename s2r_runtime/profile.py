@@ -154,11 +154,16 @@ class CertificateSettings(_Table, frozen=True):
 
 
 class Recording(_Table, frozen=True):
-    """Where logs go (relative to the state folder), when they rotate (bytes, s; 0: never)."""
+    """Where logs go (relative to the state folder), when they rotate (bytes, s; 0: never).
+
+    keep_bytes, keep_days: of all logs; the oldest runs beyond are deleted, but never what a valid certificate rests on (0: all are kept).
+    """
 
     directory: str = "logs"
     rotate_bytes: int = 1_000_000_000
     rotate_after: float = 0.0
+    keep_bytes: int = 0
+    keep_days: float = 0.0
 
 
 class Repair(_Table, frozen=True):
@@ -377,6 +382,8 @@ def _checks(p: Profile) -> list[tuple[str, object, str]]:
         if not ok:
             found.append((field, value, must))
 
+    need(p.recording.keep_bytes >= 0, "recording.keep_bytes", p.recording.keep_bytes, ">= 0 (0: all logs are kept)")
+    need(p.recording.keep_days >= 0.0, "recording.keep_days", p.recording.keep_days, ">= 0 (0: all logs are kept)")
     need(
         re.fullmatch(r"[a-z0-9][a-z0-9_-]*", p.robot.name) is not None,
         "robot.name",

@@ -19,6 +19,7 @@ import pytest
 from s2r_runtime import messages as m
 from s2r_runtime.audit.log import AuditResult, audit
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, RecordingError
+from s2r_runtime.recording.channels import LogDeleted
 from s2r_runtime.recording.reading import Entry
 from s2r_runtime.recording.recorder import Recorder
 from s2r_runtime.recording.salvage import recover
@@ -155,6 +156,15 @@ def test_a_log_that_ran_out_of_disk_holds_and_counts_what_it_lacks(run: Any, tmp
     result = audit([tmp_path / "a.mcap"])
     assert result.ok, result.text()
     assert f"{lost} messages at the end were not recorded" in result.missing[0]
+
+
+def test_a_log_that_the_daemon_deleted_is_missing_and_said_to_be(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.steps(5)
+    bench.items.append(LogDeleted(bench.t_ns, "earlier", 2, 1000, "ab" * 32, "older than 30 days"))
+    result = audit([bench.stop().write(tmp_path / "a.mcap")])
+    assert result.ok, result.text()
+    assert result.missing == [f"the log of run earlier (head {'ab' * 32}), which the daemon deleted: older than 30 days"]
 
 
 # ---------------------------------------------------------------- keys

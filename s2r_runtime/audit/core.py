@@ -67,6 +67,8 @@ class CoreReplay:
 
 def in_effect_order(outputs: tuple[Output, ...]) -> list[Output]:
     """The order in which the daemon carries outputs out: where the gate closes, the commands come first."""
+    if len(outputs) < 2:
+        return list(outputs)
     if not any(isinstance(output, GateChanged) and not output.open for output in outputs):
         return list(outputs)
     sends: list[Output] = [output for output in outputs if isinstance(output, Send)]

@@ -45,6 +45,8 @@ class Findings:
 
     def __init__(self) -> None:
         self.file = ""
+        self.files: list[str] = []
+        """Names of all files, in order."""
         self.same_platform = self.same_machine = True
         self.first: Difference | None = None
         self.differences = 0
@@ -77,6 +79,20 @@ class Findings:
         """Something is not in what was given. That is no difference."""
         if what not in self.missing:
             self.missing.append(what)
+
+    def add(self, other: Findings) -> None:
+        """What was found in another process, about the same files."""
+        self.differences += other.differences
+        if other.first is not None and (self.first is None or self._place(other.first) < self._place(self.first)):
+            self.first = other.first
+        for what, n in other.counts.items():
+            self.count(what, n)
+        for one in other.missing:
+            self.lack(one)
+        self.unchecked |= other.unchecked
+
+    def _place(self, one: Difference) -> tuple[int, int]:
+        return self.files.index(one.file) if one.file in self.files else -1, one.index
 
 
 def close(a: Any, b: Any) -> bool:

@@ -30,7 +30,7 @@ class Frames:
 
     def inbound(self, entry: Entry, frame: Frame) -> None:
         """A frame came. Everything that the one before was decoded to must have become an event by now."""
-        self._commands_left()
+        self.commands_left()
         self._events_are_there(entry)
         self._source = entry.index
         try:
@@ -41,7 +41,7 @@ class Frames:
 
     def event(self, entry: Entry, event: Event) -> None:
         """An event: one that only a frame can have brought must be the next that a frame did bring."""
-        self._commands_left()
+        self.commands_left()
         due = self._due[0] if self._due else None
         if isinstance(event, LinkChanged):
             if isinstance(due, LinkChanged) and (due.up, due.detail) == (event.up, event.detail):
@@ -100,11 +100,11 @@ class Frames:
         """
         if last_act is not None and self._left:
             self._sends.append(last_act)
-        self._commands_left()
+        self.commands_left()
         if clean and entry is not None:
             self._events_are_there(entry)
 
-    def _commands_left(self) -> None:
+    def commands_left(self) -> None:
         """Frames that left since the event before are its commands', in order. A command without a frame could not be sent."""
         while self._sends:
             encoded = self._encoded(self._sends.popleft())

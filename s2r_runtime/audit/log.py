@@ -7,6 +7,7 @@ constant memory but for attachments and campaign samples.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import msgspec
 
 from s2r_runtime import keys
+from s2r_runtime.audit.beside import Beside
 from s2r_runtime.audit.campaign import CampaignReplay
 from s2r_runtime.audit.certificates import Certificates
 from s2r_runtime.audit.evidence import Evidence
@@ -22,7 +24,7 @@ from s2r_runtime.audit.run import Across, RunAudit
 from s2r_runtime.audit.traces import SECONDS, Traces
 from s2r_runtime.errors import NotEnoughEvidence, RecordingError
 from s2r_runtime.recording.blocks import find
-from s2r_runtime.recording.channels import UNRECORDED, Unrecorded
+from s2r_runtime.recording.channels import DELETED, UNRECORDED, LogDeleted, Unrecorded
 from s2r_runtime.recording.layout import ABOUT, RECOVERED
 from s2r_runtime.recording.logs import is_log, runs
 from s2r_runtime.recording.reading import Reading
@@ -106,19 +108,22 @@ def audit(
     trusted = () if public_key is None else (public_key,)
     traces = Traces(findings, seconds=None if rerun_traces else SECONDS, progress=tell.detail)
     evidence = Evidence(findings, traces, rerun=rerun_controllers, progress=tell.detail)
-    across = Across(
-        findings, CampaignReplay(findings), evidence, Certificates(findings, evidence, revoked), traces, trusted, rerun_controllers
-    )
+    beside = Beside(findings)
+    certificates = Certificates(findings, evidence, revoked)
+    across = Across(findings, CampaignReplay(findings), evidence, certificates, traces, beside, trusted, rerun_controllers)
     readings: list[Reading] = []
     try:
         grouped = runs(paths)
     except RecordingError as error:
         return _damaged(paths, error)
-    for parts in grouped:
-        readings += parts
-        for reading in parts:
-            reading.sought = frozenset(heads)
-        _run(RunAudit(across), parts, findings, tell)
+    findings.files = [reading.path.name for parts in grouped for reading in parts]
+    with contextlib.closing(beside):
+        for parts in grouped:
+            readings += parts
+            for reading in parts:
+                reading.sought = frozenset(heads)
+            _run(RunAudit(across), parts, findings, tell)
+        beside.end()
     records = sum(sum(reading.counts.values()) for reading in readings)
     if not records and findings.first is None and _chain(readings) != "broken":
         raise NotEnoughEvidence(f"{', '.join(str(path) for path in paths)}: no record could be read, so there is nothing to audit")
@@ -179,6 +184,8 @@ def _run(run: RunAudit, parts: list[Reading], findings: Findings, tell: _Progres
                 lost = True
             else:
                 run.entry(entry)
+            if entry.channel == DELETED:
+                _deleted(entry.message, findings)
             if number % PROGRESS_EVERY == 0:
                 tell.at(reading)
         tell.over(reading)
@@ -242,6 +249,12 @@ def _anchored(readings: Sequence[Reading], heads: Sequence[bytes], findings: Fin
 def _unrecorded(message: msgspec.Struct, findings: Findings) -> None:
     assert isinstance(message, Unrecorded)  # noqa: S101 - the channel's type
     findings.lack(f"{message.count} messages at the end were not recorded: {message.reason}")
+
+
+def _deleted(message: msgspec.Struct, findings: Findings) -> None:
+    assert isinstance(message, LogDeleted)  # noqa: S101 - the channel's type
+    head = f" (head {message.head})" if message.head else ""
+    findings.lack(f"the log of run {message.run}{head}, which the daemon deleted: {message.reason}")
 
 
 def _chain(readings: Sequence[Reading]) -> str:

@@ -7,22 +7,20 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
+from s2r_runtime.audit.beside import Beside
 from s2r_runtime.audit.campaign import CampaignReplay
 from s2r_runtime.audit.certificates import Certificates
 from s2r_runtime.audit.core import CoreReplay, in_effect_order
 from s2r_runtime.audit.evidence import Evidence
 from s2r_runtime.audit.findings import Findings
-from s2r_runtime.audit.frames import Frames
 from s2r_runtime.audit.inputs import InputsReplay
 from s2r_runtime.audit.traces import RELEVANT, Traces
-from s2r_runtime.audit.watch import WatchReplay
 from s2r_runtime.canonical import digest
 from s2r_runtime.core.state import unix_now
 from s2r_runtime.daemon.model_store import parse_model
 from s2r_runtime.daemon.settings import ModelFacts, settings_of
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import (
-    AnalyticsChanged,
     Ask,
     AttemptSpent,
     CampaignFinished,
@@ -30,11 +28,9 @@ from s2r_runtime.messages import (
     Decided,
     EpochChanged,
     Event,
-    Frame,
     InputsFinished,
     IssueCertificate,
     JobFinished,
-    Measured,
     ModelAdopted,
     Observation,
     Observed,
@@ -54,10 +50,12 @@ from s2r_runtime.messages import (
     StartJob,
     StopController,
     Stopping,
+    Ticked,
 )
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import Profile, parse_profile
+from s2r_runtime.recording.channels import CHANNELS
 from s2r_runtime.recording.layout import Attached
 from s2r_runtime.recording.reading import Entry, Reading
 
@@ -66,6 +64,8 @@ if TYPE_CHECKING:
 
 
 _ENCODE = msgspec.json.Encoder().encode
+_ROUTES = {name: (name.partition("/")[0], name in RELEVANT) for name in CHANNELS}
+"""Channel -> family, and whether a trace looks at it."""
 
 
 class Across(NamedTuple):
@@ -76,6 +76,7 @@ class Across(NamedTuple):
     evidence: Evidence
     certificates: Certificates
     traces: Traces
+    beside: Beside
     trusted: tuple[bytes, ...]
     rerun: bool
 
@@ -95,8 +96,7 @@ class RunAudit:
         self._inputs = InputsReplay(across.findings)
         self._observation: Observation | None = None
         self._core = CoreReplay(across.findings)
-        self._watch = WatchReplay(across.findings)
-        self._frames: Frames | None = None
+        self._beside, self._begun = across.beside, False
         self._profile: Profile | None = None
         self._reading: Reading | None = None
         self._attachments: dict[str, Attached] = {}
@@ -117,31 +117,32 @@ class RunAudit:
     def entry(self, entry: Entry) -> None:
         """The next message."""
         self._entry = entry
-        message = entry.message if entry.channel in RELEVANT or entry.channel.startswith(("event/", "frame/")) else None
-        if message is not None and not entry.channel.startswith("out/") and _ENCODE(message) != entry.raw:
-            self._findings.differ(entry.index, entry.channel, "this is not how a recorder writes it", entry.raw, message)
-        if entry.channel.startswith("event/"):
-            self._now_ns = message.t_ns  # type: ignore[union-attr]
+        family, relevant = _ROUTES[entry.channel]
+        if family == "event":
+            event: Event = entry.message  # type: ignore[assignment]
+            self._now_ns = event.t_ns
+            if _ENCODE(event) != entry.raw:
+                self._findings.differ(entry.index, entry.channel, "this is not how a recorder writes it", entry.raw, event)
+            if relevant:
+                self._traces.take(entry, event)
+        elif relevant:
+            self._traces.take(entry, entry.message)
         if self._now_ns is not None and entry.log_time_ns != self._now_ns:
             self._findings.differ(entry.index, entry.channel, "it stands at another time than it is of", entry.log_time_ns, self._now_ns)
-        if message is not None and entry.channel in RELEVANT:
-            self._traces.take(entry, message)
-        family = entry.channel.partition("/")[0]
-        if family == "event":
-            self._take(entry, message)  # type: ignore[arg-type]
-        elif family == "out":
+        if family == "out":
             self._core.output(entry)
-        elif family == "frame" and self._frames is not None:
-            assert isinstance(message, Frame)  # noqa: S101 - the channel's type
-            (self._frames.inbound if message.inbound else self._frames.outbound)(entry, message)
+        elif family == "event":
+            self._take(entry, event)
+        elif family == "frame" and self._begun:
+            self._beside.frame(entry)
 
     def end(self, *, clean: bool) -> None:
         """Nothing follows. clean: the log was closed and lacks nothing, so neither may its last event, if that is an orderly end."""
         stopped = isinstance(self._event, Stopping)
-        if self._frames is not None:
-            self._frames.end(self._entry, None if stopped else self._last_act(), clean=clean and stopped)
+        if self._begun:
+            last_act = None if stopped else self._last_act()
+            self._beside.finish(self._entry, last_act, self._core.state.now_ns, clean=clean, stopped=stopped)
         self._core.end(complete=clean and stopped)
-        self._watch.finish(self._entry, self._core.state.now_ns, clean=clean)
         if clean and not stopped and self._event is not None:
             self._findings.lack("an orderly end: the daemon broke down, and closed its log")
 
@@ -152,9 +153,10 @@ class RunAudit:
         self._evidence.settled()
         if isinstance(event, Started):
             self._begin(entry, event)
-        if self._frames is not None:
-            self._frames.event(entry, event)
-        self._before(entry, event)
+        if self._begun:
+            self._beside.event(entry, event)
+        if type(event) is not Ticked:  # the most frequent one
+            self._before(entry, event)
         outputs = self._core.event(entry, event)
         for output in in_effect_order(outputs):
             self._output(entry, output)
@@ -173,12 +175,9 @@ class RunAudit:
     def _before(self, entry: Entry, event: Event) -> None:
         """What is recomputed of an event, before the core's outputs take effect."""
         match event:
-            case Observed(t_ns=t_ns, observation=observation):
+            case Observed(observation=observation):
                 self._seen_seq, self._observation = observation.seq, observation
-                self._watch.observed(entry, observation, t_ns)
                 self._campaigns.observed(observation)
-            case Measured():
-                self._watch.measured(entry, event)
             case Proposed() if event.command.source == "sampler":
                 (self._inputs if self._inputs.driving else self._campaigns).proposed(entry, event)
             case SampleTaken():
@@ -191,10 +190,6 @@ class RunAudit:
                 (self._inputs if self._inputs.driving else self._campaigns).started(entry, event)
             case SourceStopped(source="sampler"):
                 (self._inputs if self._inputs.driving else self._campaigns).stopped(entry, event)
-            case SourceStopped(source="controller", reason="start_failed"):
-                self._watch.doubted()
-            case AnalyticsChanged(up=up):
-                self._watch.analytics(up=up)
             case RecorderChanged(ok=False):
                 self._campaigns.doubted()
                 self._evidence.doubted()
@@ -227,8 +222,10 @@ class RunAudit:
             self._traces.begin_run(self._reading.run, self._reading.public_key, settings.trace_rows, event.memory)
         self._certificates.remembered(event.memory)
         options = {name: value for name, value in profile.transport.items() if name != "name"}
-        transport = registry().get("transports", str(profile.transport.get("name")))
-        self._frames = Frames(transport(options, facts.states, facts.inputs), len(facts.states), self._findings)
+        name = str(profile.transport.get("name"))
+        registry().get("transports", name)(options, facts.states, facts.inputs)  # a transport that is not here is said here
+        self._beside.run(name, options, facts.states, facts.inputs)
+        self._begun = True
 
     def _stored(self, entry: Entry, event: CertificateStored) -> None:
         settings = self._core.state.settings
@@ -248,27 +245,26 @@ class RunAudit:
         match output:
             case Send():
                 self._sent_seq = output.seq
-                self._watch.sent(output)
                 self._campaigns.sent(output)
-                if self._frames is not None:
-                    self._frames.send(output)
+                self._beside.sent(output)
+            case Decided():
+                self._campaigns.decided(output.reason)
+            case Ask(source="controller"):
+                pass
             case Ask(source="sampler") if self._inputs.driving:
                 self._inputs.ask(output, self._observation, settings.command_ttl_ns)
             case Ask(source="sampler"):
                 self._campaigns.ask(output, settings.command_ttl_ns)
             case StartInputs():
                 self._inputs.start(entry, output, profile, settings.inputs, self._attached())
-            case Decided():
-                self._campaigns.decided(output.reason)
             case StartCampaign():
                 in_force = settings_of(profile, profile.model, ModelFacts(settings.states, settings.inputs, settings.angles), settings.seed)
                 self._campaigns.start(output, in_force, profile.sampling)
             case StartController():
-                model = self._compose(profile.model)
-                if state.memory.gap is not None and model is not None:
-                    self._watch.begin(model, state.memory.gap, profile, state.memory, lockstep=settings.lockstep)
+                if state.memory.gap is not None and self._compose(profile.model) is not None:
+                    self._beside.begin(profile, state.memory.gap, state.memory, lockstep=settings.lockstep)
             case StopController():
-                self._watch.end()
+                self._beside.stop()
             case StartJob():
                 self._evidence.ordered(output, state.memory.gap)
             case IssueCertificate():

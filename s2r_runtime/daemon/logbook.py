@@ -12,6 +12,7 @@ from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+from s2r_runtime.daemon.retention import Retention
 from s2r_runtime.errors import ConfigError, RecordingError
 from s2r_runtime.messages import LogHead, Struct
 from s2r_runtime.modelspec import ModelSpec, dump_model
@@ -28,9 +29,17 @@ class Logbook:
     """Call `begin` before anything else. Nothing waits for the disk but `durable`, `begin` and `close`."""
 
     def __init__(
-        self, folder: Path, robot: str, settings: Recording, signer: Ed25519PrivateKey, *, lockstep: bool, file: Path | None
+        self,
+        folder: Path,
+        robot: str,
+        settings: Recording,
+        signer: Ed25519PrivateKey,
+        *,
+        lockstep: bool,
+        file: Path | None,
+        retention: Retention | None = None,
     ) -> None:
-        """file: the log's path, if it isn't to have a name of its own in `folder`."""
+        """file: the log's path, if it isn't to have a name of its own in `folder`. retention: notes what the logs are evidence of."""
         self._folder, self._robot, self._file = folder, robot, file
         self._settings, self._signer, self._lockstep = settings, signer, lockstep
         self._writer: Writer | None = None
@@ -39,6 +48,7 @@ class Logbook:
         self._trying: threading.Thread | None = None
         self._earlier: list[Path] = []
         self._attached: dict[str, Attachment] = {}
+        self._retention = retention
 
     def begin(self, profile: Path, model: ModelSpec, files: Mapping[str, str] | None = None) -> None:
         """The first log, with the profile's file and the model in force attached. files: those that the profile's transport names.
@@ -102,6 +112,8 @@ class Logbook:
         if self._writer is not None:
             self._earlier += self._writer.parts
         self._writer = writer
+        if self._retention is not None:
+            self._retention.begin(writer.path.stem)
         self._recorder = Recorder(writer, block_s=LOCKSTEP_WAIT_S if self._lockstep else 0.0)
 
     @property
@@ -126,6 +138,8 @@ class Logbook:
 
     def put(self, message: Struct, t_ns: int) -> None:
         """Records a message. One that cannot be taken shows in `health`."""
+        if self._retention is not None:
+            self._retention.note(message)
         if self._recorder is not None:
             self._recorder.put(message, t_ns)
 
@@ -136,8 +150,9 @@ class Logbook:
             self._recorder.attach(name, media_type, data)
 
     def durable(self) -> bool:
-        """Whether all that was put is on the disk now."""
-        return self._recorder is not None and self._recorder.durable()
+        """Whether all that was put is on the disk now, and what it is evidence of noted there."""
+        noted = self._retention is None or self._retention.save(self.anchor())
+        return noted and self._recorder is not None and self._recorder.durable()
 
     def health(self) -> Health:
         """How it is."""
@@ -157,6 +172,8 @@ class Logbook:
         if self._recorder is None:
             return self.health(), ""
         health = self._recorder.close()
+        if self._retention is not None:
+            self._retention.save(self.anchor())
         return health, self._recorder.head
 
     def _path(self) -> Path:

@@ -35,6 +35,7 @@ from s2r_runtime.daemon.hang_guard import HangGuard
 from s2r_runtime.daemon.logbook import Logbook
 from s2r_runtime.daemon.model_store import ModelStore
 from s2r_runtime.daemon.persistence import StateFolder
+from s2r_runtime.daemon.retention import Retention
 from s2r_runtime.daemon.robot_link import Clock, link_of
 from s2r_runtime.daemon.sampler import Keeper, Sampler
 from s2r_runtime.daemon.settings import ModelFacts, settings_of
@@ -74,6 +75,8 @@ WALL_CLOCK_NS = 1_000_000_000
 HEAD_NS = 1_000_000_000
 HEAD_LINE_NS = 600_000_000_000
 """Between two heads of the log's chain on the robot's side, and in the journal."""
+PRUNE_NS = 60_000_000_000
+"""Between two looks whether old logs are to be deleted."""
 NEW_LOG_NS = 1_000_000_000
 """Between two looks whether a new log can begin after the old one lost a message."""
 
@@ -121,7 +124,7 @@ class Daemon:
         self._recorder_ok = True
         self._next_tick_ns = self._next_round_ns = self._next_wall_ns = self._next_log_ns = 0
         self._anchored: LogHead | None = None
-        self._next_head_ns = self._next_head_line_ns = 0
+        self._next_head_ns = self._next_head_line_ns = self._next_prune_ns = 0
         self._log_closed = False
         self._ended = ""
 
@@ -175,8 +178,12 @@ class Daemon:
         registry().get("transports", str(profile.transport.get("name")))  # loaded here, while analytics loads the model
         self.workshop = Workshop(self.selector)
         stack.callback(self.workshop.close)
+        kept = profile.recording
+        self.retention = None
+        if self._log_file is None:
+            self.retention = Retention(self._log_dir, self.folder.path, profile.robot.name, kept.keep_bytes, kept.keep_days, self.say)
         self.logbook = Logbook(
-            self._log_dir, profile.robot.name, profile.recording, self.key, lockstep=self.clock.lockstep, file=self._log_file
+            self._log_dir, profile.robot.name, kept, self.key, lockstep=self.clock.lockstep, file=self._log_file, retention=self.retention
         )
         self.facts: ModelFacts = self.watcher.facts()
         self.settings = settings_of(profile, profile.model, self.facts, self.seed)
@@ -283,6 +290,7 @@ class Daemon:
         self.desk.tick(now_ns)
         self.notifier.alive(now_ns)
         self._publish_head(now_ns)
+        self._retain(now_ns)
         self.notifier.status(f"gate {'open' if self.state.gate_open else 'closed'} ({self.state.gate_reason})")
 
     def _robot_ready(self, _mask: int) -> None:
@@ -382,6 +390,16 @@ class Daemon:
         self.memory, self._recorder_ok, self.observation = self.state.memory, True, None
         self._begin_run()
         self._open_link()
+
+    def _retain(self, now_ns: int) -> None:
+        """Deletes old logs, if the profile says so and nothing valid rests on them."""
+        if self.retention is None:
+            return
+        for gone in self.retention.deleted():
+            self.logbook.put(msgspec.structs.replace(gone, t_ns=self._last_ns), self._last_ns)
+        if now_ns >= self._next_prune_ns:
+            self._next_prune_ns = now_ns + PRUNE_NS
+            self.retention.prune_beside(self.state.memory, int(time.time()))
 
     def _publish_head(self, now_ns: int) -> None:
         """Tells the robot's side, and now and then the journal, how far the log is on the disk."""

@@ -21,7 +21,7 @@ from msgspec import inspect as types
 from s2r_runtime import messages
 from s2r_runtime.messages import Frame, Struct
 
-FRAME_IN, FRAME_OUT, CHAIN, UNRECORDED = "frame/in", "frame/out", "log/chain", "log/unrecorded"
+FRAME_IN, FRAME_OUT, CHAIN, UNRECORDED, DELETED = "frame/in", "frame/out", "log/chain", "log/unrecorded", "log/deleted"
 
 
 class Seal(Struct, frozen=True, tag="chain"):
@@ -47,6 +47,17 @@ class Unrecorded(Struct, frozen=True, tag="unrecorded"):
     reason: str
 
 
+class LogDeleted(Struct, frozen=True, tag="deleted"):
+    """The log of an earlier run was deleted, because the profile keeps no more. `head`: of its chain, as far as it was known; hex."""
+
+    t_ns: int
+    run: str
+    files: int
+    bytes: int
+    head: str
+    reason: str
+
+
 def _tag(kind: type[msgspec.Struct]) -> str:
     return str(kind.__struct_config__.tag)
 
@@ -55,7 +66,7 @@ def _table() -> dict[str, type[Struct]]:
     table: dict[str, type[Struct]] = {FRAME_IN: Frame, FRAME_OUT: Frame}
     table.update((f"event/{_tag(kind)}", kind) for kind in get_args(messages.Event))
     table.update((f"out/{_tag(kind)}", kind) for kind in get_args(messages.Output))
-    table.update((f"log/{_tag(kind)}", kind) for kind in (Seal, Unrecorded))
+    table.update((f"log/{_tag(kind)}", kind) for kind in (Seal, Unrecorded, LogDeleted))
     return table
 
 
