@@ -56,6 +56,9 @@ FIT_STEPS = 4000
 STRUCTURE_STEPS = 4000
 """Transitions that the lack of fit is tested on at most."""
 
+CLEAR = 10.0
+"""Nats from which on a dictionary tells what structure depends on."""
+
 MOVED, ASKED = 1.5, 5.0
 """A robot whose measurements lie apart after the horizon as they do after one step has stood still; it was asked to move if the
 model would have it that much farther away."""
@@ -234,8 +237,10 @@ class _Whole:
         fit = evaluate(self.given, chosen.fit.model)
         found = lack_of_fit(self.given, fit, self.nominal, self._horizon)
         if not fit.added:
-            tokens = self._looks_like if found.matters else () if self._shape is None else (self._shape.token,)
-            return replace(found, tokens=tuple(dict.fromkeys((*tokens, *found.tokens))), matters=True, share=1.0) if tokens else found
+            told = found.matters and self.unnamed[1] > CLEAR  # else it is seen by sliding only, which says by itself what it depends on
+            tokens = self._looks_like if told else () if self._shape is None else (self._shape.token,)
+            named = tuple(dict.fromkeys((*tokens, *found.tokens)))
+            return replace(found, tokens=named, matters=True, share=1.0) if tokens else found
         best = fitted(self.given, fit, fit.model, 2)  # what it is compared with is fitted to all of the recording, too
         if crowded(fit) or explains_more(self.unnamed[1], best, self.nominal, left=found.matters):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
