@@ -237,6 +237,13 @@ def test_the_whole_experiment_runs_and_tells_what_came_out(tmp_path: Path, capsy
     assert "http" not in html.replace("http://www.w3.org", "")
 
 
+def test_readings_alone_need_no_campaign(capsys: pytest.CaptureFixture[str]) -> None:
+    assert experiment.main(["--readings", "20"], lambda _: SwayingWalker()) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert told[0].startswith("gap: r")
+    assert [line.split("%   ")[1] for line in told[1:]] == [r.words for r in READINGS]
+
+
 def test_coverage_holds_on_a_robot_and_is_broken_where_radii_are_too_small(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--campaigns", "60", "--law", "4000", "--starts", "40", "--json"]
     coverage.main(arguments, lambda _: SwayingWalker())
