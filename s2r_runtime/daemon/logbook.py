@@ -173,7 +173,7 @@ class Logbook:
             return self.health(), ""
         health = self._recorder.close()
         if self._retention is not None:
-            self._retention.save(self.anchor())
+            self._retention.save(self.anchor(), last=True)
         return health, self._recorder.head
 
     def _path(self) -> Path:

@@ -101,10 +101,12 @@ class Retention:
                 held.certificates.append(message.facts)
                 self._dirty = True
 
-    def save(self, head: LogHead | None = None) -> bool:
-        """Whether what was noted is on the disk now: nothing may rest on a log before. head: of this run's, as far as it is on the disk."""
+    def save(self, head: LogHead | None = None, *, last: bool = False) -> bool:
+        """Whether what was noted is on the disk now: nothing may rest on a log before. head: of this run's, as far as it is on the disk;
+        it alone is worth a write if it is the last.
+        """
         with self._lock:
-            if not self._dirty:
+            if not (self._dirty or last):
                 return True
             if head is not None and head.run in self._runs:
                 self._runs[head.run].head = head.head
