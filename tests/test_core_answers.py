@@ -232,6 +232,18 @@ def test_given_inputs_end_with_what_became_of_them(event: dict[str, Any], code: 
     assert rig.state.campaign is None
 
 
+def test_a_sequence_that_got_a_hole_in_it_says_what_made_it() -> None:
+    rig = exciting()
+    rig.observe((math.nan, 0.0, 0.0))
+    assert rig.state.campaign is not None  # nothing was driven yet, so there is no hole
+    rig.observe()
+    rig.propose(source="sampler")
+    outputs = rig.observe((math.nan, 0.0, 0.0))
+    if rig.state.asked is not None:
+        outputs = rig.propose(source="sampler")
+    assert said(outputs) == final(1, "inputs stopped after 1 of 5 rows: observation_invalid")
+
+
 def test_the_end_of_other_inputs_ends_none() -> None:
     rig = exciting()
     assert rig.feed(InputsFinished(rig.t, "others", 5, True)) == []

@@ -12,7 +12,7 @@ from core_rig import GAP, Rig, memory, one
 from s2r_runtime.core import certificates, gaps, ledger
 from s2r_runtime.core.certificates import ROUNDING
 from s2r_runtime.core.state import Job, Turn
-from s2r_runtime.messages import SERIAL, CertificateFacts, StartJob, Verification
+from s2r_runtime.messages import SERIAL, CertificateFacts, CertificateStored, StartController, StartJob, Verification
 
 replace = msgspec.structs.replace
 ENOUGH = replace(GAP, n=161)
@@ -250,3 +250,32 @@ def test_samples_of_a_gap_that_was_refuted_found_no_later_epoch() -> None:
     assert "a later epoch needs samples of its own" in problem("transitions")
     assert problem("transitions", gap=None) == ""
     assert "refuted or outgrown here" in problem("transitions", gap=None, refuted=("transitions",))
+
+
+# ---------------------------------------------------------------- at their bounds
+
+
+def test_uniform_alone_will_do_where_the_residual_is_white_and_nothing_was_traced() -> None:
+    turn = turn_of(Rig(memory()))
+    assert certificates._needs_more_laws(turn, GAP, ("uniform",)) == ""
+    assert certificates._needs_more_laws(turn, replace(GAP, white=False), ("uniform", "persistent")) == ""
+    assert "is not white" in certificates._needs_more_laws(turn, replace(GAP, white=False), ("uniform",))
+    traced = turn_of(Rig(memory(traced=True)))
+    assert "an effect was traced" in certificates._needs_more_laws(traced, GAP, ("uniform",))
+
+
+def test_a_certificate_that_nobody_asked_for_changes_nothing() -> None:
+    rig = Rig(memory())
+    before = rig.state.memory
+    assert rig.feed(CertificateStored(rig.t, FACTS)) == []
+    assert rig.state.memory == before
+
+
+def test_a_certificate_that_reaches_exactly_as_far_as_the_gap_has_grown_will_do() -> None:
+    rig = Rig()
+    rig.gap()
+    rig.request("deploy", digest="controller")
+    rig.verified()
+    rig.measure(0.015)
+    assert rig.state.memory.radius == 0.015
+    assert len([one for one in rig.stored() if isinstance(one, StartController)]) == 1

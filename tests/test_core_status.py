@@ -103,6 +103,8 @@ def test_a_campaign_shows_how_far_it_came_and_what_was_spent_on_it() -> None:
     rig.feed(SampleTaken(rig.t, 2, 9, 1, 1, (0.0, 0.0), zeros, zeros, (), 1))  # of another epoch
     campaign = {"epoch": 1, "taken": 7, "n": 161, "running": True}
     assert differs(status(rig), base) == {"campaign": campaign, "samples_to_certificate": 154}
+    rig.feed(SampleTaken(rig.t, 1, 160, 1, 1, (0.0, 0.0), zeros, zeros, (), 1))
+    assert status(rig)["samples_to_certificate"] == 0
     rig.request("stop")
     interrupted = differs(status(rig), base)
     assert interrupted == {"reason": "emergency_stop", "latched": ["emergency_stop"]}

@@ -55,6 +55,8 @@ def core_cases(seed: int, numbers: range) -> tuple[Counter[str], Counter[str], l
         except AssertionError as error:
             wrong.append(f"core case {number}: {error}")
             continue
+        except KeyboardInterrupt:  # whoever waits no longer is told what was run
+            break
         faults.update(outcome.faults)
         reasons.update(one.split(":")[0] for one in outcome.reasons)
         events.append(outcome.events)
@@ -76,13 +78,21 @@ def main() -> int:
     wrong += wrong_too
     spent = time.process_time() - begun
     if options.json:
-        found = {"cases": 2 * len(numbers), "wrong": wrong, "gate": given, "core": reasons, "faults": faults, "cpu_s": spent}
+        found = {
+            "cases": len(numbers) + len(events) + len(wrong_too),
+            "wrong": wrong,
+            "gate": given,
+            "core": reasons,
+            "faults": faults,
+            "cpu_s": spent,
+        }
         print(json.dumps(found))
         return 1 if wrong else 0
     print("\n".join(wrong[:SHOWN]))
     print(f"gate: {len(numbers)} cases, {given[gate.ALLOWED]} of them harmless and allowed, {len(given) - 1} reasons given")
-    mended = f"all mended, the last after {max(events)} events" if len(events) == len(numbers) else f"{len(events)} mended"
-    print(f"core: {len(numbers)} cases of {len(faults)} kinds of fault, {faults.total()} faults; {len(reasons)} reasons; {mended}")
+    ran = len(events) + len(wrong_too)
+    mended = f"all mended, the last after {max(events, default=0)} events" if len(events) == ran else f"{len(events)} mended"
+    print(f"core: {ran} cases of {len(faults)} kinds of fault, {faults.total()} faults; {len(reasons)} reasons; {mended}")
     for name, count in sorted(faults.items()):
         print(f"    {count:7d}  {name}")
     print(f"{len(wrong)} wrong; seed {options.seed}, {spent:.0f} s of the processor")

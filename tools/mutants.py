@@ -7,8 +7,8 @@
     statements    a call, an assignment to what exists already, a raise is removed;  return a -> return None
     parts         a keyword argument, a filter of a comprehension, an arm or guard of `match`, a caught exception is left out
 
-Not changed: docstrings, annotations, imports, decorators, and prose (a text with a space in it, and what stands between the braces of an
-f-string): what a sentence says to people is held by the tests of those sentences, where it matters.
+Not changed: docstrings, annotations, imports, `__all__`, decorators, and prose (a text with a space in it, and what stands between the
+braces of an f-string): what a sentence says to people is held by the tests of those sentences, where it matters.
 
 A mutant is named by its place and its change, not by a line number, so that its name stays while other lines come and go.
 """
@@ -148,7 +148,7 @@ def _statement(node: ast.stmt, path: Path, where: str, *, is_top: bool = False) 
             yield from _block(node, "body", path, f"{node.name}.")
         case ast.Import() | ast.ImportFrom() | ast.Pass() | ast.Global():
             return
-        case ast.If(test=ast.Name(id="TYPE_CHECKING")):
+        case ast.If(test=ast.Name(id="TYPE_CHECKING")) | ast.Assign(targets=[ast.Name(id="__all__")]):
             return
         case _:
             outer = "" if where.endswith(".") else where
