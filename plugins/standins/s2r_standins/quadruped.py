@@ -43,7 +43,7 @@ class BuiltIn:
     """What `s2r demo` needs to know (hook `s2r_robots`)."""
 
     profile = "quadruped-second"
-    story = Story(("weak_leg leg=rear_right strength=0.55",), "payload mass=4", 130.0, permit_s=14_400.0)
+    story = Story(("weak_leg leg=rear_right strength=0.6",), "payload mass=4", 130.0, permit_s=14_400.0)
 
     def command(self, seed: int, effects: list[str], connect: str = CONNECT) -> list[str]:
         """The argv that starts the robot; it ends with the process that starts it. Raises ConfigError where its physics are missing."""
