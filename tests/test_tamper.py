@@ -40,3 +40,12 @@ def test_the_same_content_in_another_form_shows_in_every_chunk_the_last_one_incl
         assert data != target.data
         how, problem = bench_tamper.judged(target, data, tmp_path / "b.mcap")
         assert (how, problem) == ("broken", ""), number
+
+
+def test_a_first_part_that_says_to_begin_later_is_damaged_from_the_start(tmp_path: Path) -> None:
+    bench_tamper.record(tmp_path / "a.mcap", 1, blocks=5, per_block=20)
+    target = bench_tamper.target(tmp_path / "a.mcap")
+    at = target.data.index(b"first_index") + len(b"first_index") + 4
+    assert target.data[at : at + 1] == b"0"
+    how, problem = bench_tamper.judged(target, target.data[:at] + b"2" + target.data[at + 1 :], tmp_path / "b.mcap")
+    assert (how, problem) == ("no log", "")

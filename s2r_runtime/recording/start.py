@@ -65,6 +65,8 @@ def read_start(file: BinaryIO, path: Path, size: int) -> Start:
             Ed25519PublicKey.from_public_bytes(key) if key else None,
             bytes.fromhex(fields["previous_head"]),
         )
+        if start.part < 1 or (start.part == 1 and start.first_index):
+            raise ValueError(f"part {start.part} begins with message {start.first_index}")
     except (ValueError, KeyError) as error:
         raise RecordingError(f"{path}: its metadata is damaged: {error}") from None
     if name != ABOUT or head[0] != Opcode.METADATA:
