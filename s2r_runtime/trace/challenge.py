@@ -41,8 +41,11 @@ LOWER = 0.05
 REACHES = 0.3
 """Of what is explained by name: a shape that screening gives less does not come up to it."""
 
-FITTED = 4
-"""Shapes of an input that are fitted, after screening."""
+FITTED, NEARLY = 3, 0.5
+"""Shapes of an input that are fitted, after screening, which must give them that share of what it gives the best."""
+
+LEAST = 4.0
+"""Nats that screening must give a shape where nothing was named."""
 
 STARTS = 600
 """Rollouts that errors are compared on at most."""
@@ -109,7 +112,7 @@ def _times(fit: Fit, channel: str) -> list[float]:
     return [float(fit.model.effects[slot.place].p[slot.name]) for slot in there if bounds_of(fit.model, slot).neutral == 0.0]
 
 
-def _fits(given: Problem, base: Fit, channel: str, least: float = 0.0, near: Sequence[float] = ()) -> list[Fit]:
+def _fits(given: Problem, base: Fit, channel: str, least: float = LEAST, near: Sequence[float] = ()) -> list[Fit]:
     """Shapes on one input, beside what the model has, that do best, the best first. least: nats that screening must give them; near:
     times from which some begin, s.
     """
@@ -122,7 +125,8 @@ def _fits(given: Problem, base: Fit, channel: str, least: float = 0.0, near: Seq
         if (starts := shape.starts(u, model.nominal, channel, given.data.dt, near))
     ]
     screened, _ = screen(given, base, offered) if offered else ([], 0)
-    fits = [fitted(given, base, s.start, 2) for s in screened[:FITTED] if s.value > max(least, 0.0)]
+    enough = max(least, NEARLY * screened[0].value) if screened else least
+    fits = [fitted(given, base, s.start, 2) for s in screened[:FITTED] if s.value > max(enough, 0.0)]
     return sorted((fit for fit in fits if _outlasts(fit, given.data.dt)), key=lambda fit: -gain(fit, base))
 
 

@@ -105,11 +105,30 @@ def lack_of_fit(given: Problem, fit: Fit, nominal: Fit, horizon: int) -> Structu
     return Structure(tokens if matters else coloured, matters, share, gains)
 
 
-def best_unnamed(given: Problem, nominal: Fit) -> tuple[str, float]:
-    """What the nominal model's residual depends on most, and the nats that a dictionary of that explains without any effect's name."""
+@dataclass(frozen=True)
+class Looks:
+    """A first look at what dictionaries say of what a model leaves. looked: (nats, place in `found`), the best first."""
+
+    left: Left
+    found: list[tuple[str, Array]]
+    looked: list[tuple[float, int]]
+
+    @property
+    def most(self) -> float:
+        """Nats of the best one at first look."""
+        return self.looked[0][0]
+
+
+def first_looks(given: Problem, nominal: Fit) -> Looks:
+    """At what the nominal model leaves."""
     left, found = _left_by(given, nominal)
-    looked = _best_of_each(sorted(((first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True), found)
-    judged = [judge(left, found[i][0], leading(left, found[i][1])) for _, i in looked[:FEW]]
+    return Looks(left, found, sorted(((first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True))
+
+
+def best_unnamed(looks: Looks) -> tuple[str, float]:
+    """What the residual depends on most, and the nats that a dictionary of that explains without any effect's name."""
+    looked = _best_of_each(looks.looked, looks.found)
+    judged = [judge(looks.left, looks.found[i][0], leading(looks.left, looks.found[i][1])) for _, i in looked[:FEW]]
     most = max(j.gain for j in judged)
     best = min((j for j in judged if j.gain >= most - ALIKE), key=lambda j: (j.x.shape[2], -j.gain))
     return TOKENS.get(best.token, best.token), most

@@ -60,9 +60,9 @@ class Shape(InputEffect):
         return np.zeros((n, 1 if self.memory else 0))
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float, near: Sequence[float] = ()) -> list[Values]:
-        """Values from which a fit begins. u: (T, nu); near: times (s) that named effects on the channel take."""
+        """Values from which a fit begins. u: (T, nu); near: times (s) that named effects on the channel take, if any do."""
         most = float(np.max(np.abs(u[:, model.inputs.index(channel)]), initial=0.0))
-        times = [*(k * dt for k in TIMES), *(s for s in near if s > SMALL)]
+        times = [s for s in near if s > SMALL] or [k * dt for k in TIMES]
         return [{**p, "most": most} for p in self._starts(dt, times)] if most > 0.0 else []
 
     def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:

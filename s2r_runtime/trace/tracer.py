@@ -29,10 +29,10 @@ from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge, noise_floor
 from s2r_runtime.trace.excitation import advice
 from s2r_runtime.trace.faults import Checked, check
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, problem
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, problem
 from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.intervals import intervals
-from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, Structure, best_unnamed, explains_more, lack_of_fit
+from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, Looks, Structure, best_unnamed, explains_more, first_looks, lack_of_fit
 from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.residual import Mask, first_steps, rms, steps_of
@@ -58,6 +58,9 @@ STRUCTURE_STEPS = 4000
 
 CLEAR = 10.0
 """Nats from which on a dictionary tells what structure depends on."""
+
+NEARLY = 0.4
+"""Of what effects explain: dictionaries that give less at first look are not judged."""
 
 MOVED, ASKED = 1.5, 5.0
 """A robot whose measurements lie apart after the horizon as they do after one step has stood still; it was asked to move if the
@@ -228,9 +231,17 @@ class _Whole:
         self._horizon = horizon
 
     @cached_property
+    def _looks(self) -> Looks:
+        return first_looks(self.given, self.nominal)
+
+    @cached_property
     def unnamed(self) -> tuple[str, float]:
         """`best_unnamed`, for whatever was selected."""
-        return best_unnamed(self.given, self.nominal)
+        return best_unnamed(self._looks)
+
+    def _unnamed_explains_more(self, fit: Fit, left: bool) -> bool:
+        """What at first look comes nowhere near it will not come up to it."""
+        return self._looks.most > NEARLY * gain(fit, self.nominal) and explains_more(self.unnamed[1], fit, self.nominal, left=left)
 
     def structure(self, chosen: Selection) -> Structure:
         """What the chosen model leaves."""
@@ -242,7 +253,7 @@ class _Whole:
             named = tuple(dict.fromkeys((*tokens, *found.tokens)))
             return replace(found, tokens=named, matters=True, share=1.0) if tokens else found
         best = fitted(self.given, fit, fit.model, 2)  # what it is compared with is fitted to all of the recording, too
-        if crowded(fit) or explains_more(self.unnamed[1], best, self.nominal, left=found.matters):
+        if crowded(fit) or self._unnamed_explains_more(best, found.matters):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
         better = better_shape(self.given, best, self._horizon)
         return found if better is None else replace(found, tokens=(better.token,), matters=True, share=1.0, nameless=True)
