@@ -240,6 +240,26 @@ def tampered(run: Any, path: Path, change: Callable[[list[Any]], int]) -> tuple[
     return audit([path], PUBLIC), entries(path)[ordinal].index
 
 
+@pytest.mark.parametrize("raw", [b'{"type":"frame"}', b"\xff"])
+def test_a_frame_that_is_none_is_refused_as_any_message_is(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, raw: bytes) -> None:
+    class Odd:
+        def encode(self, message: m.Struct) -> bytes:
+            return raw if isinstance(message, m.Frame) and not message.inbound else msgspec.json.encode(message)
+
+    write = Writer.write
+
+    def odd(writer: Writer, message: m.Struct, t_ns: int) -> None:
+        writer._encoder = Odd()  # type: ignore[assignment]
+        write(writer, message, t_ns)
+
+    monkeypatch.setattr(Writer, "write", odd)
+    bench = Bench.__new__(Bench)
+    bench.items = list(run.items)
+    bench.write(tmp_path / "odd.mcap")
+    with pytest.raises(RecordingError, match=r"frame/out.* is of another version"):
+        audit([tmp_path / "odd.mcap"], PUBLIC)
+
+
 def nth(items: list[Any], kind: type, n: int) -> int:
     return [i for i, item in enumerate(items) if isinstance(item, kind)][n]
 

@@ -24,6 +24,7 @@ from mcap.reader import NonSeekingReader, make_reader
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.messages import Ask, Command, Decided, Frame, Measured, Observation, Observed, Proposed, Send, Struct, Ticked
 from s2r_runtime.recording.channels import CHANNELS, Unrecorded, schema
+from s2r_runtime.recording.reading import Entry
 from s2r_runtime.recording.recorder import Recorder
 from s2r_runtime.recording.writer import Writer, read
 
@@ -156,6 +157,39 @@ def test_rotation_loses_nothing_and_the_next_part_continues_the_chain(tmp_path: 
         assert after.previous_head == before.head
         assert after.first_index == before.ending.index
     assert parts[-1].head.hex() == head
+
+
+def test_the_anchor_claims_nothing_of_a_part_that_was_not_synced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other thread turns to the next part just when this one is about to sync what it has."""
+    writer = Writer(tmp_path / "a.mcap", run="test", signer=KEY, rotate_bytes=2_000, timed=False)
+    writer.deferring = True
+    synced: list[int] = []
+    for call in ("fsync", "fdatasync"):
+        do = getattr(os, call)
+        monkeypatch.setattr(os, call, lambda fd, do=do: (do(fd), synced.append(os.fstat(fd).st_ino)))
+    complete = writer._file.complete
+
+    def turned_meanwhile() -> None:
+        complete()
+        if len(writer.parts) == 1:
+            for i, message in enumerate(messages(300)):
+                writer.write(message, i)
+            writer.flush()
+
+    monkeypatch.setattr(writer._file, "complete", turned_meanwhile)
+    writer.sync()
+    assert len(writer.parts) == 2
+    assert writer.anchor.records == 0 or writer.parts[0].stat().st_ino in synced
+    writer.sync()
+    assert writer.parts[0].stat().st_ino in synced
+    assert writer.anchor.records == writer.recorded > 0
+    writer.close()
+
+
+@pytest.mark.parametrize("raw", [b"\xff", b'{"t_ns": "\xff"}', b"[1]", b"{"])
+def test_what_is_no_message_is_said_to_be_of_another_version(raw: bytes) -> None:
+    with pytest.raises(RecordingError, match="of another version"):
+        _ = Entry(3, "event/ticked", 0, raw).message
 
 
 def test_a_file_that_is_no_log_is_refused_by_name(tmp_path: Path) -> None:

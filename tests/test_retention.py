@@ -140,6 +140,19 @@ def test_a_log_of_which_nobody_knows_what_it_holds_stays(tmp_path: Path) -> None
     assert any("no log from before is deleted" in line for line in robot.said)
 
 
+@pytest.mark.parametrize("data", [b"\xff", b'{"\xff": {}}', b"[1]", b"[" * 100_000])
+def test_a_note_that_is_damaged_frees_no_log_and_stops_no_daemon(tmp_path: Path, data: bytes) -> None:
+    robot = Robot(tmp_path, keep_bytes=1)
+    first = robot.run(campaign(1))
+    robot.run()
+    (robot.state / "log_evidence.json").write_bytes(data)
+    robot.again()
+    third = robot.run()
+    assert first in robot.left(memory())
+    assert third in robot.left(memory())
+    assert "cannot be read" in robot.said[0]
+
+
 def test_nothing_may_rest_on_a_log_of_which_it_could_not_be_noted(tmp_path: Path) -> None:
     robot = Robot(tmp_path)
     robot.run()

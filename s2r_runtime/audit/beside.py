@@ -17,10 +17,10 @@ import msgspec
 from s2r_runtime.audit.findings import Findings
 from s2r_runtime.audit.frames import Frames
 from s2r_runtime.audit.watch import WatchReplay
+from s2r_runtime.errors import S2RError
 from s2r_runtime.messages import (
     AnalyticsChanged,
     Event,
-    Frame,
     LinkChanged,
     Measured,
     Observed,
@@ -30,7 +30,6 @@ from s2r_runtime.messages import (
     SourceStopped,
 )
 from s2r_runtime.plugins import registry
-from s2r_runtime.recording.channels import decoder
 from s2r_runtime.recording.reading import Entry
 
 if TYPE_CHECKING:
@@ -44,7 +43,6 @@ _TOLD = frozenset((Observed, Measured, LinkChanged, OverrideChanged, AnalyticsCh
 """Events that matter there; of `Proposed` those by others."""
 _ENCODE = msgspec.json.Encoder().encode
 _SEND = msgspec.json.Decoder(Send)
-_FRAME = msgspec.json.Decoder(Frame)
 
 
 class Beside:
@@ -98,7 +96,7 @@ class Beside:
         self._tell("finish", *place, None if last_act is None else _ENCODE(last_act), t_ns, clean, stopped)
 
     def end(self) -> None:
-        """Nothing follows: what it found is added to what was found here. Raises RuntimeError if it failed."""
+        """Nothing follows: what it found is added to what was found here. Raises the S2RError that it met, RuntimeError if it failed."""
         if self._pipe is None:
             return
         self._calls.append(("over",))
@@ -107,6 +105,8 @@ class Beside:
             found = self._pipe.recv()
         except EOFError:
             found = "the process died"
+        if isinstance(found, S2RError):
+            raise found
         if not isinstance(found, Findings):
             raise RuntimeError(f"frames and watch could not be computed again: {found}")  # noqa: TRY004 - it says what went wrong there
         self.close()
@@ -160,14 +160,15 @@ class _Server:
         self._watch = WatchReplay(self.findings)
 
     def frame(self, index: int, channel: str, raw: bytes) -> None:
-        frame, entry = _FRAME.decode(raw), Entry(index, channel, 0, raw)
+        entry = Entry(index, channel, 0, raw)
+        frame: Any = entry.message
         if _ENCODE(frame) != raw:
             self.findings.differ(index, channel, "this is not how a recorder writes it", raw, frame)
         (self._frames.inbound if frame.inbound else self._frames.outbound)(entry, frame)
 
     def event(self, index: int, channel: str, raw: bytes) -> None:
-        event: Any = decoder(channel).decode(raw)
         entry = Entry(index, channel, 0, raw)
+        event: Any = entry.message
         self._frames.event(entry, event)
         match event:
             case Observed():
@@ -218,5 +219,7 @@ def _serve(pipe: Connection, parents: Connection) -> None:
                 getattr(server, name)(*call)
     except EOFError:
         return
+    except S2RError as error:
+        pipe.send(error)
     except BaseException:  # noqa: BLE001 - told to the other process, which fails with it
         pipe.send(traceback.format_exc())

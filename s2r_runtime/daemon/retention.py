@@ -73,7 +73,7 @@ class Retention:
             return {}
         try:
             return msgspec.json.decode(read(self._file), type=dict[str, Held])
-        except (S2RError, msgspec.DecodeError) as error:
+        except (S2RError, ValueError, RecursionError) as error:  # msgspec's and Unicode's are ValueErrors
             self._say(f"{self._file}: cannot be read ({error}); no log from before is deleted, as nobody knows what rests on it")
             return {}
 

@@ -135,9 +135,11 @@ class LogFile:
             self.synced(reached)
 
     def unsynced(self) -> tuple[int, tuple[bytes, int, int]] | None:
-        """A descriptor of its own, and how far the disk has the log once that is synced; None if the disk has all of it."""
+        """A descriptor of its own, and how far the disk has the log once that is synced; None if the disk has all of it, or if a part that
+        was set aside comes first: one file's sync says nothing of another's.
+        """
         reached = self._reached()
-        return None if self._fd < 0 or reached == self.anchor else (os.dup(self._fd), reached)
+        return None if self._aside or self._fd < 0 or reached == self.anchor else (os.dup(self._fd), reached)
 
     def synced(self, reached: tuple[bytes, int, int]) -> None:
         """The disk has the log so far, at least."""

@@ -45,10 +45,10 @@ class Entry(msgspec.Struct, frozen=True, gc=False):
 
     @property
     def message(self) -> Struct:
-        """The message, decoded each time it is asked for. Raises RecordingError if it is of another version."""
+        """The message, decoded each time it is asked for. Raises RecordingError if it is of another version, or no message at all."""
         try:
             return decoder(self.channel).decode(self.raw)
-        except msgspec.ValidationError as error:
+        except (ValueError, RecursionError) as error:  # msgspec's and Unicode's are ValueErrors
             raise RecordingError(f"message {self.index} ({self.channel}) is of another version of s2r: {error}") from None
 
 
