@@ -131,9 +131,13 @@ def load_trusted(paths: Iterable[Path]) -> tuple[bytes, ...]:
     one that others could have put there.
     """
     files = [file for path in paths for file in (sorted(path.glob("*.pub")) if path.is_dir() else [path]) if file.exists()]
-    for file in files:
-        check_own(file, "a trusted key")
-    return tuple(dict.fromkeys(load_public(file) for file in files))
+    return tuple(dict.fromkeys(load_trusted_file(file) for file in files))
+
+
+def load_trusted_file(path: Path) -> bytes:
+    """The public key in this file. Raises ConfigError if others could have put it there, or it is none."""
+    check_own(path, "a trusted key")
+    return load_public(path)
 
 
 def check_own(path: Path, what: str) -> None:
@@ -196,6 +200,21 @@ def rotate(path: Path) -> tuple[Path, Path]:
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
     return public, kept
+
+
+def trust(public: Path, folder: Path) -> Path:
+    """Puts a copy of a public key's file among those that are trusted, under any umask one that nobody else can write. Raises ConfigError
+    if it can't be written.
+    """
+    from s2r_runtime.daemon.persistence import replace
+
+    path = folder / f"{public.name}.pub"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        replace(path, public.read_bytes(), 0o644)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written, so the key is not trusted: {error.strerror}") from None
+    return path
 
 
 def public_bytes(key: Ed25519PrivateKey) -> bytes:

@@ -89,8 +89,12 @@ def revoke(path: Path, fingerprint: str, reason: str) -> Revocation:
 def _content(path: Path) -> _Content:
     from s2r_runtime.keys import check_own
 
-    if not (path.exists() or path.is_symlink()):
+    try:
+        path.lstat()
+    except FileNotFoundError:
         return _Content(SCHEMA)
+    except OSError as error:  # what cannot be looked at may be a list all the same
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     check_own(path, "a list of revoked keys")
     content = unseal(read(path), "revocations", _Content, str(path))
     if content.schema != SCHEMA:

@@ -42,13 +42,16 @@ def make(folder: Path, names: Sequence[str], hosts: Sequence[str], days: int = D
             raise UsageError(f"{name!r}: must be a name of letters, digits, '_', '.' and '-', and not {AUTHORITY!r}")
         if any((folder / f"{name}{suffix}").exists() for suffix in (".pem", ".key")):
             raise ConfigError(f"{folder / name}.pem: is there already and is not overwritten; move it away, or choose another name")
+    if not 1 <= days <= AUTHORITY_DAYS:
+        raise UsageError(f"{days} days: must be 1 to {AUTHORITY_DAYS}, as long as an authority is valid")
+    alternatives = [_host(host) for host in hosts]
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         authority, signer = _authority(folder)
         made = []
         for name in names:
             key = ec.generate_private_key(ec.SECP256R1())
-            issued = _issue(name, key.public_key(), authority.subject, signer, days, hosts)
+            issued = _issue(name, key.public_key(), authority.subject, signer, days, [_host(name), *alternatives])
             made.append(_write(folder, name, issued, key))
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be written: {error.strerror}") from None
@@ -81,7 +84,7 @@ def _issue(
     issuer: x509.Name | None,
     signer: ec.EllipticCurvePrivateKey,
     days: int,
-    hosts: Sequence[str],
+    hosts: Sequence[x509.GeneralName],
 ) -> x509.Certificate:
     """issuer None: an authority, signed by itself."""
     now = datetime.datetime.now(datetime.UTC)
@@ -99,7 +102,7 @@ def _issue(
     if issuer is not None:
         both = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
         builder = builder.add_extension(x509.ExtendedKeyUsage(both), critical=False)
-        builder = builder.add_extension(x509.SubjectAlternativeName([_host(host) for host in (name, *hosts)]), critical=False)
+        builder = builder.add_extension(x509.SubjectAlternativeName(hosts), critical=False)
     return builder.sign(signer, hashes.SHA256())
 
 
@@ -107,7 +110,11 @@ def _host(text: str) -> x509.GeneralName:
     try:
         return x509.IPAddress(ipaddress.ip_address(text))
     except ValueError:
+        pass
+    try:
         return x509.DNSName(text)
+    except ValueError:
+        raise UsageError(f"{text!r}: must be an address, or a host name in ASCII (xn--... for others)") from None
 
 
 def _write(folder: Path, name: str, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> Path:

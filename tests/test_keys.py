@@ -251,6 +251,17 @@ def test_a_list_that_cannot_be_read_is_no_empty_list(pair: Path, what: str) -> N
         revocations.revoke(path, "ed25519:" + "1" * 32, "")
 
 
+@pytest.mark.parametrize("folder", ["loop", "a file", "n" * 300])
+def test_a_list_that_cannot_be_looked_for_is_no_empty_list(pair: Path, folder: str) -> None:
+    there = pair.parent.parent / folder
+    if folder == "loop":
+        there.symlink_to(there)
+    elif folder == "a file":
+        there.write_text("")
+    with pytest.raises(ConfigError, match=r"revoked\.json: cannot be read"):
+        revocations.known([there / revocations.NAME])
+
+
 def test_what_is_no_fingerprint_is_refused(pair: Path) -> None:
     for name in ("", "ed25519:", "ed25519:" + "g" * 32, "ed25519:" + "0" * 31, "x.pub"):
         with pytest.raises(UsageError, match="is no key's fingerprint"):
@@ -282,3 +293,44 @@ def test_the_verbs_list_rotate_and_revoke(pair: Path, capsys: pytest.CaptureFixt
     ]
     assert main(["keys", "revoke", "nonsense"]) == 2
     assert main(["keys", "rotate", str(pair), "--trust-old"]) == 2
+
+
+def test_an_old_key_stays_trusted_under_any_umask_but_not_a_revoked_one(pair: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (pair.parent / "state.json").touch()
+    old = keys.load_public(keys.public_path(pair))
+    before = os.umask(0)
+    try:
+        assert main(["keys", "rotate", str(pair), "--trust-old"]) == 0
+    finally:
+        os.umask(before)
+    assert keys.load_trusted([pair.parent / "trusted"]) == (old,)
+    capsys.readouterr()
+    second = keys.load_public(keys.public_path(pair))
+    assert main(["keys", "revoke", keys.fingerprint(second)]) == 0
+    assert main(["keys", "rotate", str(pair), "--trust-old"]) == 2
+    assert "nothing makes it trusted again" in capsys.readouterr().err
+    assert keys.load_public(keys.public_path(pair)) == second, "nothing was rotated"
+    (pair.parent / "state.json").touch()
+    assert main(["keys", "rotate", str(pair)]) == 0
+    (pair.parent / "trusted").rename(pair.parent / "elsewhere")
+    (pair.parent / "trusted").write_text("in the way")
+    assert main(["keys", "rotate", str(pair), "--trust-old"]) == 78
+    assert "so the key is not trusted" in capsys.readouterr().err
+
+
+def test_what_is_no_key_among_the_trusted_is_listed_as_that(pair: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trusted = pair.parent / "trusted"
+    trusted.mkdir(mode=0o700)
+    (trusted / "gone.pub").symlink_to("/nowhere")
+    (trusted / "folder.pub").mkdir()
+    assert main(["keys", "list", "--state", str(pair.parent), "--json"]) == 0
+    found = {Path(one["path"]).name: one["problem"] for one in json.loads(capsys.readouterr().out)["keys"] if one["use"] == "trusted"}
+    assert found.keys() == {"gone.pub", "folder.pub"}
+    assert "is a symlink" in found["gone.pub"]
+    assert "is no file" in found["folder.pub"]
+
+
+def test_a_key_is_not_revoked_where_no_daemon_would_see_it(pair: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["keys", "revoke", str(keys.public_path(pair)), "--state", str(tmp_path / "typo")]) == 2
+    assert "nothing was revoked" in capsys.readouterr().err
+    assert not (tmp_path / "typo").exists()

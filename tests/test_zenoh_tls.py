@@ -216,6 +216,11 @@ def test_certificates_are_added_to_an_authority_and_never_overwritten(tmp_path: 
     for name in ("../up", "site", "", "-x", "a/b", "a b"):
         with pytest.raises(UsageError, match="must be a name of"):
             tls.make(folder, [name], [])
+    with pytest.raises(UsageError, match="host name in ASCII"):
+        tls.make(tmp_path / "third", ["robot"], ["röboter.local"])
+    with pytest.raises(UsageError, match="must be 1 to 3650"):
+        tls.make(tmp_path / "third", ["robot"], [], 10**9)
+    assert not (tmp_path / "third").exists()
     (folder / "site.key").chmod(0o640)
     with pytest.raises(ConfigError, match="chmod 600"):
         tls.make(folder, ["late"], [])

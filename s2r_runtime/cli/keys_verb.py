@@ -57,19 +57,19 @@ def keys_new(args: argparse.Namespace) -> int:
 
 def keys_rotate(args: argparse.Namespace) -> int:
     """Puts a new pair in the old one's place. Exit 0 when it is there."""
-    from s2r_runtime import keys
+    from s2r_runtime import keys, revocations
 
     path = args.path or keys.default_path()
-    trusted = path.parent / "trusted"
     if args.trust_old and not (path.parent / "state.json").exists():
         raise UsageError(
             f"--trust-old: {path.parent} is no robot's state folder; put the old public key where it is to be trusted yourself"
         )
     before = keys.fingerprint(keys.public_bytes(keys.load(path, revoked=True)))
+    if args.trust_old and (entry := revocations.known(revocations.places(path.parent)).get(before)) is not None:
+        raise UsageError(f"--trust-old: the key {before} was {entry}; nothing makes it trusted again")
     public, kept = keys.rotate(path)
     if args.trust_old:
-        trusted.mkdir(mode=0o700, exist_ok=True)
-        (trusted / f"{kept.name}.pub").write_bytes(kept.read_bytes())
+        keys.trust(kept, path.parent / "trusted")
     now = keys.fingerprint(keys.load_public(public))
     output.out(f"new key  {now}  in {path}; its ledger goes on. Give {public} to whoever audits")
     output.out(f"old key  {before}  signs nothing any more; its public half is {kept}, for the logs and certificates that it signed")
@@ -86,8 +86,10 @@ def keys_revoke(args: argparse.Namespace) -> int:
     """Puts a key on the list. Exit 0 when it stands there, durably."""
     from s2r_runtime import keys, revocations
 
+    if args.state is not None and not args.state.is_dir():
+        raise UsageError(f"{args.state}: there is no such state folder, so no daemon would read a list there; nothing was revoked")
     given = Path(args.key)
-    name = keys.fingerprint(keys.load_public(given)) if given.exists() else args.key
+    name = args.key if revocations.FINGERPRINT.fullmatch(args.key) or not given.is_file() else keys.fingerprint(keys.load_public(given))
     path = (args.state or keys.config_dir()) / revocations.NAME
     entry = revocations.revoke(path, name, args.reason)
     output.out(f"{name} {entry} (on {path})")
@@ -104,7 +106,7 @@ def keys_list(args: argparse.Namespace) -> int:
     private = [path for folder in folders for path in sorted({*folder.glob("*.key"), *folder.glob("*.pem")})]
     trusted = sorted((args.state / "trusted").glob("*.pub")) if args.state else []
     found = [_described("signs", path, lambda p: keys.public_bytes(keys.load(p, revoked=True))) for path in private]
-    found += [_described("trusted", path, lambda p: keys.load_trusted([p])[0]) for path in trusted]
+    found += [_described("trusted", path, keys.load_trusted_file) for path in trusted]
     for one in found:
         one["revoked"] = str(revoked[one["fingerprint"]]) if one["fingerprint"] in revoked else ""
     others = revoked.keys() - {one["fingerprint"] for one in found}
