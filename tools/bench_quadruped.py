@@ -125,9 +125,7 @@ def main() -> int:
     print(f"factor {walk['factor']:.1f} (simulated time over the processor's)")
     for name, unit in (("v", "m/s"), ("w", "rad/s")):
         t = tracked[name]
-        print(
-            f"{name}: gain {t['gain']:.3f}, bias {t['bias']:+.4f} {unit}; worst of {o.holds} holds off by {t['largest_deviation']:.4f}"
-        )
+        print(f"{name}: gain {t['gain']:.3f}, bias {t['bias']:+.4f} {unit}; worst of {o.holds} holds off by {t['largest_deviation']:.4f}")
     print("misses: " + (", ".join(misses) or "none") if not o.effect else "with effects: not judged")
     return int(bool(misses))
 
