@@ -2,18 +2,19 @@
 
 import numpy as np
 import pytest
-from trace_robots import DT, NOISE, ROBOTARIUM, declared, drive, recordings
+from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recordings
 
-from s2r_runtime.models.composed import AppliedEffect, compose
+from s2r_runtime.models.composed import AppliedEffect, compose, wrap
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
 from s2r_runtime.trace.evidence import RIDGES, evidence, margin
+from s2r_runtime.trace.faults import check
 from s2r_runtime.trace.fitting import evaluate, insert, problem
 from s2r_runtime.trace.lack_of_fit_terms import LINE, dictionaries, line, quieter
 from s2r_runtime.trace.residual import Steps, acting, residual, steps_of
-from s2r_runtime.trace.residual_noise import Noise
+from s2r_runtime.trace.residual_noise import Noise, quantum
 from s2r_runtime.trace.scores import limited
 from s2r_runtime.trace.tracer import trace
 
@@ -160,15 +161,46 @@ def test_runs_that_each_begin_at_zero_are_not_asked_when_something_happened():
         assert {"speed", "memory(ax)"} <= tokens
 
 
-def test_a_heading_that_is_rounded_coarser_than_a_step_turns_it_is_noise_and_no_spikes():
-    """Most rows repeat the heading of the row before: their median residual is next to nothing, and would make every turn an outlier."""
+def _slowly(rng, robots, steps, dt, bounds):
+    """As usual, but that the robot seldom turns, and by less in a step than a coarse compass shows."""
+    u = commands(rng, robots, steps, dt, bounds)
+    u[..., 1] = commands(rng, robots, steps, dt, [(-0.3, 0.3)], rest=0.6)[..., 0]
+    return u
+
+
+@pytest.mark.parametrize("within_a_turn", [False, True], ids=["unwrapped", "within a turn"])
+def test_a_heading_that_is_rounded_coarser_than_a_step_turns_it_is_noise_and_no_spikes(within_a_turn):
+    """Most rows repeat the heading of the row before: their median residual is next to nothing, and would make every turn an outlier. A
+    turn is 52.36 of its steps: a heading that is rounded within one is rounded afresh where it comes round.
+    """
+    step = 0.12
+    made = recordings([("input_gain", "w", {"gain": 0.6})], 1, steps=1500, seed=71, noise=2.0 * NOISE, inputs=_slowly)[0]
+    y, u = made.runs[0].y, made.runs[0].u[:: made.substeps]
+    y[:, 2] = y[:, 2] - np.mean(y[:, 2]) + np.pi
+    y[:, 2] = np.rint((wrap(y[:, 2]) if within_a_turn else y[:, 2]) / step) * step
+    assert np.any(np.abs(np.diff(y[:, 2])) > 6.0) == within_a_turn
+    assert np.mean(np.diff(y[:, 2]) == 0.0) > 0.9
+    found = check(declared(), from_arrays(declared(), [(y, u)]))
+    assert not found.faults
+    assert not found.outliers
+
+
+def test_a_robot_with_a_coarse_compass_is_traced():
     data = recordings([("input_gain", "w", {"gain": 0.6})], 1, steps=1500, seed=71, noise=2.0 * NOISE)[0]
     y = data.runs[0].y
-    step = 0.12
-    y[:, 2] = np.rint(y[:, 2] / step) * step
-    assert np.mean(np.diff(y[:, 2]) == 0.0) > 0.5
+    y[:, 2] = np.rint(y[:, 2] / 0.12) * 0.12
     found = trace(data, declared())
     assert found.outliers < 10
     assert not found.faults
     assert [(e.name, e.channel) for e in found.effects] == [("input_gain", "w")]
     assert found.effects[0].parameters["gain"][0] == pytest.approx(0.6, abs=0.06)
+
+
+def test_the_step_of_rounding_is_found_or_there_is_none():
+    rng = np.random.default_rng(4)
+    wandering = np.cumsum(rng.normal(size=500))
+    for step in (1e-9, 0.25, 1e9):
+        rounded = step * np.rint(wandering / 0.25)
+        assert quantum(rounded[:-1], rounded[1:]) == pytest.approx(step, rel=1e-6)
+    for column in (wandering, np.zeros(500), np.full(500, np.nan), np.zeros(0), np.repeat([0.0, 1.0], 250)):
+        assert quantum(column[:-1], column[1:]) == 0.0

@@ -89,7 +89,7 @@ def gain(fit: Fit, base: Fit) -> float:
 def problem(data: Dataset, steps: Steps) -> Problem:
     """Of these transitions."""
     moved = np.std(steps.y1 - steps.y0, axis=0) + 1e-9 * np.std(steps.y0, axis=0) + 1e-12
-    rounding = np.array([noises.quantum(column) for column in (steps.y1 - steps.y0).T]) ** 2 / 12.0
+    rounding = np.array([noises.quantum(*columns) for columns in zip(steps.y0.T, steps.y1.T, strict=True)]) ** 2 / 12.0
     return Problem(data, steps, Noise((EXACT * moved) ** 2, np.maximum((EXACT * moved) ** 2, rounding)))
 
 

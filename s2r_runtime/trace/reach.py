@@ -66,7 +66,8 @@ def reach_of(model: ComposedModel, data: Dataset, act: Acting) -> Reach:
     noise = np.median(np.abs(residuals[good]), axis=0) / 0.6745
     largest = np.quantile(np.abs(move[good]), 0.999, axis=0)
     y = [run.y[np.isfinite(run.y).all(axis=1)] for run in data.runs]
-    rounded = [quantum(np.concatenate([np.diff(rows[:, j]) for rows in y])) for j in range(len(model.states))]
+    starts, ends = np.concatenate([rows[:-1] for rows in y]), np.concatenate([rows[1:] for rows in y])
+    rounded = [quantum(starts[:, j], ends[:, j]) for j in range(len(model.states))]
     return Reach(np.maximum(noise, ROUNDING * np.array(rounded) + 1e-12), largest, _tail(residuals), instant)
 
 

@@ -249,9 +249,14 @@ def colour(z: Array, joined: Mask) -> Colour:
     return Colour(coefficients, scale)
 
 
-def quantum(change: Array) -> float:
-    """The step in which a measured state is rounded; 0 if it is not. change: (n,) from row to row."""
-    sizes = np.abs(change[change != 0.0])
+def quantum(before: Array, after: Array) -> float:
+    """The step in which a measured state is rounded; 0 if it is not. (n,) at the start and at the end of steps, angles unwrapped.
+
+    An angle that was rounded within a turn is rounded afresh where it passes the turn's end, at pi or at zero: that change is no multiple.
+    """
+    change = after - before
+    afresh = (np.floor(before / math.pi) != np.floor(after / math.pi)) & (np.abs(change) < math.pi)
+    sizes = np.abs(change[(change != 0.0) & ~afresh])
     if len(sizes) < ROUNDED:
         return 0.0
     least = float(np.min(sizes))
