@@ -11,15 +11,15 @@ Designed on the nominal model. Stateless and batched: x (n, 3), theta as `GridWo
 import numpy as np
 
 PARAMETERS = {
-    "speed": 0.135,  # m/s
-    "turn": 1.0,  # yaw rate per heading error, 1/s: at a step of one second it makes the error good at once, and no more
+    "speed": 0.13,  # m/s
+    "turn": 0.84,  # yaw rate per heading error, 1/s: more than 1 would turn too far in a step of a second
     "max_turn": 0.29,  # rad/s
-    "aligned": 0.65,  # cosine of the heading error at which it begins to walk
-    "lookahead": 0.7,  # m: what pushes it sideways at 1 cm/s holds it 5 cm off the line
+    "aligned": 0.69,  # cosine of the heading error at which it begins to walk
+    "lookahead": 0.49,  # m: what pushes it sideways at 1 cm/s holds it 4 cm off the line
     "body": 0.3,  # its disc, m
-    "margin": 0.17,  # to obstacles, m
-    "fade": 0.28,  # this far beside the line it only goes sideways, m
-    "hold": 0.2,  # speed towards the line per distance from it, 1/s
+    "margin": 0.165,  # to obstacles, m
+    "fade": 0.46,  # this far beside the line it only goes sideways, m
+    "hold": 0.19,  # speed towards the line per distance from it, 1/s
 }
 
 
