@@ -6,6 +6,7 @@ Run as a script this file is a process that records, for the tests that kill it:
 from __future__ import annotations
 
 import ctypes
+import errno
 import itertools
 import os
 import random
@@ -439,6 +440,36 @@ def test_a_disk_that_was_full_for_a_while_costs_no_message(tmp_path: Path) -> No
     assert seen == "File-too-large"
     found = [entry.message for entry in read(tmp_path / "a.mcap")]
     assert found == messages(int(written))
+
+
+@pytest.mark.parametrize("call", ["fdatasync", "fsync"])
+def test_a_sync_that_failed_once_ends_the_log_as_the_next_one_says_nothing_of_what_was_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
+) -> None:
+    do, failed = getattr(os, call), threading.Event()
+
+    def once(fd: int) -> None:
+        if not failed.is_set():
+            failed.set()
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        do(fd)
+
+    recorder = Recorder(Writer(tmp_path / "a.mcap", run="test", signer=KEY, timed=False), sync_s=0.01 if call == "fdatasync" else 60.0)
+    assert recorder.put(Ticked(1), 1)
+    monkeypatch.setattr(os, call, once)
+    if call == "fsync":
+        assert not recorder.durable(0.5), "it was tried once more, and that succeeded"
+    assert failed.wait(60)
+    deadline = time.monotonic() + 60
+    while recorder.health().ok and time.monotonic() < deadline:
+        time.sleep(0.01)
+    before = recorder.anchor
+    assert not recorder.durable(5)
+    assert not recorder.put(Ticked(2), 2)
+    assert "a sync of the log failed" in recorder.health().detail
+    health = recorder.close()
+    assert (health.ok, health.unrecorded) == (False, 1)
+    assert recorder.anchor == before, "what is published is what the disk has"
 
 
 # ---------------------------------------------------------------- SIGKILL

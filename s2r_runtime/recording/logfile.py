@@ -74,6 +74,8 @@ class LogFile:
         self.head = self._written = GENESIS
         self.anchor: tuple[bytes, int, int] = (GENESIS, 0, 0)
         """Head of the chain, part and messages as far as the disk is known to have them: whoever lacks these later has cut them off."""
+        self.doubted = False
+        """Whether a sync failed. The disk says so once, and the next may succeed without what was lost (fsync(2)): none counts any more."""
         self.recorded = 0
         """Messages of the run that are in the files and sealed."""
         self.size = self.chunks = 0
@@ -127,12 +129,16 @@ class LogFile:
 
     def sync(self) -> None:
         """Returns once what was written is on the disk, in the parts that were set aside too."""
-        for part in tuple(self._aside):
-            part.sync()
-        if self._fd >= 0:
-            reached = self._reached()
-            os.fsync(self._fd)
-            self.synced(reached)
+        try:
+            for part in tuple(self._aside):
+                part.sync()
+            if self._fd >= 0:
+                reached = self._reached()
+                os.fsync(self._fd)
+                self.synced(reached)
+        except OSError:
+            self.doubted = True
+            raise
 
     def unsynced(self) -> tuple[int, tuple[bytes, int, int]] | None:
         """A descriptor of its own, and how far the disk has the log once that is synced; None if the disk has all of it, or if a part that
@@ -143,7 +149,7 @@ class LogFile:
 
     def synced(self, reached: tuple[bytes, int, int]) -> None:
         """The disk has the log so far, at least."""
-        if reached[2] >= self.anchor[2]:
+        if reached[2] >= self.anchor[2] and not self.doubted:
             self.anchor = reached
 
     def all_synced(self) -> None:
@@ -163,7 +169,10 @@ class LogFile:
         with self._completing:
             while self._aside:
                 part = self._aside[0]
-                part.complete()
+                try:
+                    part.complete()
+                finally:
+                    self.doubted = self.doubted or part.doubted
                 self._aside.popleft()
 
     def abandon(self) -> None:
@@ -202,10 +211,10 @@ class LogFile:
 
 
 class _Part:
-    """A part whose data are all there. `closed`: and it is whole, and on the disk."""
+    """A part whose data are all there. `closed`: and it is whole, and on the disk. `doubted`: a sync failed."""
 
     def __init__(self, fd: int, end: int, crc: int, schemas: Mapping[int, bytes], channels: Mapping[int, bytes]) -> None:
-        self.fd, self.closed = fd, False
+        self.fd, self.closed, self.doubted = fd, False, False
         self._end, self._crc, self._schemas, self._channels = end, crc, schemas, channels
 
     def complete(self) -> None:
@@ -215,7 +224,9 @@ class _Part:
             for piece in tail(self._read_at, self._end, self._crc, self._schemas, self._channels):
                 at = _write(self.fd, piece, at)
                 time.sleep(0)  # the index of a long log takes a second: other threads get their turn
+            self.doubted = True
             os.fsync(self.fd)
+            self.doubted = False
         except OSError:
             with contextlib.suppress(OSError):
                 os.ftruncate(self.fd, self._end)

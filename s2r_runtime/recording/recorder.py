@@ -3,7 +3,8 @@
 `put` encodes the message and returns (about 3 µs); the thread seals, compresses and writes every `chunk_s`. A log has no holes: a
 message that cannot be taken, because memory is full or it cannot be encoded, is the end of the log. It and all that come
 after it are counted, the recorder's health stays bad until a new one is made, and the log says how many it lacks. A disk that is
-full for a while is no end: what is in memory is written when there is room.
+full for a while is no end: what is in memory is written when there is room. A sync that fails is one: the system says so once, and the next
+sync succeeds without what was lost.
 """
 
 from __future__ import annotations
@@ -169,6 +170,7 @@ class Recorder:
                 self._sync_trouble = ""
             except OSError as error:
                 self._sync_trouble = f"the log cannot be synced: {error.strerror}"
+                self._doubt()
 
     def _write(self) -> None:
         with self._room:
@@ -180,12 +182,19 @@ class Recorder:
                 self._writer.flush()
         except OSError as error:
             self._trouble = f"the log cannot be written: {error.strerror}"
+            self._doubt()
             return
         self._trouble = ""
         self._flushed_s = time.monotonic()
         with self._room:
             self._granted = ticket
             self._room.notify_all()
+
+    def _doubt(self) -> None:
+        """After a failure. One of a sync ends this log: that the next sync succeeds would not mean that the disk has it all."""
+        if self._writer.doubted:
+            with self._lock:
+                self._fault = self._fault or "a sync of the log failed: nobody knows what the disk has of it"
 
     def _finish(self) -> None:
         """Last words and the final seal; tries again for as long as `close` waits, which is for the caller to bound."""

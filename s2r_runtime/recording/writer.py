@@ -163,6 +163,11 @@ class Writer:
         return LogHead(self._run, part, records, head.hex(), self._public_key.hex())
 
     @property
+    def doubted(self) -> bool:
+        """Whether a sync failed: from then on nobody knows what the disk has of this log."""
+        return self._file.doubted
+
+    @property
     def parts(self) -> list[Path]:
         """The files, in order."""
         return list(self._file.parts)
@@ -197,6 +202,9 @@ class Writer:
         fd, reached = todo
         try:
             os.fdatasync(fd)
+        except OSError:
+            self._file.doubted = True
+            raise
         finally:
             os.close(fd)
         with self._writing:
