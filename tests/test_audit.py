@@ -19,7 +19,9 @@ import pytest
 from s2r_runtime import messages as m
 from s2r_runtime.audit.log import AuditResult, audit
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, RecordingError
-from s2r_runtime.recording.channels import LogDeleted
+from s2r_runtime.recording import writer as writer_module
+from s2r_runtime.recording.channels import CHANNELS, FRAME_IN, FRAME_OUT, NUMBERS, LogDeleted
+from s2r_runtime.recording.logfile import Pending
 from s2r_runtime.recording.reading import Entry
 from s2r_runtime.recording.recorder import Recorder
 from s2r_runtime.recording.salvage import recover
@@ -240,24 +242,82 @@ def tampered(run: Any, path: Path, change: Callable[[list[Any]], int]) -> tuple[
     return audit([path], PUBLIC), entries(path)[ordinal].index
 
 
-@pytest.mark.parametrize("raw", [b'{"type":"frame"}', b"\xff"])
-def test_a_frame_that_is_none_is_refused_as_any_message_is(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, raw: bytes) -> None:
+def misrecorded(run: Any, path: Path, monkeypatch: pytest.MonkeyPatch, change: Callable[[m.Struct, bytes, str], tuple[bytes, str]]) -> Path:
+    """An honest run's log by a recorder that writes some messages otherwise: (message, its bytes, its channel) -> bytes, channel."""
+
     class Odd:
         def encode(self, message: m.Struct) -> bytes:
-            return raw if isinstance(message, m.Frame) and not message.inbound else msgspec.json.encode(message)
+            raw = msgspec.json.encode(message)
+            return change(message, raw, "")[0]
 
     write = Writer.write
 
     def odd(writer: Writer, message: m.Struct, t_ns: int) -> None:
+        add = Pending.add
+        own = (FRAME_IN if message.inbound else FRAME_OUT) if isinstance(message, m.Frame) else next(iter(CHANNELS_OF[type(message)]))
+        number = NUMBERS[change(message, b"", own)[1]]
         writer._encoder = Odd()  # type: ignore[assignment]
-        write(writer, message, t_ns)
+        with monkeypatch.context() as within:
+            within.setattr(Pending, "add", lambda block, channel, *rest: add(block, number if channel == NUMBERS[own] else channel, *rest))
+            write(writer, message, t_ns)
 
     monkeypatch.setattr(Writer, "write", odd)
     bench = Bench.__new__(Bench)
     bench.items = list(run.items)
-    bench.write(tmp_path / "odd.mcap")
+    return bench.write(path)  # type: ignore[no-any-return]
+
+
+CHANNELS_OF = {kind: [name for name, one in CHANNELS.items() if one is kind] for kind in CHANNELS.values()}
+
+
+@pytest.mark.parametrize("raw", [b'{"type":"frame"}', b"\xff"])
+def test_a_frame_that_is_none_is_refused_as_any_message_is(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, raw: bytes) -> None:
+    path = misrecorded(
+        run,
+        tmp_path / "odd.mcap",
+        monkeypatch,
+        lambda message, good, channel: (raw if isinstance(message, m.Frame) and not message.inbound else good, channel),
+    )
     with pytest.raises(RecordingError, match=r"frame/out.* is of another version"):
-        audit([tmp_path / "odd.mcap"], PUBLIC)
+        audit([path], PUBLIC)
+
+
+MOVED = [(m.GateChanged, "out/decided", "another output"), (m.Frame, "frame/out", "the other direction")]
+
+
+@pytest.mark.parametrize(("kind", "channel", "what"), MOVED, ids=["output", "frame"])
+def test_a_record_on_another_channel_is_no_record_of_its_own(
+    run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: type, channel: str, what: str
+) -> None:
+    path = misrecorded(
+        run, tmp_path / "odd.mcap", monkeypatch, lambda message, good, own: (good, channel if isinstance(message, kind) else own)
+    )
+    result = audit([path], PUBLIC)
+    assert (result.ok, result.chain) == (False, "intact")
+    assert result.first_difference is not None
+    assert what in result.first_difference.what
+    assert result.first_difference.channel == channel
+
+
+def test_an_output_that_can_be_read_in_two_ways_passes_on_no_platform(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    environment = writer_module.environment
+    monkeypatch.setattr(writer_module, "environment", lambda: {**environment(), "python": "another"})
+    honest = Bench.__new__(Bench)
+    honest.items = list(run.items)
+    assert audit([honest.write(tmp_path / "honest.mcap")], PUBLIC).ok
+    path = misrecorded(
+        run,
+        tmp_path / "odd.mcap",
+        monkeypatch,
+        lambda message, good, own: (
+            good.replace(b'"open":', b'"open":false,"open":', 1) if isinstance(message, m.GateChanged) else good,
+            own,
+        ),
+    )
+    result = audit([path], PUBLIC)
+    assert not result.ok
+    assert result.first_difference is not None
+    assert (result.first_difference.channel, result.first_difference.what) == ("out/gate_changed", "the core gives another output here")
 
 
 def nth(items: list[Any], kind: type, n: int) -> int:

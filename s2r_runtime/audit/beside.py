@@ -30,6 +30,7 @@ from s2r_runtime.messages import (
     SourceStopped,
 )
 from s2r_runtime.plugins import registry
+from s2r_runtime.recording.channels import FRAME_IN
 from s2r_runtime.recording.reading import Entry
 
 if TYPE_CHECKING:
@@ -164,6 +165,8 @@ class _Server:
         frame: Any = entry.message
         if _ENCODE(frame) != raw:
             self.findings.differ(index, channel, "this is not how a recorder writes it", raw, frame)
+        if frame.inbound != (channel == FRAME_IN):
+            self.findings.differ(index, channel, "it stands among the frames of the other direction", raw, frame)
         (self._frames.inbound if frame.inbound else self._frames.outbound)(entry, frame)
 
     def event(self, index: int, channel: str, raw: bytes) -> None:

@@ -179,6 +179,10 @@ def _run(run: RunAudit, parts: list[Reading], findings: Findings, tell: _Progres
         findings.same_machine = findings.same_platform and bool(told.get(MACHINE)) and told.get(MACHINE) == here.get(MACHINE)
         run.part(reading)
         for number, entry in enumerate(reading):
+            if lost:
+                findings.differ(entry.index, entry.channel, "the log says before that nothing more could be recorded", entry.raw, None)
+            if entry.channel in (UNRECORDED, DELETED) and msgspec.json.encode(entry.message) != entry.raw:
+                findings.differ(entry.index, entry.channel, "this is not how a recorder writes it", entry.raw, entry.message)
             if entry.channel == UNRECORDED:
                 _unrecorded(entry.message, findings)
                 lost = True
