@@ -16,6 +16,7 @@ from s2r_runtime.trace.lack_of_fit_terms import LINE, dictionaries, line, quiete
 from s2r_runtime.trace.residual import Steps, acting, residual, steps_of
 from s2r_runtime.trace.residual_noise import Noise, quantum
 from s2r_runtime.trace.scores import limited
+from s2r_runtime.trace.streams import held_between, held_means
 from s2r_runtime.trace.tracer import trace
 
 
@@ -204,3 +205,17 @@ def test_the_step_of_rounding_is_found_or_there_is_none():
         assert quantum(rounded[:-1], rounded[1:]) == pytest.approx(step, rel=1e-6)
     for column in (wandering, np.zeros(500), np.full(500, np.nan), np.zeros(0), np.repeat([0.0, 1.0], 250)):
         assert quantum(column[:-1], column[1:]) == 0.0
+
+
+@pytest.mark.parametrize("begin", [0.0, 1.7e9], ids=["from zero", "since 1970"])
+@pytest.mark.parametrize(("late", "row"), [(0.013, 0.1), (0.0, 0.02), (0.007, 0.02)], ids=["off the grid", "in fifths", "in fifths, late"])
+def test_an_input_is_exactly_what_is_held_where_it_does_not_change_within_a_part(begin, late, row):
+    """An integral of stamps since 1970 is off by a hundred thousandth of a part: every part would hold a change."""
+    dt, steps, parts = 0.1, 200, 5
+    t = begin + late + row * np.arange(-10, round(steps * dt / row))
+    values = np.repeat(np.random.default_rng(6).uniform(-1.0, 1.0, (len(t), 2))[::10], 10, axis=0)[: len(t)]
+    inputs, at = Stream(t, values), begin + dt * np.arange(steps + 1)
+    apart = np.count_nonzero(np.any(np.diff(values[t > begin - row], axis=0), axis=1))
+    for means in (held_means(inputs, begin, steps, dt, parts), held_between(inputs, at, parts)):
+        mixed = ~np.isin(means, values).all(axis=1)
+        assert np.count_nonzero(mixed) == (0 if late == 0.0 else apart)

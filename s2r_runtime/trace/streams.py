@@ -21,8 +21,8 @@ Rates = Callable[[Array, Array], Array]
 ALIGNED = 0.02
 """A stamp this part of dt away from the grid counts as on it: stamps are printed with a few digits."""
 
-ROUNDING = 1e-9
-"""Of an input's size: smaller differences come from how a mean was computed."""
+ROUNDING = 1e-3
+"""Of a part's length: a change this near to an edge, or nearer than stamps can tell, is on it: stamps are printed with some digits."""
 
 TOGETHER = 0.8
 """If this part of the rows with the rarest state has all states, they come on the same stamps, and the rest is left."""
@@ -211,7 +211,7 @@ def held_means(inputs: Stream, t0: float, steps: int, dt: float, parts: int) -> 
     nearest = t0 + dt * np.rint((inputs.t - t0) / dt)
     on = np.abs(inputs.t - nearest) <= ALIGNED * dt
     t = np.where(on, nearest, inputs.t)
-    edges = t0 + dt / parts * np.arange(steps * parts + 1)
+    edges = np.asarray(t0 + dt / parts * np.arange(steps * parts + 1), dtype=np.float64)
     if bool(on.all()):
         last = np.searchsorted(t, edges[:-1] + ALIGNED * dt / parts, side="right") - 1
         return np.asarray(np.where(last[:, None] >= 0, values[np.maximum(last, 0)], 0.0))
@@ -219,15 +219,18 @@ def held_means(inputs: Stream, t0: float, steps: int, dt: float, parts: int) -> 
     last = np.searchsorted(t, edges, side="right") - 1
     i = np.maximum(last, 0)
     area = np.where(last[:, None] >= 0, total[i] + values[i] * (edges - t[i])[:, None], 0.0)
-    return _held_or_mean(np.diff(area, axis=0) * (parts / dt), values, last[:-1])
+    return _held_or_mean(np.diff(area, axis=0) * (parts / dt), values, t, edges)
 
 
-def _held_or_mean(mean: Array, values: Array, last: NDArray[np.int64]) -> Array:
-    """Means over parts, (K, nu); exactly what is held (row `last` of values) where nothing changes within a part, which an integral gives
-    but for rounding: what looks for changes would find one in every part.
+def _held_or_mean(mean: Array, values: Array, t: Array, edges: Array) -> Array:
+    """Means over the parts between the edges (K + 1,), (K, nu); exactly what is held, values (N, nu) from t (N,) on, where nothing changes
+    within a part, which an integral gives but for rounding: what looks for changes would find one in every part.
     """
-    here = np.where(last[:, None] >= 0, values[np.maximum(last, 0)], 0.0)
-    return np.asarray(np.where(np.abs(mean - here) <= ROUNDING * np.max(np.abs(values), initial=0.0), here, mean))
+    near = ROUNDING * float(np.min(np.diff(edges), initial=np.inf)) + 4.0 * float(np.spacing(np.max(np.abs(edges))))
+    first, last = (np.searchsorted(t, at, side="right") for at in (edges[:-1] + near, edges[1:] - near))
+    given = np.concatenate([np.zeros((1, values.shape[1])), values])
+    changed = np.cumsum(np.append(np.zeros((1, values.shape[1]), dtype=bool), given[1:] != given[:-1], axis=0), axis=0)
+    return np.asarray(np.where(changed[last] == changed[first], given[first], mean))
 
 
 def on_grid(t: Array, dt: float) -> bool:
@@ -266,8 +269,7 @@ def held_between(inputs: Stream, at: Array, parts: int) -> Array:
     if not len(values):
         return np.zeros(((len(at) - 1) * parts, values.shape[1]))
     edges = np.interp(np.arange((len(at) - 1) * parts + 1) / parts, np.arange(len(at)), at)
-    last = np.searchsorted(inputs.t, edges[:-1], side="right") - 1
-    return _held_or_mean(np.diff(_area(inputs, edges), axis=0) / np.diff(edges)[:, None], values, last)
+    return _held_or_mean(np.diff(_area(inputs, edges), axis=0) / np.diff(edges)[:, None], values, inputs.t, edges)
 
 
 def interpolated(states: Stream, dt: float, angles: list[int], spacing: float) -> Array:
