@@ -1,21 +1,25 @@
 """What a name rests on: the evidence for a dictionary, what chance makes of it, and what a recording could have shown."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recordings
 
 from s2r_runtime.models.composed import AppliedEffect, compose, wrap
-from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
+from s2r_runtime.trace import selection
 from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
 from s2r_runtime.trace.evidence import RIDGES, evidence, margin
 from s2r_runtime.trace.faults import check
 from s2r_runtime.trace.fitting import evaluate, insert, problem
 from s2r_runtime.trace.lack_of_fit_terms import LINE, dictionaries, line, quieter
+from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.residual import Steps, acting, residual, steps_of
 from s2r_runtime.trace.residual_noise import Noise, quantum
-from s2r_runtime.trace.scores import limited
+from s2r_runtime.trace.scores import STRICT, Scored, limited
 from s2r_runtime.trace.streams import held_between, held_means
 from s2r_runtime.trace.tracer import trace
 
@@ -219,3 +223,42 @@ def test_an_input_is_exactly_what_is_held_where_it_does_not_change_within_a_part
     for means in (held_means(inputs, begin, steps, dt, parts), held_between(inputs, at, parts)):
         mixed = ~np.isin(means, values).all(axis=1)
         assert np.count_nonzero(mixed) == (0 if late == 0.0 else apart)
+
+
+def test_an_exchange_never_takes_out_what_the_user_declared(monkeypatch):
+    """Effects stand before and behind the user's own; once the first one is exchanged, the places of all others are others."""
+    model = compose(ModelSpec("double_integrator", 0.05, {}, (EffectSpec("input_lag", "ax", {"time_constant": 0.2}),)))
+    rng = np.random.default_rng(8)
+    given_data = from_arrays(model, [(rng.normal(size=(120, 4)), rng.normal(size=(119, 2)))])
+    given = problem(given_data, steps_of(given_data))
+
+    def effect(name, channel, p):
+        return AppliedEffect(registry().get("effects", name), channel, p)
+
+    there = insert(insert(model, effect("input_gain", "ay", {"gain": 1.0}), 0), effect("input_gain", "ax", {"gain": 1.0}), 0)
+    there = insert(there, effect("input_bias", "ax", {"bias": 0.0}), 3)
+    asked = []
+
+    def best(given, base, *rest):
+        asked.append([(a.effect.name, a.channel) for a in base.model.effects])
+        other = evaluate(given, insert(base.model, effect("input_bias", "ay", {"bias": 0.0}), len(base.model.effects)))
+        return [Scored("input_bias", "ay", 1e9, replace(other, white=1e9, coloured=1e9))][: len(asked) == 1], 1
+
+    monkeypatch.setattr(selection, "best_candidates", best)
+    after = selection.exchanged(given, evaluate(given, there), STRICT)
+    assert [a.effect.name for a in after.model.effects] == ["input_gain", "input_lag", "input_bias", "input_bias"]
+    assert asked == [
+        [("input_gain", "ay"), ("input_lag", "ax"), ("input_bias", "ax")],
+        [("input_lag", "ax"), ("input_bias", "ax"), ("input_bias", "ay")],
+    ]
+
+
+def test_an_effect_on_a_state_that_asks_for_the_residual_begins_without():
+    """By how much the input moves the state: there is none on that channel."""
+    model = compose(ModelSpec("double_integrator", 0.05))
+    data = from_arrays(model, [(np.zeros((80, 4)), np.ones((79, 2)))])
+    given = problem(data, steps_of(data))
+    left = Leftover(given, evaluate(given, model))
+    effect = registry().get("effects", "regime_change")
+    assert left.starts(effect, "vx") == []
+    assert left.starts(effect, "ax")

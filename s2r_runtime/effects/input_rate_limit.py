@@ -63,7 +63,7 @@ class InputRateLimit(Follower):
         return found
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
-        """From a limit that a large change meets within a step to one that takes it twenty."""
+        """From a limit that a large change meets within a step to one that takes it thirty-six."""
         change = np.abs(np.diff(u[:, columns(model, channel)], axis=0))
         if not np.any(change):
             return []

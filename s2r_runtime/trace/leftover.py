@@ -28,9 +28,9 @@ class Leftover:
 
     def starts(self, effect: Effect, channel: str) -> list[dict[str, Any]]:
         """Further values to begin from, of an effect that asks for the residual; none of another one's."""
-        if not hasattr(effect, "starts_from_residual"):
-            return []
         model, steps = self.fit.model, self.given.steps
+        if not hasattr(effect, "starts_from_residual") or channel not in {*model.inputs, "*"}:  # a state has no input that pushes
+            return []
         pushes = self.fit.whiten(self._pushes(channel, proportional=bool(getattr(effect, "proportional", False))))
         return list(effect.starts_from_residual(self.fit.z, steps.t, pushes, model.nominal, channel, model.dt))
 

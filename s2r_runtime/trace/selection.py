@@ -201,7 +201,10 @@ def _less_each_block(given: Problem, fit: Fit, edges: Array) -> list[ComposedMod
 
 def exchanged(given: Problem, fit: Fit, bar: Bar) -> Fit:
     """Replaces an earlier effect where another one does better beside the later ones: the first choice was made without them."""
-    for place in fit.added[:-1]:
+    for who in [name_of(fit.model.effects[place]) for place in fit.added[:-1]]:
+        place = next((place for place in fit.added if name_of(fit.model.effects[place]) == who), None)
+        if place is None:  # its place is another one after every exchange, and one of the user's own may stand there
+            continue
         base = fitted(given, fit, without(fit.model, place), 1)
         found, _ = best_candidates(given, base, 4, bar, gain(fit, base))
         best = found[0].fit if found else None
