@@ -373,6 +373,26 @@ def test_a_record_that_was_put_in_is_noticed(run: Any, tmp_path: Path, kind: typ
     assert result.first_difference.index == index
 
 
+@pytest.mark.parametrize("what", ["event before", "frame before", "begins twice"])
+def test_a_run_begins_once_and_with_nothing_before(run: Any, tmp_path: Path, what: str) -> None:
+    def change(items: list[Any]) -> int:
+        first = nth(items, m.Started, 0)
+        if what == "begins twice":
+            at = nth(items, m.Observed, 100)
+            items.insert(at, msgspec.structs.replace(items[first], t_ns=items[at].t_ns))
+        else:
+            at = first
+            kind = m.Measured(0, 3, 0.0, "", 1.0, 1, 0, 1) if what == "event before" else items[nth(items, m.Frame, 0)]
+            items.insert(at, kind)
+        return ordinal(items, at)
+
+    result, index = tampered(run, tmp_path / "a.mcap", change)
+    assert not result.ok
+    assert result.first_difference is not None
+    assert result.first_difference.index == index
+    assert "begin" in result.first_difference.what
+
+
 def test_evidence_that_is_not_attached_is_missed(run: Any, tmp_path: Path) -> None:
     for name in ("controller/", "certificate/"):
         bench = Bench.__new__(Bench)

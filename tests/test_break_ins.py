@@ -103,6 +103,12 @@ def test_nothing_but_a_certificate_of_its_own_makes_a_controller_drive(rig: Rig,
     assert all(c["u"] == [0.0, 0.5] for c in rig.applied() if c["source"] == "controller")
     assert rig.messages("event/certificates_distrusted") != []
     assert [m.reason for m in rig.messages("out/revoked") if isinstance(m, Revoked)] == [why]
+    carried = rig.folder / "carried" / "key.pem"
+    carried.parent.mkdir(mode=0o700)
+    carried.touch(0o600)
+    carried.write_bytes((rig.state / "key.pem").read_bytes())
+    refused = rig.s2r("run", str(rig.profile), "--state", str(rig.state), "--key", str(carried))
+    assert (refused.returncode, "own key was revoked" in refused.stderr) == (78, True), refused.stderr
     audited = ("audit", *map(str, rig.log_files()), "--key", str(rig.state / "key.pub"))
     assert (before := rig.s2r(*audited)).returncode == 0, before.stdout
     assert rig.s2r("keys", "revoke", entry.fingerprint, "--reason", "a laptop was stolen").returncode == 0

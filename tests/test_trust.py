@@ -76,6 +76,8 @@ def test_a_revoked_key_takes_what_it_signed_along_and_nothing_else(robot: Robot,
     assert set(robot.distrusted()) == {facts.id for facts in robot.facts}
     assert robot.trust.own_objection() == f"this daemon's own key was {own}; s2r keys rotate, and start it anew"
     assert robot.trust.keys() == ()
+    with pytest.raises(ConfigError, match="own key was revoked"):
+        robot.trust.check_own()
 
 
 def test_a_key_that_is_taken_out_of_the_trusted_ones_takes_its_certificates_along(robot: Robot) -> None:

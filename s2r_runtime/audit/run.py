@@ -120,6 +120,8 @@ class RunAudit:
         family, relevant = _ROUTES[entry.channel]
         if family == "event":
             event: Event = entry.message  # type: ignore[assignment]
+            if (type(event) is Started) == (self._now_ns is not None):
+                self._findings.differ(entry.index, entry.channel, "a run begins with its Started, and has no other", event, None)
             self._now_ns = event.t_ns
             if _ENCODE(event) != entry.raw:
                 self._findings.differ(entry.index, entry.channel, "this is not how a recorder writes it", entry.raw, event)
@@ -129,6 +131,8 @@ class RunAudit:
             self._traces.take(entry, entry.message)
         if self._now_ns is not None and entry.log_time_ns != self._now_ns:
             self._findings.differ(entry.index, entry.channel, "it stands at another time than it is of", entry.log_time_ns, self._now_ns)
+        elif self._now_ns is None and family == "frame":
+            self._findings.differ(entry.index, entry.channel, "it stands before the run begins", entry.raw, None)
         if family == "out":
             self._core.output(entry)
         elif family == "event":
@@ -204,8 +208,8 @@ class RunAudit:
         for name in ("profile.toml", "model.toml"):
             if name not in attached:
                 raise ConfigError(f"{self._where()}: {name} is not attached, so nothing can be recomputed")
-        files = {name.removeprefix("profile/"): one.data.decode() for name, one in attached.items() if name.startswith("profile/")}
-        profile = parse_profile(attached["profile.toml"].data.decode(), f"{self._where()}: profile.toml", Path(), files)
+        files = {name.removeprefix("profile/"): self._text(one) for name, one in attached.items() if name.startswith("profile/")}
+        profile = parse_profile(self._text(attached["profile.toml"]), f"{self._where()}: profile.toml", Path(), files)
         self._profile = self._with_model(profile, event.settings.model_digest)
         settings = event.settings
         facts = ModelFacts(settings.states, settings.inputs, settings.angles)
@@ -226,6 +230,12 @@ class RunAudit:
         registry().get("transports", name)(options, facts.states, facts.inputs)  # a transport that is not here is said here
         self._beside.run(name, options, facts.states, facts.inputs)
         self._begun = True
+
+    def _text(self, attached: Attached) -> str:
+        try:
+            return attached.data.decode()
+        except UnicodeDecodeError as error:
+            raise ConfigError(f"{self._where()}: {attached.name} is no text: {error}") from None
 
     def _stored(self, entry: Entry, event: CertificateStored) -> None:
         settings = self._core.state.settings

@@ -168,6 +168,7 @@ class Daemon:
         self.profile = profile = self.models.in_force(profile, self.memory)
         self.key = issuing.signing_key(self._key_path, self.folder.path, self.say)
         self.trust = Trust(self.folder.path, keys.public_bytes(self.key))
+        self.trust.check_own()
         self.watcher = Watcher(self.selector, profile, str(self._profile_path), self.feed, self._analytics)
         stack.callback(self.watcher.close)
         for plugin in registry().loaded:

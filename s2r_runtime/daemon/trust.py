@@ -50,6 +50,11 @@ class Trust:
             return str(error)
         return "" if entry is None else f"this daemon's own key was {entry}; s2r keys rotate, and start it anew"
 
+    def check_own(self) -> None:
+        """Raises ConfigError if this daemon's own key was revoked, on whatever list: what it signs, its log too, is believed by nobody."""
+        if problem := self.own_objection():
+            raise ConfigError(problem)
+
     def look(self, memory: Memory) -> tuple[CertificatesDistrusted, ...]:
         """What is not believed any more, if anything has changed since the last look."""
         now, ids = self._state(), tuple(facts.id for facts in memory.certificates)
