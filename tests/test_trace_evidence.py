@@ -262,3 +262,20 @@ def test_an_effect_on_a_state_that_asks_for_the_residual_begins_without():
     effect = registry().get("effects", "regime_change")
     assert left.starts(effect, "vx") == []
     assert left.starts(effect, "ax")
+
+
+@pytest.mark.parametrize(("pull", "flow", "verdict"), [(0.0, 0.1, "unexplained"), (0.02, 0.0, "traced")], ids=["an input", "a disturbance"])
+def test_a_model_in_which_inputs_push_nowhere_is_seen_to_lack_what_they_do(tmp_path, pull, flow, verdict):
+    path = tmp_path / "tank.py"
+    path.write_text(
+        'STATES = ("level",)\nINPUTS = ("valve",)\nPARAMS = {}\n\n\ndef step(x, u, dt, params):\n    return 0.98 * x + 0.0 * u\n'
+    )
+    model = compose(ModelSpec(str(path), 0.05))
+    rng = np.random.default_rng(8)
+    u = np.repeat(rng.uniform(-1.0, 1.0, 30), 10)[:, None]
+    levels = [np.array([3.0])]
+    for k in range(300):
+        levels.append(0.98 * levels[-1] + flow * u[k] + pull)
+    found = trace(from_arrays(model, [(np.array(levels) + 0.002 * rng.normal(size=(301, 1)), u)]), model)
+    assert found.verdict == verdict
+    assert ("valve" in found.depends_on) == (flow != 0.0)

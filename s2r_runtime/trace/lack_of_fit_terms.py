@@ -1,7 +1,8 @@
 """Terms that a residual can depend on, in dictionaries by what they depend on (docs/tracing.md: the tokens of `depends_on`).
 
 A term is c(y, u, t) d: a number for every transition times a direction of the state in which it pushes. Directions of a model
-with a planar pose: along, across and about the body, each further state, and the world's axes; of another one: where its inputs push.
+with a planar pose: along, across and about the body, each further state, and the world's axes; of another one: where its inputs push
+(each state, if they push nowhere).
 Small dictionaries stand beside larger ones of the same group: with few data the small one is judged better.
 """
 
@@ -258,7 +259,7 @@ def _push(terms: Sequence[Array], directions: Sequence[Array]) -> Terms:
 
 def _directions(given: Problem, model: ComposedModel, act: Acting) -> tuple[list[Array], list[Array]]:
     """((n, nx) each) in which something can push: along, across and about the body and each further state; and the world's axes. For a
-    model without a planar pose, where its inputs push.
+    model without a planar pose, where its inputs push; each state, if they push nowhere.
     """
     n, nx = given.steps.y0.shape
     unit = np.eye(nx)
@@ -269,7 +270,8 @@ def _directions(given: Problem, model: ComposedModel, act: Acting) -> tuple[list
         along[:, x], along[:, y], across[:, x], across[:, y] = c, s, -s, c
         others = [np.tile(unit[i], (n, 1)) for i in range(nx) if i not in {x, y}]
         return [along, across, *others], [np.tile(unit[x], (n, 1)), np.tile(unit[y], (n, 1))]
-    return _own(given, model, act), []
+    own = _own(given, model, act)
+    return own if any(np.any(d) for d in own) else [np.tile(axis, (n, 1)) for axis in unit], []
 
 
 def _own(given: Problem, model: ComposedModel, act: Acting) -> Terms:
