@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
+from daemon_rig import Rig
 
 from s2r_runtime import messages as m
 from s2r_runtime.daemon.retention import Retention
+from s2r_runtime.recording.channels import LogDeleted
+from s2r_runtime.recording.reading import read
 
 NOW_S = 1_700_000_000
 MODEL, OTHER = "sha256:model", "sha256:other"
@@ -184,3 +188,24 @@ def test_a_limit_below_zero_is_refused(tmp_path: Path, field: str) -> None:
     (tmp_path / "p.toml").write_text(text + f"\n[recording]\n{field} = -1\n")
     with pytest.raises(ConfigError, match=f"recording.{field} is -1"):
         load_profile(tmp_path / "p.toml")
+
+
+def test_a_daemon_deletes_what_its_profile_does_not_keep_and_its_log_says_so_to_the_end(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, more="[recording]\nkeep_bytes = 1\n")
+    try:
+        rig.start()
+        rig.stop()
+        (first,) = rig.log_files()
+        rig.start()
+        rig.until(lambda: not first.exists())
+        rig.stop()
+        (second,) = rig.log_files()
+        audited = rig.s2r("audit", str(second), "--json")
+    finally:
+        rig.close()
+    (gone,) = [entry.message for entry in read(second) if entry.channel == "log/deleted"]
+    assert isinstance(gone, LogDeleted)
+    assert (gone.run, gone.files) == (first.stem, 1)
+    assert len(gone.head) == 64
+    assert audited.returncode == 0, audited.stdout
+    assert any(first.stem in one and gone.head in one for one in json.loads(audited.stdout)["missing"])

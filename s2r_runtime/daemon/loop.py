@@ -396,11 +396,15 @@ class Daemon:
         """Deletes old logs, if the profile says so and nothing valid rests on them."""
         if self.retention is None:
             return
-        for gone in self.retention.deleted():
-            self.logbook.put(msgspec.structs.replace(gone, t_ns=self._last_ns), self._last_ns)
+        self._log_deleted()
         if now_ns >= self._next_prune_ns:
             self._next_prune_ns = now_ns + PRUNE_NS
             self.retention.prune_beside(self.state.memory, int(time.time()))
+
+    def _log_deleted(self) -> None:
+        """What was deleted stands in the log."""
+        for gone in () if self.retention is None else self.retention.deleted():
+            self.logbook.put(msgspec.structs.replace(gone, t_ns=self._last_ns), self._last_ns)
 
     def _publish_head(self, now_ns: int) -> None:
         """Tells the robot's side, and now and then the journal, how far the log is on the disk."""
@@ -432,6 +436,7 @@ class Daemon:
         """An orderly end: the recovery command is out and the memory is kept before anything is closed."""
         self.notifier.stopping()
         self._end_sources(self._signals.name or self._ended)
+        self._log_deleted()
         self._close_log()
         if (anchor := self.logbook.anchor()) is not None:
             self.link.anchor(anchor)
