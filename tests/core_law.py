@@ -62,6 +62,7 @@ class Law:
     good_ns: int = -(10**18)
     odd: int | None = None
     anew: bool = False
+    paused: bool = False
     usable: bool = False
     asked: m.Ask | None = None
     asked_ns: int = 0
@@ -91,6 +92,8 @@ class Law:
             self.permit = None
         if anew:
             self._forget()
+        idle = event.t_ns - self.now > self.settings.observation_timeout_ns and not self.settings.lockstep
+        self.paused = idle and self.gate  # the gate closes on what was seen last, which answers what was asked, before this event counts
         self.now, self.refused, self.anew = event.t_ns, False, anew
         before = self._instant(event)
         self._facts(event, outputs)
@@ -293,7 +296,7 @@ class Law:
         """Whether this event begins a control instant: an observation in order, at least 0.9 dt after that of the last one. An
         unusable one can be an instant too, but what stamp it has is believed for one period only.
         """
-        if not isinstance(event, m.Observed) or (self.asked is not None and not self.anew):
+        if not isinstance(event, m.Observed) or (self.asked is not None and not self.anew and not self.paused):
             return False
         seen, last = event.observation, self.instant_stamp
         if seen == self.good or (self.latest is not None and seen.seq == self.latest.seq):
@@ -310,7 +313,7 @@ class Law:
     def _sends(self, event: m.Event, outputs: tuple[m.Output, ...], instant: bool) -> None:
         lockstep, sends = self.settings.lockstep, of(list(outputs), m.Send)
         if instant and isinstance(event, m.Observed):
-            assert self.answered or lockstep or self.anew, "an instant before this one got no command"
+            assert self.answered or lockstep or self.anew or self.paused, "an instant before this one got no command"
             self.instant, self.instant_stamp, self.answered = event.observation.seq, event.observation.stamp_ns, False
             self.last = None  # whatever number it has, nothing was sent for it yet
         for output in outputs:
