@@ -21,7 +21,7 @@ run: $(STAMP)
 
 # Some tests compute, most wait for robots: side by side they keep two cores busy. All of it at the lowest priority, since the daemon's
 # worker runs at that: beside tests of a higher one it would hardly run at all.
-TESTS := PYTHONHASHSEED=0 nice -n 19 $(BIN)/pytest -n 3 --dist loadfile
+TESTS := PYTHONHASHSEED=0 nice -n 19 $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 test: $(STAMP)
 	$(TESTS)

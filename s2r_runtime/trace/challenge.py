@@ -27,7 +27,7 @@ from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
 from s2r_runtime.trace.screening import screen
 from s2r_runtime.trace.selection import accepted
 from s2r_runtime.trace.shapes import SHAPES
-from s2r_runtime.trace.slots import bounds_of
+from s2r_runtime.trace.slots import bounds_of, values_of
 
 ALPHA = 1e-3
 """Chance that a shape wins against the truth, as far as the likelihood is right."""
@@ -106,10 +106,12 @@ def _price(given: Problem, fit: Fit, base: Fit) -> float:
 
 def _times(fit: Fit, channel: str) -> list[float]:
     """What the effects named on an input take, s."""
-    there = [
-        slot for slot in fit.free if fit.model.effects[slot.place].channel in {channel, "*"} and bounds_of(fit.model, slot).unit == "s"
-    ]
-    return [float(fit.model.effects[slot.place].p[slot.name]) for slot in there if bounds_of(fit.model, slot).neutral == 0.0]
+    found = []
+    for slot, value in zip(fit.free, values_of(fit.model, fit.free).tolist(), strict=True):
+        p = bounds_of(fit.model, slot)
+        if fit.model.effects[slot.place].channel in {channel, "*"} and p.unit == "s" and p.neutral == 0.0:
+            found.append(value)
+    return found
 
 
 def _fits(given: Problem, base: Fit, channel: str, least: float = LEAST, near: Sequence[float] = ()) -> list[Fit]:

@@ -68,7 +68,7 @@ class Fit:
         in frequency something is counts as two: it was looked for everywhere (N. Zhang, D. Siegmund, Biometrics 63, 2007: log n).
         """
         named = {slot.place for slot in self.free}
-        return len(self.free) + sum(1 for i in self.added if i not in named) + sum(_sought(self.model, slot) for slot in self.free)
+        return len(self.free) + sum(1 for i in self.added if i not in named) + sum(sought(self.model, slot) for slot in self.free)
 
     @property
     def added(self) -> tuple[int, ...]:
@@ -76,9 +76,10 @@ class Fit:
         return tuple(i for i, a in enumerate(self.model.effects) if isinstance(a, Added))
 
 
-def _sought(model: ComposedModel, slot: Slot) -> bool:
+def sought(model: ComposedModel, slot: Slot) -> bool:
     """Whether a number says when, or how often, something happens that does not happen under the model without it."""
-    return getattr(model.effects[slot.place].effect, "timed", False) and bounds_of(model, slot).unit in {"s", "Hz"}
+    p = bounds_of(model, slot)
+    return getattr(model.effects[slot.place].effect, "timed", False) and p.unit in {"s", "Hz"} and p.neutral is None
 
 
 def gain(fit: Fit, base: Fit) -> float:

@@ -15,7 +15,7 @@ correlated in time, whatever the inputs do, is `noise`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -125,20 +125,28 @@ def first_looks(given: Problem, nominal: Fit) -> Looks:
     return Looks(left, found, sorted(((first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True))
 
 
-def best_unnamed(looks: Looks) -> tuple[str, float]:
-    """What the residual depends on most, and the nats that a dictionary of that explains without any effect's name."""
+def best_unnamed(looks: Looks) -> Judged:
+    """The dictionary that explains most without any effect's name, under the token that is told."""
     looked = _best_of_each(looks.looked, looks.found)
     judged = [judge(looks.left, looks.found[i][0], leading(looks.left, looks.found[i][1])) for _, i in looked[:FEW]]
     most = max(j.gain for j in judged)
     best = min((j for j in judged if j.gain >= most - ALIKE), key=lambda j: (j.x.shape[2], -j.gain))
-    return TOKENS.get(best.token, best.token), most
+    return replace(best, token=TOKENS.get(best.token, best.token), gain=most)
 
 
-def explains_more(nats: float, fit: Fit, nominal: Fit, *, left: bool) -> bool:
-    """Whether a dictionary that explains so much beats the effects of `fit` clearly: these took up structure that is not theirs. left:
-    whether they leave some that matters.
+def explains_more(looks: Looks, unnamed: Judged, fit: Fit, horizon: int, *, left: bool) -> bool:
+    """Whether a dictionary beats the effects of `fit` clearly, in likelihood and in rollouts: these took up structure that is not theirs.
+    left: whether they leave some that matters. What effects change is judged as a dictionary of one term is.
     """
-    return nats > MORE * explained(fit, nominal) + ALIKE * (1.0 if left else 3.0)
+    given, nominal = looks.left.given, looks.left.fit
+    changed = looks.left.r - residual(fit.model, given.steps, acting(fit.model, given.data))
+    mine = max(explained(fit, nominal), judge(looks.left, "", _columns([changed])).gain)
+    if unnamed.gain <= MORE * mine + ALIKE * (1.0 if left else 3.0):
+        return False
+    return any(  # by a share of what the nominal model lacks: less is how steps are cut
+        np.any(named**2 - after**2 > MATTERS * np.maximum(bare**2 - after**2, named**2))
+        for named, bare, after in _rollouts(looks.left, fit, unnamed, horizon)
+    )
 
 
 def _left_by(given: Problem, fit: Fit) -> tuple[Left, list[tuple[str, Array]]]:
@@ -237,24 +245,31 @@ def _best_of_each(looked: list[tuple[float, int]], found: Sequence[tuple[str, Ar
 
 def _weight_of(left: Left, nominal: Fit, judged: Judged, horizon: int) -> tuple[bool, float]:
     """Whether the structure shows in rollouts, and what share of all that the nominal model lacks it is."""
-    data, steps, model = left.given.data, left.given.steps, left.fit.model
-    act, act_nominal = acting(model, data), acting(nominal.model, data)
-    last = np.maximum(
-        np.searchsorted(steps.place, np.arange(len(act.mean)), side="right") - 1, 0
-    )  # the step itself, or the last one before
-    extra = np.einsum("kim,km->ki", judged.x, judged.betas[left.block])[last]
-    there = np.arange(len(act.mean)) - steps.place[last] <= SKIPPED
     matters, worst, share = False, 1.0 + MATTERS, 0.0
-    for ahead in sorted({1, max(1, horizon // 4), horizon}):
-        starts = rollout_starts(data, ahead, within=there)
-        starts = starts[:: max(1, len(starts) // 1200)]
-        if len(starts) < 10:
-            continue
-        before = rms(rollout(nominal.model, data, act_nominal, starts, ahead).error)
-        now = rms(rollout(model, data, act, starts, ahead).error)
-        after = rms(rollout(model, data, act, starts, ahead, extra).error)
+    for before, now, after in _rollouts(left, nominal, judged, horizon):
         for b, n, a in zip(before, now, after, strict=True):
             matters = matters or bool(n > (1.0 + MATTERS) * a)
             if a > 0.0 and max(b, n) > worst * a:
                 worst, share = max(b, n) / a, max(n * n - a * a, 0.0) / max(b * b - a * a, n * n - a * a)
     return matters, share
+
+
+def _rollouts(left: Left, other: Fit, judged: Judged, horizon: int) -> Iterator[tuple[Array, Array, Array]]:
+    """(nx,) rms at the end of rollouts of some lengths: of another model, of the one that leaves this, and of that with the structure."""
+    data, steps, model = left.given.data, left.given.steps, left.fit.model
+    act, act_other = acting(model, data), acting(other.model, data)
+    last = np.maximum(
+        np.searchsorted(steps.place, np.arange(len(act.mean)), side="right") - 1, 0
+    )  # the step itself, or the last one before
+    extra = np.einsum("kim,km->ki", judged.x, judged.betas[left.block])[last]
+    there = np.arange(len(act.mean)) - steps.place[last] <= SKIPPED
+    for ahead in sorted({1, max(1, horizon // 4), horizon}):
+        starts = rollout_starts(data, ahead, within=there)
+        starts = starts[:: max(1, len(starts) // 1200)]
+        if len(starts) < 10:
+            continue
+        yield (
+            rms(rollout(other.model, data, act_other, starts, ahead).error),
+            rms(rollout(model, data, act, starts, ahead).error),
+            rms(rollout(model, data, act, starts, ahead, extra).error),
+        )

@@ -26,6 +26,7 @@ from s2r_runtime.trace.fitting import (
     objective,
     scatter,
     sensitivities,
+    sought,
     without,
 )
 from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
@@ -137,7 +138,7 @@ def _told_by_stamps(given: Problem, fit: Fit, base: Fit) -> bool:
 def _happens(given: Problem, fit: Fit) -> bool:
     """False for what changes at one time, if hardly any steps lie before it, or after it: that is no change."""
     for slot, value in zip(fit.free, values_of(fit.model, fit.free).tolist(), strict=True):
-        if getattr(fit.model.effects[slot.place].effect, "timed", False) and bounds_of(fit.model, slot).unit == "s":
+        if sought(fit.model, slot) and bounds_of(fit.model, slot).unit == "s":
             before = float(np.mean(given.steps.t < value))
             if not EDGE < before < 1.0 - EDGE:
                 return False

@@ -33,6 +33,7 @@ from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, prob
 from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.intervals import intervals
 from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, Looks, Structure, best_unnamed, explains_more, first_looks, lack_of_fit
+from s2r_runtime.trace.lack_of_fit_judged import Judged
 from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.residual import Mask, first_steps, rms, steps_of
@@ -235,20 +236,22 @@ class _Whole:
         return first_looks(self.given, self.nominal)
 
     @cached_property
-    def unnamed(self) -> tuple[str, float]:
+    def unnamed(self) -> Judged:
         """`best_unnamed`, for whatever was selected."""
         return best_unnamed(self._looks)
 
     def _unnamed_explains_more(self, fit: Fit, left: bool) -> bool:
         """What at first look comes nowhere near it will not come up to it."""
-        return self._looks.most > NEARLY * gain(fit, self.nominal) and explains_more(self.unnamed[1], fit, self.nominal, left=left)
+        if self._looks.most < NEARLY * gain(fit, self.nominal):
+            return False
+        return explains_more(self._looks, self.unnamed, fit, self._horizon, left=left)
 
     def structure(self, chosen: Selection) -> Structure:
         """What the chosen model leaves."""
         fit = evaluate(self.given, chosen.fit.model)
         found = lack_of_fit(self.given, fit, self.nominal, self._horizon)
         if not fit.added:
-            told = found.matters and self.unnamed[1] > CLEAR  # else it is seen by sliding only, which says by itself what it depends on
+            told = found.matters and self.unnamed.gain > CLEAR  # else it is seen by sliding only, which says by itself what it depends on
             tokens = self._looks_like if told else () if self._shape is None else (self._shape.token,)
             named = tuple(dict.fromkeys((*tokens, *found.tokens)))
             return replace(found, tokens=named, matters=True, share=1.0) if tokens else found
@@ -261,7 +264,7 @@ class _Whole:
     @cached_property
     def _looks_like(self) -> tuple[str, ...]:
         """What all that the nominal model lacks depends on most: by the best dictionary, or by a shape that does better."""
-        token, nats = self.unnamed
+        token, nats = self.unnamed.token, self.unnamed.gain
         return (token,) if self._shape is None or self._shape.nats < MORE * nats + ALIKE else (self._shape.token,)
 
     @cached_property
