@@ -126,7 +126,8 @@ def test_killed_controller_is_replaced_by_the_recovery_command(rig: Rig) -> None
     driving(rig)
     os.kill(rig.status()["pids"]["controller"], signal.SIGKILL)
     rig.until_status(latched=["controller_fault"], gate="closed", driving="recovery")
-    assert "killed by SIGKILL" in next(m.detail for m in rig.messages("event/source_stopped") if isinstance(m, SourceStopped))
+    detail = next(m.detail for m in rig.messages("event/source_stopped") if isinstance(m, SourceStopped))
+    assert "killed by SIGKILL" in detail or "closed its socket" in detail  # on a busy machine the daemon doesn't wait to learn more
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP], ids=["dead", "frozen"])

@@ -1,5 +1,5 @@
 """The tracer on measured recordings: MRCLAM (an iRobot Create, commands and Vicon poses on stamps of their own), EMPS (an arm's
-prismatic joint, force and position only) and F1TENTH (a car, 41 runs).
+prismatic joint, force and position only), F1TENTH (a car, 41 runs) and an ArduPilot rover in its simulator.
 
 K. Leung et al., The UTIAS multi-robot cooperative localization and mapping dataset, IJRR 30(8), 2011. A. Janot, M. Gautier, M. Brunot,
 Data set and reference models of EMPS, 2019. N. Kochdumper, S. Bak, Conformant synthesis for Koopman operator linearized control
@@ -67,3 +67,18 @@ def test_a_real_car_is_foretold_three_seconds_ahead():
     assert values["input_delay", "steer_cmd"]["delay"] == pytest.approx(0.10, abs=0.02)
     after = found.to_json()["error"]["after"]["rollout_rms"]
     assert (after["x"] ** 2 + after["y"] ** 2) ** 0.5 < 0.036
+
+
+@pytest.mark.skipif(not (FOLDER / "rover_sitl.tlog.gz").exists(), reason="the measured recordings are not here")
+@pytest.mark.long
+def test_the_ramps_of_a_rover_are_found_in_its_telemetry_log():
+    """Measured on it by other means: v follows as a ramp of 1 m/s² with a delay of 0.20 s, w as one of 2.09 rad/s² with 0.06 s."""
+    model = compose(ModelSpec("unicycle", 0.1))
+    found = trace(load_dataset(FOLDER / "rover_sitl.tlog.gz", model), model)
+    assert found.verdict in {"traced", "ambiguous"}
+    rates = {e.channel: e.parameters["rate"][0] for e in found.effects if e.name == "input_rate_limit"}
+    assert rates["v"] == pytest.approx(1.0, rel=0.06)
+    assert rates["w"] == pytest.approx(2.09, rel=0.1)
+    error = found.to_json()["error"]
+    for state in ("x", "y", "theta"):
+        assert error["after"]["rollout_rms"][state] < 0.15 * error["before"]["rollout_rms"][state]

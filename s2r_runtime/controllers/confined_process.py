@@ -24,6 +24,8 @@ from s2r_runtime.errors import one_line
 
 LINE_MAX = 64 << 10
 """Bytes. A message has a few hundred; who sends more without an end of line sends no message."""
+ENDS_WITHIN_S = 0.02
+"""How long the daemon's loop waits to learn how a controller ended: it has commands to send."""
 READ_MAX = 64 << 10
 """Bytes taken from the child at a time, from the socket and from the pipe: one that floods costs the loop no more than that."""
 OUTPUT_KEPT = 4 << 10
@@ -117,8 +119,8 @@ class ConfinedProcess:
         return self._process.returncode is not None or self._status() is not None
 
     def ending(self) -> str:
-        """How it ended, in a few words. Waits up to 20 ms: the end of its socket comes a moment before its own."""
-        deadline = time.monotonic() + 0.02
+        """How it ended, in a few words. Waits up to ENDS_WITHIN_S: the end of its socket comes a moment before its own."""
+        deadline = time.monotonic() + ENDS_WITHIN_S
         while (status := self._status()) is None and time.monotonic() < deadline:
             time.sleep(0.0005)
         self._drain()
