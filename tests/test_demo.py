@@ -103,3 +103,10 @@ def test_its_report_is_one_page_with_the_plots(story: tuple[Path, str]) -> None:
     assert page.count("<svg") >= 8
     assert len(page) < 5_000_000
     assert re.findall(r"""(?:src|href)\s*=\s*["'](?!#|data:)[^"']+""", page) == []
+
+
+def test_an_effect_that_the_robot_does_not_have_is_one_line(tmp_path: Path) -> None:
+    done = s2r("demo", "--effect", "nonsense", "--out", tmp_path / "run")
+    assert done.returncode == 78
+    assert "unknown effect 'nonsense'" in done.stderr.strip().splitlines()[-1]
+    assert "Traceback" not in done.stderr

@@ -18,7 +18,7 @@ from typing import Any
 
 from s2r_runtime.cli import output
 from s2r_runtime.daemon import control
-from s2r_runtime.errors import S2RError, UsageError
+from s2r_runtime.errors import ConfigError, S2RError, UsageError
 from s2r_runtime.hookspecs import Story
 from s2r_runtime.plugins import registry
 
@@ -59,7 +59,7 @@ class Demonstration:
         controller = self._robot.controller("good")
         wrong = ", ".join(self._effects) or "nothing"
         self._tell(f"robot {self._name!r} runs in its own process; what is wrong with it: {wrong} (the daemon isn't told)")
-        self._await_robot()
+        self._await_robot(robot)
         if not self._campaign():
             return False
         self._step(f"s2r deploy {controller.name}", "verify the controller against that gap")
@@ -213,14 +213,17 @@ class Demonstration:
             time.sleep(0.02)
         raise S2RError(f"the daemon did not start: {(self._out / 'daemon.txt').read_text(encoding='utf-8').strip()[-300:]}")
 
-    def _await_robot(self) -> None:
+    def _await_robot(self, robot: subprocess.Popen[str]) -> None:
         limit = time.monotonic() + START_S
-        while time.monotonic() < limit:
+        while time.monotonic() < limit and robot.poll() is None:
             status = self._call({"verb": "status"})["data"]
             if status["link"] and status["observation"]:
                 return
             time.sleep(0.02)
-        raise S2RError(f"the robot did not answer: {(self._out / 'robot.txt').read_text(encoding='utf-8').strip()[-300:]}")
+        said = (self._out / "robot.txt").read_text(encoding="utf-8").strip()
+        if robot.poll() == ConfigError.exit_code and said:  # it says itself what was wrong with what it was given
+            raise ConfigError(said.splitlines()[-1])
+        raise S2RError(f"the robot did not answer: {said[-300:]}")
 
     def _end_daemon(self, process: subprocess.Popen[str]) -> None:
         process.terminate()

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from s2r_runtime.controllers.file import ControllerFile, load
 from s2r_runtime.daemon.given_inputs import BYTES_MAX, GivenInputs, parse_inputs
@@ -14,6 +15,11 @@ from s2r_runtime.daemon.settings import ModelFacts, settings_of
 from s2r_runtime.daemon.worker import GapJob, InputsJob, Job, LoadJob, Result, SynthesisJob, TraceJob, VerifyJob
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import Gap
+
+if TYPE_CHECKING:
+    from s2r_runtime.hookspecs import Task
+    from s2r_runtime.models.composed import ComposedModel
+    from s2r_runtime.uncertain import GapSet
 
 Progress = Callable[[float, float, str], None]
 
@@ -70,15 +76,10 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
 
     from s2r_runtime.controllers.batches import BatchController
     from s2r_runtime.controllers.rehearsal import Kept
-    from s2r_runtime.models.composed import compose
-    from s2r_runtime.plugins import registry
-    from s2r_runtime.uncertain import GapSet
     from s2r_runtime.verify import verify_in_detail
 
     profile, settings = job.profile, job.profile.verification
-    model = compose(profile.model)
-    task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
-    gap_set = GapSet(job.gap.set, job.gap.weights, job.radius, job.hold_radius, job.gap.hold_periods)
+    model, task, gap_set = _asked(job)
     with BatchController(job.controller, len(model.inputs), MEMORY_BYTES) as control:
         kept = Kept(control)
         result, details = verify_in_detail(
@@ -107,18 +108,24 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
     return Result(verification=result, safety=safety)
 
 
+def _asked(job: VerifyJob | SynthesisJob) -> tuple[ComposedModel, Task, GapSet]:
+    """The model and task of the job's profile, and the disturbances that it names."""
+    from s2r_runtime.models.composed import compose
+    from s2r_runtime.plugins import registry
+    from s2r_runtime.uncertain import GapSet
+
+    model, task = compose(job.profile.model), job.profile.task
+    gap_set = GapSet(job.gap.set, job.gap.weights, job.radius, job.hold_radius, job.gap.hold_periods)
+    return model, registry().get("tasks", task.name)(task.parameters, model.nominal, model.dt), gap_set
+
+
 def synthesize(job: SynthesisJob, progress: Progress) -> Result:
     """A search over the controller's parameters; each candidate answers from a confined process of its own, as in a verification."""
     from s2r_runtime.controllers.batches import BatchController
-    from s2r_runtime.models.composed import compose
-    from s2r_runtime.plugins import registry
     from s2r_runtime.synthesize import search, search_seed
-    from s2r_runtime.uncertain import GapSet
 
     profile, settings = job.profile, job.profile.verification
-    model = compose(profile.model)
-    task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
-    gap_set = GapSet(job.gap.set, job.gap.weights, job.radius, job.hold_radius, job.gap.hold_periods)
+    model, task, gap_set = _asked(job)
     with ExitStack() as running:
 
         def answering(file: ControllerFile) -> BatchController:

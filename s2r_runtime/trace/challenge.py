@@ -3,8 +3,8 @@
 The effects that were found on an input are taken out, and each shape (`shapes`) is put in their place and fitted. With L the log likelihood
 of the recording, noise re-estimated for each, the smaller of white and coloured, and a price per number,
 
-    shape wins     L(shape) - price > L(named) - price + log(tried / ALPHA),   by MORE of all that the named effects explain,
-                   and some rollout's error is lower by LOWER
+    shape wins     L(shape) - L(named) > log(tried / ALPHA) + the price of numbers that it has more than they,
+                   and by MORE of all that the named effects explain; and some rollout's error is lower by LOWER
 
 A name that loses is not given: the recording does not look like what it means. A shape that has the named effect in it (two lags that are
 alike) costs a name nothing, as it explains no more.
@@ -23,7 +23,7 @@ from s2r_runtime.hookspecs import Effect
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace.candidates import Candidate
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, without
-from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
+from s2r_runtime.trace.residual import acting, covered, first_steps, rms, rollout, rollout_starts
 from s2r_runtime.trace.screening import screen
 from s2r_runtime.trace.selection import accepted
 from s2r_runtime.trace.shapes import SHAPES
@@ -72,8 +72,10 @@ def better_shape(given: Problem, fit: Fit, horizon: int) -> Better | None:
 def best_shape(given: Problem, base: Fit, horizon: int) -> Better | None:
     """The shape that explains most of what a model leaves, on whichever input; None if none would be taken if it were an effect."""
     found = [(gain(fit, base) - _price(given, fit, base), fit) for channel in base.model.inputs for fit in _fits(given, base, channel)]
-    nats, fit = max(found, key=lambda pair: pair[0], default=(0.0, base))
-    return Better(_token(fit), nats) if nats > 0.0 and accepted(given, fit, base, len(SHAPES) * len(base.model.inputs), horizon) else None
+    for nats, fit in sorted(found, key=lambda pair: -pair[0]):
+        if nats > 0.0 and accepted(given, fit, base, len(SHAPES) * len(base.model.inputs), horizon):
+            return Better(_token(fit), nats)
+    return None
 
 
 def _inputs(fit: Fit) -> list[str]:
@@ -147,9 +149,10 @@ def _token(fit: Fit) -> str:
 
 
 def _lower(given: Problem, named: ComposedModel, shape: ComposedModel, horizon: int) -> bool:
-    """Whether some rollout's error is lower under the shape."""
+    """Whether some rollout's error is lower under the shape, where nothing was left out."""
+    _, there = covered(given.steps, int(first_steps(given.data)[-1]))
     for ahead in sorted({1, max(1, horizon // 4), horizon}):
-        starts = rollout_starts(given.data, ahead)
+        starts = rollout_starts(given.data, ahead, within=there)
         starts = starts[:: max(1, len(starts) // STARTS)]
         if len(starts) < 10:
             continue

@@ -27,7 +27,7 @@ from s2r_runtime.trace.fitting import Fit, Problem
 from s2r_runtime.trace.fitting import gain as explained
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left, first_look, judge, leading
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
-from s2r_runtime.trace.residual import acting, residual, rms, rollout, rollout_starts, state_jacobian
+from s2r_runtime.trace.residual import acting, covered, residual, rms, rollout, rollout_starts, state_jacobian
 
 Array = NDArray[np.float64]
 
@@ -70,9 +70,6 @@ TOKENS = {"wave": "time"}
 
 MOST_GROUPS = 3
 """Groups that are named at most."""
-
-SKIPPED = 3
-"""Steps without a measured end over which structure is taken to be that of the last step before."""
 
 COLOURED = 0.2
 """Autoregression coefficient from which noise is called coloured."""
@@ -140,7 +137,8 @@ def explains_more(looks: Looks, unnamed: Judged, fit: Fit, horizon: int, *, left
     """
     given, nominal = looks.left.given, looks.left.fit
     changed = looks.left.r - residual(fit.model, given.steps, acting(fit.model, given.data))
-    mine = max(explained(fit, nominal), judge(looks.left, "", _columns([changed])).gain)
+    x = _columns([changed])
+    mine = max(explained(fit, nominal), judge(looks.left, "", x).gain if x.shape[2] else 0.0)
     if unnamed.gain <= MORE * mine + ALIKE * (1.0 if left else 3.0):
         return False
     return any(  # by a share of what the nominal model lacks: less is how steps are cut
@@ -258,11 +256,8 @@ def _rollouts(left: Left, other: Fit, judged: Judged, horizon: int) -> Iterator[
     """(nx,) rms at the end of rollouts of some lengths: of another model, of the one that leaves this, and of that with the structure."""
     data, steps, model = left.given.data, left.given.steps, left.fit.model
     act, act_other = acting(model, data), acting(other.model, data)
-    last = np.maximum(
-        np.searchsorted(steps.place, np.arange(len(act.mean)), side="right") - 1, 0
-    )  # the step itself, or the last one before
+    last, there = covered(steps, len(act.mean))
     extra = np.einsum("kim,km->ki", judged.x, judged.betas[left.block])[last]
-    there = np.arange(len(act.mean)) - steps.place[last] <= SKIPPED
     for ahead in sorted({1, max(1, horizon // 4), horizon}):
         starts = rollout_starts(data, ahead, within=there)
         starts = starts[:: max(1, len(starts) // 1200)]

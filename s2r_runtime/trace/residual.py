@@ -24,6 +24,10 @@ Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 
+SKIPPED = 3
+"""Steps without a measured end over which what is said of the last step before is taken to hold."""
+
+
 @dataclass(frozen=True)
 class Steps:
     """n transitions in order of time. place: (n,) step in the runs laid end to end; joined: (n,) starts where the one before ended.
@@ -183,6 +187,15 @@ def rollout_starts(data: Dataset, horizon: int, left_out: Sequence[tuple[int, in
             k = np.flatnonzero(good[:last] & good[horizon:]) + begin[i]
             found.append(k[count[k + horizon] == count[k]])
     return np.concatenate(found).astype(np.int64) if found else np.zeros(0, dtype=np.int64)
+
+
+def covered(steps: Steps, n: int) -> tuple[Index, Mask]:
+    """(n,) of the steps in the runs laid end to end: the transition that each is, or the last one before; and whether that one is near
+    enough to speak for it. What was left out is spoken for by none.
+    """
+    here = np.arange(n)
+    last = np.maximum(np.searchsorted(steps.place, here, side="right") - 1, 0)
+    return last, here - steps.place[last] <= SKIPPED
 
 
 def rollout(model: ComposedModel, data: Dataset, act: Acting, starts: Index, horizon: int, extra: Array | None = None) -> Rollouts:
