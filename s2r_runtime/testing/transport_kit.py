@@ -104,14 +104,20 @@ class Line:
         return True
 
     def link(self, x: tuple[float, ...]) -> int:
-        """Observations until one gets through, as a robot would send them: links take a moment. Returns its seq."""
+        """Observations until one gets through, as a robot would send them: links take a moment. Returns the newest's seq.
+
+        None is on its way any more then: a slow link may have many of them when the first arrives.
+        """
         before = len(self.good)
         end = time.monotonic() + PATIENCE_S
-        while len(self.good) == before:
+        while len(self.good) == before or not self.reached(self._seq):
             assert time.monotonic() < end, "no observation got through"
             self._seq += 1
             self.robot.publish(self._seq, self._seq * PERIOD_NS, x)
+            arrives_by = time.monotonic() + (0.5 if len(self.good) > before else 0.0)
             self.turn()
+            while time.monotonic() < arrives_by and not self.reached(self._seq):
+                self.turn()
         for _ in range(5):
             self.turn()
         return self._seq

@@ -109,7 +109,7 @@ class Node:
         """A payload, with an attachment under rmw."""
         self._sequence = self._sequence + 1 if sequence is None else sequence
         extra = attachment(self._sequence, stamp_ns, self._gid) if self._layout.kind == "rmw" else None
-        self.session.put(key, payload, attachment=extra, express=True, congestion_control=zenoh.CongestionControl.DROP)
+        self.session.put(key, payload, attachment=extra, express=True, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def publish(self, seq: int, stamp_ns: int, x: tuple[float, ...]) -> None:
         """One pose."""

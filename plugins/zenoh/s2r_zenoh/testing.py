@@ -76,7 +76,11 @@ class Robot:
             opened = self._stack.enter_context(session(self._mode, connect=self._endpoint))
             opened.declare_subscriber(f"{self._prefix}/command", self._take)
             names = ("observation", "override")
-            self._publishers = {name: opened.declare_publisher(f"{self._prefix}/{name}", express=True) for name in names}
+            # the default drops what a busy machine's sending thread does not take within a millisecond
+            waits = zenoh.CongestionControl.BLOCK
+            self._publishers = {
+                name: opened.declare_publisher(f"{self._prefix}/{name}", express=True, congestion_control=waits) for name in names
+            }
         self._publishers[channel].put(data)
 
     def _take(self, sample: zenoh.Sample) -> None:
