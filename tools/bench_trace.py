@@ -57,6 +57,7 @@ def _answer(given: TraceSet, path: Path) -> Record:
     from s2r_runtime.models.composed import compose
     from s2r_runtime.modelspec import EffectSpec, ModelSpec
     from s2r_runtime.trace.tracer import load_dataset, trace
+    from s2r_runtime.trace.unseen import alike
 
     model = given.model
     spec = ModelSpec(model["name"], model["dt"], model["parameters"], tuple(EffectSpec(**e) for e in model["effects"]))
@@ -79,7 +80,7 @@ def _answer(given: TraceSet, path: Path) -> Record:
     told["located"] = "true_faults" in truth and located(truth, answer)
     told["depends_right"] = "depends_on" in truth and depends_right(truth, answer)
     if sindy.available() and truth["expect"] in {"one", "outside", "clean"}:
-        told["sindy"] = sindy.answer(data, nominal)
+        told["sindy"] = sindy.answer(data, alike(nominal, data, None)[0])
         told["sindy"]["right"] = told["sindy"]["top"] in _sindy_right(given)
     if given.draft is not None and truth["expect"] in {"one", "pair", "outside", "clean"}:
         from trace_sets.again import errors_again

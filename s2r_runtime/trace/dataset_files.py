@@ -19,6 +19,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.robot_logs import content_digest, is_robot_log, read_robot_log
 from s2r_runtime.trace.dataset import Array, Dataset, Stream, columns_of, from_streams
 from s2r_runtime.trace.reconstruct import reconstruct
+from s2r_runtime.trace.unseen import unneeded, without
 
 MCAP_MAGIC = b"\x89MCAP"
 
@@ -36,7 +37,8 @@ def load_dataset(
 ) -> Dataset:
     """Reads a recording on the model's grid. columns: name in the model -> column of the table. Several paths: parts of one log.
     epoch: of a log, only what was recorded while that campaign was under way. bandwidth: Hz within which states that the table does not
-    have are reconstructed from those that it has (None: what the data bear). transport: the profile's, for a log in a robot's own format.
+    have are reconstructed from those that it has (None: what the data bear, and only those that the motion
+    needs: unseen.py). transport: the profile's, for a log in a robot's own format.
 
     Raises RecordingError (unreadable, lacks a column that does not follow from others, too slow for the model's dt).
     """
@@ -50,6 +52,8 @@ def load_dataset(
         segments, missing, content = _robot_segments(paths[0], model, transport)
     else:
         segments, missing, content = _table_segments(paths[0], model, columns or {})
+    spare = () if bandwidth else unneeded(model, missing)  # who gives a bandwidth wants to see them
+    model, missing = without(model, spare), tuple(s for s in missing if s not in spare)
     if not missing:
         return from_streams(model, segments, source, (*digests, content), paths)
     segments, done = reconstruct(model, segments, missing, source, bandwidth)

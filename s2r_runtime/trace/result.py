@@ -56,6 +56,8 @@ class TraceResult:
     interpolated: bool
     reconstruction: Reconstruction | None = None
     could_see: tuple[Visible, ...] = ()
+    unseen: tuple[str, ...] = ()
+    """States of the model that were not measured, and that its motion does not need."""
 
     def same(self, found: Found) -> tuple[Found, ...]:
         """Of `ambiguous_with`: other names of the very same thing on this model."""
@@ -85,6 +87,9 @@ class TraceResult:
     def done_to_data(self) -> tuple[str, ...]:
         """What stands between the measurements and what was fitted, one line each."""
         lines = [] if self.reconstruction is None else self.reconstruction.text()
+        if self.unseen:
+            was = "was" if len(self.unseen) == 1 else "were"
+            lines.append(f"{', '.join(self.unseen)} {was} not measured, and not needed: the motion follows from the inputs without")
         if self.nominal.dt != self.spec.dt:
             longer = f"fitted and judged on steps of {self.nominal.dt:g} s, the shortest that are independent"
             lines.append(f"{longer}; the model's are {self.spec.dt:g} s")
@@ -122,6 +127,7 @@ class TraceResult:
                 {"name": v.name, "channel": v.channel, "parameter": v.parameter, "size": v.size, "unit": v.unit} for v in self.could_see
             ],
             "reconstructed": None if self.reconstruction is None else self.reconstruction.to_json(),
+            "unmeasured": list(self.unseen),
             "step_s": self.nominal.dt,
             "n_fit": self.n_fit,
             "n_test": len(self.held.steps),

@@ -41,6 +41,7 @@ from s2r_runtime.trace.result import Found, Limit, TraceResult
 from s2r_runtime.trace.scores import LENIENT, names
 from s2r_runtime.trace.selection import Selection, crowded, select
 from s2r_runtime.trace.slots import Slot
+from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import confirmed, final_fit, foretells, verdict_of
 
 __all__ = ["Dataset", "TraceResult", "load_dataset", "trace"]
@@ -103,8 +104,9 @@ def _traced(
     norm: tuple[tuple[float, ...] | None, Kind],
 ) -> TraceResult:
     weights, kind = norm
-    _belongs(dataset, model)
     asked = model
+    model, dataset, test = alike(model, dataset, test)
+    _belongs(dataset, model)
     if test is not None:
         _belongs(test, model)
     model, dataset, test = thinned(model, dataset, test)
@@ -129,9 +131,10 @@ def _traced(
             rest = whole.structure(other)
             chosen, structure = (chosen, structure) if rest.matters else (other, rest)
     say(90.0, 100.0, "judging on held-out data")
-    w = np.ones(len(model.states)) if weights is None else np.asarray(weights, dtype=np.float64)
+    w = np.ones(len(model.states)) if weights is None else np.array([weights[asked.states.index(s)] for s in model.states])
     result = _result(dataset, checked, given, chosen, structure, judged_on, seed, w, kind)
-    result = replace(result, spec=msgspec.structs.replace(result.spec, dt=asked.dt))
+    unseen = tuple(s for s in asked.states if s not in model.states)
+    result = replace(result, spec=msgspec.structs.replace(result.spec, dt=asked.dt), unseen=unseen)
     say(100.0, 100.0, result.verdict)
     return result
 
