@@ -17,28 +17,31 @@ SIZE = (480, 848)
 """Height and width of a picture, in points."""
 STORY = ((1.0, 0.0, 0.0), (4.0, 0.15, 0.0), (4.0, 0.12, 0.3), (3.0, -0.15, 0.0), (4.0, 0.0, -0.3), (2.0, 0.0, 0.0))
 """Seconds, m/s, rad/s."""
+LENGTH_S = sum(seconds for seconds, _, _ in STORY)
 
 
 def film(video: Path | None, folder: Path | None, effects: list[str]) -> str:
     """Makes the film; what was made, in a line. A GIF needs nothing else; other endings need ffmpeg."""
     if video is not None and video.suffix != ".gif" and shutil.which("ffmpeg") is None:
         return sys.exit(f"{video}: needs ffmpeg, which is not installed; name it .gif, or use --frames")
-    pictures = list(_pictures(effects))
+    pictures = _pictures(effects)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-        for i, picture in enumerate(pictures):
-            picture.save(folder / f"{i:04d}.png")
-        return f"{len(pictures)} pictures in {folder}"
+        made = 0
+        for made, picture in enumerate(pictures, 1):  # each as soon as it is there: without a graphics card one takes tenths of a second
+            picture.save(folder / f"{made - 1:04d}.png")
+        return f"{made} pictures in {folder}"
     assert video is not None
     if video.suffix == ".gif":
-        pictures[0].save(video, save_all=True, append_images=pictures[1:], duration=1000 // RATE, loop=0)
+        first = next(pictures)
+        first.save(video, save_all=True, append_images=pictures, duration=1000 // RATE, loop=0)
     else:
         height, width = SIZE
         raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(RATE), "-i", "-"]
-        data = b"".join(picture.tobytes() for picture in pictures)
         argv = ["ffmpeg", "-y", "-loglevel", "error", *raw, "-pix_fmt", "yuv420p", str(video)]
+        data = b"".join(picture.tobytes() for picture in pictures)
         subprocess.run(argv, input=data, check=True)
-    return f"{len(pictures)} pictures, {len(pictures) / RATE:.0f} s, in {video}"
+    return f"{LENGTH_S:.0f} s, {round(LENGTH_S * RATE)} pictures, in {video}"
 
 
 def _pictures(effects: list[str]) -> Iterator[Any]:
