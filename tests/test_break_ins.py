@@ -171,7 +171,7 @@ def forged(rig: Rig, controller: Path, key: Path) -> str:
     memory = persistence.unseal((rig.state / "state.json").read_bytes(), "state", Memory, "state")
     facts = certificate.facts(one)
     persistence.replace(
-        rig.state / "state.json", persistence.seal("state", msgspec.structs.replace(memory, certificates=(facts,), gap=one.gap, revoked={}))
+        rig.state / "state.json", persistence.seal("state", msgspec.structs.replace(memory, certificates=(facts,), gap=one.gap))
     )
     persistence.replace(rig.state / "certificates" / f"{facts.id.removeprefix('sha256:')}.json", text)
     return facts.id
@@ -206,6 +206,14 @@ def test_a_state_that_somebody_wrote_carries_no_certificate_that_nobody_signed(r
     assert "says something else than the robot's state" in rig.status()["revoked"][honest]
     rig.stop()
     told = json.loads(rig.s2r("audit", *map(str, rig.log_files()), "--json").stdout)
+    assert not any(one["valid"] for one in told["certificates"] if one["id"] in {identity, honest})
+
+    memory = persistence.unseal((rig.state / "state.json").read_bytes(), "state", Memory, "state")
+    persistence.replace(rig.state / "state.json", persistence.seal("state", msgspec.structs.replace(memory, revoked={})))
+    before, rig.logs = rig.log_files(), rig.folder / "where no log tells"
+    rig.start()
+    rig.stop()
+    told = json.loads(rig.s2r("audit", *map(str, (*before, *rig.log_files())), "--json").stdout)
     assert "the memory forgets that certificate" in told["first_difference"]["what"]
     assert moved_by(rig) <= {"recovery", "controller"}
 

@@ -26,7 +26,7 @@ from s2r_runtime import keys
 from s2r_runtime.child import Child
 from s2r_runtime.core import reducer as core
 from s2r_runtime.core.state import State
-from s2r_runtime.daemon import control, issuing
+from s2r_runtime.daemon import control, issuing, past
 from s2r_runtime.daemon.actions import Actions
 from s2r_runtime.daemon.desk import Desk
 from s2r_runtime.daemon.driver import Driver
@@ -59,6 +59,7 @@ from s2r_runtime.messages import (
     OverrideChanged,
     Proposed,
     RecorderChanged,
+    SampleTaken,
     Send,
     Started,
     Stopping,
@@ -164,11 +165,12 @@ class Daemon:
         self.guard = stack.enter_context(HangGuard(self.say))
         self.folder = stack.enter_context(StateFolder(self.state_dir, profile.robot.name))
         self.memory = self.folder.memory(self._log_dir.glob(f"{profile.robot.name}-*.mcap") if self._log_file is None else ())
-        self.models = ModelStore(self.folder.path, profile.model.digest())
-        self.profile = profile = self.models.in_force(profile, self.memory)
         self.key = issuing.signing_key(self._key_path, self.folder.path, self.say)
         self.trust = Trust(self.folder.path, keys.public_bytes(self.key))
         self.trust.check_own()
+        self.memory, before = self._held_against_the_logs(self.memory)
+        self.models = ModelStore(self.folder.path, profile.model.digest())
+        self.profile = profile = self.models.in_force(profile, self.memory)
         self.watcher = Watcher(self.selector, profile, str(self._profile_path), self.feed, self._analytics)
         stack.callback(self.watcher.close)
         for plugin in registry().loaded:
@@ -195,7 +197,9 @@ class Daemon:
         stack.callback(self._close_link)
         self.keeper = Keeper(self.folder, self.say)
         stack.callback(self.keeper.close)
-        self.sampler = Sampler(self.folder, self.keeper, profile.sampling, lambda: tuple(map(str, self.logbook.paths)), self.next_seq)
+        self.sampler = Sampler(
+            self.folder, self.keeper, profile.sampling, lambda: tuple(map(str, self.logbook.paths)), self.next_seq, before
+        )
         self.excitation = Excitation()
         self.driver = Driver(self.selector, profile, lambda: self.settings, self.feed, self.clock.now, self.next_seq)
         stack.callback(self.driver.stop)
@@ -210,6 +214,17 @@ class Daemon:
         self._begin_run()
         self.notifier.ready("waiting for the robot")
         self.say(f"robot {profile.robot.name!r}: log {self.logbook.paths[-1]}, state {self.folder.path}")
+
+    def _held_against_the_logs(self, memory: Memory) -> tuple[Memory, list[SampleTaken]]:
+        """The memory to start with, and the samples of its unfinished campaign that were logged."""
+        folder = self._log_dir if self._log_file is None else self.state_dir / self.profile.recording.directory
+        memory = past.reconciled(memory, folder, self.trust.keys(), self.say)
+        if not memory.campaign_epoch:
+            return memory, []
+        logs = [path for parts in past.runs(folder, memory.robot)[: past.RUNS] for path in parts]
+        with contextlib.suppress(ConfigError):  # said when the campaign is to go on
+            logs += map(Path, (self.folder.campaign() or {}).get("logs", ()))
+        return memory, past.samples(dict.fromkeys(logs), memory.campaign_epoch)
 
     def _recall_proposal(self) -> None:
         """A model that waits to be adopted belongs into this log too. One that is not there any more, or not this profile's, can't be."""

@@ -10,8 +10,8 @@ content's digest stands inside, so a cut or flipped file is noticed. It is keyed
 
 Everything fails closed. The counters are the confidence that is already spent (guarantee G4): a damaged state is never
 taken for an empty one, and neither is a missing one where anything says that the robot has a past (`begun`, a campaign, or what
-the daemon names, such as logs). What no file can show is a whole folder that was deleted, or an old copy put back: the logs do, and
-the audit counts epochs and attempts over them.
+the daemon names, such as logs). An old copy that was put back is noticed by what the newest logs end with (`past`). What no file can show
+is a whole folder that was deleted or put back, logs included: the audit counts epochs and attempts over the logs that somebody kept.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ a thread writes it, because a slow disk must not hold up the robot.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
@@ -86,10 +86,17 @@ class Sampler:
     """The source `sampler`. Every method returns the events that came of it, in order."""
 
     def __init__(
-        self, folder: StateFolder, keeper: Keeper, sampling: Sampling, logs: Callable[[], tuple[str, ...]], next_seq: Callable[[], int]
+        self,
+        folder: StateFolder,
+        keeper: Keeper,
+        sampling: Sampling,
+        logs: Callable[[], tuple[str, ...]],
+        next_seq: Callable[[], int],
+        before: Sequence[SampleTaken] = (),
     ) -> None:
-        """logs: those of this run so far. next_seq: numbers the commands of all sources."""
+        """logs: those of this run so far. next_seq: numbers the commands of all sources. before: samples in earlier logs, in order."""
         self._folder, self._keeper, self._sampling, self._logs, self._next_seq = folder, keeper, sampling, logs, next_seq
+        self._before = before
         self._ttl_ns = 0
         self._campaign: Campaign | None = None
         self._earlier_logs: tuple[str, ...] = ()
@@ -112,6 +119,10 @@ class Sampler:
         try:
             campaign = Campaign.from_settings(settings, self._sampling, n=order.n, epoch=order.epoch, seed=order.seed)
             kept = self._kept(order)
+            if order.resume and (missing := self._missing(kept, order)):
+                kept = kept or Kept(order.epoch, order.n, campaign.snapshot(), (), ())
+                taken = (*kept.samples, *missing)
+                kept = Kept(kept.epoch, kept.n, {**kept.campaign, "index": len(taken)}, taken, kept.logs)
             if kept is not None:
                 campaign.restore(kept.campaign)
         except ConfigError as error:
@@ -185,6 +196,19 @@ class Sampler:
     def _keep(self) -> None:
         assert self._campaign is not None  # noqa: S101 - called while it runs
         self._keeper.keep(Kept(self.epoch, self.n, self._campaign.snapshot(), tuple(self.samples), self.logs()))
+
+    def _missing(self, kept: Kept | None, order: StartCampaign) -> list[SampleTaken]:
+        """Samples that stand in a log and were not kept: what was seen is not drawn once more, or somebody could choose (guarantee G1)."""
+        samples = () if kept is None else kept.samples
+        here = ([one for one in known if one.epoch == order.epoch] for known in (self._before, self.samples))
+        told = max(here, key=len)[: order.n]
+        for one, other in zip(samples, told, strict=False):
+            if msgspec.structs.replace(other, t_ns=one.t_ns, again=one.again) != one:
+                raise ConfigError(
+                    f"{self._folder.path / 'campaign.json'}: sample {one.index} of epoch {order.epoch} is not the one that was logged; "
+                    "cancel the campaign (s2r cancel), its share of beta is spent"
+                )
+        return told[len(samples) :]
 
     def _kept(self, order: StartCampaign) -> Kept | None:
         """What was kept of this epoch's campaign. Raises ConfigError if there should be something and it is not usable."""

@@ -1,0 +1,246 @@
+"""A robot's state that was put back from a copy, cut, edited or lost: the newest log knows better, or nothing starts."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from daemon_rig import Rig
+
+from s2r_runtime.daemon import past, persistence
+from s2r_runtime.errors import ConfigError
+from s2r_runtime.messages import MEMORY_SCHEMA, Gap, Memory, Persist, SampleTaken, Ticked
+from s2r_runtime.recording.glance import glance
+from s2r_runtime.recording.reading import read
+from s2r_runtime.recording.writer import Writer
+
+KEY = Ed25519PrivateKey.from_private_bytes(bytes(32))
+OTHER = Ed25519PrivateKey.from_private_bytes(bytes(31) + b"\1")
+PUBLIC = KEY.public_key().public_bytes_raw()
+GAP = Gap(0.25, 0.5, 0.75, 50, "ball", (1.0, 1.0, 0.0525), 161, 0, 0.03, 0.0152, 1, "sha256:aa", "sha256:bb", {})
+NOW = Memory(
+    "rig",
+    MEMORY_SCHEMA,
+    epochs=1,
+    attempts=3,
+    gap=GAP,
+    radius=0.3,
+    revoked={"sha256:00": "watch"},
+    alarm_epoch=1,
+    watch_n=40,
+    watch_exceedances=2,
+    traced=True,
+    refuted=("sha256:cc",),
+)
+"""What the newest log of these robots ends with."""
+
+
+def changed(**changes: Any) -> Memory:
+    return msgspec.structs.replace(NOW, **changes)
+
+
+OLDER = {
+    "an attempt": changed(attempts=2),
+    "the whole budget": Memory("rig", MEMORY_SCHEMA),
+    "a revocation": changed(revoked={}),
+    "the alarm": changed(alarm_epoch=0),
+    "the grown radius": changed(radius=0.25),
+    "discrepancies": changed(watch_n=39),
+    "exceedances": changed(watch_exceedances=1),
+    "a traced effect": changed(traced=False),
+    "refuted samples": changed(refuted=()),
+    "that the campaign ended": changed(gap=None, radius=0.0, campaign_epoch=1, campaign_n=161),
+}
+NEWER = {
+    "the same": NOW,
+    "a further attempt": changed(attempts=4),
+    "a further epoch under way": changed(epochs=2, campaign_epoch=2, campaign_n=200),
+    "a further gap": changed(
+        epochs=2, gap=msgspec.structs.replace(GAP, epoch=2), radius=0.1, alarm_epoch=0, watch_n=0, watch_exceedances=0
+    ),
+    "no gap any more": changed(gap=None, radius=0.0, watch_n=0, watch_exceedances=0, traced=False),
+    "more discrepancies": changed(watch_n=50, watch_exceedances=3, radius=0.4),
+    "a certificate more": changed(revoked={"sha256:00": "watch", "sha256:01": "a person"}),
+}
+
+
+def log(folder: Path, *memories: Memory, stamp: str = "20260101T000000Z", key: Ed25519PrivateKey = KEY, closed: bool = True) -> Path:
+    """A log that ends with the last of these memories, and a little more."""
+    path = folder / f"rig-{stamp}.mcap"
+    writer = Writer(path, run=path.stem, signer=key, timed=False)
+    for number, memory in enumerate(memories):
+        writer.write(Persist(number + 1, memory), number + 1)
+        for tick in range(50):
+            writer.write(Ticked(number + 1 + tick // 50), number + 1 + tick // 50)
+        writer.durable()
+    writer.close() if closed else writer.abandon()
+    return path
+
+
+def reconciled(state: Memory, folder: Path) -> tuple[Memory, str]:
+    said: list[str] = []
+    return past.reconciled(state, folder, [PUBLIC], said.append), "\n".join(said)
+
+
+@pytest.mark.parametrize("closed", [True, False], ids=["closed", "cut"])
+@pytest.mark.parametrize("lost", OLDER)
+def test_a_state_that_forgets_something_counts_for_what_the_log_ends_with(tmp_path: Path, lost: str, closed: bool) -> None:
+    log(tmp_path, Memory("rig", MEMORY_SCHEMA), NOW, closed=closed)
+    memory, said = reconciled(OLDER[lost], tmp_path)
+    assert memory == NOW
+    assert "the saved state forgets" in said
+
+
+@pytest.mark.parametrize("more", NEWER)
+def test_a_state_that_knows_more_than_the_log_counts_as_it_is(tmp_path: Path, more: str) -> None:
+    log(tmp_path, Memory("rig", MEMORY_SCHEMA), NOW)
+    assert reconciled(NEWER[more], tmp_path) == (NEWER[more], "")
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        changed(attempts=4, revoked={}),
+        changed(gap=msgspec.structs.replace(GAP, radius=0.01)),
+        changed(epochs=2, attempts=0),
+        changed(gap=msgspec.structs.replace(GAP, transitions_digest="sha256:of another robot"), attempts=1),
+    ],
+    ids=["one up, one down", "a smaller gap", "epochs for attempts", "another robot's of that name"],
+)
+def test_a_state_and_a_log_that_each_know_what_the_other_does_not_start_nothing(tmp_path: Path, state: Memory) -> None:
+    path = log(tmp_path, NOW)
+    with pytest.raises(ConfigError, match="put the newest state") as refused:
+        reconciled(state, tmp_path)
+    assert str(path) in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_what_is_latched_in_the_log_or_in_an_older_state_stays_latched(tmp_path: Path) -> None:
+    log(tmp_path, changed(latched=("emergency_stop",)))
+    assert reconciled(NOW, tmp_path)[0] == changed(latched=("emergency_stop",))
+    assert reconciled(changed(attempts=1, latched=("watch_alarm",)), tmp_path)[0].latched == ("emergency_stop", "watch_alarm")
+
+
+def test_only_a_log_that_is_sound_and_this_robots_own_is_believed(tmp_path: Path) -> None:
+    path = log(tmp_path, NOW, key=OTHER)
+    with pytest.raises(ConfigError, match="does not trust"):
+        reconciled(OLDER["an attempt"], tmp_path)
+    path.unlink()
+    data = bytearray((path := log(tmp_path, NOW, NOW)).read_bytes())
+    data[data.index(b"zstd") + 40] ^= 1  # in the first chunk: what the log ends with can be seen, but rests on what is damaged
+    path.write_bytes(data)
+    with pytest.raises(ConfigError, match="is damaged"):
+        reconciled(OLDER["an attempt"], tmp_path)
+    assert reconciled(NOW, tmp_path) == (NOW, "")
+
+
+def test_only_logs_of_this_robot_are_looked_at_and_an_unreadable_one_hides_none_before_it(tmp_path: Path) -> None:
+    log(tmp_path, NOW)
+    (tmp_path / "rig-2-20270101T000000Z.mcap").write_bytes(log(tmp_path, changed(robot="rig-2"), stamp="20270101T000000Z").read_bytes())
+    (tmp_path / "rig-20270101T000000Z.mcap").write_bytes(b"")
+    (tmp_path / "rig-20270101T000000Z-2.mcap").write_bytes(b"no log at all")
+    assert reconciled(OLDER["an attempt"], tmp_path)[0] == NOW
+    assert reconciled(changed(attempts=9), tmp_path / "nowhere")[0] == changed(attempts=9)
+
+
+@pytest.mark.parametrize("cut", [0.0, 0.3, 0.6, 0.9])
+def test_a_glance_gives_what_the_full_reading_gives_however_the_file_ends(tmp_path: Path, cut: float) -> None:
+    path = log(tmp_path, *(changed(attempts=number) for number in range(20)))
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) - round(cut * len(data))])
+    seen = list(glance(path, past.SAID))
+    full = [entry.message for entry in read(path, past.SAID)]
+    assert seen == full[: len(seen)]
+    assert len(full) - len(seen) <= 1  # of a chunk whose index is not there
+    assert list(glance(path, past.SAID, newest_first=True)) == seen[::-1]
+
+
+def test_samples_that_a_log_has_are_given_in_order_as_far_as_none_is_missing(tmp_path: Path) -> None:
+    path = tmp_path / "rig-20260101T000000Z.mcap"
+    writer = Writer(path, run=path.stem, signer=KEY, timed=False)
+    for index in (0, 1, 2, 4):
+        writer.write(SampleTaken(1, 2, index, index, index, (0.0,), (0.0,), (0.0,), (), 1), 1)
+    writer.write(SampleTaken(1, 1, 3, 3, 3, (0.0,), (0.0,), (0.0,), (), 1), 1)
+    writer.close()
+    assert [one.index for one in past.samples([path, tmp_path / "gone.mcap"], 2)] == [0, 1, 2]
+
+
+# ---------------------------------------------------------------- in a running daemon
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    opened = Rig(tmp_path)
+    yield opened
+    opened.close()
+
+
+def put_back(rig: Rig, kept: Path, *names: str) -> None:
+    for name in names:
+        shutil.copy2(kept / name, rig.state / name)
+
+
+def test_an_old_copy_of_the_state_gives_back_no_attempt_no_revocation_and_no_stop(rig: Rig) -> None:
+    rig.start_robot()
+    rig.start()
+    assert rig.deploy()["exit_code"] == 0
+    rig.until_status(gate="open")
+    kept = rig.folder / "kept"
+    kept.mkdir()
+    shutil.copy2(rig.state / "state.json", kept)
+    assert rig.ask("revoke")["exit_code"] == 0
+    assert rig.ask("deploy", path=str(rig.controller("    raise ValueError('no')\n", "bad.py")))["exit_code"] == 1
+    assert rig.ask("stop")["exit_code"] == 0
+    before = rig.status()
+    rig.kill()
+    put_back(rig, kept, "state.json")
+    rig.start()
+    after = rig.status()
+    known = ("attempts", "epoch", "revoked", "latched", "beta_spent", "certificate")
+    assert {name: after[name] for name in known} == {name: before[name] for name in known}
+    assert (after["gate"], after["attempts"], after["latched"]) == ("closed", 2, ["emergency_stop"])
+    assert "going on from what" in rig.said()
+    assert rig.stop() == 0
+
+    file = rig.state / "state.json"
+    memory = persistence.unseal(file.read_bytes(), "state", Memory, "state")
+    persistence.replace(file, persistence.seal("state", msgspec.structs.replace(memory, attempts=0, epochs=memory.epochs + 1)))
+    code, said = rig.refused()
+    assert (code, "forgets epochs or attempts" in said) == (78, True), said
+    persistence.replace(file, persistence.seal("state", memory))
+    assert rig.s2r("audit", *map(str, rig.log_files()), "--key", str(rig.state / "key.pub")).returncode == 0
+
+
+@pytest.mark.parametrize("gone", [False, True], ids=["older", "deleted"])
+def test_samples_that_were_seen_are_not_drawn_once_more_by_putting_an_old_campaign_back(rig: Rig, gone: bool) -> None:
+    rig.start_robot()
+    rig.start()
+    rig.until(lambda: rig.status()["observation"])
+    rig.ask("permit", duration_s=3600.0)
+    file, kept = rig.state / "campaign.json", rig.folder / "kept"
+    kept.mkdir()
+    with socket.socket(socket.AF_UNIX) as client:
+        client.connect(str(rig.socket))
+        client.sendall(b'{"verb": "sample"}\n')
+        rig.until(lambda: file.exists() and b'"x0"' in file.read_bytes())
+        shutil.copy2(file, kept)
+        rig.until(lambda: (rig.status()["campaign"] or {}).get("taken", 0) >= 5)
+    rig.stop()
+    seen = [m for m in rig.messages("event/sample_taken") if isinstance(m, SampleTaken)]
+    file.unlink() if gone else put_back(rig, kept, "campaign.json")
+    rig.start()
+    assert rig.sample()["exit_code"] == 0
+    rig.stop()
+    samples = [m for m in rig.messages("event/sample_taken") if isinstance(m, SampleTaken)]
+    again = [m for m in samples if m.again]
+    assert [(m.index, m.x0, m.x1) for m in again] == [(m.index, m.x0, m.x1) for m in seen]
+    assert len(samples) == len(seen) + len(again) + len([m for m in samples if m.index >= len(seen)])
+    told = json.loads(rig.s2r("audit", *map(str, rig.log_files()), "--key", str(rig.state / "key.pub"), "--json").stdout)
+    assert told["ok"], told
