@@ -2,7 +2,8 @@
 
 One sample, from observations x and inputs u, one each period of dt:
 
-    goto   waypoint ~ uniform(box inside region and geofence); Lyapunov go-to until within `waypoint_radius`
+    goto   waypoint ~ uniform(box inside region and geofence); Lyapunov go-to until within `waypoint_radius`. A robot that stands
+           still under it (stiction; a walker that takes small commands for none) is asked for more of the same, within its bounds
     stop   zero input for `stop_periods` periods and 0 to 3 more (drawn: a robot or camera with a rhythm of its own is not
            met at one phase of it again and again)
     hold   x0 = x now, u ~ uniform(input bounds) held for `hold_periods`; x1 = x one period later; held = x at the hold's end
@@ -43,10 +44,14 @@ JITTER_PERIODS = 4
 DRAWS = 1000
 """Inputs tried at one x0 until one's hold stays inside; the rarest admissible share met in practice is some percent."""
 REACH_SLACK = 1.1
-ATTEMPTS = 5
-"""Waypoints in a row at which the robot did not move before it counts as stuck for good."""
-PAUSE_S = 1.0
-"""Longer silences between observations are an interruption, not time that sampling takes."""
+ATTEMPTS, NEARER = 5, 2.0
+"""Waypoints in a row toward which the robot did not move, or in all its time came no nearer than by so many of their radii (what fell on
+its back kicks), before it counts as stuck for good.
+"""
+STILL_S = 1.0
+"""So long a robot begins to move in; after twice that without motion it is asked for twice as much, after three times for three times."""
+PAUSE_S, PAUSE_PERIODS = 1.0, 2.5
+"""Longer silences between observations, by both, are an interruption, not time that sampling takes. A period of a second is no silence."""
 
 
 class CampaignStep(NamedTuple):
@@ -113,6 +118,7 @@ class Campaign:
         self._circles = {i for i, name in enumerate(states) if name in angles and region[i][1] - region[i][0] > 2.0 * math.pi - 1e-9}
         self._angles = [i for i, name in enumerate(states) if name in angles]
         self._settings, self._dt_ns, self._dt = settings, round(dt * 1e9), dt
+        self._pause_ns = max(PAUSE_S * 1e9, PAUSE_PERIODS * self._dt_ns)
         self._n, self._epoch, self._seed = n, epoch, seed
         self._box = _waypoint_box(states, region, geofence, settings.waypoint_margin)
         self._guard = min(0.05, 0.5 * settings.waypoint_margin)
@@ -181,7 +187,7 @@ class Campaign:
         now = observation.stamp_ns
         if self._last_ns < 0:
             self._last_ns = self._began_ns = now
-        if now < self._last_ns or now - self._last_ns > PAUSE_S * 1e9:
+        if now < self._last_ns or now - self._last_ns > self._pause_ns:
             if self._phase == "hold":
                 self._reject("interrupted")
             self._began_ns, self._mark = now, None
@@ -225,25 +231,48 @@ class Campaign:
         self._held_u, self._mark, self._x0, self._x1 = self._zero, None, None, None
         self._standing: Observation | None = None
         self._before: tuple[float, ...] = ()
+        self._way = math.inf
 
     def _goto(self, observation: Observation) -> CampaignStep:
         x, now = observation.x, observation.stamp_ns
-        if goto.distance(self._model, x, self._waypoint) <= self._settings.waypoint_radius:
+        left = goto.distance(self._model, x, self._waypoint)
+        self._way = left if math.isinf(self._way) else self._way
+        if left <= self._settings.waypoint_radius:
             self._phase, self._began_ns, self._motionless = "stop", now, 0
             return self._answer(self._zero)
         if now - self._began_ns > self._settings.waypoint_timeout * 1e9:
-            return self._again("timeout", observation)
+            came = self._way - left > NEARER * self._settings.waypoint_radius
+            return self._again("timeout", observation) if came else self._nowhere("timeout", observation)
         u = goto.go_to(self._model, x, self._waypoint, self._bounds, self._gains)
         if self._mark is None or self._moved(self._mark[1], x) or not any(u):
             self._mark = (now, x)
         elif now - self._mark[0] > self._settings.stuck_after * 1e9:
-            self._motionless += 1
-            if self._motionless >= ATTEMPTS:
-                waited = ATTEMPTS * self._settings.stuck_after
-                self._failed = f"stuck: commanded for {waited:g} s toward {ATTEMPTS} waypoints, the robot did not move from {_point(x)}"
-                return self._over()
-            return self._again("stuck", observation)
+            return self._nowhere("stuck", observation)
+        if any(u):
+            u = self._pressed(u, now - self._mark[0])
         return self._answer(goto.confined(self._model, x, u, self._fence[:2], self._guard))
+
+    def _nowhere(self, reason: str, observation: Observation) -> CampaignStep:
+        """Another waypoint, unless the robot got nowhere too often."""
+        self._motionless += 1
+        if self._motionless < ATTEMPTS:
+            return self._again(reason, observation)
+        s, at = self._settings, _point(observation.x)
+        self._failed = (
+            f"stuck: commanded for {ATTEMPTS * s.stuck_after:g} s toward {ATTEMPTS} waypoints, the robot did not move from {at}"
+            if reason == "stuck"
+            else f"stuck: {ATTEMPTS} waypoints in a row were not reached, the last from {at}; in {s.waypoint_timeout:g} s "
+            "the robot came hardly nearer"
+        )
+        return self._over()
+
+    def _pressed(self, u: tuple[float, ...], still_ns: int) -> tuple[float, ...]:
+        """As many times u as the robot has stood still for STILL_S, as far as the bounds allow."""
+        used = max(value / (high if value > 0.0 else low) for value, (low, high) in zip(u, self._bounds, strict=True) if value)
+        factor = min(still_ns * 1e-9 / STILL_S, 1.0 / used)
+        return (
+            u if factor <= 1.0 else tuple(min(max(factor * value, low), high) for value, (low, high) in zip(u, self._bounds, strict=True))
+        )
 
     def _stop(self, observation: Observation) -> CampaignStep:
         before, self._standing = self._standing, observation

@@ -261,6 +261,31 @@ def test_waypoint_that_cannot_be_reached_in_time_is_given_up() -> None:
     assert c.progress().rejected["timeout"] > 0
 
 
+def test_robot_that_takes_small_commands_for_none_is_asked_for_more_within_its_bounds() -> None:
+    class Numb(Robot):
+        def move(self, u: tuple[float, ...]) -> None:
+            assert all(low <= value <= high for value, (low, high) in zip(u, BOUNDS, strict=True))
+            super().move((u[0] if abs(u[0]) > 0.15 else 0.0, u[1]))  # 0.15 m/s is asked for 0.15 m from a waypoint of 0.1 m
+
+    samples, last = drive(campaign(3), Numb())
+    assert last.done
+    assert len(samples) == 3
+
+
+def test_robot_that_kicks_where_it_lies_is_given_up_after_several_waypoints() -> None:
+    robot, c = Robot(), campaign(3, Sampling(hold_periods=5, waypoint_timeout=20.0))
+    start, kicks = robot.x, random.Random(1)
+    for _ in range(20_000):
+        step = c.step(robot.observe())
+        if step.failed:
+            break
+        robot.move(step.u)
+        robot.x = (start[0] + kicks.uniform(-0.05, 0.05), start[1], kicks.uniform(-3.0, 3.0))
+    assert step.failed.startswith(f"stuck: {ATTEMPTS} waypoints in a row were not reached")
+    assert "in 20 s the robot came hardly nearer" in step.failed
+    assert c.progress().rejected == {"timeout": ATTEMPTS - 1}
+
+
 def test_too_many_rejections_fail_with_their_counts() -> None:
     c = campaign(50, Sampling(hold_periods=10, max_rejections=4))
     _, last = drive(c, Robot(), see=lambda o: None if o.seq % 5 == 0 else o)
@@ -327,6 +352,23 @@ def test_pause_during_a_hold_counts_as_interruption() -> None:
         if step.phase == "hold" and not paused:
             paused, robot.k = True, robot.k + 100
     assert c.progress().rejected == {"interrupted": 1}
+
+
+def test_periods_of_a_second_whose_stamps_jitter_are_no_pauses() -> None:
+    names, jitter = ("x", "y", "theta"), random.Random(2)
+    settings = Sampling(hold_periods=3, stop_periods=1, position_gain=0.4, heading_gain=0.5)
+    c = Campaign("unicycle", names, ("theta",), REGION, WIDE, BOUNDS, 1.0, settings, n=4, epoch=1, seed=1)
+    x, y, theta, t = 0.0, 0.0, 0.0, 0.0
+    for k in range(2000):
+        step = c.step(Observation(k, round(t * 1e9), (x, y, theta)))
+        if step.done:
+            break
+        dt = jitter.gauss(1.0, 0.02)
+        x, y, t = x + dt * step.u[0] * math.cos(theta), y + dt * step.u[0] * math.sin(theta), t + dt
+        theta = math.remainder(theta + dt * step.u[1], 2.0 * math.pi)
+    assert step.done
+    assert c.progress().rejected == {}
+    assert c.progress().elapsed_s == pytest.approx(t)
 
 
 def test_time_left_follows_the_pace_in_robot_time() -> None:
