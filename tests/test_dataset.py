@@ -118,6 +118,13 @@ def test_a_long_silence_makes_two_runs():
     assert data.runs[1].start_s == pytest.approx(103.0)
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("ms", 1e3), ("µs", 1e6), ("ns", 1e9)])
+def test_stamps_that_are_no_seconds_are_told_by_the_models_step(unit, factor):
+    t = factor * (1.7e9 + 0.1 * np.arange(50))
+    with pytest.raises(RecordingError, match=f"here.csv: t seems to be in {unit}, must be in s"):
+        from_streams(_model(), [(Stream(t, np.zeros((50, 3))), Stream(t, np.zeros((50, 2))))], "here.csv")
+
+
 def test_a_table_with_segments_blanks_and_names_of_its_own_is_read(tmp_path):
     rows = ["part,t,px,y,theta,v,w"]
     rows += [f"a,{0.1 * k:.3f},{k},0,0,1,0" for k in range(10)]

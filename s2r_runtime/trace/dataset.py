@@ -169,6 +169,7 @@ def from_streams(
     for states, inputs in segments:
         _check_same_clock(states, inputs, source)
     dt = model.dt
+    _check_seconds(segments, dt, source)
     stretches = [part for states, inputs in segments for part in _split(states, inputs, model)]
     stretches = [part for part in stretches if len(part[0].t) >= 2 and part[0].t[-1] - part[0].t[0] > 0.5 * dt]
     if not stretches:
@@ -258,6 +259,19 @@ def _check_same_clock(states: Stream, inputs: Stream, source: str) -> None:
             f"{source}: states were measured from {a:.6g} s to {b:.6g} s, inputs given from {c:.6g} s to {d:.6g} s: "
             "their stamps must be of one clock"
         )
+
+
+def _check_seconds(segments: Sequence[tuple[Stream, Stream]], dt: float, source: str) -> None:
+    """Raises RecordingError if stamps are a usual factor too large to be seconds of this model's steps."""
+    apart = np.concatenate([np.diff(states.t) for states, _ in segments])
+    if not np.any(apart > 0.0):
+        return
+    spacing = float(np.median(apart[apart > 0.0]))
+    for unit, factor in (("ms", 1e3), ("µs", 1e6), ("ns", 1e9)):
+        if 1.0 / THINNED < spacing / factor / dt < THINNED:
+            raise RecordingError(
+                f"{source}: t seems to be in {unit}, must be in s: states are {spacing:.4g} apart, the model's step is {dt:g} s"
+            )
 
 
 def _split(states: Stream, inputs: Stream, model: ComposedModel) -> list[tuple[Stream, Stream]]:

@@ -44,6 +44,9 @@ LONG = 3.5
 MANY_ROWS = 60
 """Rows of a run in which a heading's departure from the motion is looked for."""
 
+BESIDE = 0.15
+"""Of its length: rows before and after a heading's departure that are left out too. Where it begins to wander off is not seen at once."""
+
 
 @dataclass(frozen=True)
 class Checked:
@@ -124,6 +127,7 @@ def _inconsistent(model: ComposedModel, data: Dataset, act: Acting, i: int, bad:
     noise = float(np.max(reach.noise[pose[:2]]))
     found = []
     for off in departures(y, turned, foretold - run.y[:-1, pose[2]], noise):
-        bad[off.first : off.last + 1, pose[2]] = True
+        beside = round(BESIDE * (off.last - off.first))
+        bad[max(0, off.first - beside) : off.last + beside + 1, pose[2]] = True
         found.append(Fault(run.start_s + data.dt * off.first, run.start_s + data.dt * off.last, model.states[pose[2]], "inconsistent"))
     return found
