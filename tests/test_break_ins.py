@@ -91,6 +91,11 @@ def test_nothing_but_a_certificate_of_its_own_makes_a_controller_drive(rig: Rig,
     rig.until_status(gate="open", driving="controller")
     while_one_drives(rig, good, reckless)
 
+    (rig.state / revocations.NAME).write_text("{}")  # while nobody knows who is revoked nobody drives, and no certificate ends for it
+    rig.until_status(gate="closed", reason="recorder_down", driving="recovery", revoked={})
+    (rig.state / revocations.NAME).unlink()
+    rig.until_status(gate="open", driving="controller")
+
     own = keys.load_public(rig.state / "key.pub")
     entry = revocations.revoke(rig.state / revocations.NAME, keys.fingerprint(own), "a laptop was stolen")
     rig.until_status(gate="closed", driving="recovery", controller=None)

@@ -138,6 +138,38 @@ def test_a_library_that_is_changed_where_it_is_developed_is_another_one(tmp_path
         batch_control(file)
 
 
+def test_code_behind_a_link_of_a_library_under_development_counts_and_a_ring_of_links_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site, project, shared = tmp_path / "site", tmp_path / "project", tmp_path / "shared" / "deep"
+    about = site / "linklib-1.0.dist-info"
+    for folder in (project / "linklib", about, shared, tmp_path / "other"):
+        folder.mkdir(parents=True)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: linklib\nVersion: 1.0\n")
+    (about / "top_level.txt").write_text("linklib\n")
+    (about / "direct_url.json").write_text(f'{{"dir_info": {{"editable": true}}, "url": "file://{project}"}}')
+    (project / "linklib" / "__init__.py").write_text("from linklib.deep.gain import K\n")
+    (shared / "__init__.py").write_text("")
+    (shared / "gain.py").write_text("K = 0.25\n")
+    (project / "linklib" / "deep").symlink_to(shared)
+    (shared / "ring").symlink_to(project / "linklib")
+    monkeypatch.syspath_prepend(str(project))
+    monkeypatch.syspath_prepend(str(site))
+    importlib.invalidate_caches()
+    path = tmp_path / "controller.py"
+    path.write_text("import linklib\ndef control(x, theta, parameters): return x[:, :2] * 0 + linklib.K\n")
+    found = {load(path).digest}
+    (shared / "gain.py").write_text("K = 9.00\n")
+    found.add(load(path).digest)
+    (tmp_path / "other" / "gain.py").write_text("K = 8.00\n")
+    (project / "linklib" / "deep").unlink()
+    (project / "linklib" / "deep").symlink_to(tmp_path / "other")
+    found.add(load(path).digest)
+    (project / "linklib" / "more").symlink_to(tmp_path / "other")  # the same code, under another name
+    found.add(load(path).digest)
+    assert len(found) == 4
+
+
 def test_a_library_that_changes_while_the_controller_starts_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "controller.py"
     path.write_text("import numpy\ndef control(x, theta, parameters): return x[:, :2]\n")

@@ -86,15 +86,45 @@ def test_a_key_that_is_taken_out_of_the_trusted_ones_takes_its_certificates_alon
     assert list(robot.distrusted()) == [robot.facts[1].id]
 
 
-def test_a_list_that_cannot_be_read_leaves_nothing_in_force(robot: Robot) -> None:
+def test_while_a_list_cannot_be_read_nobody_is_believed_and_no_certificate_ends_for_good(robot: Robot) -> None:
     assert robot.distrusted() == {}
-    (robot.folder / revocations.NAME).write_text("{}")
-    found = robot.distrusted()
-    assert set(found) == {facts.id for facts in robot.facts}
-    assert all("is damaged" in why for why in found.values())
-    assert "is damaged" in robot.trust.own_objection()
+    place = robot.folder / revocations.NAME
+    entry = revocations.revoke(place, robot.fingerprint("trusted/colleague.pub"), "left the company")
+    whole = place.read_bytes()
+    for spoiled in (b"{}", whole[:-7], b""):
+        place.write_bytes(spoiled)
+        for _ in range(2):  # it is looked at again and again
+            assert robot.distrusted() == {}
+            assert "is damaged" in robot.trust.trouble
+        assert "is damaged" in robot.trust.own_objection(), "and nothing is signed meanwhile"
+        with pytest.raises(ConfigError, match="is damaged"):
+            robot.trust.keys()
     with pytest.raises(ConfigError, match="is damaged"):
         Trust(robot.folder, keys.load_public(robot.folder / "key.pub"))
+    place.write_bytes(whole)
+    assert robot.distrusted() == {robot.facts[1].id: f"signed with the key {entry.fingerprint}, which was {entry}"}
+    assert robot.trust.trouble == ""
+
+
+def test_a_list_whose_permissions_change_is_looked_at(robot: Robot) -> None:
+    place = robot.folder / revocations.NAME
+    revocations.revoke(place, f"ed25519:{0:032x}", "")
+    assert robot.distrusted() == {}
+    place.chmod(0o666)
+    assert robot.distrusted() == {}
+    assert "others than its owner can write" in robot.trust.trouble
+    place.chmod(0o600)
+    assert robot.distrusted() == {}
+    assert robot.trust.trouble == ""
+
+
+def test_a_list_that_cannot_be_read_and_goes_away_again_leaves_no_trouble(robot: Robot) -> None:
+    assert robot.distrusted() == {}
+    (robot.folder / revocations.NAME).write_text("{}")
+    assert robot.distrusted() == {}
+    (robot.folder / revocations.NAME).unlink()
+    assert robot.distrusted() == {}
+    assert robot.trust.trouble == ""
 
 
 @pytest.mark.parametrize("how", ["gone", "cut", "another's", "wider in the memory"])

@@ -181,14 +181,40 @@ def _code_digest(found: metadata.Distribution) -> str:
             continue
         base = Path(origin)
         folder = base.parent if base.name == "__init__.py" else base
-        files = [base] if folder.is_file() else [path for path in folder.rglob("*") if path.suffix in CODE and path.is_file()]
-        if len(files) > FILES_MAX:
-            raise ConfigError(f"{folder}: has more than {FILES_MAX} files of code; install {found.name} as a wheel, not editable")
         try:
+            files, again = ([base], {}) if folder.is_file() else _code_files(folder)
+            if len(files) > FILES_MAX:
+                raise ConfigError(f"{folder}: has more than {FILES_MAX} files of code; install {found.name} as a wheel, not editable")
             code.update({f"{top}/{path.relative_to(base.parent)}": digest(path.read_bytes()) for path in files})
+            code.update({f"{top}/{path.relative_to(base.parent)}": f"as {first.relative_to(base.parent)}" for path, first in again.items()})
         except OSError as error:
-            raise ConfigError(f"{folder}: cannot be read: {error.strerror}") from None
+            raise ConfigError(f"{error.filename or folder}: cannot be read: {error.strerror}") from None
     return digest_of(code)
+
+
+def _code_files(folder: Path) -> tuple[list[Path], dict[Path, Path]]:
+    """All code in a folder and in those that links in it lead to; and the links that lead where another way led before (a ring, too), with
+    that way. Raises OSError for a folder that can't be listed: it may hold code all the same.
+    """
+    files: list[Path] = []
+    first: dict[str, Path] = {}
+    again: dict[Path, Path] = {}
+
+    def unreadable(error: OSError) -> None:
+        raise error
+
+    for where, folders, names in os.walk(folder, followlinks=True, onerror=unreadable):
+        here, real = Path(where), os.path.realpath(where)
+        if real in first:
+            again[here] = first[real]
+            folders.clear()
+            continue
+        first[real] = here
+        folders.sort()
+        files += [path for name in sorted(names) if (path := here / name).suffix in CODE and path.is_file()]
+        if len(files) > FILES_MAX:
+            break
+    return files, again
 
 
 def _distribution(top: str, origin: str) -> str | None:

@@ -386,9 +386,9 @@ class Daemon:
     def _look_at_log(self, now_ns: int) -> None:
         """Says when the log fails or works again; begins a new one, and with it a new run, when the old one is at its end."""
         health = self.logbook.health()
-        ok = health.ok and not self.actions.unsaved
+        ok = health.ok and not self.actions.unsaved and not self.trust.trouble
         if ok != self._recorder_ok:
-            self.log_changed(ok, health.detail or self.actions.unsaved)
+            self.log_changed(ok, health.detail or self.actions.unsaved or self.trust.trouble)
         if self.logbook.faulty and now_ns >= self._next_log_ns:
             self._next_log_ns = now_ns + NEW_LOG_NS
             if self.logbook.prepare():
@@ -414,7 +414,7 @@ class Daemon:
         self._log_deleted()
         if now_ns >= self._next_prune_ns:
             self._next_prune_ns = now_ns + PRUNE_NS
-            self.retention.prune_beside(self.state.memory, int(time.time()))
+            self.retention.prune_beside(lambda: self.state.memory, time.time())
 
     def _log_deleted(self) -> None:
         """What was deleted stands in the log."""
@@ -435,7 +435,7 @@ class Daemon:
     def log_changed(self, ok: bool, detail: str) -> None:
         """The recorder failed, or works again."""
         self._recorder_ok = ok
-        self.say("the log works again" if ok else f"the log failed: {detail}")
+        self.say("log and state can be relied on again" if ok else f"log or state cannot be relied on: {detail}")
         self.feed_first(RecorderChanged(0, ok, detail))
 
     def _end_sources(self, why: str) -> None:

@@ -18,6 +18,7 @@ def status(daemon: Daemon) -> dict[str, Any]:
     found: dict[str, Any] = core.status(daemon.state)
     sampling, health = daemon.sampler.progress(), daemon.logbook.health()
     memory, observation = daemon.state.memory, daemon.observation
+    trouble = daemon.actions.unsaved or daemon.trust.trouble
     return found | {
         "robot": daemon.settings.robot,
         "job": daemon.state.jobs[0].purpose if daemon.state.jobs else None,
@@ -36,7 +37,7 @@ def status(daemon: Daemon) -> dict[str, Any]:
         "episodes": [{"index": e.index, "steps": e.steps, "safety": e.safety, "progress": e.progress} for e in daemon.actions.episodes],
         "observation": None if observation is None else {"seq": observation.seq, "x": list(observation.x), "fault": observation.fault},
         "analytics": "up" if daemon.watcher.up else "down",
-        "recorder": "ok" if health.ok else health.detail,
+        "recorder": trouble if health.ok and trouble else "ok" if health.ok else health.detail,
         "log": str(daemon.logbook.paths[-1]),
         "log_head": None if anchor is None else {"run": anchor.run, "part": anchor.part, "records": anchor.records, "head": anchor.head},
         "recorded": health.recorded,

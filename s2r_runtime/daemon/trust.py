@@ -3,11 +3,16 @@
 A certificate in force stays in force only while a file of its own in `certificates/` says what the memory says, signed by such a key. That
 is looked at when the daemon starts, so that a memory that was written by somebody else carries no certificate that nobody signed; and
 within a second of every change of a list of revoked keys or of `trusted/`.
+
+While such a list can't be read nobody knows what still counts: the gate is closed (`trouble`, which the daemon reports as it does a disk
+that takes no log), but no certificate ends for it. That is for good, and what can't be read now may be readable in a second, and say
+nothing.
 """
 
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from pathlib import Path
 
 from s2r_runtime import certificate as certificates
@@ -28,19 +33,22 @@ class Trust:
         self._lists = revocations.places(folder)
         self._seen: _Seen | None = None
         self._looked_at: tuple[str, ...] = ()
+        self.trouble = ""
+        """Why nobody knows at the moment whose signature counts, or empty."""
         self.keys()
 
     def keys(self) -> tuple[bytes, ...]:
         """Public keys whose signature counts. Raises ConfigError as above."""
+        return self._read()[0]
+
+    def _read(self) -> tuple[tuple[bytes, ...], dict[str, revocations.Revocation]]:
+        """Public keys whose signature counts, and the revoked ones."""
         revoked = revocations.known(self._lists)
-        return tuple(key for key in (self._own, *keys.load_trusted([self._trusted])) if keys.fingerprint(key) not in revoked)
+        return tuple(key for key in (self._own, *keys.load_trusted([self._trusted])) if keys.fingerprint(key) not in revoked), revoked
 
     def objection(self, key: bytes) -> str:
         """Why a signature by this key is not believed, or empty. Raises ConfigError as above."""
-        name = keys.fingerprint(key)
-        if (entry := revocations.known(self._lists).get(name)) is not None:
-            return f"signed with the key {name}, which was {entry}"
-        return "" if key in self.keys() else f"signed with the key {name}, which is not trusted here"
+        return _objection(key, *self._read())
 
     def own_objection(self) -> str:
         """Why this daemon signs nothing any more, or empty."""
@@ -58,19 +66,24 @@ class Trust:
     def look(self, memory: Memory) -> tuple[CertificatesDistrusted, ...]:
         """What is not believed any more, if anything has changed since the last look."""
         now, ids = self._state(), tuple(facts.id for facts in memory.certificates)
-        if now == self._seen and set(ids) <= set(self._looked_at):
+        if now == self._seen and set(ids) <= set(self._looked_at) and not self.trouble:
             return ()
-        self._seen, self._looked_at = now, ids
-        reasons = {facts.id: why for facts in memory.certificates if (why := self._problem(facts))}
+        try:
+            believed = self._read()
+        except ConfigError as error:
+            self.trouble = str(error)
+            return ()
+        self.trouble, self._seen, self._looked_at = "", now, ids
+        reasons = {facts.id: why for facts in memory.certificates if (why := self._problem(facts, *believed))}
         return (CertificatesDistrusted(0, reasons),) if reasons else ()
 
-    def _problem(self, facts: CertificateFacts) -> str:
+    def _problem(self, facts: CertificateFacts, trusted: tuple[bytes, ...], revoked: Mapping[str, revocations.Revocation]) -> str:
         file = certificate_file(self._certificates, facts.id)
         try:
             data = read(file)
-            if why := self.objection(certificates.signer(data)):
+            if why := _objection(certificates.signer(data), trusted, revoked):
                 return why
-            found = certificates.facts(certificates.load(data, self.keys(), None, str(file)))
+            found = certificates.facts(certificates.load(data, trusted, None, str(file)))
         except ConfigError as error:
             return str(error)
         return "" if found == facts else f"{file}: says something else than the robot's state"
@@ -86,8 +99,15 @@ class Trust:
             except OSError:
                 found.append((str(file), 0, 0, 0))
             else:
-                found.append((str(file), status.st_mtime_ns, status.st_size, status.st_ino))
+                found.append((str(file), status.st_ctime_ns, status.st_size, status.st_ino))  # ctime: its permissions count too
         return tuple(found)
+
+
+def _objection(key: bytes, trusted: tuple[bytes, ...], revoked: Mapping[str, revocations.Revocation]) -> str:
+    name = keys.fingerprint(key)
+    if (entry := revoked.get(name)) is not None:
+        return f"signed with the key {name}, which was {entry}"
+    return "" if key in trusted else f"signed with the key {name}, which is not trusted here"
 
 
 def certificate_file(folder: Path, identity: str) -> Path:
