@@ -47,6 +47,7 @@ _EFFECTS = {
     "understeer": "a car turns less the faster it goes",
     "position_field": "a push that depends linearly on the position",
     "mass_change": "the mass is another one",
+    "parameter_change": "a parameter of one's own model is another one",
     "heading_offset": "the heading is measured with a constant offset",
     "sensor_offset": "a state is measured with a constant offset",
     "sensor_lever_arm": "another point of the body is measured",

@@ -20,6 +20,7 @@ VALUES = {
     "understeer": ({"coefficient": 0.05}, {"coefficient": -0.05}, {"coefficient": -1e3}),
     "position_field": ({"matrix": [[0.1, -0.2], [0.3, 0.05]]}, {"matrix": [[-80.0, 3.0], [0.0, 9.0]]}),
     "mass_change": ({"ratio": 1.3}, {"mass": 0.7}),
+    "parameter_change": ({"ratio": 1.3}, {"value": 0.7}),
     "heading_offset": ({"angle": 0.2}, {"angle": -3.1}),
     "sensor_offset": ({"offset": 0.2}, {"offset": -7.0}),
     "sensor_lever_arm": ({"x": 0.1, "y": -0.2},),

@@ -32,7 +32,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         metavar="RECORDING2",
         help="judge on this recording (default: the last part of the first, never seen by the fit)",
     )
-    verb.add_argument("--horizon", type=positive, default=1.0, metavar="S", help="length of the rollouts in s (default 1)")
+    verb.add_argument(
+        "--horizon", type=positive, metavar="S", help="length of the rollouts in s (default 1, or 10 steps if they take longer)"
+    )
     verb.add_argument("--seed", type=count, default=0, help="seed of everything random in it (default 0)")
     verb.add_argument(
         "--bandwidth",

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 WRITTEN_WITHIN_S = 10.0
 """The recorder hands over what it has every 50 ms; a disk that takes nothing for this long is full."""
 NICE = 10
-HORIZON_S = 1.0
 VOLATILE = ("model_path", "cpu_s")
 """What a result says that does not follow from the log."""
 
@@ -73,9 +72,7 @@ def traced(
     samples = from_samples(cut.samples, source=source) if cut.samples else None
     more = identities if samples is None else (samples.digest,)
     data = replace(dataset(model, cut, source, (about.digest,)), campaign=samples)
-    found = tracer(
-        data, model, horizon=HORIZON_S, seed=seed, progress=progress, weights=weights(profile, model.states), kind=profile.norm.set
-    )
+    found = tracer(data, model, seed=seed, progress=progress, weights=weights(profile, model.states), kind=profile.norm.set)
     fitted = found.spec
     if fitted.effects != profile.model.effects:
         fitted = msgspec.structs.replace(fitted, fitted_on=tuple(dict.fromkeys((*fitted.fitted_on, *more))))
@@ -115,7 +112,10 @@ def _number(value: Any) -> Any:
 
 def options(profile: Profile, states: Sequence[str], rows: int) -> dict[str, Any]:
     """What the tracer was told besides rows, model and seed."""
-    return {"horizon_s": HORIZON_S, "weights": list(weights(profile, states)), "set": profile.norm.set, "rows": rows}
+    from s2r_runtime.trace.tracer import usual_horizon
+
+    horizon_s = usual_horizon(profile.model.dt)
+    return {"horizon_s": horizon_s, "weights": list(weights(profile, states)), "set": profile.norm.set, "rows": rows}
 
 
 def weights(profile: Profile, states: Sequence[str]) -> tuple[float, ...]:

@@ -5,6 +5,7 @@
 | `track_scale` gain g | unicycle | `input_gain` of the yaw rate, g |
 | `longitudinal_slip` ratio r | unicycle | `input_gain` of the speed, 1 - r |
 | `mass_change` ratio r (mass m r) | joint | `input_gain` of the force, 1/r |
+| `parameter_change` ratio r | a model of one's own, where it divides or multiplies one input | `input_gain` of it, r or 1/r |
 | `constant_disturbance` world, x | joint | `input_bias` of the force, x |
 | `gravity_slope` x, y | axes | `constant_disturbance` world, x, y |
 | `sensor_offset` of the heading, b | poses | `heading_offset`, angle b |
@@ -34,6 +35,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from s2r_runtime.effects.parameter_change import EFFECT as PARAMETER
 from s2r_runtime.errors import ConfigError, PluginError
 from s2r_runtime.hookspecs import Effect, NominalModel
 from s2r_runtime.models.bound import BoundModel, bind
@@ -139,9 +141,13 @@ def _rows(model: NominalModel) -> tuple[Row, ...]:
 
 def _proposed(model: BoundModel) -> Iterator[Row]:
     """All rows that could hold, by the names of channels."""
+    changeable = [name for name in PARAMETER.channels(model) if model.parameters[name]]
     for i in model.inputs:
         yield Row("track_scale", "theta", "input_gain", i, _renamed("gain", "gain"), _renamed("gain", "gain"), {"gain": 0.7})
         yield Row("longitudinal_slip", "*", "input_gain", i, _slip_to_gain, _gain_to_slip, {"ratio": 0.3})
+        for name in changeable:
+            for to_gain, from_gain in ((_ratio_to_gain, _gain_to_ratio), (_ratio_to_inverse, _gain_to_mass)):
+                yield Row("parameter_change", name, "input_gain", i, to_gain, from_gain, {"ratio": 1.4})
         yield Row("mass_change", "*", "input_gain", i, _mass_to_gain(model), _gain_to_mass, {"ratio": 1.4})
         if "y" not in model.states:
             yield Row("constant_disturbance", "world", "input_bias", i, _renamed("x", "bias"), _renamed("bias", "x"), {"x": 0.3})
@@ -153,6 +159,10 @@ def _proposed(model: BoundModel) -> Iterator[Row]:
             if j != i and model.integration == "exact":
                 there, back = _arm_to_coupling(j), _coupling_to_arm(j)
                 yield Row("sensor_lever_arm", "*", "input_coupling", i, there, back, {"x": 0.0, "y": 0.3}, always=False)
+    for late, name in enumerate(changeable):  # two that stand in the model as a product or a ratio only
+        for other in changeable[:late]:
+            yield Row("parameter_change", name, "parameter_change", other, dict, dict, {"ratio": 1.4})
+            yield Row("parameter_change", name, "parameter_change", other, _inverse, _inverse, {"ratio": 1.4})
     push = {"x": 0.3, "y": 0.2} if "y" in model.states else {"x": 0.3}
     yield Row("gravity_slope", "*", "constant_disturbance", "world", dict, dict, push)
     yield Row(
@@ -241,6 +251,22 @@ def _mass_to_gain(model: NominalModel) -> Convert:
 
 def _gain_to_mass(p: Values) -> Values | None:
     return {"ratio": 1.0 / p["gain"]} if p["gain"] > 0.0 else None
+
+
+def _ratio_to_gain(p: Values) -> Values | None:
+    return {"gain": p["ratio"]} if "ratio" in p else None
+
+
+def _ratio_to_inverse(p: Values) -> Values | None:
+    return {"gain": 1.0 / p["ratio"]} if "ratio" in p else None
+
+
+def _gain_to_ratio(p: Values) -> Values | None:
+    return {"ratio": p["gain"]} if p["gain"] > 0.0 else None
+
+
+def _inverse(p: Values) -> Values | None:
+    return {"ratio": 1.0 / p["ratio"]} if "ratio" in p else None
 
 
 def _alone(key: str, zero: str) -> Convert:

@@ -35,11 +35,11 @@ class Plain:
     states = ("a", "b", "c")
     inputs = ("p", "q", "r")
     angles = ()
-    parameters: ClassVar[dict[str, float]] = {}
+    parameters: ClassVar[dict[str, float]] = {"vigour": 1.0, "decay": 0.0}
 
     def step(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
-        """x + dt u."""
-        return x + dt * u
+        """x + dt (vigour u - decay x)."""
+        return np.asarray(x + dt * (parameters["vigour"] * u - parameters["decay"] * x))
 
 
 class EffectKit:
@@ -266,6 +266,8 @@ class EffectKit:
                 values = {**given, **other}
                 if hasattr(self.effect, "takes"):
                     values = {name: value for name, value in values.items() if name in self.effect.takes(model, channel)}
+                    if not values:  # these are for other channels
+                        continue
                 yield model, channel, values
 
     def _takes(self, model: NominalModel, channel: str) -> set[str]:

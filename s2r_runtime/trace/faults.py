@@ -41,6 +41,9 @@ AROUND = 4
 LONG = 3.5
 """Usual intervals without a measurement before it is called a dropout."""
 
+ONE_STEP, MOVED = 0.3, 6.0
+"""Of a step, by which a usual interval may differ from it to be one; standard deviations that a state must move in it to be seen to."""
+
 MANY_ROWS = 60
 """Rows of a run in which a heading's departure from the motion is looked for."""
 
@@ -62,7 +65,7 @@ def check(model: ComposedModel, data: Dataset) -> Checked:
     """Finds the faults and takes them out."""
     act = acting(model, data)
     reach = reach_of(model, data, act)
-    faults = [_of_pause(model, data, pause, reach) for pause in data.pauses]
+    faults = [_of_pause(model, data, act, pause, reach) for pause in data.pauses]
     found = [f for f in faults if f is not None]
     pose = _pose(model)
     bad = [np.zeros(run.y.shape, dtype=bool) for run in data.runs]
@@ -88,9 +91,10 @@ def check(model: ComposedModel, data: Dataset) -> Checked:
     return Checked(replace(data, runs=runs), faults_, tuple(sorted(set(left_out))), outliers + (len(spikes) if many else 0))
 
 
-def _of_pause(model: ComposedModel, data: Dataset, pause: Pause, reach: Reach) -> Fault | None:
-    """A long interval: had the robot gone on meanwhile, or only its clock? Judged by how fast it went before and after, not by the model,
-    which may lack what made it slow. Where inputs went on being received, the clock did too.
+def _of_pause(model: ComposedModel, data: Dataset, act: Acting, pause: Pause, reach: Reach) -> Fault | None:
+    """A long interval: had the robot gone on meanwhile, or only its clock? Judged by how fast it went before and after, since the model may
+    lack what made it slow; or by the model, if the robot was where one step of it leads. Where inputs went on being received, the clock
+    did too.
     """
     run = data.runs[pause.run]
     first, last = (round((at - run.start_s) / data.dt) for at in (pause.from_s, pause.to_s))
@@ -103,9 +107,22 @@ def _of_pause(model: ComposedModel, data: Dataset, pause: Pause, reach: Reach) -
         apart, noise = np.abs(pace) * (steps - usual), 4.0 * reach.noise
         stood = np.abs(went - pace * usual) <= np.maximum(0.3 * apart, noise)
         steady = np.abs(np.nanmean(before, axis=0) - np.nanmean(after, axis=0)) < 0.5 * np.abs(pace)
-        if np.any(stood & steady & (apart > 2.0 * noise)) and np.all(stood | reach.instant):
+        known = (steady | _one_step_on(model, data, act, pause, first, reach)) & stood & (apart > 2.0 * noise)
+        if np.any(known) and np.all(stood | reach.instant):
             return Fault(pause.from_s, pause.to_s, "*", "clock_step")
     return Fault(pause.from_s, pause.to_s, "*", "dropout") if pause.to_s - pause.from_s > LONG * pause.usual_s else None
+
+
+def _one_step_on(model: ComposedModel, data: Dataset, act: Acting, pause: Pause, first: int, reach: Reach) -> Mask:
+    """(nx,) whether a state moved clearly, and as far as one step of the model after the row `first`; none, unless all of them are there."""
+    run = data.runs[pause.run]
+    if abs(pause.usual_s / data.dt - 1.0) > ONE_STEP or first >= len(run.y) - 1:
+        return np.zeros(len(model.states), dtype=bool)
+    foretold = predicted(model, data, act, pause.run)[[first]]
+    off = np.abs(model.difference(pause.after[None, :].copy(), foretold)[0])
+    moved = np.abs(model.difference(foretold, pause.before[None, :])[0])
+    there = off <= 4.0 * reach.noise
+    return np.asarray((moved > MOVED * reach.noise) & there & bool(np.all(there | reach.instant)))
 
 
 def _pose(model: ComposedModel) -> list[int] | None:

@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.dataset import Dataset
@@ -111,8 +112,20 @@ def evaluate(given: Problem, model: ComposedModel, near: Noise | None = None) ->
 
 def objective(given: Problem, fit: Fit, model: ComposedModel) -> Array:
     """z (n, nx) of a model under the noise of a fit."""
-    r = residual(model, given.steps, acting(model, given.data))
+    return _whitened(given, fit, residual(model, given.steps, acting(model, given.data)))
+
+
+def _whitened(given: Problem, fit: Fit, r: Array) -> Array:
+    """z (n, nx) of a residual (n, nx) under the noise of a fit."""
     return fit.colour(fit.whiten(r), given.steps.joined)
+
+
+def foretold(given: Problem, model: ComposedModel) -> Array | None:
+    """What a model predicts, (n, nx); None where a user's own gives no numbers at such values."""
+    try:
+        return predicted(model, given.steps, acting(model, given.data))
+    except ConfigError:
+        return None
 
 
 def sensitivities(given: Problem, fit: Fit, model: ComposedModel, free: Free) -> Array:
@@ -128,8 +141,9 @@ def sensitivities(given: Problem, fit: Fit, model: ComposedModel, free: Free) ->
             there = now.copy()
             there[j] += signed
             other = with_values(model, free, there)
-            if other is not None:
-                moved[:, :, j] = (predicted(other, given.steps, acting(other, given.data)) - here) / -signed
+            beyond = None if other is None else foretold(given, other)
+            if beyond is not None:
+                moved[:, :, j] = (beyond - here) / -signed
                 break
     return fit.colour(fit.whiten(moved), given.steps.joined).reshape(n * nx, len(free))
 
@@ -187,9 +201,10 @@ def refine(given: Problem, fit: Fit, model: ComposedModel, free: Free | None = N
             damped = normal + np.diag(damping * np.diag(normal) + 1e-12 * np.max(np.diag(normal), initial=1e-300))
             other = with_values(model, free, inside(model, free, values_of(model, free) - np.linalg.solve(damped, slope)))
             if other is not None:
-                z_other = objective(given, fit, other)
+                there = foretold(given, other)
+                z_other = z if there is None else _whitened(given, fit, other.difference(given.steps.y1, there))
                 reached = float(np.sum(noises.log_density(z_other)))
-                if reached > best:
+                if there is not None and reached > best:
                     model, z, best, damping = other, z_other, reached, damping / 10.0
                     break
             damping *= 10.0

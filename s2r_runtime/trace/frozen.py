@@ -24,11 +24,17 @@ QUANTA = 6.0
 LONG_FROZEN = 50
 """Rows of exact repeats that need no catching up to count as frozen."""
 
+RESTLESS, RESTS, REPEATS = 12, 30, 0.01
+"""Rows of exact repeats that count as frozen, however little the robot moves, where a state repeats itself on less than such a share of at
+least so many other rows on which it hardly moves either: noise that jitters there would have to hold still so often in a row.
+"""
+
 
 def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: Reach) -> list[Fault]:
     """Exact repeats through which the model moves the state by more than noise and quantisation, and after which it catches up.
 
-    Without catching up the robot itself may have stood still; only a long silence of a state that jitters otherwise is then a fault.
+    Without catching up the robot itself may have stood still; only a long silence of a state that jitters otherwise is then a fault; or one
+    of a state that jitters on other rows on which the robot stands, or nearly.
     """
     run = data.runs[i]
     if len(run.y) < FROZEN_ROWS + 1:
@@ -45,6 +51,10 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
         for a, b in _stretches(change == 0.0):
             if b - a < FROZEN_ROWS:
                 continue
+            if b - a >= RESTLESS and _restless(change, np.abs(moves[:, j]) < reach.noise[j], a, b):
+                bad[a + 1 : b + 1, j] = True
+                found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
+                continue
             path = np.cumsum(np.nan_to_num(moves[a:b, j]))
             expected, far = float(path[-1]), float(np.max(np.abs(path)))
             if far < least:
@@ -57,6 +67,13 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
                 bad[a + 1 : b + 1, j] = True
                 found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
     return found
+
+
+def _restless(change: Array, resting: Mask, a: int, b: int) -> bool:
+    """Whether a state jitters on rows outside [a, b) on which it hardly moves."""
+    others = resting & np.isfinite(change)
+    others[a:b] = False
+    return int(np.count_nonzero(others)) >= RESTS and float(np.mean(change[others] == 0.0)) < REPEATS
 
 
 def _stretches(yes: Mask) -> list[tuple[int, int]]:

@@ -66,6 +66,10 @@ def _mass(what: str, p: Values) -> str:
     return f"the mass is {p['mass']:.4g} kg" if "mass" in p else f"the mass is {_percent(p['ratio'])} of the model's"
 
 
+def _parameter(what: str, p: Values) -> str:
+    return f"{what} is {_percent(p['ratio'])} of what the model says" if "ratio" in p else f"{what} is {p['value']:.4g}, not 0"
+
+
 def _disturbance(what: str, p: Values) -> str:
     frame = {"world": "in a fixed direction of the world (wind, current)", "body": "in a fixed direction of the robot"}
     return f"something pushes steadily {frame.get(what, '')}".rstrip()
@@ -111,4 +115,5 @@ _WORDS: dict[str, Callable[[str, Values], str]] = {
     ),
     "position_field": lambda what, p: "something pushes that depends on where the robot is",
     "mass_change": _mass,
+    "parameter_change": _parameter,
 }

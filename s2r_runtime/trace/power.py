@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.candidates import Candidate, candidates
-from s2r_runtime.trace.fitting import Fit, Problem, sensitivities
+from s2r_runtime.trace.fitting import Fit, Problem, foretold, sensitivities
 from s2r_runtime.trace.residual import acting, predicted
 from s2r_runtime.trace.scores import STRICT
 from s2r_runtime.trace.slots import Slot, bounds_of, slots_of, values_of
@@ -53,7 +53,10 @@ def visible(given: Problem, fit: Fit, tried: int) -> tuple[Visible, ...]:
         key = candidate.name, candidate.channel
         if key in found:
             continue
-        column = fit.whiten(predicted(start, given.steps, acting(start, given.data)) - before).ravel()
+        there = foretold(given, start)
+        if there is None:
+            continue
+        column = fit.whiten(there - before).ravel()
         if j.shape[1]:
             column = column - j @ np.linalg.lstsq(j, column, rcond=1e-10)[0]
         bounds, neutral = bounds_of(start, slot), bounds_of(start, slot).neutral or 0.0

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.candidates import Candidate
-from s2r_runtime.trace.fitting import Fit, Problem, refine, sensitivities
+from s2r_runtime.trace.fitting import Fit, Problem, foretold, refine, sensitivities
 from s2r_runtime.trace.residual import acting, predicted
 from s2r_runtime.trace.slots import Free, bounds_of, inside, slots_of, values_of, with_values
 
@@ -63,8 +63,13 @@ def screen(given: Problem, base: Fit, found: Sequence[Candidate]) -> tuple[list[
     level = float(np.sum(noises.log_density(aside.z)))
     best: dict[tuple[str | int, ...], Screened] = {}  # one for each set of parameters: more of them may do no better at the start
     for chunk in _chunks(probes):
-        moved = [predicted(m, given.steps, acting(m, given.data)) - before for probe in chunk for m in probe.models]
-        columns = base.whiten(np.array(moved).transpose(1, 2, 0)).reshape(aside.z.size, -1)
+        made = [(probe, [foretold(given, m) for m in probe.models]) for probe in chunk]
+        there = [(probe, [f - before for f in moved if f is not None]) for probe, moved in made]
+        chunk = [probe for probe, moved in there if len(moved) == len(probe.models)]
+        if not chunk:
+            continue
+        table = np.array([column for probe, moved in there if len(moved) == len(probe.models) for column in moved])
+        columns = base.whiten(table.transpose(1, 2, 0)).reshape(aside.z.size, -1)
         at = 0
         for probe in chunk:
             c = columns[:, at : at + len(probe.models)]
@@ -73,7 +78,8 @@ def screen(given: Problem, base: Fit, found: Sequence[Candidate]) -> tuple[list[
             key: tuple[str | int, ...] = (probe.candidate.name, probe.candidate.channel, probe.candidate.place, *sorted(probe.values))
             if np.isfinite(value) and (key not in best or value - level > best[key].value):
                 best[key] = Screened(value - level, probe.candidate, start)
-    moved_on = [_moved_on(given, white, aside, before, s, level) for s in best.values()]
+    steppable = [s for s in best.values() if foretold(given, s.start) is not None]  # as it was scaled
+    moved_on = [_moved_on(given, white, aside, before, s, level) for s in steppable]
     return sorted(moved_on, key=lambda s: -s.value), len(probes)
 
 

@@ -44,13 +44,16 @@ from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import confirmed, final_fit, foretells, verdict_of
 
-__all__ = ["Dataset", "TraceResult", "load_dataset", "trace"]
+__all__ = ["Dataset", "TraceResult", "load_dataset", "trace", "usual_horizon"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[float, float, str], None]
 
 FEWEST = 60
 """Usable transitions below which nothing is said: a fit on 36 of them, and 24 to judge it."""
+
+HORIZON_S, HORIZON_STEPS = 1.0, 10
+"""Of rollouts where nobody says otherwise: a second is what a robot's controller looks ahead, and one step would show no error grow."""
 
 FIT_STEPS = 4000
 """Transitions that a fit uses at most; a parameter that matters is then known to about a per cent."""
@@ -72,18 +75,24 @@ WILD = 5.0
 """Standard deviations of a whitened residual from which it is counted as an outlier (and has next to no weight)."""
 
 
+def usual_horizon(dt: float) -> float:
+    """Of rollouts, s: a second, and ten steps of what is slow."""
+    return max(HORIZON_S, HORIZON_STEPS * dt)
+
+
 def trace(
     dataset: Dataset,
     model: ComposedModel,
     *,
     test: Dataset | None = None,
-    horizon: float = 1.0,
+    horizon: float | None = None,
     seed: int = 0,
     progress: Progress | None = None,
     weights: tuple[float, ...] | None = None,
     kind: Kind = "ball",
 ) -> TraceResult:
-    """What the model lacks. test: another recording to judge on; horizon: of the rollouts, s; weights (nx,), kind: the gap's norm.
+    """What the model lacks. test: another recording to judge on; horizon: of the rollouts, s (default `usual_horizon`); weights (nx,),
+    kind: the gap's norm.
 
     Raises NotEnoughEvidence if there are too few transitions or nothing was asked of the robot, UsageError if dataset and
     model do not belong together.
@@ -91,6 +100,7 @@ def trace(
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(limits=1):
+        horizon = usual_horizon(model.dt) if horizon is None else horizon
         return _traced(dataset, model, test, horizon, seed, progress or (lambda done, total, detail: None), (weights, kind))
 
 

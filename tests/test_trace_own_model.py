@@ -1,0 +1,89 @@
+"""A model of one's own may say a parameter wrongly: it is named, unless it is the same as something that every model can have."""
+
+import numpy as np
+import pytest
+
+from s2r_runtime.effects.classes import same
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.tracer import trace, usual_horizon
+
+DT_S, NOISE_M, PARTS = 2.0, 0.01, 20
+TANK = """
+import numpy as np
+
+STATES = ("level",)
+INPUTS = ("pump",)
+PARAMS = {"lift": 0.05, "outflow": 0.04, "leak": 0.0}
+
+
+def step(x, u, dt, params):
+    if params["outflow"] > NARROWEST:
+        raise ValueError("no such valve")
+    level = x[:, 0]
+    for _ in range(PARTS):
+        level = np.maximum(level, 0.0)
+        level = level + dt / PARTS * (params["lift"] * u[:, 0] - params["outflow"] * np.sqrt(level) - params["leak"] * level)
+    return level[:, None]
+"""
+
+
+def _model(folder, narrowest=1e9):
+    path = folder / "tank.py"
+    path.write_text(TANK.replace("NARROWEST", repr(narrowest)).replace("PARTS", str(PARTS)))
+    return compose(ModelSpec(str(path), DT_S))
+
+
+def _drive(model, lift=0.05, outflow=0.04, leak=0.0, rows=1500, seed=1):
+    rng = np.random.default_rng(seed)
+    pump = np.repeat(rng.uniform(0.0, 3.0, rows // 25), 25)
+    level, levels = 4.0, [4.0]
+    for u in pump:
+        for _ in range(PARTS):
+            level += DT_S / PARTS * (lift * u - outflow * np.sqrt(max(level, 0.0)) - leak * level)
+        levels.append(level)
+    return from_arrays(model, [(np.array(levels)[:, None] + NOISE_M * rng.normal(size=(rows + 1, 1)), pump[:, None])])
+
+
+@pytest.mark.parametrize(
+    ("robot", "name", "channel", "value"),
+    [
+        ({"outflow": 0.05}, "parameter_change", "outflow", 1.25),
+        ({"leak": 0.004}, "parameter_change", "leak", 0.004),
+        ({"lift": 0.04}, "input_gain", "pump", 0.8),
+    ],
+    ids=["a ratio", "what the model has as zero", "the same as a gain"],
+)
+def test_a_parameter_that_is_another_one_is_named_with_its_value(tmp_path, robot, name, channel, value):
+    model = _model(tmp_path)
+    found = trace(_drive(model, **robot), model)
+    (effect,) = found.effects
+    ((known, low, high, _),) = effect.parameters.values()
+    assert (found.verdict, effect.name, effect.channel) == ("traced", name, channel)
+    assert known == pytest.approx(value, rel=0.08)
+    assert low < known < high
+    assert channel in found.text()
+
+
+def test_a_model_that_is_right_gets_no_other_parameters(tmp_path):
+    model = _model(tmp_path)
+    assert trace(_drive(model), model).verdict == "none"
+
+
+def test_a_parameter_that_only_scales_an_input_is_its_gain(tmp_path):
+    nominal = _model(tmp_path).for_effects
+    assert same(nominal, "parameter_change", "lift", {"ratio": 0.8})[0] == ("input_gain", "pump", {"gain": 0.8})
+    assert same(nominal, "parameter_change", "outflow", {"ratio": 0.8}) == []
+
+
+def test_a_model_that_fails_at_other_values_is_traced_all_the_same(tmp_path):
+    """The right one cannot be tried; what can be lowers the error."""
+    model = _model(tmp_path, narrowest=0.041)
+    found = trace(_drive(model, outflow=0.05), model)
+    assert ("parameter_change", "outflow") not in {(e.name, e.channel) for e in found.effects}
+    assert np.std(found.after.ends) < 0.5 * np.std(found.before.ends)
+
+
+def test_rollouts_are_a_second_or_ten_steps():
+    assert (usual_horizon(0.02), usual_horizon(0.1), usual_horizon(2.0)) == (1.0, 1.0, 20.0)
