@@ -7,13 +7,15 @@
     anybody -> runtime   proposal     {"input": {"v": 0.1, "w": 0.0}, "seq": 0, "obs_seq": 0}; logged, never obeyed
 
 Order. A robot's `seq` and `stamp_ns` rise within one boot. The same bytes again are a keep-alive and mean nothing new; an older
-`seq` is dropped and counted. A robot that started anew says so by another `boot`, or by having been silent for `restart_ns`: its
+`seq` is dropped and counted. An observation without a usable state (NaN, a state that is missing) keeps its place, so that a robot in
+lockstep that fell is answered. A robot that started anew says so by another `boot`, or by having been silent for `restart_ns`: its
 numbers then go on above the old ones (`stamp_ns` by one second at least), so that nobody downstream ever sees a clock run
 backwards, and a link down and up is reported between the two. The first observation of all reports the link up, before itself.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from typing import Literal, TypeVar
@@ -144,11 +146,26 @@ class Wire:
                 raise Malformed("stamp_ns does not rise with seq")
         except Malformed as error:
             self.malformed += 1
-            seq, stamp = (last.seq + self._seq_offset, last.stamp_ns + self._stamp_offset) if last else (0, 0)
-            return [Observation(seq, stamp, (), fault=f"malformed observation: {error}")]
+            return [self._unusable(frame, f"malformed observation: {error}")]
         self.lost += payload.seq - last.seq - 1
         self._accept(payload, frame)
         return [self._numbered(payload, x)]
+
+    def _unusable(self, frame: Frame, fault: str) -> Observation:
+        """No state, and its own place in the count where that can be read and comes next; else the place of the one before."""
+        last, place = self._last, _place(frame.data)
+        if last is None:
+            return Observation(0, 0, (), fault)
+        if (
+            place is not None
+            and place.boot == last.boot
+            and last.seq < place.seq <= COUNT_MAX
+            and last.stamp_ns < place.stamp_ns <= STAMP_MAX
+        ):
+            self.lost += place.seq - last.seq - 1
+            self._accept(place, frame)
+            last = place
+        return Observation(last.seq + self._seq_offset, last.stamp_ns + self._stamp_offset, (), fault)
 
     def _accept(self, payload: ObservationPayload, frame: Frame) -> None:
         self._last, self._arrival_ns = payload, frame.arrival_ns
@@ -198,6 +215,17 @@ def _parsed(decoder: msgspec.json.Decoder[T], data: bytes) -> T:
         return decoder.decode(data)
     except (msgspec.MsgspecError, UnicodeError) as error:
         raise Malformed(str(error)[:120]) from None
+
+
+def _place(data: bytes) -> ObservationPayload | None:
+    """seq, stamp_ns and boot of a payload whose state is no state, NaN among it: a robot that fell waits for its answer like any other."""
+    if len(data) > PAYLOAD_MAX or data.count(b"[") + data.count(b"{") > NESTING_MAX:
+        return None
+    try:
+        found = json.loads(data)  # takes NaN, which no JSON has and some robots write
+        return msgspec.convert({**found, "state": {}}, ObservationPayload)
+    except (ValueError, TypeError, msgspec.MsgspecError):
+        return None
 
 
 def _within(value: int, most: int, name: str) -> None:

@@ -80,6 +80,26 @@ def test_malformed_observation_is_a_fault_with_its_reason_and_no_numbers(payload
     assert seen(w, observation(4)) == [Observation(4, 4000, (0.1, 0.2))], "the next good one counts"
 
 
+@pytest.mark.parametrize("state", ["{}", '{"x": 0.1}', '{"x": NaN, "theta": 0}', '{"x": 1e999, "theta": 0}', "null", '"fallen"'])
+def test_observation_without_a_usable_state_keeps_its_place_so_that_a_waiting_robot_is_answered(state: str) -> None:
+    w = wire()
+    seen(w, observation(3, boot=7))
+    (fault,) = seen(w, b'{"seq": 5, "stamp_ns": 5000, "state": %s, "boot": 7}' % state.encode())
+    assert (fault.seq, fault.stamp_ns, fault.x) == (5, 5000, ())
+    assert (w.newest, w.lost, w.malformed) == (5, 1, 1)
+    assert seen(w, observation(4, boot=7)) == [], "older than that"
+    assert seen(w, observation(6, boot=7)) == [Observation(6, 6000, (0.1, 0.2))]
+
+
+def test_unusable_observation_of_another_boot_or_with_a_stamp_that_does_not_rise_moves_nothing() -> None:
+    w = wire()
+    seen(w, observation(3, boot=7))
+    for payload in (b'{"seq": 5, "stamp_ns": 5000, "state": {}, "boot": 8}', b'{"seq": 5, "stamp_ns": 3000, "state": {}, "boot": 7}'):
+        (fault,) = seen(w, payload)
+        assert (fault.seq, fault.stamp_ns) == (3, 3000)
+    assert seen(w, observation(4, boot=7)) == [Observation(4, 4000, (0.1, 0.2))]
+
+
 def test_repeat_is_nothing_new_and_an_older_one_is_dropped() -> None:
     w = wire()
     seen(w, observation(7))
