@@ -47,8 +47,11 @@ class Outcome:
 class Drill:
     """One robot, one daemon at a time, and its faults."""
 
-    def __init__(self, folder: Path, *, clock: str = "realtime", seed: int = 1) -> None:
-        self.rig = Rig(folder, clock=clock)
+    GROWN = 0.02
+    """Beyond this the gap of the made-up certificates is given up, and the next one founds an epoch of its own."""
+
+    def __init__(self, folder: Path, *, clock: str = "realtime", seed: int = 1, rig: Rig | None = None) -> None:
+        self.rig = rig or Rig(folder, clock=clock)
         self.rng = random.Random(seed)
         self.killed = 0
         """How often a daemon, or its recorder, ended without a word: the end of that log may be missing."""
@@ -95,11 +98,11 @@ class Drill:
     def deploy(self, path: Path) -> dict[str, Any]:
         """Under a certificate of its own; a new one if the last was revoked or its gap refuted."""
         status = self.rig.status()
-        epoch = max(1, status["epoch"]) + (1 if status["alarm"] or (status["radius"] or 0.0) > 0.02 else 0)
+        epoch = max(1, status["epoch"]) + (1 if status["alarm"] or (status["radius"] or 0.0) > self.GROWN else 0)
         kept = self._certificates.get((path, epoch))
         if kept is None or any(one in kept for one in status["revoked"]):
             self._numbers += 1
-            kept = self.rig.certificate(path, verified=0.02 + 1e-9 * self._numbers, epoch=epoch)
+            kept = self.rig.certificate(path, verified=self.GROWN + 1e-9 * self._numbers, epoch=epoch)
             self._certificates[path, epoch] = kept
         return self.rig.ask("deploy", path=str(path), certificate=kept)
 
@@ -207,7 +210,7 @@ def _file_changed(drill: Drill) -> None:
 def _uncertified(drill: Drill) -> None:
     """Another controller, under the certificate of the one that drives, and under one that was changed."""
     rig, foreign = drill.rig, drill.rig.controller(f"    return np.tile([0.0, {FOREIGN_U}], (len(x), 1))\n", "foreign.py")
-    good = drill.rig.certificate(drill.good, verified=0.021)
+    good = drill.rig.certificate(drill.good, verified=1.05 * drill.GROWN)
     assert rig.ask("deploy", path=str(foreign), certificate=good)["exit_code"] != 0
     rig.ask("undeploy")
     place = drill.rng.randrange(len(good))
@@ -532,6 +535,21 @@ def _flipped(data: bytes, place: int) -> bytes:
 
 def judged(drill: Drill) -> dict[str, int]:
     """Every event of every log by the law, and every command that reached the robot by the logs. What was counted on the way."""
+    sent, count = lawful(drill)
+    known = {(one.source, one.seq, tuple(one.u), one.obs_seq) for one in sent}
+    for command in drill.rig.applied():
+        count["commands"] += 1
+        u = tuple(command["u"])
+        assert u in {(0.0, 0.0), (0.0, GOOD_U), (0.0, BAD_U)}, command
+        assert (command["source"] == "recovery") == (u == (0.0, 0.0)), command
+        count["unrecorded"] += u != (0.0, 0.0) and (command["source"], command["seq"], u, command["obs_seq"]) not in known
+    # what a killed daemon sent in its last moments may be missing: 100 ms of the log, and as much of a busy machine
+    assert count["unrecorded"] <= 30 * drill.killed, count
+    return count
+
+
+def lawful(drill: Drill) -> tuple[list[Send], dict[str, int]]:
+    """Every event of every log by the law; what the core sends, and what was counted."""
     law, sent, count = None, [], {"events": 0, "commands": 0, "unrecorded": 0}
     for path in drill.rig.log_files():
         state = core.initial()
@@ -545,15 +563,6 @@ def judged(drill: Drill) -> dict[str, int]:
             state, outputs = core.handle(state, event)
             assert law is not None
             law.judge(event, outputs)
-            sent += [(one.source, one.seq, tuple(one.u), one.obs_seq) for one in outputs if isinstance(one, Send)]
+            sent += [one for one in outputs if isinstance(one, Send)]
             count["events"] += 1
-    known = set(sent)
-    for command in drill.rig.applied():
-        count["commands"] += 1
-        u = tuple(command["u"])
-        assert u in {(0.0, 0.0), (0.0, GOOD_U), (0.0, BAD_U)}, command
-        assert (command["source"] == "recovery") == (u == (0.0, 0.0)), command
-        count["unrecorded"] += u != (0.0, 0.0) and (command["source"], command["seq"], u, command["obs_seq"]) not in known
-    # what a killed daemon sent in its last moments may be missing: 100 ms of the log, and as much of a busy machine
-    assert count["unrecorded"] <= 30 * drill.killed, count
-    return count
+    return sent, count

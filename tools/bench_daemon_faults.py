@@ -1,12 +1,14 @@
 """Faults in running daemons: real processes and a real transport, as many faults as asked for, and a driving controller between two.
 
     python tools/bench_daemon_faults.py --count 500 [--seed 1] [--only NAME] [--json FILE]
+    python tools/bench_daemon_faults.py --link zenoh|mavlink|can --quick
 
-tests/daemon_faults.py says what the faults are: controllers that raise, hang, leak, fork, print, exit; processes killed and stopped;
-a full, slow and dead recorder; states cut, flipped, another robot's, from the future; clocks that step; a link that is lost, lies or
-commands; people who stop, revoke and mistype. Every fault must be noticed with a reason of the gate's table (or do nothing at all,
-where that is right), and a certified controller must drive again. Each daemon's logs are judged
-afterwards. Exit 1 if one case does not hold.
+Without --link the robot is on a socket of its own, where a transport can be sabotaged too. tests/daemon_faults.py says what the faults are:
+controllers that raise, hang, leak, fork, print, exit; processes killed and stopped; a full, slow and dead recorder; states cut, flipped,
+another robot's, from the future; clocks that step; a link that is lost, lies or commands; people who stop, revoke and mistype. With --link
+the robot is at the end of that link, and tests/link_faults.py says what befalls it. Every fault must be noticed with a reason of the gate's
+table (or do nothing at all, where that is right), and a certified controller must drive again. Each daemon's logs are judged afterwards.
+Exit 1 if one case does not hold.
 """
 
 from __future__ import annotations
@@ -19,35 +21,36 @@ import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
+from collections.abc import Iterable
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
 
 import daemon_rig  # noqa: E402
+import link_faults  # noqa: E402
 from daemon_faults import AGAIN_S, FAULTS, Drill, judged  # noqa: E402
 
 daemon_rig.WITHIN_S = AGAIN_S  # a bench may run beside anything
 
-IN_ONE_LIFE = len(FAULTS)
-"""Faults in one robot's folder, before it is judged and a new one begins."""
 
-
-def plan(count: int, seed: int, only: str) -> list[str]:
+def plan(faults: Iterable[str], count: int, seed: int, only: str) -> list[str]:
     """Every fault as often as any other, in an order of its own each time."""
-    names = [name for name in FAULTS if only in name]
+    names = [name for name in faults if only in name]
     draw, found = random.Random(seed), []
     while len(found) < count:
         found += draw.sample(names, len(names))
     return found[:count]
 
 
-def life(names: list[str], seed: int, rows: dict[str, list[float]], reasons: dict[str, Counter[str]]) -> tuple[Counter[str], list[str]]:
+def life(
+    names: list[str], seed: int, link: str, rows: dict[str, list[float]], reasons: dict[str, Counter[str]]
+) -> tuple[Counter[str], list[str]]:
     """One robot and its faults: what was counted, and what did not hold."""
     folder = Path(tempfile.mkdtemp(prefix="faults"))
     count: Counter[str] = Counter()
     wrong: list[str] = []
-    drill = Drill(folder, seed=seed)
+    drill = link_faults.LinkDrill(folder, link, seed) if link else Drill(folder, seed=seed)
     try:
         drill.begin()
         for name in names:
@@ -61,7 +64,7 @@ def life(names: list[str], seed: int, rows: dict[str, list[float]], reasons: dic
             rows[name].append(outcome.seconds)
             reasons[name].update(outcome.reasons)
         drill.rig.stop()
-        count.update(judged(drill))
+        count.update(link_faults.judged(drill) if isinstance(drill, link_faults.LinkDrill) else judged(drill))
     except Exception as error:  # noqa: BLE001 - as above
         wrong.append(f"a life ended: {type(error).__name__}: {str(error)[:1000]}")
         print(wrong[-1], f"(kept in {folder})", flush=True)
@@ -77,20 +80,23 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=500)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", default="", help="only faults whose name contains this")
+    parser.add_argument("--link", choices=link_faults.KINDS, default="", help="over this transport; else over a socket of the rig's own")
     parser.add_argument("--quick", action="store_true", help="each fault once")
     parser.add_argument("--minutes", type=float, default=1e9, help="begin no further life after so long")
     parser.add_argument("--json", type=Path, help="write what came of it there")
     options = parser.parse_args()
-    names = plan(len(FAULTS) if options.quick else options.count, options.seed, options.only)
+    faults = link_faults.LINK_FAULTS if options.link else FAULTS
+    in_one_life = len(faults)  # in one robot's folder, before it is judged and a new one begins
+    names = plan(faults, in_one_life if options.quick else options.count, options.seed, options.only)
     rows: dict[str, list[float]] = defaultdict(list)
     reasons: dict[str, Counter[str]] = defaultdict(Counter)
     count: Counter[str] = Counter()
     wrong: list[str] = []
     begun = time.monotonic()
-    for index in range(0, len(names), IN_ONE_LIFE):
+    for index in range(0, len(names), in_one_life):
         if time.monotonic() - begun > 60.0 * options.minutes:
             break
-        found, failed = life(names[index : index + IN_ONE_LIFE], options.seed + index, rows, reasons)
+        found, failed = life(names[index : index + in_one_life], options.seed + index, options.link, rows, reasons)
         count += found
         wrong += failed
         held = sum(map(len, rows.values()))
