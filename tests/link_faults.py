@@ -192,12 +192,12 @@ def _companion(rig: LinkRig) -> None:
 
     from pymavlink.dialects.v20 import common as mavlink
 
-    mav, before = mavlink.MAVLink(None, 1, 195), rig.status()["counters"]["proposals"]
+    mav, before = mavlink.MAVLink(None, 1, 195), rig.status()["counters"]["companion_refused"]
     with socket.create_connection(("127.0.0.1", rig.companion)) as line:
 
         def told() -> bool:
             line.sendall(mav.set_position_target_local_ned_encode(0, 1, 1, 8, 1479, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, -FOREIGN_U).pack(mav))
-            return bool(rig.status()["counters"]["proposals"] > before)
+            return bool(rig.status()["counters"]["companion_refused"] > before)
 
         rig.until(told)
 

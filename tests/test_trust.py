@@ -80,6 +80,15 @@ def test_a_revoked_key_takes_what_it_signed_along_and_nothing_else(robot: Robot,
         robot.trust.check_own()
 
 
+def test_a_key_that_was_revoked_is_not_believed_again_by_a_daemon_whose_list_is_taken_away(robot: Robot) -> None:
+    place = robot.folder / revocations.NAME
+    entry = revocations.revoke(place, robot.fingerprint("trusted/colleague.pub"), "left the company")
+    assert set(robot.distrusted()) == {robot.facts[1].id}
+    place.unlink()
+    assert robot.trust.objection(keys.load_public(robot.colleague)).endswith(str(entry))
+    assert robot.trust.keys() == (keys.load_public(robot.folder / "key.pub"),)
+
+
 def test_a_key_that_is_taken_out_of_the_trusted_ones_takes_its_certificates_along(robot: Robot) -> None:
     assert robot.distrusted() == {}
     robot.colleague.unlink()

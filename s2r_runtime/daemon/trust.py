@@ -31,6 +31,7 @@ class Trust:
         """Raises ConfigError if a list of revoked keys or a trusted key can't be read, or could be somebody else's work."""
         self._own, self._trusted, self._certificates = own, folder / "trusted", folder / "certificates"
         self._lists = revocations.places(folder)
+        self._revoked: dict[str, revocations.Revocation] = {}
         self._seen: _Seen | None = None
         self._looked_at: tuple[str, ...] = ()
         self.trouble = ""
@@ -43,7 +44,7 @@ class Trust:
 
     def _read(self) -> tuple[tuple[bytes, ...], dict[str, revocations.Revocation]]:
         """Public keys whose signature counts, and the revoked ones."""
-        revoked = revocations.known(self._lists)
+        revoked = self._revoked = revocations.known(self._lists) | self._revoked  # a list only grows: an entry that is gone was taken out
         return tuple(key for key in (self._own, *keys.load_trusted([self._trusted])) if keys.fingerprint(key) not in revoked), revoked
 
     def objection(self, key: bytes) -> str:
@@ -53,7 +54,7 @@ class Trust:
     def own_objection(self) -> str:
         """Why this daemon signs nothing any more, or empty."""
         try:
-            entry = revocations.known(self._lists).get(keys.fingerprint(self._own))
+            entry = self._read()[1].get(keys.fingerprint(self._own))
         except ConfigError as error:
             return str(error)
         return "" if entry is None else f"this daemon's own key was {entry}; s2r keys rotate, and start it anew"
