@@ -21,6 +21,8 @@ from s2r_runtime.profile import Profile
 
 ROBOT_WITHIN_S = 15.0
 """Discovery on a network takes a second or two; a robot that is silent for longer is not there."""
+SILENT_S = 60.0
+"""A robot that was there and is not heard for so long went away for good: its campaign is kept, and whoever waits for it is told."""
 
 Progress = Callable[..., None]
 
@@ -30,7 +32,7 @@ class _Script:
 
     def __init__(self, n: int, permit_s: float, progress: Progress | None) -> None:
         self._n, self._permit_s, self._progress = n, permit_s, progress
-        self._began = time.monotonic()
+        self._began = self._heard = time.monotonic()
         self._number = 0
         self.exit_code, self.text = 1, ""
 
@@ -41,10 +43,20 @@ class _Script:
         elif (answer := daemon.desk.answers.get(self._number)) is not None:
             self.exit_code, self.text = answer.exit_code, answer.text
             daemon.end("the campaign is over")
+        elif self._silent(daemon):
+            taken, n = len(daemon.sampler.samples), daemon.sampler.n
+            self.exit_code = 3
+            self.text = f"the robot was not heard for {SILENT_S:g} s, after {taken} of {n} samples; the same command goes on with it"
+            daemon.end(self.text)
         elif self._progress is not None and (sampling := daemon.sampler.progress()) is not None:
             phase, taken, n, rejected, left_s = sampling
             detail = phase + "".join(f", {count} {reason}" for reason, count in sorted(rejected.items()))
             self._progress(taken, n, detail, None if daemon.clock.lockstep else left_s)
+
+    def _silent(self, daemon: Daemon) -> bool:
+        if daemon.state.link_up:
+            self._heard = time.monotonic()
+        return time.monotonic() - self._heard > SILENT_S
 
     def _begin(self, daemon: Daemon) -> None:
         if daemon.state.link_up and daemon.state.observation is not None:

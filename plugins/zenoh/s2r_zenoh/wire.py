@@ -81,6 +81,7 @@ class Malformed(ValueError):
 class Wire:
     """Decodes and encodes for one robot. states, inputs: the model's names in order. `malformed`, `old`, `lost`: counts.
 
+    `too_old`: the last payload that was dropped as behind a newer one. Who repeats it may be a robot that started anew.
     restart_ns: a robot without `boot` that was silent for so long may begin its count anew.
     """
 
@@ -91,6 +92,7 @@ class Wire:
         self._override = msgspec.json.Decoder(OverridePayload)
         self._encoder = msgspec.json.Encoder()
         self.malformed = self.old = self.lost = 0
+        self.too_old = b""
         self._last: ObservationPayload | None = None
         self._arrival_ns = 0
         self._seq_offset = self._stamp_offset = 0
@@ -138,7 +140,7 @@ class Wire:
                 self._arrival_ns = frame.arrival_ns
                 return []
             if payload.seq < last.seq:
-                self.old += 1
+                self.old, self.too_old = self.old + 1, frame.data
                 return []
             if payload.seq == last.seq:
                 raise Malformed("seq was used before, for other content")

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from s2r_zenoh.transport import ZenohTransport
 from s2r_zenoh.wire import PAYLOAD_MAX, Wire
 
 from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
@@ -147,6 +148,23 @@ def test_keep_alives_of_a_waiting_robot_hold_off_the_restart_time() -> None:
     for quarter in range(12):
         w.decode(frame(observation(10), quarter * SECOND // 4))
     assert w.decode(frame(observation(9), 3 * SECOND)) == []
+
+
+def test_robot_without_a_boot_number_that_repeats_an_old_count_is_one_that_started_anew_after_the_restart_time() -> None:
+    """In lockstep it waits and repeats itself: the transport must hand on what it repeats, or nobody would ever answer it."""
+    transport = ZenohTransport({"robot_listen": "tcp/127.0.0.1:1", "observation_timeout": 0.5}, ("x", "theta"), ("v", "w"))
+    first, again = (json.dumps(observation(seq)).encode() for seq in (900, 0))
+
+    def heard(data: bytes, at_ns: int) -> list[Any]:
+        transport._observations._waiting.append((at_ns, data))
+        return [m for f in transport.receive() for m in transport.decode(f)]
+
+    assert heard(first, 0)[-1] == Observation(900, 900_000, (0.1, 0.2))
+    assert heard(first, SECOND // 10) == [], "it waits"
+    assert [heard(again, SECOND // 5 * k) for k in (1, 2)] == [[], []], "an echo of the past, for all that is known"
+    down, up, anew = heard(again, SECOND)
+    assert (down.up, up.up, anew.seq > 900, anew.x) == (False, True, True, (0.1, 0.2))
+    assert heard(again, SECOND + 1) == [], "it waits"
 
 
 def test_command_is_named_inputs_with_all_that_the_robot_needs() -> None:
