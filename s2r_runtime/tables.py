@@ -65,6 +65,9 @@ def read_csv(path: Path | str, wanted: Sequence[str] | None = None, optional: Se
     except csv.Error as error:
         raise RecordingError(f"{path}: line 1: not CSV: {error}") from None
     names = _checked_names(path, header, wanted)
+    for name in optional:
+        if name not in header and (near := [h for h in header if h.lower() == name.lower()]):
+            raise RecordingError(f"{path}: lacks the column {name!r}, and has {near[0]!r}; column names must match exactly")
     names += [name for name in dict.fromkeys(optional) if name in header and name not in {TIME, SEGMENT, *names}]
     cells, lines = _cells(path, rows, len(header))
     numbers = {name: _numbers(path, name, cells[header.index(name)], lines) for name in (TIME, *names)}

@@ -42,7 +42,7 @@ LONG = 3.5
 """Usual intervals without a measurement before it is called a dropout."""
 
 ONE_STEP, MOVED = 0.3, 6.0
-"""Of a step, by which a usual interval may differ from it to be one; standard deviations that a state must move in it to be seen to."""
+"""Of a step, by which a usual interval may differ from it to be one; standard deviations that the state must move in it to be seen to."""
 
 MANY_ROWS = 60
 """Rows of a run in which a heading's departure from the motion is looked for."""
@@ -113,16 +113,16 @@ def _of_pause(model: ComposedModel, data: Dataset, act: Acting, pause: Pause, re
     return Fault(pause.from_s, pause.to_s, "*", "dropout") if pause.to_s - pause.from_s > LONG * pause.usual_s else None
 
 
-def _one_step_on(model: ComposedModel, data: Dataset, act: Acting, pause: Pause, first: int, reach: Reach) -> Mask:
-    """(nx,) whether a state moved clearly, and as far as one step of the model after the row `first`; none, unless all of them are there."""
+def _one_step_on(model: ComposedModel, data: Dataset, act: Acting, pause: Pause, first: int, reach: Reach) -> bool:
+    """Whether the state after a pause is clearly where one step of the model from the row `first` leads, and not where it was before."""
     run = data.runs[pause.run]
     if abs(pause.usual_s / data.dt - 1.0) > ONE_STEP or first >= len(run.y) - 1:
-        return np.zeros(len(model.states), dtype=bool)
+        return False
     foretold = predicted(model, data, act, pause.run)[[first]]
-    off = np.abs(model.difference(pause.after[None, :].copy(), foretold)[0])
-    moved = np.abs(model.difference(foretold, pause.before[None, :])[0])
-    there = off <= 4.0 * reach.noise
-    return np.asarray((moved > MOVED * reach.noise) & there & bool(np.all(there | reach.instant)))
+    off = model.difference(pause.after[None, :].copy(), foretold)[0]
+    moved = model.difference(foretold, pause.before[None, :])[0]
+    apart, way = (float(np.linalg.norm((e / reach.noise)[~reach.instant])) for e in (off, moved))
+    return way > MOVED and apart < 0.5 * way and bool(np.all((np.abs(off) <= 4.0 * reach.noise) | reach.instant))
 
 
 def _pose(model: ComposedModel) -> list[int] | None:

@@ -2,7 +2,7 @@
 
     E(c) = mean over states that go somewhere of  |y_{k+H} (-) f^H(y_k)| / |y_{k+H} (-) y_k|     (trimmed rms, H steps of half a second)
 
-for the recording as it is and with each usual mistake c taken back. As it is, the model foretells next to nothing (E > NOTHING); with one
+for the recording as it is and with each usual mistake c taken back. As it is, the model foretells little (E > NOTHING); with one
 mistake taken back it foretells well (E < WELL, and by far better): then that is what is wrong, and no effect is looked for.
 
 Inputs that come after the motion that they cause are on another clock: the residual is far smaller with the inputs earlier by some steps
@@ -23,14 +23,17 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset, Run, regridded
+from s2r_runtime.trace.never_measured import check_measured
 from s2r_runtime.trace.residual import acting, residual, rollout, rollout_starts, steps_of
 from s2r_runtime.trace.streams import Stream
 
 Array = NDArray[np.float64]
 Change = Callable[[Array], Array]
 
-NOTHING, WELL, BETTER = 0.5, 0.35, 0.4
-"""E from which a model foretells next to nothing, E below which it foretells well, and the ratio of both at most."""
+NOTHING, WELL, BETTER = 0.35, 0.35, 0.4
+"""E from which a model foretells little (two columns of four may be exchanged), E below which it foretells well, and the ratio of both at
+most.
+"""
 
 SURELY = 0.1
 """As WELL, for factors that an actuator's limits could have, too."""
@@ -76,6 +79,7 @@ class _Mistake:
 
 def check_plausible(model: ComposedModel, data: Dataset) -> None:
     """Raises RecordingError if the columns are clearly not what they say, with what they seem to be."""
+    check_measured(model, data)
     as_it_is = _foretold(model, data)
     if as_it_is is not None and as_it_is > NOTHING and data.segments:
         few = _few(data)
@@ -138,9 +142,8 @@ def _mistakes(model: ComposedModel) -> Iterator[_Mistake]:
     units: dict[str, str] = getattr(model.nominal, "units", {})
     for kind, names in (("states", model.states), ("inputs", model.inputs)):
         for a, b in combinations(names, 2):
-            if units.get(a) == units.get(b) or kind == "inputs":
-                order = [names.index({a: b, b: a}.get(name, name)) for name in names]
-                yield _mistake(kind, f"the columns {a} and {b} seem to be exchanged", partial(_ordered, order))
+            order = [names.index({a: b, b: a}.get(name, name)) for name in names]
+            yield _mistake(kind, f"the columns {a} and {b} seem to be exchanged", partial(_ordered, order))
         for j, name in enumerate(names):
             for unit, right, factor, well in _UNITS.get(units.get(name, ""), ()):
                 yield _mistake(kind, f"{name} seems to be in {unit}, must be in {right}", partial(_scaled, [j], factor), well)

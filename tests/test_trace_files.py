@@ -1,0 +1,139 @@
+"""Files as people have them, through `s2r trace`, on every model: what is wrong is said in a line, what is only written otherwise is read."""
+
+import json
+
+import numpy as np
+import pytest
+from trace_robots import GEOMETRY, INPUTS, commands, drive
+
+from s2r_runtime.cli.main import main
+
+DT, ROWS = 0.05, 260
+BOUNDS = {
+    "unicycle": [(-0.3, 1.0), (-1.5, 1.5)],
+    "bicycle": [(-0.4, 0.4), (0.2, 2.0)],
+    "differential_drive": [(-3.0, 8.0)] * 2,
+    "joint": [(-3.0, 3.0)],
+    "double_integrator": [(-1.0, 1.0)] * 2,
+}
+STATES = {
+    "unicycle": ("x", "y", "theta"),
+    "bicycle": ("x", "y", "theta", "speed"),
+    "differential_drive": ("x", "y", "theta", "wheel_left", "wheel_right"),
+    "joint": ("q", "qd"),
+    "double_integrator": ("x", "y", "vx", "vy"),
+}
+POSES = ("unicycle", "bicycle", "differential_drive")
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """Model -> (t, y, u) of a robot whose first input acts by three quarters."""
+    made = {}
+    for name, bounds in BOUNDS.items():
+        u = commands(np.random.default_rng(7), 1, ROWS, DT, bounds)
+        y = drive(np.random.default_rng(8), name, u, [("input_gain", INPUTS[name][0], {"gain": 0.75})], DT, 1e-3)[0]
+        made[name] = DT * np.arange(ROWS), y[:-1], u[0]
+    return made
+
+
+def _csv(name, t, y, u, header=None, comma=",", stamp="{:.6f}"):
+    rows = [comma.join(header or ("t", *STATES[name], *INPUTS[name]))]
+    rows += [comma.join([stamp.format(s), *("" if np.isnan(v) else f"{v:.6g}" for v in (*a, *b))]) for s, a, b in zip(t, y, u, strict=True)]
+    return "\n".join(rows) + "\n"
+
+
+def _trace(folder, capsys, name, text):
+    """(exit code, the JSON that was printed, what else was said)."""
+    path = folder / "run.csv"
+    path.write_text(text, encoding="utf-8")
+    parameters = [word for k, v in GEOMETRY.get(name, {}).items() for word in ("--param", f"{k}={v}")]
+    code = main(["trace", str(path), "--model", name, "--dt", str(DT), *parameters, "--json"])
+    out, err = capsys.readouterr()
+    return code, json.loads(out) if out.strip() else {}, err.strip()
+
+
+def _without(column):
+    def spoil(name, t, y, u):
+        y = y.copy()
+        y[:, column] = y[0, column]
+        return _csv(name, t, y, u)
+
+    return spoil
+
+
+def _swapped(name, t, y, u):
+    return _csv(name, t, y[:, [1, 0, *range(2, y.shape[1])]], u)
+
+
+REFUSED = {
+    "ms": (lambda name, t, y, u: _csv(name, 1e3 * t, y, u), "t seems to be in ms, must be in s"),
+    "ns since 1970": (lambda name, t, y, u: _csv(name, 1e9 * (1.76e9 + t), y, u, stamp="{:.0f}"), "t seems to be in ns, must be in s"),
+    "dates": (lambda name, t, y, u: _csv(name, t, y, u, stamp="2026-11-21T10:00:{:09.6f}"), "line 2: column 't' is '2026-11-21T10:00:0"),
+    "capitals": (lambda name, t, y, u: _csv(name, t, y, u, [s.upper() for s in ("t", *STATES[name], *INPUTS[name])]), "nearest: 'T'"),
+    "units": (
+        lambda name, t, y, u: _csv(name, t, y, u, [f"{s} [SI]" for s in ("t", *STATES[name], *INPUTS[name])]),
+        "lacks the columns 't'",
+    ),
+    "semicolons": (lambda name, t, y, u: _csv(name, t, y, u, comma=";").replace(".", ","), "are its columns separated by commas?"),
+    "tabs": (lambda name, t, y, u: _csv(name, t, y, u, comma="\t"), "are its columns separated by commas?"),
+    "nan": (lambda name, t, y, u: _csv(name, t, np.where(t[:, None] == t[9], np.inf, y), u), "line 11: column "),
+    "unsorted": (
+        lambda name, t, y, u: _csv(name, np.where(t == t[50], t[40], t), y, u),
+        "line 52: time runs backwards, from 2.45 s to 2.0 s",
+    ),
+    "first state": (_without(0), "in every row although the model moves it: it was not measured"),
+    "last state": (_without(-1), "in every row although the model moves it: it was not measured"),
+    "exchanged": (_swapped, "seem to be exchanged"),
+    "twenty rows": (lambda name, t, y, u: _csv(name, t[:20], y[:20], u[:20]), "at least 60 are needed: 41 more"),
+    "one row": (lambda name, t, y, u: _csv(name, t[:1], y[:1], u[:1]), "has no two rows on which a state was measured"),
+    "nothing was done": (lambda name, t, y, u: _csv(name, t, 0.0 * y, 0.0 * u), "every input is zero"),
+    "one row again and again": (lambda name, t, y, u: _csv(name, t, 0.0 * y + y[90], 0.0 * u + u[90] + 0.1), "asked to move"),
+}
+
+
+@pytest.mark.parametrize("name", BOUNDS)
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_wrong_is_said_in_one_line(tmp_path, capsys, recorded, case, name):
+    spoil, said = REFUSED[case]
+    code, answer, err = _trace(tmp_path, capsys, name, spoil(name, *recorded[name]))
+    assert code in {2, 3}
+    assert answer.get("verdict") is None
+    assert said in err
+    assert "\n" not in err
+    assert len(err) < 400 + len(str(tmp_path))
+
+
+@pytest.mark.parametrize("turn", [180.0, 360.0])
+@pytest.mark.parametrize("name", POSES)
+def test_degrees_are_told_wrapped_or_not(tmp_path, capsys, recorded, name, turn):
+    t, y, u = recorded[name]
+    degrees = (np.degrees(y[:, 2]) - turn) % 360.0 + turn - 360.0
+    code, _, err = _trace(tmp_path, capsys, name, _csv(name, t, np.column_stack([y[:, :2], degrees, y[:, 3:]]), u))
+    assert code == 2
+    assert "theta seems to be in degrees, must be in rad" in err
+
+
+WRITTEN = {
+    "doubled rows": lambda name, t, y, u: _csv(name, *(np.repeat(a, 2, axis=0) for a in (t, y, u))),
+    "a recorder twice as fast": lambda name, t, y, u: _csv(
+        name, 0.5 * DT * np.arange(2 * len(t)), *(np.repeat(a, 2, axis=0) for a in (y, u))
+    ),
+    "holes": lambda name, t, y, u: _csv(name, t, np.where(np.random.default_rng(1).random(y.shape) < 0.04, np.nan, y), u),
+    "since 1970": lambda name, t, y, u: _csv(name, 1.76e9 + t, y, u),
+    "from a spreadsheet": lambda name, t, y, u: "\ufeff" + _csv(name, t, y, u).replace("\n", "\r\n").replace(",", ", ", len(STATES[name])),
+}
+
+
+@pytest.mark.parametrize("case", WRITTEN)
+def test_what_is_only_written_otherwise_is_read(tmp_path, capsys, recorded, case):
+    code, answer, _ = _trace(tmp_path, capsys, "joint", WRITTEN[case]("joint", *recorded["joint"]))
+    assert code == 0
+    assert [(e["name"], e["channel"]) for e in answer["effects"]] == [("input_gain", "force")]
+    assert answer["effects"][0]["parameters"]["gain"]["value"] == pytest.approx(0.75, abs=0.02)
+
+
+def test_a_column_under_another_writing_is_not_taken_for_one_that_was_not_measured(tmp_path, capsys, recorded):
+    code, _, err = _trace(tmp_path, capsys, "joint", _csv("joint", *recorded["joint"], header=("t", "q", "QD", "force")))
+    assert code == 2
+    assert "lacks the column 'qd', and has 'QD'" in err
