@@ -256,3 +256,32 @@ def test_a_state_folder_that_others_can_reach_into_starts_no_daemon(rig: Rig) ->
     if os.getuid() == 0:
         os.chown(rig.state, 12345, -1)
         assert "belongs to user 12345" in refusal()
+
+
+def test_what_is_no_file_of_a_controller_holds_nobody_up_and_no_process_inherits_a_way_to_the_robot(rig: Rig) -> None:
+    """A named pipe that nobody writes into, a device without end, a file of 20 GB: deployed and adopted while a controller drives."""
+    rig.start_robot()
+    rig.start()
+    assert rig.deploy()["exit_code"] == 0
+    rig.until_status(gate="open", driving="controller")
+    os.mkfifo(rig.folder / "pipe.py")
+    (rig.folder / "zero.py").symlink_to("/dev/zero")
+    (rig.folder / "folder.py").mkdir()
+    with (rig.folder / "large.py").open("wb") as large:
+        large.truncate(20 << 30)
+    for name, words in {"pipe": "is no file", "zero": "is no file", "folder": "is no file", "large": "has more than", "none": "no"}.items():
+        before = rig.status()["observation"]["seq"]
+        answer = rig.ask("deploy", path=str(rig.folder / f"{name}.py"))
+        assert answer["exit_code"] != 0, name
+        assert words in answer["text"], (name, answer)
+        assert rig.ask("excite", path=str(rig.folder / f"{name}.py"))["exit_code"] != 0, name
+        rig.until(lambda before=before: rig.status()["observation"]["seq"] > before + 5)
+        status = rig.status()
+        assert (status["gate"], status["driving"]) == ("open", "controller"), name
+    pids = rig.status()["pids"]
+    held = {who: {str(one.readlink()) for one in Path(f"/proc/{pids[who]}/fd").iterdir()} for who in pids}
+    journal = {"/dev/null", str(rig.folder / "daemon.txt")}
+    assert held["controller"] & held["analytics"] <= journal
+    for who in ("controller", "analytics"):  # a pipe's two ends have one name; the daemon has the other one of each child's own
+        assert {one for one in held[who] & held["daemon"] if not one.startswith("pipe:")} <= journal, who
+    assert moved_by(rig) <= {"recovery", "controller"}

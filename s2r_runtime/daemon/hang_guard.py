@@ -29,7 +29,7 @@ LOOK_S = 0.25
 CALL_S = 2.0
 """For what must return at once: far beyond what a busy machine takes for it, and the longest that the gate can be held up."""
 OPEN_S = 10.0
-"""For opening and closing, where libraries start and end their threads."""
+"""For making, opening and closing: libraries are imported, start and end their threads, read files, on a busy machine."""
 GRACE_S = 2.0
 STUCK_S = 15.0
 """Above OPEN_S + GRACE_S."""

@@ -261,7 +261,7 @@ def link_of(profile: Profile, facts: ModelFacts, record: Callable[[Frame], None]
     make = registry().get("transports", name)
     named = f"transport {name!r} of {registry().offered('transports', name).distribution}"
     try:
-        transport = guard.call(f"{named}: construction", CALL_S, make, options, facts.states, facts.inputs)
+        transport = guard.call(f"{named}: construction", OPEN_S, make, options, facts.states, facts.inputs)  # it may read files of its own
     except S2RError:
         raise
     except BaseException as error:  # noqa: BLE001 - a plug-in's defect, said as one
