@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recordings
 
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.dataset import Stream, from_streams
 from s2r_runtime.trace.faults import check
 
@@ -60,6 +62,23 @@ def test_a_frozen_heading_is_reported_and_taken_out():
     assert fault.from_s == pytest.approx(300 * DT, abs=DT)
     assert fault.to_s == pytest.approx(359 * DT, abs=DT)
     assert np.isnan(checked.data.runs[0].y[305:355]).all()
+
+
+@pytest.mark.parametrize("noisy", [True, False])
+def test_a_sensor_that_jitters_at_rest_does_not_repeat_itself_a_dozen_times(noisy):
+    """The robot stands for a second now and then. What repeats there without noise says nothing; with noise, it does."""
+    rng = np.random.default_rng(6)
+    u = commands(rng, 1, STEPS, DT, [(0.1, 0.2), (-1.0, 1.0)], rest=0.4)
+    u[0, 300:340] = 0.0
+    y = drive(rng, "unicycle", u, ROBOTARIUM, DT, NOISE if noisy else 0.0 * NOISE)[0]
+    y[315:330] = y[315]
+    t = DT * np.arange(STEPS + 1)
+    found = check(declared(), from_streams(declared(), [(Stream(t, y), Stream(t[:-1], u[0]))], "here")).faults
+    if not noisy:
+        assert found == ()
+        return
+    assert {(f.kind, f.channel) for f in found} == {("frozen", s) for s in ("x", "y", "theta")}
+    assert all(abs(f.from_s / DT - 315) <= 1 and abs(f.to_s / DT - 329) <= 1 for f in found)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -136,3 +155,18 @@ def test_a_silence_is_told_from_a_clock_that_jumped(kind):
     (fault,) = check(declared(), data).faults
     assert (fault.kind, fault.channel) == (kind, "*")
     assert fault.from_s == pytest.approx(399 * DT, abs=1e-6)
+
+
+def test_a_clock_that_jumped_while_the_robot_turned_is_told_by_where_the_model_leads():
+    """Its speed along x and y is another one after every step; so is the next step's, and the robot is where that leads."""
+    rng = np.random.default_rng(9)
+    t = 0.1 * np.arange(400)
+    u = np.column_stack([0.3 + 0.1 * np.sin(0.5 * t), 2.5 * np.sin(1.1 * t)])[None]
+    model = compose(ModelSpec("unicycle", 0.1, {}, (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),)))
+    y = drive(rng, "unicycle", u, (), 0.1, NOISE)[0][:-1]
+    late = t + np.where(np.arange(400) < 205, 0.0, 2.0)
+    found = check(model, from_streams(model, [(Stream(late, y), Stream(late, u[0]))], "here")).faults
+    assert [(f.kind, f.channel, round(f.from_s, 3)) for f in found] == [("clock_step", "*", 20.4)]
+    gone = np.delete(np.arange(400), np.arange(205, 225))
+    found = check(model, from_streams(model, [(Stream(t[gone], y[gone]), Stream(t[gone], u[0, gone]))], "here")).faults
+    assert [(f.kind, f.channel) for f in found] == [("dropout", "*")]

@@ -1,4 +1,4 @@
-"""Files as people have them, through `s2r trace`, on every model: what is wrong is said in a line, what is only written otherwise is read."""
+"""Files as people have them, through `s2r trace`, on every model: what is wrong is said in a line, what is written otherwise is read."""
 
 import json
 
