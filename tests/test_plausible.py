@@ -69,9 +69,33 @@ def test_motion_that_comes_before_its_cause_is_of_another_clock(name):
         check_plausible(_model(name), _data(_model(name), *_driven(name), early=0.25))
 
 
-def test_clocks_that_drift_apart_are_told():
+def test_a_fast_recording_shows_it_too():
+    """In one step of 5 ms nothing moves beyond noise."""
+    dt, steps = 0.005, 2700
+    rng, model = np.random.default_rng(4), compose(ModelSpec("unicycle", 0.005, {}, _model("unicycle").spec.effects))
+    u = commands(rng, 1, steps, dt, BOUNDS["unicycle"])
+    y = drive(rng, "unicycle", u, (), dt, 2e-3)[0]
+    t = dt * np.arange(steps)
+    with pytest.raises(RecordingError, match=r"the motion comes about 0.3 s before"):
+        check_plausible(model, from_streams(model, [(Stream(t, y[:-1]), Stream(t + 0.3, u[0]))], "here.csv"))
+    check_plausible(model, from_streams(model, [(Stream(t, y[:-1]), Stream(t, u[0]))], "here.csv"))
+
+
+@pytest.mark.parametrize("rate", [1.03, 0.97])
+def test_clocks_that_drift_apart_are_told(rate):
+    early = 0.0 if rate > 1.0 else 1.0
     with pytest.raises(RecordingError, match="their clocks run at different rates"):
-        check_plausible(_model("unicycle"), _data(_model("unicycle"), *_driven("unicycle"), rate=1.03))
+        check_plausible(_model("unicycle"), _data(_model("unicycle"), *_driven("unicycle"), early=early, rate=rate))
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.37, 0.6, 1.31])
+def test_commands_that_repeat_themselves_come_before_and_after_what_they_cause(delay):
+    """A delay of 0.6 s of what has a period of 2 s looks like a lead of 1.4 s."""
+    t = DT * np.arange(STEPS)
+    u = np.column_stack([0.4 + 0.3 * np.sin(np.pi * t), 1.2 * np.sin(np.pi * t + 1.0)])
+    effects = [("input_delay", "*", {"delay": delay})] if delay else []
+    y = drive(np.random.default_rng(3), "unicycle", u[None], effects, DT, 1e-4)[0]
+    check_plausible(_model("unicycle"), _data(_model("unicycle"), y[:-1], u))
 
 
 @pytest.mark.parametrize("name", BOUNDS)

@@ -67,6 +67,11 @@ class Bar:
         return math.log(max(tried, 1) / self.alpha) + self.price(k, n)
 
 
+CONTENDS, SETTLES = 15.0, 6
+"""Nats behind the best within which candidates are fitted on, and for how many rounds at most: where a number and the noise hang together
+(a gain and how fast a pose drifts), two rounds leave more than that open.
+"""
+
 STRICT = Bar(1e-3)
 LENIENT = Bar(0.3, 1.5)
 """For where structure is shown already."""
@@ -85,6 +90,12 @@ def best_candidates(given: Problem, base: Fit, few: int = FEW, bar: Bar = STRICT
         key = (s.candidate.name, s.candidate.channel)
         if key not in scored or value > scored[key].score:
             scored[key] = Scored(*key, value, fit)
+    best = max((s.score for s in scored.values()), default=0.0)
+    close = [one for one in scored.values() if one.score > best - CONTENDS] if best > 0.0 else []
+    for one in close if len(close) > 1 else ():
+        if one.fit is not None:
+            fit = fitted(given, one.fit, one.fit.model, SETTLES)
+            scored[one.name, one.channel] = replace(one, score=gain(fit, base) - bar.price(fit.k - base.k, len(given.steps)), fit=fit)
     for s in screened:
         scored.setdefault((s.candidate.name, s.candidate.channel), Scored(s.candidate.name, s.candidate.channel, min(s.value, 0.0)))
     return sorted(scored.values(), key=lambda s: (s.fit is None, -s.score)), tried
