@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import time
@@ -12,6 +13,7 @@ import pytest
 from daemon_rig import Rig
 
 from s2r_runtime import messages as m
+from s2r_runtime.daemon.believed_time import BELIEVED_AFTER_S, SLACK_S, BelievedTime
 from s2r_runtime.daemon.retention import Retention
 from s2r_runtime.recording.channels import LogDeleted
 from s2r_runtime.recording.reading import read
@@ -29,22 +31,32 @@ class Robot:
         self.state.mkdir(mode=0o700, exist_ok=True)
         self.said: list[str] = []
         self.keep = keep_bytes, keep_days
+        self.wall_s, self.counted_s, self.boot = NOW_S - 20 * 86_400.0, 1000.0, "a"
         self.retention = self.again()
         self.runs = 0
 
     def again(self) -> Retention:
         """The daemon, started anew."""
-        self.retention = Retention(self.logs, self.state, "r", *self.keep, self.said.append)
+        clocks = {"wall": lambda: self.wall_s, "counted": lambda: self.counted_s, "boot": lambda: self.boot}
+        believed = functools.partial(BelievedTime, **clocks)
+        self.retention = Retention(self.logs, self.state, "r", *self.keep, self.said.append, believed)
         return self.retention
 
-    def run(self, *messages: m.Struct, parts: int = 1, known: bool = True) -> str:
-        """A run that logs these."""
+    def wait(self, until_s: float) -> None:
+        """Until then, by both clocks."""
+        self.counted_s += until_s - self.wall_s
+        self.wall_s = until_s
+
+    def run(self, *messages: m.Struct, parts: int = 1, known: bool = True, now: bool = False) -> str:
+        """A run that logs these: a day after the one before, or now, whatever the clock says."""
         self.runs += 1
+        if not now:
+            self.wait(NOW_S - (20 - self.runs) * 86_400.0)
         name = f"r-2026010{self.runs}T000000Z"
         for part in range(1, parts + 1):
             path = self.logs / (f"{name}.mcap" if part == 1 else f"{name}.{part:03d}.mcap")
             path.write_bytes(bytes(1000))
-            os.utime(path, (NOW_S - (20 - self.runs) * 86_400,) * 2)
+            os.utime(path, (self.wall_s,) * 2)
         if known:
             self.retention.begin(name)
         for message in messages:
@@ -53,8 +65,13 @@ class Robot:
         return name
 
     def left(self, memory: m.Memory, unix_s: int = NOW_S) -> list[str]:
-        """Runs whose logs are there after a look."""
-        self.retention.prune(memory, unix_s)
+        """Runs whose logs are there after a look at that time, which came as time comes."""
+        self.wait(unix_s)
+        return self.look(memory)
+
+    def look(self, memory: m.Memory) -> list[str]:
+        """Runs whose logs are there after a look now."""
+        self.retention.prune(lambda: memory)
         return sorted({path.name.split(".")[0] for path in self.logs.iterdir()})
 
 
@@ -171,12 +188,119 @@ def test_deleting_goes_on_beside_the_daemon(tmp_path: Path) -> None:
     robot = Robot(tmp_path, keep_bytes=1)
     robot.run()
     current = robot.run()
-    robot.retention.prune_beside(memory(), NOW_S)
+    robot.retention.prune_beside(memory)
     deadline = time.monotonic() + 30.0
     while not (gone := robot.retention.deleted()) and time.monotonic() < deadline:
         time.sleep(0.01)
     assert len(gone) == 1
     assert robot.left(memory()) == [current]
+
+
+# ---------------------------------------------------------------- wall clocks
+
+YEAR_S = 365 * 86_400
+
+
+def test_a_clock_set_forward_deletes_nothing_that_is_young_and_expires_no_certificate(tmp_path: Path) -> None:
+    robot = Robot(tmp_path, keep_days=30.0)
+    held = robot.run(campaign(1), m.CertificateStored(0, facts(1, 1)))
+    made = [held, *(robot.run() for _ in range(3))]
+    assert robot.left(memory()) == made
+    robot.wall_s += YEAR_S
+    assert robot.look(memory()) == made, "while it runs"
+    robot.again().begin(made[-1])
+    assert robot.look(memory()) == made, "after another start of the daemon"
+    robot.boot, robot.counted_s = "b", 10.0
+    robot.keep = 1, 30.0
+    robot.again().begin(made[-1])
+    assert robot.look(memory()) == [held, made[-1]], (
+        "after another start of the computer: what must go for its bytes goes, evidence does not"
+    )
+    robot.wall_s -= YEAR_S
+    robot.keep = 0, 30.0
+    robot.again().begin(made[-1])
+    assert robot.look(memory()) == [held, made[-1]]
+
+
+def test_logs_from_before_any_time_was_noted_are_as_young_as_their_files(tmp_path: Path) -> None:
+    robot = Robot(tmp_path, keep_days=30.0)
+    made = [robot.run() for _ in range(3)]
+    assert not (robot.state / "log_time.json").exists()
+    robot.wall_s += YEAR_S
+    robot.again().begin(made[-1])
+    assert robot.look(memory()) == made
+
+
+def test_a_clock_that_stays_ahead_is_believed_after_a_week_or_two(tmp_path: Path) -> None:
+    """A robot that was a month in a cupboard."""
+    robot = Robot(tmp_path, keep_days=30.0)
+    made = [robot.run() for _ in range(3)]
+    assert robot.left(memory()) == made
+    robot.wall_s, robot.boot, robot.counted_s = robot.wall_s + YEAR_S, "b", 10.0
+    assert robot.look(memory()) == made
+    for _ in range(int(BELIEVED_AFTER_S // 86_400) - 1):
+        assert robot.left(memory(), robot.wall_s + 86_400) == made
+    for _ in range(int(BELIEVED_AFTER_S // 86_400) + 1):
+        left = robot.left(memory(), robot.wall_s + 86_400)
+    assert left == made[-1:]
+
+
+def test_a_log_that_was_written_while_the_clock_stood_in_1970_is_no_old_one(tmp_path: Path) -> None:
+    robot = Robot(tmp_path, keep_days=30.0)
+    made = [robot.run() for _ in range(2)]
+    assert robot.left(memory()) == made
+    robot.wall_s, robot.counted_s = 1000.0, robot.counted_s + 600.0
+    robot.again()
+    made.append(robot.run(now=True))
+    robot.wall_s, robot.counted_s = NOW_S + 1200.0, robot.counted_s + 600.0
+    made.append(robot.run(now=True))
+    assert robot.look(memory()) == made
+
+
+def test_believed_time_follows_an_honest_clock_to_the_second_and_a_wrong_one_by_the_hour(tmp_path: Path) -> None:
+    clock = {"wall": float(NOW_S), "counted": 0.0}
+    file = tmp_path / "log_time.json"
+
+    def time_now() -> BelievedTime:
+        return BelievedTime(file, None, wall=lambda: clock["wall"], counted=lambda: clock["counted"], boot=lambda: "a")
+
+    one = time_now()
+    for _ in range(100):
+        clock["wall"] += 60.0 + 0.003
+        clock["counted"] += 60.0
+        assert one.now() == clock["wall"]
+    one.save()
+    clock["wall"] += YEAR_S
+    assert abs(time_now().now() - (clock["wall"] - YEAR_S + SLACK_S)) < 1.0
+    clock["wall"] -= 2 * YEAR_S
+    assert one.now() == clock["wall"], "what is behind keeps logs"
+    file.write_bytes(b"{")
+    clock["wall"] += YEAR_S
+    assert time_now().now() == clock["wall"]
+    assert BelievedTime(file, 5.0, wall=lambda: 1e9, counted=lambda: 0.0, boot=lambda: "a").now() == 5.0 + SLACK_S
+
+
+def test_what_comes_to_rest_on_a_log_while_others_are_deleted_keeps_it(tmp_path: Path) -> None:
+    """The look began before; a campaign's epoch is in force again when it comes to that log."""
+    robot = Robot(tmp_path, keep_bytes=1)
+    made = [robot.run(campaign(epoch)) for epoch in (1, 2)]
+    current = robot.run()
+    asked: list[int] = []
+
+    def meanwhile() -> m.Memory:
+        asked.append(1)
+        return memory(campaign_epoch=2 if len(asked) > 1 else 0)
+
+    robot.retention.prune(meanwhile)
+    assert sorted(path.stem for path in robot.logs.iterdir()) == [made[1], current]
+
+
+def test_what_a_kill_left_of_a_deletion_is_deleted_at_the_next_look(tmp_path: Path) -> None:
+    robot = Robot(tmp_path, keep_bytes=10**9)
+    current = robot.run()
+    (robot.logs / "r-20260101T000000Z.mcap.deleted").write_bytes(b"x")
+    (robot.logs / "other-20260101T000000Z.mcap.deleted").write_bytes(b"x")
+    assert robot.left(memory()) == ["other-20260101T000000Z", current]
 
 
 @pytest.mark.parametrize("field", ["keep_bytes", "keep_days"])

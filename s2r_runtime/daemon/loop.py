@@ -414,7 +414,7 @@ class Daemon:
         self._log_deleted()
         if now_ns >= self._next_prune_ns:
             self._next_prune_ns = now_ns + PRUNE_NS
-            self.retention.prune_beside(lambda: self.state.memory, time.time())
+            self.retention.prune_beside(lambda: self.state.memory)
 
     def _log_deleted(self) -> None:
         """What was deleted stands in the log."""

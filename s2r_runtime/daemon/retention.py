@@ -6,11 +6,13 @@ expired nor revoked. So does what the gap in force rests on, a campaign that goe
 which nobody knows what it holds.
 
 What a log holds is noted in the state folder (`log_evidence.json`) before anything may rest on it. Logs are deleted by whole runs, the
-oldest first, never the run that goes on; every deletion is said, and logged.
+oldest first, never the run that goes on; every deletion is said, and logged. How old a log is, and whether a certificate has expired,
+is not left to the wall clock alone (`believed_time`).
 """
 
 from __future__ import annotations
 
+import contextlib
 import re
 import threading
 from collections.abc import Callable, Iterable
@@ -19,6 +21,7 @@ from typing import Any
 
 import msgspec
 
+from s2r_runtime.daemon.believed_time import BelievedTime
 from s2r_runtime.daemon.persistence import read, replace
 from s2r_runtime.errors import S2RError
 from s2r_runtime.messages import (
@@ -41,6 +44,8 @@ DAY_S = 86_400
 CLOCK_S = 3600
 """A certificate counts as valid for so long after its end: wall clocks may be wrong, and a log that is gone is gone."""
 NOTED = frozenset((StartCampaign, SampleTaken, EpochChanged, AttemptSpent, IssueCertificate, CertificateStored, ModelAdopted, JobFinished))
+GOING = ".deleted"
+"""Ends the name of a file that is being deleted: renaming takes no time, deleting a large file may."""
 _PART = re.compile(r"\.\d{3,}$")
 
 
@@ -50,6 +55,8 @@ class Held(msgspec.Struct):
     tags: set[str] = set()
     certificates: list[CertificateFacts] = []
     head: str = ""
+    seen_s: float = 0.0
+    """Unix time that was believed when the run was seen to go on; a file's own time is as right as the clock was."""
 
 
 class Retention:
@@ -58,7 +65,16 @@ class Retention:
     `note`, `begin` and `save` belong to the daemon's loop, `prune` to a thread of its own.
     """
 
-    def __init__(self, folder: Path, state: Path, robot: str, keep_bytes: int, keep_days: float, say: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        state: Path,
+        robot: str,
+        keep_bytes: int,
+        keep_days: float,
+        say: Callable[[str], None],
+        believed: Callable[[Path, float | None], BelievedTime] = BelievedTime,
+    ) -> None:
         self._folder, self._file, self._robot, self._say = folder, state / "log_evidence.json", robot, say
         self._keep_bytes, self._keep_days = keep_bytes, keep_days
         self._lock = threading.Lock()
@@ -66,6 +82,8 @@ class Retention:
         self._dirty = False
         self._runs: dict[str, Held] = self._load()
         self._deleted: list[LogDeleted] = []
+        newest_s = max((when for files in self._on_disk().values() for _, _, when in files), default=None)
+        self._time = believed(state / "log_time.json", newest_s)
         self._thread: threading.Thread | None = None
 
     def _load(self) -> dict[str, Held]:
@@ -83,7 +101,8 @@ class Retention:
         """A run's log begins."""
         with self._lock:
             self._run = run
-            self._runs.setdefault(run, Held())
+            self._time.now()
+            self._runs.setdefault(run, Held()).seen_s = self._time.believed_s
             self._dirty = True
 
     def note(self, message: Struct) -> None:
@@ -119,10 +138,10 @@ class Retention:
 
     # ---- what is deleted
 
-    def prune_beside(self, memory: Memory, unix_s: int) -> None:
+    def prune_beside(self, memory: Callable[[], Memory]) -> None:
         """Begins to delete what may be, in a thread: a file system may take its time for a large file."""
         if (self._keep_bytes or self._keep_days) and (self._thread is None or not self._thread.is_alive()):
-            self._thread = threading.Thread(target=self.prune, args=(memory, unix_s), name="log-retention", daemon=True)
+            self._thread = threading.Thread(target=self.prune, args=(memory,), name="log-retention", daemon=True)
             self._thread.start()
 
     def deleted(self) -> list[LogDeleted]:
@@ -131,19 +150,26 @@ class Retention:
             found, self._deleted = self._deleted, []
         return found
 
-    def prune(self, memory: Memory, unix_s: int) -> None:
-        """Deletes the oldest logs that may be deleted until the others are few and young enough."""
+    def prune(self, memory: Callable[[], Memory]) -> None:
+        """Deletes the oldest logs that may be deleted until the others are few and young enough. memory: as it is when it is asked."""
+        for left in self._folder.glob(f"{self._robot}-*{GOING}"):  # of a daemon that was killed while it deleted
+            with contextlib.suppress(OSError):
+                left.unlink()
+        with self._lock:
+            unix_s = self._time.now()
+            if (current := self._runs.get(self._run)) is not None:
+                current.seen_s = self._time.believed_s
+            seen = {run: held.seen_s for run, held in self._runs.items()}
+        self._time.save()
         runs = self._on_disk()
         total = sum(size for files in runs.values() for _, size, _ in files)
-        with self._lock:
-            needed = _needed(memory, unix_s, self._runs.values())
-            free = [run for run, held in self._runs.items() if run != self._run and not held.tags & needed]
-        for run in sorted(runs, key=lambda run: min(when for _, _, when in runs[run])):
-            old = self._keep_days > 0 and max(when for _, _, when in runs[run]) < unix_s - self._keep_days * DAY_S
+        for run in sorted(runs, key=lambda run: max(seen.get(run, 0.0), min(when for _, _, when in runs[run]))):
+            last_s = max(seen.get(run, 0.0), *(when for _, _, when in runs[run]))
+            old = self._keep_days > 0 and last_s < unix_s - self._keep_days * DAY_S
             many = self._keep_bytes > 0 and total > self._keep_bytes
-            if run in free and (old or many):
+            if old or many:
                 reason = f"older than {self._keep_days:g} days" if old else f"all logs together had {total} bytes"
-                total -= self._delete(run, runs[run], reason)
+                total -= self._delete(run, runs[run], reason, memory, unix_s)
 
     def _on_disk(self) -> dict[str, list[tuple[Path, int, float]]]:
         """Run -> (file, bytes, time of its last change)."""
@@ -156,22 +182,31 @@ class Retention:
             found.setdefault(_PART.sub("", path.stem), []).append((path, about.st_size, about.st_mtime))
         return found
 
-    def _delete(self, run: str, files: list[tuple[Path, int, float]], reason: str) -> int:
-        """The last part first, so that what an interruption leaves can be audited. How many bytes that gave."""
-        gone = 0
-        for path, size, _ in reversed(files):
-            try:
+    def _delete(self, run: str, files: list[tuple[Path, int, float]], reason: str, memory: Callable[[], Memory], unix_s: float) -> int:
+        """If nothing rests on it. How many bytes that gave."""
+        gone = []
+        with self._lock:  # whatever is noted from here on finds the log gone, or is noted before
+            held = self._runs.get(run)
+            if held is None or run == self._run or held.tags & _needed(memory(), unix_s, self._runs.values()):
+                return 0
+            for path, size, _ in reversed(files):  # the last part first, so that what an interruption leaves can be audited
+                try:
+                    gone.append((path.rename(path.with_name(path.name + GOING)), size))
+                except OSError as error:
+                    self._say(f"{path}: cannot be deleted: {error.strerror}")
+                    break
+            else:
+                del self._runs[run]
+                total = sum(size for _, size in gone)
+                self._deleted.append(LogDeleted(0, run, len(files), total, held.head, reason))
+                self._dirty = True
+                self._say(
+                    f"log of run {run} deleted ({total} bytes, head {held.head or 'not known'}): {reason}; no valid certificate rests on it"
+                )
+        for path, _ in gone:
+            with contextlib.suppress(OSError):  # it is tried again at the next look
                 path.unlink()
-            except OSError as error:
-                self._say(f"{path}: cannot be deleted: {error.strerror}")
-                return gone
-            gone += size
-        with self._lock:
-            held = self._runs.pop(run)
-            self._deleted.append(LogDeleted(0, run, len(files), gone, held.head, reason))
-            self._dirty = True
-        self._say(f"log of run {run} deleted ({gone} bytes, head {held.head or 'not known'}): {reason}; no valid certificate rests on it")
-        return gone
+        return sum(size for _, size in gone)
 
 
 def _tags(message: Struct) -> set[str]:
@@ -205,7 +240,7 @@ def _runs_before(message: Struct) -> list[str]:
     return [] if recording is None else [part["run"] for part in recording["parts"]]
 
 
-def _needed(memory: Memory, unix_s: int, logs: Iterable[Held]) -> set[str]:
+def _needed(memory: Memory, unix_s: float, logs: Iterable[Held]) -> set[str]:
     """What something that is valid, or may become it, rests on."""
     needed = {f"epoch:{memory.campaign_epoch}", f"model:{memory.model_digest}"}
     if memory.gap is not None:
