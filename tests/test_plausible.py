@@ -76,7 +76,7 @@ def test_a_fast_recording_shows_it_too():
     u = commands(rng, 1, steps, dt, BOUNDS["unicycle"])
     y = drive(rng, "unicycle", u, (), dt, 2e-3)[0]
     t = dt * np.arange(steps)
-    with pytest.raises(RecordingError, match=r"the motion comes about 0.3 s before"):
+    with pytest.raises(RecordingError, match=r"the motion comes about 0.(3|29|31)\d* s before"):
         check_plausible(model, from_streams(model, [(Stream(t, y[:-1]), Stream(t + 0.3, u[0]))], "here.csv"))
     check_plausible(model, from_streams(model, [(Stream(t, y[:-1]), Stream(t, u[0]))], "here.csv"))
 

@@ -227,6 +227,7 @@ def _check_clocks(model: ComposedModel, data: Dataset) -> None:
             f"{by_part[-1] * data.dt:.2g} s in the end: their clocks run at different rates, their stamps must be of one clock"
         )
     if best > 0 and single < AHEAD * causal:
+        best = min(range(round(0.7 * best), round(1.4 * best) + 1, max(1, best // 20)), key=lambda lead: sum(costs(lead)))
         raise RecordingError(
             f"{data.source}: the motion comes about {best * data.dt:.2g} s before the inputs that cause it: their stamps must be of "
             "one clock, and an input must stand at the time from which it acts"
