@@ -25,18 +25,21 @@ from s2r_runtime.messages import (
 
 
 def two_that_wait() -> tuple[Rig, IssueCertificate]:
-    """One controller's certificate is being signed; meanwhile a person changed his mind, and another controller is verified."""
+    """A controller's certificate is being signed; meanwhile a person changed his mind, and another one, which has its own, starts."""
     rig = Rig()
     rig.gap()
+    rig.request("verify", digest="second")
+    rig.verified()
+    rig.stored()
     rig.request("deploy", digest="first")
     order = one(rig.verified(), IssueCertificate)
     rig.request("undeploy")
+    assert one(rig.request("deploy", digest="second"), StartController).digest == "second"
     return rig, order
 
 
 def test_a_certificate_that_comes_too_late_starts_nobody_elses_deployment() -> None:
     rig, order = two_that_wait()
-    rig.request("deploy", digest="second")
     waiting = rig.state.deployment
     outputs = rig.stored()
     assert of(outputs, StartController) == []
@@ -47,15 +50,19 @@ def test_a_certificate_that_comes_too_late_starts_nobody_elses_deployment() -> N
 
 def test_a_certificate_that_could_not_be_made_ends_nobody_elses_deployment() -> None:
     rig, order = two_that_wait()
-    rig.request("deploy", digest="second")
     waiting = rig.state.deployment
+    assert waiting is not None
     rig.feed(CertificateFailed(rig.t, "the disk is full", order.request_id))
     assert rig.state.deployment == waiting
     assert rig.state.issuing is None
 
 
 def test_a_certificate_for_a_deployment_that_was_taken_back_starts_nothing() -> None:
-    rig, _ = two_that_wait()
+    rig = Rig()
+    rig.gap()
+    rig.request("deploy", digest="first")
+    rig.verified()
+    rig.request("undeploy")
     outputs = rig.stored()
     assert of(outputs, StartController) == []
     assert rig.state.deployment is None
@@ -64,10 +71,14 @@ def test_a_certificate_for_a_deployment_that_was_taken_back_starts_nothing() -> 
 def test_a_verification_that_ends_after_another_began_ends_no_deployment() -> None:
     rig = Rig()
     rig.gap()
+    rig.request("verify", digest="second")
+    rig.verified()
+    rig.stored()
     first = one(rig.request("deploy", digest="first"), StartJob)
     rig.request("undeploy")
     rig.request("deploy", digest="second")
     waiting = rig.state.deployment
+    assert waiting is not None
     rig.feed(JobFinished(rig.t, first.job_id, "verify", error="it failed"))
     assert rig.state.deployment == waiting
 

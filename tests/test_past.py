@@ -218,7 +218,7 @@ def test_an_old_copy_of_the_state_gives_back_no_attempt_no_revocation_and_no_sto
     assert rig.s2r("audit", *map(str, rig.log_files()), "--key", str(rig.state / "key.pub")).returncode == 0
 
 
-@pytest.mark.parametrize("gone", [False, True], ids=["older", "deleted"])
+@pytest.mark.parametrize("gone", [pytest.param(False, id="older"), pytest.param(True, id="deleted", marks=pytest.mark.long)])
 def test_samples_that_were_seen_are_not_drawn_once_more_by_putting_an_old_campaign_back(rig: Rig, gone: bool) -> None:
     rig.start_robot()
     rig.start()
