@@ -158,10 +158,10 @@ def test_a_silence_is_told_from_a_clock_that_jumped(kind):
 
 
 def test_a_clock_that_jumped_while_the_robot_turned_is_told_by_where_the_model_leads():
-    """Its speed along x and y is another one after every step; so is the next step's, and the robot is where that leads."""
+    """It is told to turn the other way then, so that what it did before and after are two things; but it is where one step leads."""
     rng = np.random.default_rng(9)
     t = 0.1 * np.arange(400)
-    u = np.column_stack([0.3 + 0.1 * np.sin(0.5 * t), 2.5 * np.sin(1.1 * t)])[None]
+    u = np.where(t[:, None] < 20.5, [0.3, 1.0], [-0.1, -1.0])[None]
     model = compose(ModelSpec("unicycle", 0.1, {}, (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),)))
     y = drive(rng, "unicycle", u, (), 0.1, NOISE)[0][:-1]
     late = t + np.where(np.arange(400) < 205, 0.0, 2.0)

@@ -107,8 +107,8 @@ def _of_pause(model: ComposedModel, data: Dataset, act: Acting, pause: Pause, re
         apart, noise = np.abs(pace) * (steps - usual), 4.0 * reach.noise
         stood = np.abs(went - pace * usual) <= np.maximum(0.3 * apart, noise)
         steady = np.abs(np.nanmean(before, axis=0) - np.nanmean(after, axis=0)) < 0.5 * np.abs(pace)
-        known = (steady | _one_step_on(model, data, act, pause, first, reach)) & stood & (apart > 2.0 * noise)
-        if np.any(known) and np.all(stood | reach.instant):
+        by_pace = np.any(stood & steady & (apart > 2.0 * noise)) and np.all(stood | reach.instant)
+        if by_pace or _one_step_on(model, data, act, pause, first, reach):
             return Fault(pause.from_s, pause.to_s, "*", "clock_step")
     return Fault(pause.from_s, pause.to_s, "*", "dropout") if pause.to_s - pause.from_s > LONG * pause.usual_s else None
 
