@@ -104,7 +104,8 @@ def traced(holds: Holds, model: ComposedModel, rows: int) -> dict[str, Any]:
     except S2RError as error:
         return {"verdict": "none", "text": str(error), "effects": []}
     kept = found.effects or found.partial
-    return {"verdict": found.verdict, "text": found.text(), "effects": [_spec(e) for e in kept if _lasting(model, e)]}
+    lasting = [e for e in kept if _lasting(model, e)]
+    return {"verdict": found.verdict, "text": found.text(), "told": found.to_json(), "effects": [_spec(e) for e in lasting]}
 
 
 def _lasting(model: ComposedModel, found: Found) -> bool:
@@ -115,6 +116,11 @@ def _lasting(model: ComposedModel, found: Found) -> bool:
 
 def _spec(found: Found) -> EffectSpec:
     return EffectSpec(found.name, found.channel, found.values)
+
+
+def _said(effect: EffectSpec) -> str:
+    numbers = (f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}" for name, value in effect.parameters.items())
+    return f"{effect.name} on {effect.channel} ({', '.join(numbers)})"
 
 
 # ---------------------------------------------------------------- uncertain models
@@ -245,7 +251,8 @@ def experiment(robot: Walker, seed: int, size: Size, told: Callable[[str], None]
         "traced": {
             "verdict": lacking["verdict"],
             "text": lacking["text"],
-            "effects": [f"{e.name} on {e.channel} {e.parameters}" for e in effects],
+            "told": lacking.get("told"),
+            "effects": [_said(e) for e in effects],
         },
         "more": {r.words: of_more(r, fresh, MORE) for r in (Reading(0.1), Reading(1.0))},
         "models": [],

@@ -15,6 +15,7 @@ from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Profile
 from s2r_runtime.report import plots
 from s2r_runtime.report.page import Page
+from s2r_runtime.report.trace_section import add_trace
 from s2r_runtime.tasks.grid_layout import Grid
 from s2r_runtime.tasks.grid_world import GridWorld
 
@@ -30,6 +31,7 @@ def page(found: dict[str, Any], lines: list[str]) -> str:
         "The quadruped experiment, again",
         "P. Akella, W. Ubellacker, A. D. Ames: Safety-Critical Controller Verification via Sim2Real Gap Quantification",
     )
+    _outcome(result, found)
     _gaps(result, found)
     _traced(result, found)
     shown: set[int] = set()
@@ -38,6 +40,27 @@ def page(found: dict[str, Any], lines: list[str]) -> str:
     result.heading("In lines")
     result.items(lines)
     return result.html()
+
+
+def _outcome(result: Page, found: dict[str, Any]) -> None:
+    """What a reader wants to know first: was what was verified safe on the robot, and what does that say."""
+    judged = [one for one in found["models"] if "final" in one]
+    drives = {id(one["true_runs"]["rollouts"]): one["true_runs"] for one in judged}  # models with one winner and one step share their runs
+    runs, crashed = sum(r["n"] for r in drives.values()), sum(r["crashes"] for r in drives.values())
+    text = (
+        f"Of {len(found['models'])} pairs of an uncertain model and a disturbance law, {len(judged)} have a controller that passes. These "
+        f"controllers walked {runs} scenarios on the robot: {crashed} crashed, {sum(r['falls'] for r in drives.values())} fell."
+    )
+    result.text(text, "good" if judged and not crashed else "bad")
+    left = [one for one in judged if one["true_runs"]["steps"]["inside"] < 0.97]
+    if crashed or left:
+        names = "; ".join(f"{one['name']}, {one['law']}: {1.0 - one['true_runs']['steps']['inside']:.1%}" for one in left) or "none"
+        result.text(
+            "The gap bounds one step of the campaign's law, and verification bounds rollouts of the uncertain model; the two are no "
+            "statement about the robot under a controller (guarantee, what is not shown), whose inputs follow another law. Where more than "
+            f"3 % of the steps driven left their reachable set: {names}.",
+            "warn",
+        )
 
 
 def _gaps(result: Page, found: dict[str, Any]) -> None:
@@ -57,18 +80,7 @@ def _gaps(result: Page, found: dict[str, Any]) -> None:
         result.figure(
             plots.histogram(g["discrepancies"], "discrepancy", marks, "histogram of the gap"), f"Sampled discrepancies: {g['reading']}."
         )
-    parts = literal["drawn"]
-    result.panels(
-        [
-            (
-                plots.histogram(
-                    1e3 * parts["position"], "position, mm", {"a step": (1e3 * literal["furthest"][0], plots.ORANGE)}, "position part"
-                ),
-                "",
-            ),
-            (plots.histogram(parts["heading"], "heading, rad", {"a step": (literal["furthest"][1], plots.ORANGE)}, "heading part"), ""),
-        ]
-    )
+    result.figure(_parts(literal), "The position and the heading part of these discrepancies, against the largest input's way in one step.")
     result.heading("What says more", 3)
     colours = (plots.BLUE, plots.GREEN, plots.ORANGE)
     curves = {name: (c[:, 0], c[:, 1], colour) for (name, c), colour in zip(found["drawn"].items(), colours, strict=False) if len(c)}
@@ -93,6 +105,22 @@ def _gaps(result: Page, found: dict[str, Any]) -> None:
     result.table(("reading", "N", "discarded", "epsilon", "r", "r / standing still", "of the others beyond r"), rows)
 
 
+def _parts(gap: dict[str, Any]) -> str:
+    """Histograms of both parts."""
+    fig, axes = plots.figure(columns=2)
+    parts = (
+        ("position, mm", 1e3, gap["drawn"]["position"], gap["furthest"][0]),
+        ("heading, rad", 1.0, gap["drawn"]["heading"], gap["furthest"][1]),
+    )
+    for ax, (label, scale, values, step) in zip(axes, parts, strict=True):
+        ax.hist(scale * values, bins=20, color=plots.BLUE, alpha=0.75)
+        ax.axvline(scale * step, color=plots.ORANGE, linewidth=1.6, label="a step")
+        ax.set_xlabel(label)
+        ax.legend(frameon=False, fontsize=8)
+    axes[0].set_ylabel("count")
+    return plots.svg(fig, "position and heading parts of the gap")
+
+
 def _gap_cells(g: dict[str, Any]) -> tuple[object, ...]:
     numbers = (f"{g[key]:.4f}" for key in ("r", "median", "position", "heading", "still"))
     return (g["reading"], g["n"], *numbers, f"{g['share']:.0%}")
@@ -100,9 +128,11 @@ def _gap_cells(g: dict[str, Any]) -> tuple[object, ...]:
 
 def _traced(result: Page, found: dict[str, Any]) -> None:
     traced = found["traced"]
-    result.heading(f"What the model lacks: {traced['verdict']}")
-    for line in traced["text"].splitlines():
-        result.text(line, "soft")
+    result.heading("What the model lacks")
+    if traced["told"]:
+        add_trace(result, traced["told"])
+    else:
+        result.text(traced["text"], "soft")
     if traced["effects"]:
         result.text(
             f"In the repaired model: {'; '.join(traced['effects'])}. Whatever a model has in it, its gap comes from samples that the fit "
@@ -134,7 +164,7 @@ def _model(result: Page, one: dict[str, Any], shown: set[int]) -> None:
     )
     if id(runs["rollouts"]) not in shown:
         shown.add(id(runs["rollouts"]))
-        result.panels([(tile(r.scenario, [(r.path, plots.ORANGE, 1.6)], grid), f"run {k + 1}") for k, r in enumerate(runs["rollouts"][:4])])
+        result.panels([(tile(r.scenario, [(r.path, plots.ORANGE, 1.6)], grid), f"run {k + 1}") for k, r in enumerate(runs["rollouts"])])
 
 
 _SETS = "One-step reachable sets f(x, u) + D in the plane (discs), and where the robot then was (points)."
