@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import random
 import re
+import sys
 from collections import deque
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,6 +20,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from s2r_runtime import certificate as certificates
 from s2r_runtime import messages as m
 from s2r_runtime.audit.core import in_effect_order
+from s2r_runtime.audit.log import AuditResult, audit
 from s2r_runtime.bounds import clopper_pearson_upper
 from s2r_runtime.comparison import Campaign
 from s2r_runtime.controllers.file import load
@@ -37,11 +39,13 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec, dump_model
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import parse_profile
+from s2r_runtime.recording.reading import Entry, read
 from s2r_runtime.recording.writer import Writer
 from s2r_runtime.watch import Stream
 
 KEY = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
 OTHER = Ed25519PrivateKey.from_private_bytes(bytes(range(1, 33)))
+PUBLIC = KEY.public_key().public_bytes_raw()
 START_UNIX_S = 1_700_000_000
 
 PROFILE = """
@@ -163,10 +167,8 @@ def s2r_transports() -> list[Offer]:
     return [Offer("bench", f"{__name__}:BenchTransport")]
 
 
-def install(module: object) -> None:
-    """Makes the transport known."""
-    if "bench" not in registry().names("transports"):
-        registry().add("bench", "tests", "0", module)
+if "bench" not in registry().names("transports"):
+    registry().add("bench", "tests", "0", sys.modules[__name__])
 
 
 class Bench:
@@ -510,3 +512,13 @@ class Bench:
                 writer.flush()
         writer.close()
         return path
+
+
+def audited(bench: Bench, path: Path) -> AuditResult:
+    """What an audit says of its log, the key being known."""
+    return audit([bench.write(path)], PUBLIC)
+
+
+def entries(path: Path) -> list[Entry]:
+    """All messages of a log."""
+    return list(read(path))

@@ -83,7 +83,8 @@ class Rig:
         self.folder, self.state, self.logs = folder, folder / "state", folder / "logs"
         self.profile = folder / "rig.toml"
         self.profile.write_text(PROFILE.format(clock=clock, more=more))
-        self.environment = {**os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder / "home")}
+        self.environment = {**os.environ, "XDG_RUNTIME_DIR": str(folder)}
+        self.environment |= {"XDG_STATE_HOME": str(folder / "home"), "XDG_CONFIG_HOME": str(folder / "config")}
         self.robot: subprocess.Popen[bytes] | None = None
         self.daemon: subprocess.Popen[bytes] | None = None
         self._clock = clock

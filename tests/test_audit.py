@@ -6,15 +6,14 @@ those without the key there are test_chain and test_recording.
 
 from __future__ import annotations
 
-import importlib.util
 import random
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
+from audit_bench import KEY, OTHER, PUBLIC, Bench, entries
 
 from s2r_runtime import messages as m
 from s2r_runtime.audit.log import AuditResult, audit
@@ -22,20 +21,9 @@ from s2r_runtime.errors import ConfigError, NotEnoughEvidence, RecordingError
 from s2r_runtime.recording import writer as writer_module
 from s2r_runtime.recording.channels import CHANNELS, FRAME_IN, FRAME_OUT, NUMBERS, LogDeleted
 from s2r_runtime.recording.logfile import Pending
-from s2r_runtime.recording.reading import Entry
 from s2r_runtime.recording.recorder import Recorder
 from s2r_runtime.recording.salvage import recover
 from s2r_runtime.recording.writer import Writer, read
-
-_spec = importlib.util.spec_from_file_location("audit_bench", Path(__file__).parent / "audit_bench.py")
-assert _spec is not None
-assert _spec.loader is not None
-audit_bench = importlib.util.module_from_spec(_spec)
-sys.modules["audit_bench"] = audit_bench
-_spec.loader.exec_module(audit_bench)
-audit_bench.install(audit_bench)
-Bench, KEY, OTHER = audit_bench.Bench, audit_bench.KEY, audit_bench.OTHER
-PUBLIC = KEY.public_key().public_bytes_raw()
 
 
 def whole_run(folder: Path, lie: str = "") -> Any:
@@ -50,10 +38,6 @@ def whole_run(folder: Path, lie: str = "") -> Any:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """An honest run, for tests that only read it."""
     return whole_run(tmp_path_factory.mktemp("run"))
-
-
-def entries(path: Path) -> list[Entry]:
-    return list(read(path))
 
 
 def test_a_log_without_a_record_proves_nothing(tmp_path: Path) -> None:

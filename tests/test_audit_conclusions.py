@@ -6,14 +6,14 @@ These liars run a core (or a campaign, or a worker) of their own making. What th
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import audit_bench
 import msgspec
 import pytest
+from audit_bench import KEY, PUBLIC, Bench
 
 from s2r_runtime import gate
 from s2r_runtime import messages as m
@@ -23,16 +23,6 @@ from s2r_runtime.daemon import jobs
 from s2r_runtime.daemon.worker import GapJob, VerifyJob
 from s2r_runtime.plugins import registry
 
-if "audit_bench" not in sys.modules:
-    _spec = importlib.util.spec_from_file_location("audit_bench", Path(__file__).parent / "audit_bench.py")
-    assert _spec is not None
-    assert _spec.loader is not None
-    sys.modules["audit_bench"] = importlib.util.module_from_spec(_spec)
-    _spec.loader.exec_module(sys.modules["audit_bench"])
-audit_bench: Any = sys.modules["audit_bench"]
-audit_bench.install(audit_bench)
-Bench, KEY = audit_bench.Bench, audit_bench.KEY
-PUBLIC = KEY.public_key().public_bytes_raw()
 DAY_S = 86_400
 
 
@@ -335,6 +325,41 @@ def shrunk(memory: m.Memory) -> m.Memory:
     return msgspec.structs.replace(memory, radius=memory.gap.radius)
 
 
+def uneasy(bench: Any) -> Any:
+    """The robot changes a little: the watch doubts, and refutes nothing."""
+    bench.sample().drive(20)
+    bench.gain = 1.3
+    bench.steps(60)
+    return bench.stop()
+
+
+def begun(bench: Any) -> Any:
+    """A campaign that the end of the run interrupts."""
+    bench.step()
+    bench.ask("permit", duration_s=3600.0)
+    bench.ask("sample")
+    bench.steps(30)
+    return bench.stop()
+
+
+def traced(bench: Any) -> Any:
+    """A tracer found an effect, and nobody adopted the model that has it."""
+    bench.gain = 0.7
+    return bench.sample().trace().stop()
+
+
+def better(memory: m.Memory) -> m.Memory:
+    """Certificates as they are, but for what they were verified at."""
+    improved = (msgspec.structs.replace(one, verified_radius=2.0 * one.verified_radius) for one in memory.certificates)
+    return msgspec.structs.replace(memory, certificates=tuple(improved))
+
+
+def longer(memory: m.Memory) -> m.Memory:
+    return msgspec.structs.replace(
+        memory, certificates=tuple(msgspec.structs.replace(one, expires_unix_s=one.expires_unix_s + DAY_S) for one in memory.certificates)
+    )
+
+
 @pytest.mark.parametrize(
     ("story", "forget", "what"),
     [
@@ -344,14 +369,24 @@ def shrunk(memory: m.Memory) -> m.Memory:
         (runaway, remembering(refuted=()), "samples whose gap was refuted or outgrown"),
         (runaway, calmed, "discrepancies of epoch 1"),
         (whole, remembering(epochs=0), "forgets epochs or attempts"),
+        (whole, better, "the memory has another certificate"),
+        (whole, longer, "the memory has another certificate"),
+        (uneasy, remembering(watch_e_value=1.0), "what the watch made of the"),
+        (uneasy, remembering(watch_exchange=1.0), "what the watch made of the"),
+        (whole, remembering(campaign_digest="sha256:" + "0" * 64), "with which settings the gap of epoch 1 was measured"),
+        (begun, remembering(campaign_n=3), "was fixed beforehand at 14 samples"),
+        (traced, remembering(traced=False), "that an effect was traced"),
     ],
-    ids=["a revocation", "a grown gap", "an alarm", "refuted samples", "the stream", "an epoch"],
+    ids=[
+        *("a revocation", "a grown gap", "an alarm", "refuted samples", "the stream", "an epoch", "what a certificate was verified at"),
+        *("when a certificate ends", "the doubts of the watch", "the doubts of its other test", "settings", "how many samples", "a trace"),
+    ],
 )
 def test_a_later_run_cannot_forget(tmp_path: Path, story: Any, forget: Any, what: str) -> None:
     first = story(Bench(tmp_path))
     memory = first.state.memory
     assert forget(memory) != memory, "there is nothing to forget"
-    path = first.write(tmp_path / "a.mcap", run="first")
+    path = first.write(tmp_path / "a.mcap")
     honest = Bench(tmp_path, memory=memory).stop().write(tmp_path / "b.mcap", run="second")
     told = audit([path, honest], PUBLIC)
     assert told.ok, told.text()

@@ -5,38 +5,27 @@ The liars sign their logs with the right key, and all that follows is consistent
 
 from __future__ import annotations
 
-import importlib.util
 import random
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import audit_bench
 import msgspec
 import pytest
+from audit_bench import Bench, audited, entries
 
 from s2r_runtime import messages as m
 from s2r_runtime.audit import traces
 from s2r_runtime.audit.findings import Findings
-from s2r_runtime.audit.log import AuditResult, audit
+from s2r_runtime.audit.log import audit
 from s2r_runtime.audit.traces import Traces, near, unlike
 from s2r_runtime.daemon.worker import Failed, Progress, TraceJob, Worker
 from s2r_runtime.modelspec import EffectSpec
 from s2r_runtime.profile import parse_profile
-from s2r_runtime.recording.reading import Entry
 from s2r_runtime.recording.stretches import Cut, Part, Recorded, Segment
 from s2r_runtime.recording.writer import read
-
-if "audit_bench" not in sys.modules:
-    _spec = importlib.util.spec_from_file_location("audit_bench", Path(__file__).parent / "audit_bench.py")
-    assert _spec is not None
-    assert _spec.loader is not None
-    sys.modules["audit_bench"] = importlib.util.module_from_spec(_spec)
-    _spec.loader.exec_module(sys.modules["audit_bench"])
-audit_bench: Any = sys.modules["audit_bench"]
-audit_bench.install(audit_bench)
-Bench = audit_bench.Bench
 
 
 def slow_robot(folder: Path, lie: str = "", memory: m.Memory | None = None) -> Any:
@@ -53,14 +42,6 @@ def repaired(folder: Path, lie: str = "") -> Any:
     while bench.state.memory.gap is None and bench.seq < 5000:
         bench.step()
     return bench.excite().trace("inputs").stop()
-
-
-def audited(bench: Any, path: Path) -> AuditResult:
-    return audit([bench.write(path)])
-
-
-def entries(path: Path) -> list[Entry]:
-    return list(read(path))
 
 
 # ---------------------------------------------------------------- honest logs

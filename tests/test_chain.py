@@ -58,7 +58,7 @@ def blocks(path: Path) -> list[tuple[bytes, list[tuple[int, int, int, bytes]], b
             assert block is not None
             if block.last:
                 return found
-            messages = [(m.channel, m.sequence, m.log_time_ns, block.content[m.start : m.stop]) for m in block.messages]
+            messages = [(channel, number, t_ns, block.content[begin:end]) for channel, number, t_ns, begin, end in block.messages]
             found.append((b"".join(block.prefix), messages, b"".join(block.declarations)))
             at = block.end
 

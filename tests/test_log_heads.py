@@ -64,4 +64,5 @@ def test_the_last_head_in_the_journal_is_that_of_the_closed_log(rig: Rig) -> Non
     code, result = audit(rig, path, said)
     assert (code, result["head"], result["missing"]) == (0, said, [])
     noted = json.loads((rig.state / "log_evidence.json").read_text())
+    assert noted[path.stem].pop("seen_s") > 0.0
     assert noted == {path.stem: {"tags": [], "certificates": [], "head": said}}, "so it may be deleted some day (docs/log-format.md)"

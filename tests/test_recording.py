@@ -5,6 +5,7 @@ Run as a script this file is a process that records, for the tests that kill it:
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import itertools
@@ -470,6 +471,61 @@ def test_a_sync_that_failed_once_ends_the_log_as_the_next_one_says_nothing_of_wh
     health = recorder.close()
     assert (health.ok, health.unrecorded) == (False, 1)
     assert recorder.anchor == before, "what is published is what the disk has"
+
+
+def test_nothing_is_durable_while_another_sync_may_be_about_to_say_that_it_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The system tells one sync of a file that it failed; one that comes just after it succeeds, before the first could say so."""
+    told, honest = threading.Event(), os.fdatasync
+
+    def fails(fd: int) -> None:
+        honest(fd)
+        told.set()
+        time.sleep(0.3)  # it knows, but another thread runs first
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    writer = Writer(tmp_path / "a.mcap", run="test", signer=KEY, timed=False)
+    recorder = Recorder(writer, sync_s=0.01)
+    monkeypatch.setattr(os, "fdatasync", fails)
+    assert recorder.put(Ticked(1), 1)
+    assert told.wait(60)
+    assert recorder.put(Ticked(2), 2)
+    assert not recorder.durable(10), "what was said to be on the disk may stand behind a hole"
+    assert writer.doubted
+    assert recorder.anchor.records == 0
+    recorder.close()
+
+
+def test_nothing_is_durable_while_the_index_of_an_earlier_part_may_have_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same where the sync under way is that of a part that was set aside."""
+    writer = Writer(tmp_path / "a.mcap", run="test", signer=KEY, rotate_bytes=1_000, timed=False)
+    writer.deferring = True
+    for i, message in enumerate(messages(100)):
+        writer.write(message, i)
+    writer.flush()
+    assert writer._file._aside
+    told, honest = threading.Event(), os.fsync
+
+    def sync() -> None:
+        with contextlib.suppress(OSError):
+            writer.sync()
+
+    other = threading.Thread(target=sync)
+
+    def fails(fd: int) -> None:
+        honest(fd)
+        if threading.current_thread() is other:
+            told.set()
+            time.sleep(0.3)
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, "fsync", fails)
+    other.start()
+    assert told.wait(60)
+    with pytest.raises(OSError, match="Input/output error"):
+        writer.durable()
+    other.join(60)
+    assert writer.doubted
+    writer.abandon()
 
 
 # ---------------------------------------------------------------- SIGKILL

@@ -95,7 +95,7 @@ def apart(path: Path) -> Parts:
             block = take(file, at, size, b"" if at else start)
             if block is None or block.last:
                 return Parts(start, pieces, closing=block is not None)
-            found = [Msg(m.channel, m.sequence, m.log_time_ns, m.log_time_ns, block.content[m.start : m.stop]) for m in block.messages]
+            found = [Msg(channel, number, t_ns, t_ns, block.content[begin:end]) for channel, number, t_ns, begin, end in block.messages]
             prefix = block.prefix if at else block.prefix[1:]
             pieces.append(Piece(list(prefix), list(block.declarations), found, None if block.plain else 1))
             at = block.end

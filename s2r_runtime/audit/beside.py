@@ -104,7 +104,7 @@ class Beside:
         self._flush()
         try:
             found = self._pipe.recv()
-        except EOFError:
+        except (EOFError, OSError):
             found = "the process died"
         if isinstance(found, S2RError):
             raise found

@@ -9,7 +9,7 @@ from s2r_runtime import keys
 from s2r_runtime.audit.evidence import Evidence, attached_controller
 from s2r_runtime.audit.findings import CertificateFinding, Findings
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
-from s2r_runtime.messages import CertificateStored, IssueCertificate, Memory, Revoked, Settings
+from s2r_runtime.messages import CertificateFacts, CertificateStored, IssueCertificate, Memory, Revoked, Settings
 from s2r_runtime.profile import Profile
 from s2r_runtime.recording.layout import Attached
 from s2r_runtime.recording.reading import Entry
@@ -31,14 +31,18 @@ class Certificates:
         """revoked: keys that are not believed, by fingerprint."""
         self._findings, self._evidence, self._revoked = findings, evidence, revoked or {}
         self._orders: dict[int, tuple[IssueCertificate, bool]] = {}
+        self._facts: dict[str, CertificateFacts] = {}
 
     def begin_run(self) -> None:
         """A new run numbers its requests anew."""
         self._orders.clear()
 
-    def remembered(self, memory: Memory) -> None:
-        """A run begins with these certificates in force."""
+    def remembered(self, entry: Entry, memory: Memory) -> None:
+        """A run begins with these certificates in force: those that earlier logs stored must be the same."""
         for facts in memory.certificates:
+            known = self._facts.setdefault(facts.id, facts)
+            if known != facts:
+                self._findings.differ(entry.index, entry.channel, f"the memory has another certificate {facts.id}", facts, known)
             if facts.id not in self._findings.certificates:
                 self._findings.lack(f"the evidence of certificate {facts.id}, in an earlier log that was not given")
 
@@ -59,6 +63,7 @@ class Certificates:
     ) -> None:
         """A certificate is in force. trusted: keys whose signature counts; the log's own first. unix_s: the log's wall clock."""
         identity = event.facts.id
+        self._facts[identity] = event.facts
         try:
             note = self._judged(event, profile, settings, horizon, attachments, trusted, unix_s)
             valid = True

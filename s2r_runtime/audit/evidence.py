@@ -14,6 +14,7 @@ from s2r_runtime.canonical import digest_of
 from s2r_runtime.controllers.file import ControllerFile
 from s2r_runtime.core import ledger
 from s2r_runtime.core.gaps import REFUTED
+from s2r_runtime.core.stream import stood
 from s2r_runtime.daemon import jobs
 from s2r_runtime.daemon.worker import Failed, GapJob, Progress, Result, VerifyJob, Worker
 from s2r_runtime.errors import S2RError
@@ -218,6 +219,8 @@ def _forgotten(before: Memory | None, now: Memory) -> str:
         return f"that certificate {min(lost)} was revoked"
     if len(now.refuted) < REFUTED and not set(before.refuted) <= set(now.refuted):
         return "samples whose gap was refuted or outgrown"
+    if before.campaign_epoch and before.campaign_epoch == now.campaign_epoch and before.campaign_n != now.campaign_n:
+        return f"that the campaign of epoch {now.campaign_epoch} was fixed beforehand at {before.campaign_n} samples"
     if before.gap is None or now.gap is None or before.gap.epoch != now.gap.epoch:
         return ""
     if before.alarm_epoch == before.gap.epoch != now.alarm_epoch:
@@ -226,6 +229,12 @@ def _forgotten(before: Memory | None, now: Memory) -> str:
         return f"that the gap grew to {before.radius}"
     if now.watch_n < before.watch_n or now.watch_exceedances < before.watch_exceedances:
         return f"discrepancies of epoch {now.gap.epoch}: {before.watch_n} were counted"
+    if now.watch_n == before.watch_n and stood(now) != stood(before):
+        return f"what the watch made of the {before.watch_n} discrepancies of epoch {now.gap.epoch}"
+    if (now.model_digest, now.campaign_digest) != (before.model_digest, before.campaign_digest):
+        return f"of which model and with which settings the gap of epoch {now.gap.epoch} was measured"
+    if before.traced and not now.traced:
+        return "that an effect was traced that the model lacks (guarantee G8)"
     return ""
 
 

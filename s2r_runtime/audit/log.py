@@ -15,6 +15,7 @@ from typing import Any
 import msgspec
 
 from s2r_runtime import keys
+from s2r_runtime.audit.ahead import Ahead
 from s2r_runtime.audit.beside import Beside
 from s2r_runtime.audit.campaign import CampaignReplay
 from s2r_runtime.audit.certificates import Certificates
@@ -111,18 +112,17 @@ def audit(
     beside = Beside(findings)
     certificates = Certificates(findings, evidence, revoked)
     across = Across(findings, CampaignReplay(findings), evidence, certificates, traces, beside, trusted, rerun_controllers)
-    readings: list[Reading] = []
     try:
         grouped = runs(paths)
     except RecordingError as error:
         return _damaged(paths, error)
     findings.files = [reading.path.name for parts in grouped for reading in parts]
-    with contextlib.closing(beside):
+    readings = [reading for parts in grouped for reading in parts]
+    for reading in readings:
+        reading.sought = frozenset(heads)
+    with contextlib.closing(Ahead(readings)) as ahead, contextlib.closing(beside):
         for parts in grouped:
-            readings += parts
-            for reading in parts:
-                reading.sought = frozenset(heads)
-            _run(RunAudit(across), parts, findings, tell)
+            _run(RunAudit(across), parts, ahead, findings, tell)
         beside.end()
     records = sum(sum(reading.counts.values()) for reading in readings)
     if not records and findings.first is None and _chain(readings) != "broken":
@@ -166,10 +166,10 @@ def _damaged(paths: Sequence[Path], error: RecordingError) -> AuditResult:
     raise error
 
 
-def _run(run: RunAudit, parts: list[Reading], findings: Findings, tell: _Progress) -> None:
+def _run(run: RunAudit, parts: list[Reading], ahead: Ahead, findings: Findings, tell: _Progress) -> None:
     before: Reading | None = None
     lost = False
-    for reading in parts:
+    for done, reading in enumerate(parts, 1):
         findings.file = reading.path.name
         if not _continues(before, reading, findings):
             break
@@ -178,7 +178,7 @@ def _run(run: RunAudit, parts: list[Reading], findings: Findings, tell: _Progres
         findings.same_platform = all(told.get(key) == here.get(key) for key in PLATFORM)
         findings.same_machine = findings.same_platform and bool(told.get(MACHINE)) and told.get(MACHINE) == here.get(MACHINE)
         run.part(reading)
-        for number, entry in enumerate(reading):
+        for number, entry in enumerate(ahead.entries(reading)):
             if lost:
                 findings.differ(entry.index, entry.channel, "the log says before that nothing more could be recorded", entry.raw, None)
             if entry.channel in (UNRECORDED, DELETED) and msgspec.json.encode(entry.message) != entry.raw:
@@ -195,6 +195,8 @@ def _run(run: RunAudit, parts: list[Reading], findings: Findings, tell: _Progres
         tell.over(reading)
         before = reading
         if not _ended(reading, findings):
+            for left in parts[done:] if reading.ending.kind == "cut" else ():
+                findings.cannot(f"{left.path.name} follows a part whose end is missing, so nothing in it could be recomputed")
             break
     else:
         if before is not None and before.ending.kind == "rotated":
@@ -203,7 +205,8 @@ def _run(run: RunAudit, parts: list[Reading], findings: Findings, tell: _Progres
     run.end(clean=last.over and last.ending.kind == "closed" and not lost)
     for reading in parts:
         if not reading.over:
-            reading.to_the_end()
+            for _ in ahead.entries(reading):
+                pass
 
 
 def _continues(before: Reading | None, reading: Reading, findings: Findings) -> bool:
@@ -232,7 +235,7 @@ def _ended(reading: Reading, findings: Findings) -> bool:
         if (known := reading.metadata.get(RECOVERED)) is not None:
             told = known.get("missing", "nothing, says the recovery")
             findings.lack(f"{reading.path.name} was recovered; it lacks, as the recovery says and nothing vouches for: {told}")
-            return False
+            return reading.sealed_for_good
         findings.lack(f"{what}: {reading.path.name} was cut after {end.index} messages: {end.detail}{lost}")
     return end.kind == "rotated" or (end.kind == "cut" and reading.sealed_for_good)
 

@@ -224,7 +224,7 @@ class RunAudit:
         self._evidence.begin_run(entry, event.memory)
         if self._reading is not None:
             self._traces.begin_run(self._reading.run, self._reading.public_key, settings.trace_rows, event.memory)
-        self._certificates.remembered(event.memory)
+        self._certificates.remembered(entry, event.memory)
         options = {name: value for name, value in profile.transport.items() if name != "name"}
         name = str(profile.transport.get("name"))
         registry().get("transports", name)(options, facts.states, facts.inputs)  # a transport that is not here is said here

@@ -31,14 +31,8 @@ class Damage(Exception):
         self.offset, self.detail, self.cut = offset, detail, cut
 
 
-class Part(NamedTuple):
-    """One message inside a chunk's content: data is content[start:stop]."""
-
-    channel: int
-    sequence: int
-    log_time_ns: int
-    start: int
-    stop: int
+Part = tuple[int, int, int, int, int]
+"""One message inside a chunk's content: channel, sequence, log time in ns, start, stop; its data is content[start:stop]."""
 
 
 class Block(NamedTuple):
@@ -104,7 +98,7 @@ def _chunk_block(file: BinaryIO, offset: int, at: int, size: int, prefix: list[b
     data = file.read(data_size)
     content = _content(data, content_size, crc, at)
     declarations, messages, index = _walk(content, at)
-    if (first, last) != (messages[0].log_time_ns, messages[-1].log_time_ns):
+    if (first, last) != (messages[0][2], messages[-1][2]):
         raise Damage(at, "a chunk's times are not those of its messages")
     expected = index_records(index)
     index_at = at + CHUNK.size + data_size
@@ -134,29 +128,25 @@ def _walk(content: bytes, at: int) -> tuple[list[bytes], list[Part], dict[int, a
     messages: list[Part] = []
     index: dict[int, array[int]] = {}
     position, size = 0, len(content)
-    unpack, step, least = MESSAGE.unpack_from, MESSAGE.size, MESSAGE_FIELDS
+    unpack, step, head, least, message = MESSAGE.unpack_from, MESSAGE.size, RECORD.size, MESSAGE_FIELDS, int(Opcode.MESSAGE)
+    padded = content + bytes(step)  # so that a message's head can be looked for wherever a record begins
     while position < size:
-        if position + RECORD.size > size:
+        opcode, length, channel, sequence, log_time, publish_time = unpack(padded, position)
+        stop = position + head + length
+        if stop > size or position + head > size:
             raise Damage(at, "a chunk's content ends inside a record")
-        opcode, length = RECORD.unpack_from(content, position)
-        stop = position + RECORD.size + length
-        if stop > size:
-            raise Damage(at, "a chunk's content ends inside a record")
-        if opcode != Opcode.MESSAGE or length < least:
+        if opcode != message or length < least:
             if messages:
                 raise Damage(at, "a chunk's content is not in order")
             declarations.append(content[position:stop])
-            position = stop
-            continue
-        _, _, channel, sequence, log_time, publish_time = unpack(content, position)
-        if publish_time != log_time:
-            raise Damage(at, "a message has two times")
-        messages.append(Part(channel, sequence, log_time, position + step, stop))
-        pairs = index.get(channel)
-        if pairs is None:
-            pairs = index[channel] = array("Q")
-        pairs.append(log_time)
-        pairs.append(position)
+        else:
+            if publish_time != log_time:
+                raise Damage(at, "a message has two times")
+            messages.append((channel, sequence, log_time, position + step, stop))
+            if (pairs := index.get(channel)) is None:
+                pairs = index[channel] = array("Q")
+            pairs.append(log_time)
+            pairs.append(position)
         position = stop
     if not messages:
         raise Damage(at, "a chunk holds no message")

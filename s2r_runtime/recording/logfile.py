@@ -6,6 +6,7 @@ After an error of the operating system the file is as it was, and the same call 
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 import threading
@@ -84,6 +85,8 @@ class LogFile:
         self._fd = -1
         self._aside: deque[_Part] = deque()
         self._completing = threading.Lock()
+        self._telling = threading.Lock()
+        """Held from before a sync beside the others until it is noted how that went."""
         self._crc = self._sealed_ns = 0
         self._file = hashlib.sha256()
         self._seal = self._unwritten = b""
@@ -128,17 +131,33 @@ class LogFile:
         self.recorded, self._written = block.seal_index + 1, self.head
 
     def sync(self) -> None:
-        """Returns once what was written is on the disk, in the parts that were set aside too."""
+        """Returns once what was written is on the disk, in the parts that were set aside too. A sync that another thread has under way may
+        be the one that is told of a failure: it is waited for.
+        """
         try:
             for part in tuple(self._aside):
                 part.sync()
             if self._fd >= 0:
                 reached = self._reached()
                 os.fsync(self._fd)
+                with self._telling:
+                    if self.doubted:
+                        raise OSError(errno.EIO, os.strerror(errno.EIO))
                 self.synced(reached)
         except OSError:
             self.doubted = True
             raise
+
+    def sync_data(self, fd: int) -> None:
+        """Syncs a descriptor that `unsynced` gave, beside whatever else is done."""
+        with self._telling:
+            try:
+                os.fdatasync(fd)
+            except OSError:
+                self.doubted = True
+                raise
+            finally:
+                os.close(fd)
 
     def unsynced(self) -> tuple[int, tuple[bytes, int, int]] | None:
         """A descriptor of its own, and how far the disk has the log once that is synced; None if the disk has all of it, or if a part that
@@ -154,7 +173,8 @@ class LogFile:
 
     def all_synced(self) -> None:
         """Every part is whole, and on the disk."""
-        self.synced(self._reached())
+        with self._telling:
+            self.synced(self._reached())
 
     def _reached(self) -> tuple[bytes, int, int]:
         return self._written, len(self.parts), self.recorded
@@ -215,6 +235,7 @@ class _Part:
 
     def __init__(self, fd: int, end: int, crc: int, schemas: Mapping[int, bytes], channels: Mapping[int, bytes]) -> None:
         self.fd, self.closed, self.doubted = fd, False, False
+        self._telling = threading.Lock()
         self._end, self._crc, self._schemas, self._channels = end, crc, schemas, channels
 
     def complete(self) -> None:
@@ -224,9 +245,10 @@ class _Part:
             for piece in tail(self._read_at, self._end, self._crc, self._schemas, self._channels):
                 at = _write(self.fd, piece, at)
                 time.sleep(0)  # the index of a long log takes a second: other threads get their turn
-            self.doubted = True
-            os.fsync(self.fd)
-            self.doubted = False
+            with self._telling:
+                self.doubted = True
+                os.fsync(self.fd)
+                self.doubted = False
         except OSError:
             with contextlib.suppress(OSError):
                 os.ftruncate(self.fd, self._end)
@@ -241,6 +263,9 @@ class _Part:
         except OSError:
             if not self.closed:  # by another thread, between two lines; then they are
                 raise
+        with self._telling:
+            if self.doubted:
+                raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     def _read_at(self, length: int, offset: int) -> bytes:
         return os.pread(self.fd, length, offset)

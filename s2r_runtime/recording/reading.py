@@ -12,16 +12,16 @@ import os
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Any, BinaryIO, Literal
 
 import msgspec
 from mcap.opcode import Opcode
 
 from s2r_runtime.errors import RecordingError
-from s2r_runtime.messages import Struct
 from s2r_runtime.recording.blocks import Block, Damage, extent, find, take
 from s2r_runtime.recording.chain import advance, is_signed_by
-from s2r_runtime.recording.channels import CHAIN, CHANNELS, Seal, decoder
+from s2r_runtime.recording.channels import CHAIN, CHANNELS, Seal
+from s2r_runtime.recording.entries import Checked, Entry, entries
 from s2r_runtime.recording.layout import (
     ABOUT,
     MESSAGE,
@@ -33,23 +33,6 @@ from s2r_runtime.recording.layout import (
 )
 from s2r_runtime.recording.start import read_start
 from s2r_runtime.recording.summary import tail
-
-
-class Entry(msgspec.Struct, frozen=True, gc=False):
-    """One message. `index`: its number in the run (over all parts); raw: its bytes as recorded."""
-
-    index: int
-    channel: str
-    log_time_ns: int
-    raw: bytes
-
-    @property
-    def message(self) -> Struct:
-        """The message, decoded each time it is asked for. Raises RecordingError if it is of another version, or no message at all."""
-        try:
-            return decoder(self.channel).decode(self.raw)
-        except (ValueError, RecursionError) as error:  # msgspec's and Unicode's are ValueErrors
-            raise RecordingError(f"message {self.index} ({self.channel}) is of another version of s2r: {error}") from None
 
 
 class Ending(msgspec.Struct, frozen=True):
@@ -64,6 +47,12 @@ class Ending(msgspec.Struct, frozen=True):
     offset: int
     lost_bytes: int
     detail: str
+
+
+_FOUND = (
+    *("head", "signed", "met", "metadata", "lacking", "indexed", "first_ns"),
+    *("_at", "_index", "_log_time", "_final", "_ending", "_schemas", "_channels"),
+)
 
 
 class Reading:
@@ -108,7 +97,8 @@ class Reading:
         self._seal, self._final = b"", ""
         self._schemas: dict[int, bytes] = {}
         self._channels: dict[int, bytes] = {}
-        self._topics: dict[int, str] = {}
+        self.topics: dict[int, str] = {}
+        """Channels declared so far, by the number that messages bear."""
         self.first_ns: int | None = None
         self._digests: dict[str, bytes] = {}
 
@@ -161,6 +151,11 @@ class Reading:
 
     def __iter__(self) -> Iterator[Entry]:
         """The entries, once. Afterwards `ending` is there."""
+        for block in self.blocks():
+            yield from entries(block, self.topics, self.wanted, self.counts, self.path)
+
+    def blocks(self) -> Iterator[Checked]:
+        """The same by whole blocks, each checked before it is given out; `counts` then counts nothing."""
         self._file: BinaryIO = self.path.open("rb")
         try:
             if not self.start:
@@ -173,7 +168,7 @@ class Reading:
                 self._note(block)
                 index, self._at = self._index, block.end
                 self._index += len(block.messages)
-                yield from self._entries(block, index)
+                yield Checked(index, block.end, block.content, block.messages)
                 if block.lacking:
                     self.lacking = block.lacking
                     self._end("cut", "the file ends inside a chunk's index")
@@ -183,6 +178,25 @@ class Reading:
             self._damaged(damage)
         finally:
             self._file.close()
+
+    # ---- read by another process (`audit.ahead`)
+
+    def follow(self, end: int, topics: dict[int, str], attachments: list[Attached]) -> None:
+        """It came so far, met these attachments, and channels if there are new ones."""
+        self._at = end
+        self.topics |= topics
+        self.attachments += attachments
+
+    def found(self) -> dict[str, Any]:
+        """What it knows at the end, beyond what can be followed; `adopt` takes it over."""
+        return {name: getattr(self, name) for name in _FOUND}
+
+    def adopt(self, found: dict[str, Any]) -> None:
+        """As if it had been read here."""
+        for name in _FOUND:
+            setattr(self, name, found[name])
+
+    # ---- blocks
 
     def _take(self) -> Block | None:
         start = b"" if self._at else self.start
@@ -198,27 +212,28 @@ class Reading:
             if any(known.get(number, record) != record for number, record in new.items()):
                 raise Damage(block.offset, "a channel is declared once more, and otherwise")
             known.update(new)
-        self._topics |= topics
+        self.topics |= topics
         if self.first_ns is None:
-            self.first_ns = block.messages[0].log_time_ns
-        for number, part in enumerate(block.messages, self._index):
-            if part.sequence != number & 0xFFFFFFFF:
+            self.first_ns = block.messages[0][2]
+        before_ns = self._log_time
+        for number, (_, sequence, log_time_ns, _, _) in enumerate(block.messages, self._index):
+            if sequence != number & 0xFFFFFFFF:
                 raise Damage(block.offset, f"message {number} is missing or out of its place")
-            if part.log_time_ns < self._log_time:
+            if log_time_ns < before_ns:
                 raise Damage(block.offset, f"message {number} goes back in time")
-            self._log_time = part.log_time_ns
-        last = block.messages[-1]
-        if self._topics.get(last.channel) != CHAIN:
+            self._log_time = before_ns = log_time_ns
+        channel, _, sealed_ns, start, _ = block.messages[-1]
+        if self.topics.get(channel) != CHAIN:
             raise Damage(block.offset, "a chunk is not sealed")
-        raw = block.content[last.start :]
+        raw = block.content[start:]
         try:
             seal = msgspec.json.decode(raw, type=Seal)
         except msgspec.DecodeError as error:
             raise Damage(block.offset, f"a seal cannot be read: {error}") from None
-        seal_at = last.start - MESSAGE.size
+        seal_at = start - MESSAGE.size
         head = advance(self.head, self._seal, [*block.prefix, memoryview(block.content)[:seal_at]])
         count = self._index + len(block.messages) - 1
-        if msgspec.json.encode(Seal(last.log_time_ns, count, head, self._sha.digest(), seal.end, seal.signature)) != raw:
+        if msgspec.json.encode(Seal(sealed_ns, count, head, self._sha.digest(), seal.end, seal.signature)) != raw:
             raise Damage(block.offset, "the chain does not hold: this is not what was sealed")
         if self._key is None:
             if seal.signature:
@@ -250,16 +265,6 @@ class Reading:
             elif data:
                 name, fields = _metadata(data, block.offset)
                 self.metadata[name] = fields
-
-    def _entries(self, block: Block, index: int) -> Iterator[Entry]:
-        content, counts, wanted, topics = block.content, self.counts, self.wanted, self._topics
-        for number, part in enumerate(block.messages, index):
-            name = topics.get(part.channel, "")
-            counts[name] = counts.get(name, 0) + 1
-            if name in wanted:
-                yield Entry(number, name, part.log_time_ns, content[part.start : part.stop])
-            elif name not in CHANNELS:
-                raise RecordingError(f"{self.path}: message {number} is on channel {name!r}, which this version does not know")
 
     # ---- the end
 

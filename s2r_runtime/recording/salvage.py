@@ -143,7 +143,7 @@ def _copy(good: _Good, source: BinaryIO, target: BinaryIO, name: str) -> Account
     holes: list[Hole] = []
     records, kept_bytes, expected = good.records, max(good.end, len(good.start)), ending.index
     for block in _sound(source, good.end, size) if ending.kind == "broken" else ():
-        first = block.messages[0].sequence + (expected & ~0xFFFFFFFF)
+        first = block.messages[0][1] + (expected & ~0xFFFFFFFF)
         holes += [Hole(expected, first - expected)] if first > expected else []
         expected = first + len(block.messages)
         records += len(block.messages)
@@ -185,7 +185,7 @@ def _declare(block: Block, schemas: dict[int, bytes], channels: dict[int, bytes]
     new_schemas, new_channels, _ = declared(block.declarations)
     schemas |= new_schemas
     channels |= new_channels
-    for number in sorted({part.channel for part in block.messages} - channels.keys()):
+    for number in sorted({channel for channel, *_ in block.messages} - channels.keys()):
         if number <= len(CHANNELS):
             schemas[number], channels[number] = declaration(number)
             target.write(schemas[number] + channels[number])

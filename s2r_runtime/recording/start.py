@@ -45,6 +45,8 @@ def make_start(
 def read_start(file: BinaryIO, path: Path, size: int) -> Start:
     """Reads the start of a file of `size` bytes. Raises RecordingError if it is no log, or its start is damaged."""
     found = file.read(min(len(FIRST), size))
+    if not found.strip(b"\0"):  # a power cut before the first sync left nothing of its beginning, or zeros
+        return Start()
     if found != FIRST[: len(found)]:
         if other := other_writer(path):
             raise RecordingError(f"{path}: is an MCAP file of others ({other}), not a log of s2r")

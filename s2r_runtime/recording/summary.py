@@ -12,12 +12,21 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, ChunkIndex, DataEnd, Footer, MetadataIndex, Statistics, SummaryOffset
+from mcap.records import AttachmentIndex, DataEnd, Footer, MetadataIndex, Statistics, SummaryOffset
 
 from s2r_runtime.recording.layout import CHUNK, INDEX, MAGIC, RECORD, attachment_fields, metadata_fields, pack
 
 ReadAt = Callable[[int, int], bytes]
 """(length, offset) -> bytes of the file; raises EOFError where there are fewer."""
+
+
+WINDOW = 2048
+"""Bytes read at once: about what the indexes of a chunk of 50 ms at 100 Hz take."""
+_CHUNK_INDEX = struct.Struct("<BQQQQQI")
+"""Opcode, length, first and last log time, offset and length of the chunk, bytes of (channel, offset) pairs that follow."""
+_PAIR = struct.Struct("<HQ")
+_COMPRESSION = struct.Struct("<QI4sQQ")
+"""Bytes of the message indexes, length of the compression's name, that name, size compressed and not."""
 
 
 class Span(NamedTuple):
@@ -38,7 +47,7 @@ def spans(read_at: ReadAt, end: int) -> Iterator[Span | tuple[int, bytes]]:
     Read_at(length, offset) gives bytes of the file. Memory does not grow with the file: that is why indexes are not gathered
     while the log is written.
     """
-    offset = len(MAGIC)
+    offset, read_at = len(MAGIC), _windows(read_at, end)
     while offset < end:
         opcode, length = RECORD.unpack(read_at(RECORD.size, offset))
         after = offset + RECORD.size + length
@@ -58,6 +67,19 @@ def spans(read_at: ReadAt, end: int) -> Iterator[Span | tuple[int, bytes]]:
             at += INDEX.size + pairs
         yield Span(offset, after - offset, first, last, size, compressed, counts)
         offset = at
+
+
+def _windows(read_at: ReadAt, end: int) -> ReadAt:
+    """Reads a little more than it is asked for: the heads of a chunk's indexes, and of what follows, lie side by side."""
+    begin, data = 0, b""
+
+    def windowed(length: int, offset: int) -> bytes:
+        nonlocal begin, data
+        if not begin <= offset <= begin + len(data) - length:
+            begin, data = offset, read_at(max(length, min(WINDOW, end - offset)), offset)
+        return data[offset - begin : offset - begin + length]
+
+    return windowed
 
 
 def tail(read_at: ReadAt, end: int, crc: int, schemas: Mapping[int, bytes], channels: Mapping[int, bytes]) -> Iterator[bytes]:
@@ -141,21 +163,12 @@ class _Totals:
 
 
 def _chunk_index(span: Span) -> bytes:
-    at = span.offset + span.length
-    offsets: dict[int, int] = {}
+    begin = at = span.offset + span.length
+    pairs = []
     for channel, count in span.counts.items():
-        offsets[channel] = at
+        pairs.append(_PAIR.pack(channel, at))
         at += INDEX.size + 16 * count
-    return pack(
-        ChunkIndex(
-            message_start_time=span.first_ns,
-            message_end_time=span.last_ns,
-            chunk_start_offset=span.offset,
-            chunk_length=span.length,
-            message_index_offsets=offsets,
-            message_index_length=at - span.offset - span.length,
-            compression="zstd",
-            compressed_size=span.compressed,
-            uncompressed_size=span.size,
-        )
-    )
+    size = _PAIR.size * len(pairs)
+    length = _CHUNK_INDEX.size - RECORD.size + size + _COMPRESSION.size
+    head = _CHUNK_INDEX.pack(Opcode.CHUNK_INDEX, length, span.first_ns, span.last_ns, span.offset, span.length, size)
+    return b"".join((head, *pairs, _COMPRESSION.pack(at - begin, 4, b"zstd", span.compressed, span.size)))

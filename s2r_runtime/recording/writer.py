@@ -9,7 +9,6 @@ memory holds it. The format: docs/log-format.md.
 from __future__ import annotations
 
 import contextlib
-import os
 import platform
 import sys
 import threading
@@ -200,13 +199,7 @@ class Writer:
         if todo is None:
             return
         fd, reached = todo
-        try:
-            os.fdatasync(fd)
-        except OSError:
-            self._file.doubted = True
-            raise
-        finally:
-            os.close(fd)
+        self._file.sync_data(fd)
         with self._writing:
             self._file.synced(reached)
 
