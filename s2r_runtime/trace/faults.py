@@ -23,7 +23,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset, Pause
 from s2r_runtime.trace.frozen import frozen
 from s2r_runtime.trace.heading import departures
-from s2r_runtime.trace.jumps import jumps_of, tails_of
+from s2r_runtime.trace.jumps import WILD_SIGMAS, jumps_of, tails_of
 from s2r_runtime.trace.reach import Fault, Reach, predicted, reach_of
 from s2r_runtime.trace.residual import Acting, acting
 
@@ -73,7 +73,7 @@ def check(model: ComposedModel, data: Dataset) -> Checked:
     spikes: list[Fault] = []
     outliers = tails = 0
     for i in range(len(data.runs)):
-        tails += tails_of(model, data, act, i, reach)
+        tails += int(np.count_nonzero(tails_of(model, data, act, i, reach).any(axis=1)))
         found += frozen(model, data, act, i, bad[i], reach)
         jumps = jumps_of(model, data, act, i, bad[i], reach)
         spikes += jumps.spikes
@@ -84,6 +84,10 @@ def check(model: ComposedModel, data: Dataset) -> Checked:
             found += _inconsistent(model, data, act, i, bad[i], reach, pose)
     rows = sum(len(run.y) for run in data.runs)
     many = max(tails, len({f.from_s for f in spikes}) + outliers) > max(RARE * rows, 3.0)
+    for i, mask in enumerate(bad) if many else ():
+        wild = tails_of(model, data, act, i, reach, WILD_SIGMAS) & ~mask
+        outliers += int(np.count_nonzero(wild.any(axis=1)))
+        mask |= wild
     runs = tuple(replace(run, y=np.where(b.any(axis=1, keepdims=True), np.nan, run.y)) for run, b in zip(data.runs, bad, strict=True))
     if many:  # two of them in a row look like a jump
         found = [f for f in found if f.kind != "offset_jump"]

@@ -22,6 +22,9 @@ Mask = NDArray[np.bool_]
 TAIL_SIGMAS = 3.5
 """Robust standard deviations of both legs of a spike that count as tails: white noise has one in a million."""
 
+WILD_SIGMAS = 6.0
+"""As TAIL_SIGMAS, from which a row is left out where tails are known to be heavy; an effect hardly takes a state away for one row alone."""
+
 BEYOND = 2.2
 """Times the largest move in a step: a command that reverses and is late, or followed with a lag, leaves up to twice that."""
 
@@ -90,14 +93,16 @@ def _take_out(found: Jumps, model: ComposedModel, data: Dataset, i: int, j: int,
         bad[off, j] = True
 
 
-def tails_of(model: ComposedModel, data: Dataset, act: Acting, i: int, reach: Reach) -> int:
-    """Rows that are away from both neighbours by more than white noise would have them, whatever the inputs could do."""
+def tails_of(model: ComposedModel, data: Dataset, act: Acting, i: int, reach: Reach, sigmas: float = TAIL_SIGMAS) -> Mask:
+    """(K+1, nx) rows of run i that are away from both neighbours by more than so many deviations, whatever the inputs could do."""
     run = data.runs[i]
     e = np.nan_to_num(model.difference(run.y[1:], predicted(model, data, act, i)))
     first, second = e[:-1], e[1:]
     back = np.abs(first + second) < 0.35 * np.maximum(np.abs(first), np.abs(second))
-    away = np.minimum(np.abs(first), np.abs(second)) > TAIL_SIGMAS * reach.noise
-    return int(np.count_nonzero((back & away & ~reach.instant).any(axis=1)))
+    away = np.minimum(np.abs(first), np.abs(second)) > sigmas * reach.noise
+    found = np.zeros(run.y.shape, dtype=bool)
+    found[1:-1] = back & away & ~reach.instant
+    return found
 
 
 def _there_and_back(series: Array, k: int) -> tuple[int, int] | None:

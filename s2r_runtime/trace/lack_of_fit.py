@@ -89,6 +89,12 @@ class Structure:
     gains: dict[str, float]
     nameless: bool = False
 
+    @property
+    def likeliest(self) -> tuple[str, ...]:
+        """The group that gains most, though not beyond doubt; nothing where chance would do as well."""
+        best = max(self.gains, key=lambda token: self.gains[token], default="")
+        return (TOKENS.get(best, best),) if best and self.gains[best] > math.log(len(self.gains) / ALPHA) else ()
+
 
 def lack_of_fit(given: Problem, fit: Fit, nominal: Fit, horizon: int) -> Structure:
     """Structure left by `fit`; how much of what `nominal` leaves that is."""

@@ -164,6 +164,8 @@ def _result(
     model = chosen.nominal.model
     before, after = judge(model, judged_on), judge(chosen.fit.model, judged_on)
     verdict = verdict_of(chosen, structure, checked.faults, foretells(after, judged_on))
+    if verdict == "unexplained" and not {*structure.tokens} - {"noise"}:  # what was named foretells nothing: what else it looks like
+        structure = replace(structure, tokens=structure.likeliest or structure.tokens)
     final = final_fit(chosen, verdict)
     after = before if final is chosen.nominal else after
     gap_before, gap_after, independent = gaps((model, before), (final.model, after), judged_on, weights, kind)

@@ -1,0 +1,48 @@
+"""What is held out: stretches of time, or runs, on which the inputs reach as far as on what is fitted."""
+
+import numpy as np
+
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.holdout import fit_mask
+
+STEPS = 1000
+
+
+def _data(runs):
+    model = compose(ModelSpec("joint", 0.01))
+    return from_arrays(model, [(np.zeros((len(u) + 1, 2)), u[:, None]) for u in runs])
+
+
+def _reach(u, seen):
+    return u[seen].min(), u[~seen].min()
+
+
+def test_the_usual_stretches_are_held_out_where_inputs_are_alike_throughout():
+    seen = fit_mask(_data([np.random.default_rng(1).normal(size=STEPS)]), 0)
+    held = np.flatnonzero(~seen) / STEPS
+    assert ((held >= 0.3) & (held < 0.5) | (held >= 0.8)).all()
+    assert 0.35 < np.mean(~seen) < 0.45
+
+
+def test_pushes_that_only_one_side_would_see_are_shared():
+    """Hard pushes at the beginning and at three quarters of the time: the usual stretches hold neither."""
+    u = 0.1 * np.random.default_rng(2).normal(size=STEPS)
+    u[20:60] = u[740:780] = -10.0
+    fitted, held = _reach(u, fit_mask(_data([u]), 0))
+    assert fitted == held == -10.0
+
+
+def test_runs_are_drawn_so_that_both_sides_hold_hard_pushes():
+    rng = np.random.default_rng(3)
+    for seed in range(20):
+        runs = [0.1 * rng.normal(size=200) for _ in range(10)]
+        for run in (0, 1, 2):
+            runs[run][50:90] = -10.0
+        fitted, held = _reach(np.concatenate(runs), fit_mask(_data(runs), seed))
+        assert fitted == held == -10.0, seed
+
+
+def test_with_a_recording_of_its_own_to_judge_on_everything_is_fitted():
+    assert fit_mask(_data([np.ones(STEPS)]), 0, everything=True).all()
