@@ -140,6 +140,21 @@ def test_outliers_on_many_rows_are_counted_and_no_faults():
     assert checked.outliers > 30
 
 
+def test_outliers_that_an_input_could_have_made_are_left_out_where_tails_are_heavy():
+    """Of 5 % of all values, off by 0.05 m (rad) as a rule: a step moves the robot as far as that."""
+    rng = np.random.default_rng(13)
+    off = np.where(rng.random((STEPS + 1, 3)) < 0.05, rng.normal(0.0, 0.05, (STEPS + 1, 3)), 0.0)
+    data = recordings([], 1, steps=STEPS, seed=14)[0]
+    data.runs[0].y[:] += off
+    checked = check(declared(), data)
+    alone = (np.abs(off) > 12.0 * NOISE).any(axis=1)  # two legs of at least six deviations of a residual, or nearly
+    alone[1:] &= ~alone[:-1]
+    alone[:-1] &= ~alone[1:]
+    assert checked.faults == ()
+    assert np.mean(np.isnan(checked.data.runs[0].y[1:-1][alone[1:-1]]).all(axis=1)) > 0.85
+    assert np.mean(np.isnan(checked.data.runs[0].y[~(off != 0.0).any(axis=1)]).any(axis=1)) < 0.02
+
+
 @pytest.mark.parametrize("kind", ["dropout", "clock_step"])
 def test_a_silence_is_told_from_a_clock_that_jumped(kind):
     rng = np.random.default_rng(9)
