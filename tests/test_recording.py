@@ -473,6 +473,23 @@ def test_a_sync_that_failed_once_ends_the_log_as_the_next_one_says_nothing_of_wh
     assert recorder.anchor == before, "what is published is what the disk has"
 
 
+@pytest.mark.parametrize(("zeros", "kind"), [(4096, "broken"), (1 << 30, "cut")], ids=["the first page", "all"])
+def test_a_log_whose_beginning_a_power_cut_left_as_zeros_can_be_read_and_holds_nothing(tmp_path: Path, zeros: int, kind: str) -> None:
+    path = tmp_path / "a.mcap"
+    writer = Writer(path, run="test", signer=KEY, timed=False)
+    for i, message in enumerate(messages(600)):
+        writer.write(message, i)
+        if i % 50 == 0:
+            writer.flush()
+    writer.close()
+    data = path.read_bytes()
+    assert len(data) > 3 * 4096
+    path.write_bytes(bytes(min(zeros, len(data))) + data[zeros:])
+    reading = read(path)
+    assert list(reading) == []
+    assert (reading.ending.kind, reading.ending.index) == (kind, 0)
+
+
 def test_nothing_is_durable_while_another_sync_may_be_about_to_say_that_it_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The system tells one sync of a file that it failed; one that comes just after it succeeds, before the first could say so."""
     told, honest = threading.Event(), os.fdatasync
