@@ -218,10 +218,8 @@ def test_an_old_copy_of_the_state_gives_back_no_attempt_no_revocation_and_no_sto
     assert rig.s2r("audit", *map(str, rig.log_files()), "--key", str(rig.state / "key.pub")).returncode == 0
 
 
-@pytest.mark.parametrize("gone", [pytest.param(False, id="older"), pytest.param(True, id="deleted", marks=pytest.mark.long)])
-def test_samples_that_were_seen_are_not_drawn_once_more_by_putting_an_old_campaign_back(rig: Rig, gone: bool) -> None:
-    rig.start_robot()
-    rig.start()
+def interrupted(rig: Rig) -> tuple[Path, Path]:
+    """A campaign that the daemon's end cuts off, and where an older copy of what was kept of it is; (that file, that folder)."""
     rig.until(lambda: rig.status()["observation"])
     rig.ask("permit", duration_s=3600.0)
     file, kept = rig.state / "campaign.json", rig.folder / "kept"
@@ -233,6 +231,14 @@ def test_samples_that_were_seen_are_not_drawn_once_more_by_putting_an_old_campai
         shutil.copy2(file, kept)
         rig.until(lambda: (rig.status()["campaign"] or {}).get("taken", 0) >= 5)
     rig.stop()
+    return file, kept
+
+
+@pytest.mark.parametrize("gone", [pytest.param(False, id="older"), pytest.param(True, id="deleted", marks=pytest.mark.long)])
+def test_samples_that_were_seen_are_not_drawn_once_more_by_putting_an_old_campaign_back(rig: Rig, gone: bool) -> None:
+    rig.start_robot()
+    rig.start()
+    file, kept = interrupted(rig)
     seen = [m for m in rig.messages("event/sample_taken") if isinstance(m, SampleTaken)]
     file.unlink() if gone else put_back(rig, kept, "campaign.json")
     rig.start()
@@ -244,3 +250,19 @@ def test_samples_that_were_seen_are_not_drawn_once_more_by_putting_an_old_campai
     assert len(samples) == len(seen) + len(again) + len([m for m in samples if m.index >= len(seen)])
     told = json.loads(rig.s2r("audit", *map(str, rig.log_files()), "--key", str(rig.state / "key.pub"), "--json").stdout)
     assert told["ok"], told
+
+
+@pytest.mark.long
+def test_an_audit_tells_of_samples_that_were_drawn_again_where_the_daemon_could_not_know(rig: Rig) -> None:
+    """The logs of before are somewhere else when the campaign goes on with an old copy of what was kept."""
+    rig.start_robot()
+    rig.start()
+    interrupted(rig)
+    put_back(rig, rig.folder / "kept", "campaign.json")
+    before = [path.rename(rig.folder / path.name) for path in rig.log_files()]
+    rig.start()
+    assert rig.sample()["exit_code"] == 0
+    rig.stop()
+    told = json.loads(rig.s2r("audit", *map(str, (*before, *rig.log_files())), "--key", str(rig.state / "key.pub"), "--json").stdout)
+    assert not told["ok"]
+    assert "it drew some again" in told["first_difference"]["what"]

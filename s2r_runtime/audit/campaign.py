@@ -46,6 +46,7 @@ class CampaignReplay:
         """A new run begins: nothing of what was seen before it counts."""
         self._campaign: Campaign | None = None
         self._order: StartCampaign | None = None
+        self._place = (0, "event/source_started")
         self._dt_ns = 0
         self._due: deque[SampleTaken | Proposed | SourceStopped] = deque()
         self._observations: deque[Observation] = deque(maxlen=KEPT)
@@ -100,15 +101,17 @@ class CampaignReplay:
     def _settle(self) -> None:
         """Answers what was asked. A campaign that goes on is first told where it stood: at the samples that were logged once more.
 
-        The daemon kept those. It may have kept one that a crash cut from the log before, and may not have kept one that stands there;
-        the other counts may lack what it cut.
+        The daemon kept those. It may have kept one that a crash cut from the log before; one that stands there it takes from there, since
+        whoever draws again what he has seen may choose. The other counts may lack what a crash cut.
         """
         campaign, order = self._campaign, self._order
         if campaign is None or order is None:
             return
         if self._resumed is not None:
-            taken = len(self._again)
-            if len(self.samples.get(order.epoch, ())) > taken:
+            taken, known = len(self._again), self.samples.get(order.epoch, ())
+            if len(known) > taken:
+                what = f"the campaign of epoch {order.epoch} goes on after {taken} samples, {len(known)} had been taken: it drew some again"
+                self._findings.differ(*self._place, what, taken, len(known))
                 self.samples[order.epoch] = list(self._again)
             if taken != self._resumed["index"]:
                 self._exact = False
@@ -144,6 +147,7 @@ class CampaignReplay:
 
     def started(self, entry: Entry, event: SourceStarted) -> None:
         """The sampler runs: with these settings."""
+        self._place = (entry.index, entry.channel)
         if self._campaign is not None and event.digest != self._campaign.digest:
             self._findings.differ(entry.index, entry.channel, "the campaign has other settings", entry.raw, self._campaign.digest)
 
