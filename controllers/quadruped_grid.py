@@ -11,15 +11,15 @@ Designed on the nominal model. Stateless and batched: x (n, 3), theta as `GridWo
 import numpy as np
 
 PARAMETERS = {
-    "speed": 0.13,  # m/s
-    "turn": 0.84,  # yaw rate per heading error, 1/s: more than 1 would turn too far in a step of a second
-    "max_turn": 0.29,  # rad/s
+    "speed": 0.115,  # m/s
+    "turn": 0.7,  # yaw rate per heading error, 1/s: more than 1 would turn too far in a step of a second
+    "max_turn": 0.3,  # rad/s
     "aligned": 0.69,  # cosine of the heading error at which it begins to walk
-    "lookahead": 0.49,  # m: what pushes it sideways at 1 cm/s holds it 4 cm off the line
+    "lookahead": 0.41,  # m: what pushes it sideways at 1 cm/s holds it 4 cm off the line
     "body": 0.3,  # its disc, m
-    "margin": 0.165,  # to obstacles, m
-    "fade": 0.46,  # this far beside the line it only goes sideways, m
-    "hold": 0.19,  # speed towards the line per distance from it, 1/s
+    "margin": 0.195,  # to obstacles, m
+    "fade": 0.65,  # this far beside the line it only goes sideways, m
+    "hold": 0.16,  # speed towards the line per distance from it, 1/s
 }
 
 
