@@ -88,6 +88,10 @@ REFUSED = {
     "twenty rows": (lambda name, t, y, u: _csv(name, t[:20], y[:20], u[:20]), "at least 60 are needed: 41 more"),
     "one row": (lambda name, t, y, u: _csv(name, t[:1], y[:1], u[:1]), "has no two rows on which a state was measured"),
     "nothing was done": (lambda name, t, y, u: _csv(name, t, 0.0 * y, 0.0 * u), "every input is zero"),
+    "nothing but noise": (
+        lambda name, t, y, u: _csv(name, t, np.random.default_rng(3).normal(0.0, 0.3, y.shape), u),
+        "; nothing can be traced",
+    ),
     "one row again and again": (lambda name, t, y, u: _csv(name, t, 0.0 * y + y[90], 0.0 * u + u[90] + 0.1), "asked to move"),
 }
 

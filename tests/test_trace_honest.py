@@ -8,7 +8,10 @@ from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recor
 
 from s2r_runtime.errors import NotEnoughEvidence
 from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.errors import held, judge
+from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.verdict import foretells_nothing
 
 STEPS = 700
 GAIN = [("input_gain", "w", {"gain": 0.75})]
@@ -140,3 +143,19 @@ def test_a_heading_sensor_that_jumped_for_good_is_a_fault():
 def test_measurements_without_noise_are_no_effect():
     for data in recordings([], 3, steps=STEPS, seed=44, noise=0.0 * NOISE):
         assert trace(data, declared()).verdict == "none"
+
+
+def test_a_model_whose_rollouts_end_nowhere_near_is_another_robots_and_not_one_to_which_nothing_is_missing():
+    """A hovercraft, whose commands are accelerations. Noise that takes rollouts as far is no other robot."""
+    run = _driven()
+    u = run.u[::5]
+    speed = DT * np.cumsum(u, axis=0)
+    theta = DT * np.cumsum(np.append(0.0, speed[:-1, 1]))
+    steps = DT * speed[:, :1] * np.column_stack([np.cos(theta), np.sin(theta)])
+    hovering = np.column_stack([np.concatenate([[[0.0, 0.0]], np.cumsum(steps, axis=0)]), np.append(theta, theta[-1])])
+    for y, nothing in ((hovering, True), (run.y, False)):
+        data = from_arrays(declared(), [(y, u)])
+        given = held(declared(), data, steps_of(data), (), np.ones(len(u), dtype=bool), 1.0)
+        judged = judge(declared(), given)
+        assert foretells_nothing(judged, given, NOISE) == nothing
+        assert not foretells_nothing(judged, given, 100.0 + NOISE)

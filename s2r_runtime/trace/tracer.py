@@ -42,7 +42,7 @@ from s2r_runtime.trace.scores import LENIENT, names
 from s2r_runtime.trace.selection import Selection, crowded, select
 from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.unseen import alike
-from s2r_runtime.trace.verdict import confirmed, final_fit, foretells, verdict_of
+from s2r_runtime.trace.verdict import confirmed, final_fit, verdict_of
 
 __all__ = ["Dataset", "TraceResult", "load_dataset", "trace", "usual_horizon"]
 
@@ -163,10 +163,12 @@ def _result(
     """Verdict, intervals, errors and gap before and after."""
     model = chosen.nominal.model
     before, after = judge(model, judged_on), judge(chosen.fit.model, judged_on)
-    verdict = verdict_of(chosen, structure, checked.faults, foretells(after, judged_on))
+    floor = noise_floor(chosen.fit.model, chosen.fit.noise, judged_on, seed)
+    verdict = verdict_of(chosen, structure, checked.faults, after, judged_on, floor[1])
     if verdict == "unexplained" and not {*structure.tokens} - {"noise"}:  # what was named foretells nothing: what else it looks like
         structure = replace(structure, tokens=structure.likeliest or structure.tokens)
     final = final_fit(chosen, verdict)
+    floor = floor if final is chosen.fit else noise_floor(final.model, final.noise, judged_on, seed)
     after = before if final is chosen.nominal else after
     gap_before, gap_after, independent = gaps((model, before), (final.model, after), judged_on, weights, kind)
     ranges = intervals(given, final)
@@ -189,7 +191,7 @@ def _result(
         nominal=model,
         before=before,
         after=after,
-        floor=noise_floor(final.model, final.noise, judged_on, seed),
+        floor=floor,
         gap=(gap_before, gap_after, independent),
         held=judged_on,
         n_fit=len(given.steps),
@@ -235,6 +237,9 @@ def _enough(data: Dataset, model: ComposedModel, fit_part: Part, judged_on: Held
     went, jitter = rms(displacement(here)), rms(model.difference(fit_part.steps.y1, fit_part.steps.y0))
     if np.all(went < MOVED * jitter + 1e-12) and np.any(rms(judge(model, here).ends) > ASKED * went):
         raise NotEnoughEvidence(f"{data.source}: the robot stood still although it was asked to move; nothing can be traced until it moves")
+    sooner = [replace(here, horizon=steps) for steps in (2, 3, 5, 10) if steps < ahead]
+    if all(np.all(rms(displacement(h)) < MOVED * jitter) for h in (here, *sooner)):
+        raise NotEnoughEvidence(f"{data.source}: no state goes farther than its noise makes it jump from row to row; nothing can be traced")
 
 
 class _Whole:

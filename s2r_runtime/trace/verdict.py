@@ -3,7 +3,7 @@
 sensor_fault   nothing is missing, but measurements are wrong in places
 none           nothing beyond noise
 unexplained    structure is left that no effect accounts for: nothing was found; or what was found leaves a large part, or has the
-               wrong shape for what it acts on; or the model with it foretells the held-out data no better than `stays where it is`
+               wrong shape for what it acts on; or the model (with it) foretells the held-out data no better than `stays where it is`
 ambiguous      rivals explain as much
 traced         otherwise
 """
@@ -40,6 +40,9 @@ CONFIRMED = 0.01
 FORETELLS, NEARER = 0.7, 0.95
 """A model whose rollouts end farther off than these shares of the way that the robot went foretells nothing worth a name."""
 
+NOISIER = 3.0
+"""Times what noise alone makes of the ends of rollouts from which on it is not noise that takes them there; it may be coloured."""
+
 
 def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
     """Less the effects without which the held-out data are foretold as well: what wandered in the fit's part need not go on."""
@@ -54,12 +57,12 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
     return chosen if fit is chosen.fit else replace(chosen, fit=fit, rivals=() if not fit.added else chosen.rivals)
 
 
-def verdict_of(chosen: Selection, structure: Structure, faults: tuple[Fault, ...], foretold: bool) -> Verdict:
-    """One of the five."""
+def verdict_of(chosen: Selection, structure: Structure, faults: tuple[Fault, ...], after: Judged, given: Held, floor: Array) -> Verdict:
+    """One of the five. after: of what was chosen, on what was held out; floor: of its rollouts, by noise alone."""
     faulty = any(fault.kind != "dropout" for fault in faults)
     if not chosen.fit.added:
-        return "unexplained" if structure.matters else "sensor_fault" if faulty else "none"
-    if not foretold or _withdrawn(chosen.fit, structure):
+        return "unexplained" if structure.matters or foretells_nothing(after, given, floor) else "sensor_fault" if faulty else "none"
+    if not foretells(after, given) or _withdrawn(chosen.fit, structure):
         return "unexplained"
     return "ambiguous" if chosen.rivals else "traced"
 
@@ -78,11 +81,28 @@ def foretells(judged: Judged, given: Held) -> bool:
     """
     if not len(judged.ends):
         return True
+    share = _off(judged, given)
+    share = share[~np.isnan(share)]
+    return not len(share) or bool(np.any(share < FORETELLS) and np.all(share < NEARER))
+
+
+def foretells_nothing(judged: Judged, given: Held, floor: Array) -> bool:
+    """Whether rollouts end no nearer in some state that goes somewhere, and not because noise takes it there: the model is another
+    robot's, whatever its residual looks like. floor: (nx,) what noise alone makes of the ends of rollouts.
+    """
+    if not len(judged.ends):
+        return False
+    columns = _together(given.data.states)
+    by_noise = np.array([float(np.sqrt(np.sum(floor[group] ** 2))) for group in columns])
+    return bool(np.any((_off(judged, given) > NEARER) & (_lengths(judged.ends, columns) > NOISIER * by_noise)))
+
+
+def _off(judged: Judged, given: Held) -> Array:
+    """How far rollouts end from the measurement, over how far the state went; NaN for states that go nowhere."""
     columns = _together(given.data.states)
     gone, step, off = (_lengths(e, columns) for e in (displacement(given), given.steps.y1 - given.steps.y0, judged.ends))
-    share = off / np.maximum(gone, 1e-300)
     goes = gone > min(5.0, 0.5 * given.horizon) * step
-    return not goes.any() or bool(np.any(share[goes] < FORETELLS) and np.all(share[goes] < NEARER))
+    return np.where(goes, off / np.maximum(gone, 1e-300), np.nan)
 
 
 def _together(states: tuple[str, ...]) -> list[list[int]]:
