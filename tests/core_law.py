@@ -203,9 +203,10 @@ class Law:
             if lockstep:
                 self.latest, self.usable = seen, True
             return
-        if self.latest is not None and seen.seq == self.latest.seq and (self.usable or not lockstep or seen.fault):
-            return
         valid = not seen.fault and len(seen.x) == 3 and all(map(math.isfinite, seen.x))
+        if self.latest is not None and seen.seq == self.latest.seq and (self.usable or not lockstep or seen.fault):
+            self.usable = self.usable and (valid or lockstep)
+            return
         ordered = self.good is None or (seen.seq > self.good.seq and seen.stamp_ns > self.good.stamp_ns)
         again = seen.seq == self.odd if lockstep else self.now - self.good_ns > self.settings.observation_timeout_ns
         self.usable = valid and (ordered or again)

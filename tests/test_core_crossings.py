@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
+import msgspec
 import pytest
-from core_rig import DT, GAP, Rig, S, of, one
+from core_rig import DT, GAP, Rig, S, kinds, of, one
 
 from s2r_runtime.core import drive, ledger
 from s2r_runtime.core.state import Turn
 from s2r_runtime.messages import (
     Answer,
     CertificateFailed,
+    GateChanged,
     IssueCertificate,
     JobFinished,
+    Observed,
     OverrideChanged,
     Persist,
     Send,
@@ -200,3 +204,26 @@ def test_a_permit_of_no_time_at_all_and_one_of_the_longest_are_permits() -> None
         assert rig.state.permit_until_ns is None
     assert one(rig.request("permit", duration_s=1.0), Answer).exit_code == 0
     assert rig.state.permit_until_ns == rig.t + S
+
+
+@pytest.mark.parametrize(
+    "spoiled", [{"x": (), "fault": "malformed"}, {"x": (math.nan, 0.0, 0.0)}, {"x": (0.5, 0.2)}], ids=["fault", "NaN", "short"]
+)
+def test_what_a_robot_says_of_no_use_closes_the_gate_at_once_also_under_the_number_of_what_was_good(spoiled: dict[str, Any]) -> None:
+    """A transport that can't read the number of what came, or whose robot says that it knows its position no more, gives it that number."""
+    rig = Rig()
+    rig.driving()
+    good = rig.state.observation
+    assert good is not None
+    rig.t += DT // 2
+    outputs = rig.feed(Observed(rig.t, msgspec.structs.replace(good, **spoiled)))
+    assert kinds(outputs)[:2] == ["GateChanged", "Send"]
+    assert (one(outputs, GateChanged).reason, one(outputs, Send).source) == ("observation_invalid", "recovery")
+    assert rig.state.observation == good
+    assert kinds(rig.feed(Observed(rig.t, msgspec.structs.replace(good, **spoiled)))) == []
+    rig.feed(Observed(rig.t, good))  # an echo of before says nothing of now
+    assert rig.state.gate_reason == "observation_invalid"
+    for _ in range(8):
+        rig.observe()
+        rig.propose()
+    assert rig.state.gate_open

@@ -149,7 +149,7 @@ def observed(turn: Turn, observation: Observation) -> None:
 
 def _trouble(turn: Turn, observation: Observation) -> str:
     """Why the observation is not usable, or empty. Also takes a robot that started anew for what it is."""
-    if observation.fault or len(observation.x) != len(turn.settings.states) or not all(gate.finite(value) for value in observation.x):
+    if not _usable(turn, observation):
         return "observation_invalid"
     last = turn.state.observation
     if last is None or (observation.seq > last.seq and observation.stamp_ns > last.stamp_ns):
@@ -164,6 +164,10 @@ def _trouble(turn: Turn, observation: Observation) -> str:
     close(turn, "observation_out_of_order")  # another robot, for all that is known: the gate settles anew
     forget_observations(turn)
     return ""
+
+
+def _usable(turn: Turn, observation: Observation) -> bool:
+    return not observation.fault and len(observation.x) == len(turn.settings.states) and all(gate.finite(value) for value in observation.x)
 
 
 def forget_observations(turn: Turn) -> None:
@@ -190,6 +194,9 @@ def _begin_instant(turn: Turn, observation: Observation, trouble: str) -> None:
 
 def _repeated(turn: Turn, observation: Observation) -> None:
     if not turn.settings.lockstep:
+        if not _usable(turn, observation):  # nothing that was seen before, but what a transport makes of what has no number of its own
+            turn.set(trouble="observation_invalid")
+            regate(turn)
         return
     if observation == turn.state.observation:  # what came in between was a stray; the robot waits here
         turn.set(seen_seq=observation.seq, trouble="")
