@@ -24,9 +24,10 @@ QUANTA = 6.0
 LONG_FROZEN = 50
 """Rows of exact repeats that need no catching up to count as frozen."""
 
-RESTLESS, RESTS, REPEATS = 12, 30, 0.01
-"""Rows of exact repeats that count as frozen, however little the robot moves, where a state repeats itself on less than such a share of at
-least so many other rows on which it hardly moves either: noise that jitters there would have to hold still so often in a row.
+RESTLESS, RESTS, REPEATS, ALTERNATES = 12, 60, 0.01, -0.3
+"""Rows of exact repeats that count as frozen, however little the robot moves, where a state jitters on other rows on which it hardly moves
+either: on at least so many of them, of which less than such a share repeat, and whose residuals alternate. Noise of a measurement has a
+correlation of -1/2 from one residual to the next; a slow motion, or an effect that the model lacks, has none below zero.
 """
 
 
@@ -51,7 +52,7 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
         for a, b in _stretches(change == 0.0):
             if b - a < FROZEN_ROWS:
                 continue
-            if b - a >= RESTLESS and _restless(change, np.abs(moves[:, j]) < reach.noise[j], a, b):
+            if b - a >= RESTLESS and _restless(change, e[:, j], np.abs(moves[:, j]) < reach.noise[j], (a, b)):
                 bad[a + 1 : b + 1, j] = True
                 found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
                 continue
@@ -69,11 +70,17 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
     return found
 
 
-def _restless(change: Array, resting: Mask, a: int, b: int) -> bool:
-    """Whether a state jitters on rows outside [a, b) on which it hardly moves."""
-    others = resting & np.isfinite(change)
-    others[a:b] = False
-    return int(np.count_nonzero(others)) >= RESTS and float(np.mean(change[others] == 0.0)) < REPEATS
+def _restless(change: Array, e: Array, resting: Mask, within: tuple[int, int]) -> bool:
+    """Whether a state jitters on rows outside `within` on which it hardly moves. e: (K,) its residuals."""
+    others = resting & np.isfinite(e)
+    others[slice(*within)] = False
+    if np.count_nonzero(others) < RESTS or float(np.mean(change[others] == 0.0)) >= REPEATS:
+        return False
+    pairs = others[:-1] & others[1:]
+    limit = 3.0 * float(np.median(np.abs(e[others])))
+    first, second = (np.clip(part[pairs], -limit, limit) for part in (e[:-1], e[1:]))
+    size = float(np.sqrt(np.sum(first**2) * np.sum(second**2)))
+    return bool(np.count_nonzero(pairs) >= RESTS // 2 and size > 0.0 and float(np.sum(first * second)) < ALTERNATES * size)
 
 
 def _stretches(yes: Mask) -> list[tuple[int, int]]:
