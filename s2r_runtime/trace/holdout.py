@@ -1,8 +1,8 @@
 """Which transitions the fit sees, and which it never does.
 
 Of one run two stretches are held out, one of them the end (HELD_OUT); of several runs, whole runs drawn by the seed (TEST_SHARE). Where
-the inputs of one side do not reach as far as those of the other, other stretches, or runs, are held out on which they do (AGAIN, DRAWS): an
-end stop that only one side meets would be found and not confirmed, or not found. What the robot did then is not looked at.
+the inputs of one side do not reach as far as those of the other, other stretches, or runs, are held out on which they do (TENTHS,
+DRAWS): an end stop that only one side meets would be found and not confirmed, or not found. What the robot did then is not looked at.
 Long recordings are thinned for the fit: blocks of contiguous steps, evenly spread, each with the inputs before it from which
 hidden states settle.
 """
@@ -10,7 +10,7 @@ hidden states settle.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,18 +18,22 @@ from numpy.typing import NDArray
 from s2r_runtime.trace.dataset import Dataset, Run
 from s2r_runtime.trace.residual import Steps, first_steps, steps_of
 
+Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 HELD_OUT = ((0.3, 0.5), (0.8, 1.0))
 """Parts of a run's time. Two, so that what the robot did, and what became of it, is seen early and late on both sides."""
 
-AGAIN = (((0.2, 0.4), (0.7, 0.9)), ((0.1, 0.3), (0.6, 0.8)), ((0.0, 0.2), (0.5, 0.7)))
-"""Other parts of a run's time, in this order."""
+TENTHS = 4
+"""Tenths of a run's time that are held out, as much as in HELD_OUT."""
 
-DRAWS = 4
+DRAWS = 20
 """Draws of runs, the seed's own first."""
 
-REACH, SHORTER = 0.005, 0.2
+LOOKED_AT = 4000
+"""Rows of inputs, evenly spread, by which ways are compared."""
+
+REACH, SHORTER, LESS = 0.005, 0.07, 0.75
 """An input reaches as far as this share of its rows does, or more; and by this share of its range one side must fall shorter under the
 first way than under another one, for that to be taken.
 """
@@ -61,14 +65,22 @@ def fit_mask(data: Dataset, seed: int, *, everything: bool = False) -> Mask:
     measured = _without(data, [], ())
     if everything:
         return measured
+    u, rows = _rows(data, measured)
     if len(data.runs) >= FEWEST_RUNS:
         rng, few = np.random.default_rng(seed), round(TEST_SHARE * len(data.runs))
         ways = [_without(data, rng.permutation(len(data.runs))[:few].tolist(), ()) for _ in range(DRAWS)]
     else:
-        ways = [_without(data, [], stretches) for stretches in (HELD_OUT, *AGAIN)]
-    shorter = [_shorter(data, measured, seen) for seen in ways]
-    best = int(np.argmin(shorter))
-    return ways[best if shorter[0] > shorter[best] + SHORTER else 0]
+        chosen = [HELD_OUT, *(tuple((k / 10.0, (k + 1) / 10.0) for k in tenths) for tenths in combinations(range(10), TENTHS))]
+        ways = [_without(data, [], stretches) for stretches in sorted(chosen, key=lambda way: (_pieces(way) < 2, _pieces(way)))]
+        ways.insert(0, _without(data, [], HELD_OUT))
+    shorter = np.array([_shorter(u, seen[rows]) for seen in ways])
+    enough = np.flatnonzero(shorter <= shorter.min() + (SHORTER if shorter[0] <= shorter.min() + SHORTER else 0.5 * SHORTER))
+    return ways[int(enough[0])]
+
+
+def _pieces(stretches: tuple[tuple[float, float], ...]) -> int:
+    """How many, those that touch taken as one: the longer they are, the longer a rollout can be judged."""
+    return 1 + sum(before[1] < after[0] for before, after in pairwise(stretches))
 
 
 def _without(data: Dataset, runs: list[int], stretches: tuple[tuple[float, float], ...]) -> Mask:
@@ -86,15 +98,24 @@ def _without(data: Dataset, runs: list[int], stretches: tuple[tuple[float, float
     return seen
 
 
-def _shorter(data: Dataset, measured: Mask, seen: Mask) -> float:
-    """By which share of its range an input falls short on one side of what it reaches on the other; the worst input and direction."""
-    u = np.concatenate([run.u[:: data.substeps][: len(run.y) - 1] for run in data.runs])
-    sides = [u[measured & seen], u[measured & ~seen]]
+def _rows(data: Dataset, measured: Mask) -> tuple[Array, NDArray[np.int64]]:
+    """Inputs (n, nu) of some of the steps that were measured, and which ones."""
+    rows = np.flatnonzero(measured)
+    rows = rows[:: max(1, len(rows) // LOOKED_AT)]
+    return np.concatenate([run.u[:: data.substeps][: len(run.y) - 1] for run in data.runs])[rows], rows
+
+
+def _shorter(u: Array, seen: Mask) -> float:
+    """By which share of its range an input falls short on one side of what it reaches on the other; the worst input and direction. What the
+    fit does not reach counts in full, as it can't be found then; what the judge does not reach, LESS.
+    """
+    sides = [u[seen], u[~seen]]
     if not all(map(len, sides)):
         return 0.0
     ends = [np.sort(side, axis=0)[[int(REACH * len(side)), -1 - int(REACH * len(side))]] for side in sides]
-    span = np.ptp(u[measured], axis=0)
-    return float(np.max(np.abs(ends[0] - ends[1]) / np.where(span > 0.0, span, 1.0)))
+    beyond = np.stack([ends[0][0] - ends[1][0], ends[1][1] - ends[0][1]])  # what is held out reaches farther: low, high
+    span = np.ptp(u, axis=0)
+    return float(np.max(np.maximum(beyond, -LESS * beyond) / np.where(span > 0.0, span, 1.0)))
 
 
 def part(data: Dataset, left_out: tuple[tuple[int, int], ...], seen: Mask, most: int) -> Part:

@@ -66,8 +66,10 @@ AHEAD = 0.4
 SEGMENTS = 40
 """Segments that are looked at, evenly spread."""
 
-DRIFTS, PARTS = 3, 8
-"""Steps by which the lead must grow from the first to the last of so many parts of the recording."""
+DRIFTS, PARTS, DRIFTING = 3, 8, 0.7
+"""Steps by which the lead must grow from the first to the last of so many parts of the recording; and the squared error with it, over
+the one with the best lead for all, below which it does.
+"""
 
 
 @dataclass(frozen=True)
@@ -216,8 +218,8 @@ def _check_clocks(model: ComposedModel, data: Dataset) -> None:
     best = leads[int(np.argmin(total))]
     by_part = [leads[int(k)] for k in np.argmin(cost, axis=0)]
     steadily = by_part in (sorted(by_part), sorted(by_part, reverse=True))
-    drifts = abs(by_part[-1] - by_part[0]) >= DRIFTS and steadily and max(by_part) > 0
     followed, single = float(np.sum(np.min(cost, axis=0))), float(np.min(total))
+    drifts = abs(by_part[-1] - by_part[0]) >= DRIFTS and steadily and max(by_part) > 0 and followed < DRIFTING * single
     causal = float(np.min(total[np.array(leads) <= 0]))
     if min(followed if drifts else math.inf, single if best > 0 else math.inf) < AHEAD * causal:
         causal = min(causal, _least_causal(lambda delay: sum(costs(-delay)), min(round(LEAD_S / data.dt), longest // 4), apart))

@@ -21,7 +21,7 @@ from s2r_runtime.trace.errors import Held, Judged, better, displacement
 from s2r_runtime.trace.faults import Fault
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, without
 from s2r_runtime.trace.lack_of_fit import Structure
-from s2r_runtime.trace.residual import rms
+from s2r_runtime.trace.residual import acting, predicted, rms
 from s2r_runtime.trace.selection import Selection
 
 Array = NDArray[np.float64]
@@ -37,6 +37,9 @@ SAME_KIND = 0.05
 CONFIRMED = 0.01
 """An effect stays if it lowers some error on held-out data by this share."""
 
+ASKED = 0.1
+"""Of what an effect does in a step where it was found: if it does less where it is judged, that is not asked for it."""
+
 FORETELLS, NEARER = 0.7, 0.95
 """A model whose rollouts end farther off than these shares of the way that the robot went foretells nothing worth a name."""
 
@@ -51,10 +54,19 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
         again = False
         for place in fit.added:
             less = fitted(given, fit, without(fit.model, place), 2)
-            if not better(judged_on, fit.model, less.model, CONFIRMED):
+            if not better(judged_on, fit.model, less.model, CONFIRMED) and _asked(given, judged_on, fit.model, less.model):
                 fit, again = less, True
                 break
     return chosen if fit is chosen.fit else replace(chosen, fit=fit, rivals=() if not fit.added else chosen.rivals)
+
+
+def _asked(given: Problem, judged_on: Held, model: ComposedModel, less: ComposedModel) -> bool:
+    """Whether the held-out data ask for an effect at all: an end stop that they never meet, they can neither confirm nor refute."""
+    fitted_on, held_out = (
+        rms(model.difference(*(predicted(m, steps, acting(m, data)) for m in (model, less))))
+        for data, steps in ((given.data, given.steps), (judged_on.data, judged_on.steps))
+    )
+    return bool(np.any(held_out > ASKED * fitted_on))
 
 
 def verdict_of(chosen: Selection, structure: Structure, faults: tuple[Fault, ...], after: Judged, given: Held, floor: Array) -> Verdict:
