@@ -215,6 +215,7 @@ def test_what_a_robot_says_of_no_use_closes_the_gate_at_once_also_under_the_numb
     rig.driving()
     good = rig.state.observation
     assert good is not None
+    assert kinds(rig.feed(Observed(rig.t, good))) == []  # an echo changes nothing
     rig.t += DT // 2
     outputs = rig.feed(Observed(rig.t, msgspec.structs.replace(good, **spoiled)))
     assert kinds(outputs)[:2] == ["GateChanged", "Send"]
