@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 
 import msgspec
 
@@ -25,6 +26,7 @@ class CoreReplay:
         self._due: deque[Output] = deque()
         self.stopped = False
         self._last: Entry | None = None
+        self._events = self._outputs = 0
 
     def event(self, entry: Entry, event: Event) -> tuple[Output, ...]:
         """Handles an event; the outputs, in the core's order."""
@@ -35,7 +37,7 @@ class CoreReplay:
         self.state, outputs = core.handle(self.state, event)
         self._due.extend(outputs)
         self._last = entry
-        self._findings.count("events")
+        self._events += 1
         return outputs
 
     def output(self, entry: Entry) -> None:
@@ -49,7 +51,7 @@ class CoreReplay:
         if CHANNELS[entry.channel] is not type(due) or not self._same(_ENCODE(due), entry):
             self._differ(entry, "the core gives another output here", entry.raw, due)
             return
-        self._findings.count("outputs")
+        self._outputs += 1
 
     def _same(self, due: bytes, entry: Entry) -> bool:
         """On another platform up to rounding; but no other text that some reader would take for it."""
@@ -61,6 +63,9 @@ class CoreReplay:
 
     def end(self, *, complete: bool) -> None:
         """Nothing follows. complete: so the last event's outputs must be there."""
+        for what, n in (("events", self._events), ("outputs", self._outputs)):
+            if n:
+                self._findings.count(what, n)
         if not self._due or self.stopped:
             return
         if complete and self._last is not None:
@@ -73,11 +78,9 @@ class CoreReplay:
         self._findings.differ(entry.index, entry.channel, what, recorded, recomputed)
 
 
-def in_effect_order(outputs: tuple[Output, ...]) -> list[Output]:
+def in_effect_order(outputs: tuple[Output, ...]) -> Sequence[Output]:
     """The order in which the daemon carries outputs out: where the gate closes, the commands come first."""
-    if len(outputs) < 2:
-        return list(outputs)
-    if not any(isinstance(output, GateChanged) and not output.open for output in outputs):
-        return list(outputs)
+    if len(outputs) < 2 or not any(isinstance(output, GateChanged) and not output.open for output in outputs):
+        return outputs
     sends: list[Output] = [output for output in outputs if isinstance(output, Send)]
     return sends + [output for output in outputs if not isinstance(output, Send)]

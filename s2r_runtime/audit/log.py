@@ -8,7 +8,8 @@ constant memory but for attachments and campaign samples.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+import gc
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,19 +20,23 @@ from s2r_runtime.audit.ahead import Ahead
 from s2r_runtime.audit.beside import Beside
 from s2r_runtime.audit.campaign import CampaignReplay
 from s2r_runtime.audit.certificates import Certificates
+from s2r_runtime.audit.endings import anchored, continues, deleted, ended, unrecorded
 from s2r_runtime.audit.evidence import Evidence
 from s2r_runtime.audit.findings import CertificateFinding, Difference, Findings, ModelFinding
 from s2r_runtime.audit.run import Across, RunAudit
 from s2r_runtime.audit.traces import SECONDS, Traces
 from s2r_runtime.errors import NotEnoughEvidence, RecordingError
 from s2r_runtime.recording.blocks import find
-from s2r_runtime.recording.channels import DELETED, UNRECORDED, LogDeleted, Unrecorded
-from s2r_runtime.recording.layout import ABOUT, RECOVERED
+from s2r_runtime.recording.channels import DELETED, UNRECORDED
+from s2r_runtime.recording.layout import ABOUT
 from s2r_runtime.recording.logs import is_log, runs
-from s2r_runtime.recording.reading import Reading
+from s2r_runtime.recording.reading import Entry, Reading
 from s2r_runtime.recording.writer import environment
 from s2r_runtime.revocations import Revocation
 
+COLLECT_EVERY = 20_000
+"""Objects made beyond those that are gone again, between two searches for cycles: some MB."""
+OWN = frozenset((UNRECORDED, DELETED))
 PROGRESS_EVERY = 2000
 """Messages between two looks at how far it is."""
 MACHINE = "cpu"
@@ -120,7 +125,7 @@ def audit(
     readings = [reading for parts in grouped for reading in parts]
     for reading in readings:
         reading.sought = frozenset(heads)
-    with contextlib.closing(Ahead(readings)) as ahead, contextlib.closing(beside):
+    with _few_collections(), contextlib.closing(Ahead(readings)) as ahead, contextlib.closing(beside):
         for parts in grouped:
             _run(RunAudit(across), parts, ahead, findings, tell)
         beside.end()
@@ -128,7 +133,7 @@ def audit(
     if not records and findings.first is None and _chain(readings) != "broken":
         raise NotEnoughEvidence(f"{', '.join(str(path) for path in paths)}: no record could be read, so there is nothing to audit")
     across.campaigns.end()
-    _anchored(readings, heads, findings)
+    anchored(readings, heads, findings)
     signed_by, trusted_all = _signers(readings, public_key, revoked or {})
     chain = _chain(readings)
     valid = all(one.valid for one in findings.certificates.values())
@@ -148,6 +153,19 @@ def audit(
         skipped=list(findings.skipped),
         models=list(findings.models),
     )
+
+
+@contextlib.contextmanager
+def _few_collections() -> Iterator[None]:
+    """Messages are no cycles: looking for some every 700 of them, among all that was imported, takes time and finds nothing."""
+    before = gc.get_threshold()
+    gc.freeze()
+    gc.set_threshold(COLLECT_EVERY, *before[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)
+        gc.unfreeze()
 
 
 def _damaged(paths: Sequence[Path], error: RecordingError) -> AuditResult:
@@ -171,7 +189,7 @@ def _run(run: RunAudit, parts: list[Reading], ahead: Ahead, findings: Findings, 
     lost = False
     for done, reading in enumerate(parts, 1):
         findings.file = reading.path.name
-        if not _continues(before, reading, findings):
+        if not continues(before, reading, findings):
             break
         here = environment()
         told = reading.metadata.get(ABOUT, {})
@@ -181,20 +199,15 @@ def _run(run: RunAudit, parts: list[Reading], ahead: Ahead, findings: Findings, 
         for number, entry in enumerate(ahead.entries(reading)):
             if lost:
                 findings.differ(entry.index, entry.channel, "the log says before that nothing more could be recorded", entry.raw, None)
-            if entry.channel in (UNRECORDED, DELETED) and msgspec.json.encode(entry.message) != entry.raw:
-                findings.differ(entry.index, entry.channel, "this is not how a recorder writes it", entry.raw, entry.message)
-            if entry.channel == UNRECORDED:
-                _unrecorded(entry.message, findings)
-                lost = True
-            else:
+            if entry.channel not in OWN:
                 run.entry(entry)
-            if entry.channel == DELETED:
-                _deleted(entry.message, findings)
+            else:
+                lost |= _about_itself(run, entry, findings)
             if number % PROGRESS_EVERY == 0:
                 tell.at(reading)
         tell.over(reading)
         before = reading
-        if not _ended(reading, findings):
+        if not ended(reading, findings):
             for left in parts[done:] if reading.ending.kind == "cut" else ():
                 findings.cannot(f"{left.path.name} follows a part whose end is missing, so nothing in it could be recomputed")
             break
@@ -209,59 +222,17 @@ def _run(run: RunAudit, parts: list[Reading], ahead: Ahead, findings: Findings, 
                 pass
 
 
-def _continues(before: Reading | None, reading: Reading, findings: Findings) -> bool:
-    """Whether a part goes on where the one before ended."""
-    if before is None:
-        if reading.part > 1:
-            findings.cannot(f"{reading.path.name} is part {reading.part} of its run; without the parts before it nothing can be recomputed")
-        return reading.part <= 1
-    if reading.part != before.part + 1 or reading.public_key != before.public_key:
-        findings.cannot(f"between {before.path.name} and {reading.path.name} a part of the run is missing")
-        return False
-    if reading.previous_head != before.head or reading.first_index != before.ending.index:
-        findings.differ(reading.first_index, "log/chain", "this part does not continue the one before", reading.previous_head, before.head)
-        return False
-    return True
-
-
-def _ended(reading: Reading, findings: Findings) -> bool:
-    """Notes how a file ended; whether a next part can go on from it."""
-    end = reading.ending
-    if end.kind == "broken":
-        findings.differ(end.index, "log/chain", f"the log is damaged: {end.detail}", None, None)
-    elif end.kind == "cut":
-        lost = f" ({end.lost_bytes} bytes could not be used)" if end.lost_bytes else ""
-        what = "nothing but the index" if reading.sealed_for_good else "what came after"
-        if (known := reading.metadata.get(RECOVERED)) is not None:
-            told = known.get("missing", "nothing, says the recovery")
-            findings.lack(f"{reading.path.name} was recovered; it lacks, as the recovery says and nothing vouches for: {told}")
-            return reading.sealed_for_good
-        findings.lack(f"{what}: {reading.path.name} was cut after {end.index} messages: {end.detail}{lost}")
-    return end.kind == "rotated" or (end.kind == "cut" and reading.sealed_for_good)
-
-
-def _anchored(readings: Sequence[Reading], heads: Sequence[bytes], findings: Findings) -> None:
-    """Every head that was published must be one that the chain came by: it was on the disk when it was published."""
-    met = set[bytes]().union(*(reading.met for reading in readings))
-    last = readings[-1]
-    for head in heads:
-        if head not in met:
-            findings.file = last.path.name
-            what = "the log does not come to a head that was published: its tail was cut off, or it is another log"
-            findings.differ(last.ending.index, "log/chain", what, last.head.hex(), head.hex())
-        else:
-            findings.count("published heads")
-
-
-def _unrecorded(message: msgspec.Struct, findings: Findings) -> None:
-    assert isinstance(message, Unrecorded)  # noqa: S101 - the channel's type
-    findings.lack(f"{message.count} messages at the end were not recorded: {message.reason}")
-
-
-def _deleted(message: msgspec.Struct, findings: Findings) -> None:
-    assert isinstance(message, LogDeleted)  # noqa: S101 - the channel's type
-    head = f" (head {message.head})" if message.head else ""
-    findings.lack(f"the log of run {message.run}{head}, which the daemon deleted: {message.reason}")
+def _about_itself(run: RunAudit, entry: Entry, findings: Findings) -> bool:
+    """What the log says about itself; whether that is that it lacks all that came after."""
+    message = entry.message
+    if msgspec.json.encode(message) != entry.raw:
+        findings.differ(entry.index, entry.channel, "this is not how a recorder writes it", entry.raw, message)
+    if entry.channel == UNRECORDED:
+        unrecorded(message, findings)
+        return True
+    run.entry(entry)
+    deleted(message, findings)
+    return False
 
 
 def _chain(readings: Sequence[Reading]) -> str:
