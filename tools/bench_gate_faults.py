@@ -1,6 +1,6 @@
 """Seeded faults in the gate and in the core, as many as asked for; none may let a command pass that the document would not.
 
-    python tools/bench_gate_faults.py --count 100000 [--seed 1] [--first 0] [--json]
+    python tools/bench_gate_faults.py --count 100000 [--seed 1] [--first 0] [--core] [--json]
 
 *Gate*: the situation in which everything holds, one to three of its fields, its certificate's, its command's, its observation's or its
 settings' replaced by hostile values; the verdict and its reason are compared with the document's table (tests/gate_law.py). *Core*: one
@@ -68,18 +68,19 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=100_000, help="cases in the gate, and as many in the core")
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--core", action="store_true", help="only the cases in the core; an interrupt (SIGINT) ends them with what was run")
     parser.add_argument("--quick", action="store_true", help="a hundredth of them")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     numbers = range(options.first, options.first + (options.count // 100 if options.quick else options.count))
     begun = time.process_time()
-    given, wrong = gate_cases(options.seed, numbers)
+    given, wrong = gate_cases(options.seed, numbers) if not options.core else (Counter[str](), [])
     faults, reasons, events, wrong_too = core_cases(options.seed, numbers)
     wrong += wrong_too
     spent = time.process_time() - begun
     if options.json:
         found = {
-            "cases": len(numbers) + len(events) + len(wrong_too),
+            "cases": given.total() + len(events) + len(wrong_too),
             "wrong": wrong,
             "gate": given,
             "core": reasons,
@@ -89,7 +90,8 @@ def main() -> int:
         print(json.dumps(found))
         return 1 if wrong else 0
     print("\n".join(wrong[:SHOWN]))
-    print(f"gate: {len(numbers)} cases, {given[gate.ALLOWED]} of them harmless and allowed, {len(given) - 1} reasons given")
+    if not options.core:
+        print(f"gate: {len(numbers)} cases, {given[gate.ALLOWED]} of them harmless and allowed, {len(given) - 1} reasons given")
     ran = len(events) + len(wrong_too)
     mended = f"all mended, the last after {max(events, default=0)} events" if len(events) == ran else f"{len(events)} mended"
     print(f"core: {ran} cases of {len(faults)} kinds of fault, {faults.total()} faults; {len(reasons)} reasons; {mended}")
