@@ -8,7 +8,8 @@ sample is drawn anew, so all of them are independent and of one law. Each campai
 of `law` other samples beyond it. At 100 samples and epsilon 3 % the statement may be wrong in 4.8 % of campaigns.
 
 The promise is broken if the exact 99.9 % lower limit of the rate of misses exceeds beta. A planted fault must be caught: the least r of ten
-campaigns. Exit 1 if the promise is broken or the fault is not caught.
+campaigns, which misses in 39 %. Exit 1 if the promise is broken, or if the fault is not caught in 30 groups of ten campaigns or more (in
+fewer, a lower limit this sure often stays below 5 %).
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ from s2r_runtime.profile import load_profile
 Array = NDArray[np.float64]
 PROFILE = load_profile(ROOT / "profiles" / "quadruped.toml")
 N, EPSILON, BETA, SURE, SHOPPED = 100, 0.03, 0.05, 0.001, 10
+GROUPS = 30
+"""So many groups show the planted fault: of 30, 7 or more miss in 97.5 % of runs, and 7 have a lower limit above 5 %."""
 NORMS: tuple[tuple[str, tuple[float, ...], Kind], ...] = (
     ("literal ball", LITERAL, "ball"),
     ("weighted ball", BODY, "ball"),
@@ -73,7 +76,7 @@ def row(name: str, radii: Array, ordered: Array, *, planted: bool) -> dict[str, 
     lower = clopper_pearson_lower(missed, n, SURE)
     interval = (clopper_pearson_lower(missed, n, 0.025), clopper_pearson_upper(missed, n, 0.025))
     spread = [float(q) for q in np.quantile(radii, (0.5, 0.05, 0.95))]
-    ok = (lower > BETA) == planted
+    ok = (lower > BETA) == planted or (planted and n < GROUPS)
     return {"what": name, "campaigns": n, "missed": missed, "rate": missed / n, "interval": interval, "lower": lower, "r": spread, "ok": ok}
 
 
@@ -104,7 +107,9 @@ def main(arguments: list[str], make: Callable[[Sequence[str]], Walker] = quadrup
     print(f"N = {N}, epsilon {EPSILON:.0%}: {exact:.2%} of campaigns may miss; V(r) on {given.law} other samples")
     print(f"{'':34s} {'runs':>5s} {'missed':>7s} {'95 % interval':>17s} {'99.9 % lower':>13s}   r: median [5 %, 95 %]")
     for r in made:
-        verdict = ("caught" if r["ok"] else "NOT CAUGHT") if r["what"].startswith("fault") else ("holds" if r["ok"] else "BROKEN")
+        verdict = "holds" if r["ok"] else "BROKEN"
+        if r["what"].startswith("fault"):
+            verdict = "caught" if r["lower"] > BETA else "too few groups to tell" if r["ok"] else "NOT CAUGHT"
         low, high = r["interval"]
         median, least, most = r["r"]
         print(
