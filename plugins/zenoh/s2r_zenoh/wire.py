@@ -170,7 +170,7 @@ class Wire:
         return Observation(last.seq + self._seq_offset, last.stamp_ns + self._stamp_offset, (), fault)
 
     def _accept(self, payload: ObservationPayload, frame: Frame) -> None:
-        self._last, self._arrival_ns = payload, frame.arrival_ns
+        self._last, self._arrival_ns, self.too_old = payload, frame.arrival_ns, b""
 
     def _numbered(self, payload: ObservationPayload, x: tuple[float, ...]) -> Observation:
         return Observation(payload.seq + self._seq_offset, payload.stamp_ns + self._stamp_offset, x)

@@ -164,7 +164,9 @@ def test_robot_without_a_boot_number_that_repeats_an_old_count_is_one_that_start
     assert [heard(again, SECOND // 5 * k) for k in (1, 2)] == [[], []], "an echo of the past, for all that is known"
     down, up, anew = heard(again, SECOND)
     assert (down.up, up.up, anew.seq > 900, anew.x) == (False, True, True, (0.1, 0.2))
+    transport.send(transport.encode(Command(1, SECOND, "controller", (0.1, 0.0), anew.seq, SECOND)))
     assert heard(again, SECOND + 1) == [], "it waits"
+    assert transport.counters()["repeated"] == 2, "and gets its answer once more, which may have been lost"
 
 
 def test_command_is_named_inputs_with_all_that_the_robot_needs() -> None:
