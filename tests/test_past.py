@@ -122,6 +122,26 @@ def test_a_state_and_a_log_that_each_know_what_the_other_does_not_start_nothing(
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    "edit",
+    [
+        {"campaign_n": 161},
+        {"watch_e_value": 1.0},
+        {"watch_counts": ()},
+        {"campaign_digest": "sha256:ee"},
+        {"model_digest": "sha256:ff"},
+    ],
+    ids=lambda edit: next(iter(edit)),
+)
+def test_an_edited_state_that_spent_as_much_starts_nothing(tmp_path: Path, edit: dict[str, Any]) -> None:
+    """Fewer samples than were fixed beforehand, or a watch that saw less, would be evidence of something else."""
+    under_way = changed(epochs=2, campaign_epoch=2, campaign_n=200, watch_e_value=9.0, watch_counts=(38, 2), campaign_digest="sha256:dd")
+    log(tmp_path, under_way)
+    assert reconciled(under_way, tmp_path) == (under_way, "")
+    with pytest.raises(ConfigError, match="put the newest state"):
+        reconciled(msgspec.structs.replace(under_way, **edit), tmp_path)
+
+
 def test_what_is_latched_in_the_log_or_in_an_older_state_stays_latched(tmp_path: Path) -> None:
     log(tmp_path, changed(latched=("emergency_stop",)))
     assert reconciled(NOW, tmp_path)[0] == changed(latched=("emergency_stop",))
@@ -144,7 +164,8 @@ def test_only_a_log_that_is_sound_and_this_robots_own_is_believed(tmp_path: Path
 def test_only_logs_of_this_robot_are_looked_at_and_an_unreadable_one_hides_none_before_it(tmp_path: Path) -> None:
     log(tmp_path, NOW)
     (tmp_path / "rig-2-20270101T000000Z.mcap").write_bytes(log(tmp_path, changed(robot="rig-2"), stamp="20270101T000000Z").read_bytes())
-    (tmp_path / "rig-20270101T000000Z.mcap").write_bytes(b"")
+    for number in range(past.RUNS + 1):
+        (tmp_path / f"rig-2027010{number + 1}T000000Z.mcap").write_bytes(b"")
     (tmp_path / "rig-20270101T000000Z-2.mcap").write_bytes(b"no log at all")
     assert reconciled(OLDER["an attempt"], tmp_path)[0] == NOW
     assert reconciled(changed(attempts=9), tmp_path / "nowhere")[0] == changed(attempts=9)
@@ -162,6 +183,15 @@ def test_a_glance_gives_what_the_full_reading_gives_however_the_file_ends(tmp_pa
     assert list(glance(path, past.SAID, newest_first=True)) == seen[::-1]
 
 
+def test_a_glance_at_a_chunk_that_says_to_be_larger_than_any_memory_gives_nothing(tmp_path: Path) -> None:
+    path = log(tmp_path, NOW)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"\x28\xb5\x2f\xfd") + 4  # behind zstd's magic: one byte says that the next eight are the content's size
+    data[at : at + 9] = bytes([0xE0]) + (1 << 45).to_bytes(8, "little")
+    path.write_bytes(data)
+    assert list(glance(path, past.SAID)) == []
+
+
 def test_samples_that_a_log_has_are_given_in_order_as_far_as_none_is_missing(tmp_path: Path) -> None:
     path = tmp_path / "rig-20260101T000000Z.mcap"
     writer = Writer(path, run=path.stem, signer=KEY, timed=False)
@@ -169,7 +199,32 @@ def test_samples_that_a_log_has_are_given_in_order_as_far_as_none_is_missing(tmp
         writer.write(SampleTaken(1, 2, index, index, index, (0.0,), (0.0,), (0.0,), (), 1), 1)
     writer.write(SampleTaken(1, 1, 3, 3, 3, (0.0,), (0.0,), (0.0,), (), 1), 1)
     writer.close()
-    assert [one.index for one in past.samples([path, tmp_path / "gone.mcap"], 2)] == [0, 1, 2]
+    assert [one.index for one in past.samples([path, tmp_path / "gone.mcap"], 2, [PUBLIC])] == [0, 1, 2]
+
+
+def test_samples_count_only_from_what_this_robot_sealed(tmp_path: Path) -> None:
+    """A gap rests on them: who can only write where the logs are must not be able to make some."""
+    sample = SampleTaken(1, 2, 0, 0, 0, (0.0,), (0.0,), (0.0,), (), 1)
+    for number, key in enumerate((None, OTHER, KEY)):
+        path = tmp_path / f"{number}.mcap"
+        writer = Writer(path, run=path.stem, signer=key, timed=False)
+        writer.write(sample, 1)
+        writer.durable()
+        writer.write(msgspec.structs.replace(sample, index=1), 2)
+        writer.close()
+        assert len(past.samples([path], 2, [PUBLIC])) == (2 if key is KEY else 0)
+    data = bytearray(path.read_bytes())
+    data[data.index(b"zstd") + 40] ^= 1  # in the first chunk: nobody vouches for what follows
+    path.write_bytes(data)
+    assert past.samples([path], 2, [PUBLIC]) == []
+
+
+def test_samples_are_looked_for_in_all_runs_since_their_campaign_began(tmp_path: Path) -> None:
+    """However often the daemon started since, and did nothing."""
+    under_way = changed(epochs=2, campaign_epoch=2, campaign_n=200)
+    before = [log(tmp_path, NOW, stamp=f"2026010{day}T000000Z") for day in range(1, 6)]
+    since = [log(tmp_path, under_way, stamp=f"2026020{day}T000000Z") for day in range(1, 6)]
+    assert past.campaign_logs(tmp_path, "rig", 2) == [*since[::-1], *before[:1:-1]]
 
 
 # ---------------------------------------------------------------- in a running daemon

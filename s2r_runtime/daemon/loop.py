@@ -221,10 +221,10 @@ class Daemon:
         memory = past.reconciled(memory, folder, self.trust.keys(), self.say)
         if not memory.campaign_epoch:
             return memory, []
-        logs = [path for parts in past.runs(folder, memory.robot)[: past.RUNS] for path in parts]
+        logs = past.campaign_logs(folder, memory.robot, memory.campaign_epoch)
         with contextlib.suppress(ConfigError):  # said when the campaign is to go on
             logs += map(Path, (self.folder.campaign() or {}).get("logs", ()))
-        return memory, past.samples(dict.fromkeys(logs), memory.campaign_epoch)
+        return memory, past.samples(dict.fromkeys(logs), memory.campaign_epoch, self.trust.keys())
 
     def _recall_proposal(self) -> None:
         """A model that waits to be adopted belongs into this log too. One that is not there any more, or not this profile's, can't be."""

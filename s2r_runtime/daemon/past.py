@@ -15,21 +15,27 @@ heads that were published elsewhere tell (docs/log-format.md), and the audit ove
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
+from itertools import count, islice, takewhile
 from pathlib import Path
 
 import msgspec
 
 from s2r_runtime.core.gaps import REFUTED
+from s2r_runtime.core.stream import stood
 from s2r_runtime.errors import ConfigError, RecordingError
 from s2r_runtime.messages import Memory, Persist, SampleTaken, Started
 from s2r_runtime.recording.glance import glance
 from s2r_runtime.recording.reading import Reading
 
 SAID = ("event/started", "out/persist")
+TAKEN = ("event/sample_taken",)
 RUNS = 3
-"""Newest runs that are looked into: one that ended before its first event says nothing, and another may be older than its name."""
+"""Newest runs that say something and are looked into: another may be older than its name. One that ended before its first event says
+nothing, and does not count.
+"""
 _NAME = re.compile(r"-(\d{8}T\d{6}Z)(?:-(\d+))?(?:\.(\d{3,}))?\.mcap")
 """What follows the robot in a log's name: when the run began, which of several in that second, which part of it."""
 
@@ -46,10 +52,7 @@ def runs(folder: Path, robot: str) -> list[list[Path]]:
 def reconciled(state: Memory, folder: Path, keys: Collection[bytes], say: Callable[[str], None]) -> Memory:
     """The memory to start with. keys: public ones, whose logs count. Raises ConfigError if state and logs cannot both be true."""
     latest: tuple[str, ...] | None = None
-    for parts in runs(folder, state.robot)[:RUNS]:
-        told, path = _last_memory(parts)
-        if told is None or told.robot != state.robot:
-            continue
+    for told, path in islice(_told(folder, state.robot), RUNS):
         latest = told.latched if latest is None else latest
         if lost := forgotten(told, state):
             if gained := forgotten(state, told):
@@ -67,6 +70,14 @@ def reconciled(state: Memory, folder: Path, keys: Collection[bytes], say: Callab
 
 def _both(one: tuple[str, ...], other: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*one, *other)))
+
+
+def _told(folder: Path, robot: str) -> Iterator[tuple[Memory, Path]]:
+    """What each run ends with, and where it says so, the newest first."""
+    for parts in runs(folder, robot):
+        told, path = _last_memory(parts)
+        if told is not None and told.robot == robot:
+            yield told, path
 
 
 def _last_memory(parts: list[Path]) -> tuple[Memory | None, Path]:
@@ -108,6 +119,8 @@ def forgotten(before: Memory, now: Memory) -> str:
         return "samples whose gap was refuted or outgrown"
     if now.epochs == before.epochs and now.campaign_epoch and not before.campaign_epoch:
         return f"that the campaign of epoch {now.campaign_epoch} ended"
+    if now.campaign_epoch and now.campaign_epoch == before.campaign_epoch and now.campaign_n != before.campaign_n:
+        return f"that the campaign of epoch {now.campaign_epoch} was fixed beforehand at {before.campaign_n} samples"
     if now.gap is None:
         return ""
     if before.gap is None or before.gap.epoch != now.gap.epoch:
@@ -127,16 +140,47 @@ def _of_one_epoch(before: Memory, now: Memory) -> str:
         return f"that the gap grew to {before.radius}"
     if now.watch_n < before.watch_n or now.watch_exceedances < before.watch_exceedances:
         return f"discrepancies of epoch {epoch}: {before.watch_n} were counted"
+    if (now.watch_n, now.watch_exceedances) == (before.watch_n, before.watch_exceedances) and stood(now) != stood(before):
+        return f"what the watch made of the {before.watch_n} discrepancies of epoch {epoch}"
+    if (now.model_digest, now.campaign_digest) != (before.model_digest, before.campaign_digest):
+        return f"of which model and with which settings the gap of epoch {epoch} was measured"
     if before.traced and not now.traced:
         return "that an effect was traced in the residual"
     return ""
 
 
-def samples(logs: Iterable[Path], epoch: int) -> list[SampleTaken]:
-    """The samples of that epoch's campaign as the logs have them, by their index, as far as none is missing."""
+def campaign_logs(folder: Path, robot: str, epoch: int) -> list[Path]:
+    """Logs that may hold samples of that epoch's campaign, the newest run first: back to `RUNS` that ended before it began."""
+    found: list[Path] = []
+    before = 0
+    for parts in runs(folder, robot):
+        found += parts
+        told, _ = _last_memory(parts)
+        before += told is not None and told.robot == robot and told.epochs < epoch
+        if before == RUNS:
+            break
+    return found
+
+
+def samples(logs: Iterable[Path], epoch: int, keys: Collection[bytes]) -> list[SampleTaken]:
+    """The samples of that epoch's campaign as the logs have them, by their index, as far as none is missing.
+
+    keys: public ones. A gap will rest on them, so a log counts under one of these alone, and as far as all that it is sealed with holds.
+    """
     found: dict[int, SampleTaken] = {}
     for path in logs:
-        for message in glance(path, ("event/sample_taken",)):
-            if isinstance(message, SampleTaken) and message.epoch == epoch:
-                found.setdefault(message.index, message)
-    return [found[index] for index in range(len(found)) if index in found and all(before in found for before in range(index))]
+        if any(isinstance(message, SampleTaken) and message.epoch == epoch for message in glance(path, TAKEN)):
+            for sample in _sealed(path, keys):
+                if sample.epoch == epoch:
+                    found.setdefault(sample.index, sample)
+    return [found[index] for index in takewhile(found.__contains__, count())]
+
+
+def _sealed(path: Path, keys: Collection[bytes]) -> Iterator[SampleTaken]:
+    with contextlib.suppress(RecordingError, OSError):  # what follows is not known
+        reading = Reading(path, TAKEN)
+        if reading.public_key in keys:
+            for entry in reading:
+                message = entry.message
+                if isinstance(message, SampleTaken):
+                    yield message

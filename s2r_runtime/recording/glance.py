@@ -64,6 +64,8 @@ def _messages(data: mmap.mmap, span: Span, names: dict[int, str]) -> Iterator[St
         return
     try:
         packed = data[span.offset + CHUNK.size : span.offset + span.length]
+        if zstandard.get_frame_parameters(packed).content_size != span.size:  # else so much memory is asked for, whatever it says
+            return
         content = _DECOMPRESSOR.decompress(packed, max_output_size=span.size)
     except zstandard.ZstdError:
         return
