@@ -77,6 +77,29 @@ def test_a_parameter_that_only_scales_an_input_is_its_gain(tmp_path):
     assert same(nominal, "parameter_change", "outflow", {"ratio": 0.8}) == []
 
 
+WEIRS = """
+import numpy as np
+
+STATES = ("level",)
+INPUTS = ("pump",)
+PARAMS = {"stroke": 0.05, "most": 1.5, "weir": 0.3, "crest": 3.0, "spill": 0.1}
+
+
+def step(x, u, dt, params):
+    level = x[:, 0]
+    out = params["weir"] * np.maximum(level - params["crest"], 0.0) + params["spill"] * np.maximum(level - 4.0, 0.0)
+    return (level + dt * (np.minimum(params["stroke"] * u[:, 0], params["most"]) - out))[:, None]
+"""
+
+
+def test_parameters_that_act_only_far_from_zero_are_not_taken_for_one(tmp_path):
+    """Near zero all of these change nothing, and so are alike there."""
+    path = tmp_path / "weirs.py"
+    path.write_text(WEIRS)
+    nominal = compose(ModelSpec(str(path), DT_S)).for_effects
+    assert [same(nominal, "parameter_change", name, {"ratio": 0.8}) for name in ("most", "weir", "crest", "spill")] == [[]] * 4
+
+
 def test_a_model_that_fails_at_other_values_is_traced_all_the_same(tmp_path):
     """The right one cannot be tried; what can be lowers the error."""
     model = _model(tmp_path, narrowest=0.041)

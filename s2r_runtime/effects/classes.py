@@ -34,6 +34,7 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from numpy.typing import NDArray
 
 from s2r_runtime.effects.parameter_change import EFFECT as PARAMETER
 from s2r_runtime.errors import ConfigError, PluginError
@@ -44,12 +45,16 @@ from s2r_runtime.models.forces import axes, mass
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
 
+Array = NDArray[np.float64]
 Values = dict[str, Any]
 Named = tuple[str, str, Values]
 Convert = Callable[[Values], Values | None]
 
 TRIED, TRIED_DT_S, ALIKE = 12, 0.07, 1e-9
 """Random states on which a row of the table is tried, the step, and what counts as the same, in units of the state."""
+
+FAR = (1.0, 10.0, 100.0)
+"""How far from zero states and inputs are on which parameters of one's own model are tried: they may be about an end stop, or a limit."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +205,7 @@ def _effects() -> Iterator[tuple[str, Effect]]:
 
 
 def _holds(model: BoundModel, row: Row) -> bool:
-    """Whether both effects make the same of random states and inputs. A row without an example is taken at its word."""
+    """Whether both effects make the same, and something, of random states and inputs. A row without an example is taken at its word."""
     if not row.example:
         return True
     try:
@@ -212,22 +217,32 @@ def _holds(model: BoundModel, row: Row) -> bool:
     values = row.there(row.example)
     if values is None:
         return False
-    rng = np.random.default_rng(0)
-    x = rng.uniform(-1.0, 1.0, (TRIED, len(model.states)))
-    u = rng.uniform(-1.0, 1.0, (TRIED, len(model.inputs)))
-    made = []
-    for effect, channel, p in zip(effects, (row.channel, row.to_channel), (row.example, values), strict=True):
-        scheme = (AppliedEffect(registry().get("effects", "integration_scheme"), "*", {"scheme": model.integration}),)
-        applied = AppliedEffect(effect, channel, p)
-        shared = replace(model, integration=getattr(model.shared, "integration", ""))
-        composed = ComposedModel(
-            ModelSpec(model.name, TRIED_DT_S), shared, (applied, *(scheme if model.integration in {"exact", "rk4"} else ()))
-        )
+    first, second = (
+        AppliedEffect(effect, channel, p)
+        for effect, channel, p in zip(effects, (row.channel, row.to_channel), (row.example, values), strict=True)
+    )
+    rng, acts = np.random.default_rng(0), False
+    for far in FAR if row.name == PARAMETER.name else FAR[:1]:
+        x = rng.uniform(-far, far, (TRIED, len(model.states)))
+        u = rng.uniform(-far, far, (TRIED, len(model.inputs)))
         try:
-            made.append(composed.step(x, u, composed.at_rest(TRIED))[0])
+            one, other, usual = (_stepped(model, x, u, chain) for chain in ((first,), (second,), ()))
         except ConfigError:  # a user's model that cannot be stepped just anywhere
+            return acts
+        if not np.all(np.abs(one - other) < ALIKE * np.maximum(1.0, np.abs(usual))):
             return False
-    return bool(np.max(np.abs(made[0] - made[1])) < ALIKE)
+        acts = acts or bool(np.any(np.abs(one - usual) > ALIKE))
+    return acts
+
+
+def _stepped(model: BoundModel, x: Array, u: Array, chain: tuple[AppliedEffect, ...]) -> Array:
+    """A step from rest with these effects, (n, nx)."""
+    scheme = (AppliedEffect(registry().get("effects", "integration_scheme"), "*", {"scheme": model.integration}),)
+    shared = replace(model, integration=getattr(model.shared, "integration", ""))
+    composed = ComposedModel(
+        ModelSpec(model.name, TRIED_DT_S), shared, (*chain, *(scheme if model.integration in {"exact", "rk4"} else ()))
+    )
+    return composed.step(x, u, composed.at_rest(len(x)))[0]
 
 
 # ---------------------------------------------------------------- conversions of values
