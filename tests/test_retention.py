@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import json
 import os
@@ -293,6 +294,28 @@ def test_what_comes_to_rest_on_a_log_while_others_are_deleted_keeps_it(tmp_path:
 
     robot.retention.prune(meanwhile)
     assert sorted(path.stem for path in robot.logs.iterdir()) == [made[1], current]
+
+
+def test_a_run_goes_as_a_whole_or_stays_and_its_last_part_goes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = Robot(tmp_path, keep_bytes=1)
+    made = [robot.run(parts=3), robot.run()]
+    before = sorted(robot.logs.iterdir())
+    rename, tried = Path.rename, list[str]()
+
+    def fails_once(path: Path, target: Path) -> Path:
+        tried.append(path.name.removeprefix(made[0]))
+        if len(tried) == 3:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", fails_once)
+    assert robot.look(memory()) == made
+    assert tried[:3] == [".003.mcap", ".002.mcap", ".mcap"]
+    assert sorted(robot.logs.iterdir()) == before
+    assert robot.retention.deleted() == []
+    assert robot.look(memory()) == made[1:]
+    (gone,) = robot.retention.deleted()
+    assert (gone.run, gone.files) == (made[0], 3)
 
 
 def test_what_a_kill_left_of_a_deletion_is_deleted_at_the_next_look(tmp_path: Path) -> None:

@@ -172,9 +172,9 @@ class Retention:
                 total -= self._delete(run, runs[run], reason, memory, unix_s)
 
     def _on_disk(self) -> dict[str, list[tuple[Path, int, float]]]:
-        """Run -> (file, bytes, time of its last change)."""
+        """Run -> (file, bytes, time of its last change), part by part."""
         found: dict[str, list[tuple[Path, int, float]]] = {}
-        for path in sorted(self._folder.glob(f"{self._robot}-*.mcap")):
+        for path in sorted(self._folder.glob(f"{self._robot}-*.mcap"), key=lambda path: (len(path.name), path.name)):  # .002 behind none
             try:
                 about = path.lstat()
             except FileNotFoundError:
@@ -183,30 +183,32 @@ class Retention:
         return found
 
     def _delete(self, run: str, files: list[tuple[Path, int, float]], reason: str, memory: Callable[[], Memory], unix_s: float) -> int:
-        """If nothing rests on it. How many bytes that gave."""
+        """All of it, or nothing, if nothing rests on it. How many bytes that gave."""
         gone = []
         with self._lock:  # whatever is noted from here on finds the log gone, or is noted before
             held = self._runs.get(run)
             if held is None or run == self._run or held.tags & _needed(memory(), unix_s, self._runs.values()):
                 return 0
-            for path, size, _ in reversed(files):  # the last part first, so that what an interruption leaves can be audited
+            for path, _, _ in reversed(files):  # the last part first, so that what an interruption leaves can be audited
                 try:
-                    gone.append((path.rename(path.with_name(path.name + GOING)), size))
+                    gone.append(path.rename(path.with_name(path.name + GOING)))
                 except OSError as error:
                     self._say(f"{path}: cannot be deleted: {error.strerror}")
-                    break
-            else:
-                del self._runs[run]
-                total = sum(size for _, size in gone)
-                self._deleted.append(LogDeleted(0, run, len(files), total, held.head, reason))
-                self._dirty = True
-                self._say(
-                    f"log of run {run} deleted ({total} bytes, head {held.head or 'not known'}): {reason}; no valid certificate rests on it"
-                )
-        for path, _ in gone:
+                    for other in gone:
+                        with contextlib.suppress(OSError):
+                            other.rename(other.with_name(other.name.removesuffix(GOING)))
+                    return 0
+            del self._runs[run]
+            total = sum(size for _, size, _ in files)
+            self._deleted.append(LogDeleted(0, run, len(files), total, held.head, reason))
+            self._dirty = True
+            self._say(
+                f"log of run {run} deleted ({total} bytes, head {held.head or 'not known'}): {reason}; no valid certificate rests on it"
+            )
+        for path in gone:
             with contextlib.suppress(OSError):  # it is tried again at the next look
                 path.unlink()
-        return sum(size for _, size in gone)
+        return total
 
 
 def _tags(message: Struct) -> set[str]:
