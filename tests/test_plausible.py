@@ -111,3 +111,20 @@ def test_a_strong_effect_is_no_mistake_of_the_columns(name):
     ]
     for seed, effects in enumerate(strong):
         check_plausible(_model(name), _data(_model(name), *_driven(name, 20 + seed, effects)))
+
+
+@pytest.mark.parametrize("effect", [("input_gain", {"gain": 0.0}), ("input_deadband", {"width": 0.59})], ids=["dead", "numb"])
+@pytest.mark.parametrize(("name", "motor"), [("differential_drive", 0), ("differential_drive", 1), ("bicycle", 0)])
+def test_a_motor_that_hardly_answers_is_in_no_other_unit(name, motor, effect):
+    """What is asked of it says next to nothing then; nor would it as the share of it that degrees are."""
+    model, (_, u) = _model(name), _driven(name, 5)
+    named, ((parameter, value),) = effect[0], effect[1].items()
+    spec = EffectSpec(named, INPUTS[name][motor], {parameter: value * BOUNDS[name][motor][1]})
+    robot = compose(ModelSpec(name, DT, GEOMETRY[name], (*model.spec.effects, spec)))
+    x, hidden = np.zeros((1, len(robot.states))), robot.at_rest(1)
+    rows = []
+    for row in u:
+        rows.append(x[0])
+        x, hidden = robot.step(x, row[None], hidden)
+    y = np.array(rows) + np.random.default_rng(1).normal(0.0, 1e-3, (STEPS, len(robot.states)))
+    check_plausible(model, _data(model, y, u))

@@ -38,6 +38,9 @@ most.
 SURELY = 0.1
 """As WELL, for factors that an actuator's limits could have, too."""
 
+DEAD = 0.7
+"""Of E with an input that does nothing, which E must be below: a motor that hardly turns is in no other unit."""
+
 HORIZON_S = 0.5
 """Of the rollouts, s (1 to 50 steps)."""
 
@@ -90,7 +93,8 @@ def check_plausible(model: ComposedModel, data: Dataset) -> None:
         few = _few(data)
         tried = [(_foretold(model, _taken_back(model, few, m)), m) for m in _mistakes(model)]
         best, said = min([(e, m.said) for e, m in tried if e is not None and e < m.well], default=(math.inf, ""))
-        if best < BETTER * as_it_is:
+        dead = [_foretold(model, _taken_back(model, few, m)) for m in _dead(model)]
+        if best < min(BETTER * as_it_is, *(DEAD * e for e in dead if e is not None)):
             raise RecordingError(f"{data.source}: {said}: so read, the model errs by {best:.0%} of the motion; as it is, by {as_it_is:.0%}")
     _check_clocks(model, data)
 
@@ -162,6 +166,11 @@ def _mistakes(model: ComposedModel) -> Iterator[_Mistake]:
         j = model.states.index(name)
         yield _mistake("states", f"{name} seems to be clockwise, must be counter-clockwise", partial(_scaled, [j], -1.0))
         yield _mistake("states", f"{name} seems to be clockwise from y, must be counter-clockwise from x", partial(_turned, j))
+
+
+def _dead(model: ComposedModel) -> list[_Mistake]:
+    """What is none: each input by itself does nothing."""
+    return [_mistake("inputs", "", partial(_scaled, [j], 0.0)) for j in range(len(model.inputs))]
 
 
 _UNITS = {
