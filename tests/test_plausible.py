@@ -63,6 +63,22 @@ def test_the_tracer_says_so_instead_of_looking_for_an_effect():
         trace(_data(_model(name), *spoil(*_driven(name))), _model(name))
 
 
+@pytest.mark.parametrize("steady", [True, False])
+def test_a_speed_that_says_the_same_under_the_same_command_was_measured(steady):
+    """By a sensor of 0.1 m/s, on a car that goes a tenth slower than it is asked to; under other commands it was not."""
+    rng, model = np.random.default_rng(7), _model("bicycle")
+    u = commands(rng, 1, STEPS, DT, BOUNDS["bicycle"], rest=0.0)
+    u[0, :, 1] = 1.0 if steady else u[0, :, 1]
+    y = drive(rng, "bicycle", u, [("input_gain", "speed_cmd", {"gain": 0.9})], DT, 1e-3)[0]
+    y[:, 3] = 0.9
+    data = _data(model, y[:-1], u[0])
+    if steady:
+        check_plausible(model, data)
+        return
+    with pytest.raises(RecordingError, match="the model moves it: it was not measured"):
+        check_plausible(model, data)
+
+
 @pytest.mark.parametrize("name", ["unicycle", "joint"])
 def test_motion_that_comes_before_its_cause_is_of_another_clock(name):
     with pytest.raises(RecordingError, match=r"the motion comes about 0.[23]\d* s before"):

@@ -3,7 +3,8 @@
     m_k = f(y_k) - y_k             what the model moves it by in step k
     D   = rms(m_k + .. + m_{k+W-1}) / (sqrt(W) rms(m))       1 if that is noise of other states, sqrt(W) if it goes somewhere
 
-A robot that stood still (every state says the same) is another matter, and so is a coarse sensor in whose last digit the robot stayed.
+Where the model sets a state to an input at once, the way is what the input goes: under the same command all the time, a car's speed says
+the same. A robot that stood still (every state says the same) is another matter, and so is a coarse sensor in whose last digit it stayed.
 """
 
 from __future__ import annotations
@@ -41,15 +42,17 @@ def check_measured(model: ComposedModel, data: Dataset) -> None:
     same = np.ptp(np.concatenate([steps.y0, steps.y1]), axis=0) == 0.0
     if not same.any() or same.all():
         return
-    moves = model.difference(predicted(model, steps, acting(model, data)), steps.y0)
-    ways = np.array([_way(steps, column) for column in moves.T])
+    foretold = predicted(model, steps, acting(model, data))
+    moves = model.difference(foretold, steps.y0)
+    at_once = np.array([name in model.nominal.reached for name in model.states])
+    ways = np.where(at_once, np.ptp(foretold, axis=0), [_way(steps, column) for column in moves.T])
     units: dict[str, str] = getattr(model.nominal, "units", {})
     unit = [units.get(name, name) for name in model.states]
     for j in np.flatnonzero(same).tolist():
         name = model.states[j]
         most = max(way for way, u in zip(ways.tolist(), unit, strict=True) if u == unit[j])
         least = TURNS if name in model.nominal.angles else SHARE * most
-        if ways[j] > least and _directed(moves[:, j]):
+        if ways[j] > least and (at_once[j] or _directed(moves[:, j])):
             hint = "; leave its column out" if name in model.nominal.follows else ""
             raise RecordingError(
                 f"{data.source}: {name} is {steps.y0[0, j]:.6g} in every row although the model moves it: it was not measured{hint}"
