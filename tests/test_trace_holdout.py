@@ -1,5 +1,7 @@
 """What is held out: stretches of time, or runs, on which the inputs reach as far as on what is fitted."""
 
+import tracemalloc
+
 import numpy as np
 
 from s2r_runtime.models.composed import compose
@@ -46,3 +48,15 @@ def test_runs_are_drawn_so_that_both_sides_hold_hard_pushes():
 
 def test_with_a_recording_of_its_own_to_judge_on_everything_is_fitted():
     assert fit_mask(_data([np.ones(STEPS)]), 0, everything=True).all()
+
+
+def test_many_rows_are_looked_at_one_way_after_the_other():
+    """A mask of each way, of which there are 200, would be as large as a hundred bytes a row more."""
+    data = _data([np.random.default_rng(4).normal(size=100 * STEPS)])
+    tracemalloc.start()
+    try:
+        fit_mask(data, 0)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 100 * len(data.runs[0].u)

@@ -20,6 +20,7 @@ from s2r_runtime.trace.residual import Steps, first_steps, steps_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Stretches = tuple[tuple[float, float], ...]
 
 HELD_OUT = ((0.3, 0.5), (0.8, 1.0))
 """Parts of a run's time. Two, so that what the robot did, and what became of it, is seen early and late on both sides."""
@@ -62,36 +63,43 @@ class Part:
 
 def fit_mask(data: Dataset, seed: int, *, everything: bool = False) -> Mask:
     """(M,) steps, of the runs laid end to end, that the fit may see. everything: another recording is the judge."""
-    measured = _without(data, [], ())
+    spans = _spans(data)
+    measured = _without(data, spans, set(), ())
     if everything:
         return measured
     u, rows = _rows(data, measured)
+    ways: list[tuple[set[int], Stretches]]
     if len(data.runs) >= FEWEST_RUNS:
         rng, few = np.random.default_rng(seed), round(TEST_SHARE * len(data.runs))
-        ways = [_without(data, rng.permutation(len(data.runs))[:few].tolist(), ()) for _ in range(DRAWS)]
+        ways = [(set(rng.permutation(len(data.runs))[:few].tolist()), ()) for _ in range(DRAWS)]
     else:
         chosen = [HELD_OUT, *(tuple((k / 10.0, (k + 1) / 10.0) for k in tenths) for tenths in combinations(range(10), TENTHS))]
-        ways = [_without(data, [], stretches) for stretches in sorted(chosen, key=lambda way: (_pieces(way) < 2, _pieces(way)))]
-        ways.insert(0, _without(data, [], HELD_OUT))
-    shorter = np.array([_shorter(u, seen[rows]) for seen in ways])
+        ways = [(set(), stretches) for stretches in [HELD_OUT, *sorted(chosen, key=lambda way: (_pieces(way) < 2, _pieces(way)))]]
+    shorter = np.array([_shorter(u, _without(data, spans, *way)[rows]) for way in ways])
     enough = np.flatnonzero(shorter <= shorter.min() + (SHORTER if shorter[0] <= shorter.min() + SHORTER else 0.5 * SHORTER))
-    return ways[int(enough[0])]
+    return _without(data, spans, *ways[int(enough[0])])
 
 
-def _pieces(stretches: tuple[tuple[float, float], ...]) -> int:
+def _pieces(stretches: Stretches) -> int:
     """How many, those that touch taken as one: the longer they are, the longer a rollout can be judged."""
     return 1 + sum(before[1] < after[0] for before, after in pairwise(stretches))
 
 
-def _without(data: Dataset, runs: list[int], stretches: tuple[tuple[float, float], ...]) -> Mask:
-    """(M,) steps from each run's first measurement to its last, less some runs, and less these parts of the time of every run."""
-    begin = first_steps(data)
-    seen = np.zeros(begin[-1], dtype=bool)
-    for i, run in enumerate(data.runs):
+def _spans(data: Dataset) -> list[tuple[int, int]]:
+    """(first step, steps) of each run, of all runs laid end to end, from its first measurement to its last."""
+    found = []
+    for begin, run in zip(first_steps(data).tolist(), data.runs, strict=False):
         there = np.flatnonzero(~np.isnan(run.y).any(axis=1))
-        if i in runs or len(there) < 2:
+        found.append((begin + int(there[0]), int(there[-1] - there[0])) if len(there) > 1 else (begin, 0))
+    return found
+
+
+def _without(data: Dataset, spans: list[tuple[int, int]], runs: set[int], stretches: Stretches) -> Mask:
+    """(M,) steps from each run's first measurement to its last, less some runs, and less these parts of the time of every run."""
+    seen = np.zeros(first_steps(data)[-1], dtype=bool)
+    for i, (a, length) in enumerate(spans):
+        if i in runs:
             continue
-        a, length = int(begin[i] + there[0]), int(there[-1] - there[0])
         seen[a : a + length] = True
         for first, last in stretches:
             seen[a + round(first * length) : a + round(last * length)] = False
