@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from s2r_runtime.effects.classes import same
+from s2r_runtime.errors import NotEnoughEvidence
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.dataset import from_arrays
@@ -106,6 +107,32 @@ def test_a_model_that_fails_at_other_values_is_traced_all_the_same(tmp_path):
     found = trace(_drive(model, outflow=0.05), model)
     assert ("parameter_change", "outflow") not in {(e.name, e.channel) for e in found.effects}
     assert np.std(found.after.ends) < 0.5 * np.std(found.before.ends)
+
+
+FAN = """
+STATES = ("speed",)
+INPUTS = ("asked",)
+PARAMS = {"keeps": 0.2}
+
+
+def step(x, u, dt, params):
+    return params["keeps"] * x + (1.0 - params["keeps"]) * u
+"""
+
+
+def test_a_robot_that_answers_at_once_and_is_asked_for_something_else_in_every_step_is_traced(tmp_path):
+    """It goes no farther in ten steps than in one, and it is not noise that moves it."""
+    path = tmp_path / "fan.py"
+    path.write_text(FAN)
+    rng, model = np.random.default_rng(1), compose(ModelSpec(str(path), 0.1))
+    u, speeds = rng.uniform(-1.0, 1.0, (1000, 1)), [0.0]
+    for asked in u[:, 0]:
+        speeds.append(0.2 * speeds[-1] + 0.8 * 0.4 * asked)
+    noise = 0.005 * rng.normal(size=(1001, 1))
+    found = trace(from_arrays(model, [(np.array(speeds)[:, None] + noise, u)]), model)
+    assert [(e.name, e.channel) for e in found.effects] == [("input_gain", "asked")]
+    with pytest.raises(NotEnoughEvidence, match="nothing can be traced"):
+        trace(from_arrays(model, [(noise, u)]), model)
 
 
 def test_rollouts_are_a_second_or_ten_steps():

@@ -11,6 +11,7 @@ Deterministic: the same recording, model and seed give the same result.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
@@ -36,7 +37,7 @@ from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, Looks, Structure, best_un
 from s2r_runtime.trace.lack_of_fit_judged import Judged
 from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.power import visible
-from s2r_runtime.trace.residual import Mask, first_steps, rms, steps_of
+from s2r_runtime.trace.residual import Mask, acting, first_steps, rms, steps_of
 from s2r_runtime.trace.result import Found, Limit, TraceResult
 from s2r_runtime.trace.scores import LENIENT, names
 from s2r_runtime.trace.selection import Selection, crowded, select
@@ -66,6 +67,9 @@ CLEAR = 10.0
 
 NEARLY = 0.4
 """Of what effects explain: dictionaries that give less at first look are not judged."""
+
+FOLLOWS = 5.0
+"""Standard deviations of the correlation of noise with an input, from which a state goes with the input."""
 
 MOVED, ASKED = 1.5, 5.0
 """A robot whose measurements lie apart after the horizon as they do after one step has stood still; it was asked to move if the
@@ -238,8 +242,18 @@ def _enough(data: Dataset, model: ComposedModel, fit_part: Part, judged_on: Held
     if np.all(went < MOVED * jitter + 1e-12) and np.any(rms(judge(model, here).ends) > ASKED * went):
         raise NotEnoughEvidence(f"{data.source}: the robot stood still although it was asked to move; nothing can be traced until it moves")
     sooner = [replace(here, horizon=steps) for steps in (2, 3, 5, 10) if steps < ahead]
-    if all(np.all(rms(displacement(h)) < MOVED * jitter) for h in (here, *sooner)):
+    if all(np.all(rms(displacement(h)) < MOVED * jitter) for h in (here, *sooner)) and not _follows(fit_part, model):
         raise NotEnoughEvidence(f"{data.source}: no state goes farther than its noise makes it jump from row to row; nothing can be traced")
+
+
+def _follows(given: Part, model: ComposedModel) -> bool:
+    """Whether some state at the end of a step goes with an input over it. A robot that answers within a step, and is asked for something
+    else in each, goes no farther in many steps than in one.
+    """
+    u, y = acting(model, given.data).mean[given.steps.place], given.steps.y1
+    u, y = (e - e.mean(axis=0) for e in (u, y))
+    together, apart = np.abs(u.T @ y), np.outer(np.linalg.norm(u, axis=0), np.linalg.norm(y, axis=0))
+    return bool(np.any(together > FOLLOWS / math.sqrt(len(y)) * apart + 1e-9))
 
 
 class _Whole:
