@@ -140,6 +140,22 @@ def test_a_heading_sensor_that_jumped_for_good_is_a_fault():
     assert trace(data, declared()).verdict == "sensor_fault"
 
 
+def test_what_only_the_fit_has_seen_is_said_to_be_unconfirmed():
+    """One hard push, at half the speed: an end stop, or somebody who held it. What is held out asks for nothing of the kind."""
+    rng = np.random.default_rng(1)
+    u = commands(rng, 1, STEPS, DT, [(0.02, 0.06), (-0.5, 0.5)], rest=0.0)
+    u[0, 90:110, 0] = 0.19
+    went = u.copy()
+    went[0, 90:110, 0] = 0.1
+    y = drive(rng, "unicycle", went, ROBOTARIUM, DT, NOISE)[0]
+    found = trace(from_arrays(declared(), [(y, u[0])]), declared())
+    assert [(e.name, e.channel) for e in found.effects] == [("input_saturation", "v")]
+    assert found.to_json()["unconfirmed"] == [{"name": "input_saturation", "channel": "v"}]
+    assert "not confirmed: input_saturation on v" in " ".join(found.text().split())
+    for data in recordings(GAIN, 1, steps=STEPS, seed=45):
+        assert trace(data, declared()).unconfirmed == ()
+
+
 def test_measurements_without_noise_are_no_effect():
     for data in recordings([], 3, steps=STEPS, seed=44, noise=0.0 * NOISE):
         assert trace(data, declared()).verdict == "none"

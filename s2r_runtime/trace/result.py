@@ -58,6 +58,8 @@ class TraceResult:
     could_see: tuple[Visible, ...] = ()
     unseen: tuple[str, ...] = ()
     """States of the model that were not measured, and that its motion does not need."""
+    unconfirmed: tuple[tuple[str, str], ...] = ()
+    """Name and channel of effects that what was held out never asks for: the fit alone speaks for them."""
 
     def same(self, found: Found) -> tuple[Found, ...]:
         """Of `ambiguous_with`: other names of the very same thing on this model."""
@@ -90,6 +92,9 @@ class TraceResult:
         if self.unseen:
             was = "was" if len(self.unseen) == 1 else "were"
             lines.append(f"{', '.join(self.unseen)} {was} not measured, and not needed: the motion follows from the inputs without")
+        if self.unconfirmed:
+            names = ", ".join(f"{name} on {channel}" for name, channel in self.unconfirmed)
+            lines.append(f"not confirmed: {names}; what it was judged on never asks for that, the fit alone speaks for it")
         if self.nominal.dt != self.spec.dt:
             longer = f"fitted and judged on steps of {self.nominal.dt:g} s, the shortest that are independent"
             lines.append(f"{longer}; the model's are {self.spec.dt:g} s")
@@ -128,6 +133,7 @@ class TraceResult:
             ],
             "reconstructed": None if self.reconstruction is None else self.reconstruction.to_json(),
             "unmeasured": list(self.unseen),
+            "unconfirmed": [{"name": name, "channel": channel} for name, channel in self.unconfirmed],
             "step_s": self.nominal.dt,
             "n_fit": self.n_fit,
             "n_test": len(self.held.steps),

@@ -30,7 +30,7 @@ from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge, noise_floor
 from s2r_runtime.trace.excitation import advice
 from s2r_runtime.trace.faults import Checked, check
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, problem
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, problem, without
 from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.intervals import intervals
 from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, Looks, Structure, best_unnamed, explains_more, first_looks, lack_of_fit
@@ -43,7 +43,7 @@ from s2r_runtime.trace.scores import LENIENT, names
 from s2r_runtime.trace.selection import Selection, crowded, select
 from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.unseen import alike
-from s2r_runtime.trace.verdict import confirmed, final_fit, verdict_of
+from s2r_runtime.trace.verdict import asked, confirmed, final_fit, verdict_of
 
 __all__ = ["Dataset", "TraceResult", "load_dataset", "trace", "usual_horizon"]
 
@@ -177,6 +177,7 @@ def _result(
     gap_before, gap_after, independent = gaps((model, before), (final.model, after), judged_on, weights, kind)
     ranges = intervals(given, final)
     effects = tuple(_found(model, final, place, ranges) for place in final.added)
+    idle = [place for place in final.added if not asked(given, judged_on, final.model, without(final.model, place))]
     rivals = [s.fit for s in chosen.rivals if s.fit is not None] if verdict == "ambiguous" else []
     ties = tuple(_found(model, fit, place, {}) for fit in rivals for place in _new(fit, final))
     return TraceResult(
@@ -203,6 +204,7 @@ def _result(
         source=dataset.source,
         interpolated=dataset.interpolated,
         reconstruction=dataset.reconstruction,
+        unconfirmed=tuple((final.model.effects[place].effect.name, final.model.effects[place].channel) for place in idle),
         could_see=visible(given, final, chosen.tried),
     )
 

@@ -54,13 +54,13 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
         again = False
         for place in fit.added:
             less = fitted(given, fit, without(fit.model, place), 2)
-            if not better(judged_on, fit.model, less.model, CONFIRMED) and _asked(given, judged_on, fit.model, less.model):
+            if not better(judged_on, fit.model, less.model, CONFIRMED) and asked(given, judged_on, fit.model, less.model):
                 fit, again = less, True
                 break
     return chosen if fit is chosen.fit else replace(chosen, fit=fit, rivals=() if not fit.added else chosen.rivals)
 
 
-def _asked(given: Problem, judged_on: Held, model: ComposedModel, less: ComposedModel) -> bool:
+def asked(given: Problem, judged_on: Held, model: ComposedModel, less: ComposedModel) -> bool:
     """Whether the held-out data ask for an effect at all: an end stop that they never meet, they can neither confirm nor refute."""
     fitted_on, held_out = (
         rms(model.difference(*(predicted(m, steps, acting(m, data)) for m in (model, less))))
