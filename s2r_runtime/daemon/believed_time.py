@@ -24,7 +24,9 @@ from s2r_runtime.errors import S2RError
 SLACK_S = 3600.0
 """A wall clock that is ahead by less is believed: what rests on it keeps an hour of doubt anyway."""
 BELIEVED_AFTER_S = 7 * 86_400.0
-"""Counted by the kernel, also between two runs of the daemon. Short of that, logs are kept longer than was asked for, which costs room and nothing else."""
+"""Counted by the kernel, also between two runs of the daemon. Short of that, logs are kept longer than was asked for, which costs room
+and nothing else.
+"""
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 
