@@ -140,15 +140,25 @@ def test_a_heading_sensor_that_jumped_for_good_is_a_fault():
     assert trace(data, declared()).verdict == "sensor_fault"
 
 
-def test_what_only_the_fit_has_seen_is_said_to_be_unconfirmed():
-    """One hard push, at half the speed: an end stop, or somebody who held it. What is held out asks for nothing of the kind."""
-    rng = np.random.default_rng(1)
+def _pushed(times, rng):
+    """A slow drive with hard pushes, at half the speed each."""
     u = commands(rng, 1, STEPS, DT, [(0.02, 0.06), (-0.5, 0.5)], rest=0.0)
-    u[0, 90:110, 0] = 0.19
     went = u.copy()
-    went[0, 90:110, 0] = 0.1
-    y = drive(rng, "unicycle", went, ROBOTARIUM, DT, NOISE)[0]
-    found = trace(from_arrays(declared(), [(y, u[0])]), declared())
+    for k in times:
+        u[0, k : k + 20, 0], went[0, k : k + 20, 0] = 0.19, 0.1
+    return from_arrays(declared(), [(drive(rng, "unicycle", went, ROBOTARIUM, DT, NOISE)[0], u[0])])
+
+
+def test_one_push_that_did_less_is_no_end_stop():
+    """Somebody may have held it."""
+    found = trace(_pushed([90], np.random.default_rng(1)), declared())
+    assert (found.verdict, found.effects) == ("unexplained", ())
+
+
+def test_what_only_the_fit_has_seen_is_said_to_be_unconfirmed():
+    """What it is judged on asks for nothing of the kind."""
+    rng = np.random.default_rng(1)
+    found = trace(_pushed([90, 300, 500], rng), declared(), test=_pushed([], rng))
     assert [(e.name, e.channel) for e in found.effects] == [("input_saturation", "v")]
     assert found.to_json()["unconfirmed"] == [{"name": "input_saturation", "channel": "v"}]
     assert "not confirmed: input_saturation on v" in " ".join(found.text().split())

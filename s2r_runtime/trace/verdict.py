@@ -37,6 +37,9 @@ SAME_KIND = 0.05
 CONFIRMED = 0.01
 """An effect stays if it lowers some error on held-out data by this share."""
 
+TIMES, MOSTLY = 10, 0.9
+"""Parts of the fit's time, and the share of all that an effect does which must not fall into one of them for it to be kept unconfirmed."""
+
 ASKED = 0.1
 """Of what an effect does in a step where it was found: if it does less where it is judged, that is not asked for it."""
 
@@ -54,7 +57,8 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
         again = False
         for place in fit.added:
             less = fitted(given, fit, without(fit.model, place), 2)
-            if not better(judged_on, fit.model, less.model, CONFIRMED) and asked(given, judged_on, fit.model, less.model):
+            refutable = asked(given, judged_on, fit.model, less.model) or _once(given, fit.model, less.model)
+            if refutable and not better(judged_on, fit.model, less.model, CONFIRMED):
                 fit, again = less, True
                 break
     return chosen if fit is chosen.fit else replace(chosen, fit=fit, rivals=() if not fit.added else chosen.rivals)
@@ -67,6 +71,13 @@ def asked(given: Problem, judged_on: Held, model: ComposedModel, less: ComposedM
         for data, steps in ((given.data, given.steps), (judged_on.data, judged_on.steps))
     )
     return bool(np.any(held_out > ASKED * fitted_on))
+
+
+def _once(given: Problem, model: ComposedModel, less: ComposedModel) -> bool:
+    """Whether an effect does what it does at one time only: somebody may have held the robot there."""
+    apart = model.difference(*(predicted(m, given.steps, acting(m, given.data)) for m in (model, less)))
+    done = np.array([np.sum((part / np.maximum(rms(apart), 1e-300)) ** 2) for part in np.array_split(apart, TIMES)])
+    return bool(np.max(done) > MOSTLY * np.sum(done))
 
 
 def verdict_of(chosen: Selection, structure: Structure, faults: tuple[Fault, ...], after: Judged, given: Held, floor: Array) -> Verdict:
