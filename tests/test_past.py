@@ -321,3 +321,23 @@ def test_an_audit_tells_of_samples_that_were_drawn_again_where_the_daemon_could_
     told = json.loads(rig.s2r("audit", *map(str, (*before, *rig.log_files())), "--key", str(rig.state / "key.pub"), "--json").stdout)
     assert not told["ok"]
     assert "it drew some again" in told["first_difference"]["what"]
+
+
+@pytest.mark.parametrize("edit", ["added", "skipped"])
+def test_an_edited_campaign_does_not_go_on(rig: Rig, edit: str) -> None:
+    """Samples that nobody took would make a gap smaller; samples that are skipped would rest it on fewer."""
+    rig.start_robot()
+    rig.start()
+    file, _ = interrupted(rig)
+    content = persistence.unseal(file.read_bytes(), "campaign", dict[str, Any], str(file))
+    kept = content["snapshot"]
+    count = len(kept["samples"])
+    if edit == "added":
+        kept["samples"] += [{**kept["samples"][-1], "index": count + k} for k in range(3)]
+    kept["campaign"]["index"] = count + 3
+    persistence.replace(file, persistence.seal("campaign", content))
+    rig.start()
+    answer = rig.sample()
+    says = {"added": f"has {count + 3} samples of epoch 1, its logs have", "skipped": f"has {count} samples and goes on at {count + 3}"}
+    assert (answer["exit_code"] != 0, says[edit] in answer["text"]) == (True, True), answer
+    assert rig.status()["gate"] != "open"

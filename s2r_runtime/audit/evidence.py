@@ -13,9 +13,8 @@ from s2r_runtime.bounds import clopper_pearson_upper
 from s2r_runtime.canonical import digest_of
 from s2r_runtime.controllers.file import ControllerFile
 from s2r_runtime.core import ledger
-from s2r_runtime.core.gaps import REFUTED
-from s2r_runtime.core.stream import stood
 from s2r_runtime.daemon import jobs
+from s2r_runtime.daemon.past import lost
 from s2r_runtime.daemon.worker import Failed, GapJob, Progress, Result, VerifyJob, Worker
 from s2r_runtime.errors import S2RError
 from s2r_runtime.headroom import follows, grid
@@ -73,14 +72,15 @@ class Evidence:
     def begin_run(self, entry: Entry, memory: Memory) -> None:
         """A run begins with this memory: it may not forget what an earlier run spent."""
         self._jobs.clear()
+        before = self._kept if self._kept is not None and self._kept.robot == memory.robot else None
         if memory.epochs < self._epochs or memory.attempts < self._attempts:
             told = {"epochs": self._epochs, "attempts": self._attempts}
             found = {"epochs": memory.epochs, "attempts": memory.attempts}
             self._findings.differ(
                 entry.index, entry.channel, "the memory forgets epochs or attempts that an earlier log spent", found, told
             )
-        elif forgotten := _forgotten(self._kept, memory):
-            self._findings.differ(entry.index, entry.channel, f"the memory forgets {forgotten}", memory, self._kept)
+        elif before is not None and (what := lost(before, memory) or _more(before, memory)):
+            self._findings.differ(entry.index, entry.channel, f"the memory forgets {what}", memory, before)
         elif self._kept is not None and (cleared := set(self._kept.latched) - set(memory.latched)):
             self._findings.lack(f"who cleared {', '.join(sorted(cleared))}, in a log between two of those that were given")
         self._epochs, self._attempts, self._kept = memory.epochs, memory.attempts, memory
@@ -211,31 +211,12 @@ class Evidence:
         self._findings.differ(entry.index, entry.channel, what, recorded, recomputed)
 
 
-def _forgotten(before: Memory | None, now: Memory) -> str:
-    """What an earlier run kept and this one does not know, of what only ever grows, or empty. Runs between may be missing."""
-    if before is None or before.robot != now.robot:
-        return ""
-    if lost := before.revoked.keys() - now.revoked.keys():
-        return f"that certificate {min(lost)} was revoked"
-    if len(now.refuted) < REFUTED and not set(before.refuted) <= set(now.refuted):
-        return "samples whose gap was refuted or outgrown"
-    if before.campaign_epoch and before.campaign_epoch == now.campaign_epoch and before.campaign_n != now.campaign_n:
-        return f"that the campaign of epoch {now.campaign_epoch} was fixed beforehand at {before.campaign_n} samples"
+def _more(before: Memory, now: Memory) -> str:
+    """Exceedances that no further discrepancy brought, or empty: what is left out then is what the watch made of the ones there were."""
     if before.gap is None or now.gap is None or before.gap.epoch != now.gap.epoch:
         return ""
-    if before.alarm_epoch == before.gap.epoch != now.alarm_epoch:
-        return f"that the watch refuted the gap of epoch {now.gap.epoch}"
-    if now.radius < before.radius:
-        return f"that the gap grew to {before.radius}"
-    if now.watch_n < before.watch_n or now.watch_exceedances < before.watch_exceedances:
-        return f"discrepancies of epoch {now.gap.epoch}: {before.watch_n} were counted"
-    if now.watch_n == before.watch_n and stood(now) != stood(before):
-        return f"what the watch made of the {before.watch_n} discrepancies of epoch {now.gap.epoch}"
-    if (now.model_digest, now.campaign_digest) != (before.model_digest, before.campaign_digest):
-        return f"of which model and with which settings the gap of epoch {now.gap.epoch} was measured"
-    if before.traced and not now.traced:
-        return "that an effect was traced that the model lacks (guarantee G8)"
-    return ""
+    more = now.watch_n == before.watch_n and now.watch_exceedances > before.watch_exceedances
+    return f"what the watch made of the {before.watch_n} discrepancies of epoch {now.gap.epoch}" if more else ""
 
 
 def _contradiction(v: Verification, job: StartJob, safety: dict[str, list[float]], profile: Profile) -> str:

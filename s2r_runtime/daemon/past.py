@@ -54,14 +54,14 @@ def reconciled(state: Memory, folder: Path, keys: Collection[bytes], say: Callab
     latest: tuple[str, ...] | None = None
     for told, path in islice(_told(folder, state.robot), RUNS):
         latest = told.latched if latest is None else latest
-        if lost := forgotten(told, state):
+        if what := forgotten(told, state):
             if gained := forgotten(state, told):
                 raise ConfigError(
-                    f"the state of robot {state.robot!r} forgets {lost}, which {path} knows, and that log does not know {gained}: put the "
+                    f"the state of robot {state.robot!r} forgets {what}, which {path} knows, and that log does not know {gained}: put the "
                     "newest state.json back, or move state and logs away to begin a new life (earlier certificates are then void)"
                 )
-            say(f"the saved state forgets {lost}; going on from what {path.name} ends with")
-            state = msgspec.structs.replace(_in_full(path, told, keys, lost), latched=_both(told.latched, state.latched))
+            say(f"the saved state forgets {what}; going on from what {path.name} ends with")
+            state = msgspec.structs.replace(_in_full(path, told, keys, what), latched=_both(told.latched, state.latched))
     if missing := [reason for reason in latest or () if reason not in state.latched]:
         say(f"the saved state does not know that {', '.join(missing)} is latched, as the newest log ends with; it is latched")
         state = msgspec.structs.replace(state, latched=_both(state.latched, tuple(missing)))
@@ -113,27 +113,33 @@ def forgotten(before: Memory, now: Memory) -> str:
         return f"robot {before.robot!r}"
     if now.epochs < before.epochs or now.attempts < before.attempts:
         return f"epochs or attempts: {before.epochs} and {before.attempts} were spent, and it says {now.epochs} and {now.attempts}"
-    if lost := before.revoked.keys() - now.revoked.keys():
-        return f"that certificate {min(lost)} was revoked"
-    if not set(before.refuted) <= set(now.refuted) and len(now.refuted) < REFUTED:
-        return "samples whose gap was refuted or outgrown"
+    if what := lost(before, now):
+        return what
     if now.epochs == before.epochs and now.campaign_epoch and not before.campaign_epoch:
         return f"that the campaign of epoch {now.campaign_epoch} ended"
-    if now.campaign_epoch and now.campaign_epoch == before.campaign_epoch and now.campaign_n != before.campaign_n:
-        return f"that the campaign of epoch {now.campaign_epoch} was fixed beforehand at {before.campaign_n} samples"
     if now.gap is None:
         return ""
     if before.gap is None or before.gap.epoch != now.gap.epoch:
         older = now.gap.epoch <= before.epochs and now.gap.epoch != before.campaign_epoch
         return f"that the gap of epoch {now.gap.epoch} is not in force any more" if older else ""
-    if before.gap != now.gap:
-        return f"the gap of epoch {before.gap.epoch} as it was found"
-    return _of_one_epoch(before, now)
+    return f"the gap of epoch {before.gap.epoch} as it was found" if before.gap != now.gap else ""
 
 
-def _of_one_epoch(before: Memory, now: Memory) -> str:
-    """As `forgotten`, of what belongs to a gap that is in force in both."""
-    epoch = now.gap.epoch if now.gap is not None else 0
+def lost(before: Memory, now: Memory) -> str:
+    """As `forgotten`, of one robot, whatever runs lie between the two: the audit holds runs against each other by this, too."""
+    if gone := before.revoked.keys() - now.revoked.keys():
+        return f"that certificate {min(gone)} was revoked"
+    if not set(before.refuted) <= set(now.refuted) and len(now.refuted) < REFUTED:
+        return "samples whose gap was refuted or outgrown"
+    if now.campaign_epoch and now.campaign_epoch == before.campaign_epoch and now.campaign_n != before.campaign_n:
+        return f"that the campaign of epoch {now.campaign_epoch} was fixed beforehand at {before.campaign_n} samples"
+    if before.gap is None or now.gap is None or before.gap.epoch != now.gap.epoch:
+        return ""
+    return _of_one_epoch(before, now, now.gap.epoch)
+
+
+def _of_one_epoch(before: Memory, now: Memory, epoch: int) -> str:
+    """As `lost`, of what belongs to a gap that is in force in both."""
     if before.alarm_epoch == epoch != now.alarm_epoch:
         return f"that the watch refuted the gap of epoch {epoch}"
     if now.radius < before.radius:
@@ -145,7 +151,7 @@ def _of_one_epoch(before: Memory, now: Memory) -> str:
     if (now.model_digest, now.campaign_digest) != (before.model_digest, before.campaign_digest):
         return f"of which model and with which settings the gap of epoch {epoch} was measured"
     if before.traced and not now.traced:
-        return "that an effect was traced in the residual"
+        return "that an effect was traced that the model lacks (guarantee G8)"
     return ""
 
 

@@ -29,6 +29,9 @@ from s2r_runtime.messages import (
 )
 from s2r_runtime.profile import Sampling
 
+AHEAD = 1
+"""Samples that may be kept and not logged: a kill may come between the file and the log, which is written every 50 ms."""
+
 
 class Kept(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A campaign as it is kept: what `Campaign.restore` takes, all samples so far, and the logs that hold their frames."""
@@ -202,6 +205,11 @@ class Sampler:
         samples = () if kept is None else kept.samples
         here = ([one for one in known if one.epoch == order.epoch] for known in (self._before, self.samples))
         told = max(here, key=len)[: order.n]
+        if told and len(samples) > len(told) + AHEAD:
+            raise ConfigError(
+                f"{self._folder.path / 'campaign.json'}: has {len(samples)} samples of epoch {order.epoch}, its logs have {len(told)}; "
+                "cancel the campaign (s2r cancel), its share of beta is spent"
+            )
         for one, other in zip(samples, told, strict=False):
             if msgspec.structs.replace(other, t_ns=one.t_ns, again=one.again) != one:
                 raise ConfigError(
@@ -224,4 +232,9 @@ class Sampler:
         if (kept.epoch, kept.n) != (order.epoch, order.n):
             wanted = f"epoch {order.epoch} with {order.n} samples"
             raise ConfigError(f"{self._folder.path / 'campaign.json'}: is of epoch {kept.epoch} with {kept.n} samples, not of {wanted}")
+        if kept.campaign.get("index") != len(kept.samples):
+            raise ConfigError(
+                f"{self._folder.path / 'campaign.json'}: has {len(kept.samples)} samples and goes on at {kept.campaign.get('index')}; "
+                "cancel the campaign (s2r cancel), its share of beta is spent"
+            )
         return kept

@@ -259,7 +259,8 @@ class EffectKit:
             pytest.skip("does not act on inputs")
 
     def _tried(self, cases: list[Case]) -> Iterator[tuple[NominalModel, str, Values]]:
-        """Every case with every set of values, names of inputs filled in."""
+        """Every case with every set of values that it takes, names of inputs filled in. Fails if no set fits any case."""
+        tried = 0
         for model, channel in cases:
             for given in (self.parameters, *self.others):
                 other = {name: first_of(model, channel) for name in getattr(self.effect, "named", ()) if name in given}
@@ -268,7 +269,9 @@ class EffectKit:
                     values = {name: value for name, value in values.items() if name in self.effect.takes(model, channel)}
                     if not values:  # these are for other channels
                         continue
+                tried += 1
                 yield model, channel, values
+        assert tried, "none of the values fits any channel: they name no parameter that it takes there"
 
     def _takes(self, model: NominalModel, channel: str) -> set[str]:
         """Names of the parameters that it has there."""

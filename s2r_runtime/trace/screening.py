@@ -63,15 +63,18 @@ def screen(given: Problem, base: Fit, found: Sequence[Candidate]) -> tuple[list[
     level = float(np.sum(noises.log_density(aside.z)))
     best: dict[tuple[str | int, ...], Screened] = {}  # one for each set of parameters: more of them may do no better at the start
     for chunk in _chunks(probes):
-        made = [(probe, [foretold(given, m) for m in probe.models]) for probe in chunk]
-        there = [(probe, [f - before for f in moved if f is not None]) for probe, moved in made]
-        chunk = [probe for probe, moved in there if len(moved) == len(probe.models)]
-        if not chunk:
-            continue
-        table = np.array([column for probe, moved in there if len(moved) == len(probe.models) for column in moved])
-        columns = base.whiten(table.transpose(1, 2, 0)).reshape(aside.z.size, -1)
-        at = 0
+        whole: list[_Probe] = []
+        moved: list[Array] = []
         for probe in chunk:
+            there = [one - before for m in probe.models if (one := foretold(given, m)) is not None]
+            if len(there) == len(probe.models):  # a user's own model may not step everywhere
+                whole.append(probe)
+                moved += there
+        if not whole:
+            continue
+        columns = base.whiten(np.array(moved).transpose(1, 2, 0)).reshape(aside.z.size, -1)
+        at = 0
+        for probe in whole:
             c = columns[:, at : at + len(probe.models)]
             at += len(probe.models)
             value, start = aside.look(probe, c)
