@@ -169,9 +169,12 @@ def rig_certificate_by_force(rig: Rig, controller: Path) -> str:
         return rig.certificate(controller)
 
 
-def forged(rig: Rig, controller: Path, key: Path) -> str:
-    """A state in which a certificate is in force, sealed as the daemon seals it, its file beside it; the certificate's id."""
-    text = made_up_certificate(rig.profile, key, controller, radius=0.01, verified=0.02, epoch=1).encode()
+def forged(rig: Rig, controller: Path, key: Path, verified: float = 0.02) -> str:
+    """A state in which a certificate is in force, sealed as the daemon seals it, its file beside it; the certificate's id.
+
+    verified: another radius makes another certificate, also within the same second.
+    """
+    text = made_up_certificate(rig.profile, key, controller, radius=0.01, verified=verified, epoch=1).encode()
     one = certificate.load(text, [keys.load_public(key.with_suffix(".pub"))])
     memory = persistence.unseal((rig.state / "state.json").read_bytes(), "state", Memory, "state")
     facts = certificate.facts(one)
@@ -197,7 +200,7 @@ def test_a_state_that_somebody_wrote_carries_no_certificate_that_nobody_signed(r
     assert "which is not trusted here" in rig.status()["revoked"][identity]
     rig.stop()
 
-    identity = forged(rig, reckless, foreign)
+    identity = forged(rig, reckless, foreign, 0.03)
     (rig.state / "certificates" / f"{identity.removeprefix('sha256:')}.json").unlink()
     rig.start()
     assert "cannot be read" in rig.status()["revoked"][identity]
