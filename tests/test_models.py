@@ -115,7 +115,7 @@ def test_an_effect_that_may_stand_once_is_refused_twice():
         (("integration_scheme", "*", {"scheme": "simpson"}), "must be one of: euler, exact, rk4"),
         (("input_gain", "w", {"gain": "big"}), "must be a number"),
         (("input_saturation", "w", {"low": 1.0, "high": -1.0}), "must be below high"),
-        (("input_delay", "w", {"delay": -0.1}), r"must be in \[0.0, 10.0\] s"),
+        (("input_delay", "w", {"delay": -0.1}), r"must be in \[0.0, 600.0\] s"),
         (("input_lag", "theta", {"time_constant": 0.1}), "channel is 'theta', must be one of: v, w"),
     ],
 )

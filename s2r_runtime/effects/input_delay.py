@@ -21,7 +21,7 @@ class InputDelay(InputEffect):
     """delay in s; on one input, or on all alike (`*`)."""
 
     name = "input_delay"
-    parameters = (Parameter("delay", "s", 0.0, 10.0, neutral=0.0, kink=True),)
+    parameters = (Parameter("delay", "s", 0.0, 600.0, neutral=0.0, kink=True),)
     all_alike = True
     linear = True
     shift = True
