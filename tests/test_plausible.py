@@ -46,6 +46,9 @@ MISTAKES = {
     "compass": ("bicycle", lambda y, u: (np.column_stack([y[:, :2], np.pi / 2 - y[:, 2], y[:, 3]]), u), "clockwise from y"),
     "millimetres": ("unicycle", lambda y, u: (y * [1000, 1000, 1], u), "x and y seem to be in mm"),
     "degrees a second": ("unicycle", lambda y, u: (y, u * [1, 180 / np.pi]), "w seems to be in degrees a second"),
+    "compass in degrees": ("unicycle", lambda y, u: (np.column_stack([y[:, :2], 90 - np.degrees(y[:, 2])]), u), "degrees clockwise from y"),
+    "km/h": ("bicycle", lambda y, u: (y * [1, 1, 1, 3.6], u), "speed seems to be in km/h"),
+    "wheels in rpm": ("differential_drive", lambda y, u: (y * [1, 1, 1, 30 / np.pi, 30 / np.pi], u), "wheel_.* revolutions a minute"),
     "steer in degrees": ("bicycle", lambda y, u: (y, u * [180 / np.pi, 1]), "steer_cmd seems to be in degrees"),
 }
 
@@ -144,3 +147,32 @@ def test_a_motor_that_hardly_answers_is_in_no_other_unit(name, motor, effect):
         x, hidden = robot.step(x, row[None], hidden)
     y = np.array(rows) + np.random.default_rng(1).normal(0.0, 1e-3, (STEPS, len(robot.states)))
     check_plausible(model, _data(model, y, u))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("friction", [1.0, 3.0])
+@pytest.mark.parametrize("dry", [0.0, 1.5])
+def test_friction_in_a_loop_is_no_clock_that_is_late(seed, friction, dry):
+    """Under a controller, friction makes a joint's speed go with its force, and not with its integral: as if it knew the force ahead."""
+    rng, dt, mass = np.random.default_rng(seed), 0.005, 0.8
+    x, rows, forces = np.zeros(2), [], []
+    phase = rng.uniform(0.0, 6.0, 3)
+    for k in range(3000):
+        t = k * dt
+        wanted = sum(np.sin(w * t + p) for w, p in zip((1.1, 2.7, 4.3), phase, strict=True)) * 0.4
+        ahead = sum(w * np.cos(w * t + p) for w, p in zip((1.1, 2.7, 4.3), phase, strict=True)) * 0.4
+        force = 60.0 * (wanted - x[0]) + 12.0 * (ahead - x[1])
+        rows.append(x + rng.normal(size=2) * [2e-5, 1e-3])
+        forces.append([force])
+        for _ in range(10):
+            x = x + 0.1 * dt * np.array([x[1], (force - friction * x[1] - dry * np.tanh(x[1] / 1e-3)) / mass])
+    model = compose(ModelSpec("joint", dt, {"mass": mass}))
+    t = dt * np.arange(3000)
+    check_plausible(model, from_streams(model, [(Stream(t, np.array(rows)), Stream(t, np.array(forces)))], "here.csv"))
+
+
+def test_a_joint_whose_clock_is_late_is_still_found():
+    name = "joint"
+    y, u = _driven(name)
+    with pytest.raises(RecordingError, match="before the inputs that cause it"):
+        check_plausible(_model(name), _data(_model(name), y, u, early=0.4))

@@ -3,10 +3,12 @@
     E(c) = mean over states that go somewhere of  |y_{k+H} (-) f^H(y_k)| / |y_{k+H} (-) y_k|     (trimmed rms, H steps of half a second)
 
 for the recording as it is and with each usual mistake c taken back. As it is, the model foretells little (E > NOTHING); with one
-mistake taken back it foretells well (E < WELL, and by far better): then that is what is wrong, and no effect is looked for.
+mistake taken back it foretells well (E < WELL, and by far better): then that is what is wrong, and no effect is looked for. A state
+that nothing else follows (a car's speed) may be wrong alone: the same with the largest in the place of the mean, and NOTHING_ALONE.
 
 Inputs that come after the motion that they cause are on another clock: the model foretells a tenth of a second far better with the inputs
-earlier by some steps than with any delay. Where that lead grows over the recording, the clocks run at different rates.
+earlier by some steps than with any delay. Where that lead grows over the recording, the clocks run at different rates. Friction makes a
+mass follow its force sooner than without: where inputs push, what goes with the state at the start is taken out of every error first.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset, Run, regridded
 from s2r_runtime.trace.never_measured import check_measured
-from s2r_runtime.trace.residual import Index, acting, rollout, rollout_starts
+from s2r_runtime.trace.residual import Index, acting, predicted, rollout, rollout_starts, steps_of
 from s2r_runtime.trace.streams import Stream
 
 Array = NDArray[np.float64]
@@ -35,11 +37,17 @@ NOTHING, WELL, BETTER = 0.35, 0.35, 0.4
 most.
 """
 
+NOTHING_ALONE = 0.6
+"""As NOTHING, of the state that is foretold least."""
+
 SURELY = 0.1
 """As WELL, for factors that an actuator's limits could have, too."""
 
 DEAD = 0.7
 """Of E with an input that does nothing, which E must be below: a motor that hardly turns is in no other unit."""
+
+EXACTLY, FEWEST_STEPS = 0.02, 60
+"""How near to a unit's factor a speed must be to its command's multiple, and on how many steps at least."""
 
 HORIZON_S = 0.5
 """Of the rollouts, s (1 to 50 steps)."""
@@ -88,15 +96,54 @@ class _Mistake:
 def check_plausible(model: ComposedModel, data: Dataset) -> None:
     """Raises RecordingError if the columns are clearly not what they say, with what they seem to be."""
     check_measured(model, data)
-    as_it_is = _foretold(model, data)
-    if as_it_is is not None and as_it_is > NOTHING and data.segments:
-        few = _few(data)
-        tried = [(_foretold(model, _taken_back(model, few, m)), m) for m in _mistakes(model)]
-        best, said = min([(e, m.said) for e, m in tried if e is not None and e < m.well], default=(math.inf, ""))
-        dead = [_foretold(model, _taken_back(model, few, m)) for m in _dead(model)]
-        if best < min(BETTER * as_it_is, *(DEAD * e for e in dead if e is not None)):
-            raise RecordingError(f"{data.source}: {said}: so read, the model errs by {best:.0%} of the motion; as it is, by {as_it_is:.0%}")
+    _check_columns(model, data)
+    _check_speeds(model, data)
     _check_clocks(model, data)
+
+
+def _check_columns(model: ComposedModel, data: Dataset) -> None:
+    """Raises RecordingError if the motion is foretold so much better with one usual mistake taken back that it must have been made."""
+    every = _foretold(model, data)
+    if every is None or not data.segments or (np.mean(every) <= NOTHING and np.max(every) <= NOTHING_ALONE):
+        return
+    few = _few(data)
+    tried = [(e, m) for m in _mistakes(model) if (e := _foretold(model, _taken_back(model, few, m))) is not None]
+    dead = [e for m in _dead(model) if (e := _foretold(model, _taken_back(model, few, m))) is not None]
+    for measure, nothing in ((np.mean, NOTHING), (np.max, NOTHING_ALONE)):
+        as_it_is = float(measure(every))
+        best, said = min([(float(measure(e)), m.said) for e, m in tried if measure(e) < m.well], default=(math.inf, ""))
+        if as_it_is > nothing and best < min(BETTER * as_it_is, *(DEAD * float(measure(e)) for e in dead)):
+            raise RecordingError(f"{data.source}: {said}: so read, the model errs by {best:.0%} of the motion; as it is, by {as_it_is:.0%}")
+
+
+def _check_speeds(model: ComposedModel, data: Dataset) -> None:
+    """Raises RecordingError if a speed that an input sets is that in another unit: it goes with the command, times just that number, while
+    the robot goes as far as it was told.
+    """
+    steps = steps_of(data)
+    if len(steps) < FEWEST_STEPS:
+        return
+    foretold = predicted(model, steps, acting(model, data))
+    units: dict[str, str] = getattr(model.nominal, "units", {})
+    for j, name in enumerate(model.states):
+        if name not in model.nominal.reached:
+            continue
+        told, y = foretold[:, j], steps.y1[:, j]
+        slope = float(told @ y) / max(float(told @ told), 1e-300)
+        for unit, right, factor, _ in (*_UNITS.get(units.get(name, ""), ()), *_OF_STATES.get(units.get(name, ""), ())):
+            left = _trimmed((y - told / factor)[:, None])[0]
+            if abs(slope * factor - 1.0) < EXACTLY and left < SURELY * float(np.std(y)) and _goes_as_told(model, data):
+                raise RecordingError(
+                    f"{data.source}: {name} seems to be in {unit}, must be in {right}: it is {slope:.4g} times what was commanded, and "
+                    "the robot goes as far as it was told"
+                )
+
+
+def _goes_as_told(model: ComposedModel, data: Dataset) -> bool:
+    """Whether the states that are not set by an input are foretold."""
+    others = [i for i, name in enumerate(model.states) if name not in model.nominal.reached]
+    found = _foretold(model, data, others)
+    return found is not None and float(np.mean(found)) < WELL
 
 
 def _few(data: Dataset) -> Dataset:
@@ -121,8 +168,8 @@ def _taken_back(model: ComposedModel, data: Dataset, mistake: _Mistake) -> Datas
     return regridded(replace(data, segments=tuple(changed)), model)
 
 
-def _foretold(model: ComposedModel, data: Dataset) -> float | None:
-    """E; None where nothing goes anywhere."""
+def _foretold(model: ComposedModel, data: Dataset, among: list[int] | None = None) -> Array | None:
+    """The share that E is the mean of, of each state (or of these) that goes somewhere; None where nothing goes anywhere."""
     ahead = int(np.clip(round(HORIZON_S / data.dt), 1, 50))
     starts = rollout_starts(data, ahead)
     starts = starts[:: max(1, len(starts) // STARTS)]
@@ -137,7 +184,9 @@ def _foretold(model: ComposedModel, data: Dataset) -> float | None:
     bent = np.concatenate([np.diff(run.y, 2, axis=0) for run in data.runs])
     noise = np.nanmedian(np.abs(bent), axis=0) / 0.6745 / math.sqrt(6.0)
     goes = gone > GOES * noise + 1e-12
-    return float(np.mean(np.minimum(error[goes] / gone[goes], 2.0))) if goes.any() else None
+    if among is not None:
+        goes &= np.isin(np.arange(len(goes)), among)
+    return np.minimum(error[goes] / gone[goes], 2.0) if goes.any() else None
 
 
 def _trimmed(e: Array) -> Array:
@@ -154,7 +203,10 @@ def _mistakes(model: ComposedModel) -> Iterator[_Mistake]:
             order = [names.index({a: b, b: a}.get(name, name)) for name in names]
             yield _mistake(kind, f"the columns {a} and {b} seem to be exchanged", partial(_ordered, order))
         for j, name in enumerate(names):
-            for unit, right, factor, well in _UNITS.get(units.get(name, ""), ()):
+            for unit, right, factor, well in (
+                *_UNITS.get(units.get(name, ""), ()),
+                *(_OF_STATES.get(units.get(name, ""), ()) if kind == "states" else ()),
+            ):
                 yield _mistake(kind, f"{name} seems to be in {unit}, must be in {right}", partial(_scaled, [j], factor), well)
             if kind == "inputs":
                 yield _mistake(kind, f"{name} seems to have the other sign", partial(_scaled, [j], -1.0))
@@ -165,7 +217,9 @@ def _mistakes(model: ComposedModel) -> Iterator[_Mistake]:
     for name in model.nominal.angles:
         j = model.states.index(name)
         yield _mistake("states", f"{name} seems to be clockwise, must be counter-clockwise", partial(_scaled, [j], -1.0))
-        yield _mistake("states", f"{name} seems to be clockwise from y, must be counter-clockwise from x", partial(_turned, j))
+        yield _mistake("states", f"{name} seems to be clockwise from y, must be counter-clockwise from x", partial(_turned, j, 1.0))
+        said = f"{name} seems to be in degrees clockwise from y, must be in rad counter-clockwise from x"
+        yield _mistake("states", said, partial(_turned, j, math.pi / 180.0))
 
 
 def _dead(model: ComposedModel) -> list[_Mistake]:
@@ -178,8 +232,10 @@ _UNITS = {
     "rad/s": (("degrees a second", "rad/s", math.pi / 180.0, WELL), ("revolutions a minute", "rad/s", math.pi / 30.0, SURELY)),
     "m/s": (("mm/s", "m/s", 1e-3, WELL),),
 }
-"""Unit of a column -> units in which it may be by mistake: name, right one, factor, E below which it is believed. Not km/h, which could as
-well be a gain."""
+"""Unit of a column -> units in which it may be by mistake: name, right one, factor, E below which it is believed."""
+
+_OF_STATES = {"m/s": (("km/h", "m/s", 1.0 / 3.6, SURELY),), "m": (("cm", "m", 1e-2, WELL), ("mm", "m", 1e-3, WELL))}
+"""The same for what is measured; an input could as well have such a gain."""
 
 
 def _mistake(kind: str, said: str, change: Change, well: float = WELL) -> _Mistake:
@@ -196,9 +252,9 @@ def _scaled(columns: list[int], factor: float, values: Array) -> Array:
     return values
 
 
-def _turned(column: int, values: Array) -> Array:
+def _turned(column: int, factor: float, values: Array) -> Array:
     values = values.copy()
-    values[:, column] = 0.5 * math.pi - values[:, column]
+    values[:, column] = 0.5 * math.pi - factor * values[:, column]
     return values
 
 
@@ -218,9 +274,11 @@ def _check_clocks(model: ComposedModel, data: Dataset) -> None:
     if len(starts) < 20:
         return
     size = np.median(np.abs(_errors(model, few, 0, starts, ahead)), axis=0) / 0.6745 + 1e-12
+    aside = _pushed_aside(model, few, starts)
 
     def costs(lead: int) -> list[float]:
-        return [float(np.sum(part)) for part in _parts(_errors(model, few, lead, starts, ahead) / size)]
+        z = _errors(model, few, lead, starts, ahead) / size
+        return [float(np.sum(part)) for part in _parts(z if aside is None else _less(z, aside))]
 
     cost = np.array([costs(lead) for lead in leads])
     total = cost.sum(axis=1)
@@ -263,6 +321,30 @@ def _errors(model: ComposedModel, data: Dataset, lead: int, starts: Index, ahead
     with np.errstate(all="ignore"):
         error = rollout(model, data, acting(model, shifted), starts, ahead).error
     return np.nan_to_num(error, nan=1e300, posinf=1e300, neginf=-1e300)
+
+
+def _pushed_aside(model: ComposedModel, data: Dataset, starts: Index) -> Array | None:
+    """(n, k) what friction and springs could go with at the start of rollouts: each state, and which way it goes. None for a robot on a
+    plane, whose inputs set its speeds: what it does now tells what was asked a moment ago.
+    """
+    if {"x", "y", "theta"} <= set(model.states):
+        return None
+    begin = np.cumsum([0] + [len(run.y) - 1 for run in data.runs])
+    y = np.concatenate([run.y for run in data.runs])[starts + np.searchsorted(begin, starts, side="right") - 1]
+    y = y - np.where(np.array([unit_of(model, name).endswith("/s") for name in model.states]), 0.0, y.mean(axis=0))
+    return np.column_stack([np.ones(len(y)), y, np.sign(y)])
+
+
+def unit_of(model: ComposedModel, name: str) -> str:
+    """As the model says, or nothing."""
+    return str(getattr(model.nominal, "units", {}).get(name, ""))
+
+
+def _less(z: Array, aside: Array) -> Array:
+    """z (n, nx) less what of it goes with `aside` (n, k), wild values cut off."""
+    for _ in range(2):
+        z = z - aside @ np.linalg.lstsq(aside, np.clip(z, -WILD, WILD), rcond=1e-8)[0]
+    return z
 
 
 def _parts(z: Array) -> list[Array]:
