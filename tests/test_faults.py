@@ -65,6 +65,42 @@ def test_a_frozen_heading_is_reported_and_taken_out():
     assert np.isnan(checked.data.runs[0].y[305:355]).all()
 
 
+def _wheels(seed, spoil, step=0.08):
+    """A differential drive whose encoders count: their speeds come in steps, and repeat."""
+    rng = np.random.default_rng(seed)
+    geometry = {"wheel_radius": 0.035, "track": 0.23}
+    model = compose(ModelSpec("differential_drive", 0.02, geometry, (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),)))
+    u = commands(rng, 1, 2000, 0.02, [(-10.0, 10.0)] * 2, rest=0.1)
+    wheels = np.concatenate([np.zeros((1, 2)), u[0]])
+    pose = [np.zeros(3)]
+    for left, right in u[0]:
+        forward, turn = 0.0175 * (left + right), 0.035 * (right - left) / 0.23
+        middle = pose[-1][2] + 0.5 * 0.02 * turn
+        pose.append(pose[-1] + 0.02 * np.array([forward * np.cos(middle), forward * np.sin(middle), turn]))
+    counted = step * np.rint((wheels + rng.uniform(-0.5, 0.5, wheels.shape) * step) / step)
+    y = np.column_stack([np.array(pose) + rng.normal(size=(2001, 3)) * [0.001, 0.001, 0.002], counted])
+    spoil(y, u[0])
+    t = 0.02 * np.arange(2001)
+    return check(model, from_streams(model, [(Stream(t, y), Stream(t[:-1], u[0]))], "here")).faults
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_encoder_that_stands_still_through_commands_is_frozen(seed):
+    def freeze(y, u):
+        y[750:950, 4] = y[750, 4]
+
+    assert [(f.kind, f.channel) for f in _wheels(seed, freeze)] == [("frozen", "wheel_right")]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_wheel_at_its_limit_or_at_rest_is_not(seed):
+    def limit(y, u):
+        y[:, 3:] = np.clip(y[:, 3:], -5.04, 5.04)
+        y[600:800, 4] = 0.0  # held by its brake
+
+    assert [f for f in _wheels(seed, limit) if f.kind == "frozen"] == []
+
+
 @pytest.mark.parametrize(("noisy", "rest"), [(True, 0.4), (False, 0.4), (False, 0.0)])
 def test_a_sensor_that_jitters_at_rest_does_not_repeat_itself_a_dozen_times(noisy, rest):
     """The robot stands for a second, now and then or once. What repeats there without noise says nothing, whatever a gain leaves."""

@@ -30,6 +30,9 @@ either: on at least so many of them, of which less than such a share repeat, and
 correlation of -1/2 from one residual to the next; a slow motion, or an effect that the model lacks, has none below zero.
 """
 
+FOLLOWS, FOLLOWED = 0.25, 0.9
+"""Of what a frozen speed is off at most, how near to its command it is on other rows, and on which share of them at least."""
+
 
 def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: Reach) -> list[Fault]:
     """Exact repeats through which the model moves the state by more than noise and quantisation, and after which it catches up.
@@ -45,12 +48,17 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
     found = []
     for j, name in enumerate(model.states):
         change = np.abs(np.diff(run.y[:, j]))
-        if reach.instant[j] or not np.any(change > 0.0):
+        if not np.any(change > 0.0):
             continue
         quantum = float(np.min(change[change > 0.0]))
         least = SIGMAS * reach.noise[j] + QUANTA * quantum
         for a, b in _stretches(change == 0.0):
             if b - a < FROZEN_ROWS:
+                continue
+            if reach.instant[j]:
+                if b - a >= RESTLESS and _ignored(foretold[:, j], run.y[:, j], (a, b), least):
+                    bad[a + 1 : b + 1, j] = True
+                    found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
                 continue
             if b - a >= RESTLESS and _restless(change, e[:, j], np.abs(moves[:, j]) < reach.noise[j], (a, b)):
                 bad[a + 1 : b + 1, j] = True
@@ -68,6 +76,24 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
                 bad[a + 1 : b + 1, j] = True
                 found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
     return found
+
+
+def _ignored(foretold: Array, y: Array, within: tuple[int, int], least: float) -> bool:
+    """Whether a state that an input sets (a wheel's speed) stays through commands that it follows at all other times. Not at zero, where
+    robots stand, nor where every command is beyond it: that is a limit. foretold: (K,) by the command.
+    """
+    a, b = within
+    there, value = foretold[a:b], float(y[a])
+    missed = float(np.max(np.abs(there - value)))
+    limit = bool(np.all(there * math.copysign(1.0, value) >= abs(value) - least))
+    if missed < least or float(np.ptp(there)) < least or abs(value) < least or limit:
+        return False
+    off = np.abs(y[1:] - foretold)
+    followed = off < FOLLOWS * missed
+    back = followed[b : b + FROZEN_ROWS]
+    followed[a:b] = False
+    others = len(followed) - (b - a)
+    return bool(np.count_nonzero(followed) > FOLLOWED * others and np.any(back))
 
 
 def _restless(change: Array, e: Array, resting: Mask, within: tuple[int, int]) -> bool:
