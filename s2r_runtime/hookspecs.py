@@ -184,6 +184,7 @@ class Effect(Protocol):
       it does is a sum over its parameters, in proportion to each one's distance from neutral (a force: as long as nothing stops);
     - `same_as(model, channel) -> tuple[tuple[str, str, convert], ...]`: effects that it is identical to on this model: name, channel, and
       a function of its values that gives theirs. The tracer looks for the first of them instead (`effects.classes` has the built-in ones);
+    - `simpler(p) -> (name, p)`: the effect with fewer numbers that it is if its own agree, on the same channel;
     - `takes(model, channel) -> tuple[str, ...]`: names of the parameters that it has there (default: all);
     - `frame(model, channel) -> str` (stage `step`): "body" if it changes the motion of the body (it then applies before a pose is
       integrated along it), "world" if it adds to the motion along the world's axes (it then applies after that);

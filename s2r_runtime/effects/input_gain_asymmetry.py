@@ -22,6 +22,10 @@ class InputGainAsymmetry(InputEffect):
         """gain_positive max(u, 0) + gain_negative min(u, 0)."""
         return float(p["gain_positive"]) * np.maximum(u, 0.0) + float(p["gain_negative"]) * np.minimum(u, 0.0)
 
+    def simpler(self, p: Values) -> tuple[str, Values]:
+        """One gain for both."""
+        return "input_gain", {"gain": 0.5 * (float(p["gain_positive"]) + float(p["gain_negative"]))}
+
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
         """One is enough where the input has both signs: the response is linear in both."""
         given = u[:, columns(model, channel)]

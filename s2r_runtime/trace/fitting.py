@@ -129,10 +129,17 @@ def foretold(given: Problem, model: ComposedModel) -> Array | None:
 
 
 def sensitivities(given: Problem, fit: Fit, model: ComposedModel, free: Free) -> Array:
-    """dz/dp, (n nx, k), one-sided differences inside the bounds, under the noise of a fit."""
+    """dz/dp, (n nx, k), under the noise of a fit."""
     n, nx = given.steps.y0.shape
     if not free:
         return np.zeros((n * nx, 0))
+    moved = slopes(given, model, free)
+    return fit.colour(fit.whiten(moved), given.steps.joined).reshape(n * nx, len(free))
+
+
+def slopes(given: Problem, model: ComposedModel, free: Free) -> Array:
+    """d(residual)/dp, (n, nx, k), one-sided differences inside the bounds."""
+    n, nx = given.steps.y0.shape
     here = predicted(model, given.steps, acting(model, given.data))
     now = values_of(model, free)
     moved = np.zeros((n, nx, len(free)))
@@ -145,7 +152,7 @@ def sensitivities(given: Problem, fit: Fit, model: ComposedModel, free: Free) ->
             if beyond is not None:
                 moved[:, :, j] = (beyond - here) / -signed
                 break
-    return fit.colour(fit.whiten(moved), given.steps.joined).reshape(n * nx, len(free))
+    return moved
 
 
 def scatter(given: Problem, fit: Fit) -> Array:

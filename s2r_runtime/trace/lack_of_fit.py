@@ -8,8 +8,8 @@ rival model: its terms are added to the step,
 and its gain is the log likelihood of what is left, with noise and colour re-estimated for it, less that of the model without it. The
 best group is named, then those that add to it. A group counts only if it is beyond chance, and if the rollouts' errors fall
 with it: structure that nobody would notice is none. Beyond chance: its gain is, the scatter of its scores over blocks of time
-allowed for; or its evidence is out of reach of the same residual slid along the recording. A residual that is only
-correlated in time, whatever the inputs do, is `noise`.
+allowed for; or its evidence is out of reach of the same residual slid along the recording. Where no group counts, what happens for a
+while only is looked for (`episodes`). A residual that is only correlated in time, whatever the inputs do, is `noise`.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.episodes import episodes, may_depend_on
 from s2r_runtime.trace.evidence import evidence, margin
 from s2r_runtime.trace.fitting import Fit, Problem
 from s2r_runtime.trace.fitting import gain as explained
@@ -57,6 +58,9 @@ SEEN = 1.25
 that follow it make the noise of the process look like none, and all that comes after is foretold by that.
 """
 
+DOUBLED = 2.0
+"""As MATTERS, for what happens for a while: some rollout's error is so many times what it is without. Noise that wanders makes less."""
+
 CLIPPED = 10.0
 """Standard deviations at which a wild value is cut off where it is not taken for an outlier."""
 
@@ -80,7 +84,7 @@ class Structure:
     """tokens: docs/json.md's `depends_on`, most important first. matters: it shows in rollouts.
 
     share: part of all that the nominal model lacks which is still left (0 where there is nothing). gains: nats by group. nameless: what
-    was named looks more like something that has no name (`challenge`).
+    was named looks more like something that has no name (`challenge`). for_a_while: it comes and goes (`episodes`).
     """
 
     tokens: tuple[str, ...]
@@ -88,6 +92,7 @@ class Structure:
     share: float
     gains: dict[str, float]
     nameless: bool = False
+    for_a_while: bool = False
 
     @property
     def likeliest(self) -> tuple[str, ...]:
@@ -98,11 +103,15 @@ class Structure:
 
 def lack_of_fit(given: Problem, fit: Fit, nominal: Fit, horizon: int) -> Structure:
     """Structure left by `fit`; how much of what `nominal` leaves that is."""
-    left, found = _left_by(given, fit)
+    left, found = left_by(given, fit)
     chosen, gains = _forward(left, found) if found else ([], {})
     coloured = ("noise",) if np.any(fit.colour.strength > COLOURED) else ()
     if not chosen:
-        return Structure(coloured, False, 0.0, gains)
+        windows = episodes(left) if given.data.in_order else None
+        matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
+        if windows is None or not matters:
+            return Structure(coloured, False, 0.0, gains)
+        return Structure(may_depend_on(left, windows, found), True, share, gains, for_a_while=True)
     matters, share = _weight_of(left, nominal, chosen[-1], horizon)
     tokens = tuple(dict.fromkeys(TOKENS.get(judged.token, judged.token) for judged in chosen))
     return Structure(tokens if matters else coloured, matters, share, gains)
@@ -124,7 +133,7 @@ class Looks:
 
 def first_looks(given: Problem, nominal: Fit) -> Looks:
     """At what the nominal model leaves."""
-    left, found = _left_by(given, nominal)
+    left, found = left_by(given, nominal)
     return Looks(left, found, sorted(((first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True))
 
 
@@ -153,7 +162,7 @@ def explains_more(looks: Looks, unnamed: Judged, fit: Fit, horizon: int, *, left
     )
 
 
-def _left_by(given: Problem, fit: Fit) -> tuple[Left, list[tuple[str, Array]]]:
+def left_by(given: Problem, fit: Fit) -> tuple[Left, list[tuple[str, Array]]]:
     """What a model leaves, and the dictionaries for it."""
     act = acting(fit.model, given.data)
     r = residual(fit.model, given.steps, act)
@@ -247,12 +256,14 @@ def _best_of_each(looked: list[tuple[float, int]], found: Sequence[tuple[str, Ar
     return kept
 
 
-def _weight_of(left: Left, nominal: Fit, judged: Judged, horizon: int) -> tuple[bool, float]:
-    """Whether the structure shows in rollouts, and what share of all that the nominal model lacks it is."""
+def _weight_of(left: Left, nominal: Fit, judged: Judged, horizon: int, least: float = 1.0 + MATTERS) -> tuple[bool, float]:
+    """Whether the structure shows in rollouts, errors being so many times larger without it, and what share of all that the nominal model
+    lacks it is.
+    """
     matters, worst, share = False, 1.0 + MATTERS, 0.0
     for before, now, after in _rollouts(left, nominal, judged, horizon):
         for b, n, a in zip(before, now, after, strict=True):
-            matters = matters or bool(n > (1.0 + MATTERS) * a)
+            matters = matters or bool(n > least * a)
             if a > 0.0 and max(b, n) > worst * a:
                 worst, share = max(b, n) / a, max(n * n - a * a, 0.0) / max(b * b - a * a, n * n - a * a)
     return matters, share

@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.fitting import Problem
+from s2r_runtime.trace.fitting import Problem, slopes
 from s2r_runtime.trace.residual import Acting, Steps
 from s2r_runtime.trace.residual_noise import Noise
+from s2r_runtime.trace.slots import free_of
 
 Array = NDArray[np.float64]
 Terms = list[Array]
@@ -47,6 +48,9 @@ ROUNDS = 4
 LINE = 25.0
 """Times its neighbourhood by which a line must stand out: of 10 000 points of white noise, the highest is about 10."""
 
+FEWEST_LEVELS, MOST_LEVELS = 4.0, 200.0
+"""Steps between zero and the largest input, in which it may be carried out: fewer have dictionaries of their own."""
+
 WIDEST = 30
 """Steps to each side over which states are averaged at most."""
 
@@ -68,6 +72,7 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
     yield "constant", _push([one], [*body, *world])
     for j, name in enumerate(model.inputs):
         yield from ((name, _push(terms, body)) for terms in _static(u[:, j]))
+        yield from ((name, _push(terms, body)) for terms in _levels(r, u[:, j], body))
         yield from ((f"memory({name})", _push(terms, body)) for terms in _memory(act.mean[:, j] / size[j], steps.place))
         yield from ((f"memory({name})", _push(terms, body)) for terms in _bent_memory(act.mean[:, j] / size[j], steps.place))
         if given.data.in_order:
@@ -79,6 +84,7 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
     pushes = [u[:, j][:, None] * own for j, own in enumerate(_own(given, model, act))]
     for name, terms, directions in _of_states(model, quieter(steps, noise), u, body, world, pushes):
         yield name, terms if directions is None else _push(terms, directions)
+    yield from _varying(given, model, t, u)
     if not given.data.in_order:
         return
     for name, push in zip(model.inputs, pushes, strict=True):
@@ -88,6 +94,16 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
     yield "time", _push([one, *(np.where(t > s, one, 0.0) for s in np.linspace(0.1, 0.9, 9))], body)
     for directions in (body, world):
         yield from (("wave", _push(waves, directions)) for waves in _hum(r, given, directions))
+
+
+def pushes_by_token(given: Problem, model: ComposedModel, act: Acting) -> list[tuple[str, Array]]:
+    """(token, (n, nx)) of what may come and go: a push in each direction, and a share of each input."""
+    body, world = _directions(given, model, act)
+    u = act.mean[given.steps.place]
+    own = [
+        (f"time*{name}", u[:, j][:, None] * push) for j, (name, push) in enumerate(zip(model.inputs, _own(given, model, act), strict=True))
+    ]
+    return [(token, push) for token, push in [*own, *(("time", d) for d in (*body, *world))] if np.any(push)]
 
 
 def quieter(steps: Steps, noise: Noise) -> Array:
@@ -106,6 +122,28 @@ def quieter(steps: Steps, noise: Noise) -> Array:
             at = np.arange(len(y))
             y[:, i] = (total[at + reach + 1] - total[at - reach]) / (2 * reach + 1)
     return y
+
+
+def _varying(given: Problem, model: ComposedModel, t: Array, u: Array) -> Iterator[tuple[str, Terms]]:
+    """A number of an effect that the data, not the user, put there, and that is not one number: it grows with time, with the speed, with an
+    input's size. What a change of it would do, times that.
+    """
+    free = free_of(model)
+    moved = slopes(given, model, free) if free else np.zeros((*given.steps.y0.shape, 0))
+    speed = [_scaled(np.abs(given.steps.y0[:, i]), centred=False) for i, name in enumerate(model.states) if name in VELOCITIES]
+    for place in dict.fromkeys(slot.place for slot in free):
+        own = [moved[:, :, k] for k, slot in enumerate(free) if slot.place == place]
+        effect, channel = model.effects[place].effect, model.effects[place].channel
+        on_input = channel in model.inputs
+        if given.data.in_order:
+            waves = [t, *(f(np.pi * k * t) for k in (1, 2, 3) for f in (np.sin, np.cos))]
+            yield f"time*{channel}" if on_input else "time", [w[:, None] * m for m in own for w in waves]
+        remembers = on_input and effect.hidden(1, model.nominal, channel, model.dt, model.effects[place].p).size > 0
+        for j, name in enumerate(model.inputs):
+            token = f"memory({channel})" if remembers else f"{channel}*{name}" if on_input and channel != name else name
+            yield token, [np.abs(u[:, j])[:, None] * m for m in own]
+        if speed:
+            yield f"memory({channel})" if remembers else "speed", [v[:, None] * m for m in own for v in speed]
 
 
 def _over_time(t: Array, u: Array) -> Iterator[Terms]:
@@ -155,6 +193,22 @@ def _static(u: Array) -> Iterator[Terms]:
     yield [u, u * a, np.sign(u) * (a > 0.02)]
     yield [u, a, u * a, u * u, np.sign(u) * (a > 0.02), *(np.sign(u) * np.maximum(a - s, 0.0) for s in (0.1, 0.25, 0.5, 0.75))]
     yield [u, *(f(0.5 * np.pi * k * u) for k in range(1, 13) for f in (np.sin, np.cos))]
+
+
+def _levels(r: Array, u: Array, directions: Terms) -> Iterator[Terms]:
+    """What comes again and again as the input grows (on a scale of 1): commands that are carried out in steps. Of the one number of steps
+    at which the residual r (n, nx) follows the input most, if it stands out.
+    """
+    if len(np.unique(u)) < FLOOR:
+        return
+    steps = np.arange(FEWEST_LEVELS, MOST_LEVELS + 0.5, 0.5)
+    seen = np.stack([np.sum(r * d, axis=1) for d in directions], axis=1)
+    seen = np.clip(seen - np.median(seen, axis=0), *(sign * 4.0 * np.median(np.abs(seen), axis=0) for sign in (-1, 1)))
+    power = np.abs(np.exp(-1j * np.pi * np.outer(steps, u)) @ seen) ** 2
+    ratio = power / np.maximum(np.median(power, axis=0) / math.log(2.0), 1e-300)
+    k, c = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
+    if ratio[k, c] > LINE:
+        yield [f(h * np.pi * steps[k] * u) for h in (1, 2, 3) for f in (np.sin, np.cos)]
 
 
 def _memory(u: Array, place: NDArray[np.int64]) -> Iterator[Terms]:

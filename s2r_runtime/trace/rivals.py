@@ -10,16 +10,21 @@ anywhere about where the robot was, in any direction, at times over the whole re
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.effects.classes import canonical
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.plugins import registry
+from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.dataset import Dataset, Run
-from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, scatter, without
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, scatter, without
 from s2r_runtime.trace.residual import acting, steps_of
 from s2r_runtime.trace.scores import Scored, best_candidates, limited, name_of
+from s2r_runtime.trace.slots import Added, slots_of
 
 Array = NDArray[np.float64]
 
@@ -34,6 +39,15 @@ FITTED = 12
 
 ALIKE = 0.05
 """Mean square of what two models differ in, as a share of what the effect itself does, below which a richer one is the same thing."""
+
+BETTER = 0.5
+"""Of how far the best fit is at worst from its rivals: one that is not that much nearer to them does not take its place."""
+
+BEYOND = 3.0
+"""Times the largest input of these data to which the next drive may go, where little was asked."""
+
+EQUAL = 0.0025
+"""As ALIKE, for numbers of one effect that agree: to a twentieth of what it does."""
 
 PROBES, PROBE_STEPS = 8, 120
 """Runs and steps of the rich inputs."""
@@ -52,9 +66,85 @@ def rivals(given: Problem, fit: Fit) -> list[Scored]:
         for s in best_candidates(given, base, FITTED, against=here - close)[0]:
             if s.fit is None or (s.name, s.channel) == mine or not limited(s.fit) or gain(s.fit, base) < here - close:
                 continue
-            if s.fit.k <= fit.k or rich is None or rich.apart(s.fit.model, fit.model) > ALIKE * rich.apart(fit.model, base.model):
+            numberless = not slots_of(fit.model.effects[place], place)
+            if numberless and _coincidence(here, gain(s.fit, base)) > CLOSE:
+                continue
+            if (
+                (s.fit.k <= fit.k and not numberless)
+                or rich is None
+                or rich.apart(s.fit.model, fit.model) > ALIKE * rich.apart(fit.model, base.model)
+            ):
                 found.append(s)
     return found
+
+
+def _coincidence(mine: float, other: float) -> float:
+    """Nats for an effect that has no number (how a model is integrated) against one whose number happens to come out as what that does: a
+    Bayes factor, that number being anything from minus to plus twice what it is. mine, other: gains of the two. (With the number known to
+    1 / sqrt(2 gain) of itself: 4 sqrt(2 gain) / sqrt(2 pi); H. Jeffreys, Theory of Probability, 5.2.)
+    """
+    return mine - other + math.log(4.0 * math.sqrt(max(other, 1e-9) / math.pi))
+
+
+def simplified(given: Problem, fit: Fit) -> Fit:
+    """With a simpler effect in the place of one that does the same, or so nearly that it would not be noticed: one without a number where a
+    number comes out as what that does (every robot moves on arcs, and few slide sideways by just half a step), one with one number
+    where several agree.
+    """
+    for place in fit.added:
+        a = fit.model.effects[place]
+        instead = _agreeing(fit, place) if hasattr(a.effect, "simpler") else _without_number(given, fit, place)
+        rich = _rich(given, fit.model) if instead else None
+        near = EQUAL if hasattr(a.effect, "simpler") else ALIKE
+        for model in instead:
+            if rich is not None and rich.apart(model, fit.model) <= near * rich.apart(fit.model, without(fit.model, place)):
+                return simplified(given, fitted(given, evaluate(given, model), model))
+    return fit
+
+
+def _agreeing(fit: Fit, place: int) -> list[ComposedModel]:
+    """The model with the simpler effect that an effect names."""
+    a = fit.model.effects[place]
+    name, p = a.effect.simpler(a.p)  # type: ignore[attr-defined]
+    name, channel = canonical(fit.model.for_effects, name, a.channel)
+    effect = registry().get("effects", name)
+    if (name, channel) in {name_of(other) for other in fit.model.effects} or not set(p) <= {q.name for q in effect.parameters}:
+        return []
+    return [replace(fit.model, effects=(*fit.model.effects[:place], Added(effect, channel, p), *fit.model.effects[place + 1 :]))]
+
+
+def _without_number(given: Problem, fit: Fit, place: int) -> list[ComposedModel]:
+    """The model with each effect that has no number in the place of one that has one."""
+    a = fit.model.effects[place]
+    if len(slots_of(a, place)) != 1 or a.effect.stage != "step":
+        return []
+    less = without(fit.model, place)
+    found = candidates(less, given.data)
+    return [model for c in found if not any(slots_of(start, 0) for start in c.starts) for model in c.models(less)]
+
+
+def representative(given: Problem, fit: Fit, found: list[Scored]) -> tuple[Fit, list[Scored]]:
+    """Of explanations that tie, the one to go on with, and the others: that which is at worst least far from what the others do on inputs
+    BEYOND these, as a share of what they do. Where a limit, a deadband and a gain say the same, a gain is wrong by least elsewhere.
+
+    Nothing changes where more than one effect has rivals.
+    """
+    tied = [s.fit for s in found if s.fit is not None]
+    mine = {name_of(fit.model.effects[place]): place for place in fit.added}
+    gone = {name for other in tied for name in mine.keys() - {name_of(other.model.effects[p]) for p in other.added}}
+    if len(gone) != 1:
+        return fit, found
+    name = gone.pop()
+    less = without(fit.model, mine[name])
+    rich = _rich(given, fit.model, BEYOND)
+    models = [fit.model, *(other.model for other in tied)]
+    done = [max(rich.apart(model, less), 1e-300) for model in models]
+    worst = [max(rich.apart(one, other) / size for other, size in zip(models, done, strict=True)) for one in models]
+    best = int(np.argmin(worst))
+    if worst[best] > BETTER * worst[0]:
+        return fit, found
+    chosen = tied[best - 1]
+    return chosen, [Scored(*name, found[0].score, fit), *(s for s in found if s.fit is not chosen)]
 
 
 @dataclass(frozen=True)
@@ -71,10 +161,10 @@ class _Rich:
         return float(np.mean((one.difference(a, b) / self.scale) ** 2))
 
 
-def _rich(given: Problem, model: ComposedModel) -> _Rich:
+def _rich(given: Problem, model: ComposedModel, reach: float = 1.0) -> _Rich:
     rng = np.random.default_rng(0)
     source, steps = given.data, given.steps
-    largest = np.max(np.abs(np.concatenate([run.u for run in source.runs])), axis=0)
+    largest = reach * np.max(np.abs(np.concatenate([run.u for run in source.runs])), axis=0)
     low, high = np.min(steps.y0, axis=0), np.max(steps.y0, axis=0)
     low, high = low - 0.5 * (high - low), high + 0.5 * (high - low)
     low[model.angle_columns], high[model.angle_columns] = -np.pi, np.pi

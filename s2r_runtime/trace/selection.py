@@ -30,7 +30,7 @@ from s2r_runtime.trace.fitting import (
     without,
 )
 from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
-from s2r_runtime.trace.rivals import CLOSE, rivals
+from s2r_runtime.trace.rivals import CLOSE, representative, rivals, simplified
 from s2r_runtime.trace.scores import STRICT, Bar, Scored, best_candidates, limited, name_of, names, rescored, unlimited
 from s2r_runtime.trace.slots import bounds_of, values_of, with_values
 
@@ -100,7 +100,9 @@ def select(
             break
     fit = pruned(given, fit, tried, horizon, bar)
     progress(0.8)
-    return Selection(nominal, fit, tried, tuple(ranking), tuple(rivals(given, fit)))
+    fit = simplified(given, fit)
+    fit, others = representative(given, fit, rivals(given, fit))
+    return Selection(nominal, fit, tried, tuple(ranking), tuple(others))
 
 
 def crowded(fit: Fit) -> bool:

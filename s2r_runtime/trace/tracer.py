@@ -287,7 +287,9 @@ class _Whole:
         fit = evaluate(self.given, chosen.fit.model)
         found = lack_of_fit(self.given, fit, self.nominal, self._horizon)
         if not fit.added:
-            told = found.matters and self.unnamed.gain > CLEAR  # else it is seen by sliding only, which says by itself what it depends on
+            told = (
+                found.matters and not found.for_a_while and self.unnamed.gain > CLEAR
+            )  # else it is seen by sliding only, which says by itself what it depends on
             tokens = self._looks_like if told else () if self._shape is None else (self._shape.token,)
             named = tuple(dict.fromkeys((*tokens, *found.tokens)))
             return replace(found, tokens=named, matters=True, share=1.0) if tokens else found

@@ -1,0 +1,133 @@
+"""What comes and goes, what goes in steps, what grows with time, and what may be wrong elsewhere: no confident name, no `nothing`."""
+
+import math
+
+import numpy as np
+import pytest
+
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.episodes import episodes
+from s2r_runtime.trace.fitting import evaluate, problem
+from s2r_runtime.trace.lack_of_fit import left_by
+from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.tracer import trace
+
+DT, PARTS = 0.05, 10
+NOISE = np.array([0.0008, 0.0008, 0.002])
+
+
+def _unicycle(rng, u, share=lambda k, x: 1.0, scheme="exact"):
+    """(T + 1, 3) measured: `share` of the speed that is commanded, on arcs or by Euler's rule."""
+    x = np.zeros(3)
+    rows = [x]
+    for k, (v, w) in enumerate(u):
+        v = v * share(k, x)
+        parts = PARTS if scheme == "exact" else 1
+        x = x.copy()
+        for _ in range(parts):
+            h = DT / parts
+            x += h * np.array([v * math.cos(x[2]), v * math.sin(x[2]), w])
+        rows.append(x)
+    return np.array(rows) + rng.normal(size=(len(u) + 1, 3)) * NOISE
+
+
+def _held(rng, steps, low, high, hold=20):
+    return np.repeat(rng.uniform(low, high, (steps // hold + 1, len(low))), hold, axis=0)[:steps]
+
+
+def _traced(y, u, scheme="euler"):
+    model = compose(ModelSpec("unicycle", DT, {}, ()))
+    return trace(from_arrays(model, [(y, u)]), model)
+
+
+def test_a_stretch_of_wet_floor_is_no_noise():
+    """Two stretches of time on which the wheels slip, in places where it never comes back to."""
+    rng = np.random.default_rng(3)
+    u = np.column_stack([rng.uniform(0.2, 0.4, 800), 0.15 * np.sin(0.02 * np.arange(800))])
+    y = _unicycle(rng, u, lambda k, x: 0.55 if 300 <= k < 340 or 610 <= k < 640 else 1.0, "euler")
+    result = _traced(y, u)
+    assert result.verdict == "unexplained"
+    assert {"time", "time*v", "position"} & set(result.depends_on)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_push_that_wanders_slowly_is_no_episode(seed):
+    """At 1 kHz a force that wanders in a tenth of a second looks neither white nor like an autoregression of four milliseconds."""
+    rng = np.random.default_rng(seed)
+    dt, steps = 0.001, 1400
+    u = _held(rng, steps, [-2.0], [2.0], 150)
+    push, x = 0.0, np.zeros(2)
+    rows = [x]
+    for k in range(steps):
+        push += -push * dt / 0.1 + 0.3 * math.sqrt(2.0 * dt / 0.1) * rng.normal()
+        x = x + dt * np.array([x[1] + 0.5 * dt * (u[k, 0] + push), u[k, 0] + push])
+        rows.append(x)
+    y = np.array(rows) + rng.normal(size=(steps + 1, 2)) * [1e-4, 2e-4]
+    model = compose(ModelSpec("joint", dt, {"mass": 1.0}, ()))
+    data = from_arrays(model, [(y, u)])
+    given = problem(data, steps_of(data))
+    assert episodes(left_by(given, evaluate(given, model))[0]) is None
+
+
+def test_commands_that_are_carried_out_in_steps_are_no_limit():
+    """The largest command is cut to the last step: a saturation explains that, and nothing else of it."""
+    rng = np.random.default_rng(5)
+    step = 0.031
+    asked = _held(rng, 900, [-0.5, -1.5], [0.5, 1.5], 6)
+    y = _unicycle(
+        rng,
+        np.column_stack([step * np.rint(asked[:, 0] / step), asked[:, 1]]),
+        scheme="euler",
+    )
+    result = _traced(y, asked)
+    assert result.verdict == "unexplained"
+    assert result.depends_on[0] == "v"
+
+
+def test_a_push_that_swells_has_no_amplitude():
+    """A sine whose amplitude grows threefold in the recording is not the library's sine, although that explains most of it."""
+    rng = np.random.default_rng(6)
+    u = _held(rng, 900, [-0.5, -0.8], [0.5, 0.8])
+    t = DT * np.arange(900)
+    swell = 0.15 * (0.4 + 1.6 * (t / t[-1]) ** 2) * np.sin(2.0 * math.pi * 0.7 * t)
+    y = _unicycle(rng, u + np.column_stack([np.zeros(900), swell]), scheme="euler")
+    result = _traced(y, u)
+    assert result.verdict == "unexplained"
+    assert {"time", "time*w"} & set(result.depends_on)
+
+
+def test_arcs_under_a_model_that_goes_straight_have_one_name():
+    """A sideways slip of exactly half a step would say the same: that would be a coincidence, and is no tie."""
+    rng = np.random.default_rng(7)
+    u = _held(rng, 900, [0.2, -1.5], [0.5, 1.5])
+    result = _traced(_unicycle(rng, u), u)
+    assert (result.verdict, [e.name for e in result.effects]) == (
+        "traced",
+        ["integration_scheme"],
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_of_explanations_that_tie_the_mildest_elsewhere_is_gone_on_with(seed):
+    """Its speed was always the same: a gain, a limit at that speed, a deadband. A limit would stop the robot short at any higher speed."""
+    rng = np.random.default_rng(seed)
+    u = np.column_stack([np.full(700, 0.25), _held(rng, 700, [-1.0], [1.0])[:, 0]])
+    result = _traced(_unicycle(rng, u, lambda k, x: 0.85, "euler"), u)
+    names = {(e.name, e.channel) for e in (*result.effects, *result.ambiguous_with)}
+    assert result.verdict == "ambiguous"
+    assert {("input_gain", "v"), ("input_saturation", "v")} <= names
+    moved = result.model.step(np.zeros((1, 3)), np.array([[0.75, 0.0]]), result.model.at_rest(1))[0][0, 0]
+    assert moved == pytest.approx(0.85 * 0.75 * DT, rel=0.15)
+
+
+def test_two_gains_that_agree_are_one():
+    """A gyro's scale that differs by sign in the fourth digit only, and long data: significant, and nothing to anybody."""
+    rng = np.random.default_rng(8)
+    asked = _held(rng, 4000, [-0.5, -1.0], [0.5, 1.0], 8)
+    done = asked.copy()
+    done[:, 1] *= np.where(asked[:, 1] > 0.0, 0.9002, 0.8998)
+    x = _unicycle(np.random.default_rng(9), done, scheme="euler")
+    result = _traced(x, asked)
+    assert [(e.name, e.channel) for e in result.effects] == [("input_gain", "w")]
