@@ -137,7 +137,7 @@ class NominalModel(Protocol):
     It may also have: `units` (name of a state or input -> SI unit, for reports); `integration` = "euler" if it has a planar pose (x, y,
     theta) that is moved along the heading at the start of the step; `reached` (state -> the input that it is set to at once: such
     a state is compared with the input as it acts at the *end* of the step, the others with its mean over the step); `follows` (state that
-    a recording may lack -> the states that it follows from, and how: `Follows`).
+    a recording may lack -> the states that it follows from, and how: `Follows`); `uneven` = True: `step` also takes dt as (n,), one a row.
     """
 
     name: str
@@ -192,6 +192,10 @@ class Effect(Protocol):
     - `pushes(model, channel) -> bool`, `push(x, axis, model, channel, p) -> Push | None` and `varies`: it is a force on an axis
       (`models.forces`). A model solves for all its forces together, and does not call `after_step`;
     - `side_by_side` = True: `input_sequence` also takes u (T, runs, nu), many short runs at once;
+    - `uneven` = True: `input_sequence` also takes dt as (T,), how long each row lasts (and `start` as (T,), when each begins, where it is
+      `timed`), with which runs come one after the other, a row of zeros and REST_S seconds (`trace.chains`) between two; `after_step` also
+      takes dt as (n,). Without it, rows that do not last alike are taken to;
+    - `glides` = True: what goes on within a step settles, or is a ramp: a model foretells the step's end from its parts;
     - `within_step(dt, p) -> bool`: whether what acts changes within a step although the input is held over it;
     - `reads(model, channel) -> tuple[str, ...]`: inputs besides the channel on which what acts there depends;
     - `starts(u, model, channel, dt) -> list[dict]`: parameter values from which the tracer begins, given the input that it would

@@ -21,6 +21,7 @@ class ConstantDisturbance(ForceEffect):
 
     name = "constant_disturbance"
     parameters = (Parameter("x", "m/s", -1e6, 1e6, neutral=0.0), Parameter("y", "m/s", -1e6, 1e6, neutral=0.0))
+    uneven = True
     additive = True
 
     def channels(self, model: NominalModel) -> tuple[str, ...]:
@@ -45,7 +46,7 @@ class ConstantDisturbance(ForceEffect):
         """Its acceleration on this axis."""
         return Push(drive=float(p[direction(model, axis)]) / mass(model))
 
-    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """Rates on a pose, forces on axes."""
         if self.pushes(model, channel):
             return super().after_step(x, u, x_next, model, channel, dt, p)

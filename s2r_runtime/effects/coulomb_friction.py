@@ -19,6 +19,7 @@ class CoulombFriction(ForceEffect):
 
     name = "coulomb_friction"
     parameters = tuple(Parameter(name, "N", 0.0, 1e6, neutral=0.0) for name in ("force", "force_positive", "force_negative"))
+    uneven = True
     optional = ("force", "force_positive", "force_negative")
     additive = True
 

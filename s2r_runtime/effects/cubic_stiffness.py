@@ -27,6 +27,7 @@ class CubicStiffness(ForceEffect):
 
     name = "cubic_stiffness"
     parameters = (Parameter("coefficient", "N/m³", -1e9, 1e9, neutral=0.0),)
+    uneven = True
     varies = True
 
     def channels(self, model: NominalModel) -> tuple[str, ...]:

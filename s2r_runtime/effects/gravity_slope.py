@@ -27,7 +27,7 @@ class GravitySlope(ConstantDisturbance):
         """It adds along the headings that the step has had."""
         return "world"
 
-    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """Rates on a pose, forces on axes."""
         if self.pushes(model, channel):
             return pushed(x, x_next, model, [(self, channel, p)], dt)

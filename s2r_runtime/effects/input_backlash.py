@@ -7,6 +7,8 @@ u is constant over the step, so what acts is too. Hidden state: y, zero (the mid
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from s2r_runtime.effects.follower import Follower
@@ -23,16 +25,16 @@ class InputBacklash(Follower):
     name = "input_backlash"
     parameters = (Parameter("width", "input", 0.0, 1e6, neutral=0.0, kink=True),)
 
-    def after(self, y: Array, u: Array, steps: Array | int, dt: float, p: Values) -> Array:
+    def after(self, y: Array, u: Array, steps: Array | float, dt: float, p: Values) -> Array:
         """Pushed at once; a second step of the same input changes nothing."""
         half = 0.5 * float(p["width"])
         return np.where(np.asarray(steps) > 0, np.minimum(np.maximum(y, u - half), u + half), y)
 
-    def mean(self, y: Array, u: Array, dt: float, p: Values) -> Array:
+    def mean(self, y: Array, u: Array, dt: float | Array, p: Values) -> Array:
         """The same over all of the step."""
-        return self.after(y, u, 1, dt, p)
+        return self.after(y, u, 1, 1.0, p)
 
-    def begins(self, held: list[float], steps: list[int], dt: float, p: Values) -> list[float]:
+    def begins(self, held: list[float], steps: Sequence[float], dt: float, p: Values) -> list[float]:
         """One push a stretch."""
         half = 0.5 * float(p["width"])
         y, found = 0.0, []

@@ -25,6 +25,7 @@ class InputDelay(InputEffect):
     all_alike = True
     linear = True
     shift = True
+    uneven = True
 
     def within_step(self, dt: float, p: Values) -> bool:
         """A delay of whole steps keeps what is constant over a step so."""
@@ -43,8 +44,10 @@ class InputDelay(InputEffect):
         acting = (1.0 - part) * line[:, whole] + part * line[:, whole + 1]
         return replaced(u, model, channel, acting), line[:, :-1].reshape(len(u), -1)
 
-    def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+    def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """The whole recording shifted."""
+        if isinstance(dt, np.ndarray):
+            return replaced(u, model, channel, _shifted(u[:, columns(model, channel)], dt, float(p["delay"])))
         whole, part = _steps(p["delay"], dt)
         given = u[..., columns(model, channel)]
         line = np.concatenate([np.zeros((whole + 1, *given.shape[1:])), given])
@@ -54,6 +57,19 @@ class InputDelay(InputEffect):
         """Half steps at first, then wider, up to half a second or a dozen steps."""
         wide = [s for s in (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5) if 4.0 * dt < s <= 200.0 * dt]
         return [{"delay": s} for s in sorted({*(dt * k for k in (0.3, 0.6, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0, 12.0)), *wide})]
+
+
+def _shifted(u: Array, lasts: Array, delay: float) -> Array:
+    """u (T, c), held over rows that last so long, (T,) s, a delay later: the mean over each row, and exactly u where one value fills it."""
+    edges = np.concatenate([[0.0], np.cumsum(lasts)])
+    at = edges - delay
+    row = np.clip(np.searchsorted(edges, at, side="right") - 1, -1, len(u) - 1)
+    since = np.where(row >= 0, at - edges[row], 0.0)[:, None]
+    given = np.concatenate([u, np.zeros((1, u.shape[1]))])[row]  # zero, the last of these, before the first row
+    area = np.concatenate([[np.zeros(u.shape[1])], np.cumsum(u * lasts[:, None], axis=0)])[np.maximum(row, 0)] + given * since
+    changes = np.cumsum(np.any(np.diff(u, axis=0, prepend=0.0) != 0.0, axis=1))
+    number = np.concatenate([changes, [0]])[row]
+    return np.where((number[1:] == number[:-1])[:, None], given[:-1], np.diff(area, axis=0) / lasts[:, None])
 
 
 def _steps(delay: float, dt: float) -> tuple[int, float]:

@@ -22,12 +22,13 @@ class InputGainDrift(TimedInputEffect):
     name = "input_gain_drift"
     parameters = (Parameter("rate", "1/s", -10.0, 10.0, neutral=0.0),)
     all_alike = True
+    uneven = True
 
     def within_step(self, dt: float, p: Values) -> bool:
         """The gain goes on drifting over the step."""
         return bool(p["rate"] != 0.0)
 
-    def act_at(self, u: Array, t: Array, dt: float, p: Values) -> Array:
+    def act_at(self, u: Array, t: Array, dt: float | Array, p: Values) -> Array:
         """(1 + rate t) u."""
         mean = t + 0.5 * dt
         if t.min(initial=0.0) < 0.0:

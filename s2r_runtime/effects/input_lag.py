@@ -5,8 +5,6 @@ With a = exp(-dt/T):  s_{k+1} = u_k + (s_k - u_k) a,   u_act = u_k + (s_k - u_k)
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from s2r_runtime.effects.input_effect import Array, InputEffect, Values, columns, replaced
@@ -19,6 +17,8 @@ class InputLag(InputEffect):
     name = "input_lag"
     parameters = (Parameter("time_constant", "s", 0.0, 1e4, neutral=0.0),)
     linear = True
+    uneven = True
+    glides = True
 
     def within_step(self, dt: float, p: Values) -> bool:
         """The response goes on over the step."""
@@ -34,14 +34,15 @@ class InputLag(InputEffect):
         given = u[:, columns(model, channel)]
         return replaced(u, model, channel, given + (z - given) * mean), given + (z - given) * keep
 
-    def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
-        """The recursion as one banded triangular solve: s_{k+1} - a s_k = (1 - a) u_k."""
+    def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
+        """The recursion as one banded triangular solve: s_{k+1} - a s_k = (1 - a) u_k, with a of row k."""
         from scipy.linalg import lapack
 
         keep, mean = _factors(p["time_constant"], dt)
         given = u[..., columns(model, channel)]
-        band = np.empty((2, len(u)))
-        band[0], band[1] = 1.0, -keep
+        band = np.ones((2, len(u)))
+        band[1, :-1] = -keep[1:] if isinstance(keep, np.ndarray) else -keep
+        keep, mean = (e[:, None] if isinstance(e, np.ndarray) else e for e in (keep, mean))
         after, _ = lapack.dtbtrs(band, (1.0 - keep) * given.reshape(len(u), -1), uplo="L", diag="U")
         before = np.concatenate([np.zeros((1, *given.shape[1:])), after[:-1].reshape(given[:-1].shape)])
         return replaced(u, model, channel, given + (before - given) * mean)
@@ -52,12 +53,12 @@ class InputLag(InputEffect):
         return [{"time_constant": s} for s in sorted({*(dt * k for k in (0.3, 0.7, 1.5, 3.0, 6.0, 12.0, 40.0)), *usual})]
 
 
-def _factors(time_constant: float, dt: float) -> tuple[float, float]:
-    """What is left of a difference at the end of the step, and on average over it."""
-    if time_constant < 1e-6 * dt:
+def _factors(time_constant: float, dt: float | Array) -> tuple[float | Array, float | Array]:
+    """What is left of a difference at the end of the step, and on average over it; (T,) each for steps of dt (T,)."""
+    ratio = dt / max(float(time_constant), 1e-300)
+    if np.min(ratio) > 1e6:
         return 0.0, 0.0
-    ratio = dt / time_constant
-    return math.exp(-ratio), -math.expm1(-ratio) / ratio
+    return np.exp(-ratio), -np.expm1(-ratio) / ratio
 
 
 EFFECT = InputLag()

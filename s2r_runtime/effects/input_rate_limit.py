@@ -10,6 +10,9 @@ After j steps of the same u:  y + min(max(d, -rate_down j dt), rate j dt).   Hid
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 from s2r_runtime.effects.follower import Follower
@@ -29,17 +32,19 @@ class InputRateLimit(Follower):
     name = "input_rate_limit"
     parameters = (Parameter("rate", "input/s", 1e-6, 1e9, kink=True), Parameter("rate_down", "input/s", 1e-6, 1e9, kink=True))
     optional = ("rate_down",)
+    uneven = True
+    glides = True
 
     def within_step(self, dt: float, p: Values) -> bool:
         """A ramp goes on over the step."""
         return True
 
-    def after(self, y: Array, u: Array, steps: Array | int, dt: float, p: Values) -> Array:
+    def after(self, y: Array, u: Array, steps: Array | float, dt: float, p: Values) -> Array:
         """y moved toward u."""
         up, down = _limits(p, dt)
         return np.asarray(y + np.minimum(np.maximum(u - y, -down * steps), up * steps))
 
-    def mean(self, y: Array, u: Array, dt: float, p: Values) -> Array:
+    def mean(self, y: Array, u: Array, dt: float | Array, p: Values) -> Array:
         """Of the ramp, and of u where the ramp has reached it."""
         up, down = _limits(p, dt)
         d = u - y
@@ -48,7 +53,7 @@ class InputRateLimit(Follower):
         # a ramp of `moved` takes moved / reach of the step; what it covers it stands at for the rest
         return np.asarray(y + np.sign(d) * moved * (1.0 - moved / (2.0 * reach)))
 
-    def begins(self, held: list[float], steps: list[int], dt: float, p: Values) -> list[float]:
+    def begins(self, held: list[float], steps: Sequence[float], dt: float, p: Values) -> list[float]:
         """One ramp a stretch."""
         up, down = _limits(p, dt)
         y, found = 0.0, []
@@ -72,8 +77,8 @@ class InputRateLimit(Follower):
         return [*alike, *({"rate": rate / up, "rate_down": rate / down} for up, down in UNLIKE)]
 
 
-def _limits(p: Values, dt: float) -> tuple[float, float]:
-    """How far it gets in a step, up and down."""
+def _limits(p: Values, dt: Any) -> tuple[Any, Any]:
+    """How far it gets in a step, up and down; of every row, where dt is an array."""
     return float(p["rate"]) * dt, float(p["rate_down"] if "rate_down" in p else p["rate"]) * dt
 
 

@@ -22,6 +22,7 @@ class IntegrationScheme:
     name = "integration_scheme"
     stage = "step"
     parameters = (Parameter("scheme", "", 0.0, 0.0),)
+    uneven = True
     choices = {"scheme": ("euler", "exact", "rk4")}
     once = True
 
@@ -49,7 +50,7 @@ class IntegrationScheme:
         """Not of stage `input`."""
         return u
 
-    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """The pose's move (n, 2) turned and shortened by S."""
         px, py, theta = (model.states.index(name) for name in ("x", "y", "theta"))
         along, across = _factors(x_next[:, theta] - x[:, theta], p["scheme"])

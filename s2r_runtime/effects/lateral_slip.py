@@ -12,12 +12,13 @@ class LateralSlip(StepEffect):
 
     name = "lateral_slip"
     parameters = (Parameter("coefficient", "s", -1e3, 1e3, neutral=0.0),)
+    uneven = True
 
     def frame(self, model: NominalModel, channel: str) -> str:
         """Of the body's motion."""
         return "body"
 
-    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """left += coefficient (forward/dt) (turn/dt) dt."""
         motion = body_motion(x, x_next, model)
         return moved(x, x_next, model, motion._replace(left=motion.left + float(p["coefficient"]) / dt * motion.forward * motion.turn))

@@ -15,12 +15,13 @@ class LongitudinalSlip(StepEffect):
 
     name = "longitudinal_slip"
     parameters = (Parameter("ratio", "", -99.0, 101.0, neutral=0.0),)
+    uneven = True
 
     def frame(self, model: NominalModel, channel: str) -> str:
         """Of the body's motion."""
         return "body"
 
-    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """forward *= 1 - ratio."""
         motion = body_motion(x, x_next, model)
         return moved(x, x_next, model, motion._replace(forward=(1.0 - float(p["ratio"])) * motion.forward))

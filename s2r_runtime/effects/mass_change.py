@@ -6,6 +6,8 @@ whatever else acts on it.
 
 from __future__ import annotations
 
+from typing import Any
+
 from s2r_runtime.effects.step_effect import Array, StepEffect, Values
 from s2r_runtime.hookspecs import NominalModel, Parameter
 from s2r_runtime.models.forces import mass_name
@@ -16,6 +18,7 @@ class MassChange(StepEffect):
 
     name = "mass_change"
     parameters = (Parameter("mass", "kg", 1e-9, 1e9), Parameter("ratio", "", 1e-3, 1e3, neutral=1.0))
+    uneven = True
     optional = ("mass", "ratio")
 
     def channels(self, model: NominalModel) -> tuple[str, ...]:
@@ -30,7 +33,7 @@ class MassChange(StepEffect):
         """What is wrong with the values together."""
         return "" if ("mass" in p) != ("ratio" in p) else f"has {', '.join(sorted(p)) or 'no value'}, must have either mass or ratio"
 
-    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: Any, p: Values) -> Array:
         """The difference that another mass makes to the nominal step."""
         name = mass_name(model)
         usual = model.parameters[name]

@@ -5,6 +5,8 @@ For models of one's own. What the built-in models have (`NAMED`) belongs to effe
 
 from __future__ import annotations
 
+from typing import Any
+
 from s2r_runtime.effects.step_effect import Array, StepEffect, Values
 from s2r_runtime.hookspecs import NominalModel, Parameter
 
@@ -17,6 +19,7 @@ class ParameterChange(StepEffect):
 
     name = "parameter_change"
     parameters = (Parameter("ratio", "", 1e-2, 1e2, neutral=1.0), Parameter("value", "", -1e9, 1e9, neutral=0.0))
+    uneven = True
     optional = ("ratio", "value")
 
     def channels(self, model: NominalModel) -> tuple[str, ...]:
@@ -31,7 +34,7 @@ class ParameterChange(StepEffect):
         """What is wrong with the values together."""
         return "" if p else "lacks the parameter ratio (value, where the model's is 0)"
 
-    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: Any, p: Values) -> Array:
         """The difference that the other value makes to the nominal step."""
         usual = model.parameters[channel]
         other = {**model.parameters, channel: float(p["ratio"]) * usual if usual else float(p["value"])}

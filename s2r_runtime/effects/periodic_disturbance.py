@@ -34,12 +34,13 @@ class PeriodicDisturbance(TimedInputEffect):
         Parameter("phase", "rad", -TURN, TURN),
     )
     linear = True
+    uneven = True
 
     def within_step(self, dt: float, p: Values) -> bool:
         """The sine goes on over the step."""
         return bool(p["amplitude"] != 0.0)
 
-    def act_at(self, u: Array, t: Array, dt: float, p: Values) -> Array:
+    def act_at(self, u: Array, t: Array, dt: float | Array, p: Values) -> Array:
         """u and the sine's mean."""
         rate, phase, amplitude = TURN * float(p["frequency"]), float(p["phase"]), float(p["amplitude"])
         damped = amplitude * np.sinc(float(p["frequency"]) * dt)

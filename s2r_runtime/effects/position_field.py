@@ -30,6 +30,7 @@ class PositionField(ForceEffect):
 
     name = "position_field"
     parameters = (Parameter("matrix", "1/s", -100.0, 100.0, neutral=0.0, shape=(2, 2)),)
+    uneven = True
     varies = True
     additive = True
 
@@ -53,15 +54,16 @@ class PositionField(ForceEffect):
         row = p["matrix"][0 if name == "x" else 1]
         return Push(drive=float(row[0]) * x[:, model.states.index("x")] + float(row[1]) * x[:, model.states.index("y")])
 
-    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """Rates on a pose, forces on axes."""
         if self.pushes(model, channel):
             return super().after_step(x, u, x_next, model, channel, dt, p)
         place = [model.states.index("x"), model.states.index("y")]
-        a = dt * np.array(p["matrix"], dtype=np.float64)
+        a = np.multiply.outer(dt, np.array(p["matrix"], dtype=np.float64))
         f = _factor(a)
         after = x_next.copy()
-        after[:, place] += (x_next[:, place] - x[:, place]) @ (f - np.eye(2)).T + x[:, place] @ (f @ a).T
+        there, went = x[:, place, None], (x_next[:, place] - x[:, place])[:, :, None]
+        after[:, place] += ((f - np.eye(2)) @ went + f @ a @ there)[:, :, 0]
         return after
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
@@ -70,16 +72,16 @@ class PositionField(ForceEffect):
 
 
 def _factor(a: Array) -> Array:
-    """F of the docstring: the series of a halved often enough, then F(2a) = F(a) (exp(a) + 1)/2, exp(a) = 1 + a F(a)."""
-    size = float(np.max(np.sum(np.abs(a), axis=1)))
+    """F of the docstring, (..., 2, 2): the series of a halved often enough, then F(2a) = F(a) (exp(a) + 1)/2, exp(a) = 1 + a F(a)."""
+    size = float(np.max(np.sum(np.abs(a), axis=-1), initial=0.0))
     halved = max(0, math.ceil(math.log2(2.0 * size))) if size > 0.0 else 0
     a = a / 2.0**halved
     one = np.eye(2)
-    f = one.copy()
+    f = np.broadcast_to(one, a.shape)
     for k in range(TERMS, 1, -1):
         f = one + a @ f / k
     for _ in range(halved):
-        f = f @ (2.0 * one + a @ f) / 2.0
+        f = 0.5 * f @ (2.0 * one + a @ f)
         a = 2.0 * a
     return f
 

@@ -27,6 +27,7 @@ class QuadraticDrag(ForceEffect):
     name = "quadratic_drag"
     stage = "input"
     parameters = (Parameter("coefficient", "s/m", 0.0, 1e6, neutral=0.0),)
+    uneven = True
     varies = True
     side_by_side = True
 

@@ -46,13 +46,14 @@ class RegimeChange(TimedInputEffect):
     parameters = (Parameter("time", "s", 0.0, 1e7, kink=True), Parameter("gain", "", 0.0, 100.0, neutral=1.0))
     all_alike = True
     proportional = True
+    uneven = True
 
     def within_step(self, dt: float, p: Values) -> bool:
         """It comes within a step, unless between two."""
         place = p["time"] / dt
         return bool(abs(place - round(place)) > 1e-9 * max(place, 1.0))
 
-    def act_at(self, u: Array, t: Array, dt: float, p: Values) -> Array:
+    def act_at(self, u: Array, t: Array, dt: float | Array, p: Values) -> Array:
         """u, gain u after."""
         time, gain = float(p["time"]), float(p["gain"])
         left = np.clip((t + (dt - time)) / dt, 0.0, 1.0) if time > 0.0 else np.ones_like(t)

@@ -52,7 +52,7 @@ class StepEffect:
         """Not of stage `input`."""
         return u
 
-    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """Nothing changes."""
         return x_next
 
@@ -74,7 +74,7 @@ class ForceEffect(StepEffect):
         """What it adds on this axis at x (n, nx), accelerations; None where it does not act."""
         return None
 
-    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """The step with this force alone."""
         return pushed(x, x_next, model, [(self, channel, p)], dt) if self.pushes(model, channel) else x_next
 

@@ -28,6 +28,7 @@ class StribeckFriction(ForceEffect):
         Parameter("static_force", "N", 0.0, 1e6, neutral=0.0),
         Parameter("velocity", "m/s", 1e-9, 1e4),
     )
+    uneven = True
     varies = True
 
     def unit(self, model: NominalModel, channel: str, parameter: str) -> str:

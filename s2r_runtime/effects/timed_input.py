@@ -17,7 +17,7 @@ class TimedInputEffect(InputEffect):
 
     timed = True
 
-    def act_at(self, u: Array, t: Array, dt: float, p: Values) -> Array:
+    def act_at(self, u: Array, t: Array, dt: float | Array, p: Values) -> Array:
         """The channel's input (..., c), held over steps that begin at t (..., 1), s -> its mean as it acts over each, (..., c)."""
         return u
 
@@ -29,8 +29,13 @@ class TimedInputEffect(InputEffect):
         """One step at the time that z holds."""
         return replaced(u, model, channel, self.act_at(u[:, columns(model, channel)], z, dt, p)), z + dt
 
-    def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float, p: Values, start: float | Array = 0.0) -> Array:
-        """u (T, nu) from `start` s on; or (T, runs, nu), each run from its own (runs,)."""
+    def input_sequence(
+        self, u: Array, model: NominalModel, channel: str, dt: float | Array, p: Values, start: float | Array = 0.0
+    ) -> Array:
+        """u (T, nu) from `start` s on; or (T, runs, nu), each run from its own (runs,); or rows of dt (T,), which begin at start (T,)."""
+        if isinstance(dt, np.ndarray):
+            t = np.asarray(start, dtype=np.float64)[:, None]
+            return replaced(u, model, channel, self.act_at(u[:, columns(model, channel)], t, dt[:, None], p))
         begun = np.broadcast_to(np.asarray(start, dtype=np.float64), u.shape[1:-1])
         t = (begun + dt * np.arange(len(u)).reshape(-1, *([1] * begun.ndim)))[..., None]
         return replaced(u, model, channel, self.act_at(u[..., columns(model, channel)], t, dt, p))

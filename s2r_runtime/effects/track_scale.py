@@ -12,6 +12,7 @@ class TrackScale(StepEffect):
 
     name = "track_scale"
     parameters = (Parameter("gain", "", -100.0, 100.0, neutral=1.0),)
+    uneven = True
 
     def channels(self, model: NominalModel) -> tuple[str, ...]:
         """The heading."""
@@ -21,7 +22,7 @@ class TrackScale(StepEffect):
         """Of the body's motion."""
         return "body"
 
-    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """turn *= gain."""
         motion = body_motion(x, x_next, model)
         return moved(x, x_next, model, motion._replace(turn=float(p["gain"]) * motion.turn))

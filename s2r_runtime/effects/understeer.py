@@ -23,6 +23,7 @@ class Understeer(StepEffect):
 
     name = "understeer"
     parameters = (Parameter("coefficient", "s²/m", -1e3, 1e3, neutral=0.0),)
+    uneven = True
 
     def channels(self, model: NominalModel) -> tuple[str, ...]:
         """The heading of what has a wheel base."""
@@ -32,7 +33,7 @@ class Understeer(StepEffect):
         """Of the body's motion."""
         return "body"
 
-    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """turn *= L/(L + K v²)."""
         motion = body_motion(x, x_next, model)
         base, v = model.parameters["wheel_base"], motion.forward / dt

@@ -25,6 +25,7 @@ class ViscousFriction(ForceEffect):
     parameters = tuple(
         Parameter(name, "N s/m", 0.0, 1e6, neutral=0.0) for name in ("coefficient", "coefficient_positive", "coefficient_negative")
     )
+    uneven = True
     optional = ("coefficient", "coefficient_positive", "coefficient_negative")
     additive = True
 
@@ -55,7 +56,7 @@ class ViscousFriction(ForceEffect):
         """Its rates, 1/s."""
         return Push(rate=by_direction(p, "coefficient", mass(model))) if model.states[axis.velocity] == channel else None
 
-    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+    def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """The step with this force alone."""
         if self.pushes(model, channel):
             return super().after_step(x, u, x_next, model, channel, dt, p)

@@ -27,11 +27,12 @@ class Bicycle:
     angles = ("theta",)
     parameters: dict[str, float] = {"wheel_base": 0.33}
     follows = {"speed": Follows(("x", "y", "theta"), _speed)}
+    uneven = True
     units = {"x": "m", "y": "m", "theta": "rad", "speed": "m/s", "steer_cmd": "rad", "speed_cmd": "m/s"}
     integration = "euler"
     reached = {"speed": "speed_cmd"}
 
-    def step(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
+    def step(self, x: Array, u: Array, dt: float | Array, parameters: dict[str, float]) -> Array:
         """One step of dt seconds, (n, 4); theta is not wrapped."""
         theta = x[:, 2]
         travel = dt * u[:, 1]

@@ -37,11 +37,12 @@ class DifferentialDrive:
         "wheel_left": Follows(("x", "y", "theta"), partial(_wheel, -0.5)),
         "wheel_right": Follows(("x", "y", "theta"), partial(_wheel, 0.5)),
     }
+    uneven = True
     units = {"x": "m", "y": "m", "theta": "rad", "wheel_left": "rad/s", "wheel_right": "rad/s", "cmd_left": "rad/s", "cmd_right": "rad/s"}
     integration = "euler"
     reached = {"wheel_left": "cmd_left", "wheel_right": "cmd_right"}
 
-    def step(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
+    def step(self, x: Array, u: Array, dt: float | Array, parameters: dict[str, float]) -> Array:
         """One step of dt seconds, (n, 5); theta is not wrapped."""
         radius, track = parameters["wheel_radius"], parameters["track"]
         theta = x[:, 2]

@@ -25,10 +25,12 @@ class DoubleIntegrator:
         "vx": Follows(("x",), lambda x, rates, parameters: rates["x"]),
         "vy": Follows(("y",), lambda x, rates, parameters: rates["y"]),
     }
+    uneven = True
     units = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "ax": "m/s²", "ay": "m/s²"}
 
-    def step(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
+    def step(self, x: Array, u: Array, dt: float | Array, parameters: dict[str, float]) -> Array:
         """One step of dt seconds, (n, 4)."""
+        dt = dt[:, None] if isinstance(dt, np.ndarray) else dt
         after = np.empty_like(x)
         after[:, :2] = x[:, :2] + dt * x[:, 2:] + 0.5 * dt * dt * u
         after[:, 2:] = x[:, 2:] + dt * u

@@ -99,12 +99,12 @@ def mass(model: NominalModel) -> float:
     return float(model.parameters[name]) if name else 1.0
 
 
-def pushed(x: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushing], dt: float) -> Array:
-    """The result of the step without these effects, x_next (n, nx), with all of them."""
+def pushed(x: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushing], dt: float | Array) -> Array:
+    """The result of the step without these effects, x_next (n, nx), with all of them. dt: also of each row, (n,)."""
     varies = any(effect.varies for effect, _, _ in pushing)
     moved = [k for k in axes(model) if any(effect.push(x[:1], k, model, channel, p) is not None for effect, channel, p in pushing)]
     given = [(x_next[:, k.velocity] - x[:, k.velocity]) / dt for k in moved]
-    parts = math.ceil(dt / PART_S - 1e-9) if varies else 1
+    parts = max(1, math.ceil(float(np.max(dt, initial=0.0)) / PART_S - 1e-9)) if varies else 1
     h = dt / parts
     now, at = (x.copy(), x.copy()) if varies else (x, x)
     for _ in range(parts if varies else 0):
@@ -147,7 +147,7 @@ def _sum(a: Pair, b: Pair) -> Pair:
     return first, first if a[0] is a[1] and b[0] is b[1] else a[1] + b[1]
 
 
-def _glide(v: Array, given: Array, push: Push, h: float) -> tuple[Array, Array]:
+def _glide(v: Array, given: Array, push: Push, h: float | Array) -> tuple[Array, Array]:
     """v (n,) h seconds later, and the way made, with constant coefficients; given: (n,) acceleration without the push."""
     drive = given + push.drive
     held = push.hold or push.dry
@@ -164,12 +164,13 @@ def _glide(v: Array, given: Array, push: Push, h: float) -> tuple[Array, Array]:
     stops = np.flatnonzero(end * sign <= 0.0)
     if len(stops):
         begun, force = v[stops], drive[stops]
-        until = np.minimum(_time_to_rest(begun, pull[stops], _by_sign(_at(push.rate, stops), begun > 0.0)), h)
+        whole = h[stops] if isinstance(h, np.ndarray) else h
+        until = np.minimum(_time_to_rest(begun, pull[stops], _by_sign(_at(push.rate, stops), begun > 0.0)), whole)
         _, before = _moved(begun, pull[stops], _flow(_by_sign(_at(push.rate, stops), begun > 0.0), until))
         up, down = _at(held, stops)
         onward = np.where(force > up, 1.0, np.where(force < -down, -1.0, 0.0))
         rate, dry = (_by_sign(_at(pair, stops), onward > 0.0) for pair in (push.rate, push.dry))
-        end[stops], after = _moved(np.zeros_like(begun), np.where(onward == 0.0, 0.0, force - onward * dry), _flow(rate, h - until))
+        end[stops], after = _moved(np.zeros_like(begun), np.where(onward == 0.0, 0.0, force - onward * dry), _flow(rate, whole - until))
         way[stops] = before + after
     return end, way
 

@@ -22,9 +22,10 @@ class Joint:
     angles = ()
     parameters: dict[str, float] = {"mass": 1.0}
     follows = {"qd": Follows(("q",), lambda x, rates, parameters: rates["q"])}
+    uneven = True
     units = {"q": "m", "qd": "m/s", "force": "N"}
 
-    def step(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
+    def step(self, x: Array, u: Array, dt: float | Array, parameters: dict[str, float]) -> Array:
         """One step of dt seconds, (n, 2)."""
         acceleration = u[:, 0] / parameters["mass"]
         after = np.empty_like(x)

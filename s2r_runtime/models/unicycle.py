@@ -19,10 +19,11 @@ class Unicycle:
     inputs = ("v", "w")
     angles = ("theta",)
     parameters: dict[str, float] = {}
+    uneven = True
     units = {"x": "m", "y": "m", "theta": "rad", "v": "m/s", "w": "rad/s"}
     integration = "euler"
 
-    def step(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
+    def step(self, x: Array, u: Array, dt: float | Array, parameters: dict[str, float]) -> Array:
         """One Euler step of dt seconds, (n, 3); theta is not wrapped."""
         after = np.empty_like(x)
         theta = x[:, 2]

@@ -4,7 +4,8 @@ A tracer asks for thousands of chains that differ in one number. What acts on an
 and on the inputs that these read: so every link is known by its effect, its values and the links before it on those inputs, and what it
 gave is kept. An effect on the speed is not worked out again because the steering's delay changed.
 
-Many short runs are worked out side by side, (T, runs, nu); few or very unequal ones one after the other.
+Many short runs are worked out side by side, (T, runs, nu); few or very unequal ones one after the other. Where rows do not last alike,
+effects that know what to do with that get all runs end to end, with a long rest between them.
 """
 
 from __future__ import annotations
@@ -24,6 +25,10 @@ KEPT = 24_000_000
 """Bytes of results that are kept; the longest unused go first."""
 
 
+REST_S = 1e4
+"""Between runs that are laid end to end: no actuator remembers for so long."""
+
+
 class _Same:
     """Equal only to itself: models and effects of others need not be hashable. It is kept, so that no other object takes its place."""
 
@@ -38,20 +43,22 @@ class _Same:
 
 
 class Inputs:
-    """Held inputs of runs, (T_i, nu) each, in rows of dt; starts: of the runs, s."""
+    """Held inputs of runs, (T_i, nu) each, in rows of dt; starts: of the runs, s. lasts: (T_i,) s, of each row, where they differ."""
 
-    def __init__(self, inputs: Sequence[Array], dt: float, starts: Sequence[float]) -> None:
+    def __init__(self, inputs: Sequence[Array], dt: float, starts: Sequence[float], lasts: Sequence[Array] | None = None) -> None:
         self._dt = dt
+        self._lasts = None if lasts is None else _end_to_end([e[:, None] for e in lasts], REST_S)[:, 0]
+        begins = [] if lasts is None else [s + np.cumsum(e) - e for s, e in zip(starts, lasts, strict=True)]
+        self._begins = _end_to_end([b[:, None] for b in begins], 0.0)[:, 0] if begins else np.zeros(0)
         self._kept: OrderedDict[Key, list[Array]] = OrderedDict()
         self._bytes = 0
         lengths = np.array([len(u) for u in inputs])
         self._rows: NDArray[np.int64] | None = None
         self._starts: list[float | Array] = [float(s) for s in starts]
         self._tables = [np.asarray(u, dtype=np.float64) for u in inputs]
+        self._lengths = lengths
         if len(inputs) > 3 and len(inputs) * lengths.max() < 2 * lengths.sum():
-            table = np.zeros((lengths.max(), len(inputs), inputs[0].shape[1]))
-            for i, u in enumerate(inputs):
-                table[: len(u), i] = u
+            table = _side_by_side(self._tables)
             self._tables, self._starts = [table], [np.array(starts, dtype=np.float64)]
             run, row = np.nonzero(np.arange(len(table)) < lengths[:, None])
             self._rows = row * len(inputs) + run  # of the table laid flat, in the order of runs laid end to end
@@ -104,6 +111,10 @@ class Inputs:
         return [i for i, name in enumerate(names) if name == a.channel or name in also]
 
     def _apply(self, a: AppliedEffect, tables: list[Array], model: ComposedModel) -> list[Array]:
+        if self._lasts is not None and getattr(a.effect, "uneven", False):
+            given = _end_to_end(self._split(tables), 0.0)
+            timed = {"start": self._begins} if getattr(a.effect, "timed", False) else {}
+            return self._tabled(a.effect.input_sequence(given, model.nominal, a.channel, self._lasts, a.p, **timed))  # type: ignore[arg-type]
         if self._rows is None or getattr(a.effect, "side_by_side", False):
             return [self._over_time(a, u, model, start) for u, start in zip(tables, self._starts, strict=True)]
         z, done = a.effect.hidden(tables[0].shape[1], model.nominal, a.channel, self._dt, a.p), []
@@ -113,6 +124,18 @@ class Inputs:
             acting_now, z = a.effect.input_step(u, z, model.nominal, a.channel, self._dt, a.p)
             done.append(acting_now)
         return [np.stack(done)]
+
+    def _split(self, tables: list[Array]) -> list[Array]:
+        """One (T_i, nu) a run."""
+        if self._rows is None:
+            return tables
+        return [tables[0][:n, i] for i, n in enumerate(self._lengths.tolist())]
+
+    def _tabled(self, laid: Array) -> list[Array]:
+        """Runs with a row between them, end to end, as this has them."""
+        begin = np.cumsum(self._lengths + 1) - self._lengths - 1
+        runs = [laid[b : b + n] for b, n in zip(begin.tolist(), self._lengths.tolist(), strict=True)]
+        return runs if self._rows is None else [_side_by_side(runs)]
 
     def _over_time(self, a: AppliedEffect, u: Array, model: ComposedModel, start: float | Array) -> Array:
         """`input_sequence`; an effect that depends on time is told when the first row is."""
@@ -126,6 +149,20 @@ class Inputs:
         while self._bytes > KEPT and len(self._kept) > 1:
             _, gone = self._kept.popitem(last=False)
             self._bytes -= sum(columns.nbytes for columns in gone)
+
+
+def _side_by_side(runs: Sequence[Array]) -> Array:
+    """(T_i, nu) each -> (T, runs, nu), zero after the end of a run."""
+    table = np.zeros((max(len(u) for u in runs), len(runs), runs[0].shape[1]))
+    for i, u in enumerate(runs):
+        table[: len(u), i] = u
+    return table
+
+
+def _end_to_end(runs: Sequence[Array], between: float) -> Array:
+    """(T_i, c) each -> one after the other, with a row of this between two."""
+    rest = np.full((1, runs[0].shape[1]), between)
+    return np.concatenate([part for run in runs for part in (run, rest)][:-1])
 
 
 def _with(table: Array, columns: list[int], values: Array) -> Array:

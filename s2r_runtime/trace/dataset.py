@@ -98,6 +98,15 @@ class Run:
     u: Array
     lasts: Array | None = None
 
+    def durations(self, dt: float) -> Array:
+        """(K,) s, of each step."""
+        return np.full(len(self.y) - 1, dt) if self.lasts is None else self.lasts
+
+    def begins(self, dt: float) -> Array:
+        """(K,) s since the recording's first stamp, of each step."""
+        lasts = self.durations(dt)
+        return np.asarray(self.start_s + (dt * np.arange(len(lasts)) if self.lasts is None else np.cumsum(lasts) - lasts))
+
 
 @dataclass(frozen=True)
 class Dataset:
@@ -129,7 +138,13 @@ class Dataset:
     @cached_property
     def chains(self) -> Inputs:
         """The inputs of its runs, for chains of effects."""
-        return Inputs([run.u for run in self.runs], self.dt / self.substeps, [run.start_s for run in self.runs])
+        lasts = [np.repeat(run.durations(self.dt) / self.substeps, self.substeps) for run in self.runs] if self.uneven else None
+        return Inputs([run.u for run in self.runs], self.dt / self.substeps, [run.start_s for run in self.runs], lasts)
+
+    @property
+    def uneven(self) -> bool:
+        """Whether steps do not all last dt."""
+        return any(run.lasts is not None for run in self.runs)
 
     @cached_property
     def in_order(self) -> bool:
@@ -184,7 +199,7 @@ def from_streams(
         apart = max(apart, independent_step(reconstruction, dt))
     exact = all(on_grid(states.t, dt) for states, _ in stretches)
     as_they_are = not exact and spacing <= NEAREST * dt
-    parts = in_parts or _parts(model, stretches, exact)
+    parts = in_parts or _parts(model, stretches, exact, as_they_are)
     origin = min(float(states.t[0]) for states, _ in stretches)
     runs: list[Run] = []
     pauses: list[Pause] = []
@@ -305,14 +320,17 @@ def _received(inputs: Stream, t: Array) -> Stream:
     return Stream(np.append(t[0], inputs.t[inside]), np.concatenate([held(inputs.values[:before])[-1:], inputs.values[inside]]))
 
 
-def _parts(model: ComposedModel, stretches: Sequence[tuple[Stream, Stream]], exact: bool) -> int:
+def _parts(model: ComposedModel, stretches: Sequence[tuple[Stream, Stream]], exact: bool, as_they_are: bool) -> int:
     """S: into how many parts a step is cut."""
     least = least_parts(model)
     spacing = []
-    aligned: bool = exact
+    aligned: bool = exact or as_they_are
     for states, inputs in stretches:
         at = changes(inputs)
         place = (at - states.t[0]) / model.dt
+        if as_they_are:  # a step ends where its row is
+            _, ends = nearest(states, model.dt, model.angle_columns)
+            place = np.interp(at, ends, np.arange(len(ends)))
         off = np.abs(place - np.rint(place)) > ALIGNED
         aligned = aligned and bool(np.count_nonzero(off) <= 0.01 * len(place))
         spacing += np.diff(inputs.t)[np.diff(inputs.t) > 0.0].tolist()

@@ -20,7 +20,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import differentiation
 from s2r_runtime.trace.dataset import Dataset, regridded
 from s2r_runtime.trace.reconstruct import at_step
-from s2r_runtime.trace.residual import Steps, acting, steps_of
+from s2r_runtime.trace.residual import Acting, Steps, acting, advanced, steps_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -78,9 +78,9 @@ def input_relative(model: ComposedModel, given: Inverse) -> float:
     """See above."""
     model = model if model.dt == given.data.dt else at_step(model, given.data.dt)
     act = acting(model, given.data)
-    mean, end = act.mean[given.steps.place], act.end[given.steps.place]
+    here = act.at(given.steps.place)
     commanded = acting(model, given.data, ()).mean[given.steps.place]
-    error = mean - _needed(model, given.steps, mean, end)
+    error = here.mean - _needed(model, given.steps, here)
     lost, whole = np.zeros(error.shape[1]), np.zeros(error.shape[1])
     for a, b in given.stretches:
         lost += np.sum(differentiation.low_pass(error[a:b], given.data.dt, given.bandwidth) ** 2, axis=0)
@@ -89,26 +89,26 @@ def input_relative(model: ComposedModel, given: Inverse) -> float:
     return float(np.sqrt(np.mean(lost[used] / whole[used]))) if used.any() else float("nan")
 
 
-def _needed(model: ComposedModel, steps: Steps, mean: Array, end: Array) -> Array:
+def _needed(model: ComposedModel, steps: Steps, act: Acting) -> Array:
     """u*, (n, nu)."""
-    size = np.maximum(np.sqrt(np.mean(mean**2, axis=0)), 1e-12)
-    answer = np.stack([_slope(model, steps, mean, end, j, float(size[j])) for j in range(mean.shape[1])], axis=1)
+    size = np.maximum(np.sqrt(np.mean(act.mean**2, axis=0)), 1e-12)
+    answer = np.stack([_slope(model, steps, act, j, float(size[j])) for j in range(len(size))], axis=1)
     back = np.linalg.pinv(answer)  # (nu, nx)
-    shift = np.zeros_like(mean)
+    shift = np.zeros_like(act.mean)
     for _ in range(ROUNDS):
-        e = model.difference(steps.y1, model.advance(steps.y0, mean + shift, end + shift))
+        e = model.difference(steps.y1, advanced(model, steps.y0, act.moved(shift), slice(None)))
         step = e @ back.T
         shift = np.clip(shift + step, -FARTHEST * size, FARTHEST * size)
         if np.all(np.abs(step) < CLOSE * size):
             break
-    return np.asarray(mean + shift)
+    return np.asarray(act.mean + shift)
 
 
-def _slope(model: ComposedModel, steps: Steps, mean: Array, end: Array, j: int, h: float) -> Array:
+def _slope(model: ComposedModel, steps: Steps, act: Acting, j: int, h: float) -> Array:
     """(nx,) what a unit more of input j does to the state, where it does much: where friction holds, it does nothing."""
-    up = np.zeros(mean.shape[1])
+    up = np.zeros(act.mean.shape[1])
     up[j] = h
-    change = model.advance(steps.y0, mean + up, end + up) - model.advance(steps.y0, mean - up, end - up)
+    change = np.subtract(*(advanced(model, steps.y0, act.moved(way), slice(None)) for way in (up, -up)))
     return np.asarray(np.quantile(np.abs(change), 0.9, axis=0) * np.sign(np.sum(change, axis=0)) / (2.0 * h))
 
 

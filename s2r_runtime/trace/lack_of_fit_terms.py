@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.fitting import Problem, slopes
-from s2r_runtime.trace.residual import Acting, Steps
+from s2r_runtime.trace.residual import Acting, Steps, advanced
 from s2r_runtime.trace.residual_noise import Noise
 from s2r_runtime.trace.slots import free_of
 
@@ -330,12 +330,11 @@ def _directions(given: Problem, model: ComposedModel, act: Acting) -> tuple[list
 
 def _own(given: Problem, model: ComposedModel, act: Acting) -> Terms:
     """(n, nx) by input: where it pushes."""
-    mean, end = act.mean[given.steps.place], act.end[given.steps.place]
-    here = model.advance(given.steps.y0, mean, end)
-    pushed = []
-    for j in range(mean.shape[1]):
-        h = 1e-4 * max(1.0, float(np.max(np.abs(mean[:, j]), initial=0.0)))
-        up = np.zeros(mean.shape[1])
+    here = act.at(given.steps.place)
+    usual, pushed = advanced(model, given.steps.y0, here, slice(None)), []
+    for j in range(here.mean.shape[1]):
+        h = 1e-4 * max(1.0, float(np.max(np.abs(here.mean[:, j]), initial=0.0)))
+        up = np.zeros(here.mean.shape[1])
         up[j] = h
-        pushed.append((model.advance(given.steps.y0, mean + up, end + up) - here) / h)
+        pushed.append((advanced(model, given.steps.y0, here.moved(up), slice(None)) - usual) / h)
     return pushed

@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
-from s2r_runtime.models.composed import AppliedEffect, ComposedModel
+from s2r_runtime.models.composed import AppliedEffect, ComposedModel, at_end, gliding
 from s2r_runtime.trace.dataset import Dataset
 
 Array = NDArray[np.float64]
@@ -65,9 +65,13 @@ class Acting:
     lasts: Array | None = None
     parts: Array | None = None
 
+    def at(self, place: Index) -> Acting:
+        """Over some of the steps, each as one."""
+        return Acting(self.mean[place], self.end[place], None if self.lasts is None else self.lasts[place])
+
     def moved(self, shift: Array) -> Acting:
-        """The same with (M, nu) more."""
-        parts = None if self.parts is None else self.parts + shift[:, None, :]
+        """The same with (M, nu), or (nu,), more."""
+        parts = None if self.parts is None else self.parts + shift[..., None, :]
         return Acting(self.mean + shift, self.end + shift, self.lasts, parts)
 
 
@@ -82,7 +86,7 @@ def steps_of(data: Dataset, left_out: Sequence[tuple[int, int]] = ()) -> Steps:
     ends = [(run.y[:-1], run.y[1:]) for run in data.runs]
     y0, y1 = np.concatenate([a for a, _ in ends]), np.concatenate([b for _, b in ends])
     where = np.repeat(np.arange(len(data.runs)), np.diff(begin))
-    t = np.concatenate([run.start_s + data.dt * np.arange(len(run.y) - 1) for run in data.runs])
+    t = np.concatenate([run.begins(data.dt) for run in data.runs])
     good = ~(np.isnan(y0).any(axis=1) | np.isnan(y1).any(axis=1))
     good[[begin[run] + k for run, k in left_out]] = False
     place = np.arange(len(t))
@@ -92,29 +96,29 @@ def steps_of(data: Dataset, left_out: Sequence[tuple[int, int]] = ()) -> Steps:
 
 def times(data: Dataset) -> Array:
     """When each row of the inputs of all runs, laid end to end, begins: (sum T_i,), s since the recording's first stamp."""
-    return np.concatenate([run.start_s + data.dt / data.substeps * np.arange(len(run.u)) for run in data.runs])
+    parts = np.arange(data.substeps) / data.substeps
+    return np.concatenate([(run.begins(data.dt)[:, None] + run.durations(data.dt)[:, None] * parts).ravel() for run in data.runs])
 
 
 def acting(model: ComposedModel, data: Dataset, effects: Sequence[AppliedEffect] | None = None) -> Acting:
     """The input as it acts after the effects of stage `input` (None: the model's)."""
     chain = [a for a in (model.effects if effects is None else effects) if a.effect.stage == "input"]
     u = data.chains.through(model, chain)
-    lasts = None
-    if any(run.lasts is not None for run in data.runs):
-        lasts = np.concatenate([np.full(len(run.y) - 1, data.dt) if run.lasts is None else run.lasts for run in data.runs])
+    lasts = np.concatenate([run.durations(data.dt) for run in data.runs]) if data.uneven else None
     if data.substeps == 1:
         return Acting(u, u, lasts)
     table = u.reshape(-1, data.substeps * u.shape[1])
     mean = table @ np.tile(np.eye(u.shape[1]) / data.substeps, (data.substeps, 1))
     parts = u.reshape(-1, data.substeps, u.shape[1]) if data.in_parts else None
-    return Acting(mean, table[:, -u.shape[1] :].copy(), lasts, parts)
+    end = at_end(np.split(table, data.substeps, axis=1), gliding(model, chain))
+    return Acting(mean, np.ascontiguousarray(end), lasts, parts)
 
 
 def advanced(model: ComposedModel, x: Array, act: Acting, place: Index | slice) -> Array:
     """x (n, nx) one step later, angles not wrapped; place: which of the steps. A step of a thinned recording is many of the model's.
 
-    A model has one dt. Steps that last h are interpolated between the model's at dt (1 - s), dt and dt (1 + s), a quadratic in h: exact for
-    poses by Euler and for constant accelerations.
+    Steps of their own length each are one step of a model that takes them (`uneven`). Others are interpolated between the model's at
+    dt (1 - s), dt and dt (1 + s), a quadratic in their length: exact for poses by Euler and for constant accelerations.
     """
     lasts = None if act.lasts is None else act.lasts[place]
     if act.parts is None:
@@ -130,6 +134,8 @@ def advanced(model: ComposedModel, x: Array, act: Acting, place: Index | slice) 
 def _once(model: ComposedModel, x: Array, mean: Array, end: Array, lasts: Array | None) -> Array:
     if lasts is None:
         return model.advance(x, mean, end)
+    if model.uneven:
+        return model.advance(x, mean, end, lasts)
     h = (lasts / model.dt - 1.0)[:, None]
     s = float(np.clip(np.max(np.abs(h), initial=0.0), 0.05, 0.9))
     short, long = (replace(model, spec=structs.replace(model.spec, dt=model.dt * (1.0 + r))).advance(x, mean, end) for r in (-s, s))

@@ -8,13 +8,14 @@ asked of shapes that stand near the named ones, each with numbers that are fitte
     the input   a bend (cubic), steps
 
 A shape is never handed on: it has no name, belongs to no model that is saved, and runs over whole recordings only. Its scale is `most`, the
-largest size of its input, among its values.
+largest size of its input, among its values. Where rows do not last alike, those whose memory is of time get the length of each.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,8 @@ from s2r_runtime.hookspecs import NominalModel, Parameter
 Array = NDArray[np.float64]
 Values = dict[str, float]
 Numbers = list[float]
+Lasts = float | Array
+"""How long rows last, s: all alike, or (T,)."""
 
 TIMES = (1.5, 4.0, 12.0, 40.0)
 """Steps of the time constants from which a fit begins."""
@@ -42,9 +45,12 @@ class Shape(InputEffect):
         name: str,
         memory: bool,
         parameters: tuple[Parameter, ...],
-        over: Callable[[Array, float, Values], Array | Numbers],
+        over: Callable[[Array, Any, Values], Array | Numbers],
         starts: Callable[[float, Sequence[float]], list[Values]],
+        *,
+        uneven: bool = True,
     ) -> None:
+        self.uneven = uneven
         self.name = name
         self.memory = memory
         self.parameters = parameters
@@ -65,7 +71,7 @@ class Shape(InputEffect):
         times = [s for s in near if s > SMALL] or [k * dt for k in TIMES]
         return [{**p, "most": most} for p in self._starts(dt, times)] if most > 0.0 else []
 
-    def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
+    def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """u (T, nu) or (T, runs, nu), from rest."""
         j = model.inputs.index(channel)
         after = u.copy()
@@ -77,73 +83,80 @@ class Shape(InputEffect):
         return after
 
 
-def _two_lags(u: Array, dt: float, one: float, other: float, first: Callable[[float, float], bool]) -> Numbers:
+def _left(dt: Lasts, time_constants: float | Array, u: Array) -> Array:
+    """(T,) what a lag leaves of a difference over each row."""
+    return np.broadcast_to(np.exp(-dt / np.maximum(time_constants, SMALL)), u.shape)
+
+
+def _two_lags(u: Array, dt: Lasts, one: float, other: float, first: Callable[[float, float], bool]) -> Numbers:
     """A first-order lag z with two time constants: the first one where first(u, z)."""
-    keep, keep_other = (math.exp(-dt / max(time_constant, SMALL)) for time_constant in (one, other))
     z, acts = 0.0, []
-    for v in u.tolist():
+    for v, keep, keep_other in zip(u.tolist(), _left(dt, one, u).tolist(), _left(dt, other, u).tolist(), strict=True):
         before = z
         z = v + (z - v) * (keep if first(v, z) else keep_other)
         acts.append(0.5 * (before + z))
     return acts
 
 
-def _mean(u: Array, dt: float, time_constant: float) -> Array:
+def _mean(u: Array, dt: Lasts, time_constant: float) -> Array:
     """The same lag for all, averaged over each step: z_{k+1} - a z_k = (1 - a) u_k as one banded triangular solve."""
     from scipy.linalg import lapack
 
-    keep = math.exp(-dt / max(time_constant, SMALL))
-    band = np.empty((2, len(u)))
-    band[0], band[1] = 1.0, -keep
+    keep = _left(dt, time_constant, u)
+    band = np.ones((2, len(u)))
+    band[1, :-1] = -keep[1:]
     after, _ = lapack.dtbtrs(band, ((1.0 - keep) * u)[:, None], uplo="L", diag="U")
     z: Array = after[:, 0]
     return np.asarray(0.5 * (z + np.append(0.0, z[:-1])))
 
 
-def _out_and_back(u: Array, dt: float, p: Values) -> Numbers:
+def _out_and_back(u: Array, dt: Lasts, p: Values) -> Numbers:
     return _two_lags(u, dt, p["out"], p["back"], lambda v, z: abs(v) > abs(z))
 
 
-def _up_and_down(u: Array, dt: float, p: Values) -> Numbers:
+def _up_and_down(u: Array, dt: Lasts, p: Values) -> Numbers:
     return _two_lags(u, dt, p["up"], p["down"], lambda v, z: v > z)
 
 
-def _lag_by_size(u: Array, dt: float, p: Values) -> Numbers:
+def _lag_by_size(u: Array, dt: Lasts, p: Values) -> Numbers:
     time_constants = p["small"] + (p["large"] - p["small"]) * np.abs(u) / p["most"]
-    keeps = np.exp(-dt / np.maximum(time_constants, SMALL))
     z, acts = 0.0, []
-    for v, keep in zip(u.tolist(), keeps.tolist(), strict=True):
+    for v, keep in zip(u.tolist(), _left(dt, time_constants, u).tolist(), strict=True):
         before = z
         z = v + (z - v) * keep
         acts.append(0.5 * (before + z))
     return acts
 
 
-def _delay_by_size(u: Array, dt: float, p: Values) -> Array:
-    at = np.arange(len(u)) - (p["small"] + (p["large"] - p["small"]) * np.abs(u) / p["most"]) / dt
+def _delay_by_size(u: Array, dt: Lasts, p: Values) -> Array:
+    late = p["small"] + (p["large"] - p["small"]) * np.abs(u) / p["most"]
+    at = np.arange(len(u)) - late / dt
+    if isinstance(dt, np.ndarray):
+        begins = np.cumsum(dt) - dt
+        at = np.interp(begins - late, begins, np.arange(len(u)), left=-2.0)
     low = np.floor(at)
     part = at - low
     first, second = (np.where(k >= 0, u[np.clip(k, 0, len(u) - 1).astype(int)], 0.0) for k in (low, low + 1.0))
     return np.asarray((1.0 - part) * first + part * second)
 
 
-def _rings(u: Array, dt: float, p: Values) -> Numbers:
+def _rings(u: Array, dt: Lasts, p: Values) -> Numbers:
     """z'' = w² (u - z) - 2 d w z', exact for a held u."""
     w, d = p["rate"], p["damping"]
     s = w * math.sqrt(max(1.0 - d * d, SMALL))
-    decay, c, sn = math.exp(-d * w * dt), math.cos(s * dt), math.sin(s * dt)
+    decay, c, sn = (np.broadcast_to(e, u.shape) for e in (np.exp(-d * w * dt), np.cos(s * dt), np.sin(s * dt)))
     a11, a12 = decay * (c + d * w / s * sn), decay * sn / s
     a21, a22 = -decay * w * w / s * sn, decay * (c - d * w / s * sn)
     z, v, acts = 0.0, 0.0, []
-    for asked in u.tolist():
+    for asked, b11, b12, b21, b22 in zip(u.tolist(), a11.tolist(), a12.tolist(), a21.tolist(), a22.tolist(), strict=True):
         off = z - asked
         before = z
-        z, v = asked + a11 * off + a12 * v, a21 * off + a22 * v
+        z, v = asked + b11 * off + b12 * v, b21 * off + b22 * v
         acts.append(0.5 * (before + z))
     return acts
 
 
-def _boosts(u: Array, dt: float, p: Values) -> Array:
+def _boosts(u: Array, dt: Lasts, p: Values) -> Array:
     """u + share (u - its slow mean)."""
     return np.asarray(u + p["share"] * (u - _mean(u, dt, p["time_constant"])))
 
@@ -171,7 +184,7 @@ def _loop(u: Array, dt: float, p: Values) -> Numbers:
     return acts
 
 
-def _fades(u: Array, dt: float, p: Values) -> Array:
+def _fades(u: Array, dt: Lasts, p: Values) -> Array:
     warm = _mean((u / p["most"]) ** 2, dt, p["time_constant"])
     return np.asarray(u / (1.0 + max(p["loss"], -0.9) * warm))
 
@@ -233,6 +246,7 @@ SHAPES = (
         (_number("reach", 0.0, 2.0, 0.0, kink=True),),
         _sticks,
         lambda dt, times: [{"reach": r} for r in (0.1, 0.2, 0.4, 0.7)],
+        uneven=False,
     ),
     Shape(
         "a loop",
@@ -240,6 +254,7 @@ SHAPES = (
         (_number("share", -1.0, 1.0, 0.0), _number("width", 0.02, 10.0)),
         _loop,
         lambda dt, times: [{"share": 0.2, "width": w} for w in (0.1, 0.3, 1.0)],
+        uneven=False,
     ),
     Shape(
         "fading with what was asked lately",
@@ -254,6 +269,7 @@ SHAPES = (
         (_number("loss", -5.0, 1.0, 0.0), _second("time_constant")),
         _tires,
         lambda dt, times: [{"loss": 0.3, "time_constant": k * dt} for k in (100.0, 300.0, 1000.0)],
+        uneven=False,
     ),
     Shape(
         "a bend",
@@ -261,6 +277,7 @@ SHAPES = (
         (_number("gain", -2.0, 5.0, 1.0), _number("cubic", -5.0, 5.0, 0.0)),
         _bends,
         lambda dt, times: [{"gain": 1.0, "cubic": -0.2}],
+        uneven=False,
     ),
     Shape(
         "steps",
@@ -268,5 +285,6 @@ SHAPES = (
         (_number("step", 1e-3, 3.0, kink=True),),
         _steps,
         lambda dt, times: [{"step": s} for s in (0.1, 0.2, 0.35, 0.5, 0.8)],
+        uneven=False,
     ),
 )

@@ -1,0 +1,143 @@
+"""Steps that do not all last alike: what acts and what moves is given each step's own length."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from s2r_runtime.models.composed import ComposedModel, compose
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.trace.chains import Inputs
+from s2r_runtime.trace.residual import Acting, advanced
+from s2r_runtime.trace.shapes import SHAPES, Shape
+
+Array = NDArray[np.float64]
+
+DT = 0.05
+FINE = 2000
+"""Parts of a second in which what acts is worked out for comparison; lengths below are whole numbers of them."""
+
+ON_INPUTS: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("input_lag", {"time_constant": 0.13}),
+    ("input_lag", {"time_constant": 0.004}),
+    ("input_delay", {"delay": 0.0}),
+    ("input_delay", {"delay": 0.087}),
+    ("input_rate_limit", {"rate": 1.7}),
+    ("input_rate_limit", {"rate": 3.0, "rate_down": 0.9}),
+    ("periodic_disturbance", {"frequency": 1.3, "amplitude": 0.4, "phase": 0.7}),
+    ("regime_change", {"time": 1.234, "gain": 0.4}),
+    ("input_gain_drift", {"rate": 0.3}),
+)
+
+ON_STEPS: dict[str, tuple[tuple[str, str, dict[str, Any]], ...]] = {
+    "unicycle": (
+        ("integration_scheme", "*", {"scheme": "exact"}),
+        ("lateral_slip", "*", {"coefficient": 0.3}),
+        ("constant_disturbance", "body", {"x": 0.1, "y": 0.2}),
+        ("gravity_slope", "*", {"x": 0.1, "y": -0.2}),
+        ("position_field", "*", {"matrix": [[0.3, -0.1], [0.2, 0.4]]}),
+        ("sensor_lever_arm", "*", {"x": 0.1, "y": 0.05}),
+    ),
+    "bicycle": (
+        ("viscous_friction", "speed", {"coefficient_positive": 0.4, "coefficient_negative": 0.6}),
+        ("understeer", "theta", {"coefficient": 0.1}),
+        ("longitudinal_slip", "*", {"ratio": 0.1}),
+    ),
+    "differential_drive": (("track_scale", "theta", {"gain": 0.7}), ("constant_disturbance", "world", {"x": 0.1, "y": 0.2})),
+    "joint": (
+        ("stribeck_friction", "qd", {"force": 0.1, "static_force": 0.3, "velocity": 0.2}),
+        ("cubic_stiffness", "q", {"coefficient": 0.4}),
+        ("mass_change", "*", {"ratio": 1.3}),
+    ),
+    "double_integrator": (
+        ("coulomb_friction", "vx", {"force": 0.3}),
+        ("quadratic_drag", "vy", {"coefficient": 0.3}),
+        ("position_field", "*", {"matrix": [[0.3, -0.1], [0.2, 0.4]]}),
+    ),
+}
+
+
+def _uneven(rng: np.random.Generator, rows: int) -> Array:
+    """(rows,) s: 0.3 to 1.7 steps, whole parts of a second."""
+    return rng.integers(round(0.3 * DT * FINE), round(1.7 * DT * FINE) + 1, rows) / FINE
+
+
+def _model(name: str, *effects: EffectSpec, dt: float = DT) -> ComposedModel:
+    return compose(ModelSpec(name, dt, {}, effects))
+
+
+@pytest.mark.parametrize(("name", "p"), ON_INPUTS)
+def test_what_acts_is_what_acts_on_a_fine_grid(name: str, p: dict[str, Any]) -> None:
+    """Three runs, each from rest, rows of any length: as in parts so fine that no row is cut."""
+    rng = np.random.default_rng(3)
+    model = _model("unicycle", EffectSpec(name, "v", p))
+    starts = (0.0, 4.1, 9.7)
+    inputs = [np.repeat(rng.normal(size=(rows // 3, 2)), 3, axis=0) for rows in (60, 30, 45)]
+    lasts = [_uneven(rng, len(u)) for u in inputs]
+    found = Inputs(inputs, DT, starts, lasts).through(model, model.effects)
+    begin = 0
+    for u, last, start in zip(inputs, lasts, starts, strict=True):
+        parts = np.rint(last * FINE).astype(int)
+        fine = Inputs([np.repeat(u, parts, axis=0)], 1.0 / FINE, [start]).through(model, model.effects)
+        expected = np.add.reduceat(fine, np.cumsum(parts) - parts, axis=0) / parts[:, None]
+        assert np.allclose(found[begin : begin + len(u)], expected, rtol=0.0, atol=1e-9)
+        begin += len(u)
+
+
+@pytest.mark.parametrize(("name", "p"), ON_INPUTS)
+@pytest.mark.parametrize("runs", [1, 5])
+def test_rows_that_all_last_alike_are_what_they_were(name: str, p: dict[str, Any], runs: int) -> None:
+    """Given one by one or as one number; few runs or many."""
+    rng = np.random.default_rng(4)
+    model = _model("unicycle", EffectSpec("input_backlash", "v", {"width": 0.3}), EffectSpec(name, "v", p))
+    inputs = [rng.normal(size=(40, 2)) for _ in range(runs)]
+    starts = [3.0 * i for i in range(runs)]
+    usual = Inputs(inputs, DT, starts).through(model, model.effects)
+    each = Inputs(inputs, DT, starts, [np.full(40, DT)] * runs).through(model, model.effects)
+    assert np.allclose(each, usual, rtol=0.0, atol=1e-9)
+
+
+def test_a_delay_leaves_a_held_input_as_it_is() -> None:
+    """Not but for rounding: what looks for changes would find one in every row."""
+    rng = np.random.default_rng(5)
+    model = _model("unicycle", EffectSpec("input_delay", "v", {"delay": 0.0871}))
+    u = np.repeat(rng.normal(size=(8, 2)), 20, axis=0)
+    found = Inputs([u], DT, [0.0], [_uneven(rng, len(u))]).through(model, model.effects)[:, 0]
+    assert np.count_nonzero(np.diff(found)) <= 2 * 8
+
+
+@pytest.mark.parametrize("name", ON_STEPS)
+def test_one_advance_is_as_many_as_there_are_lengths(name: str) -> None:
+    """Every effect of stage step, alone and all of them together, on rows of lengths of their own."""
+    rng = np.random.default_rng(6)
+    chosen = [EffectSpec(*e) for e in ON_STEPS[name]]
+    for effects in (*([e] for e in chosen), chosen):
+        model = _model(name, *effects)
+        assert model.uneven
+        x, u = rng.normal(size=(30, len(model.states))), rng.normal(size=(30, len(model.inputs)))
+        lasts = _uneven(rng, 30)
+        act = Acting(u, u + 0.1, lasts)
+        found = advanced(model, x, act, np.arange(30))
+        for k in range(30):
+            alone = _model(name, *effects, dt=float(lasts[k])).advance(x[k : k + 1], u[k : k + 1], u[k : k + 1] + 0.1)
+            # forces that depend on the state are taken in parts of the step, whose number follows from the longest one
+            assert np.allclose(found[k], alone[0], rtol=0.0, atol=1e-4 if name in {"joint", "double_integrator"} else 1e-12)
+
+
+@pytest.mark.parametrize("shape", [s for s in SHAPES if s.uneven], ids=lambda s: s.name)
+def test_shapes_remember_for_as_long_as_rows_last(shape: Shape) -> None:
+    """As in parts so fine that no row is cut, but for how a shape is averaged over a row."""
+    rng = np.random.default_rng(7)
+    model = _model("unicycle")
+    u = np.repeat(rng.normal(size=(20, 2)), 6, axis=0)
+    lasts = _uneven(rng, len(u))
+    parts = np.rint(lasts * FINE).astype(int)
+    p = shape.starts(u, model.nominal, "v", DT, (0.3,))[0]
+    found, usual = (shape.input_sequence(u, model.nominal, "v", dt, p)[:, 0] for dt in (lasts, DT))
+    fine = shape.input_sequence(np.repeat(u, parts, axis=0), model.nominal, "v", 1.0 / FINE, p)[:, 0]
+    expected = np.add.reduceat(fine, np.cumsum(parts) - parts) / parts
+    errors = [float(np.sqrt(np.mean((e - expected) ** 2))) for e in (found, usual)]
+    assert errors[0] < 0.5 * errors[1]
