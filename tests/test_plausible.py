@@ -107,6 +107,21 @@ def test_clocks_that_drift_apart_are_told(rate):
         check_plausible(_model("unicycle"), _data(_model("unicycle"), *_driven("unicycle"), early=early, rate=rate))
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_delay_that_grows_by_the_same_all_the_time_is_a_clock(seed):
+    """Its clock loses 2 %: no motion comes before its cause, and the commands seem to come later and later."""
+    with pytest.raises(RecordingError, match=r"s after the inputs .* at first and .* s after them in the end: their clocks run at different"):
+        check_plausible(_model("unicycle"), _data(_model("unicycle"), *_driven("unicycle", seed), early=-0.1, rate=0.98))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_delay_that_changed_once_is_not(seed):
+    y, u = _driven("unicycle", seed)
+    late = np.concatenate([u[: STEPS // 2], np.repeat(u[STEPS // 2 : STEPS // 2 + 1], 8, axis=0), u[STEPS // 2 : -8]])
+    again = drive(np.random.default_rng(seed), "unicycle", late[None], (), DT, 1e-3)[0]
+    check_plausible(_model("unicycle"), _data(_model("unicycle"), again[:-1], u))
+
+
 @pytest.mark.parametrize("delay", [0.0, 0.37, 0.6, 1.31])
 def test_commands_that_repeat_themselves_come_before_and_after_what_they_cause(delay):
     """A delay of 0.6 s of what has a period of 2 s looks like a lead of 1.4 s."""

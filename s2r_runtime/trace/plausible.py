@@ -77,6 +77,9 @@ AHEAD = 0.4
 SEGMENTS = 40
 """Segments that are looked at, evenly spread."""
 
+EVENLY = 0.3
+"""Of how far a lead goes over the recording: how far it may lie off a line."""
+
 DRIFTS, PARTS, DRIFTING = 3, 8, 0.7
 """Steps by which the lead must grow from the first to the last of so many parts of the recording; and the squared error with it, over
 the one with the best lead for all, below which it does.
@@ -286,14 +289,16 @@ def _check_clocks(model: ComposedModel, data: Dataset) -> None:
     by_part = [leads[int(k)] for k in np.argmin(cost, axis=0)]
     steadily = by_part in (sorted(by_part), sorted(by_part, reverse=True))
     followed, single = float(np.sum(np.min(cost, axis=0))), float(np.min(total))
-    drifts = abs(by_part[-1] - by_part[0]) >= DRIFTS and steadily and max(by_part) > 0 and followed < DRIFTING * single
+    even = max(by_part) > 0 or _evenly(by_part)  # a delay may grow: by the same in every part, it is a clock's
+    drifts = abs(by_part[-1] - by_part[0]) >= DRIFTS and steadily and even and followed < DRIFTING * single
     causal = float(np.min(total[np.array(leads) <= 0]))
     if min(followed if drifts else math.inf, single if best > 0 else math.inf) < AHEAD * causal:
         causal = min(causal, _least_causal(lambda delay: sum(costs(-delay)), min(round(LEAD_S / data.dt), longest // 4), apart))
     if drifts and followed < AHEAD * causal:
+        first, last = (f"{abs(lead) * data.dt:.2g} s {'before' if lead > 0 else 'after'}" for lead in (by_part[0], by_part[-1]))
         raise RecordingError(
-            f"{data.source}: the motion comes {by_part[0] * data.dt:.2g} s before the inputs that cause it at first and "
-            f"{by_part[-1] * data.dt:.2g} s in the end: their clocks run at different rates, their stamps must be of one clock"
+            f"{data.source}: the motion comes {first} the inputs that cause it at first and {last} them in the end: their clocks run "
+            "at different rates, their stamps must be of one clock"
         )
     if best > 0 and single < AHEAD * causal:
         best = min(range(round(0.7 * best), round(1.4 * best) + 1, max(1, best // 20)), key=lambda lead: sum(costs(lead)))
@@ -301,6 +306,12 @@ def _check_clocks(model: ComposedModel, data: Dataset) -> None:
             f"{data.source}: the motion comes about {best * data.dt:.2g} s before the inputs that cause it: their stamps must be of "
             "one clock, and an input must stand at the time from which it acts"
         )
+
+
+def _evenly(leads: list[int]) -> bool:
+    """Whether they lie on a line, but for the grid of what is tried."""
+    line = np.linspace(leads[0], leads[-1], len(leads))
+    return bool(np.max(np.abs(np.array(leads) - line)) <= EVENLY * abs(leads[-1] - leads[0]))
 
 
 def _least_causal(cost: Callable[[int], float], longest: int, apart: int) -> float:
