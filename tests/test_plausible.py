@@ -110,7 +110,9 @@ def test_clocks_that_drift_apart_are_told(rate):
 @pytest.mark.parametrize("seed", range(3))
 def test_a_delay_that_grows_by_the_same_all_the_time_is_a_clock(seed):
     """Its clock loses 2 %: no motion comes before its cause, and the commands seem to come later and later."""
-    with pytest.raises(RecordingError, match=r"s after the inputs .* at first and .* s after them in the end: their clocks run at different"):
+    with pytest.raises(
+        RecordingError, match=r"s after the inputs .* at first and .* s after them in the end: their clocks run at different"
+    ):
         check_plausible(_model("unicycle"), _data(_model("unicycle"), *_driven("unicycle", seed), early=-0.1, rate=0.98))
 
 

@@ -9,12 +9,17 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from s2r_runtime.trace.found import Found
 from s2r_runtime.trace.residual import rms
 from s2r_runtime.trace.shape import Shape, components, derived, strongest, variables
 
 if TYPE_CHECKING:
     from s2r_runtime.trace.result import TraceResult
+
+Array = NDArray[np.float64]
 
 WIDTH = 100
 
@@ -35,6 +40,15 @@ HEADLINES = {
     "unexplained": "structure is left that no effect in the library accounts for, so it gets no name",
     "sensor_fault": "the measurements, not the motion, are wrong in places",
 }
+
+WANDERS = "what is left follows no input and no state: noise that is correlated in time"
+"""The headline of `none` where something is left that no effect accounts for, and that need not be one."""
+
+USUAL = 0.97
+"""Share of the rollouts that must be far off, too, for that to be said."""
+
+FAR_OFF = 2.0
+"""Times the noise at the end of rollouts from which on what was found did not explain all."""
 
 ARROW = "->"
 
@@ -58,10 +72,15 @@ def headline(r: TraceResult) -> str:
         return f"these data cannot decide between {1 + len(r.rivals)} explanations; the best is"
     if r.effects:
         count = len(r.effects)
-        return f"the model lacks {'one effect' if count == 1 else f'{count} effects'}" + (
-            ", which explains what was left over" if count == 1 else ", which explain what was left over"
-        )
-    return HEADLINES[r.verdict]
+        all_of_it = not r.depends_on and not _away(r, r.after.ends, FAR_OFF)
+        explain = f"{'explains' if count == 1 else 'explain'} {'what' if all_of_it else 'a part of what'} was left over"
+        return f"the model lacks {'one effect' if count == 1 else f'{count} effects'}, which {explain}"
+    return WANDERS if r.verdict == "none" and _wanders(r) else HEADLINES[r.verdict]
+
+
+def _wanders(r: TraceResult) -> bool:
+    """Whether a verdict without an effect leaves noise that takes rollouts away."""
+    return bool(r.depends_on) or bool(_away(r, r.after.ends, FAR_OFF))
 
 
 def _explained(r: TraceResult) -> list[str]:
@@ -95,11 +114,13 @@ def _effect(e: Found) -> list[str]:
 def _left_over(r: TraceResult) -> list[str]:
     """Of the model as it was given."""
     if r.verdict in {"none", "sensor_fault"}:
-        return ["nothing beyond noise"]
+        far = _away(r, r.before.ends, FAR_OFF)
+        return [f"nothing beyond noise in one step; {far}" if far else "nothing beyond noise"]
     over = variables(r.nominal, r.held)
     inputs = over[: len(r.nominal.inputs)]
     over += derived(r.nominal, r.held)
-    away = [_over_rollouts(r)] if _over_rollouts(r) else []
+    there = _away(r, r.before.ends, TOLD_AWAY)
+    away = [there] if there else []
     if r.verdict == "unexplained":  # the noise was estimated with the structure in it: shares are of all, noise included
         parts = components(r.nominal, r.held, r.before.one_step, r.after.one_step, 0.0 * r.floor[0])
         told = [v for v in over if v.token in r.depends_on]
@@ -123,17 +144,16 @@ def _percent(share: float) -> str:
     return f"{100.0 * share:.0f} %"
 
 
-def _over_rollouts(r: TraceResult) -> str:
-    """The state that is farthest beyond its noise at the end of the rollouts."""
-    if not len(r.before.ends):
+def _away(r: TraceResult, ends: Array, least: float) -> str:
+    """The state that is farthest beyond its noise at the ends of rollouts, (m, nx) errors; nothing if that is less than `least` times."""
+    if not len(ends):
         return ""
-    ratio = rms(r.before.ends) / r.floor[1].clip(1e-300)
+    ratio = rms(ends) / r.floor[1].clip(1e-300)
     worst = int(ratio.argmax())
-    return (
-        f"{r.nominal.states[worst]} ends {float(ratio[worst]):.3g} x the noise away after {r.horizon_s:g} s"
-        if ratio[worst] > TOLD_AWAY
-        else ""
-    )
+    usual = np.sort(np.abs(ends[:, worst]))[: max(1, round(USUAL * len(ends)))]  # a few wild rows are outliers, and counted
+    if min(ratio[worst], float(np.sqrt(np.mean(usual**2))) / max(float(r.floor[1][worst]), 1e-300)) <= least:
+        return ""
+    return f"{r.nominal.states[worst]} ends {float(ratio[worst]):.3g} x the noise away after {r.horizon_s:g} s"
 
 
 def _table(r: TraceResult) -> list[str]:
@@ -177,10 +197,13 @@ def _gap(r: TraceResult) -> list[str]:
 
 
 def _still_there(r: TraceResult) -> list[str]:
+    away = _away(r, r.after.ends, FAR_OFF)
     if not r.depends_on:
-        return ["nothing beyond noise"] if r.verdict != "unexplained" else ["structure; what it depends on cannot be told"]
+        if r.verdict == "unexplained":
+            return ["structure; what it depends on cannot be told"]
+        return [f"what no input and no state foretells: {away}"] if away else ["nothing beyond noise"]
     if r.depends_on == ("noise",):
-        return ["coloured noise: correlated in time, whatever the inputs do"]
+        return ["coloured noise: correlated in time, whatever the inputs do", *([away] if away else [])]
     percent = f"{100.0 * r.share_left:.0f} %" if r.share_left >= 0.01 else "under 1 %"
     much = f" ({percent} of what the model lacked)" if r.effects else ""
     lines = [f"structure{much} that depends on {', '.join(r.depends_on)}"]
