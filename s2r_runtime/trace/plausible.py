@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.dataset import Dataset, Run, regridded
 from s2r_runtime.trace.never_measured import check_measured
-from s2r_runtime.trace.residual import Index, acting, rollout, rollout_starts
+from s2r_runtime.trace.residual import Index, acting, first_steps, rollout, rollout_starts
 from s2r_runtime.trace.streams import Stream
 
 Array = NDArray[np.float64]
@@ -237,6 +238,9 @@ def _check_clocks(model: ComposedModel, data: Dataset) -> None:
             f"{data.source}: the motion comes {by_part[0] * data.dt:.2g} s before the inputs that cause it at first and "
             f"{by_part[-1] * data.dt:.2g} s in the end: their clocks run at different rates, their stamps must be of one clock"
         )
+    if best > 0 and single < AHEAD * causal and axes(model.nominal):
+        beside = {lead: _with_friction(model, few, _errors(model, few, lead, starts, ahead) / size, starts) for lead in leads if lead >= 0}
+        single, causal = min(cost for lead, cost in beside.items() if lead > 0), beside[0]
     if best > 0 and single < AHEAD * causal:
         best = min(range(round(0.7 * best), round(1.4 * best) + 1, max(1, best // 20)), key=lambda lead: sum(costs(lead)))
         raise RecordingError(
@@ -255,6 +259,18 @@ def _least_causal(cost: Callable[[int], float], longest: int, apart: int) -> flo
     before, here, after = (around[best + k] for k in (-1, 0, 1))
     bend = before - 2.0 * here + after
     return max(0.0, here - (before - after) ** 2 / (8.0 * bend)) if bend > 0.0 else here
+
+
+def _with_friction(model: ComposedModel, data: Dataset, z: Array, starts: Index) -> float:
+    """What errors z (n, nx) cost less what friction, a bias and a gain would make of them: a controller that has to push against friction
+    asks for a force that comes after the acceleration.
+    """
+    moving = [axis.velocity for axis in axes(model.nominal)]
+    run = np.searchsorted(first_steps(data), starts, side="right") - 1
+    v = np.concatenate([r.y for r in data.runs])[starts + run][:, moving]
+    told = np.concatenate([np.ones((len(v), 1)), v, np.sign(v), acting(model, data).mean[starts]], axis=1)
+    cut = np.clip(z, -WILD, WILD)
+    return float(sum(np.sum(part) for part in _parts(z - told @ np.linalg.lstsq(told, cut, rcond=1e-9)[0])))
 
 
 def _errors(model: ComposedModel, data: Dataset, lead: int, starts: Index, ahead: int) -> Array:
