@@ -118,7 +118,7 @@ def test_a_delay_that_grows_by_the_same_all_the_time_is_a_clock(seed):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_delay_that_changed_once_is_not(seed):
-    y, u = _driven("unicycle", seed)
+    _, u = _driven("unicycle", seed)
     late = np.concatenate([u[: STEPS // 2], np.repeat(u[STEPS // 2 : STEPS // 2 + 1], 8, axis=0), u[STEPS // 2 : -8]])
     again = drive(np.random.default_rng(seed), "unicycle", late[None], (), DT, 1e-3)[0]
     check_plausible(_model("unicycle"), _data(_model("unicycle"), again[:-1], u))

@@ -107,8 +107,7 @@ def _wandering(left: Left, pushes: list[Array]) -> float:
 
 def _coloured(whiten: Whitener, z: Array, joined: Mask) -> float:
     """Log likelihood of a whitened residual under noise of its own colour."""
-    colour = noises.colour(z, joined)
-    return float(np.sum(noises.log_density(colour(z, joined)))) - whiten.logdet - len(z) * float(np.sum(np.log(colour.scale)))
+    return noises.log_likelihood(z, whiten, noises.colour(z, joined), joined)
 
 
 def may_depend_on(left: Left, found: Judged, dictionaries: list[tuple[str, Array]]) -> tuple[str, ...]:

@@ -18,12 +18,14 @@ from s2r_runtime.errors import S2RError
 from s2r_runtime.gap import Transitions, discrepancy, hold_residuals, residuals
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.fitting import Fit
 from s2r_runtime.trace.holdout import FEWEST_RUNS
 from s2r_runtime.trace.inverse import Inverse, input_relative, inverse
-from s2r_runtime.trace.residual import Steps, acting, advanced, residual, rms, rollout, rollout_starts, state_jacobian
-from s2r_runtime.trace.residual_noise import Noise
+from s2r_runtime.trace.residual import Acting, Steps, acting, advanced, residual, rms, rollout, rollout_starts, state_jacobian
+from s2r_runtime.trace.residual_noise import Past
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Kind = Literal["ball", "box"]
 
@@ -32,6 +34,15 @@ EPSILON = 0.01
 
 FLOOR_STARTS = 2000
 """Simulated rollouts behind the noise floor; its own error is then 2 %."""
+
+COLOURED = 0.2
+"""Autoregression coefficient from which noise has a law of its own in rollouts."""
+
+SETTLE = 600
+"""Steps after which noise that wanders has forgotten where it began; of other noise a tenth."""
+
+FEWER = 4
+"""Of the simulated rollouts, every so many where noise has a law of its own: a step of it costs more."""
 
 MANY = 20_000_000
 """Model steps in rollouts from which on not every row is started from, but as many as that allows, evenly."""
@@ -111,8 +122,12 @@ def _starts(given: Held) -> NDArray[np.int64]:
     return starts[:: max(1, len(starts) * given.horizon // MANY)]
 
 
-def noise_floor(model: ComposedModel, noise: Noise, given: Held, seed: int) -> tuple[Array, Array]:
-    """(nx,) rms that the noise alone makes of a one-step residual, and of a rollout's end: both by simulation from measured states."""
+def noise_floor(fit: Fit, given: Held, seed: int) -> tuple[Array, Array]:
+    """(nx,) rms that the noise alone makes of a one-step residual, and of a rollout's end: both by simulation from measured states.
+
+    Noise that is correlated in time keeps its law: what a sensor has wrong for a while does not add up as what pushes the robot does.
+    """
+    model, noise = fit.model, fit.noise
     act = acting(model, given.data)
     one = noise.one_step(state_jacobian(model, given.steps, act))
     starts = _starts(given)
@@ -123,11 +138,40 @@ def noise_floor(model: ComposedModel, noise: Noise, given: Held, seed: int) -> t
     begin = np.cumsum([0] + [len(run.y) - 1 for run in given.data.runs])
     rows = starts + np.searchsorted(begin, starts, side="right") - 1
     clean = np.concatenate([run.y for run in given.data.runs])[rows]
+    if np.any(fit.colour.strength > COLOURED) or fit.colour.slow.size:
+        ends = _coloured_ends(fit, given, act, starts[::FEWER], clean[::FEWER], rng)
+        if ends is not None:
+            return one, rms(ends)
     noisy = clean + rng.normal(size=clean.shape) * np.sqrt(noise.r)
     for h in range(given.horizon):
         clean = advanced(model, clean, act, starts + h)
         noisy = advanced(model, noisy, act, starts + h) + rng.normal(size=clean.shape) * np.sqrt(noise.q)
     return one, rms(model.difference(clean, noisy) + rng.normal(size=clean.shape) * np.sqrt(noise.r))
+
+
+def _coloured_ends(fit: Fit, given: Held, act: Acting, starts: Index, y: Array, rng: np.random.Generator) -> Array | None:
+    """(m, nx) measured less foretold at the ends of rollouts from y (m, nx), where every step's residual is drawn by the noise's law:
+
+        r_k = scale (w_k + e_{k+1} - F e_k) + what of r the past foretells        (the colour of z taken for that of r)
+
+    None if that law has no end: then it says nothing of so long a time.
+    """
+    model, (q, s) = fit.model, (np.sqrt(fit.noise.q), np.sqrt(fit.noise.r))
+    law, e, x = Past(fit.colour, y.shape), s * rng.normal(size=y.shape), y
+    settle = SETTLE if fit.colour.slow.size else SETTLE // 10
+    for k in range(settle + given.horizon):
+        late = s * rng.normal(size=y.shape)
+        push = q * rng.normal(size=y.shape) + late
+        if k < settle:
+            law.follow(push - e)
+        else:
+            place = starts + k - settle
+            there = advanced(model, y, act, place)
+            y = there + law.follow(push - (there - advanced(model, y - e, act, place)))
+            x = advanced(model, x, act, place)
+        e = late
+    ends = model.difference(y, x)
+    return ends if law.settled else None
 
 
 def gaps(

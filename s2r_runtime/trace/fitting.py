@@ -105,8 +105,7 @@ def evaluate(given: Problem, model: ComposedModel, near: Noise | None = None) ->
     z = whiten(r)
     colour = noises.colour(z, given.steps.joined)
     white = float(np.sum(noises.log_density(z))) - whiten.logdet
-    left = float(np.sum(noises.log_density(colour(z, given.steps.joined))))
-    coloured = left - whiten.logdet - len(z) * float(np.sum(np.log(colour.scale)))
+    coloured = noises.log_likelihood(z, whiten, colour, given.steps.joined)
     return Fit(model, free_of(model), level, colour, whiten, z, white, coloured)
 
 
@@ -230,6 +229,15 @@ def fitted(given: Problem, start: Fit, model: ComposedModel, rounds: int = ROUND
         if turn and fit.white - before.white < SETTLED:
             break
     return fit
+
+
+def settled(given: Problem, fit: Fit) -> Fit:
+    """The same with its numbers under the law of what it leaves, where that wanders: nearer, and their intervals are those of that law."""
+    law = noises.wandering(fit.z, given.steps.joined, fit.colour)
+    if law is None or not fit.free:
+        return fit
+    again = evaluate(given, refine(given, replace(fit, colour=law), fit.model), fit.noise)
+    return replace(again, colour=noises.wandering(again.z, given.steps.joined, again.colour) or again.colour)
 
 
 def insert(model: ComposedModel, effect: AppliedEffect, place: int) -> ComposedModel:

@@ -26,7 +26,7 @@ from s2r_runtime.trace.episodes import episodes, may_depend_on
 from s2r_runtime.trace.evidence import evidence, margin
 from s2r_runtime.trace.fitting import Fit, Problem
 from s2r_runtime.trace.fitting import gain as explained
-from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left, first_look, judge, leading
+from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, SLOWLY, Judged, Left, first_look, judge, leading
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
 from s2r_runtime.trace.residual import acting, covered, residual, rms, rollout, rollout_starts, state_jacobian
 
@@ -50,7 +50,7 @@ MATTERS = 0.05
 SLIDING = ("constant", "time", "wave")
 """What slides along with the residual, so that sliding tells nothing."""
 
-SLOWLY, SLOW = ("constant", "time"), 3.0
+SLOW = 3.0
 """Times the usual nats for those that are slow: noise that wanders foretells the next second well, whatever its cause."""
 
 SEEN = 1.25
@@ -226,10 +226,13 @@ def _strength(left: Left, j: Judged, threshold: float) -> tuple[float, Judged]:
     foretold = j.gain if gained > needed else 0.0
     if j.token in SLIDING:
         return foretold, j
-    white = left.fit.whiten(j.x)
-    ways = [(left.fit.z, noises.weight(left.fit.z))]
+    white, z = left.fit.whiten(j.x), left.fit.z
+    if left.law is not None:  # in closed loop, inputs answer what wanders: that tie, slides would break
+        white, z = (left.law(e, left.given.steps.joined) for e in (white, z))
+    ways = [(z, noises.weight(z))]
     if left.clipped is not None:
-        ways.append((left.clipped, np.ones_like(left.clipped)))
+        clipped = left.clipped if left.law is None else left.law(left.clipped, left.given.steps.joined)
+        ways.append((clipped, np.ones_like(clipped)))
     beyond = [margin(white, z, weight, threshold) for z, weight in ways]
     best = int(np.argmax(beyond))
     if beyond[best] <= max(BEYOND, foretold):
@@ -237,9 +240,9 @@ def _strength(left: Left, j: Judged, threshold: float) -> tuple[float, Judged]:
     if foretold:
         return beyond[best], j
     weight = ways[best][1]
-    x, z = white.reshape(-1, white.shape[2]), np.clip(left.fit.z, -CLIPPED, CLIPPED).ravel()
+    x, push = white.reshape(-1, white.shape[2]), np.clip(z, -CLIPPED, CLIPPED).ravel()
     weighted = x * weight.reshape(-1, 1)
-    product, slope = x.T @ weighted, weighted.T @ z
+    product, slope = x.T @ weighted, weighted.T @ push
     beta = np.linalg.solve(product + evidence(product, slope).ridge * np.eye(len(slope)), slope)
     return beyond[best], replace(j, betas=np.tile(beta, (BLOCKS, 1)))
 

@@ -1,12 +1,14 @@
 """How a dictionary of terms is judged on what a model leaves (`lack_of_fit` says of which, and what follows from it).
 
 r = sum_j beta_j X_j + noise        beta by ridge, its strength by the evidence; without the block of time that is judged
-gain                                log likelihood of what is left, noise and colour re-estimated, less that without the terms
+gain                                log likelihood of what is left, noise and colour re-estimated, less that without the terms; where
+                                    what the model leaves wanders, no more than under the law of what is left with the terms
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -21,6 +23,9 @@ Array = NDArray[np.float64]
 
 BLOCKS = 8
 """Of the cross-validation."""
+
+SLOWLY = ("constant", "time")
+"""Dictionaries of what is slow."""
 
 LEADING = 48
 """Columns of a dictionary that are judged at most."""
@@ -59,6 +64,11 @@ class Left:
     block: NDArray[np.int64]
     clipped: Array | None
 
+    @cached_property
+    def law(self) -> Colour | None:
+        """Of what is to be explained, where it wanders."""
+        return noises.wandering(self.fit.z, self.given.steps.joined, self.fit.colour)
+
 
 def first_look(left: Left, x: Array) -> float:
     """Log evidence of the dictionary under the model's own noise."""
@@ -95,20 +105,31 @@ def judge(left: Left, token: str, x: Array) -> Judged:
         whiten = Whitener(level, left.f, joined)
         z = whiten(rest)
         colour = noises.colour(z, joined)
-        reached = _likelihood(z, whiten, colour, joined)
+        reached = noises.log_likelihood(z, whiten, colour, joined)
         # without the terms, under the same noise: a better estimate of the noise alone is no structure
-        bare = max(left.fit.coloured, *(_likelihood(whiten(left.r), whiten, c, joined) for c in (colour, left.fit.colour)))
-        if reached - bare > gain:
+        bare = max(left.fit.coloured, *(noises.log_likelihood(whiten(left.r), whiten, c, joined) for c in (colour, left.fit.colour)))
+        more = min(reached - bare, _beyond_wandering(left, token, z, whiten, colour))
+        if more > gain:
             push = colour(whiten(left.r - rest), joined)
             z = colour(z, joined)
-            gain, betas = reached - bare, betas_now
+            gain, betas = more, betas_now
             scatter = _scatter(push * z * noises.weight(z), push, left.block)
     return Judged(token, x, gain, scatter, betas_now if betas is None else betas)
 
 
-def _likelihood(z: Array, whiten: Whitener, colour: Colour, joined: NDArray[np.bool_]) -> float:
-    """Log likelihood of a whitened residual, coloured."""
-    return float(np.sum(noises.log_density(colour(z, joined)))) - whiten.logdet - len(z) * float(np.sum(np.log(colour.scale)))
+def _beyond_wandering(left: Left, token: str, z: Array, whiten: Whitener, colour: Colour) -> float:
+    """Nats of terms that leave z, (n, nx), under the law of what they leave, if that wanders; infinite if nothing does.
+
+    What is slow itself is held against what wanders by its own law: nothing else tells the two apart.
+    """
+    joined = left.given.steps.joined
+    if left.law is None:
+        return np.inf
+    law = noises.wandering(z, joined, colour) or colour
+    reached = noises.log_likelihood(z, whiten, law, joined)
+    if token in SLOWLY:
+        return reached - noises.log_likelihood(left.fit.z, left.fit.whiten, left.law, joined)
+    return np.inf if law is colour else reached - noises.log_likelihood(whiten(left.r), whiten, law, joined)
 
 
 def _scatter(scores: Array, push: Array, block: NDArray[np.int64]) -> float:

@@ -13,7 +13,7 @@ Errors have tails: a value of z has the density (1 - TAIL) N(0, 1) + TAIL N(0, W
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,19 @@ OUTLIER = 4.5
 
 ORDERS = 4
 """Highest order of the autoregression."""
+
+MEMORIES = (8.0, 32.0, 128.0, 512.0)
+SPARE = 4
+"""Steps that the running means remember by which noise is foretold that wanders more slowly than an autoregression of a few steps can say:
+the wind, a load that shifts, a slope. A process that forgets within T steps, under white noise, is foretold by such a mean. They are
+asked for where there are SPARE times as many steps.
+"""
+
+LOUDEST = 30.0
+"""Times the white noise that drives it: noise that is louder has no law that holds for long."""
+
+WANDERS = 1.5
+"""Times the Bayes criterion's price for a number, from which on noise is taken to wander."""
 
 LEAST = 1e-6
 """Least share of a residual's variance that process and measurement noise are each given: no drift is believed to be exact."""
@@ -193,10 +206,11 @@ def _one_state(
 
 @dataclass(frozen=True)
 class Colour:
-    """Autoregression of z by state: coefficients (nx, ORDERS), scale (nx,)."""
+    """Autoregression of z by state: coefficients (nx, ORDERS), scale (nx,); slow: (nx, MEMORIES), on running means, or empty."""
 
     coefficients: Array
     scale: Array
+    slow: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def strength(self) -> Array:
@@ -206,6 +220,8 @@ class Colour:
     def __call__(self, z: Array, joined: Mask) -> Array:
         """What of z (n, nx) or (n, nx, m) the past does not foretell, in standard deviations."""
         out = z.copy()
+        for k, memory in enumerate(MEMORIES if self.slow.size else ()):
+            out -= self.slow[:, k].reshape((1, -1) + (1,) * (z.ndim - 2)) * _recently(z, joined, memory)
         there = joined.copy()
         for lag in range(1, self.coefficients.shape[1] + 1):
             if lag > 1:
@@ -214,6 +230,12 @@ class Colour:
                 past = np.where(there[lag:].reshape((-1,) + (1,) * (z.ndim - 2)), z[:-lag, i], 0.0)
                 out[lag:, i] -= self.coefficients[i, lag - 1] * past
         return np.asarray(out / self.scale.reshape((1, -1) + (1,) * (z.ndim - 2)))
+
+
+def log_likelihood(z: Array, whiten: Whitener, colour: Colour, joined: Mask) -> float:
+    """Of a residual that is whitened to z (n, nx), under a colour of that."""
+    left = float(np.sum(log_density(colour(z, joined))))
+    return left - whiten.logdet - len(z) * float(np.sum(np.log(colour.scale)))
 
 
 def no_colour(nx: int) -> Colour:
@@ -226,13 +248,7 @@ def colour(z: Array, joined: Mask) -> Colour:
     n, nx = z.shape
     coefficients, scale = np.zeros((nx, ORDERS)), np.ones(nx)
     clipped = np.clip(z, -4.0, 4.0)
-    lagged = np.zeros((n, ORDERS, nx))
-    there = joined.copy()
-    for lag in range(ORDERS):
-        if lag:
-            there = there & np.append(False, there[:-1])
-        lagged[lag + 1 :, lag] = clipped[: n - lag - 1]
-        lagged[~there, lag] = 0.0
+    lagged = _lagged(clipped, joined)
     for i in range(nx):
         spread = max(float(np.mean(clipped[:, i] ** 2)), 1e-12)
         best, own = n * math.log(spread), max(math.sqrt(spread), NARROWEST)
@@ -247,6 +263,86 @@ def colour(z: Array, joined: Mask) -> Colour:
                 coefficients[i] = 0.0
                 coefficients[i, :order] = c
     return Colour(coefficients, scale)
+
+
+class Past:
+    """Draws noise of a colour, a step at a time, in many rows at once: (m, nx)."""
+
+    def __init__(self, colour: Colour, shape: tuple[int, ...]) -> None:
+        self._colour = colour
+        self._last = [np.zeros(shape) for _ in range(ORDERS)]
+        self._means = [np.zeros(shape) for _ in (MEMORIES if colour.slow.size else ())]
+        self._size = np.full(shape[1], 0.0)
+        self._white = np.full(shape[1], 0.0)
+
+    def follow(self, white: Array) -> Array:
+        """The next values, from white noise (or such as whitening makes white) of this step."""
+        c = self._colour
+        now = c.scale * white + sum(c.coefficients[:, k] * past for k, past in enumerate(self._last))
+        now = now + sum(c.slow[:, k] * mean for k, mean in enumerate(self._means))
+        keeps = [math.exp(-1.0 / memory) for memory in MEMORIES]
+        self._means = [keep * mean + (1.0 - keep) * now for keep, mean in zip(keeps, self._means, strict=False)]
+        self._last = [now, *self._last[:-1]]
+        self._size, self._white = (np.sqrt(np.mean(e**2, axis=0)) for e in (now, white))
+        return np.asarray(now)
+
+    @property
+    def settled(self) -> bool:
+        """Whether the last values are of a size that such noise can have."""
+        return bool(np.all(self._size < LOUDEST * self._white + 1e-300))
+
+
+def wandering(z: Array, joined: Mask, given: Colour) -> Colour | None:
+    """The colour with running means besides, where these foretell z beyond doubt in some state; else None. given: the colour without."""
+    n, nx = z.shape
+    clipped = np.clip(z, -4.0, 4.0)
+    means = np.stack([_recently(clipped, joined, memory) for memory in MEMORIES], axis=2)
+    few = [k for k, memory in enumerate(MEMORIES) if SPARE * memory <= n]
+    sets = [[k] for k in few] + ([few] if len(few) > 1 else [])
+    known = np.flatnonzero(np.mean(clipped**2, axis=0) > 0.25 * NARROWEST**2)
+    coefficients, scale, slow = given.coefficients.copy(), given.scale.copy(), np.zeros((nx, len(MEMORIES)))
+    lagged = _lagged(clipped, joined)
+    for i in known.tolist():
+        order = int(np.max(np.flatnonzero(given.coefficients[i]) + 1, initial=0))
+        now = clipped[:, i]
+        usual = float(np.mean((now - lagged[:, :, i] @ given.coefficients[i]) ** 2))
+        best = 0.0
+        for those in sets:
+            x = np.concatenate([lagged[:, :order, i], means[:, i, those]], axis=1)
+            c = np.linalg.lstsq(x, now, rcond=1e-4)[0]
+            left = max(float(np.mean((now - x @ c) ** 2)), 1e-12)
+            score = n * math.log(usual / left) - WANDERS * len(those) * math.log(n)
+            if score > best:
+                best, scale[i] = score, given.scale[i] * math.sqrt(left / usual)
+                coefficients[i, :order], slow[i] = c[:order], 0.0
+                slow[i, those] = c[order:]
+    return Colour(coefficients, scale, slow) if np.any(slow) else None
+
+
+def _recently(z: Array, joined: Mask, memory: float) -> Array:
+    """Running mean of what was before each step, as z: m_k = a m_{k-1} + (1 - a) z_{k-1}, a = exp(-1/memory), zero where a run begins."""
+    from scipy.linalg import lapack
+
+    keep = math.exp(-1.0 / memory)
+    flat = z.reshape(len(z), -1)
+    band = np.ones((2, len(z)))
+    band[1, :-1] = np.where(joined[1:], -keep, 0.0)
+    before = np.concatenate([np.zeros((1, flat.shape[1])), np.where(joined[1:, None], flat[:-1], 0.0)])
+    means, _ = lapack.dtbtrs(band, (1.0 - keep) * before, uplo="L", diag="U")
+    return np.asarray(means).reshape(z.shape)
+
+
+def _lagged(z: Array, joined: Mask) -> Array:
+    """(n, ORDERS, nx): z one step before and more, zero where that is not known."""
+    n, nx = z.shape
+    lagged = np.zeros((n, ORDERS, nx))
+    there = joined.copy()
+    for lag in range(ORDERS):
+        if lag:
+            there = there & np.append(False, there[:-1])
+        lagged[lag + 1 :, lag] = z[: n - lag - 1]
+        lagged[~there, lag] = 0.0
+    return lagged
 
 
 def quantum(before: Array, after: Array) -> float:

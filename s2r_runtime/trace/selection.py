@@ -9,7 +9,7 @@ relevant      some rollout's rms error falls by RELEVANT, on blocks that the par
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from s2r_runtime.trace.fitting import (
     fitted,
     gain,
     objective,
+    refine,
     scatter,
     sensitivities,
     sought,
@@ -53,6 +54,9 @@ EXCHANGED = 3
 
 BLOCKS = 5
 """Of the cross-validation."""
+
+SOME = 4
+"""Rounds of parameters under another law of noise."""
 
 STARTS = 1200
 """Rollouts that relevance is judged on at most."""
@@ -125,7 +129,7 @@ def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int, bar:
 def _told_by_stamps(given: Problem, fit: Fit, base: Fit) -> bool:
     """False for a time within a step where rows do not lie on the step: stamps, averages and reality differ by that much."""
     data = given.data
-    if not data.interpolated and all(run.lasts is None for run in data.runs):
+    if not data.interpolated and not data.uneven:
         return True
     there = names(base.model)
     values = values_of(fit.model, fit.free)
@@ -151,11 +155,34 @@ def significant(given: Problem, fit: Fit, base: Fit, tried: int, bar: Bar = STRI
     """Beyond chance, everything tried paid for; the gain shrunk by how much more than white noise the scores of blocks scatter."""
     needed = bar.needed(tried, fit.k - base.k, len(given.steps))
     reached = gain(fit, base)
+    if reached > needed and not _beyond_wandering(given, fit, base, needed):
+        return False
     if reached <= needed or reached > WIDEST**2 * needed or not fit.free:
         return reached > needed
     there = names(base.model)
     new = [i for i, slot in enumerate(fit.free) if name_of(fit.model.effects[slot.place]) not in there]
     return reached > needed * float(np.max(scatter(given, fit)[new], initial=1.0)) ** 2
+
+
+def _beyond_wandering(given: Problem, fit: Fit, base: Fit, needed: float) -> bool:
+    """Whether an effect gains as much where what is left with it wanders: under the law of that, and with that law estimated without the
+    effect, too. In closed loop inputs answer what wanders, a moment later: an effect on them then takes up a part of it. Under that law,
+    estimates are those of the prediction error (L. Ljung, System identification, 1999, ch. 13: in closed loop right if the noise's law is).
+    """
+    joined = given.steps.joined
+    law, bare = (noises.wandering(f.z, joined, f.colour) for f in (fit, base))
+    if law is None:
+        return True
+    if bare is not None:
+        both = (noises.log_likelihood(f.z, f.whiten, c, joined) for f, c in ((fit, law), (base, bare)))
+        if next(both) - next(both) <= needed:
+            return False
+    under = replace(fit, colour=law)
+    reached = [
+        float(np.sum(noises.log_density(objective(given, under, refine(given, under, m, iterations=SOME)))))
+        for m in (fit.model, base.model)
+    ]
+    return reached[0] - reached[1] > needed
 
 
 def relevant(given: Problem, fit: Fit, base: Fit, horizon: int) -> bool:

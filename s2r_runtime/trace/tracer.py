@@ -30,7 +30,7 @@ from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge, noise_floor
 from s2r_runtime.trace.excitation import advice
 from s2r_runtime.trace.faults import Checked, check
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, problem, without
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, problem, settled, without
 from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.intervals import intervals
 from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, Looks, Structure, best_unnamed, explains_more, first_looks, lack_of_fit
@@ -38,6 +38,7 @@ from s2r_runtime.trace.lack_of_fit_judged import Judged
 from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.residual import Mask, acting, first_steps, rms, steps_of
+from s2r_runtime.trace.residual_noise import no_colour
 from s2r_runtime.trace.result import Found, Limit, TraceResult
 from s2r_runtime.trace.scores import LENIENT, names
 from s2r_runtime.trace.selection import Selection, crowded, select
@@ -166,13 +167,16 @@ def _result(
 ) -> TraceResult:
     """Verdict, intervals, errors and gap before and after."""
     model = chosen.nominal.model
+    chosen = replace(chosen, fit=settled(given, chosen.fit))
     before, after = judge(model, judged_on), judge(chosen.fit.model, judged_on)
-    floor = noise_floor(chosen.fit.model, chosen.fit.noise, judged_on, seed)
-    verdict = verdict_of(chosen, structure, checked.faults, after, judged_on, floor[1])
+    floor = noise_floor(chosen.fit, judged_on, seed)
+    forgets = replace(chosen.fit, colour=no_colour(len(model.states)))  # a law with a memory may have taken up all that the model lacks
+    alone = floor if chosen.fit.added else noise_floor(forgets, judged_on, seed)
+    verdict = verdict_of(chosen, structure, checked.faults, after, judged_on, alone[1])
     if verdict == "unexplained" and not {*structure.tokens} - {"noise"}:  # what was named foretells nothing: what else it looks like
         structure = replace(structure, tokens=structure.likeliest or structure.tokens)
     final = final_fit(chosen, verdict)
-    floor = floor if final is chosen.fit else noise_floor(final.model, final.noise, judged_on, seed)
+    floor = floor if final is chosen.fit else noise_floor(final, judged_on, seed)
     after = before if final is chosen.nominal else after
     gap_before, gap_after, independent = gaps((model, before), (final.model, after), judged_on, weights, kind)
     ranges = intervals(given, final)
