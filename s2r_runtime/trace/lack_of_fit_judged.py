@@ -120,10 +120,11 @@ def judge(left: Left, token: str, x: Array) -> Judged:
 def _beyond_wandering(left: Left, token: str, z: Array, whiten: Whitener, colour: Colour) -> float:
     """Nats of terms that leave z, (n, nx), under the law of what they leave, if that wanders; infinite if nothing does.
 
-    What is slow itself is held against what wanders by its own law: nothing else tells the two apart.
+    What is slow itself is held against what wanders by its own law: nothing else tells the two apart. A line in the spectrum is none that
+    wanders.
     """
     joined = left.given.steps.joined
-    if left.law is None:
+    if left.law is None or token == "wave":
         return np.inf
     law = noises.wandering(z, joined, colour) or colour
     reached = noises.log_likelihood(z, whiten, law, joined)
