@@ -5,6 +5,8 @@ With a = exp(-dt/T):  s_{k+1} = u_k + (s_k - u_k) a,   u_act = u_k + (s_k - u_k)
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from s2r_runtime.effects.input_effect import Array, InputEffect, Values, columns, replaced
@@ -55,9 +57,11 @@ class InputLag(InputEffect):
 
 def _factors(time_constant: float, dt: float | Array) -> tuple[float | Array, float | Array]:
     """What is left of a difference at the end of the step, and on average over it; (T,) each for steps of dt (T,)."""
-    ratio = dt / max(float(time_constant), 1e-300)
-    if np.min(ratio) > 1e6:
+    if np.min(dt) * 1e-6 > time_constant:
         return 0.0, 0.0
+    ratio = dt / time_constant
+    if not isinstance(ratio, np.ndarray):
+        return math.exp(-ratio), -math.expm1(-ratio) / ratio
     return np.exp(-ratio), -np.expm1(-ratio) / ratio
 
 
