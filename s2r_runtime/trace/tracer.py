@@ -172,7 +172,7 @@ def _result(
     floor = noise_floor(chosen.fit, judged_on, seed)
     forgets = replace(chosen.fit, colour=no_colour(len(model.states)))  # a law with a memory may have taken up all that the model lacks
     alone = floor if chosen.fit.added else noise_floor(forgets, judged_on, seed)
-    verdict = verdict_of(chosen, structure, checked.faults, after, judged_on, alone[1])
+    verdict = verdict_of(chosen, structure, checked.faults, (before, after), judged_on, (floor[1], alone[1]))
     if verdict == "unexplained" and not {*structure.tokens} - {"noise"}:  # what was named foretells nothing: what else it looks like
         structure = replace(structure, tokens=structure.likeliest or structure.tokens)
     final = final_fit(chosen, verdict)

@@ -3,7 +3,8 @@
 sensor_fault   nothing is missing, but measurements are wrong in places
 none           nothing beyond noise
 unexplained    structure is left that no effect accounts for: nothing was found; or what was found leaves a large part, or has the
-               wrong shape for what it acts on; or the model (with it) foretells the held-out data no better than `stays where it is`
+               wrong shape for what it acts on; or the model (with it) foretells the held-out data no better than `stays where it is`;
+               or what is left looks like noise, step by step, and takes rollouts much farther than noise does
 ambiguous      rivals explain as much
 traced         otherwise
 """
@@ -80,12 +81,24 @@ def _once(given: Problem, model: ComposedModel, less: ComposedModel) -> bool:
     return bool(np.max(done) > MOSTLY * np.sum(done))
 
 
-def verdict_of(chosen: Selection, structure: Structure, faults: tuple[Fault, ...], after: Judged, given: Held, floor: Array) -> Verdict:
-    """One of the five. after: of what was chosen, on what was held out; floor: of its rollouts, by noise alone."""
+def verdict_of(
+    chosen: Selection,
+    structure: Structure,
+    faults: tuple[Fault, ...],
+    judged: tuple[Judged, Judged],
+    given: Held,
+    floors: tuple[Array, Array],
+) -> Verdict:
+    """One of the five. judged: the nominal model and what was chosen, on what was held out; floors: of rollouts, by noise alone under its own
+    law, and by noise that remembers nothing.
+    """
+    before, after = judged
+    away = structure.tokens == ("noise",) and goes_astray(chosen.fit.model, before, after, floors[0])
     faulty = any(fault.kind != "dropout" for fault in faults)
     if not chosen.fit.added:
-        return "unexplained" if structure.matters or foretells_nothing(after, given, floor) else "sensor_fault" if faulty else "none"
-    if not foretells(after, given) or _withdrawn(chosen.fit, structure):
+        nothing = away or foretells_nothing(after, given, floors[1])
+        return "unexplained" if structure.matters or nothing else "sensor_fault" if faulty else "none"
+    if away or not foretells(after, given) or _withdrawn(chosen.fit, structure):
         return "unexplained"
     return "ambiguous" if chosen.rivals else "traced"
 
@@ -107,6 +120,19 @@ def foretells(judged: Judged, given: Held) -> bool:
     share = _off(judged, given)
     share = share[~np.isnan(share)]
     return not len(share) or bool(np.any(share < FORETELLS) and np.all(share < NEARER))
+
+
+def goes_astray(model: ComposedModel, before: Judged, after: Judged, floor: Array) -> bool:
+    """Whether rollouts end far beyond what noise alone makes of them, in a state that goes on from where it was, and a large part of
+    what they were off before is left. What wanders slowly enough (a road's grade, a sensor that drifts, another clock) is a step's noise;
+    noise of a measurement, however coloured, does not add up. floor: (nx,).
+    """
+    if not len(after.ends):
+        return False
+    goes_on = np.array([state not in getattr(model.nominal, "reached", {}) for state in model.states])
+    was, left = (np.maximum(rms(judged.ends) ** 2 - floor**2, 0.0) for judged in (before, after))
+    far = rms(after.ends) > NOISIER * floor
+    return bool(np.any(goes_on & far & (left > LARGE * was)))
 
 
 def foretells_nothing(judged: Judged, given: Held, floor: Array) -> bool:
