@@ -24,8 +24,8 @@ Array = NDArray[np.float64]
 BLOCKS = 8
 """Of the cross-validation."""
 
-SLOWLY = ("constant", "time")
-"""Dictionaries of what is slow."""
+SLOWLY, LINES = ("constant", "time"), ("wave",)
+"""Dictionaries of what is slow, and of lines in the spectrum."""
 
 LEADING = 48
 """Columns of a dictionary that are judged at most."""
@@ -124,7 +124,7 @@ def _beyond_wandering(left: Left, token: str, z: Array, whiten: Whitener, colour
     wanders.
     """
     joined = left.given.steps.joined
-    if left.law is None or token == "wave":
+    if left.law is None or token in LINES:
         return np.inf
     law = noises.wandering(z, joined, colour) or colour
     reached = noises.log_likelihood(z, whiten, law, joined)

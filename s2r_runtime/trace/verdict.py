@@ -47,6 +47,9 @@ ASKED = 0.1
 FORETELLS, NEARER = 0.7, 0.95
 """A model whose rollouts end farther off than these shares of the way that the robot went foretells nothing worth a name."""
 
+MANY = 0.9
+"""Share of the rollouts that must go far for that to be no matter of outliers."""
+
 NOISIER = 3.0
 """Times what noise alone makes of the ends of rollouts from which on it is not noise that takes them there; it may be coloured."""
 
@@ -89,8 +92,8 @@ def verdict_of(
     given: Held,
     floors: tuple[Array, Array],
 ) -> Verdict:
-    """One of the five. judged: the nominal model and what was chosen, on what was held out; floors: of rollouts, by noise alone under its own
-    law, and by noise that remembers nothing.
+    """One of the five. judged: the nominal model and what was chosen, on what was held out; floors: of rollouts, by noise alone under its
+    own law, and by noise that remembers nothing.
     """
     before, after = judged
     away = structure.tokens == ("noise",) and goes_astray(chosen.fit.model, before, after, floors[0])
@@ -130,8 +133,9 @@ def goes_astray(model: ComposedModel, before: Judged, after: Judged, floor: Arra
     if not len(after.ends):
         return False
     goes_on = np.array([state not in getattr(model.nominal, "reached", {}) for state in model.states])
-    was, left = (np.maximum(rms(judged.ends) ** 2 - floor**2, 0.0) for judged in (before, after))
-    far = rms(after.ends) > NOISIER * floor
+    ends_before, ends = (rms(np.sort(np.abs(judged.ends), axis=0)[: max(1, round(MANY * len(judged.ends)))]) for judged in (before, after))
+    was, left = (np.maximum(e**2 - floor**2, 0.0) for e in (ends_before, ends))
+    far = ends > NOISIER * floor
     return bool(np.any(goes_on & far & (left > LARGE * was)))
 
 
