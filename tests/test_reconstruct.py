@@ -92,7 +92,7 @@ def test_states_that_follow_are_reconstructed(tmp_path, name):
 
 def test_steps_that_share_a_filter_are_not_fitted_as_if_they_were_independent(tmp_path):
     model, _, path = _driven(tmp_path / "run.csv", "joint", 3, dt=0.002, steps=6000)
-    data = load_dataset(path, model)
+    data = load_dataset(path, model, bandwidth=20.0)
     longer, thin, _ = thinned(model, data)
     assert longer.dt == pytest.approx(0.5 / data.reconstruction.bandwidth, rel=0.3)
     assert thin.dt == longer.dt

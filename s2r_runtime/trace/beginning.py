@@ -52,10 +52,14 @@ def with_history(model: ComposedModel, data: Dataset) -> Dataset:
 
 
 def _usual(model: ComposedModel, data: Dataset) -> Array:
-    """(nx,) usual size of a residual, which tells how much an error of the first steps weighs."""
+    """(nx,) usual size of a residual, which tells how much an error of the first steps weighs. A speed that was not measured tells nothing:
+    it was made with the inputs.
+    """
     act = acting(model, data)
     steps = steps_of(data)
-    return np.median(np.abs(residual(model, steps, act)), axis=0) / 0.6745 + 1e-12 if len(steps) else np.ones(len(model.states))
+    size = np.median(np.abs(residual(model, steps, act)), axis=0) / 0.6745 + 1e-12 if len(steps) else np.ones(len(model.states))
+    size[[v for _, v in data.axes_without_speed]] = np.inf
+    return size
 
 
 def _under_way(model: ComposedModel, data: Dataset, run: Run, steps: int, usual: Array) -> bool:

@@ -20,7 +20,8 @@ from typing import cast
 import numpy as np
 
 from s2r_runtime.hookspecs import Effect
-from s2r_runtime.models.composed import AppliedEffect, ComposedModel
+from s2r_runtime.models.composed import AppliedEffect
+from s2r_runtime.trace.begun import begun, measured
 from s2r_runtime.trace.candidates import Candidate
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, without
 from s2r_runtime.trace.residual import acting, covered, first_steps, rms, rollout, rollout_starts
@@ -96,7 +97,7 @@ def _challenge(given: Problem, fit: Fit, channel: str, horizon: int) -> Better |
     for shape in _fits(given, base, channel, REACHES * here, _times(fit, channel)):
         ahead = gain(shape, base) - here
         needed = max(_price(given, shape, fit), 0.0) + math.log(len(SHAPES) / ALPHA)
-        if ahead > max(needed, MORE * here) and _lower(given, fit.model, shape.model, horizon):
+        if ahead > max(needed, MORE * here) and _lower(given, fit, shape, horizon):
             return Better(_token(shape), gain(shape, base) - _price(given, shape, base))
     return None
 
@@ -148,15 +149,17 @@ def _token(fit: Fit) -> str:
     return f"memory({last.channel})" if memory else last.channel
 
 
-def _lower(given: Problem, named: ComposedModel, shape: ComposedModel, horizon: int) -> bool:
+def _lower(given: Problem, named: Fit, shape: Fit, horizon: int) -> bool:
     """Whether some rollout's error is lower under the shape, where nothing was left out."""
     _, there = covered(given.steps, int(first_steps(given.data)[-1]))
+    pair = [(fit.model, acting(fit.model, given.data), begun(given, fit)) for fit in (named, shape)]
     for ahead in sorted({1, max(1, horizon // 4), horizon}):
         starts = rollout_starts(given.data, ahead, within=there)
         starts = starts[:: max(1, len(starts) // STARTS)]
         if len(starts) < 10:
             continue
-        before, after = (rms(rollout(m, given.data, acting(m, given.data), starts, ahead).error) for m in (named, shape))
+        errors = [rollout(m, given.data, act, starts, ahead, begun=begin).error for m, act, begin in pair]
+        before, after = (rms(measured(given.data, e)) for e in errors)
         if np.any(before > (1.0 + LOWER) * after):
             return True
     return False

@@ -72,6 +72,9 @@ MOST_PARTS = 2
 as much more and ask of a measured robot what no model of it holds.
 """
 
+LONG_S = 0.04
+"""Steps longer than this are taken in parts where speeds were not measured: a position says when within a step a force acted."""
+
 BEFORE = 600
 """Steps before the first state for which inputs are kept at most: hidden states have settled then."""
 
@@ -145,6 +148,12 @@ class Dataset:
     def uneven(self) -> bool:
         """Whether steps do not all last dt."""
         return any(run.lasts is not None for run in self.runs)
+
+    @cached_property
+    def axes_without_speed(self) -> tuple[tuple[int, int], ...]:
+        """Columns (position, speed) of axes whose speed is no measurement (`reconstruct`)."""
+        pairs = self.reconstruction.axes if self.reconstruction else ()
+        return tuple((self.states.index(p), self.states.index(v)) for p, v in pairs)
 
     @cached_property
     def in_order(self) -> bool:
@@ -247,7 +256,8 @@ def regridded(data: Dataset, model: ComposedModel, in_parts: int = 0) -> Dataset
 def thinned(model: ComposedModel, data: Dataset, test: Dataset | None = None) -> tuple[ComposedModel, Dataset, Dataset | None]:
     """The same on the shortest steps that are independent of each other in both: unchanged, if they are."""
     apart = max(data.apart, test.apart if test else 1)
-    if apart == 1 and (data.reconstruction is None or data.interval * MOST_PARTS > data.dt):
+    whole = data.reconstruction is None or data.interval * MOST_PARTS > data.dt
+    if apart == 1 and whole and not (data.reconstruction and data.reconstruction.axes and data.dt > LONG_S):
         return model, data, test
     longer, parts = at_step(model, apart * model.dt), MOST_PARTS
     return longer, regridded(data, longer, parts), regridded(test, longer, parts) if test else None

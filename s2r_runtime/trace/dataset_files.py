@@ -18,7 +18,7 @@ from s2r_runtime.messages import CampaignFinished, Observed, Send, StartCampaign
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.robot_logs import content_digest, is_robot_log, read_robot_log
 from s2r_runtime.trace.dataset import Array, Dataset, Stream, columns_of, from_streams
-from s2r_runtime.trace.reconstruct import reconstruct
+from s2r_runtime.trace.reconstruct import late_speeds, reconstruct
 from s2r_runtime.trace.unseen import unneeded, without
 
 MCAP_MAGIC = b"\x89MCAP"
@@ -52,11 +52,17 @@ def load_dataset(
         segments, missing, content = _robot_segments(paths[0], model, transport)
     else:
         segments, missing, content = _table_segments(paths[0], model, columns or {})
+    behind = {} if bandwidth else late_speeds(model, segments, missing)
+    if behind:
+        names = [s for s in model.states if s not in missing]
+        kept = [j for j, s in enumerate(names) if s not in behind]
+        segments = [(Stream(states.t, states.values[:, kept]), inputs) for states, inputs in segments]
+        missing = tuple(s for s in model.states if s in {*missing, *behind})
     spare = () if bandwidth else unneeded(model, missing)  # who gives a bandwidth wants to see them
     model, missing = without(model, spare), tuple(s for s in missing if s not in spare)
     if not missing:
         return from_streams(model, segments, source, (*digests, content), paths)
-    segments, done = reconstruct(model, segments, missing, source, bandwidth)
+    segments, done = reconstruct(model, segments, missing, source, bandwidth, behind)
     return from_streams(model, segments, source, (*digests, content), paths, done)
 
 

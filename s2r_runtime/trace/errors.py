@@ -17,12 +17,13 @@ from s2r_runtime.bounds import scenario_confidence
 from s2r_runtime.errors import S2RError
 from s2r_runtime.gap import Transitions, discrepancy, hold_residuals, residuals
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace.begun import begun, measured
 from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.fitting import Fit
+from s2r_runtime.trace.fitting import Fit, evaluate, gain, problem
 from s2r_runtime.trace.holdout import FEWEST_RUNS
 from s2r_runtime.trace.inverse import Inverse, input_relative, inverse
 from s2r_runtime.trace.residual import Acting, Steps, acting, advanced, residual, rms, rollout, rollout_starts, state_jacobian
-from s2r_runtime.trace.residual_noise import Past
+from s2r_runtime.trace.residual_noise import Noise, Past
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -43,6 +44,9 @@ SETTLE = 600
 
 FEWER = 4
 """Of the simulated rollouts, every so many where noise has a law of its own: a step of it costs more."""
+
+SURELY = 4.0
+"""Nats of likelihood on data that neither of two models was fitted to: odds of 50 to 1."""
 
 MANY = 20_000_000
 """Model steps in rollouts from which on not every row is started from, but as many as that allows, evenly."""
@@ -93,19 +97,34 @@ def judge(model: ComposedModel, given: Held) -> Judged:
     act = acting(model, given.data)
     starts = _starts(given)
     inverted = None if given.inverse is None else input_relative(model, given.inverse)
-    return Judged(residual(model, given.steps, act), rollout(model, given.data, act, starts, given.horizon).error, inverted)
+    ends = rollout(model, given.data, act, starts, given.horizon, begun=_begun(given, model)).error
+    return Judged(residual(model, given.steps, act), ends, inverted)
 
 
 def better(given: Held, model: ComposedModel, other: ComposedModel, share: float) -> bool:
-    """Whether some error of `model`, at one step, a quarter of the horizon or all of it, is lower by that share than the other's."""
-    first, second = acting(model, given.data), acting(other, given.data)
+    """Whether some error of `model`, at one step, a quarter of the horizon or all of it, is lower by that share than the other's; where
+    speeds were not measured, also if what was measured is clearly likelier under it.
+    """
+    if given.data.axes_without_speed and len(given.steps):
+        here = problem(given.data, given.steps)
+        if gain(evaluate(here, model), evaluate(here, other)) > SURELY:
+            return True
+    pair = [(m, acting(m, given.data), _begun(given, m)) for m in (model, other)]
     for ahead in sorted({1, max(1, given.horizon // 4), given.horizon}):
         starts = rollout_starts(given.data, ahead, given.left_out, given.within)
         starts = starts[:: max(1, len(starts) // FLOOR_STARTS)]
-        errors = [rms(rollout(m, given.data, act, starts, ahead).error) for m, act in ((model, first), (other, second))]
+        errors = [rms(measured(given.data, rollout(m, given.data, act, starts, ahead, begun=begin).error)) for m, act, begin in pair]
         if len(starts) and np.any(errors[1] > (1.0 + share) * errors[0]):
             return True
     return False
+
+
+def _begun(given: Held, model: ComposedModel) -> Array | None:
+    """Where rollouts begin, under the noise that the model leaves there (`begun`)."""
+    if not given.data.axes_without_speed or not len(given.steps):
+        return None
+    here = problem(given.data, given.steps)
+    return begun(here, evaluate(here, model))
 
 
 def displacement(given: Held) -> Array:
@@ -129,6 +148,7 @@ def noise_floor(fit: Fit, given: Held, seed: int) -> tuple[Array, Array]:
     """
     model, noise = fit.model, fit.noise
     act = acting(model, given.data)
+    noise = _as_seen(noise, given.data)
     one = noise.one_step(state_jacobian(model, given.steps, act))
     starts = _starts(given)
     starts = starts[:: max(1, len(starts) // FLOOR_STARTS)]
@@ -138,7 +158,7 @@ def noise_floor(fit: Fit, given: Held, seed: int) -> tuple[Array, Array]:
     begin = np.cumsum([0] + [len(run.y) - 1 for run in given.data.runs])
     rows = starts + np.searchsorted(begin, starts, side="right") - 1
     clean = np.concatenate([run.y for run in given.data.runs])[rows]
-    if np.any(fit.colour.strength > COLOURED) or fit.colour.slow.size:
+    if not given.data.axes_without_speed and (np.any(fit.colour.strength > COLOURED) or fit.colour.slow.size):
         ends = _coloured_ends(fit, given, act, starts[::FEWER], clean[::FEWER], rng)
         if ends is not None:
             return one, rms(ends)
@@ -172,6 +192,14 @@ def _coloured_ends(fit: Fit, given: Held, act: Acting, starts: Index, y: Array, 
         e = late
     ends = model.difference(y, x)
     return ends if law.settled else None
+
+
+def _as_seen(noise: Noise, data: Dataset) -> Noise:
+    """With the errors of speeds that were not measured, instead of the bounds for them."""
+    r = noise.r.copy()
+    for (_, v), error in zip(data.axes_without_speed, data.reconstruction.errors if data.reconstruction else (), strict=False):
+        r[v] = error**2
+    return replace(noise, r=r)
 
 
 def gaps(

@@ -23,6 +23,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset, Pause
 from s2r_runtime.trace.frozen import frozen
 from s2r_runtime.trace.heading import departures
+from s2r_runtime.trace.holes import bridged
 from s2r_runtime.trace.jumps import WILD_SIGMAS, jumps_of, tails_of
 from s2r_runtime.trace.reach import Fault, Reach, predicted, reach_of
 from s2r_runtime.trace.residual import Acting, acting
@@ -92,7 +93,7 @@ def check(model: ComposedModel, data: Dataset) -> Checked:
     if many:  # two of them in a row look like a jump
         found = [f for f in found if f.kind != "offset_jump"]
     faults_ = tuple(sorted([*found, *([] if many else spikes)], key=lambda f: (f.from_s, f.channel)))
-    return Checked(replace(data, runs=runs), faults_, tuple(sorted(set(left_out))), outliers + (len(spikes) if many else 0))
+    return Checked(bridged(replace(data, runs=runs)), faults_, tuple(sorted(set(left_out))), outliers + (len(spikes) if many else 0))
 
 
 def _of_pause(model: ComposedModel, data: Dataset, act: Acting, pause: Pause, reach: Reach) -> Fault | None:

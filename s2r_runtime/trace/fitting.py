@@ -22,6 +22,7 @@ from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.residual import Steps, acting, predicted, residual, state_jacobian
 from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
 from s2r_runtime.trace.slots import Added, Free, Slot, bounds_of, free_of, inside, values_of, with_values
+from s2r_runtime.trace.speed_noise import BEYOND
 
 Array = NDArray[np.float64]
 
@@ -92,7 +93,11 @@ def problem(data: Dataset, steps: Steps) -> Problem:
     """Of these transitions."""
     moved = np.std(steps.y1 - steps.y0, axis=0) + 1e-9 * np.std(steps.y0, axis=0) + 1e-12
     rounding = np.array([noises.quantum(*columns) for columns in zip(steps.y0.T, steps.y1.T, strict=True)]) ** 2 / 12.0
-    return Problem(data, steps, Noise((EXACT * moved) ** 2, np.maximum((EXACT * moved) ** 2, rounding)))
+    least = np.maximum((EXACT * moved) ** 2, rounding)
+    pairs = data.axes_without_speed
+    for _, v in pairs:
+        least[v] = (BEYOND * max(float(np.sqrt(np.mean(steps.y0[:, v] ** 2))), 1e-12)) ** 2 if len(steps) else 1.0
+    return Problem(data, steps, Noise((EXACT * moved) ** 2, least, pairs))
 
 
 def evaluate(given: Problem, model: ComposedModel, near: Noise | None = None) -> Fit:
@@ -107,6 +112,15 @@ def evaluate(given: Problem, model: ComposedModel, near: Noise | None = None) ->
     white = float(np.sum(noises.log_density(z))) - whiten.logdet
     coloured = noises.log_likelihood(z, whiten, colour, given.steps.joined)
     return Fit(model, free_of(model), level, colour, whiten, z, white, coloured)
+
+
+def under_noise(given: Problem, model: ComposedModel, level: Noise) -> Fit:
+    """The model under a noise that is not its own."""
+    act = acting(model, given.data)
+    whiten = Whitener(level, state_jacobian(model, given.steps, act), given.steps.joined)
+    z = whiten(residual(model, given.steps, act))
+    told = float(np.sum(noises.log_density(z))) - whiten.logdet
+    return Fit(model, free_of(model), level, noises.no_colour(z.shape[1]), whiten, z, told, told)
 
 
 def objective(given: Problem, fit: Fit, model: ComposedModel) -> Array:
@@ -238,6 +252,23 @@ def settled(given: Problem, fit: Fit) -> Fit:
         return fit
     again = evaluate(given, refine(given, replace(fit, colour=law), fit.model), fit.noise)
     return replace(again, colour=noises.wandering(again.z, given.steps.joined, again.colour) or again.colour)
+
+
+def plainly(given: Problem, fit: Fit) -> Fit:
+    """The same model with parameters under white noise, where speeds were not measured; else as it is.
+
+    There Q has the colour of noise already, and what is left is mostly what every model lacks of a robot at high frequencies (actuators,
+    bending). Taken for colour, it would make parameters follow those frequencies, where they matter least.
+    """
+    if not given.floor.axes:
+        return fit
+    best = fit
+    for _ in range(ROUNDS):
+        model = refine(given, replace(best, colour=noises.no_colour(best.z.shape[1])), best.model)
+        before, best = best, evaluate(given, model, best.noise)
+        if best.white - before.white < SETTLED:
+            break
+    return best
 
 
 def insert(model: ComposedModel, effect: AppliedEffect, place: int) -> ComposedModel:

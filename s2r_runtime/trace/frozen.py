@@ -48,7 +48,7 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
     found = []
     for j, name in enumerate(model.states):
         change = np.abs(np.diff(run.y[:, j]))
-        if not np.any(change > 0.0):
+        if not np.isfinite(reach.noise[j]) or not np.any(change > 0.0):
             continue
         quantum = float(np.min(change[change > 0.0]))
         least = SIGMAS * reach.noise[j] + QUANTA * quantum

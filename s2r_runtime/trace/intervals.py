@@ -7,6 +7,8 @@ likelihood, the other parameters refitted, has fallen by 1.92 times the square o
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +27,8 @@ def intervals(given: Problem, fit: Fit) -> dict[Slot, tuple[float, float]]:
     """(low, high) of every number that was fitted. Where the data say nothing of a parameter: its bounds."""
     if not fit.free:
         return {}
+    if given.floor.axes:  # as `plainly` fits
+        fit = replace(fit, colour=noises.no_colour(fit.z.shape[1]))
     z = objective(given, fit, fit.model)
     j = sensitivities(given, fit, fit.model, fit.free)
     w = noises.weight(z).ravel()

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.begun import begun, measured
 from s2r_runtime.trace.episodes import episodes, may_depend_on
 from s2r_runtime.trace.evidence import evidence, margin
 from s2r_runtime.trace.fitting import Fit, Problem
@@ -29,6 +30,7 @@ from s2r_runtime.trace.fitting import gain as explained
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, SLOWLY, Judged, Left, first_look, judge, leading
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
 from s2r_runtime.trace.residual import acting, covered, residual, rms, rollout, rollout_starts, state_jacobian
+from s2r_runtime.trace.residual_noise import Whitener
 
 Array = NDArray[np.float64]
 
@@ -277,14 +279,27 @@ def _rollouts(left: Left, other: Fit, judged: Judged, horizon: int) -> Iterator[
     data, steps, model = left.given.data, left.given.steps, left.fit.model
     act, act_other = acting(model, data), acting(other.model, data)
     last, there = covered(steps, len(act.mean))
-    extra = np.einsum("kim,km->ki", judged.x, judged.betas[left.block])[last]
+    more = np.einsum("kim,km->ki", judged.x, judged.betas[left.block])
+    extra = more[last]
+    begins = _begins(left, other, more)
     for ahead in sorted({1, max(1, horizon // 4), horizon}):
         starts = rollout_starts(data, ahead, within=there)
         starts = starts[:: max(1, len(starts) // 1200)]
         if len(starts) < 10:
             continue
         yield (
-            rms(rollout(other.model, data, act_other, starts, ahead).error),
-            rms(rollout(model, data, act, starts, ahead).error),
-            rms(rollout(model, data, act, starts, ahead, extra).error),
+            rms(measured(data, rollout(other.model, data, act_other, starts, ahead, begun=begins[0]).error)),
+            rms(measured(data, rollout(model, data, act, starts, ahead, begun=begins[1]).error)),
+            rms(measured(data, rollout(model, data, act, starts, ahead, extra, begins[2]).error)),
         )
+
+
+def _begins(left: Left, other: Fit, more: Array) -> tuple[Array | None, Array | None, Array | None]:
+    """Where rollouts begin: of another model, of the one that leaves this, and of that with the structure, each under its own noise."""
+    given, fit = left.given, left.fit
+    if not given.floor.axes:
+        return None, None, None
+    level = noises.estimate(left.r - more, left.f, given.steps.joined, given.floor, fit.noise)
+    whiten = Whitener(level, left.f, given.steps.joined)
+    better = replace(fit, noise=level, whiten=whiten, z=whiten(left.r - more))
+    return begun(given, other), begun(given, fit), begun(given, better)

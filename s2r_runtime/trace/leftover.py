@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.hookspecs import Effect
-from s2r_runtime.trace.fitting import Fit, Problem
-from s2r_runtime.trace.residual import Acting, acting, advanced
+from s2r_runtime.models.composed import AppliedEffect
+from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.fitting import Fit, Problem, insert
+from s2r_runtime.trace.residual import Acting, acting, advanced, predicted
 
 Array = NDArray[np.float64]
 
@@ -31,8 +34,35 @@ class Leftover:
         model, steps = self.fit.model, self.given.steps
         if not hasattr(effect, "starts_from_residual") or channel not in {*model.inputs, "*"}:  # a state has no input that pushes
             return []
-        pushes = self.fit.whiten(self._pushes(channel, proportional=bool(getattr(effect, "proportional", False))))
-        return list(effect.starts_from_residual(self.fit.z, steps.t, pushes, model.nominal, channel, model.dt))
+        pushes = self._pushes(channel, proportional=bool(getattr(effect, "proportional", False)))
+        if (
+            self.given.floor.axes
+        ):  # whitened, a push is felt for long after: its score at every step is p' S^-1 r, and its size is told apart
+            pulled = self.fit.whiten.back(self.fit.z * noises.weight(self.fit.z))
+            found = effect.starts_from_residual(pulled, steps.t, pushes, model.nominal, channel, model.dt)
+            return [self._sized(effect, channel, p) for p in found]
+        return list(effect.starts_from_residual(self.fit.z, steps.t, self.fit.whiten(pushes), model.nominal, channel, model.dt))
+
+    def _sized(self, effect: Effect, channel: str, p: dict[str, Any]) -> dict[str, Any]:
+        """The same as large as it explains most: by least squares of what it changes, a sine's phase being free."""
+        turned = [{**p, "phase": float(p["phase"]) + shift} for shift in (0.0, 0.5 * math.pi)] if "phase" in p else [p]
+        columns = np.stack([self._changed(effect, channel, q).ravel() for q in turned], axis=1)
+        size = np.linalg.lstsq(columns, self.fit.z.ravel(), rcond=None)[0]
+        sized = dict(p)
+        if "phase" in p:
+            sized["phase"] = math.remainder(float(p["phase"]) + math.atan2(float(size[1]), float(size[0])), math.tau)
+        for bounds in effect.parameters:
+            if bounds.neutral is not None and isinstance(p.get(bounds.name), float):
+                share = float(np.hypot(*size)) if "phase" in p else float(size[0])
+                sized[bounds.name] = float(np.clip(bounds.neutral + share * (p[bounds.name] - bounds.neutral), bounds.low, bounds.high))
+        return sized
+
+    def _changed(self, effect: Effect, channel: str, p: dict[str, Any]) -> Array:
+        """(n, nx), whitened: what the effect changes in the prediction."""
+        model, steps = self.fit.model, self.given.steps
+        other = insert(model, AppliedEffect(effect, channel, p), len(model.effects))
+        here, there = (predicted(m, steps, act) for m, act in ((model, self._act), (other, acting(other, self.given.data))))
+        return self.fit.whiten(there - here)
 
     def _pushes(self, channel: str, *, proportional: bool) -> Array:
         """(n, nx): by how much a unit more of the input, or the input's own value more, moves the state over each step."""

@@ -60,6 +60,7 @@ def reach_of(model: ComposedModel, data: Dataset, act: Acting) -> Reach:
     residuals, move = np.concatenate(e), np.concatenate(moves)
     good = np.flatnonzero(np.isfinite(residuals).all(axis=1))
     instant = np.array([s in getattr(model.nominal, "reached", {}) for s in model.states])
+    unseen = [v for _, v in data.axes_without_speed]
     if not len(good):
         one = np.ones(len(model.states))
         return Reach(one, one, one, instant)
@@ -68,7 +69,9 @@ def reach_of(model: ComposedModel, data: Dataset, act: Acting) -> Reach:
     y = [run.y[np.isfinite(run.y).all(axis=1)] for run in data.runs]
     starts, ends = np.concatenate([rows[:-1] for rows in y]), np.concatenate([rows[1:] for rows in y])
     rounded = [quantum(starts[:, j], ends[:, j]) for j in range(len(model.states))]
-    return Reach(np.maximum(noise, ROUNDING * np.array(rounded) + 1e-12), largest, _tail(residuals), instant)
+    noise = np.maximum(noise, ROUNDING * np.array(rounded) + 1e-12)
+    noise[unseen] = np.inf  # what was not measured has no fault
+    return Reach(noise, largest, _tail(residuals), instant)
 
 
 def _tail(residuals: Array) -> Array:

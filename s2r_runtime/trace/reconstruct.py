@@ -10,8 +10,8 @@ measurement of its own would be as many times too sure. So what is fitted are st
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import msgspec
@@ -21,13 +21,34 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.hookspecs import Follows
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.models.forces import axes
 from s2r_runtime.trace import differentiation
-from s2r_runtime.trace.streams import Stream, complete, held_means, unwrapped
+from s2r_runtime.trace.late_speeds import late
+from s2r_runtime.trace.speeds import Smoothed, smoothed
+from s2r_runtime.trace.streams import Stream, complete, fresh, held_between, held_means, unwrapped
 
 Array = NDArray[np.float64]
 
 APART = 2.5
 """Usual intervals between rows from which on nothing is interpolated."""
+
+FEWEST = 8
+"""Rows of a segment from which a speed is told."""
+
+MANY_STEPS = 1500
+"""Steps that are enough, if longer ones show the motion as well: shorter ones show how the force went on, which is no new measurement."""
+
+LOOKED_AT = 6000
+"""Rows on which it is told whether a speed is late."""
+
+SHORT_S = 0.02
+"""Longest of such steps: actuators answer late, or lag, by some tens of milliseconds, which longer ones would blur."""
+
+INSIDE = 0.4
+"""Bandwidth over the rate of steps: what is sampled there is not mistaken for something slower."""
+
+FINER = 0.6
+"""Of a step: rows that come more often than this are filtered, so that those between the steps say something, too."""
 
 SNAPPED = 0.01
 """A usual interval this near to a whole fraction of the model's step is that fraction: stamps are printed with a few digits."""
@@ -43,15 +64,33 @@ class Reconstruction:
     bandwidth: float
     interval: float
     needed: float
+    axes: tuple[tuple[str, str], ...] = ()
+    """(position, speed) of axes whose speed is where a residual is looked at, and not a measurement: nothing was filtered."""
+    errors: tuple[float, ...] = ()
+    """Standard deviations of these speeds."""
+    apart: int = 1
+    """Of the model's steps, where nothing was filtered that would make neighbours alike."""
+    late: dict[str, float] = field(default_factory=dict)
+    """s by which speeds were late that the recording has (`late_speeds`)."""
 
     def to_json(self) -> dict[str, object]:
         """docs/json.md's `reconstructed`."""
-        return {"states": list(self.states), "bandwidth_hz": self.bandwidth}
+        told: dict[str, object] = {"states": list(self.states), "bandwidth_hz": self.bandwidth}
+        return told | ({"late_s": self.late} if self.late else {})
 
     def text(self) -> list[str]:
         """For a person."""
         who = ", ".join(self.states)
         were = "was" if len(self.states) == 1 else "were"
+        if self.axes:
+            of = ", ".join(position for position, _ in self.axes)
+            told = [f"{speed} comes {s:.2g} s late, as from a filter, and is not used: {of} tells it" for speed, s in self.late.items()]
+            if len(told) == len(self.states):
+                return told
+            return [
+                *told,
+                f"{who} {were} not measured: what is left over is judged on {of} alone (speeds seen up to {self.bandwidth:g} Hz)",
+            ]
         return [
             f"{who} {were} not measured but reconstructed within {self.bandwidth:g} Hz (--bandwidth HZ)",
             f"all states and inputs were low-passed alike at {self.bandwidth:g} Hz, without delay",
@@ -59,13 +98,22 @@ class Reconstruction:
 
 
 def reconstruct(
-    model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], missing: Sequence[str], source: str, bandwidth: float | None = None
+    model: ComposedModel,
+    segments: Sequence[tuple[Stream, Stream]],
+    missing: Sequence[str],
+    source: str,
+    bandwidth: float | None = None,
+    behind: Mapping[str, float] | None = None,
 ) -> tuple[list[tuple[Stream, Stream]], Reconstruction]:
     """Segments of (measured states in the model's order without the missing ones, inputs), filtered, with all states. bandwidth: Hz; None:
-    what the data bear. Raises RecordingError if a missing state does not follow, or if the rows are too few.
+    what the data bear. behind: speeds that were left out as they are late. Raises RecordingError if a missing state does not follow, or
+    if the rows are too few.
     """
     _check_follows(model, missing, source)
     measured = [name for name in model.states if name not in missing]
+    if bandwidth is None and (pairs := _axes_without_speed(model, missing)):
+        given, done = _with_speeds(model, segments, pairs, source)
+        return given, replace(done, late=dict(behind or {}))
     angles = [measured.index(name) for name in model.nominal.angles if name in measured]
     given = [(complete(states), inputs) for states, inputs in segments]
     intervals = [np.diff(states.t) for states, _ in given if len(states.t) > 1]
@@ -91,9 +139,101 @@ def reconstruct(
     return made, Reconstruction(tuple(missing), band, interval, min(band, differentiation.bandwidth(rows, interval, rows=0)))
 
 
+def late_speeds(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], missing: Sequence[str]) -> dict[str, float]:
+    """Speeds of axes that come late against their positions (`late_speeds.late`), in the longest segment; s."""
+    names = [name for name in model.states if name not in missing]
+    found = ((model.states[axis.position], model.states[axis.velocity]) for axis in axes(model.nominal))
+    pairs = tuple((p, v) for p, v in found if p in names and v in names and v in getattr(model.nominal, "follows", {}))
+    if not pairs or not segments:
+        return {}
+    states, inputs = max(segments, key=lambda pair: len(pair[0].t))
+    states = complete(fresh(states))
+    if len(states.t) < FEWEST or not len(inputs.t):
+        return {}
+    angles = [names.index(name) for name in model.nominal.angles if name in names]
+    states = Stream(states.t[:LOOKED_AT], unwrapped(states.values[:LOOKED_AT], angles))
+    _, smooth = _speeds(model, states, inputs, names, pairs)
+    by = {v: late(states.t, states.values[:, names.index(v)], one) for (_, v), one in zip(pairs, smooth, strict=True)}
+    return {v: seconds for v, seconds in by.items() if seconds > 0.0}
+
+
 def independent_step(done: Reconstruction, dt: float) -> int:
     """Steps of dt that make one of 1 / 2B or nearly."""
+    if done.axes:
+        return done.apart
     return max(1, round(1.0 / (2.0 * done.bandwidth * dt)))
+
+
+def _axes_without_speed(model: ComposedModel, missing: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """(position, speed) of axes, if all that is missing are speeds of axes."""
+    found = tuple((model.states[axis.position], model.states[axis.velocity]) for axis in axes(model.nominal))
+    pairs = tuple(pair for pair in found if pair[1] in missing and pair[0] not in missing)
+    return pairs if len(pairs) == len(missing) else ()
+
+
+def _with_speeds(
+    model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], pairs: tuple[tuple[str, str], ...], source: str
+) -> tuple[list[tuple[Stream, Stream]], Reconstruction]:
+    """Segments as they were received, with speeds of axes (`speeds`) on the same rows. Where rows come much more often than steps are
+    taken, all passes through one low-pass, so that no row is lost.
+    """
+    missing = tuple(speed for _, speed in pairs)
+    measured = [name for name in model.states if name not in missing]
+    angles = [measured.index(name) for name in model.nominal.angles if name in measured]
+    given = [(complete(fresh(states)), inputs) for states, inputs in segments]
+    given = [(Stream(s.t, unwrapped(s.values, angles)), inputs) for s, inputs in given if len(s.t) >= FEWEST]
+    if not given:
+        raise RecordingError(
+            f"{source}: {', '.join(missing)} cannot be told: fewer than {FEWEST} rows on which {', '.join(measured)} were measured"
+        )
+    interval = snapped(float(np.median(np.concatenate([np.diff(s.t) for s, _ in given]))), model.dt)
+    made, known = [], []
+    for states, inputs in given:
+        whole, found = _speeds(model, states, inputs, measured, pairs)
+        made.append((whole, inputs))
+        known.append(found)
+    errors = tuple(float(np.median([found[j].error for found in known])) for j in range(len(pairs)))
+    band = max(one.bandwidth for found in known for one in found)
+    steps = sum(float(s.t[-1] - s.t[0]) for s, _ in made) / model.dt
+    shown = float(f"{min(band, 0.5 / interval):.2g}")
+    rows = [part.values for s, _ in given for part in _stretches(s, interval) if len(part.t) > 2]
+    needed = min(shown, differentiation.bandwidth(rows, interval, rows=0)) if rows else shown
+    apart = max(1, min(math.ceil(steps / MANY_STEPS), math.floor(INSIDE / (needed * model.dt)), math.floor(SHORT_S / model.dt)))
+    if apart > 1 or interval < FINER * model.dt:
+        made = [both for s, u in made for both in _filtered(s, u, interval, INSIDE / (apart * model.dt))]
+        if not made:
+            raise RecordingError(f"{source}: {', '.join(missing)} cannot be told: no stretch without a gap is long enough")
+    return made, Reconstruction(missing, shown, interval, needed, pairs, errors, apart)
+
+
+def _speeds(
+    model: ComposedModel, states: Stream, inputs: Stream, measured: list[str], pairs: tuple[tuple[str, str], ...]
+) -> tuple[Stream, list[Smoothed]]:
+    """All states on the rows of what was measured."""
+    nominal, h = model.nominal, 1e-3 * model.dt
+    x = np.zeros((len(states.t), len(model.states)))
+    for j, name in enumerate(measured):
+        x[:, model.states.index(name)] = states.values[:, j]
+    u = held_between(inputs, states.t, 1)
+    rates = (nominal.step(x[:-1], u, h, nominal.parameters) - x[:-1]) / h
+    found = []
+    for position, speed in pairs:
+        j = model.states.index(speed)
+        found.append(smoothed(states.t, x[:, model.states.index(position)], rates[:, j]))
+        x[:, j] = found[-1].speed
+    return Stream(states.t, x), found
+
+
+def _filtered(states: Stream, inputs: Stream, interval: float, band: float) -> list[tuple[Stream, Stream]]:
+    """Stretches without a gap and their inputs, low-passed alike."""
+    edge = max(1, round(1.0 / (band * interval)))
+    parts = [_laid(part, interval, []) for part in _stretches(states, interval)]
+    parts = [part for part in parts if len(part.t) >= 2 * edge + 2]
+    if not parts:
+        return []
+    smooth = [Stream(p.t[edge:-edge], differentiation.low_pass(p.values, interval, band)[edge:-edge]) for p in parts]
+    whole = Stream(np.concatenate([p.t for p in smooth]), np.concatenate([p.values for p in smooth]))
+    return [(whole, _inputs(inputs, parts[0].t[0], parts[-1].t[-1], interval, band))]
 
 
 def at_step(model: ComposedModel, dt: float) -> ComposedModel:

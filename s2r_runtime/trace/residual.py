@@ -204,19 +204,30 @@ def covered(steps: Steps, n: int) -> tuple[Index, Mask]:
     return last, here - steps.place[last] <= SKIPPED
 
 
-def rollout(model: ComposedModel, data: Dataset, act: Acting, starts: Index, horizon: int, extra: Array | None = None) -> Rollouts:
-    """Rolls out from every start at once. extra: (M, nx), added to the state after each step (what a lack-of-fit model says)."""
+def rollout(
+    model: ComposedModel,
+    data: Dataset,
+    act: Acting,
+    starts: Index,
+    horizon: int,
+    extra: Array | None = None,
+    begun: Array | None = None,
+    ends: Array | None = None,
+) -> Rollouts:
+    """Rolls out from every start at once. extra: (M, nx), added to the state after each step (what a lack-of-fit model says). begun, ends:
+    states (rows of the runs laid end to end, nx) from which to begin, and where it should lead; None: as measured.
+    """
     begin = first_steps(data)
     run = np.searchsorted(begin, starts, side="right") - 1
     y = np.concatenate([r.y for r in data.runs])
     rows = starts + run  # a run has one row more than it has steps
-    x = y[rows]
+    x = y[rows] if begun is None else begun[rows]
     for h in range(horizon):
         place = starts + h
         x = advanced(model, x, act, place)
         if extra is not None:
             x = x + extra[place]
-    return Rollouts(horizon, starts, model.difference(y[rows + horizon], x))
+    return Rollouts(horizon, starts, model.difference((y if ends is None else ends)[rows + horizon], x))
 
 
 def rms(e: Array) -> Array:

@@ -18,6 +18,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.trace.speed_noise import of_axis
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -60,10 +62,13 @@ ROUNDED = 10
 
 @dataclass(frozen=True)
 class Noise:
-    """Variances by state, (nx,): q of the process a step, r of the measurement."""
+    """Variances by state, (nx,): q of the process a step, r of the measurement. axes: (position, speed) columns of which the speed was not
+    measured (`speed_noise`): their r stands for `not at all`.
+    """
 
     q: Array
     r: Array
+    axes: tuple[tuple[int, int], ...] = ()
 
     def one_step(self, f: Array) -> Array:
         """(nx,) standard deviation of a one-step residual, over the F (n, nx, nx) given."""
@@ -79,6 +84,11 @@ class Whitener:
         n, nx = f.shape[:2]
         rf = f * noise.r  # F R
         own = np.einsum("kij,klj->kil", rf, f) + np.diag(noise.q + noise.r)
+        for p, v in noise.axes:  # what pushes an axis all through a step moves it, too
+            h = f[:, p, v]
+            own[:, p, p] += noise.q[v] * h * h / 3.0
+            own[:, p, v] += noise.q[v] * h / 2.0
+            own[:, v, p] += noise.q[v] * h / 2.0
         if extra is not None:
             own[:, range(nx), range(nx)] += extra
         band = np.zeros((2 * nx, n, nx))
@@ -99,6 +109,13 @@ class Whitener:
         flat = r.reshape(r.shape[0] * r.shape[1], -1)
         z, _ = lapack.dtbtrs(self._lower, flat, uplo="L")
         return np.asarray(z).reshape(r.shape)
+
+    def back(self, z: Array) -> Array:
+        """L^-T z, same shape as z: S^-1 r of z = L^-1 r."""
+        from scipy.linalg import lapack
+
+        r, _ = lapack.dtbtrs(self._lower, z.reshape(-1, 1), uplo="L", trans="T")
+        return np.asarray(r).reshape(z.shape)
 
 
 def log_density(z: Array) -> Array:
@@ -125,13 +142,15 @@ def estimate(r: Array, f: Array, joined: Mask, floor: Noise, near: Noise | None 
     rough = np.maximum(np.abs(r) / np.sqrt(robust) / OUTLIER, 1.0) ** 2 - 1.0
     few = np.mean(rough > 0.0, axis=0) < 0.1  # more than that is no tail but the bulk of what is missing
     extra = np.where(few, rough * robust, 0.0)
+    extra[:, [v for _, v in floor.axes]] = 0.0
     noise = _by_state(r, f, joined, extra, near, floor)
     for _ in range(2):
         z = Whitener(noise, f, joined, extra)(r)
         wild = np.abs(z) > OUTLIER
         if not wild.any():
             break
-        own = noise.q + noise.r + np.einsum("kij,j->ki", f**2, noise.r)
+        seen = np.where(np.isin(range(r.shape[1]), [v for _, v in floor.axes]), 0.0, noise.r)
+        own = noise.q + seen + np.einsum("kij,j->ki", f**2, seen)
         extra += np.where(wild, (z**2 / 4.0) * (own + extra), 0.0)
         noise = _by_state(r, f, joined, extra, noise, floor)
     return noise
@@ -149,18 +168,24 @@ def _by_state(r: Array, f: Array, joined: Mask, extra: Array, near: Noise | None
     nx = r.shape[1]
     q, s = (np.zeros(nx), np.zeros(nx)) if near is None else (near.q.copy(), near.r.copy())
     square = f**2
-    for _ in range(2):
+    for p, v in floor.axes:
+        ends = np.ix_(range(len(r)), (p, v), (p, v))
+        least = float(floor.q[v]), float(floor.r[p]), float(floor.r[v])
+        q[v], s[p] = of_axis(r[:, [p, v]], f[ends], joined, extra[:, p], least, None if near is None else (q[v], s[p]))
+        q[p], s[v] = floor.q[p], floor.r[v]
+    alone = [i for i in range(nx) if not any(i in pair for pair in floor.axes)]
+    for _ in range(2 if alone else 0):
         foreign = np.zeros(nx)
-        for i in range(nx):
+        for i in alone:
             others = square[:, i] @ s - square[:, i, i] * s[i]
             start = None if near is None else (q[i], s[i])
             q[i], s[i] = _one_state(r[:, i], f[:, i, i], joined, extra[:, i] + others, (float(floor.q[i]), float(floor.r[i])), start)
-        for i in range(nx):
+        for i in alone:
             foreign[i] = np.mean(square[:, i] @ s - square[:, i, i] * s[i]) / (q[i] + s[i])
         near = Noise(q, s)
         if np.all(foreign < 0.02):
             break
-    return Noise(q, s)
+    return Noise(q, s, floor.axes)
 
 
 def _one_state(

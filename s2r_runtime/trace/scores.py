@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace.candidates import candidates
-from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain
+from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, under_noise
 from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.screening import Screened, screen
 from s2r_runtime.trace.slots import Added, bounds_of, values_of
@@ -32,6 +32,9 @@ FAR = 100.0
 
 GIVEN_UP = 1e-3
 """Of the largest number of its kind: one that is so small is none."""
+
+FIRST_LOOK = 4
+"""Candidates of the first look that are fitted, where there is a second one."""
 
 REACHES = 0.3
 """Of what another model explains: a candidate that screening gives less will not come up to it. Of 114 that did best once they were
@@ -81,11 +84,16 @@ def best_candidates(given: Problem, base: Fit, few: int = FEW, bar: Bar = STRICT
     """The candidates for one more effect, fitted, best score first; and how many starts were looked at. against: nats of gain that
     they must come up to.
     """
-    screened, tried = screen(given, base, candidates(base.model, given.data, Leftover(given, base)))
+    offered = candidates(base.model, given.data, Leftover(given, base))
+    screened, tried = screen(given, base, offered)
     scored: dict[tuple[str, str], Scored] = {}
-    promising = _promising(screened, few, REACHES * against)
-    for s in promising:
-        fit = fitted(given, base, s.start, 2)
+    promising = [(s, base) for s in _promising(screened, few, REACHES * against)]
+    if given.floor.axes and promising:
+        quiet = _quieter(given, base, promising[0][0])
+        screened, _ = screen(given, quiet, offered)
+        promising = [*promising[:FIRST_LOOK], *((s, quiet) for s in _promising(screened, few, 0.0))]
+    for s, under in promising:
+        fit = fitted(given, under, s.start, 2)
         value = gain(fit, base) - bar.price(fit.k - base.k, len(given.steps))
         key = (s.candidate.name, s.candidate.channel)
         if key not in scored or value > scored[key].score:
@@ -99,6 +107,14 @@ def best_candidates(given: Problem, base: Fit, few: int = FEW, bar: Bar = STRICT
     for s in screened:
         scored.setdefault((s.candidate.name, s.candidate.channel), Scored(s.candidate.name, s.candidate.channel, min(s.value, 0.0)))
     return sorted(scored.values(), key=lambda s: (s.fit is None, -s.score)), tried
+
+
+def _quieter(given: Problem, base: Fit, best: Screened) -> Fit:
+    """The same model under the noise that the best candidate leaves. Where a speed was not measured, nearly all that a model lacks can be
+    taken for noise that pushes: under that, candidates look alike, and none looks like much.
+    """
+    fit = fitted(given, base, best.start, 2)
+    return under_noise(given, base.model, fit.noise) if fit.white > base.white else base
 
 
 def rescored(found: Sequence[Scored], base: Fit, n: int, bar: Bar) -> list[Scored]:

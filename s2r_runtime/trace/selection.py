@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.begun import begun, uncertain
 from s2r_runtime.trace.fitting import (
     WIDEST,
     Fit,
@@ -24,10 +25,12 @@ from s2r_runtime.trace.fitting import (
     fitted,
     gain,
     objective,
+    plainly,
     refine,
     scatter,
     sensitivities,
     sought,
+    under_noise,
     without,
 )
 from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
@@ -102,7 +105,7 @@ def select(
         fit = exchanged(given, chosen, bar) if 1 < len(chosen.added) <= EXCHANGED else chosen
         if crowded(fit):
             break
-    fit = pruned(given, fit, tried, horizon, bar)
+    fit = plainly(given, pruned(given, fit, tried, horizon, bar))
     progress(0.8)
     fit = simplified(given, fit)
     fit, others = representative(given, fit, rivals(given, fit))
@@ -187,15 +190,18 @@ def _beyond_wandering(given: Problem, fit: Fit, base: Fit, needed: float) -> boo
 
 def relevant(given: Problem, fit: Fit, base: Fit, horizon: int) -> bool:
     """Whether some state's error at one step, a quarter of the horizon or all of it falls by RELEVANT, cross-validated."""
+    known = (begun(given, fit), uncertain(fit, given.data.dt)) if given.floor.axes else None
     for steps in sorted({1, max(1, horizon // 4), horizon}):
-        before, after = held_out_errors(given, base, steps), held_out_errors(given, fit, steps)
+        before, after = held_out_errors(given, base, steps, known), held_out_errors(given, fit, steps, known)
         if np.any(before > (1.0 + RELEVANT) * after):
             return True
     return False
 
 
-def held_out_errors(given: Problem, fit: Fit, horizon: int) -> Array:
-    """(nx,) rms at the end of rollouts, in blocks of time, each under parameters from the other blocks."""
+def held_out_errors(given: Problem, fit: Fit, horizon: int, known: tuple[Array | None, Array] | None = None) -> Array:
+    """(nx,) rms at the end of rollouts, in blocks of time, each under parameters from the other blocks. known: where axes were whose speed
+    was not measured (rows, nx), and its variances; else by what was measured.
+    """
     starts = rollout_starts(given.data, horizon)
     starts = starts[np.isin(starts, given.steps.place)]
     starts = starts[:: max(1, len(starts) // STARTS)]
@@ -206,8 +212,12 @@ def held_out_errors(given: Problem, fit: Fit, horizon: int) -> Array:
     for block, model in enumerate(_less_each_block(given, fit, edges)):
         inside = starts[(starts >= edges[block]) & ((starts < edges[block + 1]) | (block == BLOCKS - 1))]
         if len(inside):
-            errors.append(rollout(model, given.data, acting(model, given.data), inside, horizon).error)
-    return rms(np.concatenate(errors))
+            begin = begun(given, under_noise(given, model, fit.noise)) if given.floor.axes else None
+            errors.append(
+                rollout(model, given.data, acting(model, given.data), inside, horizon, begun=begin, ends=known and known[0]).error
+            )
+    off = rms(np.concatenate(errors))
+    return off if known is None else np.sqrt(off**2 + known[1])
 
 
 def _less_each_block(given: Problem, fit: Fit, edges: Array) -> list[ComposedModel]:

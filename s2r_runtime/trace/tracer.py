@@ -24,6 +24,7 @@ from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.beginning import with_history
+from s2r_runtime.trace.begun import begun
 from s2r_runtime.trace.challenge import Better, best_shape, better_shape
 from s2r_runtime.trace.dataset import Dataset, thinned
 from s2r_runtime.trace.dataset_files import load_dataset
@@ -135,7 +136,13 @@ def _traced(
     _enough(dataset, model, fit_part, judged_on, ahead)
     given = problem(fit_part.data, fit_part.steps)
     say(5.0, 100.0, "looking for effects")
-    chosen = select(given, model, ahead, lambda share: say(5.0 + 75.0 * share, 100.0, "looking for effects"))
+    chosen = select(given, model, ahead, lambda share: say(5.0 + 55.0 * share, 100.0, "looking for effects"))
+    if given.floor.axes and any(chosen.fit.model.effects[place].effect.stage == "step" for place in chosen.fit.added):
+        checked = replace(checked, data=_restated(checked, chosen.fit))  # what depends on a speed is seen where the speed is better known
+        fit_part = part(checked.data, checked.left_out, seen, FIT_STEPS)
+        judged_on = _held_out(checked, seen, test, model, horizon)
+        given = problem(fit_part.data, fit_part.steps)
+        chosen = select(given, model, ahead, lambda share: say(60.0 + 20.0 * share, 100.0, "looking for effects"))
     chosen = confirmed(given, chosen, judged_on)
     say(80.0, 100.0, "testing what is left")
     whole = _Whole(checked, model, ahead)
@@ -229,6 +236,22 @@ def _held_out(checked: Checked, seen: Mask, test: Dataset | None, model: Compose
         return held(model, other.data, steps_of(other.data, other.left_out), other.left_out, everything, horizon)
     steps = steps_of(checked.data, checked.left_out)
     return held(model, checked.data, steps.take(np.flatnonzero(~seen[steps.place])), checked.left_out, ~seen, horizon)
+
+
+def _restated(checked: Checked, fit: Fit) -> Dataset:
+    """The recording with the speeds that were not measured as the model has them, which knows more than none."""
+    everything = problem(checked.data, steps_of(checked.data, checked.left_out))
+    states = begun(everything, evaluate(everything, fit.model, fit.noise))
+    if states is None:
+        return checked.data
+    rows = np.cumsum([0] + [len(run.y) for run in checked.data.runs])
+    runs = []
+    for run, a, b in zip(checked.data.runs, rows[:-1], rows[1:], strict=True):
+        y = run.y.copy()
+        for _, v in checked.data.axes_without_speed:
+            y[:, v] = np.where(np.isnan(y[:, v]), np.nan, states[a:b, v])
+        runs.append(replace(run, y=y))
+    return replace(checked.data, runs=tuple(runs))
 
 
 def _enough(data: Dataset, model: ComposedModel, fit_part: Part, judged_on: Held, ahead: int) -> None:

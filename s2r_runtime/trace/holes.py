@@ -1,0 +1,46 @@
+"""Single rows that lack, in recordings of axes whose speed was not measured: bridged, so that what is known of the speed is not lost there.
+
+Without a speed, every gap begins the reckoning anew: it takes many rows until the positions say again how fast the axis is. A row or few
+between two that were measured are put on the cubic that has their positions and speeds (Hermite's): off by a 384th of the fourth
+derivative times the gap's fourth power, which is far below what a row says by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.trace.dataset import Dataset, Run
+
+Array = NDArray[np.float64]
+
+BRIEF = 4
+"""Rows that are bridged at most."""
+
+
+def bridged(data: Dataset) -> Dataset:
+    """The same; unchanged where some state is none of such an axis."""
+    pairs = data.axes_without_speed
+    if {j for pair in pairs for j in pair} != set(range(len(data.states))):
+        return data
+    return replace(data, runs=tuple(_bridged(run, pairs, data.dt) for run in data.runs))
+
+
+def _bridged(run: Run, pairs: tuple[tuple[int, int], ...], dt: float) -> Run:
+    there = np.flatnonzero(~np.isnan(run.y).any(axis=1))
+    gaps = np.flatnonzero((np.diff(there) > 1) & (np.diff(there) <= BRIEF + 1))
+    if not len(gaps):
+        return run
+    y = run.y.copy()
+    t = np.concatenate([[0.0], np.cumsum(np.full(len(y) - 1, dt) if run.lasts is None else run.lasts)])
+    for a, b in zip(there[gaps].tolist(), there[gaps + 1].tolist(), strict=True):
+        h = t[b] - t[a]
+        s = (t[a + 1 : b] - t[a]) / h
+        for p, v in pairs:
+            way, first, last = y[b, p] - y[a, p], h * y[a, v], h * y[b, v]
+            bend, twist = 3.0 * way - 2.0 * first - last, first + last - 2.0 * way
+            y[a + 1 : b, p] = y[a, p] + s * (first + s * (bend + s * twist))
+            y[a + 1 : b, v] = (first + s * (2.0 * bend + 3.0 * s * twist)) / h
+    return replace(run, y=y)
