@@ -195,7 +195,6 @@ class Effect(Protocol):
     - `uneven` = True: `input_sequence` also takes dt as (T,), how long each row lasts (and `start` as (T,), when each begins, where it is
       `timed`), with which runs come one after the other, a row of zeros and REST_S seconds (`trace.chains`) between two; `after_step` also
       takes dt as (n,). Without it, rows that do not last alike are taken to;
-    - `glides` = True: what goes on within a step settles, or is a ramp: a model foretells the step's end from its parts;
     - `within_step(dt, p) -> bool`: whether what acts changes within a step although the input is held over it;
     - `reads(model, channel) -> tuple[str, ...]`: inputs besides the channel on which what acts there depends;
     - `starts(u, model, channel, dt) -> list[dict]`: parameter values from which the tracer begins, given the input that it would

@@ -20,7 +20,6 @@ class InputLag(InputEffect):
     parameters = (Parameter("time_constant", "s", 0.0, 1e4, neutral=0.0),)
     linear = True
     uneven = True
-    glides = True
 
     def within_step(self, dt: float, p: Values) -> bool:
         """The response goes on over the step."""

@@ -33,7 +33,6 @@ class InputRateLimit(Follower):
     parameters = (Parameter("rate", "input/s", 1e-6, 1e9, kink=True), Parameter("rate_down", "input/s", 1e-6, 1e9, kink=True))
     optional = ("rate_down",)
     uneven = True
-    glides = True
 
     def within_step(self, dt: float, p: Values) -> bool:
         """A ramp goes on over the step."""

@@ -13,14 +13,12 @@ scheme by which a pose is integrated among them); what adds to the motion along 
 u_act is the input's mean over the step. Where a nominal model says that a state is set to an input at once (`reached`: a wheel's
 speed, a car's speed), that state is the input as it acts at the end of the step. What an effect makes of a held input may change within
 the step (`within_step`: a lag, a delay by a part of a step). Where that meets such a state, or a later effect that is not linear,
-the effects are run in SUBSTEPS parts of the step, of which the last one stands for its end; where an effect takes an input steadily to
-somewhere (`glides`), the end is foretold from the last three.
+the effects are run in SUBSTEPS parts of the step, of which the last one stands for its end.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -142,8 +140,7 @@ class ComposedModel:
     def act(self, u: Array, hidden: Hidden) -> tuple[Array, Array, Hidden]:
         """Commanded u over one step -> (mean over the step, at its end, hidden')."""
         parts = self.substeps
-        mean = u
-        ends: list[Array] = []
+        mean = end = u
         for part in range(parts):
             end, after = u, []
             for a, z in zip(self.effects, hidden, strict=True):
@@ -151,9 +148,8 @@ class ComposedModel:
                     end, z = a.effect.input_step(end, z, self.nominal, a.channel, self.dt / parts, a.p)
                 after.append(z)
             hidden = tuple(after)
-            ends.append(end)
             mean = end if part == 0 else mean + (end - mean) / (part + 1)
-        return mean, at_end(ends, gliding(self, self.effects)) if parts > 1 else mean, hidden
+        return mean, end, hidden
 
     @cached_property
     def uneven(self) -> bool:
@@ -237,32 +233,6 @@ class ComposedModel:
         for column in self.angle_columns:
             e[:, column] = wrap(e[:, column])
         return e
-
-
-def gliding(model: ComposedModel, chain: Sequence[AppliedEffect]) -> Array:
-    """(nu,) 1 for inputs whose last effect that goes on within a step takes them steadily to somewhere, 0 for others."""
-    found = np.zeros(len(model.inputs))
-    for a in chain:
-        if a.effect.stage == "input" and getattr(a.effect, "within_step", _never)(model.dt, a.p):
-            here = [model.inputs.index(a.channel)] if a.channel in model.inputs else slice(None)
-            found[here] = float(getattr(a.effect, "glides", False))
-    return found
-
-
-def at_end(parts: Sequence[Array], glides: Array) -> Array:
-    """What acts at the end of a step, (n, nu), from its means over the last three parts: what settles, with a of what is left after each
-    part, goes on by a (a log(a)/(1 - a) + 1)/(1 - a) of its last change; a ramp, a = 1, by half of it.
-    """
-    last = parts[-1]
-    here = np.flatnonzero(glides)
-    if not len(here) or len(parts) < 3:
-        return last
-    changes = np.diff(np.stack([part[:, here] for part in parts[-3:]]), axis=0)
-    a = np.clip(changes[1] / np.where(changes[0] == 0.0, np.inf, changes[0]), 1e-9, 1.0)
-    gone = np.maximum(1.0 - a, 1e-3)
-    end = last.copy()
-    end[:, here] += changes[1] * a * np.where(1.0 - a < gone, 0.5 + (1.0 - a) / 6.0, (a * np.log(a) / gone + 1.0) / gone)
-    return end
 
 
 def compose(spec: ModelSpec, where: str = "model") -> ComposedModel:

@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
-from s2r_runtime.models.composed import AppliedEffect, ComposedModel, at_end, gliding
+from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace.dataset import Dataset
 
 Array = NDArray[np.float64]
@@ -110,8 +110,7 @@ def acting(model: ComposedModel, data: Dataset, effects: Sequence[AppliedEffect]
     table = u.reshape(-1, data.substeps * u.shape[1])
     mean = table @ np.tile(np.eye(u.shape[1]) / data.substeps, (data.substeps, 1))
     parts = u.reshape(-1, data.substeps, u.shape[1]) if data.in_parts else None
-    end = at_end(np.split(table, data.substeps, axis=1), gliding(model, chain))
-    return Acting(mean, np.ascontiguousarray(end), lasts, parts)
+    return Acting(mean, table[:, -u.shape[1] :].copy(), lasts, parts)
 
 
 def advanced(model: ComposedModel, x: Array, act: Acting, place: Index | slice) -> Array:
