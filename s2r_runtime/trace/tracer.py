@@ -174,7 +174,8 @@ def _result(
 ) -> TraceResult:
     """Verdict, intervals, errors and gap before and after."""
     model = chosen.nominal.model
-    chosen = replace(chosen, fit=settled(given, chosen.fit))
+    if dataset.reconstruction is None:  # what a filter leaves has the filter's law, not the noise's
+        chosen = replace(chosen, fit=settled(given, chosen.fit))
     before, after = judge(model, judged_on), judge(chosen.fit.model, judged_on)
     floor = noise_floor(chosen.fit, judged_on, seed)
     forgets = replace(chosen.fit, colour=no_colour(len(model.states)))  # a law with a memory may have taken up all that the model lacks
