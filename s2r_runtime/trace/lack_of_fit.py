@@ -229,20 +229,21 @@ def _strength(left: Left, j: Judged, threshold: float) -> tuple[float, Judged]:
     if j.token in SLIDING:
         return foretold, j
     white, z = left.fit.whiten(j.x), left.fit.z
-    if left.law is not None:  # in closed loop, inputs answer what wanders: that tie, slides would break
-        white, z = (left.law(e, left.given.steps.joined) for e in (white, z))
     ways = [(z, noises.weight(z))]
     if left.clipped is not None:
-        clipped = left.clipped if left.law is None else left.law(left.clipped, left.given.steps.joined)
-        ways.append((clipped, np.ones_like(clipped)))
+        ways.append((left.clipped, np.ones_like(left.clipped)))
     beyond = [margin(white, z, weight, threshold) for z, weight in ways]
+    if left.law is not None and max(beyond) > BEYOND:  # in closed loop, inputs answer what wanders: that tie, slides would break
+        joined = left.given.steps.joined
+        under = [margin(left.law(white, joined), left.law(z, joined), weight, threshold) for z, weight in ways]
+        beyond = [min(pair) for pair in zip(beyond, under, strict=True)]
     best = int(np.argmax(beyond))
     if beyond[best] <= max(BEYOND, foretold):
         return foretold, j
     if foretold:
         return beyond[best], j
     weight = ways[best][1]
-    x, push = white.reshape(-1, white.shape[2]), np.clip(z, -CLIPPED, CLIPPED).ravel()
+    x, push = white.reshape(-1, white.shape[2]), np.clip(left.fit.z, -CLIPPED, CLIPPED).ravel()
     weighted = x * weight.reshape(-1, 1)
     product, slope = x.T @ weighted, weighted.T @ push
     beta = np.linalg.solve(product + evidence(product, slope).ridge * np.eye(len(slope)), slope)
