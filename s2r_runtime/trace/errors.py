@@ -17,7 +17,7 @@ from s2r_runtime.bounds import scenario_confidence
 from s2r_runtime.errors import S2RError
 from s2r_runtime.gap import Transitions, discrepancy, hold_residuals, residuals
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.begun import begun, measured
+from s2r_runtime.trace.begun import begun, measured, uncertain
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.fitting import Fit, evaluate, gain, problem
 from s2r_runtime.trace.holdout import FEWEST_RUNS
@@ -146,9 +146,10 @@ def noise_floor(fit: Fit, given: Held, seed: int) -> tuple[Array, Array]:
 
     Noise that is correlated in time keeps its law: what a sensor has wrong for a while does not add up as what pushes the robot does.
     """
-    model, noise = fit.model, fit.noise
+    if fit.noise.axes != given.data.axes_without_speed and len(given.steps):  # another recording, with other states measured
+        fit = replace(fit, noise=evaluate(problem(given.data, given.steps), fit.model).noise)
+    model, noise = fit.model, _as_seen(fit.noise, given.data)
     act = acting(model, given.data)
-    noise = _as_seen(noise, given.data)
     one = noise.one_step(state_jacobian(model, given.steps, act))
     starts = _starts(given)
     starts = starts[:: max(1, len(starts) // FLOOR_STARTS)]
@@ -162,7 +163,8 @@ def noise_floor(fit: Fit, given: Held, seed: int) -> tuple[Array, Array]:
         ends = _coloured_ends(fit, given, act, starts[::FEWER], clean[::FEWER], rng)
         if ends is not None:
             return one, rms(ends)
-    noisy = clean + rng.normal(size=clean.shape) * np.sqrt(noise.r)
+    known = uncertain(fit, given.data.dt) if fit.noise.axes else noise.r
+    noisy = clean + rng.normal(size=clean.shape) * np.sqrt(known)
     for h in range(given.horizon):
         clean = advanced(model, clean, act, starts + h)
         noisy = advanced(model, noisy, act, starts + h) + rng.normal(size=clean.shape) * np.sqrt(noise.q)

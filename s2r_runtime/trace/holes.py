@@ -25,7 +25,19 @@ def bridged(data: Dataset) -> Dataset:
     pairs = data.axes_without_speed
     if {j for pair in pairs for j in pair} != set(range(len(data.states))):
         return data
-    return replace(data, runs=tuple(_bridged(run, pairs, data.dt) for run in data.runs))
+    return replace(data, runs=tuple(_but_silences(i, run, _bridged(run, pairs, data.dt), data) for i, run in enumerate(data.runs)))
+
+
+def _but_silences(number: int, run: Run, whole: Run, data: Dataset) -> Run:
+    """The bridged run less what lies in silences in which the command changed: nobody knows when."""
+    begins = run.begins(data.dt)
+    for pause in data.pauses:
+        if pause.run != number or not pause.silent:
+            continue
+        a, b = (int(np.argmin(np.abs(begins - s))) for s in (pause.from_s, pause.to_s))
+        if np.any(run.u[a * data.substeps] != run.u[b * data.substeps]):
+            whole.y[a + 1 : b] = run.y[a + 1 : b]
+    return whole
 
 
 def _bridged(run: Run, pairs: tuple[tuple[int, int], ...], dt: float) -> Run:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.dataset import Dataset, Run, regridded
 from s2r_runtime.trace.never_measured import check_measured
 from s2r_runtime.trace.residual import Index, acting, predicted, rollout, rollout_starts, steps_of
@@ -342,13 +343,9 @@ def _pushed_aside(model: ComposedModel, data: Dataset, starts: Index) -> Array |
         return None
     begin = np.cumsum([0] + [len(run.y) - 1 for run in data.runs])
     y = np.concatenate([run.y for run in data.runs])[starts + np.searchsorted(begin, starts, side="right") - 1]
-    y = y - np.where(np.array([unit_of(model, name).endswith("/s") for name in model.states]), 0.0, y.mean(axis=0))
+    rates = [axis.velocity for axis in axes(model.nominal)]
+    y = y - np.where(np.isin(np.arange(y.shape[1]), rates), 0.0, y.mean(axis=0))
     return np.column_stack([np.ones(len(y)), y, np.sign(y)])
-
-
-def unit_of(model: ComposedModel, name: str) -> str:
-    """As the model says, or nothing."""
-    return str(getattr(model.nominal, "units", {}).get(name, ""))
 
 
 def _less(z: Array, aside: Array) -> Array:

@@ -105,11 +105,10 @@ def select(
         fit = exchanged(given, chosen, bar) if 1 < len(chosen.added) <= EXCHANGED else chosen
         if crowded(fit):
             break
-    fit = plainly(given, pruned(given, fit, tried, horizon, bar))
+    fit = plainly(given, simplified(given, pruned(given, fit, tried, horizon, bar)))
     progress(0.8)
-    fit = simplified(given, fit)
-    fit, others = representative(given, fit, rivals(given, fit))
-    return Selection(nominal, fit, tried, tuple(ranking), tuple(others))
+    first, others = representative(given, fit, rivals(given, fit))
+    return Selection(nominal, fit if first is fit else plainly(given, first), tried, tuple(ranking), tuple(others))
 
 
 def crowded(fit: Fit) -> bool:

@@ -37,9 +37,8 @@ ENOUGH = 6000
 
 @dataclass(frozen=True)
 class Smoothed:
-    """position, speed: (n,); error: standard deviation of the speed; bandwidth: Hz, where half of the speed passes."""
+    """speed: (n,); error: standard deviation of the speed; bandwidth: Hz, where half of the speed passes."""
 
-    position: Array
     speed: Array
     error: float
     bandwidth: float
@@ -56,7 +55,7 @@ def smoothed(t: Array, y: Array, pushed: Array) -> Smoothed:
         if not np.any(off > WILD):
             break
         weight = np.where(off > WILD, (WILD / np.maximum(off, WILD)) ** 2 / 4.0, 1.0)
-    return Smoothed(x[0], x[1] / unit, spread / unit, math.exp(0.25 * ratio) / (2.0 * math.pi * unit))
+    return Smoothed(x[1] / unit, spread / unit, math.exp(0.25 * ratio) / (2.0 * math.pi * unit))
 
 
 def _likeliest(h: Array, y: Array, weight: Array, ways: tuple[Array, ...]) -> tuple[float, Array]:
@@ -97,7 +96,6 @@ class _Spline:
         self._rhs[3::2] += g2
         self._rhs[0:-2:2] -= g1
         self._rhs[1:-2:2] -= h * g1 + g2
-        self._bb = float(np.sum(b1 * g1 + b2 * g2))
         self._origin = float(np.mean(y))
 
     def _solved(self, ratio: float) -> tuple[Array, Array, float]:
