@@ -206,7 +206,7 @@ class Demonstration:
     def _await_socket(self, process: subprocess.Popen[str]) -> Path:
         limit = time.monotonic() + START_S
         while time.monotonic() < limit:
-            if found := list((self._out / "run").rglob("*.sock")):
+            if (found := list((self._out / "run").rglob("*.sock"))) and _answers(found[0]):
                 return found[0]
             if process.poll() is not None:
                 break
@@ -310,6 +310,12 @@ def _free_ports(number: int) -> list[int]:
 def _s2r(*argv: str) -> int:
     sys.stdout.flush()
     return subprocess.call([sys.executable, "-m", "s2r_runtime.cli.main", *argv])
+
+
+def _answers(path: Path) -> bool:
+    """Whether somebody listens: a socket is a file a moment before that."""
+    with socket.socket(socket.AF_UNIX) as tried:
+        return tried.connect_ex(str(path)) == 0
 
 
 def _end(process: subprocess.Popen[str]) -> None:

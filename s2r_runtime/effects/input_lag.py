@@ -17,7 +17,7 @@ class InputLag(InputEffect):
     """time_constant T in s; 0 is none."""
 
     name = "input_lag"
-    parameters = (Parameter("time_constant", "s", 0.0, 1e4, neutral=0.0),)
+    parameters = (Parameter("time_constant", "s", 0.0, 1e3, neutral=0.0),)
     linear = True
     uneven = True
 

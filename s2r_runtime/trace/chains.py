@@ -25,7 +25,7 @@ KEPT = 24_000_000
 """Bytes of results that are kept; the longest unused go first."""
 
 
-REST_S = 1e5
+REST_S = 1e4
 """Between runs that are laid end to end: no actuator remembers for so long."""
 
 

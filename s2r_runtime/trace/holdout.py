@@ -49,7 +49,7 @@ BLOCK = 500
 """Steps of a block when a long recording is thinned."""
 
 SETTLE_S = 3.0
-"""Inputs before a block, s (120 to 600 steps): hidden states have settled then, or nearly."""
+"""Inputs before a block, s (30 to 600 steps): hidden states have settled then, or nearly."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def part(data: Dataset, left_out: tuple[tuple[int, int], ...], seen: Mask, most:
     """The part of a dataset with these steps, at most about `most` of them."""
     begin = first_steps(data)
     blocks = _blocks(begin, seen, most)
-    settle = int(np.clip(SETTLE_S / data.dt, 120, 600))
+    settle = int(np.clip(SETTLE_S / data.dt, 30, 600))
     runs: list[Run] = []
     out: list[tuple[int, int]] = []
     known = set(left_out)
