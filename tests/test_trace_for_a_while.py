@@ -5,13 +5,16 @@ import math
 import numpy as np
 import pytest
 
-from s2r_runtime.models.composed import compose
+from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.episodes import episodes
-from s2r_runtime.trace.fitting import evaluate, problem
+from s2r_runtime.trace.fitting import evaluate, insert, problem
 from s2r_runtime.trace.lack_of_fit import left_by
 from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.rivals import representative
+from s2r_runtime.trace.scores import Scored
 from s2r_runtime.trace.tracer import trace
 
 DT, PARTS = 0.05, 10
@@ -131,3 +134,16 @@ def test_two_gains_that_agree_are_one():
     x = _unicycle(np.random.default_rng(9), done, scheme="euler")
     result = _traced(x, asked)
     assert [(e.name, e.channel) for e in result.effects] == [("input_gain", "w")]
+
+
+def test_explanations_that_do_the_very_same_stay_in_their_order():
+    rng = np.random.default_rng(10)
+    u = _held(rng, 300, [-0.5, -1.0], [0.5, 1.0])
+    model = compose(ModelSpec("unicycle", DT, {}, ()))
+    data = from_arrays(model, [(_unicycle(rng, u, lambda k, x: 0.8, "euler"), u)])
+    given = problem(data, steps_of(data))
+    gain = AppliedEffect(registry().get("effects", "input_gain"), "v", {"gain": 0.8})
+    same = AppliedEffect(registry().get("effects", "input_gain_asymmetry"), "v", {"gain_positive": 0.8, "gain_negative": 0.8})
+    first, second = (evaluate(given, insert(model, e, 0)) for e in (gain, same))
+    found = [Scored("input_gain_asymmetry", "v", 1.0, second)]
+    assert representative(given, first, found) == (first, found)

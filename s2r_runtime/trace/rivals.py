@@ -21,8 +21,8 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.dataset import Dataset, Run
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, scatter, without
-from s2r_runtime.trace.residual import acting, steps_of
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, foretold, gain, problem, scatter, without
+from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.scores import Scored, best_candidates, limited, name_of
 from s2r_runtime.trace.slots import Added, slots_of
 
@@ -69,11 +69,7 @@ def rivals(given: Problem, fit: Fit) -> list[Scored]:
             numberless = not slots_of(fit.model.effects[place], place)
             if numberless and _coincidence(here, gain(s.fit, base)) > CLOSE:
                 continue
-            if (
-                (s.fit.k <= fit.k and not numberless)
-                or rich is None
-                or rich.apart(s.fit.model, fit.model) > ALIKE * rich.apart(fit.model, base.model)
-            ):
+            if (s.fit.k <= fit.k and not numberless) or rich is None or not rich.same(s.fit.model, fit.model, base.model):
                 found.append(s)
     return found
 
@@ -97,7 +93,7 @@ def simplified(given: Problem, fit: Fit) -> Fit:
         rich = _rich(given, fit.model) if instead else None
         near = EQUAL if hasattr(a.effect, "simpler") else ALIKE
         for model in instead:
-            if rich is not None and rich.apart(model, fit.model) <= near * rich.apart(fit.model, without(fit.model, place)):
+            if rich is not None and rich.same(model, fit.model, without(fit.model, place), near):
                 return simplified(given, fitted(given, evaluate(given, model), model))
     return fit
 
@@ -141,7 +137,7 @@ def representative(given: Problem, fit: Fit, found: list[Scored]) -> tuple[Fit, 
     done = [max(rich.apart(model, less), 1e-300) for model in models]
     worst = [max(rich.apart(one, other) / size for other, size in zip(models, done, strict=True)) for one in models]
     best = int(np.argmin(worst))
-    if worst[best] > BETTER * worst[0]:
+    if best == 0 or not np.all(np.isfinite(worst)) or worst[best] > BETTER * worst[0]:
         return fit, found
     chosen = tied[best - 1]
     return chosen, [Scored(*name, found[0].score, fit), *(s for s in found if s.fit is not chosen)]
@@ -154,11 +150,15 @@ class _Rich:
     data: Dataset
     scale: Array
 
+    def same(self, one: ComposedModel, other: ComposedModel, less: ComposedModel, near: float = ALIKE) -> bool:
+        """Whether two models differ by next to nothing of what the other one adds to `less`. False where that cannot be told."""
+        return self.apart(one, other) <= near * self.apart(other, less)
+
     def apart(self, one: ComposedModel, other: ComposedModel) -> float:
-        """Mean square difference of their steps, on the scale of the steps themselves."""
-        steps = steps_of(self.data)
-        a, b = (m.advance(steps.y0, act.mean[steps.place], act.end[steps.place]) for m in (one, other) for act in [acting(m, self.data)])
-        return float(np.mean((one.difference(a, b) / self.scale) ** 2))
+        """Mean square difference of their steps, on the scale of the steps themselves; NaN where a user's own model does not step there."""
+        given = problem(self.data, steps_of(self.data))
+        a, b = (foretold(given, m) for m in (one, other))
+        return math.nan if a is None or b is None else float(np.mean((one.difference(a, b) / self.scale) ** 2))
 
 
 def _rich(given: Problem, model: ComposedModel, reach: float = 1.0) -> _Rich:
