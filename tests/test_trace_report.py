@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -103,6 +104,17 @@ def test_what_has_no_name_gets_none_and_nothing_is_said_to_have_changed(results)
     assert "structure that depends on heading" in text
     assert "->" not in text[text.index("error, rms") :]
     assert re.search(r"\d+ % of it, noise included, is (v|w) times\s+a\s+factor that follows the\s+heading", text)
+
+
+def test_structure_without_a_name_is_not_counted_as_noise(results):
+    """The sensors' noise is known here, and nothing pushes the robot: a rollout that begins and ends at measured rows is off by twice
+    its variance. The structure's own rollouts end some thirty times as far.
+    """
+    r = results["unexplained"]
+    truth = math.sqrt(2.0) * NOISE[2]
+    assert 0.9 < r.floor[0][2] / truth < 1.2
+    assert 0.9 < r.floor[1][2] / truth < 2.0
+    assert r.before.ends[:, 2].std() > 10.0 * r.floor[1][2]
 
 
 def test_faults_are_told_with_their_times(results):

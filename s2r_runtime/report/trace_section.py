@@ -36,7 +36,7 @@ def add_trace(page: Page, trace: dict[str, Any]) -> None:
     if trace["depends_on"]:
         page.text("What is left depends on: " + ", ".join(trace["depends_on"]), "warn")
     _faults(page, trace["faults"])
-    # structure that nothing explains went into the estimate of the noise
+    # what no dictionary took up of a structure without a name is still in it
     _errors(page, trace["error"], "noise alone" if trace["verdict"] != "unexplained" else "noise as estimated")
     _gap(page, trace.get("gap") or {})
 

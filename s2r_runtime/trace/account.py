@@ -121,7 +121,7 @@ def _left_over(r: TraceResult) -> list[str]:
     over += derived(r.nominal, r.held)
     there = _away(r, r.before.ends, TOLD_AWAY)
     away = [there] if there else []
-    if r.verdict == "unexplained":  # the noise was estimated with the structure in it: shares are of all, noise included
+    if r.verdict == "unexplained":  # some of the structure may still be in the noise: shares are of all, noise included
         parts = components(r.nominal, r.held, r.before.one_step, r.after.one_step, 0.0 * r.floor[0])
         told = [v for v in over if v.token in r.depends_on]
         shapes = [s for s in strongest(parts, told, inputs) if s.share > SEEN and s.variable is not None] if told else []

@@ -30,7 +30,7 @@ from s2r_runtime.trace.fitting import gain as explained
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, SLOWLY, Judged, Left, first_look, judge, leading
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
 from s2r_runtime.trace.residual import acting, covered, residual, rms, rollout, rollout_starts, state_jacobian
-from s2r_runtime.trace.residual_noise import Whitener
+from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
 
 Array = NDArray[np.float64]
 
@@ -86,7 +86,8 @@ class Structure:
     """tokens: docs/json.md's `depends_on`, most important first. matters: it shows in rollouts.
 
     share: part of all that the nominal model lacks which is still left (0 where there is nothing). gains: nats by group. nameless: what
-    was named looks more like something that has no name (`challenge`). for_a_while: it comes and goes (`episodes`).
+    was named looks more like something that has no name (`challenge`). for_a_while: it comes and goes (`episodes`). noise: what would be
+    left beside the structure, and its colour; None where there is none that matters.
     """
 
     tokens: tuple[str, ...]
@@ -95,6 +96,7 @@ class Structure:
     gains: dict[str, float]
     nameless: bool = False
     for_a_while: bool = False
+    noise: tuple[Noise, Colour] | None = None
 
     @property
     def likeliest(self) -> tuple[str, ...]:
@@ -113,10 +115,18 @@ def lack_of_fit(given: Problem, fit: Fit, nominal: Fit, horizon: int) -> Structu
         matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
         if windows is None or not matters:
             return Structure(coloured, False, 0.0, gains)
-        return Structure(may_depend_on(left, windows, found), True, share, gains, for_a_while=True)
+        return Structure(may_depend_on(left, windows, found), True, share, gains, for_a_while=True, noise=_beside(left, windows))
     matters, share = _weight_of(left, nominal, chosen[-1], horizon)
     tokens = tuple(dict.fromkeys(TOKENS.get(judged.token, judged.token) for judged in chosen))
-    return Structure(tokens if matters else coloured, matters, share, gains)
+    return Structure(tokens if matters else coloured, matters, share, gains, noise=_beside(left, chosen[-1]) if matters else None)
+
+
+def _beside(left: Left, judged: Judged) -> tuple[Noise, Colour]:
+    """Noise and colour of what is left beside a dictionary."""
+    joined = left.given.steps.joined
+    rest = left.r - np.einsum("kim,km->ki", judged.x, judged.betas[left.block])
+    level = noises.estimate(rest, left.f, joined, left.given.floor, left.fit.noise)
+    return level, noises.colour(Whitener(level, left.f, joined)(rest), joined)
 
 
 @dataclass(frozen=True)

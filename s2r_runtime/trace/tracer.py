@@ -184,7 +184,11 @@ def _result(
     if verdict == "unexplained" and not {*structure.tokens} - {"noise"}:  # what was named foretells nothing: what else it looks like
         structure = replace(structure, tokens=structure.likeliest or structure.tokens)
     final = final_fit(chosen, verdict)
-    floor = floor if final is chosen.fit else noise_floor(final, judged_on, seed)
+    if verdict == "unexplained":
+        level, colour = structure.noise or (chosen.fit.noise, chosen.fit.colour)  # the structure itself is no noise
+        floor = noise_floor(replace(final, noise=level, colour=colour), judged_on, seed)
+    elif final is not chosen.fit:
+        floor = noise_floor(final, judged_on, seed)
     after = before if final is chosen.nominal else after
     gap_before, gap_after, independent = gaps((model, before), (final.model, after), judged_on, weights, kind)
     ranges = intervals(given, final)
