@@ -9,6 +9,8 @@ from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.residual import acting
 
 DT = 0.04
 PARTS = 100
@@ -173,7 +175,48 @@ def test_effects_on_all_inputs_alike_do_to_each_what_they_do_to_one():
 def test_the_wheels_speed_is_the_end_of_the_ramp_and_the_pose_moves_by_its_mean():
     model = compose(ModelSpec("differential_drive", 0.1, {}, (EffectSpec("input_rate_limit", "cmd_left", {"rate": 20.0}),)))
     x, hidden = model.step(np.zeros((1, 5)), np.array([[5.0, 0.0]]), model.at_rest(1))
-    assert x[0, 3] == pytest.approx(2.0, abs=20.0 * 0.1 / model.substeps / 2.0 + 1e-9)  # known to a tenth of a step
+    assert x[0, 3] == pytest.approx(2.0, rel=1e-12)
     assert x[0, 0] == pytest.approx(0.1 * 0.1 * 1.0 / 2.0)  # radius * dt * the ramp's mean / 2
     x, _ = model.step(x, np.array([[5.0, 0.0]]), hidden)
-    assert x[0, 3] == pytest.approx(4.0, abs=0.21)
+    assert x[0, 3] == pytest.approx(4.0, rel=1e-12)
+    x, _ = model.step(x, np.array([[4.5, 0.0]]), model.step(x, np.array([[5.0, 0.0]]), hidden)[1])
+    assert x[0, 3] == pytest.approx(4.5, rel=1e-12)  # it got there within the step
+
+
+@pytest.mark.parametrize("tau", [0.03, 0.2, 1.5])
+def test_the_wheels_speed_is_where_the_lag_stands_at_the_steps_end(tau):
+    lag = EffectSpec("input_lag", "cmd_left", {"time_constant": tau})
+    for effects, factor in (((lag,), 1.0), ((lag, EffectSpec("input_gain", "cmd_left", {"gain": 0.6})), 0.6)):
+        model = compose(ModelSpec("differential_drive", 0.05, {}, effects))
+        x, hidden = np.zeros((1, 5)), model.at_rest(1)
+        for k in range(3):
+            x, hidden = model.step(x, np.array([[1.0, 2.0]]), hidden)
+            assert x[0, 3] == pytest.approx(-factor * np.expm1(-0.05 * (k + 1) / tau), rel=1e-9)
+            assert x[0, 4] == 2.0
+
+
+def test_what_acts_at_the_ends_of_steps_is_the_same_over_time_at_once_as_step_by_step():
+    chains = (
+        [("input_lag", "cmd_left", {"time_constant": 0.2})],
+        [
+            ("input_delay", "cmd_left", {"delay": 0.13}),
+            ("input_lag", "cmd_left", {"time_constant": 0.2}),
+            ("input_deadband", "cmd_left", {"width": 0.3}),
+        ],
+        [("input_lag", "cmd_left", {"time_constant": 0.1}), ("input_coupling", "cmd_right", {"from": "cmd_left", "coefficient": 0.3})],
+        [
+            ("input_lag", "cmd_left", {"time_constant": 0.1}),
+            ("input_delay", "*", {"delay": 0.07}),
+            ("input_gain_drift", "*", {"rate": 0.2}),
+        ],
+        [("input_rate_limit", "cmd_right", {"rate": 9.0, "rate_down": 4.0}), ("input_backlash", "cmd_right", {"width": 0.2})],
+    )
+    u = np.repeat(np.random.default_rng(5).normal(size=(20, 2)).round(1), 3, axis=0)
+    for chain in chains:
+        model = compose(ModelSpec("differential_drive", 0.05, {}, tuple(EffectSpec(*link) for link in chain)))
+        data = from_arrays(model, [(np.zeros((len(u) + 1, 5)), u)])
+        act, hidden = acting(model, data), model.at_rest(1)
+        for k, row in enumerate(u):
+            mean, end, hidden = model.act(row[None], hidden)
+            assert act.mean[k] == pytest.approx(mean[0], rel=1e-9, abs=1e-12)
+            assert act.end[k] == pytest.approx(end[0], rel=1e-9, abs=1e-12)

@@ -12,6 +12,9 @@ import numpy as np
 from s2r_runtime.effects.input_effect import Array, InputEffect, Values, columns, replaced
 from s2r_runtime.hookspecs import NominalModel, Parameter
 
+SMALLEST = 1e-300
+"""Not to divide by zero where nothing is left of a difference, on average or at the end."""
+
 
 class InputLag(InputEffect):
     """time_constant T in s; 0 is none."""
@@ -47,6 +50,12 @@ class InputLag(InputEffect):
         after, _ = lapack.dtbtrs(band, (1.0 - keep) * given.reshape(len(u), -1), uplo="L", diag="U")
         before = np.concatenate([np.zeros((1, *given.shape[1:])), after[:-1].reshape(given[:-1].shape)])
         return replaced(u, model, channel, given + (before - given) * mean)
+
+    def at_end(self, given: Array, acting: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
+        """The state itself, from its mean over the step: s_{k+1} = u_k + (u_act - u_k) a / mean."""
+        keep, mean = _factors(p["time_constant"], dt)
+        u = given[..., columns(model, channel)]
+        return replaced(acting, model, channel, u + (acting[..., columns(model, channel)] - u) * (keep / np.maximum(mean, SMALLEST)))
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
         """From a third of a step to 40 steps, and the time constants that actuators have."""

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from s2r_runtime.effects.follower import Follower
-from s2r_runtime.effects.input_effect import Array, Values, columns
+from s2r_runtime.effects.input_effect import Array, Values, columns, replaced
 from s2r_runtime.hookspecs import NominalModel, Parameter
 
 CATCHING_UP = (0.8, 1.5, 3.0, 6.0, 11.0, 20.0, 36.0)
@@ -51,6 +51,12 @@ class InputRateLimit(Follower):
         moved = np.minimum(np.abs(d), reach)
         # a ramp of `moved` takes moved / reach of the step; what it covers it stands at for the rest
         return np.asarray(y + np.sign(d) * moved * (1.0 - moved / (2.0 * reach)))
+
+    def at_end(self, given: Array, acting: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
+        """The ramp's end, from its mean: half a step's ramp further, and u where it got there (the mean is less than that short of it)."""
+        u, mean = given[..., columns(model, channel)], acting[..., columns(model, channel)]
+        up, down = _limits(p, dt)
+        return replaced(acting, model, channel, mean + np.minimum(np.maximum(u - mean, -0.5 * down), 0.5 * up))
 
     def begins(self, held: list[float], steps: Sequence[float], dt: float, p: Values) -> list[float]:
         """One ramp a stretch."""

@@ -13,14 +13,16 @@ scheme by which a pose is integrated among them); what adds to the motion along 
 u_act is the input's mean over the step. Where a nominal model says that a state is set to an input at once (`reached`: a wheel's
 speed, a car's speed), that state is the input as it acts at the end of the step. What an effect makes of a held input may change within
 the step (`within_step`: a lag, a delay by a part of a step). Where that meets such a state, or a later effect that is not linear,
-the effects are run in SUBSTEPS parts of the step, of which the last one stands for its end.
+the effects are run in SUBSTEPS parts of the step; its end is what the effects say of it (`at_end`: a lag, a rate limit), otherwise the last
+part stands for it.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +43,7 @@ Array = NDArray[np.float64]
 Hidden = tuple[Array, ...]
 
 SUBSTEPS = 5
-"""Parts of a step where one is not enough: its end is then known to a tenth of a step."""
+"""Parts of a step where one is not enough. What an effect does not say of the step's end (`at_end`) is then known to a tenth of a step."""
 
 FRAMES = ("body", "", "world")
 """Where an effect on the step acts, in the order in which they apply."""
@@ -67,6 +69,27 @@ class AppliedEffect:
     effect: Effect
     channel: str
     p: dict[str, Any]
+
+    def ends(self, given: Array, acting: Array, end: Array, again: Callable[[], Array], nominal: BoundModel, dt: Any) -> Array:
+        """What acts at the ends of steps of dt, (..., nu). given: what came in, held over each; acting: what acted on average; end: what
+        came in at the ends (`given` itself, if that is all there is); again: the effect, applied to `end`. dt: s, or of each row, (..., 1).
+        """
+        if hasattr(self.effect, "at_end"):
+            found = self.effect.at_end(given, acting, nominal, self.channel, dt, self.p)
+        elif end is given:
+            return acting
+        elif self._remembers(nominal, float(np.min(dt))):
+            found = acting  # what came in at the ends of the steps before is not kept
+        else:
+            found = again()
+        changed = slice(None) if self.channel not in nominal.inputs else [nominal.inputs.index(self.channel)]
+        after = end.copy()
+        after[..., changed] = found[..., changed]
+        return after
+
+    def _remembers(self, nominal: BoundModel, dt: float) -> bool:
+        clock = 1 if getattr(self.effect, "timed", False) else 0  # time is no memory of an input
+        return bool(self.effect.hidden(1, nominal, self.channel, dt, self.p).shape[1] > clock)
 
 
 @dataclass(frozen=True)
@@ -140,16 +163,26 @@ class ComposedModel:
     def act(self, u: Array, hidden: Hidden) -> tuple[Array, Array, Hidden]:
         """Commanded u over one step -> (mean over the step, at its end, hidden')."""
         parts = self.substeps
+        dt = self.dt / parts
         mean = end = u
         for part in range(parts):
-            end, after = u, []
+            end = acting = u
+            after = []
             for a, z in zip(self.effects, hidden, strict=True):
                 if a.effect.stage == "input":
-                    end, z = a.effect.input_step(end, z, self.nominal, a.channel, self.dt / parts, a.p)
+                    given, before = acting, z
+                    acting, z = a.effect.input_step(given, z, self.nominal, a.channel, dt, a.p)
+                    again = partial(self._again, a, end, before)
+                    end = a.ends(given, acting, end, again, self.nominal, dt) if part == parts - 1 else acting
                 after.append(z)
             hidden = tuple(after)
-            mean = end if part == 0 else mean + (end - mean) / (part + 1)
+            mean = acting if part == 0 else mean + (acting - mean) / (part + 1)
         return mean, end, hidden
+
+    def _again(self, a: AppliedEffect, u: Array, z: Array) -> Array:
+        """What the effect makes of an input over a part of a step that begins at z."""
+        acting, _ = a.effect.input_step(u, z, self.nominal, a.channel, self.dt / self.substeps, a.p)
+        return acting
 
     @cached_property
     def uneven(self) -> bool:

@@ -26,6 +26,8 @@ Values = dict[str, Any]
 DT = 0.033
 MOST_STARTS = 20
 """The tracer pays time for each: rarely are more than eight worth it."""
+PARTS = 64
+"""Of a step, fine enough to see where it ends."""
 
 
 class Plain:
@@ -82,6 +84,17 @@ class EffectKit:
             np.testing.assert_allclose(self.effect.input_sequence(u, model, channel, DT, p), parts.mean(axis=1), rtol=1e-9, atol=1e-11)
             if hasattr(self.effect, "within_step") and not self.effect.within_step(DT, p):
                 assert np.allclose(parts, parts[:, :1], rtol=1e-9, atol=1e-11), "within_step says that nothing changes within a step"
+
+    def test_what_acts_at_a_steps_end_is_where_its_parts_get_to(self, cases: list[Case]) -> None:
+        """A wheel's speed is what acts at the end of a step, not on average over it."""
+        if not hasattr(self.effect, "at_end"):
+            pytest.skip("does not say it")
+        for model, channel, p in self._tried(cases):
+            u = self._inputs(model, 60)
+            ends = self.effect.at_end(u, self.effect.input_sequence(u, model, channel, DT, p), model, channel, DT, p)
+            fine = self.effect.input_sequence(np.repeat(u, PARTS, axis=0), model, channel, DT / PARTS, p).reshape(60, PARTS, -1)
+            going = np.abs(fine[:, -1] - fine[:, -2])  # on average the last part is half of this short of its end
+            assert np.all(np.abs(ends - fine[:, -1]) <= going + 1e-9), "at_end is not where the last part of a step gets to"
 
     def test_runs_side_by_side_are_the_same_as_one_after_the_other(self, cases: list[Case]) -> None:
         if not getattr(self.effect, "side_by_side", False):

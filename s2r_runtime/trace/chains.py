@@ -11,7 +11,8 @@ effects that know what to do with that get all runs end to end, with a long rest
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 
 Array = NDArray[np.float64]
 Key = tuple[object, ...]
+Tables = tuple[list[Array], list[Array], list[Array]]
 
 KEPT = 24_000_000
 """Bytes of results that are kept; the longest unused go first."""
@@ -27,6 +29,9 @@ KEPT = 24_000_000
 
 REST_S = 1e4
 """Between runs that are laid end to end: no actuator remembers for so long."""
+
+TINY = 1e-9
+"""s that rows after the end of a run last, which nobody reads: no division by zero."""
 
 
 class _Same:
@@ -62,13 +67,30 @@ class Inputs:
             self._tables, self._starts = [table], [np.array(starts, dtype=np.float64)]
             run, row = np.nonzero(np.arange(len(table)) < lengths[:, None])
             self._rows = row * len(inputs) + run  # of the table laid flat, in the order of runs laid end to end
+        self._each: list[float | Array] = [dt for _ in self._tables]
+        """How long rows of each table last, s: all alike, or (T, 1), (T, runs, 1)."""
+        if lasts is not None:
+            columns = [np.asarray(e)[:, None] for e in lasts]
+            self._each = [np.maximum(_side_by_side(columns), TINY)] if self._rows is not None else [*columns]
 
     def through(self, model: ComposedModel, chain: Sequence[AppliedEffect]) -> Array:
-        """What acts after the chain, from rest: the runs laid end to end, (sum T_i, nu)."""
+        """What acts after the chain, on average over each row, from rest: the runs laid end to end, (sum T_i, nu)."""
+        now, _, links = self._follow(model, chain, ends=False)
+        return self._laid(("laid", *links), now)
+
+    def with_ends(self, model: ComposedModel, chain: Sequence[AppliedEffect]) -> tuple[Array, Array]:
+        """The same, and what acts at the end of each row. One and the same array, if no effect says anything of the ends."""
+        ends = bool(getattr(model.nominal, "reached", None)) and any(hasattr(a.effect, "at_end") for a in chain)
+        now, last, links = self._follow(model, chain, ends=ends)
+        mean = self._laid(("laid", *links), now)
+        return mean, (self._laid(("laid at the ends", *links), last) if ends else mean)
+
+    def _follow(self, model: ComposedModel, chain: Sequence[AppliedEffect], *, ends: bool) -> tuple[list[Array], list[Array], list[Key]]:
+        """Tables on average and at the ends of rows (the same ones, unless these are asked for), and the last link on each input."""
         nominal = model.nominal
         who: Key = (_Same(nominal.shared), *sorted(nominal.parameters.items()))
         links: list[Key] = [(who, name) for name in nominal.inputs]
-        now = self._tables
+        now = last = self._tables
         for a in chain:
             touched = self._touched(a, model)
             key: Key = (_Same(a.effect), a.channel, _values(a), *(links[c] for c in touched))
@@ -78,10 +100,29 @@ class Inputs:
                 self._keep(key, found)
             else:
                 self._kept.move_to_end(key)
-            now = [_with(table, touched, columns) for table, columns in zip(now, found, strict=True)]
+            acted = [_with(table, touched, columns) for table, columns in zip(now, found, strict=True)]
+            last = self._ends(key, a, (now, acted, last), touched, model) if ends else acted
+            now = acted
             for c in touched:
                 links[c] = key
-        return self._laid(("laid", *links), now)
+        return now, last, links
+
+    def _ends(self, key: Key, a: AppliedEffect, tables: Tables, touched: list[int], model: ComposedModel) -> list[Array]:
+        """At the ends of rows after one more link, from tables of what it was given, what acted, and what it was given at the ends."""
+        given, acted, last = tables
+        if last is given and not hasattr(a.effect, "at_end"):
+            return acted
+        known = ("ends", *key)
+        found = self._kept.get(known)
+        if found is None:
+            again = cache(lambda: self._apply(a, last, model))
+            found = []
+            for i, (u, acting, end, dt) in enumerate(zip(given, acted, last, self._each, strict=True)):
+                found.append(a.ends(u, acting, end, partial(_one, again, i), model.nominal, dt)[..., touched])
+            self._keep(known, found)
+        else:
+            self._kept.move_to_end(known)
+        return [_with(table, touched, columns) for table, columns in zip(last, found, strict=True)]
 
     def _laid(self, key: Key, tables: list[Array]) -> Array:
         """The runs laid end to end."""
@@ -163,6 +204,10 @@ def _end_to_end(runs: Sequence[Array], between: float) -> Array:
     """(T_i, c) each -> one after the other, with a row of this between two."""
     rest = np.full((1, runs[0].shape[1]), between)
     return np.concatenate([part for run in runs for part in (run, rest)][:-1])
+
+
+def _one(tables: Callable[[], list[Array]], i: int) -> Array:
+    return tables()[i]
 
 
 def _with(table: Array, columns: list[int], values: Array) -> Array:

@@ -103,14 +103,14 @@ def times(data: Dataset) -> Array:
 def acting(model: ComposedModel, data: Dataset, effects: Sequence[AppliedEffect] | None = None) -> Acting:
     """The input as it acts after the effects of stage `input` (None: the model's)."""
     chain = [a for a in (model.effects if effects is None else effects) if a.effect.stage == "input"]
-    u = data.chains.through(model, chain)
+    u, ends = data.chains.with_ends(model, chain)
     lasts = np.concatenate([run.durations(data.dt) for run in data.runs]) if data.uneven else None
     if data.substeps == 1:
-        return Acting(u, u, lasts)
+        return Acting(u, ends, lasts)
     table = u.reshape(-1, data.substeps * u.shape[1])
     mean = table @ np.tile(np.eye(u.shape[1]) / data.substeps, (data.substeps, 1))
     parts = u.reshape(-1, data.substeps, u.shape[1]) if data.in_parts else None
-    return Acting(mean, table[:, -u.shape[1] :].copy(), lasts, parts)
+    return Acting(mean, ends[data.substeps - 1 :: data.substeps].copy(), lasts, parts)
 
 
 def advanced(model: ComposedModel, x: Array, act: Acting, place: Index | slice) -> Array:
@@ -126,7 +126,8 @@ def advanced(model: ComposedModel, x: Array, act: Acting, place: Index | slice) 
     count = parts.shape[1]
     short = replace(model, spec=structs.replace(model.spec, dt=model.dt / count))
     for i in range(count):
-        x = _once(short, x, parts[:, i], parts[:, i], None if lasts is None else lasts / count)
+        end = parts[:, i] if i < count - 1 else act.end[place]
+        x = _once(short, x, parts[:, i], end, None if lasts is None else lasts / count)
     return x
 
 
