@@ -9,7 +9,7 @@ from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
 from s2r_runtime.trace.residual import acting
 
 DT = 0.04
@@ -220,3 +220,50 @@ def test_what_acts_at_the_ends_of_steps_is_the_same_over_time_at_once_as_step_by
             mean, end, hidden = model.act(row[None], hidden)
             assert act.mean[k] == pytest.approx(mean[0], rel=1e-9, abs=1e-12)
             assert act.end[k] == pytest.approx(end[0], rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("even", [True, False])
+def test_what_acts_at_the_ends_of_steps_is_exact_behind_a_lag_a_ramp_and_a_delay_by_a_part_of_a_step(even):
+    dt, parts = 0.05, 400
+    rng = np.random.default_rng(3)
+    t = dt * (np.arange(81) + (0.0 if even else np.append(0.0, rng.uniform(-0.2, 0.2, 80))))
+    u = np.repeat(rng.normal(size=(20, 2)).round(1), 4, axis=0)
+    model = compose(ModelSpec("differential_drive", dt))
+    streams = Stream(t, np.zeros((81, 5))), Stream(t[:-1], u)
+    data = from_streams(model, [streams], "made")
+    fine = np.repeat(u, parts, axis=0)
+    lasts = np.repeat(np.diff(t) / parts, parts)
+    for name, values, off in (
+        ("input_lag", {"time_constant": 0.08}, 1e-9),
+        ("input_rate_limit", {"rate": 9.0}, 1e-9),
+        ("input_delay", {"delay": 0.048}, 0.0),
+    ):
+        one = compose(ModelSpec("differential_drive", dt, {}, (EffectSpec(name, "cmd_left", values),)))
+        effect = one.effects[0].effect
+        acts = effect.input_sequence(fine, one.nominal, "cmd_left", lasts, values)
+        ends = effect.at_end(fine, acts, None, one.nominal, "cmd_left", lasts[:, None], values)[parts - 1 :: parts, 0]
+        assert acting(one, data).end[:, 0] == pytest.approx(ends, abs=off)
+
+
+def test_a_delay_may_stand_before_or_behind_a_lag_and_the_wheel_is_where_both_have_it():
+    lag, delay = EffectSpec("input_lag", "cmd_left", {"time_constant": 0.08}), EffectSpec("input_delay", "cmd_left", {"delay": 0.034})
+    u = np.repeat(np.random.default_rng(4).normal(size=(15, 2)).round(1), 4, axis=0)
+    ends = []
+    for effects in ((lag, delay), (delay, lag)):
+        model = compose(ModelSpec("differential_drive", 0.05, {}, effects))
+        data = from_arrays(model, [(np.zeros((len(u) + 1, 5)), u)])
+        act, hidden = acting(model, data), model.at_rest(1)
+        for k, row in enumerate(u):
+            mean, end, hidden = model.act(row[None], hidden)
+            assert act.mean[k] == pytest.approx(mean[0], rel=1e-9, abs=1e-12)
+            assert act.end[k] == pytest.approx(end[0], rel=1e-9, abs=1e-12)
+        ends.append(act.end)
+    assert ends[0] == pytest.approx(ends[1], abs=1e-12)
+
+
+def test_a_wheels_sine_is_that_at_the_end_of_the_step():
+    values = {"frequency": 0.8, "amplitude": 1.0, "phase": 0.3}
+    model = compose(ModelSpec("differential_drive", 0.05, {}, (EffectSpec("periodic_disturbance", "cmd_left", values),)))
+    data = from_arrays(model, [(np.zeros((41, 5)), np.zeros((40, 2)))])
+    end = 0.05 * np.arange(1, 41)
+    assert acting(model, data).end[:, 0] == pytest.approx(np.sin(2.0 * np.pi * 0.8 * end + 0.3), abs=1e-3)

@@ -14,7 +14,7 @@ from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
 from s2r_runtime.trace.evidence import RIDGES, evidence, margin
 from s2r_runtime.trace.faults import check
-from s2r_runtime.trace.fitting import evaluate, insert, problem
+from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
 from s2r_runtime.trace.lack_of_fit_terms import LINE, dictionaries, line, quieter
 from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.residual import Steps, acting, residual, steps_of
@@ -279,3 +279,23 @@ def test_a_model_in_which_inputs_push_nowhere_is_seen_to_lack_what_they_do(tmp_p
     found = trace(from_arrays(model, [(np.array(levels) + 0.002 * rng.normal(size=(301, 1)), u)]), model)
     assert found.verdict == verdict
     assert ("valve" in found.depends_on) == (flow != 0.0)
+
+
+def test_a_rival_that_explains_clearly_more_takes_the_place_of_what_was_found():
+    late = EffectSpec("input_delay", "w", {"delay": 0.11})
+    model, robot = (compose(ModelSpec("unicycle", 0.05, {}, effects)) for effects in ((), (late,)))
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-1.0, 1.0, (60, 2)), 8, axis=0)
+    x, hidden, rows = np.zeros((1, 3)), robot.at_rest(1), [np.zeros(3)]
+    for k in range(len(u)):
+        x, hidden = robot.step(x, u[k : k + 1], hidden)
+        rows.append(x[0])
+    data = from_arrays(model, [(np.array(rows) + rng.normal(size=(len(rows), 3)) * 0.003, u)])
+    given = problem(data, steps_of(data))
+    lag = AppliedEffect(registry().get("effects", "input_lag"), "w", {"time_constant": 0.1})
+    nominal = evaluate(given, model)
+    first = fitted(given, nominal, insert(model, lag, 0))
+    found, rivals = selection.overtaken(given, first, STRICT)
+    assert [(found.model.effects[i].effect.name, found.model.effects[i].channel) for i in found.added] == [("input_delay", "w")]
+    assert found.white > first.white + 10.0
+    assert ("input_lag", "w") not in {(s.name, s.channel) for s in rivals}

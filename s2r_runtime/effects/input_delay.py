@@ -53,6 +53,20 @@ class InputDelay(InputEffect):
         line = np.concatenate([np.zeros((whole + 1, *given.shape[1:])), given])
         return replaced(u, model, channel, (1.0 - part) * line[1 : 1 + len(u)] + part * line[: len(u)])
 
+    def at_end(
+        self, given: Array, acting: Array, before: Array | None, model: NominalModel, channel: str, dt: float | Array, p: Values
+    ) -> Array:
+        """What was held a delay before the end: u_{k-m}, whole, where the mean is a mixture."""
+        u = given[..., columns(model, channel)]
+        if before is not None:
+            whole, _ = _steps(p["delay"], float(np.min(dt)))
+            line = np.concatenate([u, before], axis=1).reshape(len(u), whole + 2, u.shape[1])
+            return replaced(acting, model, channel, line[:, whole])
+        lasts = np.broadcast_to(dt, (len(u), *u.shape[1:-1], 1))[..., 0].reshape(len(u), -1)
+        runs = u.reshape(len(u), lasts.shape[1], -1)
+        late = np.stack([_before(runs[:, i], lasts[:, i], float(p["delay"])) for i in range(lasts.shape[1])], axis=1)
+        return replaced(acting, model, channel, late.reshape(u.shape))
+
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
         """Half steps at first, then wider, up to half a second or a dozen steps."""
         wide = [s for s in (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5) if 4.0 * dt < s <= 200.0 * dt]
@@ -70,6 +84,13 @@ def _shifted(u: Array, lasts: Array, delay: float) -> Array:
     changes = np.cumsum(np.any(np.diff(u, axis=0, prepend=0.0) != 0.0, axis=1))
     number = np.concatenate([changes, [0]])[row]
     return np.where((number[1:] == number[:-1])[:, None], given[:-1], np.diff(area, axis=0) / lasts[:, None])
+
+
+def _before(u: Array, lasts: Array, delay: float) -> Array:
+    """u (T, c), held over rows that last so long, (T,) s, as it was a delay before the end of each row; zero before the first."""
+    edges = np.concatenate([[0.0], np.cumsum(lasts)])
+    row = np.searchsorted(edges, edges[1:] - delay - ROUNDING * np.median(lasts), side="right") - 1
+    return np.where((row >= 0)[:, None], u[np.clip(row, 0, None)], 0.0)
 
 
 def _steps(delay: float, dt: float) -> tuple[int, float]:

@@ -51,7 +51,9 @@ class InputLag(InputEffect):
         before = np.concatenate([np.zeros((1, *given.shape[1:])), after[:-1].reshape(given[:-1].shape)])
         return replaced(u, model, channel, given + (before - given) * mean)
 
-    def at_end(self, given: Array, acting: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
+    def at_end(
+        self, given: Array, acting: Array, before: Array | None, model: NominalModel, channel: str, dt: float | Array, p: Values
+    ) -> Array:
         """The state itself, from its mean over the step: s_{k+1} = u_k + (u_act - u_k) a / mean."""
         keep, mean = _factors(p["time_constant"], dt)
         u = given[..., columns(model, channel)]

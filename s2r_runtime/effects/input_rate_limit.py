@@ -52,7 +52,9 @@ class InputRateLimit(Follower):
         # a ramp of `moved` takes moved / reach of the step; what it covers it stands at for the rest
         return np.asarray(y + np.sign(d) * moved * (1.0 - moved / (2.0 * reach)))
 
-    def at_end(self, given: Array, acting: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
+    def at_end(
+        self, given: Array, acting: Array, before: Array | None, model: NominalModel, channel: str, dt: float | Array, p: Values
+    ) -> Array:
         """The ramp's end, from its mean: half a step's ramp further, and u where it got there (the mean is less than that short of it)."""
         u, mean = given[..., columns(model, channel)], acting[..., columns(model, channel)]
         up, down = _limits(p, dt)

@@ -13,18 +13,18 @@ scheme by which a pose is integrated among them); what adds to the motion along 
 u_act is the input's mean over the step. Where a nominal model says that a state is set to an input at once (`reached`: a wheel's
 speed, a car's speed), that state is the input as it acts at the end of the step. What an effect makes of a held input may change within
 the step (`within_step`: a lag, a delay by a part of a step). Where that meets such a state, or a later effect that is not linear,
-the effects are run in SUBSTEPS parts of the step; its end is what the effects say of it (`at_end`: a lag, a rate limit), otherwise the last
-part stands for it.
+the effects are run in SUBSTEPS parts of the step; its end is what the effects say of it (`at_end`: a lag, a rate limit, a delay), otherwise
+the last part stands for it. Delays are worked out before all that does not mind, while the input is held yet.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -41,6 +41,7 @@ from s2r_runtime.plugins import registry
 
 Array = NDArray[np.float64]
 Hidden = tuple[Array, ...]
+T = TypeVar("T")
 
 SUBSTEPS = 5
 """Parts of a step where one is not enough. What an effect does not say of the step's end (`at_end`) is then known to a tenth of a step."""
@@ -70,15 +71,24 @@ class AppliedEffect:
     channel: str
     p: dict[str, Any]
 
-    def ends(self, given: Array, acting: Array, end: Array, again: Callable[[], Array], nominal: BoundModel, dt: Any) -> Array:
-        """What acts at the ends of steps of dt, (..., nu). given: what came in, held over each; acting: what acted on average; end: what
-        came in at the ends (`given` itself, if that is all there is); again: the effect, applied to `end`. dt: s, or of each row, (..., 1).
+    @property
+    def says_ends(self) -> bool:
+        """Whether what acts at the end of a step may be another thing than what acts on average, though the input is held."""
+        return hasattr(self.effect, "at_end") or bool(getattr(self.effect, "timed", False))
+
+    def ends(
+        self, tables: tuple[Array, Array, Array], before: Array | None, again: Callable[[], Array], nominal: BoundModel, dt: Any
+    ) -> Array:
+        """What acts at the ends of steps of dt, (..., nu). tables: what came in, held over each; what acted on average; what came in at the
+        ends (the first one itself, if that is all there is). before: hidden state at the start of one step, None over time. again: the
+        effect, applied to what came in at the ends. dt: s, or of each row, (..., 1).
         """
+        given, acting, end = tables
         if hasattr(self.effect, "at_end"):
-            found = self.effect.at_end(given, acting, nominal, self.channel, dt, self.p)
-        elif end is given:
-            return acting
-        elif self._remembers(nominal, float(np.min(dt))):
+            found = self.effect.at_end(given, acting, before, nominal, self.channel, dt, self.p)
+        elif getattr(self.effect, "timed", False):
+            found = again()
+        elif end is given or self.effect.hidden(1, nominal, self.channel, float(np.min(dt)), self.p).size:
             found = acting  # what came in at the ends of the steps before is not kept
         else:
             found = again()
@@ -86,10 +96,6 @@ class AppliedEffect:
         after = end.copy()
         after[..., changed] = found[..., changed]
         return after
-
-    def _remembers(self, nominal: BoundModel, dt: float) -> bool:
-        clock = 1 if getattr(self.effect, "timed", False) else 0  # time is no memory of an input
-        return bool(self.effect.hidden(1, nominal, self.channel, dt, self.p).shape[1] > clock)
 
 
 @dataclass(frozen=True)
@@ -167,21 +173,27 @@ class ComposedModel:
         mean = end = u
         for part in range(parts):
             end = acting = u
-            after = []
-            for a, z in zip(self.effects, hidden, strict=True):
-                if a.effect.stage == "input":
-                    given, before = acting, z
-                    acting, z = a.effect.input_step(given, z, self.nominal, a.channel, dt, a.p)
-                    again = partial(self._again, a, end, before)
-                    end = a.ends(given, acting, end, again, self.nominal, dt) if part == parts - 1 else acting
-                after.append(z)
+            after = list(hidden)
+            for i, a in self._chain:
+                given, before = acting, hidden[i]
+                acting, after[i] = a.effect.input_step(given, before, self.nominal, a.channel, dt, a.p)
+                again = partial(self._again, a, end, before)
+                end = a.ends((given, acting, end), before, again, self.nominal, dt) if part == parts - 1 else acting
             hidden = tuple(after)
             mean = acting if part == 0 else mean + (acting - mean) / (part + 1)
         return mean, end, hidden
 
+    @cached_property
+    def _chain(self) -> list[tuple[int, AppliedEffect]]:
+        """Effects of stage `input` in the order in which they are worked out, each with its place."""
+        numbered = [(i, a) for i, a in enumerate(self.effects) if a.effect.stage == "input"]
+        return delays_first(self.nominal, numbered, lambda pair: pair[1])
+
     def _again(self, a: AppliedEffect, u: Array, z: Array) -> Array:
-        """What the effect makes of an input over a part of a step that begins at z."""
-        acting, _ = a.effect.input_step(u, z, self.nominal, a.channel, self.dt / self.substeps, a.p)
+        """What the effect makes of an input over a part of a step that begins at z; if it depends on time, around the end of that part."""
+        dt = self.dt / self.substeps
+        z = z + 0.5 * dt if getattr(a.effect, "timed", False) else z
+        acting, _ = a.effect.input_step(u, z, self.nominal, a.channel, dt, a.p)
         return acting
 
     @cached_property
@@ -266,6 +278,27 @@ class ComposedModel:
         for column in self.angle_columns:
             e[:, column] = wrap(e[:, column])
         return e
+
+
+def delays_first(nominal: BoundModel, chain: Sequence[T], of: Callable[[T], AppliedEffect]) -> list[T]:
+    """A chain with each delay before what does not mind being delayed: the same, but what comes in is held yet, so that it is known to
+    the instant what acts at the end of a step. As it is, where nothing depends on that.
+    """
+    found = list(chain)
+    for i in range(1, len(found) if getattr(nominal, "reached", None) else 0):
+        while i and getattr(of(found[i]).effect, "shift", False) and _waits(nominal, of(found[i - 1]), of(found[i]).channel):
+            found[i - 1 : i + 1] = found[i], found[i - 1]
+            i -= 1
+    return found
+
+
+def _waits(nominal: BoundModel, a: AppliedEffect, channel: str) -> bool:
+    """Whether an effect may come after a delay on a channel as well as before it."""
+    if getattr(a.effect, "timed", False) or getattr(a.effect, "shift", False):
+        return False
+    reads = getattr(a.effect, "reads", None)
+    touched = {a.channel, *(reads(nominal, a.channel) if reads else ())}
+    return channel == "*" or touched == {channel} or (channel not in touched and "*" not in touched)
 
 
 def compose(spec: ModelSpec, where: str = "model") -> ComposedModel:

@@ -91,7 +91,7 @@ class EffectKit:
             pytest.skip("does not say it")
         for model, channel, p in self._tried(cases):
             u = self._inputs(model, 60)
-            ends = self.effect.at_end(u, self.effect.input_sequence(u, model, channel, DT, p), model, channel, DT, p)
+            ends = self.effect.at_end(u, self.effect.input_sequence(u, model, channel, DT, p), None, model, channel, DT, p)
             fine = self.effect.input_sequence(np.repeat(u, PARTS, axis=0), model, channel, DT / PARTS, p).reshape(60, PARTS, -1)
             going = np.abs(fine[:, -1] - fine[:, -2])  # on average the last part is half of this short of its end
             assert np.all(np.abs(ends - fine[:, -1]) <= going + 1e-9), "at_end is not where the last part of a step gets to"

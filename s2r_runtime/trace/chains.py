@@ -17,7 +17,7 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.models.composed import AppliedEffect, ComposedModel
+from s2r_runtime.models.composed import AppliedEffect, ComposedModel, delays_first
 
 Array = NDArray[np.float64]
 Key = tuple[object, ...]
@@ -80,7 +80,7 @@ class Inputs:
 
     def with_ends(self, model: ComposedModel, chain: Sequence[AppliedEffect]) -> tuple[Array, Array]:
         """The same, and what acts at the end of each row. One and the same array, if no effect says anything of the ends."""
-        ends = bool(getattr(model.nominal, "reached", None)) and any(hasattr(a.effect, "at_end") for a in chain)
+        ends = bool(getattr(model.nominal, "reached", None)) and any(a.says_ends for a in chain)
         now, last, links = self._follow(model, chain, ends=ends)
         mean = self._laid(("laid", *links), now)
         return mean, (self._laid(("laid at the ends", *links), last) if ends else mean)
@@ -91,7 +91,7 @@ class Inputs:
         who: Key = (_Same(nominal.shared), *sorted(nominal.parameters.items()))
         links: list[Key] = [(who, name) for name in nominal.inputs]
         now = last = self._tables
-        for a in chain:
+        for a in delays_first(nominal, chain, lambda link: link):
             touched = self._touched(a, model)
             key: Key = (_Same(a.effect), a.channel, _values(a), *(links[c] for c in touched))
             found = self._kept.get(key)
@@ -110,15 +110,15 @@ class Inputs:
     def _ends(self, key: Key, a: AppliedEffect, tables: Tables, touched: list[int], model: ComposedModel) -> list[Array]:
         """At the ends of rows after one more link, from tables of what it was given, what acted, and what it was given at the ends."""
         given, acted, last = tables
-        if last is given and not hasattr(a.effect, "at_end"):
+        if last is given and not a.says_ends:
             return acted
         known = ("ends", *key)
         found = self._kept.get(known)
         if found is None:
-            again = cache(lambda: self._apply(a, last, model))
+            again = cache(lambda: self._apply(a, last, model, later=0.5))
             found = []
             for i, (u, acting, end, dt) in enumerate(zip(given, acted, last, self._each, strict=True)):
-                found.append(a.ends(u, acting, end, partial(_one, again, i), model.nominal, dt)[..., touched])
+                found.append(a.ends((u, acting, end), None, partial(_one, again, i), model.nominal, dt)[..., touched])
             self._keep(known, found)
         else:
             self._kept.move_to_end(known)
@@ -151,16 +151,17 @@ class Inputs:
         also = reads(model.nominal, a.channel) if reads else ()
         return [i for i, name in enumerate(names) if name == a.channel or name in also]
 
-    def _apply(self, a: AppliedEffect, tables: list[Array], model: ComposedModel) -> list[Array]:
+    def _apply(self, a: AppliedEffect, tables: list[Array], model: ComposedModel, later: float = 0.0) -> list[Array]:
+        """What acts. later: rows by which time is ahead of the rows, for what depends on it."""
         if self._lasts is not None and getattr(a.effect, "uneven", False):
             given = _end_to_end(self._split(tables), 0.0)
-            timed = {"start": self._begins} if getattr(a.effect, "timed", False) else {}
+            timed = {"start": self._begins + later * self._lasts} if getattr(a.effect, "timed", False) else {}
             return self._tabled(a.effect.input_sequence(given, model.nominal, a.channel, self._lasts, a.p, **timed))  # type: ignore[arg-type]
         if self._rows is None or getattr(a.effect, "side_by_side", False):
-            return [self._over_time(a, u, model, start) for u, start in zip(tables, self._starts, strict=True)]
+            return [self._over_time(a, u, model, start + later * self._dt) for u, start in zip(tables, self._starts, strict=True)]
         z, done = a.effect.hidden(tables[0].shape[1], model.nominal, a.channel, self._dt, a.p), []
         if getattr(a.effect, "timed", False):
-            z[:, 0] = self._starts[0]
+            z[:, 0] = self._starts[0] + later * self._dt
         for u in tables[0]:
             acting_now, z = a.effect.input_step(u, z, model.nominal, a.channel, self._dt, a.p)
             done.append(acting_now)

@@ -107,7 +107,8 @@ def select(
             break
     fit = plainly(given, simplified(given, pruned(given, fit, tried, horizon, bar)))
     progress(0.8)
-    first, others = representative(given, fit, rivals(given, fit))
+    fit, found = overtaken(given, fit, bar)
+    first, others = representative(given, fit, found)
     return Selection(nominal, fit if first is fit else plainly(given, first), tried, tuple(ranking), tuple(others))
 
 
@@ -253,6 +254,19 @@ def exchanged(given: Problem, fit: Fit, bar: Bar) -> Fit:
         if gain(best, fit) > bar.price(best.k - fit.k, len(given.steps)) + margin:
             fit = fitted(given, best, best.model)
     return fit
+
+
+def overtaken(given: Problem, fit: Fit, bar: Bar) -> tuple[Fit, list[Scored]]:
+    """The fit with its rivals. One that does better beside all that was found takes its place, which earlier rounds could not know."""
+    found = rivals(given, fit)
+    for _ in fit.added:
+        better = [(gain(s.fit, fit) - bar.price(s.fit.k - fit.k, len(given.steps)), s.fit) for s in found if s.fit is not None]
+        more, best = max(better, key=lambda pair: pair[0], default=(0.0, fit))
+        if more <= CLOSE:
+            break
+        fit = plainly(given, fitted(given, best, best.model))
+        found = rivals(given, fit)
+    return fit, found
 
 
 def pruned(given: Problem, fit: Fit, tried: int, horizon: int, bar: Bar) -> Fit:

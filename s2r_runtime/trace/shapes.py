@@ -83,6 +83,20 @@ class Shape(InputEffect):
         return after
 
 
+class Following(Shape):
+    """A shape of which the mean over a row is that of where it begins and where it ends, (z_k + z_{k+1}) / 2, from z = 0."""
+
+    def at_end(
+        self, given: Array, acting: Array, before: Array | None, model: NominalModel, channel: str, dt: float | Array, p: Values
+    ) -> Array:
+        """z_{k+1} = 2 (m_k - m_{k-1} + m_{k-2} - ...), of the means m."""
+        j = model.inputs.index(channel)
+        sign = (1.0 - 2.0 * (np.arange(len(acting)) % 2)).reshape(-1, *([1] * (acting.ndim - 2)))
+        after = acting.copy()
+        after[..., j] = 2.0 * sign * np.cumsum(sign * acting[..., j], axis=0)
+        return after
+
+
 def _left(dt: Lasts, time_constants: float | Array, u: Array) -> Array:
     """(T,) what a lag leaves of a difference over each row."""
     return np.broadcast_to(np.exp(-dt / np.maximum(time_constants, SMALL)), u.shape)
@@ -216,9 +230,9 @@ def _pairs(one: str, two: str) -> Callable[[float, Sequence[float]], list[Values
 
 
 SHAPES = (
-    Shape("two lags, out and back", True, (_second("out"), _second("back")), _out_and_back, _pairs("out", "back")),
-    Shape("two lags, up and down", True, (_second("up"), _second("down")), _up_and_down, _pairs("up", "down")),
-    Shape("a lag that goes with the size", True, (_second("small"), _second("large")), _lag_by_size, _pairs("small", "large")),
+    Following("two lags, out and back", True, (_second("out"), _second("back")), _out_and_back, _pairs("out", "back")),
+    Following("two lags, up and down", True, (_second("up"), _second("down")), _up_and_down, _pairs("up", "down")),
+    Following("a lag that goes with the size", True, (_second("small"), _second("large")), _lag_by_size, _pairs("small", "large")),
     Shape(
         "a delay that goes with the size",
         True,
@@ -226,7 +240,7 @@ SHAPES = (
         _delay_by_size,
         _pairs("small", "large"),
     ),
-    Shape(
+    Following(
         "an actuator that rings",
         True,
         (_number("rate", 1e-2, 1e4), _number("damping", 0.01, 0.999)),
