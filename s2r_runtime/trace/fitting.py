@@ -9,7 +9,7 @@ model with an effect. Parameters are refined by Gauss-Newton with the weights of
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -44,11 +44,12 @@ SETTLED = 0.3
 
 @dataclass(frozen=True)
 class Problem:
-    """Transitions that a model is to explain. floor: least variances of noise."""
+    """Transitions that a model is to explain. floor: least variances of noise. searches: what was tried beside which model (`scores`)."""
 
     data: Dataset
     steps: Steps
     floor: Noise
+    searches: dict[tuple[object, ...], object] = field(default_factory=dict, repr=False, compare=False)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace.candidates import candidates
@@ -35,6 +36,12 @@ GIVEN_UP = 1e-3
 
 FIRST_LOOK = 4
 """Candidates of the first look that are fitted, where there is a second one."""
+
+KEPT = 6
+"""Searches that are known at a time: a selection goes back to the models less one effect, of which there are at most five."""
+
+AS_MUCH = 3.0
+"""Nats that a model may explain less than another one of the same effects (its noise was begun elsewhere) for a search beside it to do."""
 
 REACHES = 0.3
 """Of what another model explains: a candidate that screening gives less will not come up to it. Of 114 that did best once they were
@@ -84,16 +91,10 @@ def best_candidates(given: Problem, base: Fit, few: int = FEW, bar: Bar = STRICT
     """The candidates for one more effect, fitted, best score first; and how many starts were looked at. against: nats of gain that
     they must come up to.
     """
-    offered = candidates(base.model, given.data, Leftover(given, base))
-    screened, tried = screen(given, base, offered)
+    search = _search(given, base)
     scored: dict[tuple[str, str], Scored] = {}
-    promising = [(s, base) for s in _promising(screened, few, REACHES * against)]
-    if given.floor.axes and promising:
-        quiet = _quieter(given, base, promising[0][0])
-        screened, _ = screen(given, quiet, offered)
-        promising = [*promising[:FIRST_LOOK], *((s, quiet) for s in _promising(screened, few, 0.0))]
-    for s, under in promising:
-        fit = fitted(given, under, s.start, 2)
+    screened, looked_at = search.fitted(few, REACHES * against)
+    for s, fit in looked_at:
         value = gain(fit, base) - bar.price(fit.k - base.k, len(given.steps))
         key = (s.candidate.name, s.candidate.channel)
         if key not in scored or value > scored[key].score:
@@ -102,19 +103,66 @@ def best_candidates(given: Problem, base: Fit, few: int = FEW, bar: Bar = STRICT
     close = [one for one in scored.values() if one.score > best - CONTENDS] if best > 0.0 else []
     for one in close if len(close) > 1 else ():
         if one.fit is not None:
-            fit = fitted(given, one.fit, one.fit.model, SETTLES)
+            fit = search.settled(one.fit)
             scored[one.name, one.channel] = replace(one, score=gain(fit, base) - bar.price(fit.k - base.k, len(given.steps)), fit=fit)
     for s in screened:
         scored.setdefault((s.candidate.name, s.candidate.channel), Scored(s.candidate.name, s.candidate.channel, min(s.value, 0.0)))
-    return sorted(scored.values(), key=lambda s: (s.fit is None, -s.score)), tried
+    return sorted(scored.values(), key=lambda s: (s.fit is None, -s.score)), search.tried
 
 
-def _quieter(given: Problem, base: Fit, best: Screened) -> Fit:
-    """The same model under the noise that the best candidate leaves. Where a speed was not measured, nearly all that a model lacks can be
-    taken for noise that pushes: under that, candidates look alike, and none looks like much.
+class _Search:
+    """What was looked at and fitted beside one model. It is asked for more than once: under another bar, for what does better than an
+    effect that was found, and for what does as well.
     """
-    fit = fitted(given, base, best.start, 2)
-    return under_noise(given, base.model, fit.noise) if fit.white > base.white else base
+
+    def __init__(self, given: Problem, base: Fit) -> None:
+        self.base = base
+        self._given = given
+        self._offered = candidates(base.model, given.data, Leftover(given, base))
+        self._first, self.tried = screen(given, base, self._offered)
+        self._fits: dict[int, tuple[object, Fit]] = {}
+
+    def fitted(self, few: int, least: float) -> tuple[list[Screened], list[tuple[Screened, Fit]]]:
+        """All as screened, and those fitted that screening makes promising. least: nats."""
+        screened = self._first
+        promising = [(s, self.base) for s in _promising(screened, few, least)]
+        if self._given.floor.axes and promising:
+            quiet, screened = self._quietly
+            promising = [*promising[:FIRST_LOOK], *((s, quiet) for s in _promising(screened, few, 0.0))]
+        return screened, [(s, self._refined(s, under, s.start, 2)) for s, under in promising]
+
+    def settled(self, fit: Fit) -> Fit:
+        """One of these, fitted on."""
+        return self._refined(fit, fit, fit.model, SETTLES)
+
+    @cached_property
+    def _quietly(self) -> tuple[Fit, list[Screened]]:
+        """The model under the noise that the best candidate leaves, and the candidates under that. Where a speed was not measured, nearly
+        all that a model lacks can be taken for noise that pushes: under that, candidates look alike, and none looks like much.
+        """
+        fit = fitted(self._given, self.base, self._first[0].start, 2)
+        quiet = under_noise(self._given, self.base.model, fit.noise) if fit.white > self.base.white else self.base
+        return quiet, screen(self._given, quiet, self._offered)[0]
+
+    def _refined(self, of: object, under: Fit, model: ComposedModel, rounds: int) -> Fit:
+        """Known by the identity of what it is of, which is kept with it: no other object takes its place."""
+        if id(of) not in self._fits:
+            self._fits[id(of)] = of, fitted(self._given, under, model, rounds)
+        return self._fits[id(of)][1]
+
+
+def _search(given: Problem, base: Fit) -> _Search:
+    """The one beside a model of the same effects that explains as much, if there was one; the last KEPT are known. What is fitted beside it
+    has numbers and noise of its own: where these began makes no difference.
+    """
+    key = tuple((*name_of(a), isinstance(a, Added)) for a in base.model.effects)
+    there = given.searches.pop(key, None)
+    if not isinstance(there, _Search) or base.white > there.base.white + AS_MUCH:
+        there = _Search(given, base)
+    given.searches[key] = there
+    while len(given.searches) > KEPT:
+        given.searches.pop(next(iter(given.searches)))
+    return there
 
 
 def rescored(found: Sequence[Scored], base: Fit, n: int, bar: Bar) -> list[Scored]:
