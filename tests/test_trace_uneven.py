@@ -10,9 +10,13 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.chains import Inputs
-from s2r_runtime.trace.residual import Acting, advanced
+from s2r_runtime.trace.dataset import from_streams
+from s2r_runtime.trace.holdout import part
+from s2r_runtime.trace.residual import Acting, acting, advanced, residual, steps_of
 from s2r_runtime.trace.shapes import SHAPES, Shape
+from s2r_runtime.trace.streams import Stream
 
 Array = NDArray[np.float64]
 
@@ -107,6 +111,24 @@ def test_a_delay_leaves_a_held_input_as_it_is() -> None:
     u = np.repeat(rng.normal(size=(8, 2)), 20, axis=0)
     found = Inputs([u], DT, [0.0], [_uneven(rng, len(u))]).through(model, model.effects)[:, 0]
     assert np.count_nonzero(np.diff(found)) <= 2 * 8
+
+
+@pytest.mark.parametrize("even", [True, False], ids=["on the grid", "uneven"])
+@pytest.mark.parametrize("gain", [1.0, 0.7])
+def test_a_speed_is_what_was_commanded_last_however_late_in_its_step(even: bool, gain: float) -> None:
+    """Commands nine tenths of a step after the states, each another one: half way through the last part of five. In what is fitted, too."""
+    rng = np.random.default_rng(7)
+    model = _model("bicycle", EffectSpec("input_gain", "speed_cmd", {"gain": gain}))
+    t = 1.7e9 + np.cumsum(np.full(200, DT) if even else 0.8 * DT + 0.4 * DT * rng.random(200))
+    u = rng.uniform(0.5, 1.5, (199, 2)) * [0.1, 1.0]
+    y = np.cumsum(rng.normal(size=(200, 4)), axis=0)
+    y[1:, 3] = gain * u[:, 1]
+    data = with_history(model, from_streams(model, [(Stream(t, y), Stream(t[:-1] + 0.9 * np.diff(t), u))], "late"))
+    some = np.zeros(sum(len(run.y) - 1 for run in data.runs), dtype=bool)
+    some[40:150] = True
+    for used in (data, part(data, (), some, 1000).data):
+        off = residual(model, steps_of(used), acting(model, used))[1:-1, 3]
+        assert np.max(np.abs(off)) < 1e-9
 
 
 @pytest.mark.parametrize("name", ON_STEPS)

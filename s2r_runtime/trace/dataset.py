@@ -42,12 +42,14 @@ from s2r_runtime.trace.streams import (
     interpolated,
     nearest,
     on_grid,
+    turned,
     unwrapped,
 )
 
 __all__ = ["Dataset", "Pause", "Run", "Stream", "from_arrays", "from_streams", "thinned"]
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 PARTS = (4, 6)
 """Least and most parts of a step where inputs change within steps."""
@@ -94,12 +96,15 @@ class Pause:
 
 @dataclass(frozen=True)
 class Run:
-    """One contiguous stretch. start_s: of its first row; y: (K+1, nx); u: (K S, nu); lasts: (K,) s, of each step (None: dt)."""
+    """One contiguous stretch. start_s: of its first row; y: (K+1, nx); u: (K S, nu); lasts: (K,) s, of each step (None: dt).
+    turned: (K, nu) steps in whose last part an input changes (`streams.turned`; None: in none).
+    """
 
     start_s: float
     y: Array
     u: Array
     lasts: Array | None = None
+    turned: Mask | None = None
 
     def durations(self, dt: float) -> Array:
         """(K,) s, of each step."""
@@ -148,6 +153,15 @@ class Dataset:
     def uneven(self) -> bool:
         """Whether steps do not all last dt."""
         return any(run.lasts is not None for run in self.runs)
+
+    @cached_property
+    def turned(self) -> Mask | None:
+        """(M, nu) of all runs' steps; None where no input changes within the last part of a step."""
+        if all(run.turned is None for run in self.runs):
+            return None
+        return np.concatenate(
+            [np.zeros((len(run.y) - 1, len(self.inputs)), bool) if run.turned is None else run.turned for run in self.runs]
+        )
 
     @cached_property
     def axes_without_speed(self) -> tuple[tuple[int, int], ...]:
@@ -217,15 +231,16 @@ def from_streams(
         pauses += _pauses(states, inputs.t, len(runs), spacing, origin, dt)
         early = math.ceil((t0 - inputs.t[0]) / dt - ALIGNED) if len(inputs.t) else 0
         early = min(max(early, 0), BEFORE)
-        lasts = None
+        lasts, late = None, None
         if as_they_are:
             y, at = nearest(states, dt, model.angle_columns)
             at = np.concatenate([t0 - dt * np.arange(early, 0, -1), at])
-            u, lasts = held_between(inputs, at, parts), np.diff(at)
+            u, lasts, late = held_between(inputs, at, parts), np.diff(at), turned(inputs, at, parts)
         else:
             y = at_grid(states, dt, model.angle_columns) if exact else interpolated(states, dt, model.angle_columns, spacing)
             u = held_means(inputs, t0 - early * dt, len(y) - 1 + early, dt, parts)
-        runs.append(Run(t0 - early * dt - origin, np.concatenate([np.full((early, y.shape[1]), np.nan), y]), u, lasts))
+            late = turned(inputs, t0 + dt * np.arange(-early, len(y)), parts, ALIGNED * dt) if exact and parts > 1 else None
+        runs.append(Run(t0 - early * dt - origin, np.concatenate([np.full((early, y.shape[1]), np.nan), y]), u, lasts, late))
     rows = sum(len(states.t) for states, _ in stretches)
     return Dataset(
         model.states,

@@ -141,7 +141,8 @@ def part(data: Dataset, left_out: tuple[tuple[int, int], ...], seen: Mask, most:
         y[: a - early] = np.nan
         out += [(len(runs), k - early) for k in range(early, b) if (run, k) in known] if known else []
         lasts = None if given.lasts is None else given.lasts[early:b]
-        runs.append(Run(float(given.begins(data.dt)[early]), y, given.u[early * data.substeps : b * data.substeps], lasts))
+        turned = None if given.turned is None else given.turned[early:b] & (np.arange(early, b) < b - 1)[:, None]
+        runs.append(Run(float(given.begins(data.dt)[early]), y, given.u[early * data.substeps : b * data.substeps], lasts, turned))
     made = replace(data, runs=tuple(runs))
     return Part(made, steps_of(made, out), tuple(out))
 

@@ -366,4 +366,4 @@ def _earlier(run: Run, rows: int) -> Run:
         u[-rows:] = run.u[-1]
     elif rows < 0:
         u[:-rows] = run.u[0]
-    return replace(run, u=u)
+    return replace(run, u=u, turned=None)

@@ -110,7 +110,11 @@ def acting(model: ComposedModel, data: Dataset, effects: Sequence[AppliedEffect]
     table = u.reshape(-1, data.substeps * u.shape[1])
     mean = table @ np.tile(np.eye(u.shape[1]) / data.substeps, (data.substeps, 1))
     parts = u.reshape(-1, data.substeps, u.shape[1]) if data.in_parts else None
-    return Acting(mean, ends[data.substeps - 1 :: data.substeps].copy(), lasts, parts)
+    end = ends[data.substeps - 1 :: data.substeps].copy()
+    if data.turned is not None:  # what changes within the last part is over by its end, unless an effect says what acts there
+        plain = data.turned & (end == u[data.substeps - 1 :: data.substeps])
+        end[plain] = np.roll(table[:, : u.shape[1]], -1, axis=0)[plain]
+    return Acting(mean, end, lasts, parts)
 
 
 def advanced(model: ComposedModel, x: Array, act: Acting, place: Index | slice) -> Array:

@@ -233,6 +233,22 @@ def _held_or_mean(mean: Array, values: Array, t: Array, edges: Array) -> Array:
     return np.asarray(np.where(changed[last] == changed[first], given[first], mean))
 
 
+def turned(inputs: Stream, at: Array, parts: int, on_edge: float = 0.0) -> Mask | None:
+    """(K, nu) of steps between the stamps at (K + 1,): whether an input changes within the last part of a step and holds over the next.
+    What acts at the end of that step is what acts over the next part: its own last part has a mean of before and after. None: nowhere.
+    on_edge: s from a stamp within which a change is on it.
+    """
+    values = held(inputs.values)
+    found: Mask = np.zeros((len(at) - 1, values.shape[1]), dtype=np.bool_)
+    last, after = np.diff(at)[:-1] / parts, np.diff(at)[1:] / parts
+    near = np.maximum(ROUNDING * np.minimum(last, after) + 4.0 * np.spacing(np.abs(at[1:-1])), on_edge)
+    for j, column in enumerate(values.T):
+        t = inputs.t[np.append(True, column[1:] != column[:-1])] if len(column) else inputs.t
+        a, b, c = (np.searchsorted(t, e) for e in (at[1:-1] - last + near, at[1:-1] - near, at[1:-1] + after - near))
+        found[:-1, j] = (b > a) & (c == b)
+    return found if found.any() else None
+
+
 def on_grid(t: Array, dt: float) -> bool:
     """Whether nearly every grid point that has a row in reach has one on it."""
     place = (t - t[0]) / dt
