@@ -5,6 +5,8 @@
 for the recording as it is and with each usual mistake c taken back. As it is, the model foretells little (E > NOTHING); with one
 mistake taken back it foretells well (E < WELL, and by far better): then that is what is wrong, and no effect is looked for. A state
 that nothing else follows (a car's speed) may be wrong alone: the same with the largest in the place of the mean, and NOTHING_ALONE.
+A position and its rate, or all states, may be so many times too large together (degrees, cm), or of the other sign. Where inputs so many
+times larger do the same (a mass under a force), only the number itself tells: 180/pi to EXACTLY is no mass.
 
 Inputs that come after the motion that they cause are on another clock: the model foretells a tenth of a second far better with the inputs
 earlier by some steps than with any delay. Where that lead grows over the recording, the clocks run at different rates. Friction makes a
@@ -22,12 +24,13 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.errors import RecordingError
+from s2r_runtime.errors import ConfigError, RecordingError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.dataset import Dataset, Run, regridded
 from s2r_runtime.trace.never_measured import check_measured
 from s2r_runtime.trace.residual import Index, acting, predicted, rollout, rollout_starts, steps_of
+from s2r_runtime.trace.scales import SCALES, Scale, axis_pairs, groups
 from s2r_runtime.trace.streams import Stream
 
 Array = NDArray[np.float64]
@@ -50,8 +53,17 @@ DEAD = 0.7
 EXACTLY, FEWEST_STEPS = 0.02, 60
 """How near to a unit's factor a speed must be to its command's multiple, and on how many steps at least."""
 
+ALIKE = 1.5
+"""Times E with states in another unit, below which E with inputs as many times larger says the same."""
+
+FAR = 50.0
+"""Times too large, from which on E need not be below SURELY: no robot is that far off by itself."""
+
 HORIZON_S = 0.5
 """Of the rollouts, s (1 to 50 steps)."""
+
+SLOW_STEPS = 10
+"""Of the rollouts, where a step is as long as that: in one step a tank's level hardly moves beyond its noise."""
 
 STARTS = 300
 """Rollouts: their mean error is then known to a few per cent."""
@@ -101,6 +113,7 @@ def check_plausible(model: ComposedModel, data: Dataset) -> None:
     """Raises RecordingError if the columns are clearly not what they say, with what they seem to be."""
     check_measured(model, data)
     _check_columns(model, data)
+    _check_scales(model, data)
     _check_speeds(model, data)
     _check_clocks(model, data)
 
@@ -111,13 +124,48 @@ def _check_columns(model: ComposedModel, data: Dataset) -> None:
     if every is None or not data.segments or (np.mean(every) <= NOTHING and np.max(every) <= NOTHING_ALONE):
         return
     few = _few(data)
-    tried = [(e, m) for m in _mistakes(model) if (e := _foretold(model, _taken_back(model, few, m))) is not None]
-    dead = [e for m in _dead(model) if (e := _foretold(model, _taken_back(model, few, m))) is not None]
+    tried = [(e, m) for m in _mistakes(model) if (e := _if_taken_back(model, few, m)) is not None]
+    dead = [e for m in _dead(model) if (e := _if_taken_back(model, few, m)) is not None]
     for measure, nothing in ((np.mean, NOTHING), (np.max, NOTHING_ALONE)):
         as_it_is = float(measure(every))
         best, said = min([(float(measure(e)), m.said) for e, m in tried if measure(e) < m.well], default=(math.inf, ""))
         if as_it_is > nothing and best < min(BETTER * as_it_is, *(DEAD * float(measure(e)) for e in dead)):
             raise RecordingError(f"{data.source}: {said}: so read, the model errs by {best:.0%} of the motion; as it is, by {as_it_is:.0%}")
+
+
+def _check_scales(model: ComposedModel, data: Dataset) -> None:
+    """Raises RecordingError if states that belong together are clearly so many times what they must be."""
+    every = _foretold(model, data)
+    if every is None or not data.segments or (np.mean(every) <= NOTHING and np.max(every) <= NOTHING_ALONE):
+        return
+    few, every_input = _few(data), list(range(len(model.inputs)))
+    limit = min(WELL, BETTER * float(np.mean(every)), DEAD * _err(model, few, inputs=partial(_scaled, every_input, 0.0)))
+    tried = [
+        (_err(model, few, partial(_rescaled, list(group), 1.0 / scale.times, scale.zero)), group, scale)
+        for group in groups(model)
+        for scale in SCALES
+    ]
+    for e, group, scale in sorted(tried, key=lambda one: one[0]):
+        if not e < (limit if scale.times >= FAR else min(limit, SURELY)):
+            return
+        alike = scale.zero != 0.0 or _err(model, few, inputs=partial(_scaled, every_input, scale.times)) < ALIKE * e
+        if not alike or (scale.by_number and _exactly(model, few, group, scale)):
+            raise RecordingError(
+                f"{data.source}: {scale.said([model.states[j] for j in group])}: so read, the model errs by {e:.0%} of the motion"
+            )
+
+
+def _exactly(model: ComposedModel, data: Dataset, group: tuple[int, ...], scale: Scale) -> bool:
+    """Whether it is this number, to EXACTLY, by which states are foretold best."""
+    tried = (1.0 - 2.0 * EXACTLY, 1.0 - EXACTLY, 1.0, 1.0 + EXACTLY, 1.0 + 2.0 * EXACTLY)
+    off = [(1.0 / scale.times, k * scale.zero) if scale.zero else (k / scale.times, 0.0) for k in tried]
+    return abs(int(np.argmin([_err(model, data, partial(_rescaled, list(group), *one)) for one in off])) - 2) <= 1
+
+
+def _err(model: ComposedModel, data: Dataset, states: Change | None = None, inputs: Change | None = None) -> float:
+    """Mean E with columns changed; infinite where nothing goes anywhere then."""
+    e = _if_taken_back(model, data, _Mistake("", states, inputs, WELL))
+    return math.inf if e is None else float(np.mean(e))
 
 
 def _check_speeds(model: ComposedModel, data: Dataset) -> None:
@@ -172,9 +220,17 @@ def _taken_back(model: ComposedModel, data: Dataset, mistake: _Mistake) -> Datas
     return regridded(replace(data, segments=tuple(changed)), model)
 
 
+def _if_taken_back(model: ComposedModel, data: Dataset, mistake: _Mistake) -> Array | None:
+    """What is foretold then; None where somebody's own model cannot go there."""
+    try:
+        return _foretold(model, _taken_back(model, data, mistake))
+    except ConfigError:
+        return None
+
+
 def _foretold(model: ComposedModel, data: Dataset, among: list[int] | None = None) -> Array | None:
     """The share that E is the mean of, of each state (or of these) that goes somewhere; None where nothing goes anywhere."""
-    ahead = int(np.clip(round(HORIZON_S / data.dt), 1, 50))
+    ahead = int(np.clip(round(HORIZON_S / data.dt), 1, 50)) if data.dt < HORIZON_S else SLOW_STEPS
     starts = rollout_starts(data, ahead)
     starts = starts[:: max(1, len(starts) // STARTS)]
     if len(starts) < 20:
@@ -204,8 +260,7 @@ def _mistakes(model: ComposedModel) -> Iterator[_Mistake]:
     units: dict[str, str] = getattr(model.nominal, "units", {})
     for kind, names in (("states", model.states), ("inputs", model.inputs)):
         for a, b in combinations(names, 2):
-            order = [names.index({a: b, b: a}.get(name, name)) for name in names]
-            yield _mistake(kind, f"the columns {a} and {b} seem to be exchanged", partial(_ordered, order))
+            yield _exchanged(kind, names, ((a, b),))
         for j, name in enumerate(names):
             for unit, right, factor, well in (
                 *_UNITS.get(units.get(name, ""), ()),
@@ -224,6 +279,17 @@ def _mistakes(model: ComposedModel) -> Iterator[_Mistake]:
         yield _mistake("states", f"{name} seems to be clockwise from y, must be counter-clockwise from x", partial(_turned, j, 1.0))
         said = f"{name} seems to be in degrees clockwise from y, must be in rad counter-clockwise from x"
         yield _mistake("states", said, partial(_turned, j, math.pi / 180.0))
+
+    for one, other in combinations(axis_pairs(model), 2):
+        yield _exchanged("states", model.states, tuple((model.states[j], model.states[k]) for j, k in zip(one, other, strict=True)))
+
+
+def _exchanged(kind: str, names: tuple[str, ...], pairs: tuple[tuple[str, str], ...]) -> _Mistake:
+    other = {name: partner for a, b in pairs for name, partner in ((a, b), (b, a))}
+    said = ", ".join(f"{a} and {b}" for a, b in pairs)
+    return _mistake(
+        kind, f"the columns {said} seem to be exchanged", partial(_ordered, [names.index(other.get(name, name)) for name in names])
+    )
 
 
 def _dead(model: ComposedModel) -> list[_Mistake]:
@@ -251,8 +317,13 @@ def _ordered(order: list[int], values: Array) -> Array:
 
 
 def _scaled(columns: list[int], factor: float, values: Array) -> Array:
+    return _rescaled(columns, factor, 0.0, values)
+
+
+def _rescaled(columns: list[int], factor: float, zero: float, values: Array) -> Array:
+    """values (N, n): these columns less their zero, times a number."""
     values = values.copy()
-    values[:, columns] *= factor
+    values[:, columns] = factor * (values[:, columns] - zero)
     return values
 
 
