@@ -1,16 +1,18 @@
 """Which other effects do these data leave possible?
 
-A rival replaces one effect of the chosen model and explains as much: its log likelihood, noise re-estimated, is within CLOSE of the chosen
-one's. What its parameters cost does not count here: being simpler is a reason to prefer, not to know.
+A rival replaces one effect of the chosen model and explains as much: its log likelihood, noise re-estimated, on what was fitted and on what
+was held out, is within CLOSE of the best one's. What its parameters cost counts little here, being simpler is a reason to prefer, not to
+know: it must be beyond SURELY. If the best one has more numbers, one that comes within CLOSE with numbers paid for is a rival, too.
 
 A richer effect that has fitted itself to the chosen one (a gain by sign with both gains alike) says the same thing and is no rival. That is
-seen on inputs and states that these data need not have: values of both signs up to the largest seen, held short and long, from
-anywhere about where the robot was, in any direction, at times over the whole recording.
+seen on inputs and states that these data need not have: values between the least and the largest seen, and zero, held short and
+long, from anywhere about where the robot was, in any direction, at times over the whole recording.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,15 +23,23 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.dataset import Dataset, Run
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, foretold, gain, problem, scatter, without
+from s2r_runtime.trace.fitting import SETTLED, Fit, Problem, evaluate, fitted, foretold, gain, problem, scatter, without
 from s2r_runtime.trace.residual import steps_of
-from s2r_runtime.trace.scores import Scored, best_candidates, limited, name_of
+from s2r_runtime.trace.scores import STRICT, Scored, best_candidates, limited, name_of
 from s2r_runtime.trace.slots import Added, slots_of
 
 Array = NDArray[np.float64]
 
 CLOSE = 3.0
 """Nats of likelihood within which rivals cannot be told apart: odds of 20 to 1."""
+
+SURELY = 6.0
+"""The same with the numbers paid for, from which on a rival is out however near it comes: four numbers that were looked for everywhere come
+near to what one foretells, but that one did foretell it. Odds of 400 to 1: a price of numbers is known to a few nats.
+"""
+
+NEAR = 15.0
+"""Nats of likelihood within which what was not fitted decides: where noise wanders, a fit may prefer by that much what foretells less."""
 
 LOOSEST = 6.0
 """Noise that wanders makes differences of likelihood larger than they mean, up to this."""
@@ -54,17 +64,15 @@ PROBES, PROBE_STEPS = 8, 120
 
 
 def rivals(given: Problem, fit: Fit) -> list[Scored]:
-    """Models with one effect replaced by another, of which the likelihood says the same."""
+    """Models with one effect replaced by another, of which the likelihood says nearly the same."""
     found = []
     rich = _rich(given, fit.model) if fit.added else None
-    loose = scatter(given, fit) ** 2 if fit.free else np.ones(0)
     for place in fit.added:
-        close = CLOSE * min(max([1.0, *(loose[i] for i, slot in enumerate(fit.free) if slot.place == place)]), LOOSEST)
         mine = name_of(fit.model.effects[place])
         base = fitted(given, fit, without(fit.model, place), 1)
         here = gain(fit, base)
-        for s in best_candidates(given, base, FITTED, against=here - close)[0]:
-            if s.fit is None or (s.name, s.channel) == mine or not limited(s.fit) or gain(s.fit, base) < here - close:
+        for s in best_candidates(given, base, FITTED, against=here - NEAR)[0]:
+            if s.fit is None or (s.name, s.channel) == mine or not limited(s.fit) or not _contends(given, s.fit, fit, base):
                 continue
             numberless = not slots_of(fit.model.effects[place], place)
             if numberless and _coincidence(here, gain(s.fit, base)) > CLOSE:
@@ -72,6 +80,33 @@ def rivals(given: Problem, fit: Fit) -> list[Scored]:
             if (s.fit.k <= fit.k and not numberless) or rich is None or not rich.same(s.fit.model, fit.model, base.model):
                 found.append(s)
     return found
+
+
+def _contends(given: Problem, other: Fit, fit: Fit, base: Fit) -> bool:
+    """Whether it is near enough for what was not fitted to decide, its numbers paid for or not."""
+    behind = gain(fit, base) - gain(other, base)
+    return behind + min(STRICT.price(other.k - fit.k, len(given.steps)), 0.0) <= NEAR
+
+
+def tied(given: Problem, fit: Fit, found: list[Scored], ahead: Sequence[float]) -> tuple[Fit, list[Scored]]:
+    """The likeliest explanation on all of the recording, and those that tie with it. ahead: nats of each, `fit` first, by which it
+    foretells what was not fitted.
+    """
+    fits = [fit, *(s.fit for s in found if s.fit is not None)]
+    wide = min(max([1.0, *(scatter(given, fit) ** 2)]), LOOSEST) if fit.free else 1.0
+    nats = np.array([gain(one, fit) + more for one, more in zip(fits, ahead, strict=True)])
+    paid = nats - np.array([STRICT.price(one.k - fit.k, len(given.steps)) for one in fits])
+    best = int(np.argmax(paid)) if np.max(paid) > paid[0] + SETTLED else 0
+    behind, beaten = nats[best] - nats, paid[best] - paid
+    near = (beaten <= CLOSE * wide) | ((behind <= CLOSE * wide) & (beaten <= SURELY * wide))
+    left = [i for i in np.flatnonzero(near).tolist() if i != best]
+    return fits[best], [found[i - 1] if i else Scored(*_gone(fit, fits[best]), found[0].score, fit) for i in left]
+
+
+def _gone(fit: Fit, other: Fit) -> tuple[str, str]:
+    """The effect of one model that the other does not have."""
+    there = {name_of(other.model.effects[place]) for place in other.added}
+    return next(name for place in fit.added if (name := name_of(fit.model.effects[place])) not in there)
 
 
 def _coincidence(mine: float, other: float) -> float:
@@ -121,10 +156,12 @@ def _without_number(given: Problem, fit: Fit, place: int) -> list[ComposedModel]
 
 def representative(given: Problem, fit: Fit, found: list[Scored]) -> tuple[Fit, list[Scored]]:
     """Of explanations that tie, the one to go on with, and the others: that which is at worst least far from what the others do on inputs
-    BEYOND these, as a share of what they do. Where a limit, a deadband and a gain say the same, a gain is wrong by least elsewhere.
+    BEYOND these, as a share of what they do. Where a limit, a deadband and a gain say the same, a gain is wrong by least elsewhere. One
+    that is behind by CLOSE with its numbers paid for is not gone on with.
 
     Nothing changes where more than one effect has rivals.
     """
+    n = len(given.steps)
     tied = [s.fit for s in found if s.fit is not None]
     mine = {name_of(fit.model.effects[place]): place for place in fit.added}
     gone = {name for other in tied for name in mine.keys() - {name_of(other.model.effects[p]) for p in other.added}}
@@ -136,7 +173,8 @@ def representative(given: Problem, fit: Fit, found: list[Scored]) -> tuple[Fit, 
     models = [fit.model, *(other.model for other in tied)]
     done = [max(rich.apart(model, less), 1e-300) for model in models]
     worst = [max(rich.apart(one, other) / size for other, size in zip(models, done, strict=True)) for one in models]
-    best = int(np.argmin(worst))
+    dear = [STRICT.price(one.k - fit.k, n) - gain(one, fit) > CLOSE for one in (fit, *tied)]
+    best = int(np.argmin(np.where(dear, np.inf, worst)))
     if best == 0 or not np.all(np.isfinite(worst)) or worst[best] > BETTER * worst[0]:
         return fit, found
     chosen = tied[best - 1]
@@ -164,14 +202,18 @@ class _Rich:
 def _rich(given: Problem, model: ComposedModel, reach: float = 1.0) -> _Rich:
     rng = np.random.default_rng(0)
     source, steps = given.data, given.steps
-    largest = reach * np.max(np.abs(np.concatenate([run.u for run in source.runs])), axis=0)
+    asked = np.concatenate([run.u for run in source.runs])
+    least, most = np.minimum(np.min(asked, axis=0), 0.0), np.maximum(np.max(asked, axis=0), 0.0)
+    if reach > 1.0:
+        most = reach * np.maximum(-least, most)
+        least = -most
     low, high = np.min(steps.y0, axis=0), np.max(steps.y0, axis=0)
     low, high = low - 0.5 * (high - low), high + 0.5 * (high - low)
     low[model.angle_columns], high[model.angle_columns] = -np.pi, np.pi
     runs = []
     for start in np.linspace(float(steps.t[0]), float(steps.t[-1]), PROBES):
         hold = np.maximum(1, np.rint(10.0 ** rng.uniform(0.0, 1.6, PROBE_STEPS)).astype(int))
-        u = np.repeat(rng.uniform(-1.0, 1.0, (PROBE_STEPS, len(largest))) * largest, hold, axis=0)[:PROBE_STEPS]
+        u = np.repeat(rng.uniform(least, most, (PROBE_STEPS, len(most))), hold, axis=0)[:PROBE_STEPS]
         y = rng.uniform(low, high, (PROBE_STEPS + 1, len(low)))
         runs.append(Run(float(start), y, np.repeat(u, source.substeps, axis=0)))
     made = Dataset(source.states, source.inputs, source.dt, source.substeps, tuple(runs), False, 0, "rich inputs")

@@ -29,7 +29,7 @@ HOPELESS, HOPELESS_SHARE = 2.0, 0.2
 """A candidate that screening gives fewer nats, or less than this share of the best one's, is not fitted."""
 
 FAR = 100.0
-"""Bounds beyond it are there for form's sake: no robot's parameter is near them."""
+"""Bounds beyond it, and below its inverse, are there for form's sake: no robot's parameter is near them."""
 
 GIVEN_UP = 1e-3
 """Of the largest number of its kind: one that is so small is none."""
@@ -203,6 +203,8 @@ def unlimited(fit: Fit, place: int) -> bool:
         if slot.place != place:
             continue
         if (v >= 0.99 * p.high and p.high >= FAR) or (v <= 0.99 * p.low and p.low <= -FAR):
+            return True
+        if p.neutral is None and 0.0 < p.low <= 1.0 / FAR and v <= 2.0 * p.low:
             return True
         effect = fit.model.effects[slot.place].effect
         several = sum(other.place == slot.place for other in fit.free) > 1

@@ -34,7 +34,7 @@ from s2r_runtime.trace.fitting import (
     without,
 )
 from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
-from s2r_runtime.trace.rivals import CLOSE, representative, rivals, simplified
+from s2r_runtime.trace.rivals import CLOSE, rivals, simplified
 from s2r_runtime.trace.scores import STRICT, Bar, Scored, best_candidates, limited, name_of, names, rescored, unlimited
 from s2r_runtime.trace.slots import bounds_of, values_of, with_values
 
@@ -54,6 +54,11 @@ MOST, MOST_ON_ONE = 5, 3
 
 EXCHANGED = 3
 """Effects up to which earlier ones are asked again whether another would do better: that takes a round for each."""
+
+FIRSTS, SECONDS = 3, 4
+"""Effects that are looked at together with another one where those that do best one after the other leave structure, and how many others
+are fitted beside each.
+"""
 
 BLOCKS = 5
 """Of the cross-validation."""
@@ -108,8 +113,25 @@ def select(
     fit = plainly(given, simplified(given, pruned(given, fit, tried, horizon, bar)))
     progress(0.8)
     fit, found = overtaken(given, fit, bar)
-    first, others = representative(given, fit, found)
-    return Selection(nominal, fit if first is fit else plainly(given, first), tried, tuple(ranking), tuple(others))
+    return Selection(nominal, fit, tried, tuple(ranking), tuple(found))
+
+
+def another_way(given: Problem, chosen: Selection, horizon: int) -> Selection | None:
+    """Selection again from two effects together: of two that hide each other, neither is what does best alone, or is seen at all. None
+    where no such two explain clearly more than what was chosen.
+    """
+    there, n = names(chosen.fit.model), len(given.steps)
+    firsts = [s.fit for s in chosen.ranking if s.fit is not None and (s.name, s.channel) not in there][:FIRSTS]
+    seconds = [best_candidates(given, first, SECONDS)[0] for first in firsts]
+    pairs = [found[0].fit for found in seconds if found and found[0].fit is not None]
+
+    def worth(fit: Fit) -> float:
+        return gain(fit, chosen.nominal) - STRICT.price(fit.k - chosen.nominal.k, n)
+
+    best = max(pairs, key=worth, default=None)
+    if best is None or worth(best) <= worth(chosen.fit) + CLOSE:
+        return None
+    return select(given, chosen.nominal.model, horizon, lambda share: None, before=replace(chosen, fit=best, rivals=()))
 
 
 def crowded(fit: Fit) -> bool:

@@ -42,7 +42,7 @@ from s2r_runtime.trace.residual import Mask, acting, first_steps, rms, steps_of
 from s2r_runtime.trace.residual_noise import no_colour
 from s2r_runtime.trace.result import Found, Limit, TraceResult
 from s2r_runtime.trace.scores import LENIENT, names
-from s2r_runtime.trace.selection import Selection, crowded, select
+from s2r_runtime.trace.selection import Selection, another_way, crowded, select
 from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import asked, confirmed, final_fit, verdict_of
@@ -147,11 +147,8 @@ def _traced(
     say(80.0, 100.0, "testing what is left")
     whole = _Whole(checked, model, ahead)
     structure = whole.structure(chosen)
-    if structure.matters and not structure.nameless:  # something is there: its name may be asked with a lower bar, if that leaves nothing
-        other = confirmed(given, select(given, model, ahead, lambda share: None, LENIENT, chosen), judged_on)
-        if names(other.fit.model) != names(chosen.fit.model):
-            rest = whole.structure(other)
-            chosen, structure = (chosen, structure) if rest.matters else (other, rest)
+    if structure.matters and not structure.nameless:
+        chosen, structure = _once_more(given, whole, chosen, structure, judged_on, ahead)
     say(90.0, 100.0, "judging on held-out data")
     w = np.ones(len(model.states)) if weights is None else np.array([weights[asked.states.index(s)] for s in model.states])
     result = _result(dataset, checked, given, chosen, structure, judged_on, seed, w, kind)
@@ -159,6 +156,26 @@ def _traced(
     result = replace(result, spec=msgspec.structs.replace(result.spec, dt=asked.dt), unseen=unseen)
     say(100.0, 100.0, result.verdict)
     return result
+
+
+def _once_more(
+    given: Problem, whole: _Whole, chosen: Selection, structure: Structure, judged_on: Held, ahead: int
+) -> tuple[Selection, Structure]:
+    """Where structure is left, something is there: two effects together that leave nothing, coloured noise neither (two take up a part of
+    anything, and the rest looks like that); or what is found with a lower bar, if that leaves nothing.
+    """
+    ways: tuple[tuple[Callable[[], Selection | None], set[str]], ...] = (
+        (lambda: another_way(given, chosen, ahead), set()),
+        (lambda: select(given, chosen.nominal.model, ahead, lambda share: None, LENIENT, chosen), {"noise"}),
+    )
+    for way, may_be_left in ways:
+        found = way()
+        other = chosen if found is None else confirmed(given, found, judged_on)
+        if names(other.fit.model) != names(chosen.fit.model):
+            rest = whole.structure(other)
+            if not rest.matters and {*rest.tokens} <= may_be_left:
+                return other, rest
+    return chosen, structure
 
 
 def _result(

@@ -4,6 +4,7 @@ sensor_fault   nothing is missing, but measurements are wrong in places
 none           nothing beyond noise
 unexplained    structure is left that no effect accounts for: nothing was found; or what was found leaves a large part, or has the
                wrong shape for what it acts on; or the model (with it) foretells the held-out data no better than `stays where it is`;
+               or with what was found rollouts are worse than without;
                or what is left looks like noise, step by step, and takes rollouts much farther than noise does
 ambiguous      rivals explain as much
 traced         otherwise
@@ -20,9 +21,10 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.errors import Held, Judged, better, displacement
 from s2r_runtime.trace.faults import Fault
-from s2r_runtime.trace.fitting import Fit, Problem, fitted, without
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, plainly, problem, without
 from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import acting, predicted, rms
+from s2r_runtime.trace.rivals import representative, tied
 from s2r_runtime.trace.selection import Selection
 
 Array = NDArray[np.float64]
@@ -47,6 +49,9 @@ ASKED = 0.1
 FORETELLS, NEARER = 0.7, 0.95
 """A model whose rollouts end farther off than these shares of the way that the robot went foretells nothing worth a name."""
 
+WORSE = 1.1
+"""Times the error of rollouts without what was found from which on it is no repair."""
+
 MANY = 0.9
 """Share of the rollouts that must go far for that to be no matter of outliers."""
 
@@ -65,7 +70,19 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
             if refutable and not better(judged_on, fit.model, less.model, CONFIRMED):
                 fit, again = less, True
                 break
-    return chosen if fit is chosen.fit else replace(chosen, fit=fit, rivals=() if not fit.added else chosen.rivals)
+    rivals = list(chosen.rivals) if fit.added else []
+    if rivals:
+        fits = [fit, *(s.fit for s in rivals if s.fit is not None)]
+        fit, rivals = representative(given, *tied(given, fit, rivals, _ahead(judged_on, fits)))
+    fit = fit if fit is chosen.fit else plainly(given, fit)
+    return replace(chosen, fit=fit, rivals=tuple(rivals))
+
+
+def _ahead(judged_on: Held, fits: list[Fit]) -> list[float]:
+    """Nats by which each foretells what is held out better than the first one."""
+    here = problem(judged_on.data, judged_on.steps)
+    foretelling = [evaluate(here, one.model) for one in fits]
+    return [gain(one, foretelling[0]) for one in foretelling]
 
 
 def asked(given: Problem, judged_on: Held, model: ComposedModel, less: ComposedModel) -> bool:
@@ -103,7 +120,7 @@ def verdict_of(
     if not chosen.fit.added:
         nothing = away or foretells_nothing(after, given, floors[1])
         return "unexplained" if structure.matters or nothing else "sensor_fault" if faulty else "none"
-    if away or not foretells(after, given) or _withdrawn(chosen.fit, structure):
+    if away or not foretells(after, given) or _withdrawn(chosen.fit, structure) or harms(before, after, floor):
         return "unexplained"
     return "ambiguous" if chosen.rivals else "traced"
 
@@ -139,6 +156,16 @@ def goes_astray(model: ComposedModel, before: Judged, after: Judged, floor: Arra
     was, left = (np.maximum(e**2 - floor**2, 0.0) for e in (ends_before, ends))
     far = ends > NOISIER * floor
     return bool(np.any(goes_on & far & (left > LARGE * was)))
+
+
+def harms(before: Judged, after: Judged, floor: Array) -> bool:
+    """Whether rollouts end clearly farther off with what was found than without it, all states together, each over what noise makes of it:
+    a step that is a little better and a second that is worse is no repair. floor: (nx,), without end where nobody measured.
+    """
+    if not len(before.ends):
+        return False
+    was, now = (float(np.sqrt(np.sum((rms(judged.ends) / np.maximum(floor, 1e-300)) ** 2))) for judged in (before, after))
+    return now > WORSE * was
 
 
 def foretells_nothing(judged: Judged, given: Held, floor: Array) -> bool:

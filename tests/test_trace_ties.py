@@ -1,0 +1,101 @@
+"""Which explanations tie, which one is the likeliest, and two effects that hide each other."""
+
+import numpy as np
+import pytest
+from test_trace_for_a_while import DT, _held, _unicycle
+from trace_sets.families import make
+
+from s2r_runtime.models.composed import AppliedEffect, compose
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.plugins import registry
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.errors import Judged
+from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
+from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.rivals import SURELY, rivals, tied
+from s2r_runtime.trace.scores import Scored, unlimited
+from s2r_runtime.trace.tracer import load_dataset, trace
+from s2r_runtime.trace.verdict import harms
+
+UNICYCLE = ModelSpec("unicycle", DT, {}, ())
+
+
+def _problem(u, share=lambda k, x: 0.8):
+    model = compose(UNICYCLE)
+    data = from_arrays(model, [(_unicycle(np.random.default_rng(12), u, share, "euler"), u)])
+    return problem(data, steps_of(data)), model
+
+
+def _with(given, model, name, channel, **p):
+    bare = evaluate(given, model)
+    return fitted(given, bare, insert(model, AppliedEffect(registry().get("effects", name), channel, p), 0))
+
+
+def test_what_was_not_fitted_decides_between_explanations_that_tie():
+    """At one speed a gain and an offset are one thing; on the other part of the recording one of them foretells more, or both as much."""
+    u = np.column_stack([np.full(400, 0.3), _held(np.random.default_rng(11), 400, [-1.0], [1.0])[:, 0]])
+    given, model = _problem(u)
+    one, other = _with(given, model, "input_gain", "v", gain=0.8), _with(given, model, "input_bias", "v", bias=-0.06)
+    assert abs(gain(other, one)) < 0.5
+    found = [Scored("input_bias", "v", 1.0, other)]
+    assert tied(given, one, found, [0.0, 0.0]) == (one, found)
+    assert tied(given, one, found, [0.0, -20.0]) == (one, [])
+    assert tied(given, one, found, [0.0, 20.0]) == (other, [])
+    best, rest = tied(given, one, found, [0.0, 2.0])
+    assert best is other
+    assert [(s.name, s.channel, s.fit) for s in rest] == [("input_gain", "v", one)]
+
+
+def test_four_numbers_that_come_near_to_one_are_no_rival_of_it():
+    """A sine of any frequency, size and phase, on a drive in which the speed goes up and down: one gain foretold that."""
+    u = np.column_stack([0.3 + 0.2 * np.sin(0.1 * np.arange(400)), _held(np.random.default_rng(11), 400, [-1.0], [1.0])[:, 0]])
+    given, model = _problem(u)
+    one = _with(given, model, "input_gain", "v", gain=0.8)
+    assert one.k == 1
+    many = _with(given, model, "input_gain", "v", gain=0.8)
+    object.__setattr__(many, "free", many.free * 4)
+    found = [Scored("periodic_disturbance", "v", 1.0, many)]
+    assert 3 * 0.5 * np.log(400) > SURELY
+    assert tied(given, one, found, [0.0, 0.0]) == (one, [])
+
+
+def test_a_gain_of_what_was_never_commanded_makes_no_tie():
+    """The robot only ever drove forward: a gain by sign says the same of that, and nothing of the rest."""
+    rng = np.random.default_rng(13)
+    given, model = _problem(_held(rng, 500, [0.1, -1.0], [0.5, 1.0]))
+    one = _with(given, model, "input_gain", "v", gain=0.8)
+    assert "input_gain_asymmetry" not in {s.name for s in rivals(given, one)}
+
+
+@pytest.mark.parametrize(("velocity", "gone"), [(1e-9, True), (0.02, False)])
+def test_a_curve_that_shrank_to_a_point_is_none(velocity, gone):
+    """Friction that is larger at standstill only is seen by nobody."""
+    model = compose(ModelSpec("joint", DT, {"mass": 1.0}, ()))
+    rng = np.random.default_rng(14)
+    data = from_arrays(model, [(rng.normal(size=(100, 2)), rng.normal(size=(99, 1)))])
+    given = problem(data, steps_of(data))
+    p = {"force": 0.1, "static_force": 0.3, "velocity": velocity}
+    there = evaluate(given, insert(model, AppliedEffect(registry().get("effects", "stribeck_friction"), "qd", p), 0))
+    assert unlimited(there, 0) is gone
+
+
+def test_two_effects_that_hide_each_other_are_found_together(tmp_path):
+    """A joint in closed loop with a steady push and one that swings: beside either, what is left scatters too much for the other."""
+    made = make("pair", 20014)
+    path, _ = made.write(tmp_path)
+    m = made.model
+    model = compose(ModelSpec(m["name"], m["dt"], m["parameters"], tuple(EffectSpec(**e) for e in m["effects"])))
+    found = trace(load_dataset(path, model), model)
+    assert found.verdict == "traced"
+    assert {e.name for e in found.effects} == {"periodic_disturbance", "input_bias"}
+
+
+def test_a_repair_that_makes_rollouts_worse_is_none():
+    """However much better a single step is; a speed that nobody measured says nothing."""
+    rng = np.random.default_rng(15)
+    noise, floor = rng.normal(size=(400, 2)), np.ones(2)
+    near, far = Judged(noise, noise), Judged(0.5 * noise, 1.2 * noise)
+    assert harms(near, far, floor)
+    assert not harms(near, Judged(noise, 1.05 * noise), floor)
+    assert not harms(far, near, floor)
+    assert not harms(near, Judged(noise, noise * [1.0, 9.0]), np.array([1.0, np.inf]))
