@@ -222,3 +222,54 @@ def test_a_clock_that_jumped_while_the_robot_turned_is_told_by_where_the_model_l
     gone = np.delete(np.arange(400), np.arange(205, 225))
     found = check(model, from_streams(model, [(Stream(t[gone], y[gone]), Stream(t[gone], u[0, gone]))], "here")).faults
     assert [(f.kind, f.channel) for f in found] == [("dropout", "*")]
+
+
+def _driver(seed, effects=(), spoil=None):
+    """A car at up to 14 m/s, by a driver who moves wheel and pedal smoothly; its GPS is good to 2 cm."""
+    rng, dt, steps = np.random.default_rng(seed), 0.1, 800
+    asked = commands(rng, 1, steps, dt, [(-0.15, 0.15), (4.0, 14.0)], rest=0.0)[0]
+    u = np.empty_like(asked)
+    u[0] = asked[0]
+    for k in range(1, steps):
+        u[k] = u[k - 1] + dt * (asked[k] - u[k - 1]) / [0.5, 1.5]
+    arcs = EffectSpec("integration_scheme", "*", {"scheme": "exact"})
+    model = compose(ModelSpec("bicycle", dt, {"wheel_base": 2.7}, (arcs,)))
+    robot = compose(ModelSpec("bicycle", dt, {"wheel_base": 2.7}, (*effects, arcs)))
+    x, hidden = np.array([[0.0, 0.0, 0.0, u[0, 1]]]), robot.at_rest(1)
+    rows = []
+    for k in range(steps + 1):
+        rows.append(x[0])
+        if k < steps:
+            x, hidden = robot.step(x, u[k : k + 1], hidden)
+    y = np.array(rows) + rng.normal(size=(steps + 1, 4)) * [0.02, 0.02, 0.003, 0.03]
+    if spoil:
+        spoil(y)
+    t = dt * np.arange(steps + 1)
+    return check(model, from_streams(model, [(Stream(t, y), Stream(t[:-1], u))], "here")).faults
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_position_that_jumps_by_less_than_a_car_goes_in_a_step_is_told(seed):
+    """It goes 1.4 m a step; for 25 s its receiver had no fixed solution, and was 0.86 m off."""
+
+    def drifted(y):
+        y[400:600, :2] += [0.7, -0.5]
+
+    found = [(f.kind, f.channel, round(f.from_s, 1), round(f.to_s, 1)) for f in _driver(seed, spoil=drifted)]
+    assert found == [("offset_jump", "x", 40.0, 59.9), ("offset_jump", "y", 40.0, 59.9)]
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        EffectSpec("input_delay", "*", {"delay": 0.5}),
+        EffectSpec("input_rate_limit", "speed_cmd", {"rate": 0.5}),
+        EffectSpec("input_saturation", "speed_cmd", {"low": -9.0, "high": 9.0}),
+        EffectSpec("input_backlash", "steer_cmd", {"width": 0.1}),
+        EffectSpec("regime_change", "*", {"time": 30.0, "gain": 0.5}),
+        EffectSpec("input_deadband", "speed_cmd", {"width": 4.0}),
+    ],
+    ids=lambda e: e.name,
+)
+def test_what_a_car_lacks_is_no_jump_of_its_position(effect):
+    assert _driver(5, (effect,)) == ()

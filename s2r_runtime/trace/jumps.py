@@ -2,6 +2,9 @@
 
 spike        one row (or few) away, and back
 offset_jump  one transition by more than the inputs could move the state, and it stays there; to the end, or until it jumps back
+
+What acts on a robot's speed changes where it goes from then on. In one step alone it is no more than the speed itself changes within a
+step: a car at 15 m/s whose commands change smoothly does not go 0.7 m more in one step of 0.1 s, and none more in those around it.
 """
 
 from __future__ import annotations
@@ -55,15 +58,19 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
         return found
     e = model.difference(run.y[1:], predicted(model, data, act, i))
     change = model.difference(run.y[1:].copy(), run.y[:-1])
+    pose = {"x", "y", "theta"} if getattr(model.nominal, "integration", None) is not None else set()
     for j, name in enumerate(model.states):
         series = np.nan_to_num(change[:, j] if reach.instant[j] else e[:, j])
         limit = SIGMAS * reach.noise[j] + BEYOND * reach.move[j]
+        for_one_step = SIGMAS * reach.noise[j] + BEYOND * (reach.turn if name in pose else reach.move)[j]
         lost = np.isnan(run.y[:, j])
         single: list[int] = []
-        for k in np.flatnonzero(np.abs(series) > limit).tolist():
+        for k in np.flatnonzero(np.abs(series) > for_one_step).tolist():
             if bad[k, j] or bad[k + 1, j]:  # the end of something that is taken out already
                 continue
             rows = _there_and_back(series, k)
+            if rows is not None and abs(float(series[k])) <= limit:  # a row that was stamped late is as far away, and back
+                continue
             if rows is not None:
                 bad[rows[0] : rows[1] + 1, j] = True
                 kind = found.spikes if abs(float(series[k])) > reach.tail[j] else found.tails

@@ -40,12 +40,14 @@ class Fault:
 
 @dataclass(frozen=True)
 class Reach:
-    """noise: (nx,) robust standard deviation of a residual; move: (nx,) largest move in a step that the model foresees; tail: (nx,)
-    leg of a spike that noise with tails such as these has in one recording of a hundred.
+    """noise: (nx,) robust standard deviation of a residual; move: (nx,) largest move in a step that the model foresees; turn: (nx,)
+    largest change of it from one step to the next; tail: (nx,) leg of a spike that noise with tails such as these has in one recording
+    of a hundred.
     """
 
     noise: Array
     move: Array
+    turn: Array
     tail: Array
     instant: Mask
 
@@ -63,15 +65,18 @@ def reach_of(model: ComposedModel, data: Dataset, act: Acting) -> Reach:
     unseen = [v for _, v in data.axes_without_speed]
     if not len(good):
         one = np.ones(len(model.states))
-        return Reach(one, one, one, instant)
+        return Reach(one, one, one, one, instant)
     noise = np.median(np.abs(residuals[good]), axis=0) / 0.6745
     largest = np.quantile(np.abs(move[good]), 0.999, axis=0)
+    turns = np.concatenate([np.abs(np.diff(part, axis=0)) for part in moves])
+    turns = turns[np.isfinite(turns).all(axis=1)]
+    turn = np.minimum(np.quantile(turns, 0.999, axis=0), largest) if len(turns) else largest
     y = [run.y[np.isfinite(run.y).all(axis=1)] for run in data.runs]
     starts, ends = np.concatenate([rows[:-1] for rows in y]), np.concatenate([rows[1:] for rows in y])
     rounded = [quantum(starts[:, j], ends[:, j]) for j in range(len(model.states))]
     noise = np.maximum(noise, ROUNDING * np.array(rounded) + 1e-12)
     noise[unseen] = np.inf  # what was not measured has no fault
-    return Reach(noise, largest, _tail(residuals), instant)
+    return Reach(noise, largest, turn, _tail(residuals), instant)
 
 
 def _tail(residuals: Array) -> Array:
