@@ -225,6 +225,22 @@ def test_without_effects_the_nominal_model_is_as_good_as_the_oracle():
     assert rollout_errors(run.starts, world).ratio == pytest.approx(1.0, abs=1e-9)
 
 
+def test_a_measured_speed_shows_what_acts_at_the_moment_that_it_is_read():
+    plant, (f, a, phase) = plants.bicycle(0.33), (3.0, 0.5, 0.2)
+    swing = physics(plant, "periodic_disturbance", "speed_cmd", {"frequency": f, "amplitude": a, "phase": phase})
+    rows = PARTS * np.arange(51)
+    run = record(
+        World(plant, DT, PARTS, (swing,)),
+        rows,
+        rows[:-1],
+        np.ones((50, 2)),
+        Noise("none", np.zeros(4)),
+        [0.0] * 4,
+        np.random.default_rng(0),
+    )
+    assert np.allclose(run.y[1:, 3], 1.0 + a * np.sin(math.tau * f * DT * np.arange(1, 51) + phase), atol=1e-6)
+
+
 def test_the_ratio_is_the_nominal_error_over_the_noise():
     plant, steps, sigma = plants.joint(1.0), 10, 0.02
     world = World(plant, DT, PARTS, (physics(plant, "input_gain", "force", {"gain": 2.0}),))

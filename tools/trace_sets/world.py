@@ -115,8 +115,8 @@ class Moment:
 
     @property
     def t(self) -> float:
-        """Seconds since the recording's first stamp."""
-        return self.origin + self.i * self.world.h
+        """Seconds since the recording's first stamp. A sensor reads at the end of the part whose command it sees."""
+        return self.origin + (self.i + self.instant) * self.world.h
 
     def copy(self) -> Moment:
         """An independent one, over the same commands, without noise."""
