@@ -9,7 +9,7 @@ from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recor
 from s2r_runtime.models.composed import AppliedEffect, compose, wrap
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import selection
+from s2r_runtime.trace import scores, selection
 from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
 from s2r_runtime.trace.evidence import RIDGES, evidence, margin
@@ -19,7 +19,7 @@ from s2r_runtime.trace.lack_of_fit_terms import LINE, dictionaries, line, quiete
 from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.residual import Steps, acting, residual, steps_of
 from s2r_runtime.trace.residual_noise import Noise, quantum
-from s2r_runtime.trace.scores import STRICT, Scored, limited
+from s2r_runtime.trace.scores import STRICT, Scored, limited, names
 from s2r_runtime.trace.streams import held_between, held_means
 from s2r_runtime.trace.tracer import trace
 
@@ -223,6 +223,16 @@ def test_an_input_is_exactly_what_is_held_where_it_does_not_change_within_a_part
     for means in (held_means(inputs, begin, steps, dt, parts), held_between(inputs, at, parts)):
         mixed = ~np.isin(means, values).all(axis=1)
         assert np.count_nonzero(mixed) == (0 if late == 0.0 else apart)
+
+
+def test_what_was_searched_beside_a_model_is_known_when_it_is_searched_again(monkeypatch):
+    looked_at = []
+    looks = scores.screen
+    monkeypatch.setattr(scores, "screen", lambda given, base, found: looked_at.append(names(base.model)) or looks(given, base, found))
+    off = recordings([("input_gain", "w", {"gain": 0.8})], 1, steps=300, seed=5)[0]
+    found = trace(off, declared())
+    assert [e.name for e in found.effects] == ["input_gain"]
+    assert len(looked_at) == len(set(looked_at)) == 2  # beside nothing, and beside the gain; what else there could be instead is known
 
 
 def test_an_exchange_never_takes_out_what_the_user_declared(monkeypatch):

@@ -142,19 +142,19 @@ def foretold(given: Problem, model: ComposedModel) -> Array | None:
         return None
 
 
-def sensitivities(given: Problem, fit: Fit, model: ComposedModel, free: Free) -> Array:
-    """dz/dp, (n nx, k), under the noise of a fit."""
+def sensitivities(given: Problem, fit: Fit, model: ComposedModel, free: Free, here: Array | None = None) -> Array:
+    """dz/dp, (n nx, k), under the noise of a fit. here: (n, nx), what the model predicts, where that is known."""
     n, nx = given.steps.y0.shape
     if not free:
         return np.zeros((n * nx, 0))
-    moved = slopes(given, model, free)
+    moved = slopes(given, model, free, here)
     return fit.colour(fit.whiten(moved), given.steps.joined).reshape(n * nx, len(free))
 
 
-def slopes(given: Problem, model: ComposedModel, free: Free) -> Array:
-    """d(residual)/dp, (n, nx, k), one-sided differences inside the bounds."""
+def slopes(given: Problem, model: ComposedModel, free: Free, here: Array | None = None) -> Array:
+    """d(residual)/dp, (n, nx, k), one-sided differences inside the bounds. here: (n, nx), what the model predicts, where that is known."""
     n, nx = given.steps.y0.shape
-    here = predicted(model, given.steps, acting(model, given.data))
+    here = predicted(model, given.steps, acting(model, given.data)) if here is None else here
     now = values_of(model, free)
     moved = np.zeros((n, nx, len(free)))
     for j, h in enumerate(_differences(given, model, free)):
@@ -210,11 +210,12 @@ def refine(given: Problem, fit: Fit, model: ComposedModel, free: Free | None = N
     free = free_of(model) if free is None else free
     if not free:
         return model
-    z = objective(given, fit, model)
+    here = predicted(model, given.steps, acting(model, given.data))
+    z = _whitened(given, fit, model.difference(given.steps.y1, here))
     best = float(np.sum(noises.log_density(z)))
     damping = 1e-4
     for _ in range(iterations):
-        j = sensitivities(given, fit, model, free)
+        j = sensitivities(given, fit, model, free, here)
         w = noises.weight(z).ravel()
         normal, slope = j.T @ (j * w[:, None]), j.T @ (w * z.ravel())
         before = best
@@ -226,7 +227,7 @@ def refine(given: Problem, fit: Fit, model: ComposedModel, free: Free | None = N
                 z_other = z if there is None else _whitened(given, fit, other.difference(given.steps.y1, there))
                 reached = float(np.sum(noises.log_density(z_other)))
                 if there is not None and reached > best:
-                    model, z, best, damping = other, z_other, reached, damping / 10.0
+                    model, here, z, best, damping = other, there, z_other, reached, damping / 10.0
                     break
             damping *= 10.0
         damping = max(damping, 1e-8)

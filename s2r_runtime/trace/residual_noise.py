@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.trace.speed_noise import of_axis
+from s2r_runtime.trace.state_noise import of_state
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -45,9 +46,6 @@ LOUDEST = 30.0
 WANDERS = 1.5
 """Times the Bayes criterion's price for a number, from which on noise is taken to wander."""
 
-LEAST = 1e-6
-"""Least share of a residual's variance that process and measurement noise are each given: no drift is believed to be exact."""
-
 NARROWEST = 0.7
 """Least standard deviation of z that is believed: below it the noise stands at its floor, which is meant to stay (and far below it
 there is no noise whose colour could be told)."""
@@ -72,7 +70,7 @@ class Noise:
 
     def one_step(self, f: Array) -> Array:
         """(nx,) standard deviation of a one-step residual, over the F (n, nx, nx) given."""
-        return np.asarray(np.sqrt(self.q + self.r + np.mean(np.einsum("kij,j->ki", f**2, self.r), axis=0)))
+        return np.asarray(np.sqrt(self.q + self.r + np.mean(f**2, axis=0) @ self.r))
 
 
 class Whitener:
@@ -82,21 +80,20 @@ class Whitener:
         from scipy.linalg import lapack
 
         n, nx = f.shape[:2]
-        rf = f * noise.r  # F R
-        own = np.einsum("kij,klj->kil", rf, f) + np.diag(noise.q + noise.r)
-        for p, v in noise.axes:  # what pushes an axis all through a step moves it, too
-            h = f[:, p, v]
-            own[:, p, p] += noise.q[v] * h * h / 3.0
-            own[:, p, v] += noise.q[v] * h / 2.0
-            own[:, v, p] += noise.q[v] * h / 2.0
-        if extra is not None:
-            own[:, range(nx), range(nx)] += extra
+        ft = np.ascontiguousarray(f.transpose(1, 2, 0))
+        rf = ft * noise.r[:, None]  # F R, (nx, nx, n)
+        linked = np.where(joined[1:], -rf[:, :, 1:], 0.0)
         band = np.zeros((2 * nx, n, nx))
         for a in range(nx):
+            band[0, :, a] = noise.q[a] + noise.r[a] + (0.0 if extra is None else extra[:, a])
             for b in range(nx):
                 if a >= b:
-                    band[a - b, :, b] = own[:, a, b]
-                band[nx + a - b, :-1, b] = np.where(joined[1:], -rf[1:, a, b], 0.0)
+                    band[a - b, :, b] += np.sum(rf[a] * ft[b], axis=0)
+                band[nx + a - b, :-1, b] = linked[a, b]
+        for p, v in noise.axes:  # what pushes an axis all through a step moves it, too
+            h = ft[p, v]
+            band[0, :, p] += noise.q[v] * h * h / 3.0
+            band[abs(v - p), :, min(p, v)] += noise.q[v] * h / 2.0
         self._lower, info = lapack.dpbtrf(band.reshape(2 * nx, n * nx), lower=1)
         if info != 0:
             raise ValueError("the noise has no positive definite covariance")
@@ -121,7 +118,7 @@ class Whitener:
 def log_density(z: Array) -> Array:
     """log of the density of z, elementwise, without the normal's constant."""
     half = 0.5 * z * z
-    return np.asarray(np.logaddexp(math.log(1.0 - TAIL) - half, math.log(TAIL / WIDE) - half / WIDE**2))
+    return np.asarray(math.log(TAIL / WIDE) - half / WIDE**2 + np.log(1.0 + (1.0 - TAIL) * WIDE / TAIL * np.exp((WIDE**-2 - 1.0) * half)))
 
 
 def weight(z: Array) -> Array:
@@ -150,7 +147,7 @@ def estimate(r: Array, f: Array, joined: Mask, floor: Noise, near: Noise | None 
         if not wild.any():
             break
         seen = np.where(np.isin(range(r.shape[1]), [v for _, v in floor.axes]), 0.0, noise.r)
-        own = noise.q + seen + np.einsum("kij,j->ki", f**2, seen)
+        own = noise.q + seen + f**2 @ seen
         extra += np.where(wild, (z**2 / 4.0) * (own + extra), 0.0)
         noise = _by_state(r, f, joined, extra, noise, floor)
     return noise
@@ -179,54 +176,13 @@ def _by_state(r: Array, f: Array, joined: Mask, extra: Array, near: Noise | None
         for i in alone:
             others = square[:, i] @ s - square[:, i, i] * s[i]
             start = None if near is None else (q[i], s[i])
-            q[i], s[i] = _one_state(r[:, i], f[:, i, i], joined, extra[:, i] + others, (float(floor.q[i]), float(floor.r[i])), start)
+            q[i], s[i] = of_state(r[:, i], f[:, i, i], joined, extra[:, i] + others, (float(floor.q[i]), float(floor.r[i])), start)
         for i in alone:
             foreign[i] = np.mean(square[:, i] @ s - square[:, i, i] * s[i]) / (q[i] + s[i])
         near = Noise(q, s)
         if np.all(foreign < 0.02):
             break
     return Noise(q, s, floor.axes)
-
-
-def _one_state(
-    r: Array, f: Array, joined: Mask, other: Array, floor: tuple[float, float], near: tuple[float, float] | None
-) -> tuple[float, float]:
-    """(q, r) of one state by maximum likelihood; pattern search over their logarithms. floor: least q and r."""
-    from scipy.linalg import lapack
-
-    link = np.where(joined[1:], -f[1:], 0.0)
-    gain = 1.0 + f * f
-
-    def cost(a: float, b: float) -> float:
-        s = math.exp(b)
-        d, e, info = lapack.dpttrf(math.exp(a) + s * gain + other, s * link)
-        if info != 0:
-            return math.inf
-        x, _ = lapack.dpttrs(d, e, r)
-        return 0.5 * float(r @ x) + 0.5 * float(np.log(d).sum())
-
-    least = floor[0] + 2.0 * floor[1]
-    total = max(float(np.mean(np.minimum(r * r, 9.0 * max(float(np.median(r * r)), least)))), least)
-    low_q, low_r, high = math.log(max(floor[0], LEAST * total)), math.log(max(floor[1], LEAST * total)), math.log(16.0 * total)
-    if near is None:
-        seeds = [(share, (1.0 - share) / 2.0) for share in (1e-3, 0.05, 0.3, 0.7, 0.99)]
-        starts = [(max(math.log(total * a), low_q), max(math.log(total * b), low_r)) for a, b in seeds]
-    else:
-        starts = [(min(max(math.log(near[0]), low_q), high), min(max(math.log(near[1]), low_r), high))]
-    best, (a, b) = min((cost(*start), start) for start in starts)
-    step, moves = 1.0 if near is None else 0.5, [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]
-    while step > 0.04:
-        for move in list(moves):
-            there = min(max(a + move[0] * step, low_q), high), min(max(b + move[1] * step, low_r), high)
-            found = cost(*there) if there != (a, b) else math.inf
-            if found < best - 1e-6:
-                best, (a, b) = found, there
-                moves.remove(move)
-                moves.insert(0, move)
-                break
-        else:
-            step /= 2.0
-    return math.exp(a), math.exp(b)
 
 
 @dataclass(frozen=True)
@@ -278,10 +234,10 @@ def colour(z: Array, joined: Mask) -> Colour:
         spread = max(float(np.mean(clipped[:, i] ** 2)), 1e-12)
         best, own = n * math.log(spread), max(math.sqrt(spread), NARROWEST)
         scale[i] = own
+        product, slope = lagged[i] @ lagged[i].T, lagged[i] @ clipped[:, i]
         for order in range(1, ORDERS + 1) if spread > 0.25 * NARROWEST**2 else ():
-            x = lagged[:, :order, i]
-            c = np.linalg.solve(x.T @ x + 1e-9 * n * spread * np.eye(order), x.T @ clipped[:, i])
-            left = max(float(np.mean((clipped[:, i] - x @ c) ** 2)), 1e-12)
+            c = np.linalg.solve(product[:order, :order] + 1e-9 * n * spread * np.eye(order), slope[:order])
+            left = max(spread - float(c @ (2.0 * slope[:order] - product[:order, :order] @ c)) / n, 1e-12)
             score = n * math.log(left) + (order + 1.0) * math.log(n)
             if score < best - 1e-9:
                 best, scale[i] = score, own * math.sqrt(left / spread)
@@ -330,10 +286,10 @@ def wandering(z: Array, joined: Mask, given: Colour) -> Colour | None:
     for i in known.tolist():
         order = int(np.max(np.flatnonzero(given.coefficients[i]) + 1, initial=0))
         now = clipped[:, i]
-        usual = float(np.mean((now - lagged[:, :, i] @ given.coefficients[i]) ** 2))
+        usual = float(np.mean((now - given.coefficients[i] @ lagged[i]) ** 2))
         best = 0.0
         for those in sets:
-            x = np.concatenate([lagged[:, :order, i], means[:, i, those]], axis=1)
+            x = np.concatenate([lagged[i, :order].T, means[:, i, those]], axis=1)
             c = np.linalg.lstsq(x, now, rcond=1e-4)[0]
             left = max(float(np.mean((now - x @ c) ** 2)), 1e-12)
             score = n * math.log(usual / left) - WANDERS * len(those) * math.log(n)
@@ -358,15 +314,15 @@ def _recently(z: Array, joined: Mask, memory: float) -> Array:
 
 
 def _lagged(z: Array, joined: Mask) -> Array:
-    """(n, ORDERS, nx): z one step before and more, zero where that is not known."""
+    """(nx, ORDERS, n): z one step before and more, zero where that is not known."""
     n, nx = z.shape
-    lagged = np.zeros((n, ORDERS, nx))
+    lagged = np.zeros((nx, ORDERS, n))
     there = joined.copy()
     for lag in range(ORDERS):
         if lag:
             there = there & np.append(False, there[:-1])
-        lagged[lag + 1 :, lag] = z[: n - lag - 1]
-        lagged[~there, lag] = 0.0
+        lagged[:, lag, lag + 1 :] = z[: n - lag - 1].T
+        lagged[:, lag, ~there] = 0.0
     return lagged
 
 
