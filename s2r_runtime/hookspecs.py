@@ -196,9 +196,10 @@ class Effect(Protocol):
       `timed`), with which runs come one after the other, a row of zeros and REST_S seconds (`trace.chains`) between two; `after_step` also
       takes dt as (n,). Without it, rows that do not last alike are taken to;
     - `within_step(dt, p) -> bool`: whether what acts changes within a step although the input is held over it;
-    - `at_end(given, acting, before, model, channel, dt, p) -> Array`: what acts at the end of each step, from what came in, held over the
-      step, and what acted on average (all (..., nu)): for states that are what acts (`reached`). before: hidden state at the start of a
-      step; None where rows come one after the other in time; dt: s, or of each row, (..., 1). Without it a part's mean is taken;
+    - `at_end(tables, before, model, channel, dt, p) -> Array`: what acts at the end of each step, for states that are what acts
+      (`reached`), from what came in, held over it, what acted on average, and what came in at the end (all (..., nu)). before: hidden
+      state at the start of a step; where rows come one after the other in time None, or (`timed`) when each begins, (..., 1). dt: s, or
+      of each row, (..., 1). Without it a part's mean is taken;
     - `reads(model, channel) -> tuple[str, ...]`: inputs besides the channel on which what acts there depends;
     - `starts(u, model, channel, dt) -> list[dict]`: parameter values from which the tracer begins, given the input that it would
       get, u (T, nu). Without it the tracer begins from a grid over the parameters' bounds;

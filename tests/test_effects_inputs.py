@@ -241,7 +241,7 @@ def test_what_acts_at_the_ends_of_steps_is_exact_behind_a_lag_a_ramp_and_a_delay
         one = compose(ModelSpec("differential_drive", dt, {}, (EffectSpec(name, "cmd_left", values),)))
         effect = one.effects[0].effect
         acts = effect.input_sequence(fine, one.nominal, "cmd_left", lasts, values)
-        ends = effect.at_end(fine, acts, None, one.nominal, "cmd_left", lasts[:, None], values)[parts - 1 :: parts, 0]
+        ends = effect.at_end((fine, acts, fine), None, one.nominal, "cmd_left", lasts[:, None], values)[parts - 1 :: parts, 0]
         assert acting(one, data).end[:, 0] == pytest.approx(ends, abs=off)
 
 
@@ -266,4 +266,4 @@ def test_a_wheels_sine_is_that_at_the_end_of_the_step():
     model = compose(ModelSpec("differential_drive", 0.05, {}, (EffectSpec("periodic_disturbance", "cmd_left", values),)))
     data = from_arrays(model, [(np.zeros((41, 5)), np.zeros((40, 2)))])
     end = 0.05 * np.arange(1, 41)
-    assert acting(model, data).end[:, 0] == pytest.approx(np.sin(2.0 * np.pi * 0.8 * end + 0.3), abs=1e-3)
+    assert acting(model, data).end[:, 0] == pytest.approx(np.sin(2.0 * np.pi * 0.8 * end + 0.3), abs=1e-6)

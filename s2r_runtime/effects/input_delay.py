@@ -54,9 +54,10 @@ class InputDelay(InputEffect):
         return replaced(u, model, channel, (1.0 - part) * line[1 : 1 + len(u)] + part * line[: len(u)])
 
     def at_end(
-        self, given: Array, acting: Array, before: Array | None, model: NominalModel, channel: str, dt: float | Array, p: Values
+        self, tables: tuple[Array, Array, Array], before: Array | None, model: NominalModel, channel: str, dt: float | Array, p: Values
     ) -> Array:
         """What was held a delay before the end: u_{k-m}, whole, where the mean is a mixture."""
+        given, acting, _ = tables
         u = given[..., columns(model, channel)]
         if before is not None:
             whole, _ = _steps(p["delay"], float(np.min(dt)))

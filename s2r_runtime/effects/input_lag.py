@@ -52,9 +52,10 @@ class InputLag(InputEffect):
         return replaced(u, model, channel, given + (before - given) * mean)
 
     def at_end(
-        self, given: Array, acting: Array, before: Array | None, model: NominalModel, channel: str, dt: float | Array, p: Values
+        self, tables: tuple[Array, Array, Array], before: Array | None, model: NominalModel, channel: str, dt: float | Array, p: Values
     ) -> Array:
         """The state itself, from its mean over the step: s_{k+1} = u_k + (u_act - u_k) a / mean."""
+        given, acting, _ = tables
         keep, mean = _factors(p["time_constant"], dt)
         u = given[..., columns(model, channel)]
         return replaced(acting, model, channel, u + (acting[..., columns(model, channel)] - u) * (keep / np.maximum(mean, SMALLEST)))

@@ -53,9 +53,10 @@ class InputRateLimit(Follower):
         return np.asarray(y + np.sign(d) * moved * (1.0 - moved / (2.0 * reach)))
 
     def at_end(
-        self, given: Array, acting: Array, before: Array | None, model: NominalModel, channel: str, dt: float | Array, p: Values
+        self, tables: tuple[Array, Array, Array], before: Array | None, model: NominalModel, channel: str, dt: float | Array, p: Values
     ) -> Array:
         """The ramp's end, from its mean: half a step's ramp further, and u where it got there (the mean is less than that short of it)."""
+        given, acting, _ = tables
         u, mean = given[..., columns(model, channel)], acting[..., columns(model, channel)]
         up, down = _limits(p, dt)
         return replaced(acting, model, channel, mean + np.minimum(np.maximum(u - mean, -0.5 * down), 0.5 * up))

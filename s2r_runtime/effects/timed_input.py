@@ -11,6 +11,9 @@ import numpy as np
 from s2r_runtime.effects.input_effect import Array, InputEffect, Values, columns, replaced
 from s2r_runtime.hookspecs import NominalModel
 
+INSTANT = 1e-6
+"""Of a step."""
+
 
 class TimedInputEffect(InputEffect):
     """An effect without memory that depends on time; override `act_at`."""
@@ -39,3 +42,13 @@ class TimedInputEffect(InputEffect):
         begun = np.broadcast_to(np.asarray(start, dtype=np.float64), u.shape[1:-1])
         t = (begun + dt * np.arange(len(u)).reshape(-1, *([1] * begun.ndim)))[..., None]
         return replaced(u, model, channel, self.act_at(u[..., columns(model, channel)], t, dt, p))
+
+    def at_end(
+        self, tables: tuple[Array, Array, Array], before: Array | None, model: NominalModel, channel: str, dt: float | Array, p: Values
+    ) -> Array:
+        """Of what came in at the end, over the last instant of the step; before: when it begins, (..., 1)."""
+        _, acting, end = tables
+        if before is None:
+            return acting
+        instant = INSTANT * dt
+        return replaced(acting, model, channel, self.act_at(end[..., columns(model, channel)], before[..., :1] + dt - instant, instant, p))

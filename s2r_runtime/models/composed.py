@@ -74,20 +74,18 @@ class AppliedEffect:
     @property
     def says_ends(self) -> bool:
         """Whether what acts at the end of a step may be another thing than what acts on average, though the input is held."""
-        return hasattr(self.effect, "at_end") or bool(getattr(self.effect, "timed", False))
+        return hasattr(self.effect, "at_end")
 
     def ends(
         self, tables: tuple[Array, Array, Array], before: Array | None, again: Callable[[], Array], nominal: BoundModel, dt: Any
     ) -> Array:
         """What acts at the ends of steps of dt, (..., nu). tables: what came in, held over each; what acted on average; what came in at the
-        ends (the first one itself, if that is all there is). before: hidden state at the start of one step, None over time. again: the
-        effect, applied to what came in at the ends. dt: s, or of each row, (..., 1).
+        ends (the first one itself, if that is all there is). before: hidden state at the start of one step; over time None, or when each
+        row begins, (..., 1), of what is `timed`. again: the effect, applied to what came in at the ends. dt: s, or of each row, (..., 1).
         """
         given, acting, end = tables
         if hasattr(self.effect, "at_end"):
-            found = self.effect.at_end(given, acting, before, nominal, self.channel, dt, self.p)
-        elif getattr(self.effect, "timed", False):
-            found = again()
+            found = self.effect.at_end(tables, before, nominal, self.channel, dt, self.p)
         elif end is given or self.effect.hidden(1, nominal, self.channel, float(np.min(dt)), self.p).size:
             found = acting  # what came in at the ends of the steps before is not kept
         else:
@@ -190,10 +188,8 @@ class ComposedModel:
         return delays_first(self.nominal, numbered, lambda pair: pair[1])
 
     def _again(self, a: AppliedEffect, u: Array, z: Array) -> Array:
-        """What the effect makes of an input over a part of a step that begins at z; if it depends on time, around the end of that part."""
-        dt = self.dt / self.substeps
-        z = z + 0.5 * dt if getattr(a.effect, "timed", False) else z
-        acting, _ = a.effect.input_step(u, z, self.nominal, a.channel, dt, a.p)
+        """What the effect makes of an input over a part of a step that begins at z."""
+        acting, _ = a.effect.input_step(u, z, self.nominal, a.channel, self.dt / self.substeps, a.p)
         return acting
 
     @cached_property

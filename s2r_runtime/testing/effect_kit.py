@@ -91,9 +91,12 @@ class EffectKit:
             pytest.skip("does not say it")
         for model, channel, p in self._tried(cases):
             u = self._inputs(model, 60)
-            ends = self.effect.at_end(u, self.effect.input_sequence(u, model, channel, DT, p), None, model, channel, DT, p)
+            acting = self.effect.input_sequence(u, model, channel, DT, p)
+            when = DT * np.arange(60.0)[:, None] if getattr(self.effect, "timed", False) else None
+            ends = self.effect.at_end((u, acting, u), when, model, channel, DT, p)
             fine = self.effect.input_sequence(np.repeat(u, PARTS, axis=0), model, channel, DT / PARTS, p).reshape(60, PARTS, -1)
-            going = np.abs(fine[:, -1] - fine[:, -2])  # on average the last part is half of this short of its end
+            change = np.diff(fine[:, -3:], axis=1)
+            going = np.abs(change[:, 1]) + np.abs(change[:, 1] - change[:, 0])  # on average the last part is half a change short of its end
             assert np.all(np.abs(ends - fine[:, -1]) <= going + 1e-9), "at_end is not where the last part of a step gets to"
 
     def test_runs_side_by_side_are_the_same_as_one_after_the_other(self, cases: list[Case]) -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import cache, cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,14 +115,24 @@ class Inputs:
         known = ("ends", *key)
         found = self._kept.get(known)
         if found is None:
-            again = cache(lambda: self._apply(a, last, model, later=0.5))
+            again = cache(lambda: self._apply(a, last, model))
             found = []
-            for i, (u, acting, end, dt) in enumerate(zip(given, acted, last, self._each, strict=True)):
-                found.append(a.ends((u, acting, end), None, partial(_one, again, i), model.nominal, dt)[..., touched])
+            when = self._when if getattr(a.effect, "timed", False) else [None for _ in given]
+            for i, (u, acting, end, dt, t) in enumerate(zip(given, acted, last, self._each, when, strict=True)):
+                found.append(a.ends((u, acting, end), t, partial(_one, again, i), model.nominal, dt)[..., touched])
             self._keep(known, found)
         else:
             self._kept.move_to_end(known)
         return [_with(table, touched, columns) for table, columns in zip(last, found, strict=True)]
+
+    @cached_property
+    def _when(self) -> list[Array]:
+        """When each row of each table begins, s: (T, 1) or (T, runs, 1)."""
+        found = []
+        for table, start, dt in zip(self._tables, self._starts, self._each, strict=True):
+            lasts = np.broadcast_to(dt, (*table.shape[:-1], 1))
+            found.append(np.cumsum(lasts, axis=0) - lasts + (start[:, None] if isinstance(start, np.ndarray) else start))
+        return found
 
     def _laid(self, key: Key, tables: list[Array]) -> Array:
         """The runs laid end to end."""
@@ -151,17 +161,17 @@ class Inputs:
         also = reads(model.nominal, a.channel) if reads else ()
         return [i for i, name in enumerate(names) if name == a.channel or name in also]
 
-    def _apply(self, a: AppliedEffect, tables: list[Array], model: ComposedModel, later: float = 0.0) -> list[Array]:
-        """What acts. later: rows by which time is ahead of the rows, for what depends on it."""
+    def _apply(self, a: AppliedEffect, tables: list[Array], model: ComposedModel) -> list[Array]:
+        """What acts."""
         if self._lasts is not None and getattr(a.effect, "uneven", False):
             given = _end_to_end(self._split(tables), 0.0)
-            timed = {"start": self._begins + later * self._lasts} if getattr(a.effect, "timed", False) else {}
+            timed = {"start": self._begins} if getattr(a.effect, "timed", False) else {}
             return self._tabled(a.effect.input_sequence(given, model.nominal, a.channel, self._lasts, a.p, **timed))  # type: ignore[arg-type]
         if self._rows is None or getattr(a.effect, "side_by_side", False):
-            return [self._over_time(a, u, model, start + later * self._dt) for u, start in zip(tables, self._starts, strict=True)]
+            return [self._over_time(a, u, model, start) for u, start in zip(tables, self._starts, strict=True)]
         z, done = a.effect.hidden(tables[0].shape[1], model.nominal, a.channel, self._dt, a.p), []
         if getattr(a.effect, "timed", False):
-            z[:, 0] = self._starts[0] + later * self._dt
+            z[:, 0] = self._starts[0]
         for u in tables[0]:
             acting_now, z = a.effect.input_step(u, z, model.nominal, a.channel, self._dt, a.p)
             done.append(acting_now)

@@ -41,6 +41,12 @@ ROUNDS = 6
 SETTLED = 0.3
 """Nats below which another round of parameters and noise is not worth it."""
 
+FLOORED = 2.0
+"""Of its floor: process noise below it is not told from that."""
+
+ABOUT, STAYS = 4, 1e-3
+"""Rounds of states and numbers in turn, at most; share of itself by which no number moves any more."""
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -249,11 +255,56 @@ def fitted(given: Problem, start: Fit, model: ComposedModel, rounds: int = ROUND
 
 def settled(given: Problem, fit: Fit) -> Fit:
     """The same with its numbers under the law of what it leaves, where that wanders: nearer, and their intervals are those of that law."""
-    law = noises.wandering(fit.z, given.steps.joined, fit.colour)
+    law = _law(given, fit)
     if law is None or not fit.free:
         return fit
     again = evaluate(given, refine(given, replace(fit, colour=law), fit.model), fit.noise)
-    return replace(again, colour=noises.wandering(again.z, given.steps.joined, again.colour) or again.colour)
+    return replace(again, colour=_law(given, again) or again.colour)
+
+
+def _law(given: Problem, fit: Fit) -> Colour | None:
+    """Of what wanders, for numbers."""
+    law = noises.wandering(fit.z, given.steps.joined, fit.colour)
+    if law is None:
+        return None
+    law = noises.no_steadier(law, fit.colour, fit.noise.q <= FLOORED * given.floor.q)
+    return law if np.any(law.slow) else None
+
+
+def about(given: Problem, fit: Fit) -> Problem:
+    """The same transitions, taken about where a model says, with its noise, that the robot was: with e_k = y_k - x_k (`begun`),
+
+        y0 -> x,   y1 -> y1 - F e,   so that  y1 (-) f(y0)  becomes  y1 (-) f(x) - F e:
+
+    the same to first order, with the same covariance. What bends with the state (dry friction near standstill, drag, a curve) is asked
+    where the robot was, not where its sensors were off to: noise in a regressor makes a curve look flatter and wider than it is (R. J.
+    Carroll et al., Measurement error in nonlinear models, 2006; the iterated Kalman smoother of A. Jazwinski, Stochastic processes and
+    filtering theory, 1970).
+    """
+    steps, act = given.steps, acting(fit.model, given.data)
+    s = fit.whiten.back(fit.z * noises.weight(fit.z))
+    before = np.where(steps.joined[:, None], np.concatenate([np.zeros((1, s.shape[1])), s[:-1]]), 0.0)
+    error = fit.noise.r * (before - np.einsum("kji,kj->ki", state_jacobian(fit.model, steps, act), s))
+    begin = replace(steps, y0=steps.y0 - error)
+    moved = np.einsum("kij,kj->ki", state_jacobian(fit.model, begin, act), error)
+    return replace(given, steps=replace(begin, y1=steps.y1 - moved))
+
+
+def told(given: Problem, fit: Fit) -> tuple[Fit, Problem, Fit]:
+    """The fit with its numbers as they are told; the problem on which they are (`about`), and the fit on that."""
+    if given.floor.axes or not fit.free:  # where speeds were not measured, the model is stepped from smoothed ones as it is
+        fit = settled(given, fit)
+        return fit, given, fit
+    problem, near = given, fit
+    for _ in range(ABOUT):
+        before = values_of(near.model, near.free)
+        problem = about(given, evaluate(given, near.model, near.noise))
+        near = fitted(problem, evaluate(problem, near.model, near.noise), near.model, 2)
+        if np.allclose(values_of(near.model, near.free), before, rtol=STAYS, atol=0.0):
+            break
+    near = settled(problem, near)
+    fit = evaluate(given, near.model, near.noise)
+    return replace(fit, colour=noises.wandering(fit.z, given.steps.joined, fit.colour) or fit.colour), problem, near
 
 
 def plainly(given: Problem, fit: Fit) -> Fit:

@@ -300,6 +300,15 @@ def wandering(z: Array, joined: Mask, given: Colour) -> Colour | None:
     return Colour(coefficients, scale, slow) if np.any(slow) else None
 
 
+def no_steadier(law: Colour, given: Colour, floored: Mask) -> Colour:
+    """The law less that of states (nx,) whose process noise stands at its floor and which wander less than white noise does: that says no
+    more than that the floor is higher than what is there. It is meant to be: no model is believed to be more exact.
+    """
+    drop = floored & (law.slow.sum(axis=1) < 0.0)
+    one = drop[:, None]
+    return Colour(np.where(one, given.coefficients, law.coefficients), np.where(drop, given.scale, law.scale), np.where(one, 0.0, law.slow))
+
+
 def _recently(z: Array, joined: Mask, memory: float) -> Array:
     """Running mean of what was before each step, as z: m_k = a m_{k-1} + (1 - a) z_{k-1}, a = exp(-1/memory), zero where a run begins."""
     from scipy.linalg import lapack

@@ -87,9 +87,10 @@ class Following(Shape):
     """A shape of which the mean over a row is that of where it begins and where it ends, (z_k + z_{k+1}) / 2, from z = 0."""
 
     def at_end(
-        self, given: Array, acting: Array, before: Array | None, model: NominalModel, channel: str, dt: float | Array, p: Values
+        self, tables: tuple[Array, Array, Array], before: Array | None, model: NominalModel, channel: str, dt: float | Array, p: Values
     ) -> Array:
         """z_{k+1} = 2 (m_k - m_{k-1} + m_{k-2} - ...), of the means m."""
+        _, acting, _ = tables
         j = model.inputs.index(channel)
         sign = (1.0 - 2.0 * (np.arange(len(acting)) % 2)).reshape(-1, *([1] * (acting.ndim - 2)))
         after = acting.copy()

@@ -31,7 +31,7 @@ from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge, noise_floor
 from s2r_runtime.trace.excitation import advice
 from s2r_runtime.trace.faults import Checked, check
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, problem, settled, without
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, problem, told, without
 from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.intervals import intervals
 from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, Looks, Structure, best_unnamed, explains_more, first_looks, lack_of_fit
@@ -191,8 +191,10 @@ def _result(
 ) -> TraceResult:
     """Verdict, intervals, errors and gap before and after."""
     model = chosen.nominal.model
+    there, near = given, chosen.fit
     if dataset.reconstruction is None:  # what a filter leaves has the filter's law, not the noise's
-        chosen = replace(chosen, fit=settled(given, chosen.fit))
+        fit, there, near = told(given, chosen.fit)
+        chosen = replace(chosen, fit=fit)
     before, after = judge(model, judged_on), judge(chosen.fit.model, judged_on)
     floor = noise_floor(chosen.fit, judged_on, seed)
     forgets = replace(chosen.fit, colour=no_colour(len(model.states)))  # a law with a memory may have taken up all that the model lacks
@@ -208,7 +210,7 @@ def _result(
         floor = noise_floor(final, judged_on, seed)
     after = before if final is chosen.nominal else after
     gap_before, gap_after, independent = gaps((model, before), (final.model, after), judged_on, weights, kind)
-    ranges = intervals(given, final)
+    ranges = intervals(there, near) if final is chosen.fit else intervals(given, final)
     effects = tuple(_found(model, final, place, ranges) for place in final.added)
     idle = [place for place in final.added if not asked(given, judged_on, final.model, without(final.model, place))]
     rivals = [s.fit for s in chosen.rivals if s.fit is not None] if verdict == "ambiguous" else []

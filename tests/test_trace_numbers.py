@@ -1,0 +1,58 @@
+"""Numbers that are told: unbiased where sensors are coarse against what bends with the state, and under the right law of what is left."""
+
+import numpy as np
+import pytest
+
+from s2r_runtime.models.composed import AppliedEffect, compose
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.plugins import registry
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem, told
+from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.residual_noise import Colour, no_colour, no_steadier
+from s2r_runtime.trace.slots import values_of
+
+DRY, VISCOUS = 0.5, 0.4
+
+
+def _recorded(seed, rounded):
+    """A joint that goes to and fro slowly; its speed is measured in steps of 0.3, or as badly."""
+    model = compose(ModelSpec("joint", 0.02, {"mass": 1.0}))
+    effects = (EffectSpec("coulomb_friction", "qd", {"force": DRY}), EffectSpec("viscous_friction", "qd", {"coefficient": VISCOUS}))
+    robot = compose(ModelSpec("joint", 0.02, {"mass": 1.0}, effects))
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-1.2, 1.2, (50, 1)), 24, axis=0)
+    x, hidden, rows = np.zeros((1, 2)), robot.at_rest(1), [np.zeros(2)]
+    for k in range(len(u)):
+        x, hidden = robot.step(x, u[k : k + 1], hidden)
+        rows.append(x[0])
+    y = np.array(rows) + rng.normal(size=(len(rows), 2)) * ([0.004, 0.06] if rounded else [0.004, 0.1])
+    return model, from_arrays(model, [(np.column_stack([y[:, 0], np.round(y[:, 1] / 0.3) * 0.3 if rounded else y[:, 1]]), u)])
+
+
+@pytest.mark.parametrize("rounded", [False, True])
+def test_friction_is_not_told_weaker_than_it_is_because_the_speed_is_measured_coarsely(rounded):
+    """Where the sensor says that the robot is, friction seems to be weaker and to grow more with the speed: by far less where it was."""
+    off = []
+    for seed in range(4):
+        model, data = _recorded(seed, rounded)
+        given = problem(data, steps_of(data))
+        both = model
+        for name, p in (("coulomb_friction", {"force": 0.3}), ("viscous_friction", {"coefficient": 0.3})):
+            both = insert(both, AppliedEffect(registry().get("effects", name), "qd", p), len(both.effects))
+        fit = fitted(given, evaluate(given, model), both)
+        off.append([values_of(m, fit.free) - [DRY, VISCOUS] for m in (fit.model, told(given, fit)[0].model)])
+    first, last = np.mean(np.abs(off), axis=0)
+    assert np.all(np.mean(off, axis=0)[0] * [-1.0, 1.0] > 0.05)
+    assert np.all(last < 0.7 * first)
+
+
+def test_what_is_steadier_than_white_noise_makes_numbers_no_surer_where_process_noise_stands_at_its_floor():
+    none = no_colour(2)
+    law = Colour(none.coefficients + 0.1, 0.9 * none.scale, np.array([[0.0, -2.3, 0.0, 0.0], [0.0, 0.4, 0.0, 0.0]]))
+    left = no_steadier(law, none, np.array([True, True]))
+    assert np.all(left.slow[0] == 0.0)
+    assert (left.scale[0], left.scale[1]) == (1.0, 0.9)
+    assert np.all(left.coefficients[0] == 0.0)
+    assert np.all(left.slow[1] == law.slow[1])
+    assert np.array_equal(no_steadier(law, none, np.array([False, False])).slow, law.slow)  # a sensor that is wrong for a while
