@@ -99,3 +99,20 @@ def test_a_repair_that_makes_rollouts_worse_is_none():
     assert not harms(near, Judged(noise, 1.05 * noise), floor)
     assert not harms(far, near, floor)
     assert not harms(near, Judged(noise, noise * [1.0, 9.0]), np.array([1.0, np.inf]))
+
+
+def test_a_ramp_that_is_over_within_a_step_is_no_delay():
+    """Wheels that are measured, at changes a step that the ramp catches up with in a third of it."""
+    rng = np.random.default_rng(16)
+    t = 0.04 * np.arange(500)
+    u = 3.0 * np.column_stack([np.sin(1.3 * t) + np.sin(2.9 * t), np.sin(1.7 * t + 1.0) + np.sin(3.1 * t)])
+    model = compose(ModelSpec("differential_drive", 0.04, {}, ()))
+    true = compose(ModelSpec("differential_drive", 0.04, {}, (EffectSpec("input_rate_limit", "cmd_right", {"rate": 45.0}),)))
+    x, hidden, rows = np.zeros((1, 5)), true.at_rest(1), [np.zeros(5)]
+    for row in u:
+        x, hidden = true.step(x, row[None, :], hidden)
+        rows.append(x[0])
+    y = np.array(rows) + rng.normal(size=(501, 5)) * [1e-3, 1e-3, 1e-3, 5e-3, 5e-3]
+    found = trace(from_arrays(model, [(y, u)]), model)
+    assert [(e.name, e.channel) for e in found.effects] == [("input_rate_limit", "cmd_right")]
+    assert found.effects[0].parameters["rate"][0] == pytest.approx(45.0, rel=0.1)

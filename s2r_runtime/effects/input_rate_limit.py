@@ -19,8 +19,10 @@ from s2r_runtime.effects.follower import Follower
 from s2r_runtime.effects.input_effect import Array, Values, columns, replaced
 from s2r_runtime.hookspecs import NominalModel, Parameter
 
-CATCHING_UP = (0.8, 1.5, 3.0, 6.0, 11.0, 20.0, 36.0)
-"""Steps that a large change of the input takes at the rates from which the tracer begins."""
+CATCHING_UP = (0.1, 0.35, 0.8, 1.5, 3.0, 6.0, 11.0, 20.0, 36.0)
+"""Steps that a large change of the input takes at the rates from which the tracer begins: what is over within a step shows in a measured
+wheel, and in a mean.
+"""
 
 UNLIKE = ((2.0, 5.0), (5.0, 2.0))
 """The same, up and down, for a limit that depends on the direction."""
@@ -76,7 +78,7 @@ class InputRateLimit(Follower):
         return found
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
-        """From a limit that a large change meets within a step to one that takes it thirty-six."""
+        """From a limit that a large change meets for a tenth of a step to one that takes it thirty-six."""
         change = np.abs(np.diff(u[:, columns(model, channel)], axis=0))
         if not np.any(change):
             return []
