@@ -45,6 +45,7 @@ _EFFECTS = {
     "longitudinal_slip": "wheels turn farther than the robot moves",
     "track_scale": "yaw is a constant factor of the ideal one: skidding wheels",
     "understeer": "a car turns less the faster it goes",
+    "rear_slip": "a car's rear tyres give way in curves, with the speed squared",
     "position_field": "a push that depends linearly on the position",
     "mass_change": "the mass is another one",
     "parameter_change": "a parameter of one's own model is another one",

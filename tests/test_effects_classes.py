@@ -44,6 +44,7 @@ VALUES = {
     "longitudinal_slip": {"ratio": 0.2},
     "track_scale": {"gain": 0.6},
     "understeer": {"coefficient": 0.3},
+    "rear_slip": {"coefficient": 0.2},
     "position_field": {"matrix": [[0.2, -0.1], [0.3, 0.4]]},
     "mass_change": {"ratio": 1.4},
     "heading_offset": {"angle": 0.3},

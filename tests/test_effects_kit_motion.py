@@ -18,6 +18,7 @@ VALUES = {
     "longitudinal_slip": ({"ratio": 0.2}, {"ratio": 1.0}),
     "track_scale": ({"gain": 0.4}, {"gain": -1.0}),
     "understeer": ({"coefficient": 0.05}, {"coefficient": -0.05}, {"coefficient": -1e3}),
+    "rear_slip": ({"coefficient": 0.02}, {"coefficient": -0.02}),
     "position_field": ({"matrix": [[0.1, -0.2], [0.3, 0.05]]}, {"matrix": [[-80.0, 3.0], [0.0, 9.0]]}),
     "mass_change": ({"ratio": 1.3}, {"mass": 0.7}),
     "parameter_change": ({"ratio": 1.3}, {"value": 0.7}),

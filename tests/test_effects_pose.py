@@ -60,11 +60,13 @@ EFFECTS = {
     "skidding": (("track_scale", "theta", {"gain": 0.6}), lambda v, w: {"w": 0.6 * w}),
     "field": (("position_field", "*", {"matrix": M.tolist()}), lambda v, w: {"drift": lambda px, py: M @ np.stack([px, py])}),
     "understeer": (("understeer", "theta", {"coefficient": 0.3}), lambda v, w: {"w": w * 0.5 / (0.5 + 0.3 * v**2)}),
+    "tyres": (("rear_slip", "*", {"coefficient": 0.2}), lambda v, w: {"side": -0.2 * v * v * w}),
 }
+OF_CARS = {"understeer", "tyres"}
 
 
 def _cases():
-    return [(name, effect) for name in GEOMETRY for effect in EFFECTS if effect != "understeer" or name == "bicycle"]
+    return [(name, effect) for name in GEOMETRY for effect in EFFECTS if effect not in OF_CARS or name == "bicycle"]
 
 
 @pytest.mark.parametrize("arc", [True, False])
@@ -96,6 +98,18 @@ def test_changes_of_the_body_apply_before_the_arc_and_the_worlds_after_it_in_any
     # the order of two changes of the body is that of the list: sliding by the yaw rate before it is scaled
     other = composed("unicycle", 0.1, ARC, slip, skid).advance(x, u, u)
     assert np.max(np.abs(other - expected)) > 1e-3
+
+
+def test_tyres_give_way_by_the_yaw_rate_that_is_left_in_any_order():
+    rng = np.random.default_rng(5)
+    x = rng.uniform(-1.0, 1.0, (ROWS, 4))
+    u = rng.uniform(0.5, 2.0, (ROWS, 2)) * [0.3, 1.0]
+    less, slides = EFFECTS["understeer"][0], EFFECTS["tyres"][0]
+    one, other = (composed("bicycle", 0.1, ARC, *both).advance(x, u, u) for both in ((less, slides), (slides, less)))
+    v, w = commanded("bicycle", u)
+    w = w * 0.5 / (0.5 + 0.3 * v**2)
+    assert np.allclose(one, other, rtol=0.0, atol=1e-12)
+    assert np.allclose(one[:, :3], moved(x, v, w, 0.1, arc=True, side=-0.2 * v * v * w), rtol=0.0, atol=1e-6)
 
 
 def test_a_slope_of_the_world_is_no_wind():
@@ -237,7 +251,7 @@ def test_a_model_of_the_users_own_with_a_pose_has_the_effects_of_poses(tmp_path)
     x, u = rng.uniform(-1.0, 1.0, (ROWS, 3)), rng.uniform(-2.0, 2.0, (ROWS, 2))
     full = np.column_stack([x[:, 2], x[:, 0], x[:, 1], np.ones(ROWS)])
     for effect, (spec, _) in EFFECTS.items():
-        if effect == "understeer":
+        if effect in OF_CARS:
             continue
         theirs, ours = compose(ModelSpec(str(path), 0.1, {}, (EffectSpec(*spec),))), composed("unicycle", 0.1, ARC, spec)
         assert np.allclose(theirs.advance(full, u, u)[:, [1, 2, 0]], ours.advance(x, u, u), rtol=0.0, atol=1e-13), effect
@@ -260,7 +274,7 @@ def test_a_hundred_thousand_rows_take_milliseconds():
     rng = np.random.default_rng(9)
     x, u = rng.normal(size=(100_000, 3)), rng.normal(size=(100_000, 2))
     for spec, _ in EFFECTS.values():
-        if spec[0] == "understeer":
+        if spec[0] in {"understeer", "rear_slip"}:
             continue
         model = composed("unicycle", 0.01, ARC, spec)
         took = []

@@ -89,6 +89,7 @@ _NEEDS = {
     "position_field": "all over the floor",
     "lateral_slip": "curves of several radii at several speeds",
     "understeer": "the same steering at several speeds",
+    "rear_slip": "curves at several speeds",
     "longitudinal_slip": _SIZES,
     "track_scale": _SIZES,
     "sensor_lever_arm": "turning on the spot, and driving straight",

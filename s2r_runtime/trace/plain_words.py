@@ -108,6 +108,9 @@ _WORDS: dict[str, Callable[[str, Values], str]] = {
     "longitudinal_slip": lambda what, p: f"the wheels slip: {_percent(p['ratio'])} of the way is lost",
     "track_scale": lambda what, p: f"it turns at {_percent(p['gain'])} of the ideal rate",
     "understeer": lambda what, p: f"it turns {'less' if p['coefficient'] > 0.0 else 'more'} than its steering says, with the speed squared",
+    "rear_slip": lambda what, p: (
+        f"its rear axle slides {'outwards' if p['coefficient'] > 0.0 else 'inwards'} in curves, with the speed squared: tyres give way"
+    ),
     "heading_offset": lambda what, p: f"the measured heading is off by {math.degrees(p['angle']):.3g} deg",
     "sensor_offset": lambda what, p: f"{what} is measured {abs(p['offset']):.3g} too {'high' if p['offset'] > 0.0 else 'low'}",
     "sensor_lever_arm": lambda what, p: (

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.begun import begun, uncertain
+from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.fitting import (
     WIDEST,
     Fit,
@@ -36,7 +37,7 @@ from s2r_runtime.trace.fitting import (
 from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
 from s2r_runtime.trace.rivals import CLOSE, rivals, simplified
 from s2r_runtime.trace.scores import STRICT, Bar, Scored, best_candidates, limited, name_of, names, rescored, unlimited
-from s2r_runtime.trace.slots import bounds_of, values_of, with_values
+from s2r_runtime.trace.slots import bounds_of, slots_of, values_of, with_values
 
 Array = NDArray[np.float64]
 
@@ -59,6 +60,9 @@ FIRSTS, SECONDS = 3, 4
 """Effects that are looked at together with another one where those that do best one after the other leave structure, and how many others
 are fitted beside each.
 """
+
+BENT = 3.0
+"""Standard deviations by which a number must change to have been bent by what the model lacks beside."""
 
 BLOCKS = 5
 """Of the cross-validation."""
@@ -110,7 +114,8 @@ def select(
         fit = exchanged(given, chosen, bar) if 1 < len(chosen.added) <= EXCHANGED else chosen
         if crowded(fit):
             break
-    fit = plainly(given, simplified(given, pruned(given, fit, tried, horizon, bar)))
+    fit = unbent(given, simplified(given, pruned(given, fit, tried, horizon, bar)), tried, bar)
+    fit = plainly(given, fit)
     progress(0.8)
     fit, found = overtaken(given, fit, bar)
     return Selection(nominal, fit, tried, tuple(ranking), tuple(found))
@@ -302,3 +307,31 @@ def pruned(given: Problem, fit: Fit, tried: int, horizon: int, bar: Bar) -> Fit:
                 fit, again = less, True
                 break
     return fit
+
+
+def unbent(given: Problem, fit: Fit, tried: int, bar: Bar) -> Fit:
+    """With an effect that has no number, where the data call for it and numbers took up what it does: a car that moves on arcs slides less
+    by half a step times its speed than a model that moves in straight pieces says. Rollouts need not get better by it; the numbers do.
+    """
+    if not any(_of_body(fit.model, place) for place in fit.added):
+        return fit
+    plain = [c for c in candidates(fit.model, given.data) if c.replaced < 0 and not any(slots_of(start, 0) for start in c.starts)]
+    for other in sorted((fitted(given, fit, m, 1) for c in plain for m in c.models(fit.model)), key=lambda other: -gain(other, fit)):
+        if significant(given, other, fit, tried, bar):
+            apart = np.abs(values_of(other.model, other.free) - values_of(fit.model, fit.free))
+            return other if np.any(apart > BENT * _deviations(given, other)) else fit
+    return fit
+
+
+def _of_body(model: ComposedModel, place: int) -> bool:
+    """Whether an effect changes how a pose moves, or where on it somebody measures."""
+    a = model.effects[place]
+    frame = a.effect.frame(model.nominal, a.channel) if hasattr(a.effect, "frame") else ""
+    return a.effect.stage == "sensor" or (a.effect.stage == "step" and frame in {"body", "sliding"})
+
+
+def _deviations(given: Problem, fit: Fit) -> Array:
+    """(k,) standard deviations of what was fitted."""
+    j = sensitivities(given, fit, fit.model, fit.free)
+    w = noises.weight(objective(given, fit, fit.model)).ravel()
+    return np.asarray(np.sqrt(np.abs(np.diag(np.linalg.pinv(j.T @ (j * w[:, None]), rcond=1e-12, hermitian=True)))))

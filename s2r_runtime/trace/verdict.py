@@ -26,6 +26,7 @@ from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import acting, predicted, rms
 from s2r_runtime.trace.rivals import representative, tied
 from s2r_runtime.trace.selection import Selection
+from s2r_runtime.trace.slots import slots_of
 
 Array = NDArray[np.float64]
 
@@ -67,7 +68,7 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
         for place in fit.added:
             less = fitted(given, fit, without(fit.model, place), 2)
             refutable = asked(given, judged_on, fit.model, less.model) or _once(given, fit.model, less.model)
-            if refutable and not better(judged_on, fit.model, less.model, CONFIRMED):
+            if refutable and not _holds(judged_on, fit, less, place):
                 fit, again = less, True
                 break
     rivals = list(chosen.rivals) if fit.added else []
@@ -83,6 +84,14 @@ def _ahead(judged_on: Held, fits: list[Fit]) -> list[float]:
     here = problem(judged_on.data, judged_on.steps)
     foretelling = [evaluate(here, one.model) for one in fits]
     return [gain(one, foretelling[0]) for one in foretelling]
+
+
+def _holds(judged_on: Held, fit: Fit, less: Fit, place: int) -> bool:
+    """Whether held-out data are foretold better with an effect; if it has no number, whether they are likelier."""
+    if len(fit.added) > 1 and not slots_of(fit.model.effects[place], place) and len(judged_on.steps):
+        here = problem(judged_on.data, judged_on.steps)
+        return gain(evaluate(here, fit.model), evaluate(here, less.model)) > 0.0
+    return better(judged_on, fit.model, less.model, CONFIRMED)
 
 
 def asked(given: Problem, judged_on: Held, model: ComposedModel, less: ComposedModel) -> bool:
