@@ -70,8 +70,9 @@ def _factors(phi: Array, scheme: str) -> tuple[Array, Array]:
         return np.ones_like(phi), np.zeros_like(phi)
     if scheme == "rk4":
         return (1.0 + 4.0 * np.cos(phi / 2.0) + np.cos(phi)) / 6.0, (4.0 * np.sin(phi / 2.0) + np.sin(phi)) / 6.0
-    half = np.sinc(phi / (2.0 * np.pi))  # sin(phi/2) / (phi/2)
-    return np.sinc(phi / np.pi), phi / 2.0 * half * half
+    phi = np.where(phi == 0.0, 1e-300, phi)
+    half = np.sin(0.5 * phi)
+    return 2.0 * half * np.cos(0.5 * phi) / phi, 2.0 * half * half / phi
 
 
 EFFECT = IntegrationScheme()

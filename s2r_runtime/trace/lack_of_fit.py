@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,13 +106,13 @@ class Structure:
         return (TOKENS.get(best, best),) if best and self.gains[best] > math.log(len(self.gains) / ALPHA) else ()
 
 
-def lack_of_fit(given: Problem, fit: Fit, nominal: Fit, horizon: int) -> Structure:
-    """Structure left by `fit`; how much of what `nominal` leaves that is."""
-    left, found = left_by(given, fit)
-    chosen, gains = _forward(left, found) if found else ([], {})
-    coloured = ("noise",) if np.any(fit.colour.strength > COLOURED) else ()
+def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
+    """Structure left by a model; how much of what `nominal` leaves that is."""
+    left, found = looks.left, looks.found
+    chosen, gains = _forward(looks) if found else ([], {})
+    coloured = ("noise",) if np.any(left.fit.colour.strength > COLOURED) else ()
     if not chosen:
-        windows = episodes(left) if given.data.in_order else None
+        windows = episodes(left) if left.given.data.in_order else None
         matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
         if windows is None or not matters:
             return Structure(coloured, False, 0.0, gains)
@@ -142,19 +143,24 @@ class Looks:
         """Nats of the best one at first look."""
         return self.looked[0][0]
 
+    @cached_property
+    def judged(self) -> list[Judged]:
+        """The FEW best of them with their own noise."""
+        looked = _best_of_each(self.looked, self.found)
+        terms = [(self.found[i][0], leading(self.left, self.found[i][1])) for _, i in looked[:FEW]]
+        return [judge(self.left, token, x) for token, x in terms]
 
-def first_looks(given: Problem, nominal: Fit) -> Looks:
-    """At what the nominal model leaves."""
-    left, found = left_by(given, nominal)
+
+def first_looks(given: Problem, fit: Fit) -> Looks:
+    """At what a model leaves."""
+    left, found = left_by(given, fit)
     return Looks(left, found, sorted(((first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True))
 
 
 def best_unnamed(looks: Looks) -> Judged:
     """The dictionary that explains most without any effect's name, under the token that is told."""
-    looked = _best_of_each(looks.looked, looks.found)
-    judged = [judge(looks.left, looks.found[i][0], leading(looks.left, looks.found[i][1])) for _, i in looked[:FEW]]
-    most = max(j.gain for j in judged)
-    best = min((j for j in judged if j.gain >= most - ALIKE), key=lambda j: (j.x.shape[2], -j.gain))
+    most = max(j.gain for j in looks.judged)
+    best = min((j for j in looks.judged if j.gain >= most - ALIKE), key=lambda j: (j.x.shape[2], -j.gain))
     return replace(best, token=TOKENS.get(best.token, best.token), gain=most)
 
 
@@ -202,13 +208,11 @@ def _columns(terms: Sequence[Array]) -> Array:
     return np.asarray(table.transpose(1, 2, 0))
 
 
-def _forward(left: Left, found: Sequence[tuple[str, Array]]) -> tuple[list[Judged], dict[str, float]]:
+def _forward(looks: Looks) -> tuple[list[Judged], dict[str, float]]:
     """The best group, then those that add to it; the last one holds the columns of all."""
-    threshold = math.log(len(found) / ALPHA)
-    looked = _best_of_each(sorted(((first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True), found)
-    gains = {token: 0.0 for token, _ in found}
-    terms = [(found[i][0], leading(left, found[i][1])) for _, i in looked[:FEW]]
-    judged = [judge(left, token, x) for token, x in terms]
+    left, judged = looks.left, looks.judged
+    threshold = math.log(len(looks.found) / ALPHA)
+    gains = {token: 0.0 for token, _ in looks.found}
     for j in judged:
         gains[j.token] = max(gains[j.token], j.gain)
     strengths = [_strength(left, j, threshold) for j in judged]

@@ -74,8 +74,9 @@ def first_look(left: Left, x: Array) -> float:
     """Log evidence of the dictionary under the model's own noise."""
     white = left.fit.whiten(x).reshape(-1, x.shape[2])
     z = left.fit.z.ravel()
-    weighted = white * noises.weight(z)[:, None]
-    told = evidence(white.T @ weighted, weighted.T @ z).log
+    root = np.sqrt(noises.weight(z))
+    weighted = white * root[:, None]
+    told = evidence(weighted.T @ weighted, weighted.T @ (root * z)).log  # half the work of a product of two
     return told if left.clipped is None else max(told, evidence(white.T @ white, white.T @ left.clipped.ravel()).log)
 
 

@@ -125,7 +125,8 @@ def advanced(model: ComposedModel, x: Array, act: Acting, place: Index | slice) 
     """
     lasts = None if act.lasts is None else act.lasts[place]
     if act.parts is None:
-        return _once(model, x, act.mean[place], act.end[place], lasts)
+        mean = act.mean[place]
+        return _once(model, x, mean, mean if act.end is act.mean else act.end[place], lasts)
     parts = act.parts[place]
     count = parts.shape[1]
     short = replace(model, spec=structs.replace(model.spec, dt=model.dt / count))

@@ -171,7 +171,7 @@ def _once_more(
     for way, may_be_left in ways:
         found = way()
         other = chosen if found is None else confirmed(given, found, judged_on)
-        if names(other.fit.model) != names(chosen.fit.model):
+        if names(other.fit.model) != names(chosen.fit.model) and not crowded(other.fit):
             rest = whole.structure(other)
             if not rest.matters and {*rest.tokens} <= may_be_left:
                 return other, rest
@@ -335,8 +335,8 @@ class _Whole:
 
     def structure(self, chosen: Selection) -> Structure:
         """What the chosen model leaves."""
-        fit = evaluate(self.given, chosen.fit.model)
-        found = lack_of_fit(self.given, fit, self.nominal, self._horizon)
+        fit = evaluate(self.given, chosen.fit.model) if chosen.fit.added else self.nominal
+        found = lack_of_fit(first_looks(self.given, fit) if fit.added else self._looks, self.nominal, self._horizon)
         if not fit.added:
             told = (
                 found.matters and not found.for_a_while and self.unnamed.gain > CLEAR
