@@ -8,9 +8,11 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem, told
+from s2r_runtime.trace.intervals import intervals
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.residual_noise import Colour, no_colour, no_steadier
-from s2r_runtime.trace.slots import values_of
+from s2r_runtime.trace.retimed import retimed
+from s2r_runtime.trace.slots import Slot, values_of
 
 DRY, VISCOUS = 0.5, 0.4
 
@@ -56,3 +58,36 @@ def test_what_is_steadier_than_white_noise_makes_numbers_no_surer_where_process_
     assert np.all(left.coefficients[0] == 0.0)
     assert np.all(left.slow[1] == law.slow[1])
     assert np.array_equal(no_steadier(law, none, np.array([False, False])).slow, law.slow)  # a sensor that is wrong for a while
+
+
+def _changed(seed, time, gain):
+    """A unicycle of which w does less from one time on, among inputs that change often."""
+    model = compose(ModelSpec("unicycle", 0.05))
+    robot = compose(ModelSpec("unicycle", 0.05, {}, (EffectSpec("regime_change", "w", {"time": time, "gain": gain}),)))
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-1.0, 1.0, (100, 2)), 4, axis=0)
+    x, hidden, rows = np.zeros((1, 3)), robot.at_rest(1), [np.zeros(3)]
+    for k in range(len(u)):
+        x, hidden = robot.step(x, u[k : k + 1], hidden)
+        rows.append(x[0])
+    data = from_arrays(model, [(np.array(rows) + rng.normal(size=(len(rows), 3)) * 0.006, u)])
+    given = problem(data, steps_of(data))
+    effect = registry().get("effects", "regime_change")
+    return given, evaluate(given, model), lambda when: insert(model, AppliedEffect(effect, "w", {"time": when, "gain": gain}), 0)
+
+
+def test_the_time_of_a_change_leaves_a_peak_that_is_not_the_highest():
+    given, nominal, changed = _changed(0, 9.33, 0.7)
+    fit = fitted(given, nominal, changed(13.0))
+    assert abs(fit.model.effects[0].p["time"] - 9.33) > 1.0
+    assert retimed(given, fit).model.effects[0].p["time"] == pytest.approx(9.33, abs=0.1)
+
+
+def test_the_time_of_a_change_lies_in_its_interval_as_often_as_that_says():
+    covered = 0
+    for seed in range(30):
+        given, nominal, changed = _changed(seed, 9.33, 0.8)
+        fit = retimed(given, fitted(given, nominal, changed(9.0)))
+        low, high = intervals(given, fit)[Slot(0, "time")]
+        covered += low <= 9.33 <= high
+    assert covered >= 26  # of 30 at 95 %: fewer in one of 80 draws

@@ -2,7 +2,7 @@
 
 Smooth parameters: value ± 1.96 s, s from Gauss-Newton, widened by the ratio in which the scores of blocks of time scatter more than
 the likelihood says (a sandwich; never narrowed). Parameters that enter with a kink (delays, limits): profile likelihood, where the log
-likelihood, the other parameters refitted, has fallen by 1.92 times the square of that ratio.
+likelihood, the other parameters refitted, has fallen by 1.92 (3.68 for the time of a change) times the square of that ratio.
 """
 
 from __future__ import annotations
@@ -15,11 +15,17 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.fitting import Fit, Problem, objective, sensitivities, widening
+from s2r_runtime.trace.retimed import is_time, spread
 from s2r_runtime.trace.slots import Free, Slot, bounds_of, values_of, with_values
 
 Array = NDArray[np.float64]
 
 NORMAL_95 = 1.96
+CHANGE_95 = 3.68
+"""Nats, for the time of a change: the likelihood is then the higher one of two random walks, P(less than x) = (1 - exp(-x))^2, no parabola
+(D. Siegmund, Confidence sets in change-point problems, International Statistical Review 56, 1988).
+"""
+
 BLOCKS = 20
 
 
@@ -42,16 +48,19 @@ def intervals(given: Problem, fit: Fit) -> dict[Slot, tuple[float, float]]:
         s = float(np.sqrt(max(covariance[index, index], 0.0)) * wider[index])
         known = normal[index, index] > 1e-12 * max(float(np.max(np.diag(normal))), 1e-300)
         if bounds.kink or not known:
-            found[slot] = _profile(given, fit, index, value, s, wider[index], bounds.low, bounds.high)
+            drop = (CHANGE_95 if is_time(fit.model, slot) else 0.5 * NORMAL_95**2) * float(wider[index]) ** 2
+            found[slot] = _profile(given, fit, index, value, s, drop, bounds.low, bounds.high)
+            if is_time(fit.model, slot):
+                first, last = spread(given, fit, slot, drop)
+                found[slot] = min(found[slot][0], first), max(found[slot][1], last)
         else:
             found[slot] = float(max(value - NORMAL_95 * s, bounds.low)), float(min(value + NORMAL_95 * s, bounds.high))
     return found
 
 
-def _profile(given: Problem, fit: Fit, index: int, value: float, s: float, wider: float, low: float, high: float) -> tuple[float, float]:
-    """Where the profile falls by 1.92 wider^2, by doubling and bisection."""
+def _profile(given: Problem, fit: Fit, index: int, value: float, s: float, drop: float, low: float, high: float) -> tuple[float, float]:
+    """Where the profile falls by so many nats, by doubling and bisection."""
     best = _reached(given, fit, index, value)
-    drop = 0.5 * NORMAL_95**2 * wider**2
     ends = []
     for sign, bound in ((-1.0, low), (1.0, high)):
         near, step = value, max(s, 1e-3 * abs(value), 1e-9)
