@@ -37,6 +37,9 @@ SCORE_BLOCKS = 10
 """Blocks of time whose scores are compared: long against what noise remembers, many enough to tell."""
 
 ITERATIONS = 8
+NEXT = 0.02
+"""Nats that the next step of a refinement must promise, and the last one have brought."""
+
 ROUNDS = 6
 SETTLED = 0.3
 """Nats below which another round of parameters and noise is not worth it."""
@@ -227,7 +230,10 @@ def refine(given: Problem, fit: Fit, model: ComposedModel, free: Free | None = N
         before = best
         while damping < 1e6:
             damped = normal + np.diag(damping * np.diag(normal) + 1e-12 * np.max(np.diag(normal), initial=1e-300))
-            other = with_values(model, free, inside(model, free, values_of(model, free) - np.linalg.solve(damped, slope)))
+            step = np.linalg.solve(damped, slope)
+            if slope @ step - 0.5 * step @ normal @ step < NEXT:  # and with more damping, less
+                break
+            other = with_values(model, free, inside(model, free, values_of(model, free) - step))
             if other is not None:
                 there = foretold(given, other)
                 z_other = z if there is None else _whitened(given, fit, other.difference(given.steps.y1, there))
@@ -237,7 +243,7 @@ def refine(given: Problem, fit: Fit, model: ComposedModel, free: Free | None = N
                     break
             damping *= 10.0
         damping = max(damping, 1e-8)
-        if best - before < 0.02:
+        if best - before < NEXT:
             break
     return model
 
