@@ -64,6 +64,9 @@ are fitted beside each.
 BENT = 3.0
 """Standard deviations by which a number must change to have been bent by what the model lacks beside."""
 
+CLOSE_BY, SHORT = 3, 0.5
+"""Effects that fall short which what was not fitted is asked about, and the share of what is needed that they must have."""
+
 BLOCKS = 5
 """Of the cross-validation."""
 
@@ -139,17 +142,35 @@ def another_way(given: Problem, chosen: Selection, horizon: int) -> Selection | 
     return select(given, chosen.nominal.model, horizon, lambda share: None, before=replace(chosen, fit=best, rivals=()))
 
 
+def one_more(given: Problem, chosen: Selection, horizon: int, foretells: Callable[[Fit, Fit], float]) -> Selection:
+    """With an effect besides that falls short of what is needed on what was fitted, but not on all of the recording. foretells: nats by
+    which one model foretells what was not fitted better than another one does: the probability of both parts is that of one times that
+    of the other, given the first, so they add. It counts for no more than the fit does.
+    """
+    fit = chosen.fit
+    if len(fit.added) >= MOST or crowded(fit):
+        return chosen
+    for s in best_candidates(given, fit)[0][:CLOSE_BY]:
+        if s.fit is None or gain(s.fit, fit) < SHORT * STRICT.needed(chosen.tried, s.fit.k - fit.k, len(given.steps)):
+            continue
+        ahead = min(foretells(s.fit, fit), gain(s.fit, fit))
+        if ahead > 0.0 and accepted(given, s.fit, fit, chosen.tried, horizon, ahead=ahead):
+            more, found = overtaken(given, plainly(given, fitted(given, s.fit, s.fit.model)), STRICT)
+            return replace(chosen, fit=more, rivals=tuple(found))
+    return chosen
+
+
 def crowded(fit: Fit) -> bool:
     """Whether more effects were found on some input than are believed."""
     channels = [fit.model.effects[i].channel for i in fit.added if fit.model.effects[i].effect.stage == "input"]
     return any(channels.count(c) > MOST_ON_ONE for c in channels)
 
 
-def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int, bar: Bar = STRICT) -> bool:
-    """Significant and relevant."""
+def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int, bar: Bar = STRICT, ahead: float = 0.0) -> bool:
+    """Significant and relevant. ahead: nats by which it foretells better what was not fitted."""
     return (
         limited(fit)
-        and significant(given, fit, base, tried, bar)
+        and significant(given, fit, base, tried, bar, ahead)
         and _told_by_stamps(given, fit, base)
         and _happens(given, fit)
         and relevant(given, fit, base, horizon)
@@ -181,11 +202,11 @@ def _happens(given: Problem, fit: Fit) -> bool:
     return True
 
 
-def significant(given: Problem, fit: Fit, base: Fit, tried: int, bar: Bar = STRICT) -> bool:
+def significant(given: Problem, fit: Fit, base: Fit, tried: int, bar: Bar = STRICT, ahead: float = 0.0) -> bool:
     """Beyond chance, everything tried paid for; the gain shrunk by how much more than white noise the scores of blocks scatter."""
     needed = bar.needed(tried, fit.k - base.k, len(given.steps))
-    reached = gain(fit, base)
-    if reached > needed and not _beyond_wandering(given, fit, base, needed):
+    reached = gain(fit, base) + ahead
+    if reached > needed and not _beyond_wandering(given, fit, base, needed - ahead):
         return False
     if reached <= needed or reached > WIDEST**2 * needed or not fit.free:
         return reached > needed

@@ -46,7 +46,7 @@ from s2r_runtime.trace.scores import LENIENT, names
 from s2r_runtime.trace.selection import Selection, another_way, crowded, select
 from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.unseen import alike
-from s2r_runtime.trace.verdict import asked, confirmed, final_fit, verdict_of
+from s2r_runtime.trace.verdict import asked, confirmed, final_fit, foretold_too, verdict_of
 
 __all__ = ["Dataset", "TraceResult", "load_dataset", "trace", "usual_horizon"]
 
@@ -144,7 +144,7 @@ def _traced(
         judged_on = _held_out(checked, seen, test, model, horizon)
         given = problem(fit_part.data, fit_part.steps)
         chosen = select(given, model, ahead, lambda share: say(60.0 + 20.0 * share, 100.0, "looking for effects"))
-    chosen = confirmed(given, chosen, judged_on)
+    chosen = confirmed(given, foretold_too(given, chosen, judged_on, ahead), judged_on)
     say(80.0, 100.0, "testing what is left")
     whole = _Whole(checked, model, ahead)
     structure = whole.structure(chosen)

@@ -25,7 +25,7 @@ from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, plai
 from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import acting, predicted, rms
 from s2r_runtime.trace.rivals import representative, tied
-from s2r_runtime.trace.selection import Selection
+from s2r_runtime.trace.selection import Selection, one_more
 from s2r_runtime.trace.slots import slots_of
 
 Array = NDArray[np.float64]
@@ -77,6 +77,11 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
         fit, rivals = representative(given, *tied(given, fit, rivals, _ahead(judged_on, fits)))
     fit = fit if fit is chosen.fit else plainly(given, fit)
     return replace(chosen, fit=fit, rivals=tuple(rivals))
+
+
+def foretold_too(given: Problem, chosen: Selection, judged_on: Held, horizon: int) -> Selection:
+    """With an effect besides that only all of the recording shows."""
+    return one_more(given, chosen, horizon, lambda fit, base: _ahead(judged_on, [base, fit])[1])
 
 
 def _ahead(judged_on: Held, fits: list[Fit]) -> list[float]:
