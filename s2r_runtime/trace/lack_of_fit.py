@@ -26,6 +26,7 @@ from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.begun import begun, measured
 from s2r_runtime.trace.episodes import episodes, may_depend_on
 from s2r_runtime.trace.evidence import evidence, margin
+from s2r_runtime.trace.fields import Field, field
 from s2r_runtime.trace.fitting import Fit, Problem
 from s2r_runtime.trace.fitting import gain as explained
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, SLOWLY, Judged, Left, first_look, judge, leading
@@ -97,6 +98,7 @@ class Structure:
     gains: dict[str, float]
     nameless: bool = False
     for_a_while: bool = False
+    varies: bool = False
     noise: tuple[Noise, Colour] | None = None
 
     @property
@@ -111,15 +113,21 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     left, found = looks.left, looks.found
     chosen, gains = _forward(looks) if found else ([], {})
     coloured = ("noise",) if np.any(left.fit.colour.strength > COLOURED) else ()
-    if not chosen:
-        windows = episodes(left) if left.given.data.in_order else None
-        matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
-        if windows is None or not matters:
-            return Structure(coloured, False, 0.0, gains)
-        return Structure(may_depend_on(left, windows, found), True, share, gains, for_a_while=True, noise=_beside(left, windows))
-    matters, share = _weight_of(left, nominal, chosen[-1], horizon)
-    tokens = tuple(dict.fromkeys(TOKENS.get(judged.token, judged.token) for judged in chosen))
-    return Structure(tokens if matters else coloured, matters, share, gains, noise=_beside(left, chosen[-1]) if matters else None)
+    if chosen:
+        matters, share = _weight_of(left, nominal, chosen[-1], horizon)
+        if matters:
+            tokens = tuple(dict.fromkeys(TOKENS.get(judged.token, judged.token) for judged in chosen))
+            return Structure(tokens, True, share, gains, noise=_beside(left, chosen[-1]))
+    varied = looks.field
+    if varied is not None and varied.beyond > 0.0:
+        matters, share = _weight_of(left, nominal, varied.judged, horizon)
+        if matters:
+            return Structure(varied.tokens, True, share, gains, varies=True, noise=_beside(left, varied.judged))
+    windows = episodes(left) if left.given.data.in_order and not chosen else None
+    matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
+    if windows is None or not matters:
+        return Structure(coloured, False, 0.0, gains)
+    return Structure(may_depend_on(left, windows, found), True, share, gains, for_a_while=True, noise=_beside(left, windows))
 
 
 def _beside(left: Left, judged: Judged) -> tuple[Noise, Colour]:
@@ -142,6 +150,11 @@ class Looks:
     def most(self) -> float:
         """Nats of the best one at first look."""
         return self.looked[0][0]
+
+    @cached_property
+    def field(self) -> Field | None:
+        """The smooth random field that explains most of what is left; none is looked for where a speed was not measured."""
+        return None if self.left.given.floor.axes else field(self.left)
 
     @cached_property
     def judged(self) -> list[Judged]:
@@ -180,15 +193,20 @@ def explains_more(looks: Looks, unnamed: Judged, fit: Fit, horizon: int, *, left
     )
 
 
-def left_by(given: Problem, fit: Fit) -> tuple[Left, list[tuple[str, Array]]]:
-    """What a model leaves, and the dictionaries for it."""
+def left_of(given: Problem, fit: Fit) -> Left:
+    """What a model leaves."""
     act = acting(fit.model, given.data)
     r = residual(fit.model, given.steps, act)
     n = len(given.steps)
     block = np.minimum(np.arange(n) * BLOCKS // n, BLOCKS - 1)
     wild = np.any(np.abs(fit.z) > noises.OUTLIER)
-    left = Left(given, fit, r, state_jacobian(fit.model, given.steps, act), block, _clipped(fit.z) if wild else None)
-    found = [(token, _columns(terms)) for token, terms in dictionaries(given, fit.model, act, fit.noise, r)]
+    return Left(given, fit, r, state_jacobian(fit.model, given.steps, act), block, _clipped(fit.z) if wild else None)
+
+
+def left_by(given: Problem, fit: Fit) -> tuple[Left, list[tuple[str, Array]]]:
+    """What a model leaves, and the dictionaries for it."""
+    left, act = left_of(given, fit), acting(fit.model, given.data)
+    found = [(token, _columns(terms)) for token, terms in dictionaries(given, fit.model, act, fit.noise, left.r)]
     return left, [(token, x) for token, x in found if x.shape[2]]
 
 

@@ -63,7 +63,7 @@ VELOCITIES = ("speed", "vx", "vy", "qd", "wheel_left", "wheel_right")
 def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise, r: Array) -> Iterator[tuple[str, Terms]]:
     """(token, terms (n, nx) each); `wave`: a line in the spectrum of r (n, nx), which depends on time, and does not wander."""
     steps = given.steps
-    body, world = _directions(given, model, act)
+    body, world = directions_of(given, model, act)
     u = act.mean[steps.place]
     size = np.maximum(np.max(np.abs(u), axis=0), 1e-12)
     u = u / size
@@ -81,7 +81,7 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
             a, b = u[:, i], u[:, j]
             yield f"{model.inputs[i]}*{name}", _push([a * b, np.abs(a) * b, a * np.abs(b), np.abs(a * b)], body)
             yield f"{model.inputs[i]}*{name}", _push([a * b, a * a * b, a * b * b], body)
-    pushes = [u[:, j][:, None] * own for j, own in enumerate(_own(given, model, act))]
+    pushes = [u[:, j][:, None] * own for j, own in enumerate(own_pushes(given, model, act))]
     for name, terms, directions in _of_states(model, quieter(steps, noise), u, body, world, pushes):
         yield name, terms if directions is None else _push(terms, directions)
     yield from _varying(given, model, t, u)
@@ -98,10 +98,11 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
 
 def pushes_by_token(given: Problem, model: ComposedModel, act: Acting) -> list[tuple[str, Array]]:
     """(token, (n, nx)) of what may come and go: a push in each direction, and a share of each input."""
-    body, world = _directions(given, model, act)
+    body, world = directions_of(given, model, act)
     u = act.mean[given.steps.place]
     own = [
-        (f"time*{name}", u[:, j][:, None] * push) for j, (name, push) in enumerate(zip(model.inputs, _own(given, model, act), strict=True))
+        (f"time*{name}", u[:, j][:, None] * push)
+        for j, (name, push) in enumerate(zip(model.inputs, own_pushes(given, model, act), strict=True))
     ]
     return [(token, push) for token, push in [*own, *(("time", d) for d in (*body, *world))] if np.any(push)]
 
@@ -311,7 +312,7 @@ def _push(terms: Sequence[Array], directions: Sequence[Array]) -> Terms:
     return [c[:, None] * d for c in terms for d in directions]
 
 
-def _directions(given: Problem, model: ComposedModel, act: Acting) -> tuple[list[Array], list[Array]]:
+def directions_of(given: Problem, model: ComposedModel, act: Acting) -> tuple[list[Array], list[Array]]:
     """((n, nx) each) in which something can push: along, across and about the body and each further state; and the world's axes. For a
     model without a planar pose, where its inputs push; each state, if they push nowhere.
     """
@@ -324,11 +325,11 @@ def _directions(given: Problem, model: ComposedModel, act: Acting) -> tuple[list
         along[:, x], along[:, y], across[:, x], across[:, y] = c, s, -s, c
         others = [np.tile(unit[i], (n, 1)) for i in range(nx) if i not in {x, y}]
         return [along, across, *others], [np.tile(unit[x], (n, 1)), np.tile(unit[y], (n, 1))]
-    own = _own(given, model, act)
+    own = own_pushes(given, model, act)
     return own if any(np.any(d) for d in own) else [np.tile(axis, (n, 1)) for axis in unit], []
 
 
-def _own(given: Problem, model: ComposedModel, act: Acting) -> Terms:
+def own_pushes(given: Problem, model: ComposedModel, act: Acting) -> Terms:
     """(n, nx) by input: where it pushes."""
     here = act.at(given.steps.place)
     usual, pushed = advanced(model, given.steps.y0, here, slice(None)), []

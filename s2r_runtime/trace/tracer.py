@@ -31,11 +31,12 @@ from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge, noise_floor
 from s2r_runtime.trace.excitation import advice
 from s2r_runtime.trace.faults import Checked, check
+from s2r_runtime.trace.fields import Field, beats, wanders
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, problem, told, without
 from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.intervals import intervals
-from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, Looks, Structure, best_unnamed, explains_more, first_looks, lack_of_fit
-from s2r_runtime.trace.lack_of_fit_judged import Judged
+from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, Looks, Structure, best_unnamed, explains_more, first_looks, lack_of_fit, left_of
+from s2r_runtime.trace.lack_of_fit_judged import Judged, Left
 from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.residual import Mask, acting, first_steps, rms, steps_of
@@ -153,6 +154,8 @@ def _traced(
     say(90.0, 100.0, "judging on held-out data")
     w = np.ones(len(model.states)) if weights is None else np.array([weights[asked.states.index(s)] for s in model.states])
     result = _result(dataset, checked, given, chosen, structure, judged_on, seed, w, kind)
+    if result.verdict == "unexplained" and chosen.fit.added and not {*result.depends_on} - {"noise"}:
+        result = replace(result, depends_on=whole.likeliest or result.depends_on)
     unseen = tuple(s for s in asked.states if s not in model.states)
     result = replace(result, spec=msgspec.structs.replace(result.spec, dt=asked.dt), unseen=unseen)
     say(100.0, 100.0, result.verdict)
@@ -339,23 +342,46 @@ class _Whole:
         fit = evaluate(self.given, chosen.fit.model) if chosen.fit.added else self.nominal
         found = lack_of_fit(first_looks(self.given, fit) if fit.added else self._looks, self.nominal, self._horizon)
         if not fit.added:
-            told = (
-                found.matters and not found.for_a_while and self.unnamed.gain > CLEAR
-            )  # else it is seen by sliding only, which says by itself what it depends on
-            tokens = self._looks_like if told else () if self._shape is None else (self._shape.token,)
+            seen = found.matters and not found.for_a_while and not found.varies
+            if seen and self.unnamed.gain > CLEAR:
+                tokens = self._looks_like
+            elif seen and self._field is not None and self._field.beyond > CLEAR:
+                tokens = self._field.tokens  # it was seen by sliding only, which names what it tries
+            else:
+                tokens = () if self._shape is None else (self._shape.token,)
             named = tuple(dict.fromkeys((*tokens, *found.tokens)))
             return replace(found, tokens=named, matters=True, share=1.0) if tokens else found
         best = fitted(self.given, fit, fit.model, 2)  # what it is compared with is fitted to all of the recording, too
         if crowded(fit) or self._unnamed_explains_more(best, found.matters):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
+        if not self.given.floor.axes and self._no_name(found, left_of(self.given, best)):
+            return replace(found, tokens=self._looks_like, matters=True, share=1.0)
         better = better_shape(self.given, best, self._horizon)
         return found if better is None else replace(found, tokens=(better.token,), matters=True, share=1.0, nameless=True)
 
+    def _no_name(self, found: Structure, named: Left) -> bool:
+        """Whether a field explains more than what was named, or a push that wanders as much."""
+        if found.varies and self._field is not None and self._field.beyond > 0.0 and beats(self._field, self._looks.left, named):
+            return True
+        return wanders(self._looks.left, named)
+
+    @property
+    def likeliest(self) -> tuple[str, ...]:
+        """What all that the nominal model lacks depends on most, if that is clear."""
+        return self._looks_like if self.unnamed.gain > CLEAR else ()
+
     @cached_property
     def _looks_like(self) -> tuple[str, ...]:
-        """What all that the nominal model lacks depends on most: by the best dictionary, or by a shape that does better."""
+        """What all that the nominal model lacks depends on most: by the best dictionary, or by a shape or a field that does better."""
         token, nats = self.unnamed.token, self.unnamed.gain
-        return (token,) if self._shape is None or self._shape.nats < MORE * nats + ALIKE else (self._shape.token,)
+        if self._shape is not None and self._shape.nats >= MORE * nats + ALIKE:
+            token, nats = self._shape.token, self._shape.nats
+        return self._field.tokens if self._field is not None and self._field.nats > nats + CLEAR else (token,)
+
+    @property
+    def _field(self) -> Field | None:
+        """The field that explains most of it."""
+        return self._looks.field
 
     @cached_property
     def _shape(self) -> Better | None:

@@ -1,0 +1,301 @@
+"""Does the robot move otherwise at some places, headings, times or commands, in ways that a few terms cannot follow?
+
+What its inputs do now, or a named effect does, is more here and less there (a floor that rolls, stripes on which wheels slip), by how much
+is a smooth random function of a coordinate c (a Gaussian process, on bumps g_j over the cells that were visited):
+
+    r = sum_j beta_j g_j(c) push + noise,      beta_j ~ N(0, tau^2)
+
+Its evidence is the marginal likelihood, tau by maximum, noise re-estimated from what is left (Laplace's approximation, with the weights
+of the noise's density; D. MacKay, Neural Computation 4(3), 1992). It needs no place to be visited twice. Whatever wanders by itself, the
+wind, a load, follows such a function, too: a field counts only beyond noise of any colour, and beyond pushes that wander in time whatever
+the inputs do.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.evidence import evidence
+from s2r_runtime.trace.fitting import slopes
+from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
+from s2r_runtime.trace.lack_of_fit_terms import directions_of, own_pushes, quieter
+from s2r_runtime.trace.residual import acting
+from s2r_runtime.trace.residual_noise import Whitener
+from s2r_runtime.trace.slots import free_of
+
+Array = NDArray[np.float64]
+
+CELLS = (12, 40, 120, 360)
+"""Visited cells at most, by how fine a field is."""
+
+SLOW = 2
+"""Levels of CELLS in time: a battery, a motor's heat change a number slowly, a floor as quickly as one comes along. Where a robot never
+comes back, nothing but this tells the two apart.
+"""
+
+GRIDS = (256, 192, 128, 96, 64, 48, 32, 24, 16, 12, 8, 6, 4, 3)
+"""Cells along the longest axis that are tried."""
+
+WIDE = 0.8
+"""Standard deviation of a bump over the cells' spacing: neighbours overlap, and together are flat to a hundredth."""
+
+SPARE = 3
+"""Steps for each cell at least."""
+
+CLIPPED = 30.0
+"""Standard deviations at which wild values are cut off: under the little noise that a field leaves, all that it explains is wild."""
+
+SAME = 0.9999
+"""Cosine between two pushes from which on they are one."""
+
+PASSES = 4
+"""Of fields and noise in turn."""
+
+LOOKS = 4.0
+"""Nats at first look from which on a field is fitted with noise of its own."""
+
+FITTED = 3
+"""Fields, and pushes that wander, that are."""
+
+ALPHA = 1e-3
+"""Chance that noise shows a field, as far as likelihoods are right."""
+
+MORE = 0.05
+"""Of what effects explain that a field must explain beyond them, for them to be the wrong ones."""
+
+CLEARLY, NEEDED = 20.0, 5.0
+"""Nats by which a push that wanders must explain more than names do, and by which these must add to it, to be more than such a push."""
+
+NEARLY = 0.25
+"""Of what names explain, at first look: a push that wanders and has less will not come up to them."""
+
+ALIKE = 3.0
+"""Nats within which two coordinates say the same."""
+
+BODY, ANGLES = {"x", "y", "theta"}, ("theta", "heading", "yaw")
+
+
+@dataclass(frozen=True)
+class Field:
+    """token: what it depends on; also: what others that say the same do. x: (n, nx, m) bumps times a push; beta: (m,).
+
+    nats: beyond the model's own noise of any colour. beyond: nats beyond that and what wanders by itself, less the price of having looked.
+    """
+
+    token: str
+    also: tuple[str, ...]
+    x: Array
+    beta: Array
+    nats: float
+    beyond: float
+
+    @property
+    def judged(self) -> Judged:
+        """As a dictionary that was judged, for rollouts."""
+        return Judged(self.token, self.x, self.nats, 1.0, np.tile(self.beta, (BLOCKS, 1)))
+
+    @property
+    def tokens(self) -> tuple[str, ...]:
+        """Likeliest first."""
+        return tuple(dict.fromkeys((self.token, *self.also)))
+
+
+@dataclass(frozen=True)
+class _Offer:
+    """One field that may be: its token, bumps (n, m) and push (n, nx). late: it takes long, and is looked at last."""
+
+    token: str
+    bumps: Array
+    push: Array
+    late: bool
+
+    @property
+    def x(self) -> Array:
+        """(n, nx, m) on a scale of 1."""
+        x = self.push[:, :, None] * self.bumps[:, None, :]
+        return np.asarray(x / math.sqrt(max(float(np.mean(x * x)), 1e-300)))
+
+
+def field(left: Left) -> Field | None:
+    """The field that explains most of what a model leaves, if it is beyond noise of its own colour."""
+    bare = bare_nats(left)
+    looked, tried = _looked(left, _offered(left), bare)
+    kept = [offer for nats, offer in looked if nats > LOOKS][:FITTED]
+    if not kept:
+        return None
+    fitted = sorted(((*_marginal(left, offer.x, PASSES), k) for k, offer in enumerate(kept)), key=lambda f: -f[0])
+    nats, beta, best = fitted[0]
+    price = math.log(tried / ALPHA)
+    if nats - bare < price:
+        return None
+    beyond = nats - max(bare, wandering_nats(left)) - price
+    also = tuple(kept[k].token for other, _, k in fitted[1:] if other > nats - ALIKE)
+    return Field(kept[best].token, also, kept[best].x, beta, nats - bare, beyond)
+
+
+def _looked(left: Left, offered: Iterable[list[_Offer]], bare: float) -> tuple[list[tuple[float, _Offer]], int]:
+    """(nats at first look, offer), the best first, and how many there were. Each list has a field from coarse to fine: what is `late` is
+    worth a look where the one before says anything.
+    """
+    looked = []
+    for finer in offered:
+        nats = 0.0
+        for offer in finer:
+            if offer.late and nats < 0.0:
+                break
+            nats = _marginal(left, offer.x, 1)[0] - bare
+            looked.append((nats, offer))
+    return sorted(looked, key=lambda pair: -pair[0]), len(looked)
+
+
+def beats(field: Field, nominal: Left, named: Left) -> bool:
+    """Whether a field in what the nominal model leaves explains more than what was named does, and a push that wanders beside it."""
+    mine = max(bare_nats(named), wandering_nats(named)) - bare_nats(nominal)
+    return field.nats - mine > MORE * abs(mine) + math.log(1.0 / ALPHA)
+
+
+def wanders(nominal: Left, named: Left) -> bool:
+    """Whether a push that wanders in time explains clearly more than what was named, and this nothing beside it."""
+    bare, alone = bare_nats(nominal), bare_nats(named)
+    without = wandering_nats(nominal, NEARLY * (alone - bare))
+    return without - alone > CLEARLY and max(alone, wandering_nats(named)) - without < NEEDED
+
+
+def bare_nats(left: Left) -> float:
+    """Log likelihood of what a model leaves, under noise of whatever colour is likeliest."""
+    return _under_any_law(left.fit.z, left.fit.whiten, left)
+
+
+def wandering_nats(left: Left, least: float = 0.0) -> float:
+    """The same with a push that wanders in time, in whichever direction that is likeliest. least: nats that it must have at first look,
+    else it is not looked at any closer.
+    """
+    given, model = left.given, left.fit.model
+    body, world = directions_of(given, model, acting(model, given.data))
+    when = np.arange(len(given.steps), dtype=float)[:, None]
+    bare = bare_nats(left)
+    looked, _ = _looked(left, _over("time", when, (*body, *world), quick=2), bare)
+    kept = [offer for nats, offer in looked if nats > max(least, 0.0)][:FITTED]
+    return max((_marginal(left, offer.x, PASSES)[0] for offer in kept), default=bare)
+
+
+def _offered(left: Left) -> Iterator[list[_Offer]]:
+    """Fields, each from coarse to fine."""
+    given, model = left.given, left.fit.model
+    act = acting(model, given.data)
+    y = quieter(given.steps, left.fit.noise)
+    u = act.mean[given.steps.place]
+    body, world = directions_of(given, model, act)
+    own = [u[:, [j]] * push for j, push in enumerate(own_pushes(given, model, act))]
+    named = _named(left)
+    moved = _apart([*_moved(left), *named] if set(model.states) >= BODY else [*own, *named])
+    for place in _places(model.states, y):
+        yield from _over("position", place, moved, quick=2)  # floors have stripes and hills of all sizes
+        yield from _over("position", place, world or body)
+    for name in ANGLES:
+        if name in model.states:
+            angle = y[:, model.states.index(name)]
+            yield from _over("heading", np.column_stack([np.cos(angle), np.sin(angle)]), [*moved, *body])
+    for j, name in enumerate(model.inputs):
+        size = max(float(np.max(np.abs(u[:, j]))), 1e-12)
+        if given.data.in_order:
+            yield from _over(f"time*{name}", given.steps.t[:, None], [own[j]], SLOW)
+        for i, other in enumerate(model.inputs):
+            if i != j:
+                yield from _over(f"{other}*{name}" if i < j else f"{name}*{other}", u[:, [j]] / size, [own[i]])
+    if named and given.data.in_order:
+        yield from _over("time", given.steps.t[:, None], named, SLOW)
+
+
+def _over(token: str, coordinate: Array, pushes: Sequence[Array], levels: int = len(CELLS), quick: int = 1) -> Iterator[list[_Offer]]:
+    pushes = [push for push in pushes if np.any(push)]
+    bumps = list(_bumps(coordinate))[:levels] if pushes else []
+    yield from ([_Offer(token, b, push, b.shape[1] > CELLS[quick]) for b in bumps] for push in pushes)
+
+
+def _places(states: Sequence[str], y: Array) -> list[Array]:
+    """Positions; of a robot without a heading, axis by axis, too."""
+    columns = [i for i, name in enumerate(states) if name in {"x", "y", "z", "q"}]
+    alone = [y[:, [i]] for i in columns] if len(columns) > 1 and not set(states) >= BODY else []
+    return [*([y[:, columns]] if columns else []), *alone]
+
+
+def _moved(left: Left) -> list[Array]:
+    """(n, nx) how the model goes, and how it turns, in each step."""
+    model, steps = left.fit.model, left.given.steps
+    way = model.difference(steps.y1, steps.y0) - left.r
+    on, about = np.zeros_like(way), np.zeros_like(way)
+    columns = [model.states.index(name) for name in ("x", "y")]
+    on[:, columns] = way[:, columns]
+    about[:, model.states.index("theta")] = way[:, model.states.index("theta")]
+    return [on, about]
+
+
+def _apart(pushes: list[Array]) -> list[Array]:
+    """Less those that are another one on another scale."""
+    kept: list[Array] = []
+    for push in pushes:
+        size = float(np.linalg.norm(push))
+        if size > 0.0 and all(abs(float(np.sum(push * other))) < SAME * size * float(np.linalg.norm(other)) for other in kept):
+            kept.append(push)
+    return kept
+
+
+def _named(left: Left) -> list[Array]:
+    """(n, nx) what a change of each number does that the data put into the model."""
+    model = left.fit.model
+    free = free_of(model)
+    table = slopes(left.given, model, free) if free else np.zeros((*left.r.shape, 0))
+    return [table[:, :, k] for k in range(table.shape[2])]
+
+
+def _bumps(c: Array) -> Iterator[Array]:
+    """(n, cells) bumps over where c (n, d) was, the coarse ones first."""
+    span = float(np.max(np.ptp(c, axis=0)))
+    before = 0
+    for most in CELLS if span > 0.0 else ():
+        for along in GRIDS:
+            wide = span / along
+            cells = np.unique(np.rint((c - c.min(axis=0)) / wide), axis=0)
+            if len(cells) <= min(most, len(c) // SPARE):
+                break
+        if before < len(cells) <= min(most, len(c) // SPARE):
+            before = len(cells)
+            away = (c - c.min(axis=0))[:, None, :] / wide - cells
+            yield np.exp(-0.5 * np.sum((away / WIDE) ** 2, axis=2))
+
+
+def _marginal(left: Left, x: Array, passes: int) -> tuple[float, Array]:
+    """(log marginal likelihood, beta (m,)) of x (n, nx, m), the best of some passes of beta and noise in turn."""
+    whiten, z, joined = left.fit.whiten, left.fit.z, left.given.steps.joined
+    best, told = -math.inf, np.asarray(np.zeros(x.shape[2]))
+    for _ in range(passes):
+        white = whiten(x).reshape(-1, x.shape[2])
+        weighted = white * noises.weight(np.clip(z, -CLIPPED, CLIPPED)).reshape(-1, 1)
+        product, slope = white.T @ weighted, weighted.T @ np.clip(whiten(left.r), -CLIPPED, CLIPPED).ravel()
+        ridge = evidence(product, slope).ridge
+        beta: Array = np.asarray(np.linalg.solve(product + ridge * np.eye(len(slope)), slope))
+        price = 0.5 * float(np.linalg.slogdet(np.eye(len(slope)) + product / ridge)[1]) + 0.5 * ridge * float(beta @ beta)
+        rest = left.r - x @ beta
+        for again in range(2 if passes > 1 else 1):
+            if again:
+                whiten = Whitener(noises.estimate(rest, left.f, joined, left.given.floor), left.f, joined)
+            z = whiten(rest)
+            nats = _under_any_law(z, whiten, left) - price
+            if nats > best:
+                best, told = nats, beta
+    return best, told
+
+
+def _under_any_law(z: Array, whiten: Whitener, left: Left) -> float:
+    """Log likelihood of a whitened residual under white noise, or coloured, or such as wanders."""
+    joined = left.given.steps.joined
+    colour = noises.colour(z, joined)
+    laws = (noises.no_colour(z.shape[1]), colour, noises.wandering(z, joined, colour))
+    return max(noises.log_likelihood(z, whiten, law, joined) for law in laws if law is not None)

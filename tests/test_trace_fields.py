@@ -1,0 +1,76 @@
+"""What the robot does more here and less there: no noise, and no number of an effect; and pushes that wander by themselves, which are."""
+
+import math
+
+import numpy as np
+import pytest
+
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.fields import field
+from s2r_runtime.trace.fitting import evaluate, problem
+from s2r_runtime.trace.lack_of_fit import left_by
+from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.tracer import trace
+
+DT = 0.05
+NOISE = np.array([0.0008, 0.0008, 0.002])
+
+
+def _driven(rng, u, twist):
+    """(T + 1, 3) measured; twist(k, x, v, w): what the robot does instead of v and w."""
+    x = np.zeros(3)
+    rows = [x]
+    for k, (v, w) in enumerate(u):
+        x = x.copy()
+        went, turned = twist(k, x, v, w)
+        x += DT * np.array([went * math.cos(x[2]), went * math.sin(x[2]), turned])
+        rows.append(x)
+    return np.array(rows) + rng.normal(size=(len(rows), 3)) * NOISE
+
+
+def _held(rng, steps, low, high, hold=20):
+    return np.repeat(rng.uniform(low, high, (steps // hold + 1, len(low))), hold, axis=0)[:steps]
+
+
+def _recording(y, u):
+    model = compose(ModelSpec("unicycle", DT, {}, ()))
+    return from_arrays(model, [(y, u)]), model
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_floor_on_which_it_turns_now_more_now_less_is_no_noise(seed):
+    """Hills of half a metre: step by step what is left looks like noise of some colour."""
+    rng = np.random.default_rng(seed)
+    u = _held(rng, 700, [0.1, -0.6], [0.4, 1.8])
+    wave = 2.0 * math.pi / 0.5
+    y = _driven(rng, u, lambda k, x, v, w: (v, w * (1.0 - 0.5 * math.sin(wave * x[0]) * math.cos(wave * x[1]))))
+    assert trace(*_recording(y, u)).verdict == "unexplained"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_stripes_that_slip_are_no_slip_of_the_wheels(seed):
+    rng = np.random.default_rng(seed)
+    u = _held(rng, 600, [-0.5, -1.5], [0.5, 1.5])
+    y = _driven(rng, u, lambda k, x, v, w: (v * (0.6 if math.sin(2.0 * math.pi * x[0] / 0.5) > 0.2 else 1.0), w))
+    result = trace(*_recording(y, u))
+    assert result.verdict == "unexplained"
+    assert "position" in result.depends_on
+
+
+@pytest.mark.parametrize("memory", [0.1, 0.5, 2.0, 8.0])
+def test_a_push_that_wanders_is_no_field(memory):
+    """Within some steps, or within a good part of the recording; whatever the robot does meanwhile, and wherever it is."""
+    rng = np.random.default_rng(round(10 * memory))
+    u = _held(rng, 900, [0.1, -1.2], [0.5, 1.2])
+    keep = math.exp(-DT / memory)
+    push = np.zeros((900, 2))
+    for k in range(1, 900):
+        push[k] = keep * push[k - 1] + math.sqrt(1.0 - keep * keep) * rng.normal(size=2) * [0.04, 0.1]
+    y = _driven(rng, u, lambda k, x, v, w: (v + push[k, 0], w + push[k, 1]))
+    data, model = _recording(y, u)
+    given = problem(data, steps_of(data))
+    found = field(left_by(given, evaluate(given, model))[0])
+    assert found is None or found.beyond <= 0.0
+    assert trace(data, model).verdict == "none"
