@@ -135,6 +135,20 @@ def test_a_heading_that_leaves_the_motion_and_comes_back_is_found(seed):
     assert np.isnan(checked.data.runs[0].y[off > 0.0]).all()  # also where it only begins to leave, which nothing could show yet
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_heading_that_wanders_off_and_never_comes_back_is_found(seed):
+    """An IMU that drifts by 0.4 rad, and stays so for the last two fifths of the run: that is half of what a median sees."""
+    rng = np.random.default_rng(80 + seed)
+    u = commands(rng, 1, STEPS, DT, [(0.1, 0.2), (-1.0, 1.0)], rest=0.0)
+    y = drive(rng, "unicycle", u, ROBOTARIUM, DT, 3.0 * NOISE)[0]
+    y[:, 2] += np.interp(np.arange(STEPS + 1), [500, 620], [0.0, 0.4])
+    t = DT * np.arange(STEPS + 1)
+    (fault,) = check(declared(), from_streams(declared(), [(Stream(t, y), Stream(t[:-1], u[0]))], "here")).faults
+    assert (fault.kind, fault.channel) == ("inconsistent", "theta")
+    assert 490 * DT < fault.from_s < 600 * DT
+    assert fault.to_s == pytest.approx(STEPS * DT, abs=2 * DT)
+
+
 @pytest.mark.parametrize(
     "outside",
     [
