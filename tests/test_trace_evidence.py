@@ -9,12 +9,12 @@ from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recor
 from s2r_runtime.models.composed import AppliedEffect, compose, wrap
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import scores, selection
+from s2r_runtime.trace import fitting, scores, selection
 from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
 from s2r_runtime.trace.evidence import RIDGES, evidence, margin
 from s2r_runtime.trace.faults import check
-from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
+from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem, refine
 from s2r_runtime.trace.lack_of_fit_terms import LINE, dictionaries, line, quieter
 from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.residual import Steps, acting, residual, steps_of
@@ -233,6 +233,18 @@ def test_what_was_searched_beside_a_model_is_known_when_it_is_searched_again(mon
     found = trace(off, declared())
     assert [e.name for e in found.effects] == ["input_gain"]
     assert len(looked_at) == len(set(looked_at)) == 2  # beside nothing, and beside the gain; what else there could be instead is known
+
+
+def test_a_refinement_that_is_at_its_optimum_steps_the_model_for_its_slopes_only(monkeypatch):
+    data = recordings([("input_gain", "w", {"gain": 0.8})], 1, steps=300, seed=5)[0]
+    given = problem(data, steps_of(data))
+    model = insert(declared(), AppliedEffect(registry().get("effects", "input_gain"), "w", {"gain": 0.9}), len(declared().effects))
+    fit = fitted(given, evaluate(given, model), model)
+    stepped = []
+    foretell = fitting.foretold
+    monkeypatch.setattr(fitting, "foretold", lambda given, model: stepped.append(model) or foretell(given, model))
+    assert refine(given, fit, fit.model) is fit.model
+    assert len(stepped) == 1
 
 
 def test_an_exchange_never_takes_out_what_the_user_declared(monkeypatch):
