@@ -91,3 +91,22 @@ def test_the_time_of_a_change_lies_in_its_interval_as_often_as_that_says():
         low, high = intervals(given, fit)[Slot(0, "time")]
         covered += low <= 9.33 <= high
     assert covered >= 26  # of 30 at 95 %: fewer in one of 80 draws
+
+
+def test_a_phase_is_told_within_half_a_turn_of_zero():
+    values = {"frequency": 0.9, "amplitude": 0.3, "phase": -3.09}
+    model, robot = (
+        compose(ModelSpec("joint", 0.04, {"mass": 1.0}, effects))
+        for effects in ((), (EffectSpec("periodic_disturbance", "force", values),))
+    )
+    x, hidden, rows = np.zeros((1, 2)), robot.at_rest(1), [np.zeros(2)]
+    for _ in range(200):
+        x, hidden = robot.step(x, np.zeros((1, 1)), hidden)
+        rows.append(x[0])
+    y = np.array(rows) + np.random.default_rng(0).normal(size=(201, 2)) * 0.002
+    data = from_arrays(model, [(y, np.zeros((200, 1)))])
+    given = problem(data, steps_of(data))
+    sine = AppliedEffect(registry().get("effects", "periodic_disturbance"), "force", {**values, "phase": 3.2})
+    fit, _, near = told(given, fitted(given, evaluate(given, model), insert(model, sine, 0)))
+    assert fit.model.effects[0].p["phase"] == pytest.approx(-3.09, abs=0.05)
+    assert near.model.effects[0].p["phase"] == fit.model.effects[0].p["phase"]

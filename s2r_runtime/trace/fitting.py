@@ -9,6 +9,7 @@ model with an effect. Parameters are refined by Gauss-Newton with the weights of
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -298,6 +299,10 @@ def about(given: Problem, fit: Fit) -> Problem:
 
 def told(given: Problem, fit: Fit) -> tuple[Fit, Problem, Fit]:
     """The fit with its numbers as they are told; the problem on which they are (`about`), and the fit on that."""
+    turned = [
+        math.remainder(v, math.tau) if slot.name == "phase" else v for slot, v in zip(fit.free, values_of(fit.model, fit.free), strict=True)
+    ]
+    fit = replace(fit, model=with_values(fit.model, fit.free, np.array(turned)) or fit.model)  # a sine's phase is one of a turn
     if given.floor.axes or not fit.free:  # where speeds were not measured, the model is stepped from smoothed ones as it is
         fit = settled(given, fit)
         return fit, given, fit
