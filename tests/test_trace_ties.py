@@ -9,13 +9,14 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import from_arrays
-from s2r_runtime.trace.errors import Judged
+from s2r_runtime.trace.errors import Judged, held
 from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.rivals import SURELY, rivals, tied
 from s2r_runtime.trace.scores import Scored, unlimited
+from s2r_runtime.trace.selection import Selection
 from s2r_runtime.trace.tracer import load_dataset, trace
-from s2r_runtime.trace.verdict import harms
+from s2r_runtime.trace.verdict import confirmed, harms
 
 UNICYCLE = ModelSpec("unicycle", DT, {}, ())
 
@@ -123,3 +124,25 @@ def test_a_ramp_that_is_over_within_a_step_is_no_delay():
     found = trace(from_arrays(model, [(y, u)]), model)
     assert [(e.name, e.channel) for e in found.effects] == [("input_rate_limit", "cmd_right")]
     assert found.effects[0].parameters["rate"][0] == pytest.approx(45.0, rel=0.1)
+
+
+def test_rivals_are_those_of_what_held_out_data_confirm():
+    """Where an effect is dropped there, rivals of the model with both say nothing of the one that is left."""
+    u = np.column_stack([np.full(400, 0.3), _held(np.random.default_rng(11), 400, [-1.0], [1.0])[:, 0]])
+    given, model = _problem(u)
+    both = evaluate(given, insert(_with(given, model, "input_gain", "v", gain=0.8).model, _bias(), 0))
+    here = held(model, given.data, given.steps, (), np.ones(400, dtype=bool), 1.0)
+    found = [Scored("input_bias", "v", 1.0, evaluate(given, insert(both.model, _bias("v"), 0)))]
+    chosen = Selection(evaluate(given, model), both, 100, (), tuple(found))
+    left = confirmed(given, chosen, here)
+    assert {left.fit.model.effects[i].effect.name for i in left.fit.added} <= {
+        "input_gain",
+        "input_bias",
+        "quadratic_drag",
+        "input_deadband",
+    }
+    assert all(len(s.fit.added) == len(left.fit.added) == 1 for s in left.rivals)
+
+
+def _bias(channel="w"):
+    return AppliedEffect(registry().get("effects", "input_bias"), channel, {"bias": 1e-9})

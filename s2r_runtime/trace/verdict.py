@@ -24,7 +24,7 @@ from s2r_runtime.trace.faults import Fault
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, plainly, problem, without
 from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import acting, predicted, rms
-from s2r_runtime.trace.rivals import representative, tied
+from s2r_runtime.trace.rivals import representative, rivals, tied
 from s2r_runtime.trace.selection import Selection, one_more
 from s2r_runtime.trace.slots import slots_of
 
@@ -71,12 +71,12 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
             if refutable and not _holds(judged_on, fit, less, place):
                 fit, again = less, True
                 break
-    rivals = list(chosen.rivals) if fit.added else []
-    if rivals:
-        fits = [fit, *(s.fit for s in rivals if s.fit is not None)]
-        fit, rivals = representative(given, *tied(given, fit, rivals, _ahead(judged_on, fits)))
+    found = list(chosen.rivals) if fit is chosen.fit else rivals(given, fit)  # those of a model with more effects are none of this one
+    if found:
+        fits = [fit, *(s.fit for s in found if s.fit is not None)]
+        fit, found = representative(given, *tied(given, fit, found, _ahead(judged_on, fits)))
     fit = fit if fit is chosen.fit else plainly(given, fit)
-    return replace(chosen, fit=fit, rivals=tuple(rivals))
+    return replace(chosen, fit=fit, rivals=tuple(found))
 
 
 def foretold_too(given: Problem, chosen: Selection, judged_on: Held, horizon: int) -> Selection:
