@@ -31,8 +31,11 @@ from s2r_runtime.trace.slots import free_of
 
 Array = NDArray[np.float64]
 
-CELLS = (12, 40, 120, 360)
+CELLS = (12, 40, 120)
 """Visited cells at most, by how fine a field is."""
+
+QUICKEST = 360
+"""The same, of a push that wanders in time."""
 
 SLOW = 2
 """Levels of CELLS in time: a battery, a motor's heat change a number slowly, a floor as quickly as one comes along. Where a robot never
@@ -62,6 +65,12 @@ LOOKS = 4.0
 
 FITTED = 3
 """Fields, and pushes that wander, that are."""
+
+LATE = 3
+"""Fields that are looked at more finely."""
+
+SETTLED = 0.5
+"""Nats that a pass must gain for another one."""
 
 ALPHA = 1e-3
 """Chance that noise shows a field, as far as likelihoods are right."""
@@ -141,16 +150,24 @@ def field(left: Left) -> Field | None:
 
 def _looked(left: Left, offered: Iterable[list[_Offer]], bare: float) -> tuple[list[tuple[float, _Offer]], int]:
     """(nats at first look, offer), the best first, and how many there were. Each list has a field from coarse to fine: what is `late` is
-    worth a look where the one before says anything.
+    worth a look where the one before says anything, and few others say more.
     """
-    looked = []
+    looked, later = [], []
     for finer in offered:
         nats = 0.0
         for offer in finer:
-            if offer.late and nats < 0.0:
+            if offer.late:
                 break
             nats = _marginal(left, offer.x, 1)[0] - bare
             looked.append((nats, offer))
+        if nats >= 0.0:
+            later.append((nats, [offer for offer in finer if offer.late]))
+    for _, finest in sorted(later, key=lambda pair: -pair[0])[:LATE]:
+        for offer in finest:
+            nats = _marginal(left, offer.x, 1)[0] - bare
+            looked.append((nats, offer))
+            if nats < 0.0:
+                break
     return sorted(looked, key=lambda pair: -pair[0]), len(looked)
 
 
@@ -167,6 +184,12 @@ def wanders(nominal: Left, named: Left) -> bool:
     return without - alone > CLEARLY and max(alone, wandering_nats(named)) - without < NEEDED
 
 
+def as_noise(left: Left, judged: Judged) -> bool:
+    """Whether a push that wanders explains what a dictionary does, and more."""
+    mine = max(bare_nats(left), _marginal(left, judged.x, PASSES)[0])
+    return wandering_nats(left) > mine + ALIKE
+
+
 def bare_nats(left: Left) -> float:
     """Log likelihood of what a model leaves, under noise of whatever colour is likeliest."""
     return _under_any_law(left.fit.z, left.fit.whiten, left)
@@ -180,7 +203,7 @@ def wandering_nats(left: Left, least: float = 0.0) -> float:
     body, world = directions_of(given, model, acting(model, given.data))
     when = np.arange(len(given.steps), dtype=float)[:, None]
     bare = bare_nats(left)
-    looked, _ = _looked(left, _over("time", when, (*body, *world), quick=2), bare)
+    looked, _ = _looked(left, _over("time", when, (*body, *world), (*CELLS, QUICKEST), quick=2), bare)
     kept = [offer for nats, offer in looked if nats > max(least, 0.0)][:FITTED]
     return max((_marginal(left, offer.x, PASSES)[0] for offer in kept), default=bare)
 
@@ -205,17 +228,17 @@ def _offered(left: Left) -> Iterator[list[_Offer]]:
     for j, name in enumerate(model.inputs):
         size = max(float(np.max(np.abs(u[:, j]))), 1e-12)
         if given.data.in_order:
-            yield from _over(f"time*{name}", given.steps.t[:, None], [own[j]], SLOW)
+            yield from _over(f"time*{name}", given.steps.t[:, None], [own[j]], CELLS[:SLOW])
         for i, other in enumerate(model.inputs):
             if i != j:
                 yield from _over(f"{other}*{name}" if i < j else f"{name}*{other}", u[:, [j]] / size, [own[i]])
     if named and given.data.in_order:
-        yield from _over("time", given.steps.t[:, None], named, SLOW)
+        yield from _over("time", given.steps.t[:, None], named, CELLS[:SLOW])
 
 
-def _over(token: str, coordinate: Array, pushes: Sequence[Array], levels: int = len(CELLS), quick: int = 1) -> Iterator[list[_Offer]]:
+def _over(token: str, coordinate: Array, pushes: Sequence[Array], cells: Sequence[int] = CELLS, quick: int = 1) -> Iterator[list[_Offer]]:
     pushes = [push for push in pushes if np.any(push)]
-    bumps = list(_bumps(coordinate))[:levels] if pushes else []
+    bumps = list(_bumps(coordinate, cells)) if pushes else []
     yield from ([_Offer(token, b, push, b.shape[1] > CELLS[quick]) for b in bumps] for push in pushes)
 
 
@@ -255,11 +278,11 @@ def _named(left: Left) -> list[Array]:
     return [table[:, :, k] for k in range(table.shape[2])]
 
 
-def _bumps(c: Array) -> Iterator[Array]:
+def _bumps(c: Array, at_most: Sequence[int]) -> Iterator[Array]:
     """(n, cells) bumps over where c (n, d) was, the coarse ones first."""
     span = float(np.max(np.ptp(c, axis=0)))
     before = 0
-    for most in CELLS if span > 0.0 else ():
+    for most in at_most if span > 0.0 else ():
         for along in GRIDS:
             wide = span / along
             cells = np.unique(np.rint((c - c.min(axis=0)) / wide), axis=0)
@@ -276,9 +299,10 @@ def _marginal(left: Left, x: Array, passes: int) -> tuple[float, Array]:
     whiten, z, joined = left.fit.whiten, left.fit.z, left.given.steps.joined
     best, told = -math.inf, np.asarray(np.zeros(x.shape[2]))
     for _ in range(passes):
-        white = whiten(x).reshape(-1, x.shape[2])
-        weighted = white * noises.weight(np.clip(z, -CLIPPED, CLIPPED)).reshape(-1, 1)
-        product, slope = white.T @ weighted, weighted.T @ np.clip(whiten(left.r), -CLIPPED, CLIPPED).ravel()
+        before, root = best, np.sqrt(noises.weight(np.clip(z, -CLIPPED, CLIPPED)))
+        weighted = (whiten(x) * root[:, :, None]).reshape(-1, x.shape[2])
+        product = weighted.T @ weighted  # half the work of a product of two
+        slope = weighted.T @ (root * np.clip(whiten(left.r), -CLIPPED, CLIPPED)).ravel()
         ridge = evidence(product, slope).ridge
         beta: Array = np.asarray(np.linalg.solve(product + ridge * np.eye(len(slope)), slope))
         price = 0.5 * float(np.linalg.slogdet(np.eye(len(slope)) + product / ridge)[1]) + 0.5 * ridge * float(beta @ beta)
@@ -290,6 +314,8 @@ def _marginal(left: Left, x: Array, passes: int) -> tuple[float, Array]:
             nats = _under_any_law(z, whiten, left) - price
             if nats > best:
                 best, told = nats, beta
+        if best < before + SETTLED:
+            break
     return best, told
 
 

@@ -26,7 +26,7 @@ from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.begun import begun, measured
 from s2r_runtime.trace.episodes import episodes, may_depend_on
 from s2r_runtime.trace.evidence import evidence, margin
-from s2r_runtime.trace.fields import Field, field
+from s2r_runtime.trace.fields import Field, as_noise, field
 from s2r_runtime.trace.fitting import Fit, Problem
 from s2r_runtime.trace.fitting import gain as explained
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, SLOWLY, Judged, Left, first_look, judge, leading
@@ -115,7 +115,7 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     coloured = ("noise",) if np.any(left.fit.colour.strength > COLOURED) else ()
     if chosen:
         matters, share = _weight_of(left, nominal, chosen[-1], horizon)
-        if matters:
+        if matters and not _wanders(left, chosen[-1]):
             tokens = tuple(dict.fromkeys(TOKENS.get(judged.token, judged.token) for judged in chosen))
             return Structure(tokens, True, share, gains, noise=_beside(left, chosen[-1]))
     varied = looks.field
@@ -128,6 +128,11 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     if windows is None or not matters:
         return Structure(coloured, False, 0.0, gains)
     return Structure(may_depend_on(left, windows, found), True, share, gains, for_a_while=True, noise=_beside(left, windows))
+
+
+def _wanders(left: Left, judged: Judged) -> bool:
+    """Whether what only sliding shows, and what foretells nothing elsewhere, is rather a push that wanders: slides know nothing of that."""
+    return judged.gain <= 0.0 and not left.given.floor.axes and as_noise(left, judged)
 
 
 def _beside(left: Left, judged: Judged) -> tuple[Noise, Colour]:
