@@ -230,8 +230,8 @@ def _offered(left: Left) -> Iterator[list[_Offer]]:
         if given.data.in_order:
             yield from _over(f"time*{name}", given.steps.t[:, None], [own[j]], CELLS[:SLOW])
         for i, other in enumerate(model.inputs):
-            if i != j:
-                yield from _over(f"{other}*{name}" if i < j else f"{name}*{other}", u[:, [j]] / size, [own[i]])
+            token = name if i == j else f"{other}*{name}" if i < j else f"{name}*{other}"
+            yield from _over(token, u[:, [j]] / size, [own[i]])
     if named and given.data.in_order:
         yield from _over("time", given.steps.t[:, None], named, CELLS[:SLOW])
 

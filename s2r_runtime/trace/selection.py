@@ -124,9 +124,9 @@ def select(
     return Selection(nominal, fit, tried, tuple(ranking), tuple(found))
 
 
-def another_way(given: Problem, chosen: Selection, horizon: int) -> Selection | None:
-    """Selection again from two effects together: of two that hide each other, neither is what does best alone, or is seen at all. None
-    where no such two explain clearly more than what was chosen.
+def two_together(given: Problem, chosen: Selection) -> Selection | None:
+    """Two effects that hide each other: neither is what does best alone, or is seen at all. `select` goes on from them. None where no such
+    two explain clearly more than what was chosen.
     """
     there, n = names(chosen.fit.model), len(given.steps)
     firsts = [s.fit for s in chosen.ranking if s.fit is not None and (s.name, s.channel) not in there][:FIRSTS]
@@ -139,7 +139,7 @@ def another_way(given: Problem, chosen: Selection, horizon: int) -> Selection | 
     best = max(pairs, key=worth, default=None)
     if best is None or worth(best) <= worth(chosen.fit) + CLOSE:
         return None
-    return select(given, chosen.nominal.model, horizon, lambda share: None, before=replace(chosen, fit=best, rivals=()))
+    return replace(chosen, fit=fitted(given, best, best.model), rivals=())
 
 
 def one_more(given: Problem, chosen: Selection, horizon: int, foretells: Callable[[Fit, Fit], float]) -> Selection:
@@ -163,7 +163,7 @@ def one_more(given: Problem, chosen: Selection, horizon: int, foretells: Callabl
 def crowded(fit: Fit) -> bool:
     """Whether more effects were found on some input than are believed."""
     channels = [fit.model.effects[i].channel for i in fit.added if fit.model.effects[i].effect.stage == "input"]
-    return any(channels.count(c) > MOST_ON_ONE for c in channels)
+    return any(channels.count(c) + channels.count("*") * (c != "*") > MOST_ON_ONE for c in channels)
 
 
 def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int, bar: Bar = STRICT, ahead: float = 0.0) -> bool:

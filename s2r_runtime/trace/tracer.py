@@ -43,8 +43,8 @@ from s2r_runtime.trace.residual import Mask, acting, first_steps, rms, steps_of
 from s2r_runtime.trace.residual_noise import no_colour
 from s2r_runtime.trace.result import Found, Limit, TraceResult
 from s2r_runtime.trace.retimed import retimed
-from s2r_runtime.trace.scores import LENIENT, names
-from s2r_runtime.trace.selection import Selection, another_way, crowded, select
+from s2r_runtime.trace.scores import LENIENT, STRICT, names
+from s2r_runtime.trace.selection import Selection, crowded, select, two_together
 from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import asked, confirmed, final_fit, foretold_too, verdict_of
@@ -168,13 +168,12 @@ def _once_more(
     """Where structure is left, something is there: two effects together that leave nothing, coloured noise neither (two take up a part of
     anything, and the rest looks like that); or what is found with a lower bar, if that leaves nothing.
     """
-    ways: tuple[tuple[Callable[[], Selection | None], set[str]], ...] = (
-        (lambda: another_way(given, chosen, ahead), set()),
-        (lambda: select(given, chosen.nominal.model, ahead, lambda share: None, LENIENT, chosen), {"noise"}),
-    )
-    for way, may_be_left in ways:
-        found = way()
-        other = chosen if found is None else confirmed(given, found, judged_on)
+    pair = two_together(given, chosen)
+    hidden = pair is not None and not whole.structure(pair).tokens
+    for bar, before, may_be_left in ((STRICT, pair if hidden else None, set()), (LENIENT, chosen, {"noise"})):
+        if before is None:
+            continue
+        other = confirmed(given, select(given, chosen.nominal.model, ahead, lambda share: None, bar, before), judged_on)
         if names(other.fit.model) != names(chosen.fit.model) and not crowded(other.fit):
             rest = whole.structure(other)
             if not rest.matters and {*rest.tokens} <= may_be_left:
