@@ -187,7 +187,8 @@ class Effect(Protocol):
     - `simpler(p) -> (name, p)`: the effect with fewer numbers that it is if its own agree, on the same channel;
     - `takes(model, channel) -> tuple[str, ...]`: names of the parameters that it has there (default: all);
     - `frame(model, channel) -> str` (stage `step`): "body" if it changes the motion of the body (it then applies before a pose is
-      integrated along it), "world" if it adds to the motion along the world's axes (it then applies after that);
+      integrated along it), "sliding" if it depends on that motion (after "body"), "world" if it adds to the motion along the world's
+      axes (after that);
     - `integrates(p) -> str`: it is the scheme by which a pose is integrated; effects see it as the `integration` of their model;
     - `pushes(model, channel) -> bool`, `push(x, axis, model, channel, p) -> Push | None` and `varies`: it is a force on an axis
       (`models.forces`). A model solves for all its forces together, and does not call `after_step`;

@@ -79,8 +79,8 @@ MISTAKES = {
 }
 
 
-def _recorded(folder, robot, seed=1, steps=600, gain=1.0, push=0.0, **other):
-    """A model as its file says, and what was recorded of a robot with these parameters, whose inputs act `gain` times, and `push` more."""
+def _recorded(folder, robot, seed=1, steps=600, gain=1.0, **other):
+    """A model as its file says, and what was recorded of a robot with these parameters, whose inputs act `gain` times."""
     text, dt, bounds, first, noise = ROBOTS[robot]
     path = folder / f"{robot}.py"
     path.write_text(text)
@@ -92,7 +92,7 @@ def _recorded(folder, robot, seed=1, steps=600, gain=1.0, push=0.0, **other):
         if robot == "lift":  # held up by somebody's stick
             u[k] = np.clip(u[k] - 6.0 * (x[0, 0] - 1.0) - 4.0 * x[0, 1], 8.0, 16.0)
         rows.append(x[0])
-        x = model.nominal.step(x, gain * u[k : k + 1] + push, dt, {**model.parameters, **other})
+        x = model.nominal.step(x, gain * u[k : k + 1], dt, {**model.parameters, **other})
     return model, np.array(rows) + rng.normal(size=(steps, len(first))) * noise, u
 
 

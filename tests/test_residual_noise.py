@@ -55,7 +55,7 @@ def test_both_variances_are_found_again(q, r):
 
 @pytest.mark.parametrize("near", [None, (1e-3, 1e2)])
 def test_the_noise_of_a_state_is_the_most_likely_one(near):
-    """No other pair on a fine grid is likelier by more than a hundredth of a nat; of white noise, of measurement noise, of neither."""
+    """No other pair on a fine grid is likelier by more than two hundredths of a nat; of white noise, of measurement noise, of neither."""
     rng, n = np.random.default_rng(6), 300
     joined = np.append(False, rng.random(n - 1) < 0.98)
     for q, r, wander in ((1.0, 0.0, 0.0), (1e-3, 1.0, 0.0), (0.3, 0.3, 0.0), (0.1, 0.1, 3.0)):

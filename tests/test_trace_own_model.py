@@ -1,14 +1,20 @@
 """A model of one's own may say a parameter wrongly: it is named, unless it is the same as something that every model can have."""
 
+import math
+
 import numpy as np
 import pytest
 
 from s2r_runtime.effects.classes import same
 from s2r_runtime.errors import NotEnoughEvidence
 from s2r_runtime.models.composed import compose
-from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.errors import held
+from s2r_runtime.trace.fitting import evaluate, problem
+from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.tracer import trace, usual_horizon
+from s2r_runtime.trace.verdict import _ahead
 
 DT_S, NOISE_M, PARTS = 2.0, 0.01, 20
 TANK = """
@@ -137,3 +143,19 @@ def test_a_robot_that_answers_at_once_and_is_asked_for_something_else_in_every_s
 
 def test_rollouts_are_a_second_or_ten_steps():
     assert (usual_horizon(0.02), usual_horizon(0.1), usual_horizon(2.0)) == (1.0, 1.0, 20.0)
+
+
+def test_what_gives_no_numbers_on_held_out_data_is_out_of_the_question_there(tmp_path):
+    """A pump that draws empties a tank that was full where the fit was, and is not where it is judged."""
+    path = tmp_path / "tank.py"
+    path.write_text(TANK.replace("NARROWEST", "1e9").replace("PARTS", "2").replace("level = np.maximum(level, 0.0)", "pass"))
+    model = compose(ModelSpec(str(path), DT_S))
+    rows, pump = np.linspace(1.0, 2.0, 61)[:, None], np.ones((60, 1))
+    data = from_arrays(model, [(rows, pump)])
+    here = held(model, data, steps_of(data), (), np.ones(60, dtype=bool), 10.0 * DT_S)
+    given = problem(from_arrays(model, [(rows + 3.0, pump)]), steps_of(from_arrays(model, [(rows + 3.0, pump)])))
+    off = compose(ModelSpec(str(path), DT_S, {}, (EffectSpec("input_bias", "pump", {"bias": -60.0}),)))
+    fits = [evaluate(given, model), evaluate(given, off)]
+    with np.errstate(invalid="ignore"):
+        assert _ahead(here, fits) == [0.0, -math.inf]
+        assert _ahead(here, fits[::-1]) == [0.0, 0.0]

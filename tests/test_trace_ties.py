@@ -13,7 +13,7 @@ from s2r_runtime.trace.errors import Judged, held
 from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.rivals import SURELY, rivals, tied
-from s2r_runtime.trace.scores import Scored, unlimited
+from s2r_runtime.trace.scores import Scored, _search, unlimited
 from s2r_runtime.trace.selection import Selection
 from s2r_runtime.trace.tracer import load_dataset, trace
 from s2r_runtime.trace.verdict import confirmed, harms
@@ -141,8 +141,18 @@ def test_rivals_are_those_of_what_held_out_data_confirm():
         "quadratic_drag",
         "input_deadband",
     }
+    assert left.rivals
     assert all(len(s.fit.added) == len(left.fit.added) == 1 for s in left.rivals)
 
 
 def _bias(channel="w"):
     return AppliedEffect(registry().get("effects", "input_bias"), channel, {"bias": 1e-9})
+
+
+def test_a_search_beside_another_scheme_is_another_one():
+    """Names and channels are the same; what is fitted beside one model says nothing of what the other one leaves."""
+    rng = np.random.default_rng(3)
+    given, model = _problem(np.column_stack([_held(rng, 300, [-0.5], [0.5])[:, 0], _held(rng, 300, [-1.0], [1.0])[:, 0]]))
+    ways = [_with(given, model, "integration_scheme", "*", scheme=scheme) for scheme in ("exact", "rk4")]
+    assert _search(given, ways[0]) is not _search(given, ways[1])
+    assert _search(given, ways[0]) is _search(given, ways[0])

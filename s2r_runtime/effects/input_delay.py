@@ -90,7 +90,7 @@ def _shifted(u: Array, lasts: Array, delay: float) -> Array:
 def _before(u: Array, lasts: Array, delay: float) -> Array:
     """u (T, c), held over rows that last so long, (T,) s, as it was a delay before the end of each row; zero before the first."""
     edges = np.concatenate([[0.0], np.cumsum(lasts)])
-    row = np.searchsorted(edges, edges[1:] - delay - ROUNDING * np.median(lasts), side="right") - 1
+    row = np.searchsorted(edges, edges[1:] - delay - ROUNDING * np.max(lasts), side="right") - 1
     return np.where((row >= 0)[:, None], u[np.clip(row, 0, None)], 0.0)
 
 

@@ -88,8 +88,8 @@ class Structure:
     """tokens: docs/json.md's `depends_on`, most important first. matters: it shows in rollouts.
 
     share: part of all that the nominal model lacks which is still left (0 where there is nothing). gains: nats by group. nameless: what
-    was named looks more like something that has no name (`challenge`). for_a_while: it comes and goes (`episodes`). noise: what would be
-    left beside the structure, and its colour; None where there is none that matters.
+    was named looks more like something that has no name (`challenge`). for_a_while: it comes and goes (`episodes`). varies: it is a
+    field (`fields`). noise: what would be left beside the structure, and its colour; None where there is none that matters.
     """
 
     tokens: tuple[str, ...]

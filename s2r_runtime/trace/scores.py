@@ -167,7 +167,7 @@ def _search(given: Problem, base: Fit) -> _Search:
     """The one beside a model of the same effects that explains as much, if there was one; the last KEPT are known. What is fitted beside it
     has numbers and noise of its own: where these began makes no difference.
     """
-    key = tuple((*name_of(a), isinstance(a, Added)) for a in base.model.effects)
+    key = tuple((*name_of(a), isinstance(a, Added), _texts(a)) for a in base.model.effects)
     there = given.searches.pop(key, None)
     if not isinstance(there, _Search) or base.white > there.base.white + AS_MUCH:
         there = _Search(given, base)
@@ -175,6 +175,11 @@ def _search(given: Problem, base: Fit) -> _Search:
     while len(given.searches) > KEPT:
         given.searches.pop(next(iter(given.searches)))
     return there
+
+
+def _texts(a: AppliedEffect) -> tuple[tuple[str, str], ...]:
+    """Parameters that are no numbers: with another scheme, or from another input, it is another model."""
+    return tuple(sorted((name, value) for name, value in a.p.items() if isinstance(value, str)))
 
 
 def rescored(found: Sequence[Scored], base: Fit, n: int, bar: Bar) -> list[Scored]:

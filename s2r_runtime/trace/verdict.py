@@ -12,6 +12,7 @@ traced         otherwise
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Literal
 
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.errors import Held, Judged, better, displacement
 from s2r_runtime.trace.faults import Fault
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, plainly, problem, without
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, foretold, gain, plainly, problem, without
 from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import acting, predicted, rms
 from s2r_runtime.trace.rivals import representative, rivals, tied
@@ -85,17 +86,19 @@ def foretold_too(given: Problem, chosen: Selection, judged_on: Held, horizon: in
 
 
 def _ahead(judged_on: Held, fits: list[Fit]) -> list[float]:
-    """Nats by which each foretells what is held out better than the first one."""
+    """Nats by which each foretells what is held out better than the first one. What a user's own model gives no numbers for there is out of
+    the question; if that is so of the first one, nothing is known.
+    """
     here = problem(judged_on.data, judged_on.steps)
-    foretelling = [evaluate(here, one.model) for one in fits]
-    return [gain(one, foretelling[0]) for one in foretelling]
+    foretelling = [None if foretold(here, one.model) is None else evaluate(here, one.model) for one in fits]
+    first = foretelling[0]
+    return [0.0 if first is None else -math.inf if one is None else gain(one, first) for one in foretelling]
 
 
 def _holds(judged_on: Held, fit: Fit, less: Fit, place: int) -> bool:
     """Whether held-out data are foretold better with an effect; if it has no number, whether they are likelier."""
     if len(fit.added) > 1 and not slots_of(fit.model.effects[place], place) and len(judged_on.steps):
-        here = problem(judged_on.data, judged_on.steps)
-        return gain(evaluate(here, fit.model), evaluate(here, less.model)) > 0.0
+        return _ahead(judged_on, [less, fit])[1] > 0.0
     return better(judged_on, fit.model, less.model, CONFIRMED)
 
 
