@@ -8,13 +8,13 @@ score   gain less price
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace.candidates import candidates
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, refine, under_noise
+from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, under_noise
 from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.screening import Screened, screen
 from s2r_runtime.trace.slots import Added, bounds_of, values_of
@@ -39,9 +39,6 @@ FIRST_LOOK = 4
 
 KEPT = 6
 """Searches that are known at a time: a selection goes back to the models less one effect, of which there are at most five."""
-
-BEHIND = 0.4
-"""Of what the best candidate explains after one round of parameters and noise: one that explains less is given no second one."""
 
 AS_MUCH = 3.0
 """Nats that a model may explain less than another one of the same effects (its noise was begun elsewhere) for a search beside it to do."""
@@ -123,7 +120,7 @@ class _Search:
         self._given = given
         self._offered = candidates(base.model, given.data, Leftover(given, base))
         self._first, self.tried = screen(given, base, self._offered)
-        self._fits: dict[tuple[int, int], tuple[object, Fit]] = {}
+        self._fits: dict[int, tuple[object, Fit]] = {}
 
     def fitted(self, few: int, least: float) -> tuple[list[Screened], list[tuple[Screened, Fit]]]:
         """All as screened, and those fitted that screening makes promising. least: nats."""
@@ -132,19 +129,11 @@ class _Search:
         if self._given.floor.axes and promising:
             quiet, screened = self._quietly
             promising = [*promising[:FIRST_LOOK], *((s, quiet) for s in _promising(screened, few, 0.0))]
-        once = [self._known(s, 1, lambda s=s, under=under: fitted(self._given, under, s.start, 1)) for s, under in promising]  # type: ignore[misc]
-        enough = BEHIND * max((fit.white - self.base.white for fit in once), default=0.0)
-        return screened, [
-            (s, fit if fit.white - self.base.white < enough else self._again(fit)) for (s, _), fit in zip(promising, once, strict=True)
-        ]
-
-    def _again(self, fit: Fit) -> Fit:
-        """Another round, under the noise that the first one left."""
-        return self._known(fit, 2, lambda: evaluate(self._given, refine(self._given, fit, fit.model), fit.noise))
+        return screened, [(s, self._refined(s, under, s.start, 2)) for s, under in promising]
 
     def settled(self, fit: Fit) -> Fit:
         """One of these, fitted on."""
-        return self._known(fit, SETTLES, lambda: fitted(self._given, fit, fit.model, SETTLES))
+        return self._refined(fit, fit, fit.model, SETTLES)
 
     @cached_property
     def _quietly(self) -> tuple[Fit, list[Screened]]:
@@ -155,12 +144,11 @@ class _Search:
         quiet = under_noise(self._given, self.base.model, fit.noise) if fit.white > self.base.white else self.base
         return quiet, screen(self._given, quiet, self._offered)[0]
 
-    def _known(self, of: object, rounds: int, make: Callable[[], Fit]) -> Fit:
-        """By the identity of what it is of, which is kept with it: no other object takes its place."""
-        key = id(of), rounds
-        if key not in self._fits:
-            self._fits[key] = of, make()
-        return self._fits[key][1]
+    def _refined(self, of: object, under: Fit, model: ComposedModel, rounds: int) -> Fit:
+        """Known by the identity of what it is of, which is kept with it: no other object takes its place."""
+        if id(of) not in self._fits:
+            self._fits[id(of)] = of, fitted(self._given, under, model, rounds)
+        return self._fits[id(of)][1]
 
 
 def _search(given: Problem, base: Fit) -> _Search:
