@@ -7,10 +7,11 @@ import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.trace import fields
 from s2r_runtime.trace.dataset import from_arrays
-from s2r_runtime.trace.fields import field
+from s2r_runtime.trace.fields import SEEN, field
 from s2r_runtime.trace.fitting import evaluate, problem
-from s2r_runtime.trace.lack_of_fit import left_by
+from s2r_runtime.trace.lack_of_fit import left_of
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.tracer import trace
 
@@ -71,6 +72,34 @@ def test_a_push_that_wanders_is_no_field(memory):
     y = _driven(rng, u, lambda k, x, v, w: (v + push[k, 0], w + push[k, 1]))
     data, model = _recording(y, u)
     given = problem(data, steps_of(data))
-    found = field(left_by(given, evaluate(given, model))[0])
+    found = field(left_of(given, evaluate(given, model)))
     assert found is None or found.beyond <= 0.0
     assert trace(data, model).verdict == "none"
+
+
+def test_only_fields_that_stand_out_are_looked_at(monkeypatch):
+    """The score test lets a field through that is there; of those by chance, a share of noise above SEEN = 1 standard deviation: less than
+    half of them, whatever the tails (Cantelli: 1 / (1 + SEEN^2)).
+    """
+    looked = []
+    marginal = fields._marginal
+    monkeypatch.setattr(fields, "_marginal", lambda left, x, passes: looked.append(passes) or marginal(left, x, passes))
+    for slips in (0.0, 0.4):
+        rng = np.random.default_rng(3)
+        u = _held(rng, 600, [-0.5, -1.5], [0.5, 1.5])
+        y = _driven(rng, u, lambda k, x, v, w, slips=slips: (v * (1.0 - slips if math.sin(2.0 * math.pi * x[0] / 0.5) > 0.2 else 1.0), w))
+        data, model = _recording(y, u)
+        given = problem(data, steps_of(data))
+        left = left_of(given, evaluate(given, model))
+        flipped = fields._flipped(left)
+        offered = list(fields._offered(left))
+        standing = [offer for offer in offered if fields._stands_out(offer, flipped) > SEEN]
+        looked.clear()
+        found = field(left)
+        assert len(looked) <= 2 * (fields.LOOKED_AT + fields.FITTED)  # fields, and pushes that wander
+        assert (found is not None) == bool(slips)
+        if slips:
+            assert found.tokens[0] == "position"
+            assert "position" in {offer.token for offer in standing}
+        else:
+            assert len(standing) < len(offered) / 2

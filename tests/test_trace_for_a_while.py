@@ -11,7 +11,7 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.episodes import episodes
 from s2r_runtime.trace.fitting import evaluate, insert, problem
-from s2r_runtime.trace.lack_of_fit import left_by
+from s2r_runtime.trace.lack_of_fit import left_of
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.rivals import representative
 from s2r_runtime.trace.scores import Scored
@@ -71,7 +71,7 @@ def test_a_push_that_wanders_slowly_is_no_episode(seed):
     model = compose(ModelSpec("joint", dt, {"mass": 1.0}, ()))
     data = from_arrays(model, [(y, u)])
     given = problem(data, steps_of(data))
-    assert episodes(left_by(given, evaluate(given, model))[0]) is None
+    assert episodes(left_of(given, evaluate(given, model))) is None
 
 
 def test_commands_that_are_carried_out_in_steps_are_no_limit():

@@ -66,8 +66,11 @@ LOOKS = 4.0
 FITTED = 3
 """Fields, and pushes that wander, that are."""
 
-LATE = 3
-"""Fields that are looked at more finely."""
+FLIPS = 24
+"""Draws of what is left with signs by chance, step by step: what fields would see in noise alone."""
+
+SEEN, LOOKED_AT = 1.0, 8
+"""Standard deviations above those from which on a field is looked at, and how many are: the ones that stand out most."""
 
 SETTLED = 0.5
 """Nats that a pass must gain for another one."""
@@ -117,12 +120,11 @@ class Field:
 
 @dataclass(frozen=True)
 class _Offer:
-    """One field that may be: its token, bumps (n, m) and push (n, nx). late: it takes long, and is looked at last."""
+    """One field that may be: its token, bumps (n, m) and push (n, nx)."""
 
     token: str
     bumps: Array
     push: Array
-    late: bool
 
     @property
     def x(self) -> Array:
@@ -148,27 +150,30 @@ def field(left: Left) -> Field | None:
     return Field(kept[best].token, also, kept[best].x, beta, nats - bare, beyond)
 
 
-def _looked(left: Left, offered: Iterable[list[_Offer]], bare: float) -> tuple[list[tuple[float, _Offer]], int]:
-    """(nats at first look, offer), the best first, and how many there were. Each list has a field from coarse to fine: what is `late` is
-    worth a look where the one before says anything, and few others say more.
+def _looked(left: Left, offered: Iterable[_Offer], bare: float) -> tuple[list[tuple[float, _Offer]], int]:
+    """(nats at first look, offer), the best first, of those that stand out; and how many were offered."""
+    flipped = _flipped(left)
+    scored = [(_stands_out(offer, flipped), offer) for offer in offered]
+    best = sorted((pair for pair in scored if pair[0] > SEEN), key=lambda pair: -pair[0])[:LOOKED_AT]
+    looked = [(_marginal(left, offer.x, 1)[0] - bare, offer) for _, offer in best]
+    return sorted(looked, key=lambda pair: -pair[0]), len(scored)
+
+
+def _flipped(left: Left) -> Array:
+    """(n, nx, 1 + FLIPS) S^-1 r, wild values weighted down; then the same with the sign of each step by chance."""
+    z = left.fit.z
+    push = np.clip(z, -CLIPPED, CLIPPED) * noises.weight(z)
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(z), 1, FLIPS))
+    return left.fit.whiten.back(np.concatenate([push[:, :, None], push[:, :, None] * signs], axis=2))
+
+
+def _stands_out(offer: _Offer, flipped: Array) -> float:
+    """Score test of tau = 0: standard deviations by which the size of the slopes, each on the scale that chance gives it, is above that by
+    chance. It needs no whitened bumps, so a field that is not there costs next to nothing (X. Lin, Biometrika 84, 1997, on such tests).
     """
-    looked, later = [], []
-    for finer in offered:
-        nats = 0.0
-        for offer in finer:
-            if offer.late:
-                break
-            nats = _marginal(left, offer.x, 1)[0] - bare
-            looked.append((nats, offer))
-        if nats >= 0.0:
-            later.append((nats, [offer for offer in finer if offer.late]))
-    for _, finest in sorted(later, key=lambda pair: -pair[0])[:LATE]:
-        for offer in finest:
-            nats = _marginal(left, offer.x, 1)[0] - bare
-            looked.append((nats, offer))
-            if nats < 0.0:
-                break
-    return sorted(looked, key=lambda pair: -pair[0]), len(looked)
+    slopes = offer.bumps.T @ np.einsum("ki,kis->ks", offer.push, flipped)
+    size = np.sum(slopes**2 / np.maximum(np.mean(slopes[:, 1:] ** 2, axis=1, keepdims=True), 1e-300), axis=0)
+    return float((size[0] - np.mean(size[1:])) / max(float(np.std(size[1:])), 1e-300))
 
 
 def beats(field: Field, nominal: Left, named: Left) -> bool:
@@ -180,8 +185,11 @@ def beats(field: Field, nominal: Left, named: Left) -> bool:
 def wanders(nominal: Left, named: Left) -> bool:
     """Whether a push that wanders in time explains clearly more than what was named, and this nothing beside it."""
     bare, alone = bare_nats(nominal), bare_nats(named)
+    beside = wandering_nats(named)
+    if beside - alone < NEEDED:  # with the names, it does as well as alone at least
+        return False
     without = wandering_nats(nominal, NEARLY * (alone - bare))
-    return without - alone > CLEARLY and max(alone, wandering_nats(named)) - without < NEEDED
+    return without - alone > CLEARLY and beside - without < NEEDED
 
 
 def as_noise(left: Left, judged: Judged) -> bool:
@@ -203,12 +211,12 @@ def wandering_nats(left: Left, least: float = 0.0) -> float:
     body, world = directions_of(given, model, acting(model, given.data))
     when = np.arange(len(given.steps), dtype=float)[:, None]
     bare = bare_nats(left)
-    looked, _ = _looked(left, _over("time", when, (*body, *world), (*CELLS, QUICKEST), quick=2), bare)
-    kept = [offer for nats, offer in looked if nats > max(least, 0.0)][:FITTED]
+    looked, _ = _looked(left, _over("time", when, (*body, *world), (*CELLS, QUICKEST)), bare)
+    kept = [offer for nats, offer in looked if nats > max(least, LOOKS)][:FITTED]
     return max((_marginal(left, offer.x, PASSES)[0] for offer in kept), default=bare)
 
 
-def _offered(left: Left) -> Iterator[list[_Offer]]:
+def _offered(left: Left) -> Iterator[_Offer]:
     """Fields, each from coarse to fine."""
     given, model = left.given, left.fit.model
     act = acting(model, given.data)
@@ -219,7 +227,7 @@ def _offered(left: Left) -> Iterator[list[_Offer]]:
     named = _named(left)
     moved = _apart([*_moved(left), *named] if set(model.states) >= BODY else [*own, *named])
     for place in _places(model.states, y):
-        yield from _over("position", place, moved, quick=2)  # floors have stripes and hills of all sizes
+        yield from _over("position", place, moved)  # floors have stripes and hills of all sizes
         yield from _over("position", place, world or body)
     for name in ANGLES:
         if name in model.states:
@@ -236,10 +244,10 @@ def _offered(left: Left) -> Iterator[list[_Offer]]:
         yield from _over("time", given.steps.t[:, None], named, CELLS[:SLOW])
 
 
-def _over(token: str, coordinate: Array, pushes: Sequence[Array], cells: Sequence[int] = CELLS, quick: int = 1) -> Iterator[list[_Offer]]:
+def _over(token: str, coordinate: Array, pushes: Sequence[Array], cells: Sequence[int] = CELLS) -> Iterator[_Offer]:
     pushes = [push for push in pushes if np.any(push)]
-    bumps = list(_bumps(coordinate, cells)) if pushes else []
-    yield from ([_Offer(token, b, push, b.shape[1] > CELLS[quick]) for b in bumps] for push in pushes)
+    for bumps in _bumps(coordinate, cells) if pushes else ():
+        yield from (_Offer(token, bumps, push) for push in pushes)
 
 
 def _places(states: Sequence[str], y: Array) -> list[Array]:

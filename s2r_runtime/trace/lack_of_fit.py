@@ -42,6 +42,9 @@ ALPHA = 1e-3
 FEW = 6
 """Dictionaries that are judged with their own noise, after a first look under the model's."""
 
+NOTHING = 1.0
+"""Nats at first look up to which a dictionary says nothing, and is not judged any closer."""
+
 ALIKE = 3.0
 """Nats within which dictionaries say the same: the smallest one is named."""
 
@@ -145,16 +148,24 @@ def _beside(left: Left, judged: Judged) -> tuple[Noise, Colour]:
 
 @dataclass(frozen=True)
 class Looks:
-    """A first look at what dictionaries say of what a model leaves. looked: (nats, place in `found`), the best first."""
+    """A first look at what dictionaries say of what a model leaves."""
 
     left: Left
-    found: list[tuple[str, Array]]
-    looked: list[tuple[float, int]]
+
+    @cached_property
+    def found(self) -> list[tuple[str, Array]]:
+        """The dictionaries."""
+        return dictionaries_of(self.left)
+
+    @cached_property
+    def looked(self) -> list[tuple[float, int]]:
+        """(nats, place in `found`), the best first."""
+        return sorted(((first_look(self.left, x), i) for i, (_, x) in enumerate(self.found)), reverse=True)
 
     @property
     def most(self) -> float:
         """Nats of the best one at first look."""
-        return self.looked[0][0]
+        return self.looked[0][0] if self.looked else 0.0
 
     @cached_property
     def field(self) -> Field | None:
@@ -163,16 +174,10 @@ class Looks:
 
     @cached_property
     def judged(self) -> list[Judged]:
-        """The FEW best of them with their own noise."""
-        looked = _best_of_each(self.looked, self.found)
-        terms = [(self.found[i][0], leading(self.left, self.found[i][1])) for _, i in looked[:FEW]]
-        return [judge(self.left, token, x) for token, x in terms]
-
-
-def first_looks(given: Problem, fit: Fit) -> Looks:
-    """At what a model leaves."""
-    left, found = left_by(given, fit)
-    return Looks(left, found, sorted(((first_look(left, x), i) for i, (_, x) in enumerate(found)), reverse=True))
+        """The FEW best of them with their own noise; the best one only, where none says anything."""
+        looked = _best_of_each(self.looked, self.found)[:FEW]
+        kept = [i for nats, i in looked if nats > NOTHING] or [i for _, i in looked[:1]]
+        return [judge(self.left, self.found[i][0], leading(self.left, self.found[i][1])) for i in kept]
 
 
 def best_unnamed(looks: Looks) -> Judged:
@@ -208,11 +213,11 @@ def left_of(given: Problem, fit: Fit) -> Left:
     return Left(given, fit, r, state_jacobian(fit.model, given.steps, act), block, _clipped(fit.z) if wild else None)
 
 
-def left_by(given: Problem, fit: Fit) -> tuple[Left, list[tuple[str, Array]]]:
-    """What a model leaves, and the dictionaries for it."""
-    left, act = left_of(given, fit), acting(fit.model, given.data)
-    found = [(token, _columns(terms)) for token, terms in dictionaries(given, fit.model, act, fit.noise, left.r)]
-    return left, [(token, x) for token, x in found if x.shape[2]]
+def dictionaries_of(left: Left) -> list[tuple[str, Array]]:
+    """Those for what a model leaves; terms that vanish are dropped."""
+    model = left.fit.model
+    offered = dictionaries(left.given, model, acting(model, left.given.data), left.fit.noise, left.r)
+    return [(token, x) for token, terms in offered if (x := _columns(terms)).shape[2]]
 
 
 def _clipped(z: Array) -> Array:

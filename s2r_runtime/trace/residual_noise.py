@@ -108,10 +108,10 @@ class Whitener:
         return np.asarray(z).reshape(r.shape)
 
     def back(self, z: Array) -> Array:
-        """L^-T z, same shape as z: S^-1 r of z = L^-1 r."""
+        """L^-T z for z (n, nx) or (n, nx, m), same shape: S^-1 r of z = L^-1 r."""
         from scipy.linalg import lapack
 
-        r, _ = lapack.dtbtrs(self._lower, z.reshape(-1, 1), uplo="L", trans="T")
+        r, _ = lapack.dtbtrs(self._lower, z.reshape(z.shape[0] * z.shape[1], -1), uplo="L", trans="T")
         return np.asarray(r).reshape(z.shape)
 
 

@@ -106,7 +106,8 @@ def select(
         if ranking and not fit.added:
             found, columns = rescored(ranking, nominal, len(given.steps), bar), tried
         else:
-            found, columns = best_candidates(given, fit, bar=bar)
+            needed = bar.needed(tried, 1, len(given.steps)) if fit.added else 0.0  # of the model as given, all are told
+            found, columns = best_candidates(given, fit, bar=bar, against=needed)
         tried = max(tried, columns)
         ranking = ranking or found
         progress(0.1 + 0.6 * (step + 1) / (MOST + 1))

@@ -35,7 +35,7 @@ from s2r_runtime.trace.fields import Field, beats, wanders
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, problem, told, without
 from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.intervals import intervals
-from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, Looks, Structure, best_unnamed, explains_more, first_looks, lack_of_fit, left_of
+from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, NOTHING, Looks, Structure, best_unnamed, explains_more, lack_of_fit, left_of
 from s2r_runtime.trace.lack_of_fit_judged import Judged, Left
 from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.power import visible
@@ -323,7 +323,7 @@ class _Whole:
 
     @cached_property
     def _looks(self) -> Looks:
-        return first_looks(self.given, self.nominal)
+        return Looks(left_of(self.given, self.nominal))
 
     @cached_property
     def unnamed(self) -> Judged:
@@ -339,7 +339,8 @@ class _Whole:
     def structure(self, chosen: Selection) -> Structure:
         """What the chosen model leaves."""
         fit = evaluate(self.given, chosen.fit.model) if chosen.fit.added else self.nominal
-        found = lack_of_fit(first_looks(self.given, fit) if fit.added else self._looks, self.nominal, self._horizon)
+        looks = Looks(left_of(self.given, fit)) if fit.added else self._looks
+        found = lack_of_fit(looks, self.nominal, self._horizon)
         if not fit.added:
             seen = found.matters and not found.for_a_while and not found.varies
             if seen and self.unnamed.gain > CLEAR:
@@ -350,13 +351,21 @@ class _Whole:
                 tokens = () if self._shape is None else (self._shape.token,)
             named = tuple(dict.fromkeys((*tokens, *found.tokens)))
             return replace(found, tokens=named, matters=True, share=1.0) if tokens else found
-        best = fitted(self.given, fit, fit.model, 2)  # what it is compared with is fitted to all of the recording, too
-        if crowded(fit) or self._unnamed_explains_more(best, found.matters):
+        if crowded(fit):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
-        if not self.given.floor.axes and self._no_name(found, left_of(self.given, best)):
+        if looks.most <= NOTHING and not found.matters:  # what explained more than the names would explain something beside them
+            return found
+        best = fitted(self.given, fit, fit.model, 2)  # what it is compared with is fitted to all of the recording, too
+        if (looks.most > ALIKE or found.matters) and self._explained_without(best, found):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
         better = better_shape(self.given, best, self._horizon)
         return found if better is None else replace(found, tokens=(better.token,), matters=True, share=1.0, nameless=True)
+
+    def _explained_without(self, best: Fit, found: Structure) -> bool:
+        """Whether something without a name explains more than what was named."""
+        if self._unnamed_explains_more(best, found.matters):
+            return True
+        return not self.given.floor.axes and self._no_name(found, left_of(self.given, best))
 
     def _no_name(self, found: Structure, named: Left) -> bool:
         """Whether a field explains more than what was named, or a push that wanders as much."""
