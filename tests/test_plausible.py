@@ -156,14 +156,53 @@ def test_a_motor_that_hardly_answers_is_in_no_other_unit(name, motor, effect):
     model, (_, u) = _model(name), _driven(name, 5)
     named, ((parameter, value),) = effect[0], effect[1].items()
     spec = EffectSpec(named, INPUTS[name][motor], {parameter: value * BOUNDS[name][motor][1]})
-    robot = compose(ModelSpec(name, DT, GEOMETRY[name], (*model.spec.effects, spec)))
+    check_plausible(model, _data(model, _stepped(name, u, spec), u))
+
+
+def _stepped(name, u, effect, noise=1e-3, heading=0.0):
+    """(STEPS, nx), measured, of a robot with an effect as the library has it."""
+    robot = compose(ModelSpec(name, DT, GEOMETRY.get(name, {}), (*_model(name).spec.effects, effect)))
     x, hidden = np.zeros((1, len(robot.states))), robot.at_rest(1)
+    x[:, robot.angle_columns] = heading
     rows = []
     for row in u:
         rows.append(x[0])
         x, hidden = robot.step(x, row[None], hidden)
-    y = np.array(rows) + np.random.default_rng(1).normal(0.0, 1e-3, (STEPS, len(robot.states)))
-    check_plausible(model, _data(model, y, u))
+    return np.array(rows) + np.random.default_rng(1).normal(size=(STEPS, len(robot.states))) * noise
+
+
+STRONG = {
+    "a joint that keeps up with its force": ("joint", EffectSpec("viscous_friction", "qd", {"coefficient": 6.0}), [3e-3, 1e-2]),
+    "an axis that is braked to a crawl": (
+        "double_integrator",
+        EffectSpec("viscous_friction", "vx", {"coefficient": 10.0}),
+        [3e-3] * 2 + [1e-2] * 2,
+    ),
+    "a tenth of what is asked": ("double_integrator", EffectSpec("input_gain", "ay", {"gain": 0.1}), 1e-3),
+}
+
+
+@pytest.mark.parametrize("case", STRONG)
+def test_what_a_strong_effect_does_under_slow_commands_is_no_mistake_of_the_columns(case):
+    name, effect, noise = STRONG[case]
+    for seed in (41, 42):
+        _, u = _driven(name, seed)
+        slow = np.repeat(u[: STEPS // 2], 2, axis=0)
+        check_plausible(_model(name), _data(_model(name), _stepped(name, slow, effect, noise), slow))
+
+
+def test_wind_that_carries_a_robot_as_its_mirror_image_would_go_is_wind():
+    """It drives at 0.05 m/s to where the wind comes from, and its model with x and y exchanged drives as fast with the wind."""
+    u = np.column_stack([0.05 + 0.0 * np.arange(STEPS), 0.2 * np.sin(2.0 * DT * np.arange(STEPS))])
+    wind = EffectSpec("constant_disturbance", "world", {"x": 0.07, "y": -0.07})
+    y = _stepped("unicycle", u, wind, 1e-3, heading=2.0)
+    check_plausible(_model("unicycle"), _data(_model("unicycle"), y, u))
+
+
+def test_a_rate_in_another_unit_than_its_position_is_told():
+    y, u = _driven("joint")
+    with pytest.raises(RecordingError, match="qd seems to be in mm/s"):
+        check_plausible(_model("joint"), _data(_model("joint"), y * [1.0, 1000.0], u))
 
 
 @pytest.mark.parametrize("seed", range(4))

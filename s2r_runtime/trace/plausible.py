@@ -7,6 +7,8 @@ mistake taken back it foretells well (E < WELL, and by far better): then that is
 that nothing else follows (a car's speed) may be wrong alone: the same with the largest in the place of the mean, and NOTHING_ALONE.
 A position and its rate, or all states, may be so many times too large together (degrees, cm), or of the other sign. Where inputs so many
 times larger do the same (a mass under a force), only the number itself tells: 180/pi to EXACTLY is no mass.
+What an input that does nothing, or a steady push (wind, a slope), explains nearly as well is no mistake, and neither is what would part a
+position from its rate.
 
 Inputs that come after the motion that they cause are on another clock: the model foretells a tenth of a second far better with the inputs
 earlier by some steps than with any delay. Where that lead grows over the recording, the clocks run at different rates. Friction makes a
@@ -124,12 +126,12 @@ def _check_columns(model: ComposedModel, data: Dataset) -> None:
     if every is None or not data.segments or (np.mean(every) <= NOTHING and np.max(every) <= NOTHING_ALONE):
         return
     few = _few(data)
-    tried = [(e, m) for m in _mistakes(model) if (e := _if_taken_back(model, few, m)) is not None]
-    dead = [e for m in _dead(model) if (e := _if_taken_back(model, few, m)) is not None]
+    tried = [(e, m) for m in _mistakes(model) if (e := _if_taken_back(model, few, m)) is not None and _moves_as_well(model, few, m)]
+    otherwise = _otherwise(model, few)
     for measure, nothing in ((np.mean, NOTHING), (np.max, NOTHING_ALONE)):
         as_it_is = float(measure(every))
         best, said = min([(float(measure(e)), m.said) for e, m in tried if measure(e) < m.well], default=(math.inf, ""))
-        if as_it_is > nothing and best < min(BETTER * as_it_is, *(DEAD * float(measure(e)) for e in dead)):
+        if as_it_is > nothing and best < min(BETTER * as_it_is, *(DEAD * float(measure(e)) for e in otherwise)):
             raise RecordingError(f"{data.source}: {said}: so read, the model errs by {best:.0%} of the motion; as it is, by {as_it_is:.0%}")
 
 
@@ -139,7 +141,9 @@ def _check_scales(model: ComposedModel, data: Dataset) -> None:
     if every is None or not data.segments or (np.mean(every) <= NOTHING and np.max(every) <= NOTHING_ALONE):
         return
     few, every_input = _few(data), list(range(len(model.inputs)))
-    limit = min(WELL, BETTER * float(np.mean(every)), DEAD * _err(model, few, inputs=partial(_scaled, every_input, 0.0)))
+    still = DEAD * min(_err(model, few, inputs=partial(_scaled, some, 0.0)) for some in (every_input, *([j] for j in every_input)))
+    pushed = DEAD * min((float(np.mean(e)) for e in _otherwise(model, few)[-1:]), default=math.inf)
+    limit = min(WELL, BETTER * float(np.mean(every)), still)
     tried = [
         (_err(model, few, partial(_rescaled, list(group), 1.0 / scale.times, scale.zero)), group, scale)
         for group in groups(model)
@@ -148,7 +152,10 @@ def _check_scales(model: ComposedModel, data: Dataset) -> None:
     for e, group, scale in sorted(tried, key=lambda one: one[0]):
         if not e < (limit if scale.times >= FAR else min(limit, SURELY)):
             return
-        alike = scale.zero != 0.0 or _err(model, few, inputs=partial(_scaled, every_input, scale.times)) < ALIKE * e
+        if scale.zero == 0.0 and not e < pushed:  # another zero is a steady push, told from others by its number
+            continue
+        gains = (every_input, *([j] for j in every_input if 1.0 / FAR < abs(scale.times) < FAR))
+        alike = scale.zero != 0.0 or min(_err(model, few, inputs=partial(_scaled, g, scale.times)) for g in gains) < ALIKE * e
         if not alike or (scale.by_number and _exactly(model, few, group, scale)):
             raise RecordingError(
                 f"{data.source}: {scale.said([model.states[j] for j in group])}: so read, the model errs by {e:.0%} of the motion"
@@ -228,8 +235,10 @@ def _if_taken_back(model: ComposedModel, data: Dataset, mistake: _Mistake) -> Ar
         return None
 
 
-def _foretold(model: ComposedModel, data: Dataset, among: list[int] | None = None) -> Array | None:
-    """The share that E is the mean of, of each state (or of these) that goes somewhere; None where nothing goes anywhere."""
+def _foretold(model: ComposedModel, data: Dataset, among: list[int] | None = None, *, pushed: bool = False) -> Array | None:
+    """The share that E is the mean of, of each state (or of these) that goes somewhere; None where nothing goes anywhere. pushed: less a
+    steady push on each state.
+    """
     ahead = int(np.clip(round(HORIZON_S / data.dt), 1, 50)) if data.dt < HORIZON_S else SLOW_STEPS
     starts = rollout_starts(data, ahead)
     starts = starts[:: max(1, len(starts) // STARTS)]
@@ -239,7 +248,8 @@ def _foretold(model: ComposedModel, data: Dataset, among: list[int] | None = Non
     rows = starts + np.searchsorted(begin, starts, side="right") - 1
     y = np.concatenate([run.y for run in data.runs])
     with np.errstate(all="ignore"):
-        error = _trimmed(rollout(model, data, acting(model, data), starts, ahead).error)
+        error = rollout(model, data, acting(model, data), starts, ahead).error
+    error = _trimmed(error - np.median(error, axis=0) if pushed else error)
     gone = _trimmed(model.difference(y[rows + ahead].copy(), y[rows]))
     bent = np.concatenate([np.diff(run.y, 2, axis=0) for run in data.runs])
     noise = np.nanmedian(np.abs(bent), axis=0) / 0.6745 / math.sqrt(6.0)
@@ -292,9 +302,35 @@ def _exchanged(kind: str, names: tuple[str, ...], pairs: tuple[tuple[str, str], 
     )
 
 
-def _dead(model: ComposedModel) -> list[_Mistake]:
-    """What is none: each input by itself does nothing."""
-    return [_mistake("inputs", "", partial(_scaled, [j], 0.0)) for j in range(len(model.inputs))]
+def _otherwise(model: ComposedModel, data: Dataset) -> list[Array]:
+    """E where it is no mistake: each input by itself does nothing; something pushes steadily (wind, a slope)."""
+    dead = [_if_taken_back(model, data, _mistake("inputs", "", partial(_scaled, [j], 0.0))) for j in range(len(model.inputs))]
+    return [e for e in (*dead, _foretold(model, data, pushed=True)) if e is not None]
+
+
+def _moves_as_well(model: ComposedModel, data: Dataset, mistake: _Mistake) -> bool:
+    """Whether positions go as their rates say with a mistake of states taken back, if they do as it is: no effect changes that."""
+    if mistake.states is None or not axes(model.nominal):
+        return True
+    before, after = (_unlike(model, one) for one in (data, _taken_back(model, data, mistake)))
+    return bool(np.all(after <= np.maximum(before, WELL)))
+
+
+def _unlike(model: ComposedModel, data: Dataset) -> Array:
+    """(axes,) how far positions go otherwise than their rates say in HORIZON_S, over how far they go, at most 2."""
+    ahead = max(1, round(HORIZON_S / data.dt))
+    found = []
+    for axis in axes(model.nominal):
+        off, way = [np.zeros(0)], [np.zeros(0)]
+        for run in data.runs:
+            rate = run.y[:, axis.velocity]
+            gone = np.append(0.0, np.nancumsum(0.5 * (rate[1:] + rate[:-1]) * run.durations(data.dt)))
+            went = run.y[ahead:, axis.position] - run.y[:-ahead, axis.position]
+            off.append(went - (gone[ahead:] - gone[:-ahead]))
+            way.append(went)
+        e, w = (_trimmed(np.concatenate(part)[:, None]) for part in (off, way))
+        found.append(min(float(e[0] / max(w[0], 1e-300)), 2.0))
+    return np.array(found)
 
 
 _UNITS = {
