@@ -12,8 +12,8 @@ from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import Judged, held
 from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.residual import steps_of
-from s2r_runtime.trace.rivals import SURELY, rivals, tied
-from s2r_runtime.trace.scores import Scored, _search, unlimited
+from s2r_runtime.trace.rivals import SURELY, rivals, simplified, tied
+from s2r_runtime.trace.scores import Scored, _search, names, unlimited
 from s2r_runtime.trace.selection import Selection
 from s2r_runtime.trace.tracer import load_dataset, trace
 from s2r_runtime.trace.verdict import confirmed, harms
@@ -78,6 +78,21 @@ def test_a_curve_that_shrank_to_a_point_is_none(velocity, gone):
     p = {"force": 0.1, "static_force": 0.3, "velocity": velocity}
     there = evaluate(given, insert(model, AppliedEffect(registry().get("effects", "stribeck_friction"), "qd", p), 0))
     assert unlimited(there, 0) is gone
+
+
+@pytest.mark.parametrize(("static", "name"), [(0.41, "coulomb_friction"), (0.9, "stribeck_friction")])
+def test_dry_friction_that_is_hardly_larger_at_rest_is_dry_friction(static, name):
+    """A filter in a recorded speed bends a line by as much."""
+    model, rng = compose(ModelSpec("joint", DT, {"mass": 1.0}, ())), np.random.default_rng(16)
+    p = {"force": 0.4, "static_force": static, "velocity": 0.3}
+    robot = insert(model, AppliedEffect(registry().get("effects", "stribeck_friction"), "qd", p), 0)
+    u = np.repeat(rng.uniform(-2.0, 2.0, (60, 1)), 10, axis=0)
+    rows = [np.zeros((1, 2))]
+    for k in range(len(u)):
+        rows.append(robot.advance(rows[-1], u[k : k + 1], u[k : k + 1]))
+    data = from_arrays(model, [(np.concatenate(rows) + rng.normal(size=(len(u) + 1, 2)) * 1e-4, u)])
+    given = problem(data, steps_of(data))
+    assert names(simplified(given, evaluate(given, robot)).model) == ((name, "qd"),)
 
 
 @pytest.mark.parametrize(

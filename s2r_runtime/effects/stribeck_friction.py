@@ -49,6 +49,10 @@ class StribeckFriction(ForceEffect):
         dry = fast + (still - fast) * np.exp(-((x[:, axis.velocity] / float(p["velocity"])) ** 2))
         return Push(dry=(dry, dry), hold=(still, still))
 
+    def simpler(self, p: Values) -> tuple[str, Values]:
+        """Dry friction that is no larger at rest."""
+        return "coulomb_friction", {"force": p["force"]}
+
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
         """Curves that fall within a part of the speeds that such inputs lead to."""
         force, speed = FORCE_SHARE * size_of(u), usual_speed(u, model, dt)
