@@ -6,13 +6,15 @@ import pytest
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.dataset import from_arrays, from_streams
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem, told
 from s2r_runtime.trace.intervals import intervals
+from s2r_runtime.trace.orders import in_either_order
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.residual_noise import Colour, no_colour, no_steadier
 from s2r_runtime.trace.retimed import retimed
 from s2r_runtime.trace.slots import Slot, values_of
+from s2r_runtime.trace.streams import Stream
 
 DRY, VISCOUS = 0.5, 0.4
 
@@ -110,3 +112,58 @@ def test_a_phase_is_told_within_half_a_turn_of_zero():
     fit, _, near = told(given, fitted(given, evaluate(given, model), insert(model, sine, 0)))
     assert fit.model.effects[0].p["phase"] == pytest.approx(-3.09, abs=0.05)
     assert near.model.effects[0].p["phase"] == fit.model.effects[0].p["phase"]
+
+
+def _two(effects):
+    """A unicycle with two effects on w, and the model with them."""
+    robot = compose(ModelSpec("unicycle", 0.05, {}, tuple(EffectSpec(name, "w", p) for name, p in effects)))
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-1.0, 1.0, (100, 2)), 4, axis=0)
+    x, hidden, rows = np.zeros((1, 3)), robot.at_rest(1), [np.zeros(3)]
+    for k in range(len(u)):
+        x, hidden = robot.step(x, u[k : k + 1], hidden)
+        rows.append(x[0])
+    model = compose(ModelSpec("unicycle", 0.05))
+    data = from_arrays(model, [(np.array(rows) + rng.normal(size=(len(rows), 3)) * 0.003, u)])
+    given, both = problem(data, steps_of(data)), model
+    for place, (name, p) in enumerate(effects):
+        both = insert(both, AppliedEffect(registry().get("effects", name), "w", p), place)
+    return given, fitted(given, evaluate(given, model), both)
+
+
+def test_where_nothing_tells_which_of_two_effects_comes_first_intervals_cover_the_numbers_of_both_orders():
+    given, fit = _two((("input_coupling", {"from": "v", "coefficient": -0.3}), ("input_gain", {"gain": 1.5})))
+    low, high = in_either_order(given, fit)[Slot(0, "coefficient")]
+    assert low < -0.45 < -0.3 < high
+    assert high - low < 0.2
+    low, high = in_either_order(given, fit)[Slot(1, "gain")]
+    assert low < 1.5 < high < 1.52
+
+
+def test_where_the_order_shows_intervals_are_those_of_it():
+    given, fit = _two((("input_lag", {"time_constant": 0.2}), ("input_saturation", {"low": -0.4, "high": 0.4})))
+    assert in_either_order(given, fit) == intervals(given, fit)
+
+
+def test_a_lag_is_told_right_where_commands_come_within_steps():
+    """On a clock of their own: a change that counts as a mean over a quarter of a step looks like more delay and less lag."""
+    effects = (EffectSpec("input_delay", "force", {"delay": 0.094}), EffectSpec("input_lag", "force", {"time_constant": 0.112}))
+    robot = compose(ModelSpec("joint", 0.002, {"mass": 1.0}, effects))
+    rng = np.random.default_rng(0)
+    changes = np.cumsum(rng.integers(60, 140, 300))
+    changes = changes[changes < 20000]
+    held = rng.uniform(-1.0, 1.0, len(changes))
+    u = np.concatenate([[0.0], held])[np.searchsorted(changes, np.arange(20000), side="right")]
+    x, hidden, rows = np.zeros((1, 2)), robot.at_rest(1), [np.zeros(2)]
+    for k in range(len(u)):
+        x, hidden = robot.step(x, u[k : k + 1, None], hidden)
+        rows.append(x[0])
+    y = np.array(rows[::50]) + rng.normal(size=(401, 2)) * 1e-4
+    model = compose(ModelSpec("joint", 0.1, {"mass": 1.0}))
+    data = from_streams(model, [(Stream(0.1 * np.arange(401), y), Stream(0.002 * changes, held[:, None]))], "rows")
+    given, both = problem(data, steps_of(data)), model
+    for place, (name, p) in enumerate((("input_delay", {"delay": 0.1}), ("input_lag", {"time_constant": 0.1}))):
+        both = insert(both, AppliedEffect(registry().get("effects", name), "force", p), place)
+    delay, lag = values_of(fitted(given, evaluate(given, model), both).model, (Slot(0, "delay"), Slot(1, "time_constant")))
+    assert delay == pytest.approx(0.094, abs=5e-4)
+    assert lag == pytest.approx(0.112, abs=5e-4)

@@ -51,8 +51,11 @@ __all__ = ["Dataset", "Pause", "Run", "Stream", "from_arrays", "from_streams", "
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-PARTS = (4, 6)
-"""Least and most parts of a step where inputs change within steps."""
+PARTS = (10, 12)
+"""Least and most parts of a step where inputs change within steps. A change within a part counts as a mean over it, which spreads it as a
+lag would: of a delay and a lag of a step each, parts of a quarter make the one longer and the other shorter by a hundredth of a step, far
+outside their intervals where there is little noise.
+"""
 
 MOST_ROWS, EVEN = 12, 0.02
 """Rows of inputs in a step up to which parts are whole shares of a row, where the rows go evenly into a step: a part that lies across two

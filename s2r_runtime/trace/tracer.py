@@ -34,9 +34,9 @@ from s2r_runtime.trace.faults import Checked, check
 from s2r_runtime.trace.fields import Field, beats, wanders
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, problem, told, without
 from s2r_runtime.trace.holdout import Part, fit_mask, part
-from s2r_runtime.trace.intervals import intervals
 from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, NOTHING, Looks, Structure, best_unnamed, explains_more, lack_of_fit, left_of
 from s2r_runtime.trace.lack_of_fit_judged import Judged, Left
+from s2r_runtime.trace.orders import in_either_order
 from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.residual import Mask, acting, first_steps, rms, steps_of
@@ -213,7 +213,7 @@ def _result(
         floor = noise_floor(final, judged_on, seed)
     after = before if final is chosen.nominal else after
     gap_before, gap_after, independent = gaps((model, before), (final.model, after), judged_on, weights, kind)
-    ranges = intervals(there, near) if final is chosen.fit else intervals(given, final)
+    ranges = in_either_order(there, near) if final is chosen.fit else {}
     effects = tuple(_found(model, final, place, ranges) for place in final.added)
     idle = [place for place in final.added if not asked(given, judged_on, final.model, without(final.model, place))]
     rivals = [s.fit for s in chosen.rivals if s.fit is not None] if verdict == "ambiguous" else []
