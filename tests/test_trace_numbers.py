@@ -1,5 +1,7 @@
 """Numbers that are told: unbiased where sensors are coarse against what bends with the state, and under the right law of what is left."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,11 +10,13 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import from_arrays, from_streams
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem, told
+from s2r_runtime.trace.grid_errors import widened
 from s2r_runtime.trace.intervals import intervals
 from s2r_runtime.trace.orders import in_either_order
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.residual_noise import Colour, no_colour, no_steadier
 from s2r_runtime.trace.retimed import retimed
+from s2r_runtime.trace.selection import WITHIN
 from s2r_runtime.trace.slots import Slot, values_of
 from s2r_runtime.trace.streams import Stream
 
@@ -145,25 +149,49 @@ def test_where_the_order_shows_intervals_are_those_of_it():
     assert in_either_order(given, fit) == intervals(given, fit)
 
 
-def test_a_lag_is_told_right_where_commands_come_within_steps():
-    """On a clock of their own: a change that counts as a mean over a quarter of a step looks like more delay and less lag."""
-    effects = (EffectSpec("input_delay", "force", {"delay": 0.094}), EffectSpec("input_lag", "force", {"time_constant": 0.112}))
-    robot = compose(ModelSpec("joint", 0.002, {"mass": 1.0}, effects))
+def _within_steps(**effects):
+    """A joint with effects on its force, whose commands come on a clock of their own: the problem, and a fit from the true numbers."""
+    model, finely = (compose(ModelSpec("joint", dt, {"mass": 1.0})) for dt in (0.1, 0.002))
+    for place, (name, p) in enumerate(effects.items()):
+        model, finely = (insert(m, AppliedEffect(registry().get("effects", name), "force", p), place) for m in (model, finely))
     rng = np.random.default_rng(0)
-    changes = np.cumsum(rng.integers(60, 140, 300))
-    changes = changes[changes < 20000]
+    changes = np.cumsum(rng.integers(60, 140, 180))
     held = rng.uniform(-1.0, 1.0, len(changes))
     u = np.concatenate([[0.0], held])[np.searchsorted(changes, np.arange(20000), side="right")]
-    x, hidden, rows = np.zeros((1, 2)), robot.at_rest(1), [np.zeros(2)]
+    x, hidden, rows = np.zeros((1, 2)), finely.at_rest(1), [np.zeros(2)]
     for k in range(len(u)):
-        x, hidden = robot.step(x, u[k : k + 1, None], hidden)
+        x, hidden = finely.step(x, u[k : k + 1, None], hidden)
         rows.append(x[0])
     y = np.array(rows[::50]) + rng.normal(size=(401, 2)) * 1e-4
-    model = compose(ModelSpec("joint", 0.1, {"mass": 1.0}))
-    data = from_streams(model, [(Stream(0.1 * np.arange(401), y), Stream(0.002 * changes, held[:, None]))], "rows")
-    given, both = problem(data, steps_of(data)), model
-    for place, (name, p) in enumerate((("input_delay", {"delay": 0.1}), ("input_lag", {"time_constant": 0.1}))):
-        both = insert(both, AppliedEffect(registry().get("effects", name), "force", p), place)
-    delay, lag = values_of(fitted(given, evaluate(given, model), both).model, (Slot(0, "delay"), Slot(1, "time_constant")))
+    data = from_streams(replace(model, effects=()), [(Stream(0.1 * np.arange(401), y), Stream(0.002 * changes, held[:, None]))], "rows")
+    given = problem(data, steps_of(data))
+    return given, fitted(given, evaluate(given, model), model)
+
+
+def test_a_lag_is_told_right_where_commands_come_within_steps():
+    """On a clock of their own: a change that counts as a mean over a quarter of a step looks like more delay and less lag."""
+    _, fit = _within_steps(input_delay={"delay": 0.094}, input_lag={"time_constant": 0.112})
+    delay, lag = values_of(fit.model, (Slot(0, "delay"), Slot(1, "time_constant")))
     assert delay == pytest.approx(0.094, abs=5e-4)
     assert lag == pytest.approx(0.112, abs=5e-4)
+
+
+def test_an_interval_takes_up_what_is_not_known_of_when_within_a_step_a_command_came():
+    """A ramp begins with the part of a step in which its command comes: the rate looks lower than it is."""
+    given, fit = _within_steps(input_rate_limit={"rate": 9.0})
+    found = intervals(given, fit)
+    low, high = found[Slot(0, "rate")]
+    assert high < 9.0
+    wider = widened(given, fit, dict(found))[Slot(0, "rate")]
+    assert wider[0] == low
+    assert 9.0 < wider[1] < 9.0 + 3.0 * (9.0 - low)
+
+
+def test_no_time_is_known_better_than_rows_that_were_interpolated_say():
+    given, fit = _two((("input_lag", {"time_constant": 0.2}), ("input_gain", {"gain": 0.7})))
+    found = intervals(given, fit)
+    assert widened(given, fit, dict(found)) == found
+    between = replace(given, data=replace(given.data, interpolated=True))
+    (low, high), gain = (widened(between, fit, dict(found))[slot] for slot in fit.free)
+    assert (found[fit.free[0]][0] - low, high - found[fit.free[0]][1]) == pytest.approx((WITHIN * 0.05, WITHIN * 0.05))
+    assert gain == found[fit.free[1]]

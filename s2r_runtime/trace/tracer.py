@@ -33,6 +33,7 @@ from s2r_runtime.trace.excitation import advice
 from s2r_runtime.trace.faults import Checked, check
 from s2r_runtime.trace.fields import Field, beats, wanders
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, problem, told, without
+from s2r_runtime.trace.grid_errors import widened
 from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, NOTHING, Looks, Structure, best_unnamed, explains_more, lack_of_fit, left_of
 from s2r_runtime.trace.lack_of_fit_judged import Judged, Left
@@ -213,7 +214,7 @@ def _result(
         floor = noise_floor(final, judged_on, seed)
     after = before if final is chosen.nominal else after
     gap_before, gap_after, independent = gaps((model, before), (final.model, after), judged_on, weights, kind)
-    ranges = in_either_order(there, near) if final is chosen.fit else {}
+    ranges = widened(there, near, in_either_order(there, near)) if final is chosen.fit else {}
     effects = tuple(_found(model, final, place, ranges) for place in final.added)
     idle = [place for place in final.added if not asked(given, judged_on, final.model, without(final.model, place))]
     rivals = [s.fit for s in chosen.rivals if s.fit is not None] if verdict == "ambiguous" else []

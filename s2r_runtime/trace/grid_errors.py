@@ -1,0 +1,78 @@
+"""What the grid adds to the intervals of numbers: commands that come within steps, and rows that were interpolated.
+
+A command that changes within a part of a step counts as its mean over that part. What an effect makes of it is then off by c h or c h^2, h
+the part's length, and so are numbers: a rate limit that begins its ramp too early looks slow. With parts of 2 h a number p comes out by
+c h (3 c h^2) farther off, so what is left is within  p(h) - p(2 h),  and lies that way (L. F. Richardson, Phil. Trans. A 210, 1911). Where
+inputs push masses, a step takes their mean over all of it; what steps in parts say instead is added in the same way. Both to first order:
+
+    p(other) - p = -(J^T W J)^-1 J^T W (z_other - z)        z: whitened residuals on the other grid and on this one
+
+Between rows that were interpolated nothing is known of when within WITHIN of a step something acted: no time is known better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.models.forces import axes
+from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.dataset import Dataset, Run
+from s2r_runtime.trace.fitting import Fit, Problem, objective, sensitivities
+from s2r_runtime.trace.selection import WITHIN
+from s2r_runtime.trace.slots import Slot, bounds_of
+
+Array = NDArray[np.float64]
+Ranges = dict[Slot, tuple[float, float]]
+
+
+def widened(given: Problem, fit: Fit, found: Ranges) -> Ranges:
+    """Intervals (low, high) with what the grid adds."""
+    for shift in _shifts(given, fit):
+        for slot, by in zip(fit.free, shift.tolist(), strict=True):
+            low, high = found[slot]
+            found[slot] = min(low, low + by), max(high, high + by)
+    for slot in fit.free if given.data.interpolated else ():
+        bounds, (low, high) = bounds_of(fit.model, slot), found[slot]
+        if bounds.unit == "s":
+            found[slot] = max(low - WITHIN * given.data.dt, bounds.low), min(high + WITHIN * given.data.dt, bounds.high)
+    return found
+
+
+def _shifts(given: Problem, fit: Fit) -> list[Array]:
+    """(k,) each, by which numbers would move on a finer grid of commands, and with steps in parts."""
+    if not fit.free or given.data.in_parts or not _within_steps(given.data):
+        return []
+    coarse = replace(given, data=_coarser(given.data))
+    fine, rough = (objective(there, fit, fit.model) for there in (given, coarse))
+    w = noises.weight(fine)
+    j = sensitivities(given, fit, fit.model, fit.free)
+    inverse = np.linalg.pinv(j.T @ (j * w.ravel()[:, None]), rcond=1e-12, hermitian=True)
+
+    def moves(apart: Array) -> Array:
+        return np.asarray(-inverse @ (j.T @ (w * apart).ravel()))
+
+    found = [moves(fine - rough)]
+    if axes(fit.model.nominal):
+        parts = replace(coarse, data=replace(coarse.data, in_parts=True))
+        found.append(moves(objective(parts, fit, fit.model) - rough))
+    return found
+
+
+def _within_steps(data: Dataset) -> bool:
+    """Whether commands change within steps, on a grid that can be made coarser by half."""
+    return data.substeps % 2 == 0 and any(np.any(run.u[::2] != run.u[1::2]) for run in data.runs)
+
+
+def _coarser(data: Dataset) -> Dataset:
+    """The same with inputs as means over two parts."""
+    runs = tuple(_in_pairs(run, data.substeps) for run in data.runs)
+    return replace(data, runs=runs, substeps=data.substeps // 2)
+
+
+def _in_pairs(run: Run, substeps: int) -> Run:
+    u = run.u.reshape(-1, substeps, run.u.shape[1])
+    last = np.append((u[:-1, -2] != u[:-1, -1]) & (u[:-1, -1] == u[1:, 0]), np.zeros((1, u.shape[2]), dtype=bool), axis=0)
+    return replace(run, u=run.u.reshape(-1, 2, run.u.shape[1]).mean(axis=1), turned=last if run.turned is None else last | run.turned)
