@@ -16,7 +16,7 @@ from s2r_runtime.trace.orders import in_either_order
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.residual_noise import Colour, no_colour, no_steadier
 from s2r_runtime.trace.retimed import retimed
-from s2r_runtime.trace.selection import WITHIN
+from s2r_runtime.trace.selection import WITHIN, _beyond_rounding
 from s2r_runtime.trace.slots import Slot, values_of
 from s2r_runtime.trace.streams import Stream
 
@@ -195,3 +195,21 @@ def test_no_time_is_known_better_than_rows_that_were_interpolated_say():
     (low, high), gain = (widened(between, fit, dict(found))[slot] for slot in fit.free)
     assert (found[fit.free[0]][0] - low, high - found[fit.free[0]][1]) == pytest.approx((WITHIN * 0.05, WITHIN * 0.05))
     assert gain == found[fit.free[1]]
+
+
+@pytest.mark.parametrize(
+    ("offset", "step", "speeds", "believed"),
+    [(-0.03, 0.24, 5, False), (-0.2, 0.24, 5, True), (-0.03, 0.0, 5, True), (-0.06, 0.24, 300, True), (-0.01, 0.24, 300, False)],
+)
+def test_an_offset_of_a_sensor_that_its_rounding_may_be_is_none(offset, step, speeds, believed):
+    """One value in steps of 0.24 m/s is off by up to 0.12 m/s; the mean of many different ones is known better."""
+    model = compose(ModelSpec("bicycle", 0.04, {"wheel_base": 0.48}))
+    speed = np.tile(np.linspace(0.1, 0.24 * min(speeds, 60), speeds), 600 // speeds)
+    rough = speed + np.random.default_rng(0).normal(size=len(speed)) * 1e-3
+    y = np.column_stack([0.04 * np.cumsum(speed), 0.0 * speed, 0.0 * speed, np.round(speed / step) * step if step else rough])
+    data = from_arrays(model, [(y, np.column_stack([0.0 * speed, speed])[:-1])])
+    given = problem(data, steps_of(data))
+    offsets = AppliedEffect(registry().get("effects", "sensor_offset"), "speed", {"offset": offset})
+    base, fit = (evaluate(given, m) for m in (model, insert(model, offsets, 0)))
+    assert _beyond_rounding(given, fit, base) == believed
+    assert _beyond_rounding(given, fit, fit)  # what was there before is not asked again

@@ -173,6 +173,7 @@ def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int, bar:
         limited(fit)
         and significant(given, fit, base, tried, bar, ahead)
         and _told_by_stamps(given, fit, base)
+        and _beyond_rounding(given, fit, base)
         and _happens(given, fit)
         and relevant(given, fit, base, horizon)
     )
@@ -191,6 +192,23 @@ def _told_by_stamps(given: Problem, fit: Fit, base: Fit) -> bool:
         if name_of(fit.model.effects[slot.place]) not in there
     ]
     return all(p.unit != "s" or p.neutral != 0.0 or value > WITHIN * data.dt for p, value in new)
+
+
+def _beyond_rounding(given: Problem, fit: Fit, base: Fit) -> bool:
+    """False for an offset of a sensor that its rounding may be. In steps of q one value is off by up to q / 2, always by the same; n values
+    alike often by q / sqrt(12 n) on average, and hardly ever by q / sqrt(n).
+    """
+    there = names(base.model)
+    for a in (fit.model.effects[place] for place in fit.added):
+        if a.effect.stage != "sensor" or a.channel not in fit.model.states or name_of(a) in there:
+            continue
+        j = fit.model.states.index(a.channel)
+        q = noises.quantum(given.steps.y0[:, j], given.steps.y1[:, j])
+        if q > 0.0:
+            share = np.unique(np.rint(given.steps.y0[:, j] / q), return_counts=True)[1] / len(given.steps)
+            if max(map(abs, a.p.values())) < q * min(0.5, float(np.sqrt(np.sum(share**2)))):
+                return False
+    return True
 
 
 def _happens(given: Problem, fit: Fit) -> bool:
