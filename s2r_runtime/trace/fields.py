@@ -319,12 +319,19 @@ def _marginal(left: Left, x: Array, passes: int) -> tuple[float, Array]:
             if again:
                 whiten = Whitener(noises.estimate(rest, left.f, joined, left.given.floor), left.f, joined)
             z = whiten(rest)
-            nats = _under_any_law(z, whiten, left) - price
+            less = 1.0 if again else _less(left, z)
+            nats = _under_any_law(z / less, whiten, left) - price - len(z) * float(np.sum(np.log(less)))
             if nats > best:
                 best, told = nats, beta
         if best < before + SETTLED:
             break
     return best, told
+
+
+def _less(left: Left, z: Array) -> Array:
+    """(nx,) times the noise of the model that what is left, whitened by it to z, still has: estimated noise in short."""
+    least = left.given.floor.one_step(left.f) / left.fit.noise.one_step(left.f)
+    return np.asarray(np.clip(np.sqrt(np.mean(np.clip(z, -4.0, 4.0) ** 2, axis=0)), np.minimum(least, 1.0), 1.0))
 
 
 def _under_any_law(z: Array, whiten: Whitener, left: Left) -> float:

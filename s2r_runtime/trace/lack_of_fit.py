@@ -82,6 +82,9 @@ TOKENS = {"wave": "time"}
 MOST_GROUPS = 3
 """Groups that are named at most."""
 
+VANISHING = 1e-24
+"""Mean square of a term that is none."""
+
 COLOURED = 0.2
 """Autoregression coefficient from which noise is called coloured."""
 
@@ -193,7 +196,7 @@ def explains_more(looks: Looks, unnamed: Judged, fit: Fit, horizon: int, *, left
     """
     given, nominal = looks.left.given, looks.left.fit
     changed = looks.left.r - residual(fit.model, given.steps, acting(fit.model, given.data))
-    x = _columns([changed])
+    x = _columns([changed], np.ones(changed.shape[1]))
     mine = max(explained(fit, nominal), judge(looks.left, "", x).gain if x.shape[2] else 0.0)
     if unnamed.gain <= MORE * mine + ALIKE * (1.0 if left else 3.0):
         return False
@@ -215,9 +218,10 @@ def left_of(given: Problem, fit: Fit) -> Left:
 
 def dictionaries_of(left: Left) -> list[tuple[str, Array]]:
     """Those for what a model leaves; terms that vanish are dropped."""
-    model = left.fit.model
-    offered = dictionaries(left.given, model, acting(model, left.given.data), left.fit.noise, left.r)
-    return [(token, x) for token, terms in offered if (x := _columns(terms)).shape[2]]
+    given, fit = left.given, left.fit
+    spread = np.ones(left.r.shape[1]) if given.floor.axes else fit.noise.one_step(left.f)
+    offered = dictionaries(given, fit.model, acting(fit.model, given.data), fit.noise, left.r)
+    return [(token, x) for token, terms in offered if (x := _columns(terms, spread)).shape[2]]
 
 
 def _clipped(z: Array) -> Array:
@@ -226,13 +230,16 @@ def _clipped(z: Array) -> Array:
     return np.asarray(cut / np.maximum(np.sqrt(np.mean(cut**2, axis=0)), 1.0))
 
 
-def _columns(terms: Sequence[Array]) -> Array:
-    """Terms (n, nx) side by side on a scale of 1, (n, nx, m); those that vanish are dropped."""
+def _columns(terms: Sequence[Array], spread: Array) -> Array:
+    """Terms (n, nx) side by side, (n, nx, m), each as large as the noise (nx,) of the states that it pushes; those that vanish are dropped.
+    A ridge is the same for all: on any other scale it lets nothing push a state that is noisier than others.
+    """
     table = np.array(terms)  # a column after the other in memory: whitening and products run along columns
-    size = np.sqrt(np.einsum("mki,mki->m", table, table) / table[0].size)
-    if np.any(size <= 1e-12):
-        table, size = table[size > 1e-12], size[size > 1e-12]
-    table /= size[:, None, None]
+    size = np.einsum("mki,mki->mi", table, table) / table[0].size
+    there = np.sum(size, axis=1) > VANISHING
+    if not np.all(there):
+        table, size = table[there], size[there]
+    table /= np.sqrt(size @ spread**-2.0)[:, None, None]
     return np.asarray(table.transpose(1, 2, 0))
 
 
