@@ -1,11 +1,14 @@
 """The tracer on measured recordings: MRCLAM (an iRobot Create, commands and Vicon poses on stamps of their own), EMPS (an arm's
-prismatic joint, force and position only), F1TENTH (a car, 41 runs) and an ArduPilot rover in its simulator.
+prismatic joint, force and position only), F1TENTH (a car, 41 runs), a Clearpath Husky (skid steer, 603 windows) and an ArduPilot rover
+in its simulator.
 
 K. Leung et al., The UTIAS multi-robot cooperative localization and mapping dataset, IJRR 30(8), 2011. A. Janot, M. Gautier, M. Brunot,
 Data set and reference models of EMPS, 2019. N. Kochdumper, S. Bak, Conformant synthesis for Koopman operator linearized control
-systems, 2022. The data are not part of this project: the tests run where S2R_DATA, or a folder beside the repository, holds them.
+systems, 2022. D. Baril et al., DRIVE: data-driven robot input vector exploration, ICRA 2024. The data are not part of this project: the tests run where S2R_DATA, or a folder beside the repository, holds them.
 """
 
+import csv
+import gzip
 import os
 from pathlib import Path
 
@@ -67,6 +70,32 @@ def test_a_real_car_is_foretold_three_seconds_ahead():
     assert values["input_delay", "steer_cmd"]["delay"] == pytest.approx(0.10, abs=0.02)
     after = found.to_json()["error"]["after"]["rollout_rms"]
     assert (after["x"] ** 2 + after["y"] ** 2) ** 0.5 < 0.036
+
+
+def _wheels(source, to, held_out):
+    """The windows of every third 6 s step, or those of the others, with the wheels' measured speeds for inputs."""
+    with gzip.open(source, "rt") as read, to.open("w") as write:
+        out = csv.writer(write)
+        out.writerow(["segment", "t", "x", "y", "theta", "cmd_left", "cmd_right"])
+        for row in csv.DictReader(read):
+            if (int(row["segment"]) // 3 % 3 == 2) == held_out:
+                out.writerow([row[name] for name in ("segment", "t", "x", "y", "theta", "wheel_left", "wheel_right")])
+    return to
+
+
+@pytest.mark.skipif(not (FOLDER / "husky_drive.csv.gz").exists(), reason="the measured recordings are not here")
+@pytest.mark.long
+def test_what_a_skid_steer_robot_slips_is_found_from_its_wheels(tmp_path):
+    """By others, every third step held out, rms after 2 s: position 0.554 to 0.261 m, heading 1.51 to 0.24 rad; yaw gain 0.38, forward 0.80."""
+    model = compose(ModelSpec("differential_drive", 0.05, {"wheel_radius": 0.165, "track": 0.55}))
+    files = [_wheels(FOLDER / "husky_drive.csv.gz", tmp_path / f"{held_out}.csv", held_out) for held_out in (False, True)]
+    found = trace(load_dataset(files[0], model), model, test=load_dataset(files[1], model), horizon=2.0)
+    values = {e.name: {name: value[0] for name, value in e.parameters.items()} for e in found.effects}
+    assert values["track_scale"]["gain"] == pytest.approx(0.38, abs=0.03)
+    assert values["longitudinal_slip"]["ratio"] == pytest.approx(0.20, abs=0.03)
+    after = found.to_json()["error"]["after"]["rollout_rms"]
+    assert (after["x"] ** 2 + after["y"] ** 2) ** 0.5 < 0.261
+    assert after["theta"] < 0.245
 
 
 @pytest.mark.skipif(not (FOLDER / "rover_sitl.tlog.gz").exists(), reason="the measured recordings are not here")

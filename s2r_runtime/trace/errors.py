@@ -180,7 +180,8 @@ def _coloured_ends(fit: Fit, given: Held, act: Acting, starts: Index, y: Array, 
     """
     model, (q, s) = fit.model, (np.sqrt(fit.noise.q), np.sqrt(fit.noise.r))
     law, e, x = Past(fit.colour, y.shape), s * rng.normal(size=y.shape), y
-    settle = SETTLE if fit.colour.slow.size else SETTLE // 10
+    before = max(len(run.y) for run in given.data.runs) - 1 - given.horizon  # what lasts longer than a run was not seen, nor its law
+    settle = min(SETTLE if fit.colour.slow.size else SETTLE // 10, max(before, 0))
     for k in range(settle + given.horizon):
         late = s * rng.normal(size=y.shape)
         push = q * rng.normal(size=y.shape) + late
