@@ -74,6 +74,28 @@ def test_a_push_that_wanders_slowly_is_no_episode(seed):
     assert episodes(left_of(given, evaluate(given, model))) is None
 
 
+def test_commands_that_are_lost_for_a_while_are_no_matter_of_another_input():
+    """Six times a car's speed is nothing for six steps. These are wild, as it is measured well."""
+    rng = np.random.default_rng(6)
+    steps = 1500
+    t = 0.033 * np.arange(steps)
+    u = np.column_stack([0.4 * np.sin(0.8 * t) * np.cos(0.23 * t), 0.7 + 0.5 * np.sin(0.5 * t + 1.0)])
+    model = compose(ModelSpec("bicycle", 0.033, {"wheel_base": 0.5}, ()))
+    robot = u.copy()
+    for begin in (100, 340, 610, 800, 1130, 1380):
+        robot[begin : begin + 6, 1] = 0.0
+    x, hidden = np.zeros((1, 4)), model.at_rest(1)
+    rows = [x[0]]
+    for k in range(steps):
+        x, hidden = model.step(x, robot[k : k + 1], hidden)
+        rows.append(x[0])
+    wild = rng.random((steps + 1, 4)) < 0.01
+    y = np.array(rows) + rng.normal(size=(steps + 1, 4)) * [0.002, 0.002, 0.002, 0.001] * np.where(wild, 15.0, 1.0)
+    result = trace(from_arrays(model, [(y, u)]), model)
+    assert result.verdict in {"unexplained", "sensor_fault"}
+    assert result.depends_on[:1] in {("time*speed_cmd",), ("speed_cmd",), ("time",), ()}
+
+
 def test_commands_that_are_carried_out_in_steps_are_no_limit():
     """The largest command is cut to the last step: a saturation explains that, and nothing else of it."""
     rng = np.random.default_rng(5)

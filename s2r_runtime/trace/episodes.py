@@ -6,10 +6,11 @@ from other times (`lack_of_fit_judged`) cannot. So windows [a, b) are looked for
 
     r = sum_w beta_w 1[a_w <= k < b_w] d_w + noise          d: a push in some direction, or what an input pushes
 
-and count if the log likelihood, noise and colour re-estimated, is beyond that of coloured noise alone by the price of having looked
-everywhere, log(windows x directions) + 1/2 log n for each (the price of a change at an unknown time: N. Zhang, D. Siegmund, Biometrics
-63, 2007), and by BEYOND, and beyond the evidence for a push in the same directions that wanders: waves of all lengths, their
-amplitudes falling as their frequency grows, as an Ornstein-Uhlenbeck process has them.
+or all those together in which values stay wild, with one beta (commands that are lost now and then: `_lost`). They count if the log
+likelihood, noise and colour re-estimated, is beyond that of coloured noise alone by the price of having looked everywhere,
+log(windows x directions) + 1/2 log n for each (the price of a change at an unknown time: N. Zhang, D. Siegmund, Biometrics 63, 2007), and
+by BEYOND, and beyond the evidence for a push in the same directions that wanders: waves of all lengths, their amplitudes falling as their
+frequency grows, as an Ornstein-Uhlenbeck process has them.
 """
 
 from __future__ import annotations
@@ -58,30 +59,62 @@ LOOKS_LIKE = 0.9
 
 def episodes(left: Left) -> Judged | None:
     """The windows of what a model leaves; None if noise may have made them."""
-    given, fit, r = left.given, left.fit, left.r
-    pushes = pushes_by_token(given, fit.model, acting(fit.model, given.data))
-    n, joined = len(given.steps), given.steps.joined
+    fit = left.fit
+    pushes = pushes_by_token(left.given, fit.model, acting(fit.model, left.given.data))
+    n = len(left.given.steps)
     price = math.log(0.5 * n**2 * max(len(pushes), 1)) + 0.5 * math.log(n)
     bare = max(fit.coloured, fit.white)
     best: Judged | None = None
+    lost = _lost(left, pushes)
+    if lost:
+        best, _, _ = _better(left, fit.whiten, lost, bare + price * max(lost[0][2], len(lost)), None)
     found: list[Window] = []
-    whiten, rest = fit.whiten, r
+    whiten, rest = fit.whiten, left.r
     while pushes and len(found) < MOST:
         found.append(_window(whiten, rest, pushes))
         if found[-1][2] < price:
             break
-        x = np.stack([term for _, term, _ in found], axis=2)
-        for _ in range(2):  # less noise is left than was thought
-            betas = _solved(whiten(x), whiten(r))
-            rest = r - x @ betas
-            whiten = Whitener(noises.estimate(rest, left.f, joined, given.floor), left.f, joined)
-        gain = _coloured(whiten, whiten(rest), joined) - bare - price * len(found)
-        if gain > (BEYOND if best is None else best.gain):
-            best = Judged(found[0][0], x, gain, 1.0, np.tile(betas, (BLOCKS, 1)))
+        best, rest, whiten = _better(left, whiten, found, bare + price * len(found), best)
     if best is None:
         return None
-    used = [push for token, push in pushes if token in {t for t, _, _ in found}]
+    used = [push for token, push in pushes if token in {best.token, *(t for t, _, _ in found)}]
     return best if best.gain > max(_wandering(left, used), 0.0) + BEYOND else None
+
+
+def _better(left: Left, whiten: Whitener, found: list[Window], least: float, best: Judged | None) -> tuple[Judged | None, Array, Whitener]:
+    """These windows if they are beyond `least`, and better than the best so far; what they leave, and a whitener of that."""
+    joined, x = left.given.steps.joined, np.stack([term for _, term, _ in found], axis=2)
+    for _ in range(2):  # less noise is left than was thought
+        betas = _solved(whiten(x), whiten(left.r))
+        rest = left.r - x @ betas
+        whiten = Whitener(noises.estimate(rest, left.f, joined, left.given.floor), left.f, joined)
+    gain = _coloured(whiten, whiten(rest), joined) - least
+    if gain > (BEYOND if best is None else best.gain):
+        best = Judged(_most_of(found, whiten(x) * betas), x, gain, 1.0, np.tile(betas, (BLOCKS, 1)))
+    return best, rest, whiten
+
+
+def _lost(left: Left, pushes: list[tuple[str, Array]]) -> list[Window]:
+    """(token, (n, nx) push, how many) where some state is wild for SHORTEST steps on end, the same share of a push wherever that is:
+    commands that are lost now and then. A measurement that is off is wild for two steps. (Whitened, all that follows a jump is wild.)
+    """
+    usual = np.maximum(np.median(np.abs(left.r), axis=0) / 0.6745, left.given.floor.one_step(left.f))
+    wild = np.abs(left.r) > noises.OUTLIER * usual
+    n = len(wild)
+    begun = np.any(np.all([wild[k : n - SHORTEST + 1 + k] for k in range(SHORTEST)], axis=0), axis=1)
+    inside: Mask = np.zeros(n, dtype=bool)
+    for k in range(SHORTEST):
+        inside[k : n - SHORTEST + 1 + k] |= begun
+    count = float(np.count_nonzero(np.diff(inside.astype(int), prepend=0) > 0))
+    windows = [(token, np.where(inside[:, None], push, 0.0), count) for token, push in pushes]
+    return [w for w in windows if np.any(w[1])] if count else []
+
+
+def _most_of(found: list[Window], explained: Array) -> str:
+    """The token whose windows explain most, (n, nx, windows), under the noise that they leave: the first one explained most under more."""
+    size = np.sum(explained**2, axis=(0, 1))
+    total = {token: float(sum(s for s, (t, _, _) in zip(size, found, strict=True) if t == token)) for token, _, _ in found}
+    return max(total, key=lambda token: total[token])
 
 
 def _wandering(left: Left, pushes: list[Array]) -> float:

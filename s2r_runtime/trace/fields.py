@@ -194,8 +194,12 @@ def wanders(nominal: Left, named: Left) -> bool:
 
 def as_noise(left: Left, judged: Judged) -> bool:
     """Whether a push that wanders explains what a dictionary does, and more."""
-    mine = max(bare_nats(left), _marginal(left, judged.x, PASSES)[0])
-    return wandering_nats(left) > mine + ALIKE
+    return wandering_nats(left) > bare_nats(left) + max(nats_of(left, judged), 0.0) + ALIKE
+
+
+def nats_of(left: Left, judged: Judged) -> float:
+    """What a dictionary explains as a field is judged: beyond noise of any colour, by its marginal likelihood, with noise of its own."""
+    return _marginal(left, judged.x, PASSES)[0] - bare_nats(left)
 
 
 def bare_nats(left: Left) -> float:

@@ -8,8 +8,9 @@ rival model: its terms are added to the step,
 and its gain is the log likelihood of what is left, with noise and colour re-estimated for it, less that of the model without it. The
 best group is named, then those that add to it. A group counts only if it is beyond chance, and if the rollouts' errors fall
 with it: structure that nobody would notice is none. Beyond chance: its gain is, the scatter of its scores over blocks of time
-allowed for; or its evidence is out of reach of the same residual slid along the recording. Where no group counts, what happens for a
-while only is looked for (`episodes`). A residual that is only correlated in time, whatever the inputs do, is `noise`.
+allowed for; or its evidence is out of reach of the same residual slid along the recording. Where no group counts, or foretells nothing
+elsewhere and explains less, what happens for a while only is looked for (`episodes`). A residual that is only correlated in time, or
+wanders, whatever the inputs do, is `noise`.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.begun import begun, measured
 from s2r_runtime.trace.episodes import episodes, may_depend_on
 from s2r_runtime.trace.evidence import evidence, margin
-from s2r_runtime.trace.fields import Field, as_noise, field
+from s2r_runtime.trace.fields import Field, as_noise, field, nats_of
 from s2r_runtime.trace.fitting import Fit, Problem
 from s2r_runtime.trace.fitting import gain as explained
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, SLOWLY, Judged, Left, first_look, judge, leading
@@ -118,7 +119,12 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     """Structure left by a model; how much of what `nominal` leaves that is."""
     left, found = looks.left, looks.found
     chosen, gains = _forward(looks) if found else ([], {})
-    coloured = ("noise",) if np.any(left.fit.colour.strength > COLOURED) else ()
+    coloured = ("noise",) if np.any(left.fit.colour.strength > COLOURED) or left.law is not None else ()
+    windows: Judged | None = None
+    if chosen and chosen[-1].gain <= 0.0:  # it was seen by sliding only: that names what it tries
+        windows = _for_a_while(left)
+        if windows is not None and windows.gain > nats_of(left, chosen[-1]):
+            chosen = []
     if chosen:
         matters, share = _weight_of(left, nominal, chosen[-1], horizon)
         if matters and not _wanders(left, chosen[-1]):
@@ -129,11 +135,16 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
         matters, share = _weight_of(left, nominal, varied.judged, horizon)
         if matters:
             return Structure(varied.tokens, True, share, gains, varies=True, noise=_beside(left, varied.judged))
-    windows = episodes(left) if left.given.data.in_order and not chosen else None
+    windows = None if chosen else windows or _for_a_while(left)
     matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
     if windows is None or not matters:
         return Structure(coloured, False, 0.0, gains)
     return Structure(may_depend_on(left, windows, found), True, share, gains, for_a_while=True, noise=_beside(left, windows))
+
+
+def _for_a_while(left: Left) -> Judged | None:
+    """What happens for a while and in no other block of time, if rows are in order."""
+    return episodes(left) if left.given.data.in_order else None
 
 
 def _wanders(left: Left, judged: Judged) -> bool:
