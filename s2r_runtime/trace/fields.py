@@ -72,6 +72,9 @@ FLIPS = 24
 SEEN, LOOKED_AT = 1.0, 8
 """Standard deviations above those from which on a field is looked at, and how many are: the ones that stand out most."""
 
+SURE = 10.0
+"""Those from which on all are: where all have a mean in them that is there, the finest stands out least, and may explain most."""
+
 SETTLED = 0.5
 """Nats that a pass must gain for another one."""
 
@@ -154,8 +157,8 @@ def _looked(left: Left, offered: Iterable[_Offer], bare: float) -> tuple[list[tu
     """(nats at first look, offer), the best first, of those that stand out; and how many were offered."""
     flipped = _flipped(left)
     scored = [(_stands_out(offer, flipped), offer) for offer in offered]
-    best = sorted((pair for pair in scored if pair[0] > SEEN), key=lambda pair: -pair[0])[:LOOKED_AT]
-    looked = [(_marginal(left, offer.x, 1)[0] - bare, offer) for _, offer in best]
+    best = sorted((pair for pair in scored if pair[0] > SEEN), key=lambda pair: -pair[0])
+    looked = [(_marginal(left, offer.x, 1)[0] - bare, offer) for k, (far, offer) in enumerate(best) if k < LOOKED_AT or far > SURE]
     return sorted(looked, key=lambda pair: -pair[0]), len(scored)
 
 
