@@ -1,6 +1,7 @@
 """What the robot does more here and less there: no noise, and no number of an effect; and pushes that wander by themselves, which are."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,10 +9,12 @@ import pytest
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace import fields
+from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.fields import SEEN, field
 from s2r_runtime.trace.fitting import evaluate, problem
-from s2r_runtime.trace.lack_of_fit import left_of
+from s2r_runtime.trace.lack_of_fit import _wanders, left_of
+from s2r_runtime.trace.lack_of_fit_judged import Judged
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.tracer import trace
 
@@ -145,3 +148,37 @@ def test_a_wind_below_the_noise_of_a_step_is_not_nothing():
     y = _driven(rng, u, lambda k, x, v, w: (v + sum(0.006 * math.cos(c - x[2]) for a, b, c in gusts if a <= k < b), w))
     result = trace(*_recording(y, u))
     assert (result.verdict, result.depends_on) == ("none", ("noise",))
+
+
+def _standing_left(rng, pushed, steps=800):
+    """What a unicycle's model leaves of a straight drive that is `pushed` ahead, (steps,) m/s."""
+    u = np.tile([0.3, 0.0], (steps, 1))
+    left_by = _driven(rng, u, lambda k, x, v, w: (v + pushed[k], w))
+    data, model = _recording(left_by, u)
+    given = problem(data, steps_of(data))
+    return left_of(given, evaluate(given, model))
+
+
+def test_what_a_smooth_function_took_away_is_no_law_of_the_noise():
+    """After many bumps were fitted, sums of what is left are smaller than white noise's: that foretells it, and tells nothing."""
+    rng = np.random.default_rng(0)
+    left = _standing_left(rng, np.zeros(800))
+    z = rng.normal(size=(800, 3))
+    when = np.arange(800.0)[:, None]
+    bumps = np.exp(-0.5 * ((when - np.arange(0.0, 800.0, 5.0)) / 4.0) ** 2)
+    rest = z - bumps @ np.linalg.lstsq(bumps, z, rcond=None)[0]
+    white, joined = noises.no_colour(3), left.given.steps.joined
+    whiten = left.fit.whiten
+    usual = max(noises.log_likelihood(rest, whiten, law, joined) for law in (white, noises.colour(rest, joined)))
+    assert fields._under_any_law(rest, whiten, left) < usual + 1.0
+
+
+def test_what_is_slow_in_a_short_drive_and_foretells_little_is_a_push_that_wanders():
+    rng = np.random.default_rng(1)
+    left = _standing_left(rng, 0.1 * np.convolve(rng.normal(size=860), np.hanning(60) / 8.0, "valid")[:800])
+    along = np.linspace(-1.0, 1.0, 800)
+    x = np.zeros((800, 3, 2))
+    x[:, 0] = 0.01 * np.column_stack([along, np.cos(np.pi * along)])
+    little = Judged("position", x, 12.0, 1.0, np.zeros((8, 2)))
+    assert _wanders(left, little, enough=30.0)
+    assert not _wanders(left, replace(little, gain=40.0), enough=30.0)

@@ -342,8 +342,12 @@ def _less(left: Left, z: Array) -> Array:
 
 
 def _under_any_law(z: Array, whiten: Whitener, left: Left) -> float:
-    """Log likelihood of a whitened residual under white noise, or coloured, or such as wanders."""
+    """Log likelihood of a whitened residual under white noise, or coloured, or such as wanders. What a smooth function was fitted to
+    wanders less than white noise does afterwards: that is the fit's own doing, and no law of the noise.
+    """
     joined = left.given.steps.joined
     colour = noises.colour(z, joined)
-    laws = (noises.no_colour(z.shape[1]), colour, noises.wandering(z, joined, colour))
+    law = noises.wandering(z, joined, colour)
+    law = law and noises.no_steadier(law, colour, np.ones(z.shape[1], dtype=bool))
+    laws = (noises.no_colour(z.shape[1]), colour, law)
     return max(noises.log_likelihood(z, whiten, law, joined) for law in laws if law is not None)

@@ -127,7 +127,7 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
             chosen = []
     if chosen:
         matters, share = _weight_of(left, nominal, chosen[-1], horizon)
-        if matters and not _wanders(left, chosen[-1]):
+        if matters and not _wanders(left, chosen[-1], SLOW * math.log(len(looks.found) / ALPHA)):
             tokens = tuple(dict.fromkeys(TOKENS.get(judged.token, judged.token) for judged in chosen))
             return Structure(tokens, True, share, gains, noise=_beside(left, chosen[-1]))
     varied = looks.field
@@ -147,9 +147,11 @@ def _for_a_while(left: Left) -> Judged | None:
     return episodes(left) if left.given.data.in_order else None
 
 
-def _wanders(left: Left, judged: Judged) -> bool:
-    """Whether what only sliding shows, and what foretells nothing elsewhere, is rather a push that wanders: slides know nothing of that."""
-    return judged.gain <= 0.0 and not left.given.floor.axes and as_noise(left, judged)
+def _wanders(left: Left, judged: Judged, enough: float) -> bool:
+    """Whether what foretells fewer than `enough` nats elsewhere (none, if only sliding shows it) is rather a push that wanders: in a short
+    drive places and headings are as slow as time is, and slides know nothing of what wanders.
+    """
+    return judged.gain <= enough and not left.given.floor.axes and as_noise(left, judged)
 
 
 def _beside(left: Left, judged: Judged) -> tuple[Noise, Colour]:
