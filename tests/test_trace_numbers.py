@@ -144,6 +144,12 @@ def test_where_nothing_tells_which_of_two_effects_comes_first_intervals_cover_th
     assert low < 1.5 < high < 1.52
 
 
+def test_a_sine_before_a_gain_is_another_one_than_behind_it():
+    given, fit = _two((("input_gain", {"gain": 1.4}), ("periodic_disturbance", {"frequency": 0.5, "amplitude": 0.2, "phase": 0.3})))
+    low, high = in_either_order(given, fit)[Slot(1, "amplitude")]
+    assert low < 0.2 / 1.4 < 0.2 < high
+
+
 def test_where_the_order_shows_intervals_are_those_of_it():
     given, fit = _two((("input_lag", {"time_constant": 0.2}), ("input_saturation", {"low": -0.4, "high": 0.4})))
     assert in_either_order(given, fit) == intervals(given, fit)

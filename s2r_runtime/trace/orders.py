@@ -11,9 +11,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
 
+import numpy as np
+
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.candidates import commute
-from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain
+from s2r_runtime.trace.fitting import NEXT, Fit, Problem, fitted, foretold, gain, objective
 from s2r_runtime.trace.intervals import intervals
 from s2r_runtime.trace.rivals import CLOSE
 from s2r_runtime.trace.scores import limited
@@ -26,7 +27,7 @@ ROUNDS = 3
 def in_either_order(given: Problem, fit: Fit) -> dict[Slot, tuple[float, float]]:
     """(low, high) of every number that was fitted."""
     found = intervals(given, fit)
-    for i, j, model in _exchanged(fit):
+    for i, j, model in _exchanged(given, fit):
         other = fitted(given, fit, model, ROUNDS)
         if gain(fit, other) > CLOSE or not limited(other):
             continue
@@ -36,11 +37,14 @@ def in_either_order(given: Problem, fit: Fit) -> dict[Slot, tuple[float, float]]
     return found
 
 
-def _exchanged(fit: Fit) -> Iterator[tuple[int, int, ComposedModel]]:
-    """The model with two of the effects that were found in each other's place, where that makes a difference."""
+def _exchanged(given: Problem, fit: Fit) -> Iterator[tuple[int, int, ComposedModel]]:
+    """The model with two of the effects that were found in each other's place, where that makes a difference to what they do."""
     there = fit.model.effects
-    for i, j in combinations([place for place in fit.added if there[place].effect.stage == "input"], 2):
-        if not commute(there[i].effect, there[i].channel, there[j], fit.model):
-            effects = list(there)
-            effects[i], effects[j] = there[j], there[i]
-            yield i, j, replace(fit.model, effects=tuple(effects))
+    places = [place for place in fit.added if there[place].effect.stage == "input"]
+    z = objective(given, fit, fit.model) if len(places) > 1 else fit.z
+    for i, j in combinations(places, 2):
+        effects = list(there)
+        effects[i], effects[j] = there[j], there[i]
+        model = replace(fit.model, effects=tuple(effects))
+        if foretold(given, model) is not None and np.sum((objective(given, fit, model) - z) ** 2) > NEXT:
+            yield i, j, model
