@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from s2r_runtime.models.forces import axes
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.dataset import Dataset, Run
-from s2r_runtime.trace.fitting import Fit, Problem, objective, sensitivities
+from s2r_runtime.trace.fitting import Fit, Problem, foretold, objective, sensitivities
 from s2r_runtime.trace.selection import WITHIN
 from s2r_runtime.trace.slots import Slot, bounds_of
 
@@ -57,7 +57,8 @@ def _shifts(given: Problem, fit: Fit) -> list[Array]:
     found = [moves(fine - rough)]
     if axes(fit.model.nominal):
         parts = replace(coarse, data=replace(coarse.data, in_parts=True))
-        found.append(moves(objective(parts, fit, fit.model) - rough))
+        if foretold(parts, fit.model) is not None:
+            found.append(moves(objective(parts, fit, fit.model) - rough))
     return found
 
 

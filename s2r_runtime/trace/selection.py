@@ -206,7 +206,8 @@ def _beyond_rounding(given: Problem, fit: Fit, base: Fit) -> bool:
         q = noises.quantum(given.steps.y0[:, j], given.steps.y1[:, j])
         if q > 0.0:
             share = np.unique(np.rint(given.steps.y0[:, j] / q), return_counts=True)[1] / len(given.steps)
-            if max(map(abs, a.p.values())) < q * min(0.5, float(np.sqrt(np.sum(share**2)))):
+            sizes = [abs(value) for value in a.p.values() if isinstance(value, float)]
+            if sizes and max(sizes) < q * min(0.5, float(np.sqrt(np.sum(share**2)))):
                 return False
     return True
 
