@@ -7,10 +7,15 @@ import pytest
 from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recordings, wandering
 
 from s2r_runtime.errors import NotEnoughEvidence
+from s2r_runtime.models.composed import AppliedEffect, compose
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import held, judge
+from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
+from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import steps_of
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.tracer import _bent, trace
 from s2r_runtime.trace.verdict import foretells_nothing
 
 STEPS = 700
@@ -185,3 +190,22 @@ def test_a_model_whose_rollouts_end_nowhere_near_is_another_robots_and_not_one_t
         judged = judge(declared(), given)
         assert foretells_nothing(judged, given, NOISE) == nothing
         assert not foretells_nothing(judged, given, 100.0 + NOISE)
+
+
+@pytest.mark.parametrize(("left", "bent"), [({"position": 0.2}, True), ({"position": 0.01}, False), ({"speed": 0.2}, False)])
+def test_what_goes_with_the_position_beside_a_spring_says_that_it_is_none(left, bent):
+    """left: nats of what is left, as a share of what the spring explains."""
+    rng, model = np.random.default_rng(17), compose(ModelSpec("joint", 0.02, {"mass": 0.8}))
+    u = np.repeat(rng.uniform(-4.0, 4.0, (50, 1)), 10, axis=0)
+    x, rows = np.zeros(2), [np.zeros(2)]
+    for push in np.repeat(u[:, 0], 10):
+        x = x + 0.002 * np.array([x[1], (push - 5.0 * x[0] ** 3 - 0.3 * x[1]) / 0.8])
+        rows.append(x)
+    data = from_arrays(model, [(np.array(rows[::10]) + rng.normal(size=(501, 2)) * [1e-4, 2e-3], u)])
+    given = problem(data, steps_of(data))
+    nominal = evaluate(given, model)
+    spring = AppliedEffect(registry().get("effects", "cubic_stiffness"), "q", {"coefficient": 3.0})
+    named = fitted(given, nominal, insert(model, spring, 0))
+    nats = {token: share * gain(named, nominal) for token, share in left.items()}
+    assert gain(named, nominal) > 50.0
+    assert _bent(Structure(tuple(nats), True, 0.03, nats), named, nominal) is bent

@@ -25,6 +25,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.begun import begun
+from s2r_runtime.trace.challenge import MORE as SHAPED
 from s2r_runtime.trace.challenge import Better, best_shape, better_shape
 from s2r_runtime.trace.dataset import Dataset, thinned
 from s2r_runtime.trace.dataset_files import load_dataset
@@ -48,7 +49,7 @@ from s2r_runtime.trace.scores import LENIENT, STRICT, names
 from s2r_runtime.trace.selection import Selection, crowded, select, two_together
 from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.unseen import alike
-from s2r_runtime.trace.verdict import asked, confirmed, final_fit, foretold_too, verdict_of
+from s2r_runtime.trace.verdict import asked, confirmed, curves_of, final_fit, foretold_too, verdict_of
 
 __all__ = ["Dataset", "TraceResult", "load_dataset", "trace", "usual_horizon"]
 
@@ -359,6 +360,8 @@ class _Whole:
         best = fitted(self.given, fit, fit.model, 2)  # what it is compared with is fitted to all of the recording, too
         if (looks.most > ALIKE or found.matters) and self._explained_without(best, found):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
+        if found.matters and _bent(found, best, self.nominal):
+            return replace(found, share=1.0)
         better = better_shape(self.given, best, self._horizon)
         return found if better is None else replace(found, tokens=(better.token,), matters=True, share=1.0, nameless=True)
 
@@ -396,6 +399,14 @@ class _Whole:
     def _shape(self) -> Better | None:
         """The shape that explains most of it."""
         return best_shape(self.given, self.nominal, self._horizon)
+
+
+def _bent(found: Structure, best: Fit, nominal: Fit) -> bool:
+    """Whether what is left goes with the very position or speed that a named effect goes with, by as large a part of what was explained as
+    that by which a shape must be better to win (`challenge`): then it is another curve. A spring is not what gravity does to a link.
+    """
+    left = max((nats for token, nats in found.gains.items() if token in found.tokens and token in curves_of(best)), default=0.0)
+    return left > SHAPED * gain(best, nominal)
 
 
 def _new(fit: Fit, other: Fit) -> list[int]:

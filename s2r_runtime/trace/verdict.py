@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.errors import Held, Judged, better, displacement
 from s2r_runtime.trace.faults import Fault
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, foretold, gain, plainly, problem, without
@@ -218,6 +219,13 @@ def _lengths(e: Array, columns: list[list[int]]) -> Array:
 def final_fit(chosen: Selection, verdict: Verdict) -> Fit:
     """The model that is handed on: with the effects, unless their names were withdrawn."""
     return chosen.nominal if verdict in {"unexplained", "sensor_fault", "none"} else chosen.fit
+
+
+def curves_of(fit: Fit) -> set[str]:
+    """Tokens of the states that what was found goes with: friction with a speed, a spring with a position."""
+    channels = {fit.model.effects[place].channel for place in fit.added if fit.model.effects[place].effect.stage == "step"}
+    tokens = {fit.model.states[j]: name for axis in axes(fit.model.nominal) for j, name in zip(axis, ("position", "speed"), strict=True)}
+    return {tokens[channel] for channel in channels if channel in tokens}
 
 
 def _about(model: ComposedModel, place: int) -> list[str]:
