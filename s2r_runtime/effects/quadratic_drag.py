@@ -14,7 +14,11 @@ from s2r_runtime.hookspecs import NominalModel, Parameter
 from s2r_runtime.models.forces import Axis, Push, mass
 
 SPEEDS = {"m/s", "rad/s"}
-"""Units of inputs that are speeds. An input without a unit, in somebody's own model, may be one."""
+"""Units of inputs that are speeds. An input without a unit, in somebody's own model, may be one: the tracer asks if its name says so."""
+
+NAMES = ("speed", "vel", "omega", "rate")
+LETTERS = {"v", "vx", "vy", "vz", "w"}
+"""Parts of names, and names, of speeds. Nothing drags at a steering angle, a voltage or a valve."""
 
 INPUT_SHARE = 0.1
 RATE = 0.3
@@ -69,8 +73,11 @@ class QuadraticDrag(ForceEffect):
         return replaced(u, model, channel, given - float(p["coefficient"]) * given * np.abs(given))
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
-        """One is enough: the response is linear."""
+        """One is enough: the response is linear. None on an input that nothing says is a speed."""
         if channel in model.inputs:
+            said = channel in getattr(model, "units", {}) or channel in LETTERS or any(part in channel for part in NAMES)
+            if not said:
+                return []
             return [{"coefficient": INPUT_SHARE / size_of(u[:, [model.inputs.index(channel)]])}]
         return [{"coefficient": RATE * mass(model) / usual_speed(u, model, dt)}]
 
