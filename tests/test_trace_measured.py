@@ -87,7 +87,7 @@ def _wheels(source, to, held_out):
 @pytest.mark.skipif(not (FOLDER / "husky_drive.csv.gz").exists(), reason="the measured recordings are not here")
 @pytest.mark.long
 def test_what_a_skid_steer_robot_slips_is_found_from_its_wheels(tmp_path):
-    """By others, every third step held out, after 2 s: position 0.554 to 0.261 m, heading 1.51 to 0.24 rad; gains: yaw 0.38, forward 0.80."""
+    """By others, every third step held out: after 2 s 0.554 to 0.261 m, heading 1.51 to 0.24 rad; gains: yaw 0.38, forward 0.80."""
     model = compose(ModelSpec("differential_drive", 0.05, {"wheel_radius": 0.165, "track": 0.55}))
     files = [_wheels(FOLDER / "husky_drive.csv.gz", tmp_path / f"{held_out}.csv", held_out) for held_out in (False, True)]
     found = trace(load_dataset(files[0], model), model, test=load_dataset(files[1], model), horizon=2.0)
