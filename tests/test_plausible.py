@@ -232,3 +232,16 @@ def test_a_joint_whose_clock_is_late_is_still_found():
     y, u = _driven(name)
     with pytest.raises(RecordingError, match="before the inputs that cause it"):
         check_plausible(_model(name), _data(_model(name), y, u, early=0.4))
+
+
+def test_a_joint_that_friction_holds_from_then_on_has_no_clock_that_runs_away():
+    """Once it is held, forces do nothing, whatever they are: the smallest, wherever it stands, foretells that best."""
+    dt, n, u = 0.01, 800, np.repeat([[-1.69], [-0.62], [-0.94], [-0.07]], 212, axis=0)[:800]
+    robot = compose(ModelSpec("joint", dt, {}, (EffectSpec("coulomb_friction", "qd", {"force": 1.6}),)))
+    x, rows = np.zeros((1, 2)), []
+    for k in range(n):
+        rows.append(x[0])
+        x, _ = robot.step(x, u[k : k + 1], robot.at_rest(1))
+    y, t = np.array(rows) + np.random.default_rng(3).normal(size=(n, 2)) * [2e-4, 3e-3], dt * np.arange(n)
+    model = compose(ModelSpec("joint", dt))
+    check_plausible(model, from_streams(model, [(Stream(t, y), Stream(t, u))], "here.csv"))

@@ -13,6 +13,7 @@ position from its rate.
 Inputs that come after the motion that they cause are on another clock: the model foretells a tenth of a second far better with the inputs
 earlier by some steps than with any delay. Where that lead grows over the recording, the clocks run at different rates. Friction makes a
 mass follow its force sooner than without: where inputs push, what goes with the state at the start is taken out of every error first.
+Where it holds the mass, for a while or from then on, inputs do nothing, and that is compared with, too.
 """
 
 from __future__ import annotations
@@ -387,8 +388,8 @@ def _check_clocks(model: ComposedModel, data: Dataset) -> None:
     size = np.median(np.abs(_errors(model, few, 0, starts, ahead)), axis=0) / 0.6745 + 1e-12
     aside = _pushed_aside(model, few, starts)
 
-    def costs(lead: int) -> list[float]:
-        z = _errors(model, few, lead, starts, ahead) / size
+    def costs(lead: int, of: Dataset = few) -> list[float]:
+        z = _errors(model, of, lead, starts, ahead) / size
         return [float(np.sum(part)) for part in _parts(z if aside is None else _less(z, aside))]
 
     cost = np.array([costs(lead) for lead in leads])
@@ -399,7 +400,9 @@ def _check_clocks(model: ComposedModel, data: Dataset) -> None:
     followed, single = float(np.sum(np.min(cost, axis=0))), float(np.min(total))
     even = max(by_part) > 0 or _evenly(by_part)  # a delay may grow: by the same in every part, it is a clock's
     drifts = abs(by_part[-1] - by_part[0]) >= DRIFTS and steadily and even and followed < DRIFTING * single
-    causal = float(np.min(total[np.array(leads) <= 0]))
+    still = replace(few, runs=tuple(replace(run, u=0.0 * run.u, turned=None) for run in long))
+    held = np.array(costs(0, still))  # friction that holds a robot for a while makes inputs do nothing
+    causal = float(np.min(np.minimum(cost, held).sum(axis=1)[np.array(leads) <= 0]))
     if min(followed if drifts else math.inf, single if best > 0 else math.inf) < AHEAD * causal:
         causal = min(causal, _least_causal(lambda delay: sum(costs(-delay)), min(round(LEAD_S / data.dt), longest // 4), apart))
     if drifts and followed < AHEAD * causal:
