@@ -75,6 +75,9 @@ SEEN, LOOKED_AT = 1.0, 8
 SURE = 10.0
 """Those from which on all are: where all have a mean in them that is there, the finest stands out least, and may explain most."""
 
+DIRECTIONS = 4
+"""Pushes that wander, in some direction and as quickly, that are looked at."""
+
 SETTLED = 0.5
 """Nats that a pass must gain for another one."""
 
@@ -139,7 +142,7 @@ class _Offer:
 def field(left: Left) -> Field | None:
     """The field that explains most of what a model leaves, if it is beyond noise of its own colour."""
     bare = bare_nats(left)
-    looked, tried = _looked(left, _offered(left), bare)
+    looked, tried = _looked(left, _offered(left), bare, LOOKED_AT, SURE)
     kept = [offer for nats, offer in looked if nats > LOOKS][:FITTED]
     if not kept:
         return None
@@ -153,12 +156,14 @@ def field(left: Left) -> Field | None:
     return Field(kept[best].token, also, kept[best].x, beta, nats - bare, beyond)
 
 
-def _looked(left: Left, offered: Iterable[_Offer], bare: float) -> tuple[list[tuple[float, _Offer]], int]:
-    """(nats at first look, offer), the best first, of those that stand out; and how many were offered."""
+def _looked(
+    left: Left, offered: Iterable[_Offer], bare: float, most: int, sure: float = math.inf
+) -> tuple[list[tuple[float, _Offer]], int]:
+    """(nats at first look, offer), the best first, of those that stand out most, or beyond doubt; and how many were offered."""
     flipped = _flipped(left)
     scored = [(_stands_out(offer, flipped), offer) for offer in offered]
     best = sorted((pair for pair in scored if pair[0] > SEEN), key=lambda pair: -pair[0])
-    looked = [(_marginal(left, offer.x, 1)[0] - bare, offer) for k, (far, offer) in enumerate(best) if k < LOOKED_AT or far > SURE]
+    looked = [(_marginal(left, offer.x, 1)[0] - bare, offer) for k, (far, offer) in enumerate(best) if k < most or far > sure]
     return sorted(looked, key=lambda pair: -pair[0]), len(scored)
 
 
@@ -218,7 +223,7 @@ def wandering_nats(left: Left, least: float = 0.0) -> float:
     body, world = directions_of(given, model, acting(model, given.data))
     when = np.arange(len(given.steps), dtype=float)[:, None]
     bare = bare_nats(left)
-    looked, _ = _looked(left, _over("time", when, (*body, *world), (*CELLS, QUICKEST)), bare)
+    looked, _ = _looked(left, _over("time", when, (*body, *world), (*CELLS, QUICKEST)), bare, DIRECTIONS)
     kept = [offer for nats, offer in looked if nats > max(least, LOOKS)][:FITTED]
     return max((_marginal(left, offer.x, PASSES)[0] for offer in kept), default=bare)
 
