@@ -7,7 +7,8 @@ import numpy as np
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.dataset import from_arrays
-from s2r_runtime.trace.holdout import fit_mask
+from s2r_runtime.trace.holdout import fit_mask, part
+from s2r_runtime.trace.tracer import trace
 
 STEPS = 1000
 
@@ -60,3 +61,33 @@ def test_many_rows_are_looked_at_one_way_after_the_other():
     finally:
         tracemalloc.stop()
     assert peak < 100 * len(data.runs[0].u)
+
+
+def test_inputs_are_known_from_the_beginning_of_a_run_and_measurements_where_they_may_be_seen():
+    u = np.random.default_rng(5).normal(size=STEPS)
+    data = _data([u])
+    seen = np.zeros(STEPS, dtype=bool)
+    seen[600:700] = seen[701:800] = True  # one step between the two is held out
+    kept = part(data, ((0, 650),), seen, STEPS)
+    assert [run.u[:, 0].tolist() for run in kept.data.runs] == [u[:800].tolist()]
+    measured = ~np.isnan(kept.data.runs[0].y).any(axis=1)
+    assert np.flatnonzero(measured).tolist() == list(range(600, 801))
+    assert kept.steps.place.tolist() == [k for k in range(600, 800) if k not in {650, 700}]
+
+
+def test_a_play_as_wide_as_its_input_goes_is_found_with_its_width():
+    """Its output moves at the beginning of the drive, and hardly ever again: it never forgets where that was."""
+    rng = np.random.default_rng(6)
+    dt, width = 0.05, 1.1
+    u = np.interp(np.arange(700), np.arange(0, 1200, 20), np.append([0.0, 0.5, 0.2, 1.2, 0.9, 1.3], rng.uniform(0.3, 0.9, 54)))
+    v, x, rows = 0.0, np.zeros(3), [np.zeros(3)]
+    for now in u:
+        v = min(max(v, now - width / 2.0), now + width / 2.0)
+        x = x + dt * np.array([v * np.cos(x[2]), v * np.sin(x[2]), 0.4])
+        rows.append(x)
+    model = compose(ModelSpec("unicycle", dt))
+    y = np.array(rows) + rng.normal(size=(701, 3)) * 0.002
+    found = trace(from_arrays(model, [(y, np.column_stack([u, np.full(700, 0.4)]))]), model)
+    (play,) = [e for e in found.effects if (e.name, e.channel) == ("input_backlash", "v")]
+    low, high = play.parameters["width"][1:3]
+    assert low - 0.02 < width < high + 0.02

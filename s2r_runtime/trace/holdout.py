@@ -3,8 +3,8 @@
 Of one run two stretches are held out, one of them the end (HELD_OUT); of several runs, whole runs drawn by the seed (TEST_SHARE). Where
 the inputs of one side do not reach as far as those of the other, other stretches, or runs, are held out on which they do (TENTHS,
 DRAWS): an end stop that only one side meets would be found and not confirmed, or not found. What the robot did then is not looked at.
-Long recordings are thinned for the fit: blocks of contiguous steps, evenly spread, each with the inputs before it from which
-hidden states settle.
+The inputs of a run are kept from its beginning: a wide play never forgets, and a slow process hardly. Long recordings are thinned for the
+fit: blocks of contiguous steps, evenly spread, each with the inputs before it from which hidden states settle.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ FEWEST_RUNS = 5
 BLOCK = 500
 """Steps of a block when a long recording is thinned."""
 
-SETTLE_S = 3.0
-"""Inputs before a block, s (30 to 600 steps): hidden states have settled then, or nearly."""
+SETTLE_S, SETTLE_STEPS = 3.0, (100, 600)
+"""Inputs before a block, s, and least and most steps: hidden states have settled then, or nearly."""
 
 
 @dataclass(frozen=True)
@@ -128,35 +128,35 @@ def _shorter(u: Array, seen: Mask) -> float:
 
 def part(data: Dataset, left_out: tuple[tuple[int, int], ...], seen: Mask, most: int) -> Part:
     """The part of a dataset with these steps, at most about `most` of them."""
-    begin = first_steps(data)
-    blocks = _blocks(begin, seen, most)
-    settle = int(np.clip(SETTLE_S / data.dt, 30, 600))
     runs: list[Run] = []
     out: list[tuple[int, int]] = []
     known = set(left_out)
-    for run, a, b in blocks:
-        early = max(0, a - settle)
-        given = data.runs[run]
-        y = given.y[early : b + 1].copy()
-        y[: a - early] = np.nan
-        out += [(len(runs), k - early) for k in range(early, b) if (run, k) in known] if known else []
-        lasts = None if given.lasts is None else given.lasts[early:b]
-        turned = None if given.turned is None else given.turned[early:b] & (np.arange(early, b) < b - 1)[:, None]
-        runs.append(Run(float(given.begins(data.dt)[early]), y, given.u[early * data.substeps : b * data.substeps], lasts, turned))
+    for run, early, kept in _kept(data, seen, most):
+        given, end = data.runs[run], kept[-1][1]
+        y = np.full((end + 1 - early, given.y.shape[1]), np.nan)
+        for a, b in kept:
+            y[a - early : b + 1 - early] = given.y[a : b + 1]
+            out += [(len(runs), k - early) for k in range(a, b) if (run, k) in known] if known else []
+        out += [(len(runs), a - 1 - early) for (_, before), (a, _) in pairwise(kept) if a == before + 1]
+        lasts = None if given.lasts is None else given.lasts[early:end]
+        turned = None if given.turned is None else given.turned[early:end] & (np.arange(early, end) < end - 1)[:, None]
+        runs.append(Run(float(given.begins(data.dt)[early]), y, given.u[early * data.substeps : end * data.substeps], lasts, turned))
     made = replace(data, runs=tuple(runs))
     return Part(made, steps_of(made, out), tuple(out))
 
 
-def _blocks(begin: NDArray[np.int64], seen: Mask, most: int) -> list[tuple[int, int, int]]:
-    """(run, first step, step after the last) of what is kept, evenly over what may be seen."""
+def _kept(data: Dataset, seen: Mask, most: int) -> list[tuple[int, int, list[tuple[int, int]]]]:
+    """(run, first step whose inputs are kept, [(first step, step after the last) of what is kept]), evenly over what may be seen."""
+    begin = first_steps(data)
     stretches = []
     for run, (a, b) in enumerate(pairwise(begin.tolist())):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], seen[a:b].astype(np.int8), [0]])))
-        stretches += [(run, int(p), int(q)) for p, q in zip(edges[::2], edges[1::2], strict=True)]
-    total = sum(q - p for _, p, q in stretches)
+        stretches.append((run, [(int(p), int(q)) for p, q in zip(edges[::2], edges[1::2], strict=True)]))
+    total = sum(q - p for _, kept in stretches for p, q in kept)
     if total <= most * 1.2:
-        return stretches
-    pieces = [(run, k, min(k + BLOCK, q)) for run, p, q in stretches for k in range(p, q, BLOCK)]
+        return [(run, 0, kept) for run, kept in stretches if kept]
+    pieces = [(run, k, min(k + BLOCK, q)) for run, kept in stretches for p, q in kept for k in range(p, q, BLOCK)]
     count = max(1, round(most / (total / len(pieces))))
     chosen = np.unique(np.linspace(0, len(pieces) - 1, count).round().astype(int))
-    return [pieces[i] for i in chosen]
+    settle = int(np.clip(SETTLE_S / data.dt, *SETTLE_STEPS))
+    return [(run, max(0, a - settle), [(a, b)]) for run, a, b in (pieces[i] for i in chosen)]
