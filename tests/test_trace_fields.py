@@ -112,6 +112,15 @@ def test_a_push_that_wanders_is_no_field(memory):
     assert (result.verdict, result.depends_on) == ("none", ("noise",))
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_sensors_that_are_steadier_than_a_model_is_believed_to_be_are_no_noise_that_wanders(seed):
+    """White noise on a robot that does what it is told: process noise is never below its floor, and sums of what is left are small."""
+    rng = np.random.default_rng(seed)
+    u = _held(rng, 1300, [-0.5, -1.5], [0.5, 1.5])
+    result = trace(*_recording(_driven(rng, u, lambda k, x, v, w: (v, w)), u))
+    assert (result.verdict, result.depends_on) == ("none", ())
+
+
 def test_only_fields_that_stand_out_are_looked_at(monkeypatch):
     """The score test lets a field through that is there; of those by chance, a share of noise above SEEN = 1 standard deviation: less than
     half of them, whatever the tails (Cantelli: 1 / (1 + SEEN^2)).

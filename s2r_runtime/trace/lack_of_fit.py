@@ -119,7 +119,8 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     """Structure left by a model; how much of what `nominal` leaves that is."""
     left, found = looks.left, looks.found
     chosen, gains = _forward(looks) if found else ([], {})
-    coloured = ("noise",) if np.any(left.fit.colour.strength > COLOURED) or left.law is not None else ()
+    wanders = left.law is not None and np.any(left.law.slow.sum(axis=1) > 0.0)  # else what is left is steadier than white noise
+    coloured = ("noise",) if np.any(left.fit.colour.strength > COLOURED) or wanders else ()
     windows: Judged | None = None
     if chosen and chosen[-1].gain <= 0.0:  # it was seen by sliding only: that names what it tries
         windows = _for_a_while(left)
