@@ -6,6 +6,7 @@ import pytest
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.trace import plausible
 from s2r_runtime.trace.dataset import Stream, from_streams
 from s2r_runtime.trace.plausible import check_plausible
 
@@ -134,3 +135,41 @@ def test_a_light_joint_is_not_in_degrees(gain):
     _check(model, np.array(rows), np.array(forces))
     with pytest.raises(RecordingError, match=r"q and qd seem to be 57.3 times what the model takes them for"):
         _check(model, np.degrees(rows), gain * np.array(forces))
+
+
+def test_a_model_that_needs_some_input_is_not_asked_what_none_does(tmp_path):
+    path = tmp_path / "own.py"
+    path.write_text('STATES, INPUTS, PARAMS = ("q",), ("fan",), {}\n\n\ndef step(x, u, dt, params):\n    return x + dt * (1.0 / u - x)\n')
+    model, rng = compose(ModelSpec(str(path), 0.1)), np.random.default_rng(0)
+    u = np.repeat(rng.uniform(0.5, 3.0, (50, 1)), 10, axis=0)
+    rows = [np.ones(1)]
+    for given in u[:-1]:
+        rows.append(rows[-1] + 0.1 * (1.0 / given - rows[-1]))
+    _check(model, np.array(rows) + rng.normal(size=(500, 1)) * 1e-3, u)
+
+
+def _short_runs(rate_in):
+    """Of a joint, 0.24 s each, and its model."""
+    model, rng, segments = compose(ModelSpec("joint", 0.002)), np.random.default_rng(0), []
+    for run in range(30):
+        u = np.repeat(rng.uniform(-30.0, 30.0, (4, 1)), 30, axis=0)
+        x, rows = rng.normal(size=(1, 2)) * [0.1, 3.0], []
+        for k in range(len(u)):
+            rows.append(x[0])
+            x, _ = model.step(x, u[k : k + 1], model.at_rest(1))
+        t = 100.0 * run + 0.002 * np.arange(len(u))
+        segments.append((Stream(t, (np.array(rows) + rng.normal(size=(len(u), 2)) * [1e-5, 1e-3]) * [1.0, rate_in]), Stream(t, u)))
+    return model, from_streams(model, segments, "here.csv")
+
+
+def test_a_rate_in_another_unit_is_told_where_runs_are_shorter_than_half_a_second():
+    check_plausible(*_short_runs(1.0))
+    with pytest.raises(RecordingError, match="qd seems to be in mm/s"):
+        check_plausible(*_short_runs(1000.0))
+
+
+def test_a_mistake_and_what_else_it_may_be_are_compared_on_the_same_rows(monkeypatch):
+    model, data = _short_runs(1.0)
+    monkeypatch.setattr(plausible, "ROWS", 60)
+    few = plausible._few(model, data)
+    assert {len(run.y) for run in few.runs} == {len(states.t) for states, _ in few.segments} == {60}

@@ -126,13 +126,13 @@ def _check_columns(model: ComposedModel, data: Dataset) -> None:
     every = _foretold(model, data)
     if every is None or not data.segments or (np.mean(every) <= NOTHING and np.max(every) <= NOTHING_ALONE):
         return
-    few = _few(data)
+    few = _few(model, data)
     tried = [(e, m) for m in _mistakes(model) if (e := _if_taken_back(model, few, m)) is not None and _moves_as_well(model, few, m)]
     otherwise = _otherwise(model, few)
     for measure, nothing in ((np.mean, NOTHING), (np.max, NOTHING_ALONE)):
         as_it_is = float(measure(every))
         best, said = min([(float(measure(e)), m.said) for e, m in tried if measure(e) < m.well], default=(math.inf, ""))
-        if as_it_is > nothing and best < min(BETTER * as_it_is, *(DEAD * float(measure(e)) for e in otherwise)):
+        if as_it_is > nothing and best < min([BETTER * as_it_is, *(DEAD * float(measure(e)) for e in otherwise)]):
             raise RecordingError(f"{data.source}: {said}: so read, the model errs by {best:.0%} of the motion; as it is, by {as_it_is:.0%}")
 
 
@@ -141,7 +141,7 @@ def _check_scales(model: ComposedModel, data: Dataset) -> None:
     every = _foretold(model, data)
     if every is None or not data.segments or (np.mean(every) <= NOTHING and np.max(every) <= NOTHING_ALONE):
         return
-    few, every_input = _few(data), list(range(len(model.inputs)))
+    few, every_input = _few(model, data), list(range(len(model.inputs)))
     still = DEAD * min(_err(model, few, inputs=partial(_scaled, some, 0.0)) for some in (every_input, *([j] for j in every_input)))
     pushed = DEAD * min((float(np.mean(e)) for e in _otherwise(model, few)[-1:]), default=math.inf)
     limit = min(WELL, BETTER * float(np.mean(every)), still)
@@ -206,12 +206,12 @@ def _goes_as_told(model: ComposedModel, data: Dataset) -> bool:
     return found is not None and float(np.mean(found)) < WELL
 
 
-def _few(data: Dataset) -> Dataset:
-    """The beginning of each segment, of many every so many."""
+def _few(model: ComposedModel, data: Dataset) -> Dataset:
+    """The beginning of each segment, of many every so many, and runs of these."""
     some = [pair for pair in data.segments if len(pair[0].t) > 1]
     every = max(1, len(some) // SEGMENTS)
     cut = tuple((Stream(s.t[:ROWS], s.values[:ROWS]), _until(i, s.t[:ROWS])) for s, i in some[::every])
-    return replace(data, segments=cut)
+    return regridded(replace(data, segments=cut), model)
 
 
 def _until(inputs: Stream, t: Array) -> Stream:
@@ -240,7 +240,7 @@ def _foretold(model: ComposedModel, data: Dataset, among: list[int] | None = Non
     """The share that E is the mean of, of each state (or of these) that goes somewhere; None where nothing goes anywhere. pushed: less a
     steady push on each state.
     """
-    ahead = int(np.clip(round(HORIZON_S / data.dt), 1, 50)) if data.dt < HORIZON_S else SLOW_STEPS
+    ahead = _ahead(data)
     starts = rollout_starts(data, ahead)
     starts = starts[:: max(1, len(starts) // STARTS)]
     if len(starts) < 20:
@@ -258,6 +258,11 @@ def _foretold(model: ComposedModel, data: Dataset, among: list[int] | None = Non
     if among is not None:
         goes &= np.isin(np.arange(len(goes)), among)
     return np.minimum(error[goes] / gone[goes], 2.0) if goes.any() else None
+
+
+def _ahead(data: Dataset) -> int:
+    """Steps of the rollouts."""
+    return int(np.clip(round(HORIZON_S / data.dt), 1, 50)) if data.dt < HORIZON_S else SLOW_STEPS
 
 
 def _trimmed(e: Array) -> Array:
@@ -318,8 +323,8 @@ def _moves_as_well(model: ComposedModel, data: Dataset, mistake: _Mistake) -> bo
 
 
 def _unlike(model: ComposedModel, data: Dataset) -> Array:
-    """(axes,) how far positions go otherwise than their rates say in HORIZON_S, over how far they go, at most 2."""
-    ahead = max(1, round(HORIZON_S / data.dt))
+    """(axes,) how far positions go otherwise than their rates say in the steps of a rollout, over how far they go, at most 2."""
+    ahead = _ahead(data)
     found = []
     for axis in axes(model.nominal):
         off, way = [np.zeros(0)], [np.zeros(0)]
@@ -401,7 +406,10 @@ def _check_clocks(model: ComposedModel, data: Dataset) -> None:
     even = max(by_part) > 0 or _evenly(by_part)  # a delay may grow: by the same in every part, it is a clock's
     drifts = abs(by_part[-1] - by_part[0]) >= DRIFTS and steadily and even and followed < DRIFTING * single
     still = replace(few, runs=tuple(replace(run, u=0.0 * run.u, turned=None) for run in long))
-    held = np.array(costs(0, still))  # friction that holds a robot for a while makes inputs do nothing
+    try:
+        held = np.array(costs(0, still))  # friction that holds a robot for a while makes inputs do nothing
+    except ConfigError:  # somebody's own model may need some
+        held = np.full(cost.shape[1], math.inf)
     causal = float(np.min(np.minimum(cost, held).sum(axis=1)[np.array(leads) <= 0]))
     if min(followed if drifts else math.inf, single if best > 0 else math.inf) < AHEAD * causal:
         causal = min(causal, _least_causal(lambda delay: sum(costs(-delay)), min(round(LEAD_S / data.dt), longest // 4), apart))
