@@ -5,9 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from s2r_runtime.effects.step_effect import SensorEffect
+from s2r_runtime.hookspecs import Parameter
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
+from s2r_runtime.trace import grid_errors
 from s2r_runtime.trace.dataset import from_arrays, from_streams
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem, told
 from s2r_runtime.trace.grid_errors import widened
@@ -17,7 +20,7 @@ from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.residual_noise import Colour, no_colour, no_steadier
 from s2r_runtime.trace.retimed import retimed
 from s2r_runtime.trace.selection import WITHIN, _beyond_rounding
-from s2r_runtime.trace.slots import Slot, values_of
+from s2r_runtime.trace.slots import Slot, bounds_of, values_of
 from s2r_runtime.trace.streams import Stream
 
 DRY, VISCOUS = 0.5, 0.4
@@ -193,6 +196,15 @@ def test_an_interval_takes_up_what_is_not_known_of_when_within_a_step_a_command_
     assert 9.0 < wider[1] < 9.0 + 3.0 * (9.0 - low)
 
 
+def test_what_a_grid_adds_stays_within_what_a_number_may_be(monkeypatch):
+    given, fit = _two((("input_lag", {"time_constant": 0.2}), ("input_gain", {"gain": 0.7})))
+    found = intervals(given, fit)
+    monkeypatch.setattr(grid_errors, "_shifts", lambda given, fit: [np.array([-1.0, 1e9])])
+    lag, gain = (widened(given, fit, dict(found))[slot] for slot in fit.free)
+    assert lag == (bounds_of(fit.model, fit.free[0]).low, found[fit.free[0]][1])
+    assert gain == (found[fit.free[1]][0], bounds_of(fit.model, fit.free[1]).high)
+
+
 def test_no_time_is_known_better_than_rows_that_were_interpolated_say():
     given, fit = _two((("input_lag", {"time_constant": 0.2}), ("input_gain", {"gain": 0.7})))
     found = intervals(given, fit)
@@ -209,13 +221,39 @@ def test_no_time_is_known_better_than_rows_that_were_interpolated_say():
 )
 def test_an_offset_of_a_sensor_that_its_rounding_may_be_is_none(offset, step, speeds, believed):
     """One value in steps of 0.24 m/s is off by up to 0.12 m/s; the mean of many different ones is known better."""
-    model = compose(ModelSpec("bicycle", 0.04, {"wheel_base": 0.48}))
-    speed = np.tile(np.linspace(0.1, 0.24 * min(speeds, 60), speeds), 600 // speeds)
-    rough = speed + np.random.default_rng(0).normal(size=len(speed)) * 1e-3
-    y = np.column_stack([0.04 * np.cumsum(speed), 0.0 * speed, 0.0 * speed, np.round(speed / step) * step if step else rough])
-    data = from_arrays(model, [(y, np.column_stack([0.0 * speed, speed])[:-1])])
-    given = problem(data, steps_of(data))
+    given, model = _coarse_speed(step, speeds)
     offsets = AppliedEffect(registry().get("effects", "sensor_offset"), "speed", {"offset": offset})
     base, fit = (evaluate(given, m) for m in (model, insert(model, offsets, 0)))
     assert _beyond_rounding(given, fit, base) == believed
     assert _beyond_rounding(given, fit, fit)  # what was there before is not asked again
+
+
+class _Scale(SensorEffect):
+    """measured = gain * true"""
+
+    name = "sensor_scale"
+    parameters = (Parameter("gain", "", 0.5, 2.0, neutral=1.0),)
+
+    def to_true(self, x, model, channel, p):
+        return self.to_measured(x, model, channel, {"gain": 1.0 / p["gain"]})
+
+    def to_measured(self, x, model, channel, p):
+        after = x.copy()
+        after[:, model.states.index(channel)] *= p["gain"]
+        return after
+
+
+def test_a_sensor_that_reads_too_much_is_not_asked_whether_its_factor_is_below_its_step():
+    given, model = _coarse_speed(3.0, 5)
+    scaled = insert(model, AppliedEffect(_Scale(), "speed", {"gain": 1.2}), 0)
+    assert _beyond_rounding(given, evaluate(given, scaled), evaluate(given, model))
+
+
+def _coarse_speed(step, speeds):
+    """A car that reads its speed in such steps, m/s (0: as it is), and has had so many; its model."""
+    model = compose(ModelSpec("bicycle", 0.04, {"wheel_base": 0.48}))
+    speed = np.tile(np.linspace(0.1, max(step, 0.24) * min(speeds, 60), speeds), 600 // speeds)
+    rough = speed + np.random.default_rng(0).normal(size=len(speed)) * 1e-3
+    y = np.column_stack([0.04 * np.cumsum(speed), 0.0 * speed, 0.0 * speed, np.round(speed / step) * step if step else rough])
+    data = from_arrays(model, [(y, np.column_stack([0.0 * speed, speed])[:-1])])
+    return problem(data, steps_of(data)), model

@@ -32,8 +32,8 @@ def widened(given: Problem, fit: Fit, found: Ranges) -> Ranges:
     """Intervals (low, high) with what the grid adds."""
     for shift in _shifts(given, fit):
         for slot, by in zip(fit.free, shift.tolist(), strict=True):
-            low, high = found[slot]
-            found[slot] = min(low, low + by), max(high, high + by)
+            bounds, (low, high) = bounds_of(fit.model, slot), found[slot]
+            found[slot] = max(min(low, low + by), bounds.low), min(max(high, high + by), bounds.high)
     for slot in fit.free if given.data.interpolated else ():
         bounds, (low, high) = bounds_of(fit.model, slot), found[slot]
         if bounds.unit == "s":

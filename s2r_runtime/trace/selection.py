@@ -47,6 +47,9 @@ RELEVANT = 0.05
 WITHIN = 0.4
 """Of a step: what stamps off the grid can look like."""
 
+SAME = 1e-3
+"""Of the step in which a sensor reads: what moves all values by the same to so much is an offset."""
+
 EDGE = 0.02
 """Share of the steps on either side of a change that makes it one."""
 
@@ -196,7 +199,7 @@ def _told_by_stamps(given: Problem, fit: Fit, base: Fit) -> bool:
 
 def _beyond_rounding(given: Problem, fit: Fit, base: Fit) -> bool:
     """False for an offset of a sensor that its rounding may be. In steps of q one value is off by up to q / 2, always by the same; n values
-    alike often by q / sqrt(12 n) on average, and hardly ever by q / sqrt(n).
+    alike often by q / sqrt(12 n) on average, and hardly ever by q / sqrt(n). What moves some values more than others is no offset.
     """
     there = names(base.model)
     for a in (fit.model.effects[place] for place in fit.added):
@@ -206,8 +209,8 @@ def _beyond_rounding(given: Problem, fit: Fit, base: Fit) -> bool:
         q = noises.quantum(given.steps.y0[:, j], given.steps.y1[:, j])
         if q > 0.0:
             share = np.unique(np.rint(given.steps.y0[:, j] / q), return_counts=True)[1] / len(given.steps)
-            sizes = [abs(value) for value in a.p.values() if isinstance(value, float)]
-            if sizes and max(sizes) < q * min(0.5, float(np.sqrt(np.sum(share**2)))):
+            off = (a.effect.to_measured(given.steps.y0, fit.model.nominal, a.channel, a.p) - given.steps.y0)[:, j]
+            if np.ptp(off) < SAME * q and abs(off[0]) < q * min(0.5, float(np.sqrt(np.sum(share**2)))):
                 return False
     return True
 
