@@ -152,15 +152,16 @@ def test_a_heavier_joint_is_pushed_less_whatever_else_acts_on_it():
             assert np.allclose(heavy.step(x, u, heavy.at_rest(2))[0], weak.step(x, u, weak.at_rest(2))[0], rtol=0.0, atol=1e-14)
 
 
-def test_drag_is_looked_for_on_inputs_that_say_that_they_are_speeds(tmp_path):
+@pytest.mark.parametrize("speed", ["ground_speed", "v_cmd", "ref_w", "Velocity"])
+def test_drag_is_looked_for_on_inputs_that_say_that_they_are_speeds(tmp_path, speed):
     """Nothing drags at a steering angle."""
     path = tmp_path / "own.py"
     path.write_text(
-        'STATES = ("x", "r")\nINPUTS = ("steer", "ground_speed")\nPARAMS = {}\n\n\ndef step(x, u, dt, params):\n    return x + dt * u\n',
+        f'STATES = ("x", "r")\nINPUTS = ("steer", "{speed}")\nPARAMS = {{}}\n\n\ndef step(x, u, dt, params):\n    return x + dt * u\n',
         "utf-8",
     )
     model = compose(ModelSpec(str(path), 0.1)).nominal
     drag, u = registry().get("effects", "quadratic_drag"), np.ones((5, 2))
-    assert drag.starts(u, model, "ground_speed", 0.1)
+    assert drag.starts(u, model, speed, 0.1)
     assert not drag.starts(u, model, "steer", 0.1)
-    assert {"steer", "ground_speed"} <= {*drag.channels(model)}, "who knows better may say so"
+    assert {"steer", speed} <= {*drag.channels(model)}, "who knows better may say so"

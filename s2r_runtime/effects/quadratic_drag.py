@@ -18,7 +18,7 @@ SPEEDS = {"m/s", "rad/s"}
 
 NAMES = ("speed", "vel", "omega", "rate")
 LETTERS = {"v", "vx", "vy", "vz", "w"}
-"""Parts of names, and names, of speeds. Nothing drags at a steering angle, a voltage or a valve."""
+"""Parts of names of speeds, and words in them (cmd_v, w_ref). Nothing drags at a steering angle, a voltage or a valve."""
 
 INPUT_SHARE = 0.1
 RATE = 0.3
@@ -75,8 +75,9 @@ class QuadraticDrag(ForceEffect):
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
         """One is enough: the response is linear. None on an input that nothing says is a speed."""
         if channel in model.inputs:
-            said = channel in getattr(model, "units", {}) or channel in LETTERS or any(part in channel for part in NAMES)
-            if not said:
+            name = channel.lower()
+            said = any(part in name for part in NAMES) or not LETTERS.isdisjoint(name.split("_"))
+            if not said and channel not in getattr(model, "units", {}):
                 return []
             return [{"coefficient": INPUT_SHARE / size_of(u[:, [model.inputs.index(channel)]])}]
         return [{"coefficient": RATE * mass(model) / usual_speed(u, model, dt)}]
