@@ -16,7 +16,7 @@ from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.tracer import _bent, trace
-from s2r_runtime.trace.verdict import foretells_nothing
+from s2r_runtime.trace.verdict import curves_of, foretells_nothing
 
 STEPS = 700
 GAIN = [("input_gain", "w", {"gain": 0.75})]
@@ -209,3 +209,19 @@ def test_what_goes_with_the_position_beside_a_spring_says_that_it_is_none(left, 
     nats = {token: share * gain(named, nominal) for token, share in left.items()}
     assert gain(named, nominal) > 50.0
     assert _bent(Structure(tuple(nats), True, 0.03, nats), named, nominal) is bent
+
+
+@pytest.mark.parametrize(
+    ("effect", "channel", "p", "token"),
+    [
+        ("cubic_stiffness", "q", {"coefficient": 3.0}, {"position"}),
+        ("viscous_friction", "qd", {"coefficient": 0.3}, {"speed"}),
+        ("quadratic_drag", "qd", {"coefficient": 0.3}, {"speed"}),
+        ("sensor_offset", "qd", {"offset": 0.1}, set()),
+        ("input_gain", "force", {"gain": 1.2}, set()),
+    ],
+)
+def test_what_goes_with_a_speed_or_a_position_does_so_whatever_it_is_called(effect, channel, p, token):
+    model = insert(compose(ModelSpec("joint", 0.02)), AppliedEffect(registry().get("effects", effect), channel, p), 0)
+    data = from_arrays(model, [(np.zeros((20, 2)), np.zeros((19, 1)))])
+    assert curves_of(evaluate(problem(data, steps_of(data)), model)) == token

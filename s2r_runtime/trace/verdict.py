@@ -222,8 +222,8 @@ def final_fit(chosen: Selection, verdict: Verdict) -> Fit:
 
 
 def curves_of(fit: Fit) -> set[str]:
-    """Tokens of the states that what was found goes with: friction with a speed, a spring with a position."""
-    channels = {fit.model.effects[place].channel for place in fit.added if fit.model.effects[place].effect.stage == "step"}
+    """Tokens of the states that what was found goes with: friction and drag with a speed, a spring with a position."""
+    channels = {fit.model.effects[place].channel for place in fit.added if fit.model.effects[place].effect.stage != "sensor"}
     tokens = {fit.model.states[j]: name for axis in axes(fit.model.nominal) for j, name in zip(axis, ("position", "speed"), strict=True)}
     return {tokens[channel] for channel in channels if channel in tokens}
 
