@@ -192,6 +192,15 @@ def test_a_model_whose_rollouts_end_nowhere_near_is_another_robots_and_not_one_t
         assert not foretells_nothing(judged, given, 100.0 + NOISE)
 
 
+def test_a_model_that_nothing_can_ask_to_move_is_refused_in_a_line(tmp_path):
+    path = tmp_path / "own.py"
+    path.write_text('STATES, INPUTS, PARAMS = ("q",), (), {}\n\n\ndef step(x, u, dt, params):\n    return x - dt * x\n')
+    model, rng = compose(ModelSpec(str(path), 0.1)), np.random.default_rng(0)
+    y = 0.9 ** np.arange(301)[:, None] + rng.normal(size=(301, 1)) * 1e-3
+    with pytest.raises(NotEnoughEvidence, match="the model has no inputs"):
+        trace(from_arrays(model, [(y, np.zeros((300, 0)))]), model)
+
+
 @pytest.mark.parametrize(("left", "bent"), [({"position": 0.2}, True), ({"position": 0.01}, False), ({"speed": 0.2}, False)])
 def test_what_goes_with_the_position_beside_a_spring_says_that_it_is_none(left, bent):
     """left: nats of what is left, as a share of what the spring explains."""
@@ -209,6 +218,7 @@ def test_what_goes_with_the_position_beside_a_spring_says_that_it_is_none(left, 
     nats = {token: share * gain(named, nominal) for token, share in left.items()}
     assert gain(named, nominal) > 50.0
     assert _bent(Structure(tuple(nats), True, 0.03, nats), named, nominal) is bent
+    assert not _bent(Structure((), True, 0.03, {}), nominal, named), "what explains nothing is bent by nothing"
 
 
 @pytest.mark.parametrize(

@@ -125,6 +125,8 @@ def _traced(
 ) -> TraceResult:
     weights, kind = norm
     asked = model
+    if not model.inputs:
+        raise NotEnoughEvidence(f"{dataset.source}: the model has no inputs; nothing can be traced of a robot that is asked nothing")
     model, dataset, test = alike(model, dataset, test)
     _belongs(dataset, model)
     if test is not None:
@@ -406,7 +408,7 @@ def _bent(found: Structure, best: Fit, nominal: Fit) -> bool:
     that by which a shape must be better to win (`challenge`): then it is another curve. A spring is not what gravity does to a link.
     """
     left = max((nats for token, nats in found.gains.items() if token in found.tokens and token in curves_of(best)), default=0.0)
-    return left > SHAPED * gain(best, nominal)
+    return left > SHAPED * max(gain(best, nominal), 0.0)
 
 
 def _new(fit: Fit, other: Fit) -> list[int]:
