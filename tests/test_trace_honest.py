@@ -1,6 +1,7 @@
 """Where there is nothing to name, or nothing that the library knows, or no way to tell, the tracer says so."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,10 +12,11 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import from_arrays
-from s2r_runtime.trace.errors import held, judge
+from s2r_runtime.trace.errors import held, judge, noise_floor
 from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.residual_noise import MEMORIES
 from s2r_runtime.trace.tracer import _bent, trace
 from s2r_runtime.trace.verdict import curves_of, foretells_nothing
 
@@ -199,6 +201,22 @@ def test_a_model_that_nothing_can_ask_to_move_is_refused_in_a_line(tmp_path):
     y = 0.9 ** np.arange(301)[:, None] + rng.normal(size=(301, 1)) * 1e-3
     with pytest.raises(NotEnoughEvidence, match="the model has no inputs"):
         trace(from_arrays(model, [(y, np.zeros((300, 0)))]), model)
+
+
+def test_noise_remembers_no_longer_than_a_run_was_measured_whatever_was_commanded_before():
+    rng, model = np.random.default_rng(4), compose(ModelSpec("joint", 0.02))
+    y, u = np.cumsum(rng.normal(size=(121, 2)) * 0.01, axis=0), np.zeros((120, 1))
+    floors = []
+    for early in (0, 300):
+        nowhere, nothing = np.full((early, 2), np.nan), np.zeros((early, 1))
+        data = from_arrays(model, [(np.concatenate([nowhere, y]), np.concatenate([nothing, u]))])
+        steps = steps_of(data)
+        given = held(model, data, steps, (), np.ones(early + 120, dtype=bool), 0.2)
+        fit = evaluate(problem(data, steps), model)
+        slow = np.zeros((2, len(MEMORIES)))
+        slow[:, -1] = 0.8
+        floors.append(noise_floor(replace(fit, colour=replace(fit.colour, slow=slow)), given, 0)[1])
+    assert floors[1] == pytest.approx(floors[0], rel=1e-9)
 
 
 @pytest.mark.parametrize(("left", "bent"), [({"position": 0.2}, True), ({"position": 0.01}, False), ({"speed": 0.2}, False)])

@@ -180,7 +180,9 @@ def _coloured_ends(fit: Fit, given: Held, act: Acting, starts: Index, y: Array, 
     """
     model, (q, s) = fit.model, (np.sqrt(fit.noise.q), np.sqrt(fit.noise.r))
     law, e, x = Past(fit.colour, y.shape), s * rng.normal(size=y.shape), y
-    before = max(len(run.y) for run in given.data.runs) - 1 - given.horizon  # what lasts longer than a run was not seen, nor its law
+    measured = [np.flatnonzero(~np.isnan(run.y).any(axis=1)) for run in given.data.runs]  # rows before the first one are inputs alone
+    longest = max((int(rows[-1] - rows[0]) for rows in measured if len(rows)), default=0)
+    before = longest - given.horizon  # what lasts longer than a run was not seen, nor its law
     settle = min(SETTLE if fit.colour.slow.size else SETTLE // 10, max(before, 0))
     for k in range(settle + given.horizon):
         late = s * rng.normal(size=y.shape)
