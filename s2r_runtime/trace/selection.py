@@ -101,7 +101,19 @@ def select(
     bar: Bar = STRICT,
     before: Selection | None = None,
 ) -> Selection:
-    """The effects that the transitions call for. before: what was selected with another bar, from which it goes on."""
+    """The effects that the transitions call for, and their rivals. before: what was selected with another bar, from which it goes on."""
+    return against_rivals(given, called_for(given, model, horizon, progress, bar, before), bar)
+
+
+def called_for(
+    given: Problem,
+    model: ComposedModel,
+    horizon: int,
+    progress: Callable[[float], None],
+    bar: Bar = STRICT,
+    before: Selection | None = None,
+) -> Selection:
+    """The same, before their rivals are asked."""
     nominal = evaluate(given, model) if before is None else before.nominal
     fit, tried = (nominal, 0) if before is None else (before.fit, before.tried)
     ranking = [] if before is None else list(before.ranking)
@@ -122,16 +134,22 @@ def select(
         if crowded(fit):
             break
     fit = unbent(given, simplified(given, pruned(given, fit, tried, horizon, bar)), tried, bar)
-    fit = plainly(given, fit)
     progress(0.8)
-    fit, found = overtaken(given, fit, bar)
-    return Selection(nominal, fit, tried, tuple(ranking), tuple(found))
+    return Selection(nominal, plainly(given, fit), tried, tuple(ranking), ())
+
+
+def against_rivals(given: Problem, chosen: Selection, bar: Bar = STRICT) -> Selection:
+    """With its rivals, one of which may take its place."""
+    fit, found = overtaken(given, chosen.fit, bar)
+    return replace(chosen, fit=fit, rivals=tuple(found))
 
 
 def two_together(given: Problem, chosen: Selection) -> Selection | None:
     """Two effects that hide each other: neither is what does best alone, or is seen at all. `select` goes on from them. None where no such
-    two explain clearly more than what was chosen.
+    two explain clearly more than what was chosen, or where this is more than two already.
     """
+    if len(chosen.fit.added) > 2:
+        return None
     there, n = names(chosen.fit.model), len(given.steps)
     firsts = [s.fit for s in chosen.ranking if s.fit is not None and (s.name, s.channel) not in there][:FIRSTS]
     seconds = [best_candidates(given, first, SECONDS)[0] for first in firsts]

@@ -46,7 +46,7 @@ from s2r_runtime.trace.residual_noise import no_colour
 from s2r_runtime.trace.result import Found, Limit, TraceResult
 from s2r_runtime.trace.retimed import retimed
 from s2r_runtime.trace.scores import LENIENT, STRICT, names
-from s2r_runtime.trace.selection import Selection, crowded, select, two_together
+from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded, select, two_together
 from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import asked, confirmed, curves_of, final_fit, foretold_too, verdict_of
@@ -177,12 +177,24 @@ def _once_more(
     for bar, before, may_be_left in ((STRICT, pair if hidden else None, set()), (LENIENT, chosen, {"noise"})):
         if before is None:
             continue
-        other = confirmed(given, select(given, chosen.nominal.model, ahead, lambda share: None, bar, before), judged_on)
-        if names(other.fit.model) != names(chosen.fit.model) and not crowded(other.fit):
-            rest = whole.structure(other)
-            if not rest.matters and {*rest.tokens} <= may_be_left:
-                return other, rest
+        alone = called_for(given, chosen.nominal.model, ahead, lambda share: None, bar, before)
+        rest = _all_explained(whole, alone, chosen, may_be_left)
+        if rest is None:  # as it mostly is: no need to ask for rivals
+            continue
+        other = confirmed(given, against_rivals(given, alone, bar), judged_on)
+        if other.fit is not alone.fit:
+            rest = _all_explained(whole, other, chosen, may_be_left)
+        if rest is not None:
+            return other, rest
     return chosen, structure
+
+
+def _all_explained(whole: _Whole, other: Selection, chosen: Selection, may_be_left: set[str]) -> Structure | None:
+    """What another selection leaves, if that is no more than may be left; None if it does leave more, or is no other one."""
+    if names(other.fit.model) == names(chosen.fit.model) or crowded(other.fit):
+        return None
+    rest = whole.structure(other)
+    return None if rest.matters or not {*rest.tokens} <= may_be_left else rest
 
 
 def _result(
