@@ -46,6 +46,15 @@ def test_rows_a_fraction_of_a_step_apart_are_picked_and_inputs_averaged():
     assert np.allclose(mean, inputs.values[:40].reshape(10, 4, 2).mean(axis=1))
 
 
+@pytest.mark.parametrize(("rows", "parts"), [(0.6, 10), (9.4, 10), (10.4, 12), (11.45, 12), (13.7, 12)])
+def test_a_step_within_which_commands_change_has_parts_in_pairs(rows, parts):
+    """A grid half as fine tells what is left of the finer one: rows of commands (in a step) off the grid."""
+    states, _ = _streams()
+    t = np.arange(0.0, 5.0, 0.1 / rows) + 0.013
+    data = from_streams(_model(), [(states, Stream(t, np.random.default_rng(2).normal(size=(len(t), 2))))], "here")
+    assert data.substeps == parts
+
+
 def test_irregular_rows_are_taken_as_they_are_and_a_gap_is_a_gap():
     t = np.concatenate([np.arange(0.0, 5.0, 0.013), np.arange(6.0, 9.0, 0.013)])
     u = np.stack([np.sin(t), np.cos(t)], axis=1)

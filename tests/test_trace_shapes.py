@@ -8,6 +8,7 @@ from trace_robots import declared, recordings
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.trace import tracer
 from s2r_runtime.trace.shapes import SHAPES
 from s2r_runtime.trace.tracer import trace
 
@@ -170,3 +171,18 @@ def test_a_name_that_is_right_stands(physics):
         found = trace(data, declared())
         assert found.verdict == "traced"
         assert [(e.name.removeprefix("input_"), e.channel) for e in found.effects] == [(physics[0].removeprefix("input_"), "w")]
+
+
+@pytest.mark.parametrize(
+    ("physics", "left"), [(("input_lag", "w", {"time_constant": 0.25}), False), (("uneven_lag", "w", {"out": 0.1, "back": 0.5}), True)]
+)
+def test_names_are_challenged_where_they_leave_something_and_only_there(physics, left, monkeypatch):
+    """What explained more than a name would explain something beside it: where nothing is left, nothing else is fitted."""
+    asked = []
+    for name in ("better_shape", "best_unnamed", "wanders"):
+        challenge = getattr(tracer, name)
+        monkeypatch.setattr(tracer, name, lambda *of, challenge=challenge: asked.append(challenge) or challenge(*of))
+    (data,) = recordings([physics], 1, steps=1200, seed=61)
+    found = trace(data, declared())
+    assert bool(asked) == left
+    assert (found.verdict == "unexplained") == left

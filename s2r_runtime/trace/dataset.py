@@ -54,7 +54,7 @@ Mask = NDArray[np.bool_]
 PARTS = (10, 12)
 """Least and most parts of a step where inputs change within steps. A change within a part counts as a mean over it, which spreads it as a
 lag would: of a delay and a lag of a step each, parts of a quarter make the one longer and the other shorter by a hundredth of a step, far
-outside their intervals where there is little noise.
+outside their intervals where there is little noise. Even, so that a grid half as fine tells what is left of that (`grid_errors`).
 """
 
 MOST_ROWS, EVEN = 12, 0.02
@@ -368,7 +368,7 @@ def _parts(model: ComposedModel, stretches: Sequence[tuple[Stream, Stream]], exa
     whole = round(rows)
     if 1 < whole <= MOST_ROWS and abs(rows - whole) < EVEN * whole:
         return whole * math.ceil(max(least, PARTS[0]) / whole)
-    return max(least, min(max(math.ceil(rows - ALIGNED), PARTS[0]), PARTS[1]))
+    return max(least, PARTS[rows - ALIGNED > PARTS[0]])
 
 
 def _pauses(states: Stream, stamps: Array, run: int, usual: float, origin: float, dt: float) -> list[Pause]:

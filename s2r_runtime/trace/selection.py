@@ -93,16 +93,9 @@ class Selection:
     rivals: tuple[Scored, ...]
 
 
-def select(
-    given: Problem,
-    model: ComposedModel,
-    horizon: int,
-    progress: Callable[[float], None],
-    bar: Bar = STRICT,
-    before: Selection | None = None,
-) -> Selection:
-    """The effects that the transitions call for, and their rivals. before: what was selected with another bar, from which it goes on."""
-    return against_rivals(given, called_for(given, model, horizon, progress, bar, before), bar)
+def select(given: Problem, model: ComposedModel, horizon: int, progress: Callable[[float], None]) -> Selection:
+    """The effects that the transitions call for, and their rivals."""
+    return against_rivals(given, called_for(given, model, horizon, progress), STRICT)
 
 
 def called_for(
@@ -113,7 +106,7 @@ def called_for(
     bar: Bar = STRICT,
     before: Selection | None = None,
 ) -> Selection:
-    """The same, before their rivals are asked."""
+    """The effects alone, by any bar. before: what was selected with another one, from which it goes on."""
     nominal = evaluate(given, model) if before is None else before.nominal
     fit, tried = (nominal, 0) if before is None else (before.fit, before.tried)
     ranking = [] if before is None else list(before.ranking)
@@ -138,7 +131,7 @@ def called_for(
     return Selection(nominal, plainly(given, fit), tried, tuple(ranking), ())
 
 
-def against_rivals(given: Problem, chosen: Selection, bar: Bar = STRICT) -> Selection:
+def against_rivals(given: Problem, chosen: Selection, bar: Bar) -> Selection:
     """With its rivals, one of which may take its place."""
     fit, found = overtaken(given, chosen.fit, bar)
     return replace(chosen, fit=fit, rivals=tuple(found))
