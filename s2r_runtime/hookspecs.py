@@ -176,9 +176,9 @@ class Effect(Protocol):
     defined by `input_step` and, for long recordings, the same thing over time at once, `input_sequence`; the kit checks that the two agree.
 
     It may also have
-    - `optional`: names of parameters that may be left out; `choices`: parameter -> its words, for one that is not a number; `named`:
-      parameters that say the name of another input; `wrong(p) -> str`: what is wrong with values that are each within bounds, or an
-      empty text;
+    - `optional`: names of parameters that may be left out; `fuller(p) -> p | None`: values with more of them that do the same;
+    - `choices`: parameter -> its words, for one that is not a number; `named`: parameters that say the name of another input;
+      `wrong(p) -> str`: what is wrong with values that are each within bounds, or an empty text;
     - `once` = True: a model has at most one of it; `linear` = True: it commutes with other linear effects, so the tracer tries one
       place in the list only; `shift` = True: a pure delay, which commutes with all that has no clock of its own; `additive` = True: what
       it does is a sum over its parameters, in proportion to each one's distance from neutral (a force: as long as nothing stops);

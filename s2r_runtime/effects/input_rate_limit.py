@@ -24,9 +24,6 @@ CATCHING_UP = (0.1, 0.35, 0.8, 1.5, 3.0, 6.0, 11.0, 20.0, 36.0)
 wheel, and in a mean.
 """
 
-UNLIKE = ((2.0, 5.0), (5.0, 2.0))
-"""The same, up and down, for a limit that depends on the direction."""
-
 
 class InputRateLimit(Follower):
     """rate in the input's unit a second, for growing values; rate_down for falling ones (left out: the same)."""
@@ -83,8 +80,11 @@ class InputRateLimit(Follower):
         if not np.any(change):
             return []
         rate = float(np.quantile(change[change > 0.0], 0.9)) / dt
-        alike: list[Values] = [{"rate": rate / n} for n in CATCHING_UP]
-        return [*alike, *({"rate": rate / up, "rate_down": rate / down} for up, down in UNLIKE)]
+        return [{"rate": rate / n} for n in CATCHING_UP]
+
+    def fuller(self, p: Values) -> Values | None:
+        """One for each direction."""
+        return None if "rate_down" in p else {**p, "rate_down": p["rate"]}
 
 
 def _limits(p: Values, dt: Any) -> tuple[Any, Any]:

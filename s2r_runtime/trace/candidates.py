@@ -64,7 +64,7 @@ def candidates(model: ComposedModel, data: Dataset, left: Leftover | None = None
             if getattr(effect, "once", False) and there:
                 found += _instead(model, effect, channel, there[0], data.dt)
                 continue
-            for place in _places(model, effect, channel):
+            for place in places(model, effect, channel):
                 if place not in given:
                     given[place] = data.chains.through(model, _input_effects(model, place))
                 starts = _starts(effect, given[place], model, channel, data.dt, t)
@@ -79,7 +79,7 @@ def _input_effects(model: ComposedModel, place: int) -> list[AppliedEffect]:
     return [a for a in model.effects[:place] if a.effect.stage == "input"]
 
 
-def _places(model: ComposedModel, effect: Effect, channel: str) -> list[int]:
+def places(model: ComposedModel, effect: Effect, channel: str) -> list[int]:
     """The end, and before each effect that it does not commute with."""
     end = len(model.effects)
     if effect.stage != "input":

@@ -129,7 +129,7 @@ def _fits(given: Problem, base: Fit, channel: str, least: float = LEAST, near: S
         for shape in SHAPES
         if (starts := shape.starts(u, model.nominal, channel, given.data.dt, near))
     ]
-    screened, _ = screen(given, base, offered) if offered else ([], 0)
+    screened, _ = screen(given, base, offered, math.inf) if offered else ([], 0)  # from few starts
     enough = max(least, NEARLY * screened[0].value) if screened else least
     fits = [fitted(given, base, s.start, 2) for s in screened[:FITTED] if s.value > max(enough, 0.0)]
     return sorted((fit for fit in fits if _outlasts(fit, given.data.dt)), key=lambda fit: -gain(fit, base))

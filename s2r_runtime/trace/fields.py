@@ -193,11 +193,11 @@ def beats(field: Field, nominal: Left, named: Left) -> bool:
 def wanders(nominal: Left, named: Left) -> bool:
     """Whether a push that wanders in time explains clearly more than what was named, and this nothing beside it."""
     bare, alone = bare_nats(nominal), bare_nats(named)
-    beside = wandering_nats(named)
-    if beside - alone < NEEDED:  # with the names, it does as well as alone at least
-        return False
     without = wandering_nats(nominal, NEARLY * (alone - bare))
-    return without - alone > CLEARLY and beside - without < NEEDED
+    if without - alone <= CLEARLY:
+        return False
+    beside = wandering_nats(named)  # with the names, it does as well as alone at least, unless it was not found
+    return beside - alone >= NEEDED and beside - without < NEEDED
 
 
 def as_noise(left: Left, judged: Judged) -> bool:
@@ -212,20 +212,27 @@ def nats_of(left: Left, judged: Judged) -> float:
 
 def bare_nats(left: Left) -> float:
     """Log likelihood of what a model leaves, under noise of whatever colour is likeliest."""
-    return _under_any_law(left.fit.z, left.fit.whiten, left)
+    if "bare" not in left.known:
+        left.known["bare"] = _under_any_law(left.fit.z, left.fit.whiten, left)
+    return left.known["bare"]
 
 
 def wandering_nats(left: Left, least: float = 0.0) -> float:
     """The same with a push that wanders in time, in whichever direction that is likeliest. least: nats that it must have at first look,
     else it is not looked at any closer.
     """
+    if "wandering" in left.known:
+        return left.known["wandering"]
     given, model = left.given, left.fit.model
     body, world = directions_of(given, model, acting(model, given.data))
     when = np.arange(len(given.steps), dtype=float)[:, None]
     bare = bare_nats(left)
     looked, _ = _looked(left, _over("time", when, (*body, *world), (*CELLS, QUICKEST)), bare, DIRECTIONS)
     kept = [offer for nats, offer in looked if nats > max(least, LOOKS)][:FITTED]
-    return max((_marginal(left, offer.x, PASSES)[0] for offer in kept), default=bare)
+    found = max((_marginal(left, offer.x, PASSES)[0] for offer in kept), default=bare)
+    if least <= LOOKS:
+        left.known["wandering"] = found
+    return found
 
 
 def _offered(left: Left) -> Iterator[_Offer]:

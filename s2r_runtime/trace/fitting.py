@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.coarse import coarse
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.residual import Steps, acting, predicted, residual, state_jacobian
 from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
@@ -60,6 +62,11 @@ class Problem:
     steps: Steps
     floor: Noise
     searches: dict[tuple[object, ...], object] = field(default_factory=dict, repr=False, compare=False)
+
+    @cached_property
+    def coarse(self) -> Problem:
+        """The same with steps in fewer parts, for a first look: most of what it takes is to work out what acts in each."""
+        return replace(self, data=coarse(self.data))
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.forces import axes
 from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.dataset import Dataset, Run
+from s2r_runtime.trace.coarse import coarser
+from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.fitting import Fit, Problem, foretold, objective, sensitivities
 from s2r_runtime.trace.selection import WITHIN
 from s2r_runtime.trace.slots import Slot, bounds_of
@@ -45,7 +46,7 @@ def _shifts(given: Problem, fit: Fit) -> list[Array]:
     """(k,) each, by which numbers would move on a finer grid of commands, and with steps in parts."""
     if not fit.free or given.data.in_parts or not _within_steps(given.data):
         return []
-    coarse = replace(given, data=_coarser(given.data))
+    coarse = replace(given, data=coarser(given.data, 2))
     fine, rough = (objective(there, fit, fit.model) for there in (given, coarse))
     w = noises.weight(fine)
     j = sensitivities(given, fit, fit.model, fit.free)
@@ -65,15 +66,3 @@ def _shifts(given: Problem, fit: Fit) -> list[Array]:
 def _within_steps(data: Dataset) -> bool:
     """Whether commands change within steps, on a grid that can be made coarser by half."""
     return data.substeps % 2 == 0 and any(np.any(run.u[::2] != run.u[1::2]) for run in data.runs)
-
-
-def _coarser(data: Dataset) -> Dataset:
-    """The same with inputs as means over two parts."""
-    runs = tuple(_in_pairs(run, data.substeps) for run in data.runs)
-    return replace(data, runs=runs, substeps=data.substeps // 2)
-
-
-def _in_pairs(run: Run, substeps: int) -> Run:
-    u = run.u.reshape(-1, substeps, run.u.shape[1])
-    last = np.append((u[:-1, -2] != u[:-1, -1]) & (u[:-1, -1] == u[1:, 0]), np.zeros((1, u.shape[2]), dtype=bool), axis=0)
-    return replace(run, u=run.u.reshape(-1, 2, run.u.shape[1]).mean(axis=1), turned=last if run.turned is None else last | run.turned)

@@ -10,7 +10,7 @@ An effect that enters linearly needs no grid: its columns, one a number, are sca
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +28,14 @@ Array = NDArray[np.float64]
 STEPS_ON = 2
 """Gauss-Newton steps from the best start of an effect with several numbers: enough to show whether it leads anywhere."""
 
+HOPELESS = 50.0
+"""Nats, or those of the best start if they are more, by which a start is worse than nothing that two steps will not make worth a fit: one
+of 397 such came to more than a fifth of the best, where that had more than 7 nats.
+"""
+
+PROMISING = 0.2
+"""Of what the best start explains: one that explains less is not looked at in its fuller form."""
+
 CHUNK = 48
 """Columns that are whitened together: few enough to stay in the cache of a small machine."""
 
@@ -42,8 +50,8 @@ class Screened:
 
 
 @dataclass(frozen=True)
-class _Probe:
-    """models: one a column; free: the slots that the columns scale, none where the start is taken as it is; values: names of the
+class Probe:
+    """A start. models: one a column; free: the slots that the columns scale, none where the start is taken as it is; values: names of the
     effect's parameters that the start holds.
     """
 
@@ -54,36 +62,66 @@ class _Probe:
     values: tuple[str, ...]
 
 
-def screen(given: Problem, base: Fit, found: Sequence[Candidate]) -> tuple[list[Screened], int]:
-    """Every candidate with its best start, best first; and how many starts were looked at."""
-    probes = [probe for c in found for probe in _probes(c, base.model)]
+def screen(given: Problem, base: Fit, found: Sequence[Candidate], hopeless: float = HOPELESS) -> tuple[list[Screened], int]:
+    """Every candidate with its best start, best first; and how many starts were looked at. hopeless: nats below nothing from which on a
+    start is not followed, if the best one has no more than that above.
+    """
+    given = given.coarse
+    probes = probes_of(base.model, found)
     before = predicted(base.model, given.steps, acting(base.model, given.data))
     white = replace(base, colour=noises.no_colour(base.z.shape[1]))  # what looks like colour may be what an effect explains
     aside = _Aside(base.z.ravel(), sensitivities(given, white, base.model, base.free))
     level = float(np.sum(noises.log_density(aside.z)))
     best: dict[tuple[str | int, ...], Screened] = {}  # one for each set of parameters: more of them may do no better at the start
+    for probe, c in columns(given, base, probes, before):
+        value, start = aside.look(probe, c)
+        key: tuple[str | int, ...] = (probe.candidate.name, probe.candidate.channel, probe.candidate.place, *sorted(probe.values))
+        if np.isfinite(value) and (key not in best or value - level > best[key].value):
+            best[key] = Screened(value - level, probe.candidate, start)
+    steppable = [s for s in best.values() if foretold(given, s.start) is not None]  # as it was scaled
+    least = -max(max((s.value for s in steppable), default=0.0), hopeless)
+    moved_on = [_moved_on(given, white, aside, before, s, level) if s.value > least else s for s in steppable]
+    enough = max(PROMISING * max((s.value for s in moved_on), default=0.0), 0.0)
+    more = [_moved_on(given, white, aside, before, s, level) for s in _fuller(s for s in moved_on if s.value > enough)]
+    return sorted([*moved_on, *more], key=lambda s: -s.value), len(probes) + len(more)
+
+
+def _fuller(found: Iterable[Screened]) -> Iterator[Screened]:
+    """The same with more numbers, where an effect has a fuller form that does the same to begin with."""
+    for s in found:
+        place = s.candidate.place if s.candidate.replaced < 0 else s.candidate.replaced
+        there = s.start.effects
+        fuller = getattr(there[place].effect, "fuller", None)
+        values = fuller(there[place].p) if fuller else None
+        if values is not None:
+            effects = (*there[:place], replace(there[place], p=values), *there[place + 1 :])
+            yield replace(s, start=replace(s.start, effects=effects))
+
+
+def probes_of(model: ComposedModel, found: Sequence[Candidate]) -> list[Probe]:
+    """Every start of every candidate beside a model."""
+    return [probe for c in found for probe in _probes(c, model)]
+
+
+def columns(given: Problem, base: Fit, probes: Sequence[Probe], before: Array) -> Iterator[tuple[Probe, Array]]:
+    """Each probe with what it changes in the prediction, `before` (n, nx), whitened: (n nx, models). A user's own model may not step
+    everywhere; what it cannot step is left out.
+    """
     for chunk in _chunks(probes):
-        whole: list[_Probe] = []
+        whole: list[Probe] = []
         moved: list[Array] = []
         for probe in chunk:
             there = [one - before for m in probe.models if (one := foretold(given, m)) is not None]
-            if len(there) == len(probe.models):  # a user's own model may not step everywhere
+            if len(there) == len(probe.models):
                 whole.append(probe)
                 moved += there
         if not whole:
             continue
-        columns = base.whiten(np.array(moved).transpose(1, 2, 0)).reshape(aside.z.size, -1)
+        table = base.whiten(np.array(moved).transpose(1, 2, 0)).reshape(before.size, -1)
         at = 0
         for probe in whole:
-            c = columns[:, at : at + len(probe.models)]
+            yield probe, table[:, at : at + len(probe.models)]
             at += len(probe.models)
-            value, start = aside.look(probe, c)
-            key: tuple[str | int, ...] = (probe.candidate.name, probe.candidate.channel, probe.candidate.place, *sorted(probe.values))
-            if np.isfinite(value) and (key not in best or value - level > best[key].value):
-                best[key] = Screened(value - level, probe.candidate, start)
-    steppable = [s for s in best.values() if foretold(given, s.start) is not None]  # as it was scaled
-    moved_on = [_moved_on(given, white, aside, before, s, level) for s in steppable]
-    return sorted(moved_on, key=lambda s: -s.value), len(probes)
 
 
 def _moved_on(given: Problem, white: Fit, aside: _Aside, before: Array, s: Screened, level: float) -> Screened:
@@ -98,12 +136,12 @@ def _moved_on(given: Problem, white: Fit, aside: _Aside, before: Array, s: Scree
         return s
     start = refine(given, white, s.start, slots, STEPS_ON)
     column = white.whiten(predicted(start, given.steps, acting(start, given.data)) - before).reshape(-1, 1)
-    value, _ = aside.look(_Probe(s.candidate, start, (start,), (), ()), column)
+    value, _ = aside.look(Probe(s.candidate, start, (start,), (), ()), column)
     return Screened(value - level, s.candidate, start) if value - level > s.value else s
 
 
-def _chunks(probes: Sequence[_Probe]) -> Iterator[list[_Probe]]:
-    chunk: list[_Probe] = []
+def _chunks(probes: Sequence[Probe]) -> Iterator[list[Probe]]:
+    chunk: list[Probe] = []
     for probe in probes:
         chunk.append(probe)
         if sum(len(p.models) for p in chunk) >= CHUNK:
@@ -113,19 +151,22 @@ def _chunks(probes: Sequence[_Probe]) -> Iterator[list[_Probe]]:
         yield chunk
 
 
-def _probes(candidate: Candidate, model: ComposedModel) -> Iterator[_Probe]:
+def _probes(candidate: Candidate, model: ComposedModel) -> Iterator[Probe]:
     for start in candidate.models(model):
         place = candidate.place if candidate.replaced < 0 else candidate.replaced
         slots = tuple(slots_of(start.effects[place], place))
         held = tuple(start.effects[place].p)
         neutral = [bounds_of(start, s).neutral for s in slots]
-        known = all(v is not None for v in neutral)
-        if slots and known and (len(slots) == 1 or getattr(start.effects[place].effect, "additive", False)):
+        sizes = tuple(s for s, v in zip(slots, neutral, strict=True) if v is not None)
+        if len(sizes) == 1:  # from nothing at all to the start, whatever else it holds (when, how often)
+            yield Probe(candidate, start, (start,), sizes, held)
+            continue
+        if slots and len(sizes) == len(slots) and getattr(start.effects[place].effect, "additive", False):
             alone = [_alone(start, slots, i, neutral) for i in range(len(slots))]
             if all(m is not None for m in alone):
-                yield _Probe(candidate, start, tuple(m for m in alone if m is not None), slots, held)
+                yield Probe(candidate, start, tuple(m for m in alone if m is not None), slots, held)
                 continue
-        yield _Probe(candidate, start, (start,), (), held)
+        yield Probe(candidate, start, (start,), (), held)
 
 
 def _alone(start: ComposedModel, slots: Free, i: int, neutral: Sequence[float | None]) -> ComposedModel | None:
@@ -142,7 +183,7 @@ class _Aside:
         self._j = j
         self._w = noises.weight(self.z)
 
-    def look(self, probe: _Probe, c: Array) -> tuple[float, ComposedModel]:
+    def look(self, probe: Probe, c: Array) -> tuple[float, ComposedModel]:
         """Log density of what the probe leaves, and the model that it means."""
         best = self._left(self.z - c[:, 0], self._j) if not probe.free or len(probe.free) == 1 else (-np.inf, np.zeros(0))
         value, start = best[0], probe.start

@@ -59,11 +59,6 @@ MOST, MOST_ON_ONE = 5, 3
 EXCHANGED = 3
 """Effects up to which earlier ones are asked again whether another would do better: that takes a round for each."""
 
-FIRSTS, SECONDS = 3, 4
-"""Effects that are looked at together with another one where those that do best one after the other leave structure, and how many others
-are fitted beside each.
-"""
-
 BENT = 3.0
 """Standard deviations by which a number must change to have been bent by what the model lacks beside."""
 
@@ -132,29 +127,11 @@ def called_for(
 
 
 def against_rivals(given: Problem, chosen: Selection, bar: Bar) -> Selection:
-    """With its rivals, one of which may take its place."""
+    """With its rivals, one of which may take its place. A crowd is not believed, whatever its rivals."""
+    if crowded(chosen.fit):
+        return chosen
     fit, found = overtaken(given, chosen.fit, bar)
     return replace(chosen, fit=fit, rivals=tuple(found))
-
-
-def two_together(given: Problem, chosen: Selection) -> Selection | None:
-    """Two effects that hide each other: neither is what does best alone, or is seen at all. `select` goes on from them. None where no such
-    two explain clearly more than what was chosen, or where this is more than two already.
-    """
-    if len(chosen.fit.added) > 2:
-        return None
-    there, n = names(chosen.fit.model), len(given.steps)
-    firsts = [s.fit for s in chosen.ranking if s.fit is not None and (s.name, s.channel) not in there][:FIRSTS]
-    seconds = [best_candidates(given, first, SECONDS)[0] for first in firsts]
-    pairs = [found[0].fit for found in seconds if found and found[0].fit is not None]
-
-    def worth(fit: Fit) -> float:
-        return gain(fit, chosen.nominal) - STRICT.price(fit.k - chosen.nominal.k, n)
-
-    best = max(pairs, key=worth, default=None)
-    if best is None or worth(best) <= worth(chosen.fit) + CLOSE:
-        return None
-    return replace(chosen, fit=fitted(given, best, best.model), rivals=())
 
 
 def one_more(given: Problem, chosen: Selection, horizon: int, foretells: Callable[[Fit, Fit], float]) -> Selection:
@@ -166,7 +143,7 @@ def one_more(given: Problem, chosen: Selection, horizon: int, foretells: Callabl
     if len(fit.added) >= MOST or crowded(fit):
         return chosen
     for s in best_candidates(given, fit)[0][:CLOSE_BY]:
-        if s.fit is None or gain(s.fit, fit) < SHORT * STRICT.needed(chosen.tried, s.fit.k - fit.k, len(given.steps)):
+        if s.fit is None or crowded(s.fit) or gain(s.fit, fit) < SHORT * STRICT.needed(chosen.tried, s.fit.k - fit.k, len(given.steps)):
             continue
         ahead = min(foretells(s.fit, fit), gain(s.fit, fit))
         if ahead > 0.0 and accepted(given, s.fit, fit, chosen.tried, horizon, ahead=ahead):

@@ -35,6 +35,7 @@ from s2r_runtime.trace.faults import Checked, check
 from s2r_runtime.trace.fields import Field, beats, wanders
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, problem, told, without
 from s2r_runtime.trace.grid_errors import widened
+from s2r_runtime.trace.hidden_pairs import two_together
 from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, NOTHING, Looks, Structure, best_unnamed, explains_more, lack_of_fit, left_of
 from s2r_runtime.trace.lack_of_fit_judged import Judged, Left
@@ -46,7 +47,7 @@ from s2r_runtime.trace.residual_noise import no_colour
 from s2r_runtime.trace.result import Found, Limit, TraceResult
 from s2r_runtime.trace.retimed import retimed
 from s2r_runtime.trace.scores import LENIENT, STRICT, names
-from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded, select, two_together
+from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded, select
 from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import asked, confirmed, curves_of, final_fit, foretold_too, verdict_of

@@ -1,0 +1,126 @@
+"""Two effects that hide each other: neither is what does best alone, or is seen at all.
+
+A robot that takes a bias on an input for half of its friction shows neither. All pairs of starts are looked at without a fit: with columns
+c_i of `screening` (what a start changes in the prediction, whitened, rows weighted by the noise's density), on a scale of 1, and what is
+left, z,
+
+    b = (c_i'z, c_j'z),  k = c_i'c_j:    nats of both = (b_i^2 - 2 k b_i b_j + b_j^2) / (2 (1 - k^2))
+
+as far as effects enter linearly and their numbers stay inside their bounds. The best few are fitted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.candidates import candidates, places
+from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, insert
+from s2r_runtime.trace.leftover import Leftover
+from s2r_runtime.trace.residual import acting, predicted
+from s2r_runtime.trace.scores import STRICT, name_of, names
+from s2r_runtime.trace.screening import Probe, columns, probes_of
+from s2r_runtime.trace.selection import Selection
+from s2r_runtime.trace.slots import bounds_of, values_of
+
+Array = NDArray[np.float64]
+
+TAKEN = 0.3, 3.0
+"""Times what it does that a start may do that does not enter linearly."""
+
+ALIKE = 0.9999
+"""Square of the cosine between two columns from which on they are one."""
+
+FITTED = 4
+"""Pairs that are fitted, of those with an effect that was chosen already (beside which anything makes a good pair), and of others."""
+
+
+def two_together(given: Problem, chosen: Selection) -> Selection | None:
+    """The two that explain most together. `called_for` goes on from them. None where no such two explain more than what was chosen, every
+    start tried paid for, or where this is more than two already.
+    """
+    if len(chosen.fit.added) > 2:
+        return None
+    base, n = chosen.nominal, len(given.steps)
+
+    def worth(fit: Fit) -> float:
+        return gain(fit, base) - STRICT.price(fit.k - base.k, n)
+
+    fits = [fitted(given, base, model, 2) for pair in _promising(given, chosen) for model in _together(*pair)]
+    best = max(fits, key=worth, default=None)
+    if best is None or worth(best) - worth(chosen.fit) <= STRICT.needed(chosen.tried, 0, n):
+        return None
+    return replace(chosen, fit=fitted(given, best, best.model), rivals=())
+
+
+def _promising(given: Problem, chosen: Selection) -> list[tuple[Probe, Probe]]:
+    """Pairs of different effects that explain most, as far as that is linear."""
+    base, given = chosen.nominal, given.coarse
+    before = predicted(base.model, given.steps, acting(base.model, given.data))
+    probes = probes_of(base.model, candidates(base.model, given.data, Leftover(given, base)))
+    found = [(probe, i, c[:, i]) for probe, c in columns(given, base, probes, before) for i in range(c.shape[1])]
+    root = np.sqrt(noises.weight(base.z.ravel()))
+    table = np.array([c for _, _, c in found]).reshape(len(found), -1) * root
+    size = np.linalg.norm(table, axis=1)
+    there = np.flatnonzero(size > 1e-9 * np.max(size, initial=0.0))
+    who = [found[i][0] for i in there.tolist()]
+    ranges = np.array([_range(*found[i][:2]) for i in there.tolist()]).reshape(-1, 2) * size[there, None]
+    nats = _nats(table[there] / size[there, None], root * base.z.ravel(), ranges)
+    return _best(nats, who, set(names(chosen.fit.model)))
+
+
+def _nats(c: Array, z: Array, ranges: Array) -> Array:
+    """(m, m) what two columns of c (m, n) explain together of z (n,); 0 where that takes one of them out of its range (m, 2)."""
+    k, b = c @ c.T, c @ z
+    apart = 1.0 - np.minimum(k * k, ALIKE)
+    beta = (b[:, None] - k * b) / apart  # [i, j]: of i, beside j
+    inside = (beta >= ranges[:, :1]) & (beta <= ranges[:, 1:])
+    nats = 0.5 * (b[:, None] * beta + b * beta.T)
+    return np.asarray(np.where(inside & inside.T & (k * k < ALIKE), nats, 0.0))
+
+
+def _range(probe: Probe, i: int) -> tuple[float, float]:
+    """Scales of a probe's column i at which its number is inside its bounds; behind a kink it is no line for long."""
+    if not probe.free:
+        return TAKEN
+    slot = probe.free[i]
+    p, value = bounds_of(probe.start, slot), float(values_of(probe.start, (slot,))[0])
+    neutral = p.neutral or 0.0
+    away = value - neutral
+    if away == 0.0:
+        return 0.0, 0.0
+    low, high = sorted(((p.low - neutral) / away, (p.high - neutral) / away))
+    return (max(low, 0.0), min(high, TAKEN[1])) if p.kink else (low, high)
+
+
+def _best(nats: Array, who: list[Probe], chosen: set[tuple[str, str]]) -> list[tuple[Probe, Probe]]:
+    """The best pairs, FITTED of either kind, each (effect, channel) with another one once."""
+    one, other = np.triu_indices(len(who), 1)
+    upper = nats[one, other]
+    kept: dict[frozenset[tuple[str, str]], tuple[Probe, Probe]] = {}
+    places_left = {True: FITTED, False: FITTED}
+    for i in np.argsort(-upper).tolist():
+        pair = who[one[i]], who[other[i]]
+        key = frozenset((p.candidate.name, p.candidate.channel) for p in pair)
+        known = bool(key & chosen)
+        if upper[i] <= 0.0 or not any(places_left.values()):
+            break
+        if len(key) == 2 and key not in kept and places_left[known]:
+            kept[key] = pair
+            places_left[known] -= 1
+    return list(kept.values())
+
+
+def _together(one: Probe, other: Probe) -> list[ComposedModel]:
+    """The model with both, in each order that makes a difference."""
+    c, there = other.candidate, one.start.effects
+    a = other.start.effects[c.place if c.replaced < 0 else c.replaced]
+    if c.replaced < 0:
+        return [insert(one.start, a, place) for place in places(one.start, a.effect, a.channel)]
+    if name_of(there[c.replaced]) != name_of(a):  # the first one stands before it
+        return []
+    return [replace(one.start, effects=(*there[: c.replaced], a, *there[c.replaced + 1 :]))]

@@ -1,0 +1,139 @@
+"""The first look at candidates and at pairs of them, by columns: which starts lead to a fit."""
+
+import numpy as np
+import pytest
+from test_trace_for_a_while import DT, _held
+
+from s2r_runtime.models.composed import AppliedEffect, compose
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.plugins import registry
+from s2r_runtime.trace.candidates import candidates
+from s2r_runtime.trace.coarse import FEW, coarse, coarser
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
+from s2r_runtime.trace.hidden_pairs import TAKEN, _nats, two_together
+from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.scores import names
+from s2r_runtime.trace.screening import screen
+from s2r_runtime.trace.selection import Selection
+
+JOINT, WHEELS = ModelSpec("joint", DT, {"mass": 1.0}, ()), ModelSpec("differential_drive", DT, {}, ())
+
+
+def _drive(spec, effects, u, sigma, seed=21):
+    """(problem, nominal model) of a robot with effects, driven by u (T, nu)."""
+    true = compose(ModelSpec(spec.name, DT, spec.parameters, tuple(EffectSpec(*e) for e in effects)))
+    x, hidden = np.zeros((1, len(true.states))), true.at_rest(1)
+    rows = [x[0]]
+    for row in u:
+        x, hidden = true.step(x, row[None, :], hidden)
+        rows.append(x[0])
+    y = np.array(rows) + np.random.default_rng(seed).normal(size=(len(u) + 1, len(true.states))) * sigma
+    model = compose(spec)
+    data = from_arrays(model, [(y, u)])
+    return problem(data, steps_of(data)), model
+
+
+def test_a_limit_that_depends_on_the_direction_is_fitted_from_one_that_does_not():
+    """Where there is next to no noise, a search from anywhere else ends in a number of its own."""
+    u = _held(np.random.default_rng(22), 500, [-4.0, -4.0], [4.0, 4.0])
+    rates = {"rate": 3.0, "rate_down": 9.0}
+    given, model = _drive(WHEELS, [("input_rate_limit", "cmd_right", rates)], u, 1e-5)
+    base = evaluate(given, model)
+    best = screen(given, base, candidates(model, given.data))[0][0]
+    assert (best.candidate.name, best.candidate.channel) == ("input_rate_limit", "cmd_right")
+    found = fitted(given, base, best.start).model.effects[-1].p
+    assert found == pytest.approx(rates, rel=1e-3)
+
+
+def test_what_changes_at_some_time_is_looked_at_with_the_size_that_explains_most():
+    """A gain of 1.4 from 6 s on, the nearest starts being at other times and gains."""
+    u = _held(np.random.default_rng(23), 400, [-1.0], [1.0])
+    given, model = _drive(JOINT, [("regime_change", "force", {"time": 6.0, "gain": 1.4})], u, 1e-3)
+    tried = [c for c in candidates(model, given.data) if c.name == "regime_change"]
+    for s in screen(given, evaluate(given, model), tried)[0]:
+        assert s.value > 0.0
+        assert s.start.effects[-1].p["gain"] == pytest.approx(1.4, abs=0.1)
+
+
+def test_nats_of_two_columns_are_those_of_a_least_squares_fit():
+    rng = np.random.default_rng(24)
+    c, z = rng.normal(size=(5, 300)), rng.normal(size=300)
+    c[1] = c[0] + 0.1 * c[1]
+    c[4] = c[3]
+    c /= np.linalg.norm(c, axis=1)[:, None]
+    nats = _nats(c, z, np.tile([-np.inf, np.inf], (5, 1)))
+    for i in range(3):
+        for j in range(i):
+            rest = z - c[[i, j]].T @ np.linalg.lstsq(c[[i, j]].T, z, rcond=None)[0]
+            assert nats[i, j] == pytest.approx(0.5 * (z @ z - rest @ rest), rel=1e-6)
+    assert nats[4, 3] == 0.0  # one and the same
+    both = np.linalg.lstsq(c[[0, 1]].T, z, rcond=None)[0]
+    ranges = np.tile([-np.inf, np.inf], (5, 1))
+    ranges[0] = sorted((0.0, -both[0]))
+    assert _nats(c, z, ranges)[0, 1] == 0.0  # the other way round than it may be
+
+
+def test_two_effects_of_which_either_alone_shows_little_are_found_together():
+    """A push and friction on a joint that always moves one way, so that each looks like the other with the other sign."""
+    u = 1.0 + 0.6 * np.sign(np.sin(0.05 * np.arange(600)))[:, None]
+    effects = [("input_bias", "force", {"bias": 0.5}), ("viscous_friction", "qd", {"coefficient": 0.9})]
+    given, model = _drive(JOINT, effects, u, 2e-3)
+    base = evaluate(given, model)
+    nothing = Selection(base, base, 100, (), ())
+    pair = two_together(given, nothing)
+    assert names(pair.fit.model) == (("input_bias", "force"), ("viscous_friction", "qd"))
+    assert two_together(given, Selection(base, pair.fit, 100, (), ())) is None  # nothing explains more than they do
+
+
+def test_one_that_is_inserted_before_it_leaves_the_users_own_effect_where_it_is():
+    """The model as declared moves on arcs; of pairs with another scheme none may replace what was just put in."""
+    spec = ModelSpec("unicycle", DT, {}, (EffectSpec("integration_scheme", "*", {"scheme": "euler"}),))
+    u = _held(np.random.default_rng(25), 400, [-0.5, -2.0], [0.5, 2.0])
+    given, _ = _drive(ModelSpec("unicycle", DT, {}, ()), [("input_gain", "v", {"gain": 0.8}), ("input_bias", "w", {"bias": 0.2})], u, 1e-4)
+    model = compose(spec)
+    base = evaluate(given, model)
+    pair = two_together(given, Selection(base, base, 100, (), ()))
+    assert pair is not None
+    assert gain(pair.fit, base) > 0.0
+    assert sum(a.effect.name == "integration_scheme" for a in pair.fit.model.effects) == 1
+
+
+@pytest.mark.parametrize(("substeps", "left"), [(1, 1), (5, 1), (10, 2), (12, 3), (7, 1)])
+def test_a_coarse_recording_has_the_same_mean_input_in_every_step(substeps, left):
+    rng = np.random.default_rng(26)
+    model = compose(WHEELS)
+    data = from_arrays(model, [(rng.normal(size=(41, 5)), rng.normal(size=(40, 2)))])
+    fine = data.__class__(
+        **{**data.__dict__, "substeps": substeps, "runs": tuple(_cut(run, data.substeps, substeps, rng) for run in data.runs)}
+    )
+    few = coarse(fine)
+    assert few.substeps == left <= FEW
+    for run, other in zip(fine.runs, few.runs, strict=True):
+        means = run.u.reshape(40, substeps, 2).mean(axis=1)
+        assert other.u.reshape(40, left, 2).mean(axis=1) == pytest.approx(means)
+    assert coarser(fine, 1).runs[0].u == pytest.approx(fine.runs[0].u)
+
+
+def _cut(run, before, substeps, rng):
+    u = np.repeat(run.u[::before], substeps, axis=0)
+    return run.__class__(run.start_s, run.y, u + rng.normal(size=u.shape))
+
+
+def test_a_start_of_the_wrong_sign_is_worth_nothing_to_a_pair():
+    """Behind a kink a start is a line for some way only."""
+    low, high = TAKEN
+    rng = np.random.default_rng(27)
+    c = rng.normal(size=(2, 200))
+    c /= np.linalg.norm(c, axis=1)[:, None]
+    for share, told in ((1.0, True), (-1.0, False), (2.0 * high, False), (0.5 * low, False)):
+        nats = _nats(c, c.T @ np.array([share, 1.0]), np.array([TAKEN, TAKEN]))
+        assert bool(nats[0, 1] > 0.0) is told
+
+
+def test_an_effect_of_the_tracers_is_at_the_place_at_which_it_was_looked_at():
+    given, model = _drive(JOINT, [("input_bias", "force", {"bias": 0.2})], _held(np.random.default_rng(28), 200, [-1.0], [1.0]), 1e-3)
+    model = insert(model, AppliedEffect(registry().get("effects", "input_gain"), "force", {"gain": 1.1}), 0)
+    for s in screen(given, evaluate(given, model), candidates(model, given.data))[0]:
+        place = s.candidate.place if s.candidate.replaced < 0 else s.candidate.replaced
+        assert (s.start.effects[place].effect.name, s.start.effects[place].channel) == (s.candidate.name, s.candidate.channel)
