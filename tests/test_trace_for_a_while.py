@@ -9,10 +9,11 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import from_arrays
-from s2r_runtime.trace.episodes import episodes
+from s2r_runtime.trace.episodes import _lost, episodes
 from s2r_runtime.trace.fitting import evaluate, insert, problem
 from s2r_runtime.trace.lack_of_fit import left_of
-from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.lack_of_fit_terms import pushes_by_token
+from s2r_runtime.trace.residual import acting, steps_of
 from s2r_runtime.trace.rivals import representative
 from s2r_runtime.trace.scores import Scored
 from s2r_runtime.trace.tracer import trace
@@ -169,3 +170,18 @@ def test_explanations_that_do_the_very_same_stay_in_their_order():
     first, second = (evaluate(given, insert(model, e, 0)) for e in (gain, same))
     found = [Scored("input_gain_asymmetry", "v", 1.0, second)]
     assert representative(given, first, found) == (first, found)
+
+
+def test_what_is_wild_at_the_end_of_a_run_and_at_the_start_of_the_next_one_is_no_lost_command():
+    """Two wild steps at the end of a run, and two at the start of the next one."""
+    rng = np.random.default_rng(5)
+    runs = []
+    for k in range(20):
+        u = _held(rng, 30, [0.2, -0.5], [0.4, 0.5])
+        lost = {"first": (28, 30), "second": (0, 2)}["second" if k % 2 else "first"]
+        runs.append((_unicycle(rng, u, lambda at, x, lost=lost: 0.0 if lost[0] <= at < lost[1] else 1.0, "euler"), u))
+    model = compose(ModelSpec("unicycle", DT, {}, ()))
+    data = from_arrays(model, runs)
+    given = problem(data, steps_of(data))
+    left = left_of(given, evaluate(given, model))
+    assert not _lost(left, pushes_by_token(given, model, acting(model, data)))

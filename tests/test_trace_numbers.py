@@ -11,7 +11,7 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import grid_errors
-from s2r_runtime.trace.dataset import from_arrays, from_streams
+from s2r_runtime.trace.dataset import Run, from_arrays, from_streams
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem, told
 from s2r_runtime.trace.grid_errors import widened
 from s2r_runtime.trace.intervals import intervals
@@ -257,3 +257,12 @@ def _coarse_speed(step, speeds):
     y = np.column_stack([0.04 * np.cumsum(speed), 0.0 * speed, 0.0 * speed, np.round(speed / step) * step if step else rough])
     data = from_arrays(model, [(y, np.column_stack([0.0 * speed, speed])[:-1])])
     return problem(data, steps_of(data)), model
+
+
+def test_what_changes_within_a_coarse_part_is_over_by_its_end_only_if_the_next_one_holds():
+    u = np.array([[0.0, 0.0, 0.0, 1.0], [1.0, 1.0, 1.0, 2.0], [2.0, 3.0, 3.0, 3.0]]).reshape(-1, 1)
+    pairs = grid_errors._in_pairs(Run(0.0, np.zeros((4, 1)), u), 4)
+    assert pairs.turned[:, 0].tolist() == [True, False, False]
+    fine = Run(0.0, np.zeros((4, 1)), u, turned=np.array([[False], [True], [False]]))
+    assert grid_errors._in_pairs(fine, 4).turned[:, 0].tolist() == [True, False, False]
+    assert pairs.u[:, 0].tolist() == [0.0, 0.5, 1.0, 1.5, 2.5, 3.0]

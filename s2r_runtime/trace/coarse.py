@@ -24,6 +24,9 @@ def coarse(data: Dataset) -> Dataset:
 
 
 def _joined(run: Run, substeps: int, by: int) -> Run:
+    """What changes within the last parts of a step counts as over by its end if the next ones hold (`streams.turned`)."""
     u = run.u.reshape(-1, substeps, run.u.shape[1])
-    last = np.append((u[:-1, -by] != u[:-1, -1]) & (u[:-1, -1] == u[1:, 0]), np.zeros((1, u.shape[2]), dtype=bool), axis=0)
-    return replace(run, u=run.u.reshape(-1, by, run.u.shape[1]).mean(axis=1), turned=last if run.turned is None else last | run.turned)
+    last = (u[:-1, -by] != u[:-1, -1]) & (u[:-1, -1] == u[1:, 0])
+    changed = last if run.turned is None else last | run.turned[:-1]
+    turned = np.append(changed & (u[1:, 0] == u[1:, by - 1]), np.zeros((1, u.shape[2]), dtype=bool), axis=0)
+    return replace(run, u=run.u.reshape(-1, by, run.u.shape[1]).mean(axis=1), turned=turned)

@@ -100,12 +100,13 @@ def _lost(left: Left, pushes: list[tuple[str, Array]]) -> list[Window]:
     """
     usual = np.maximum(np.median(np.abs(left.r), axis=0) / 0.6745, left.given.floor.one_step(left.f))
     wild = np.abs(left.r) > noises.OUTLIER * usual
-    n = len(wild)
-    begun = np.any(np.all([wild[k : n - SHORTEST + 1 + k] for k in range(SHORTEST)], axis=0), axis=1)
+    n, joined = len(wild), left.given.steps.joined
+    on_end = [wild[k : n - SHORTEST + 1 + k] & (joined[k : n - SHORTEST + 1 + k, None] | (k == 0)) for k in range(SHORTEST)]
+    begun = np.any(np.all(on_end, axis=0), axis=1)
     inside: Mask = np.zeros(n, dtype=bool)
     for k in range(SHORTEST):
         inside[k : n - SHORTEST + 1 + k] |= begun
-    count = float(np.count_nonzero(np.diff(inside.astype(int), prepend=0) > 0))
+    count = float(np.count_nonzero(inside & ~(joined & np.append(False, inside[:-1]))))
     windows = [(token, np.where(inside[:, None], push, 0.0), count) for token, push in pushes]
     return [w for w in windows if np.any(w[1])] if count else []
 

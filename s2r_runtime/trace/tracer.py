@@ -39,6 +39,7 @@ from s2r_runtime.trace.hidden_pairs import two_together
 from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, NOTHING, Looks, Structure, best_unnamed, explains_more, lack_of_fit, left_of
 from s2r_runtime.trace.lack_of_fit_judged import Judged, Left
+from s2r_runtime.trace.one_place import from_one_place
 from s2r_runtime.trace.orders import in_either_order
 from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.power import visible
@@ -134,6 +135,7 @@ def _traced(
         _belongs(test, model)
     model, dataset, test = thinned(model, dataset, test)
     check_plausible(model, dataset)
+    dataset, test = from_one_place(model, dataset), None if test is None else from_one_place(model, test)
     say(0.0, 100.0, "looking for faults of measurement")
     checked = check(model, with_history(model, dataset))
     seen = fit_mask(checked.data, seed, everything=test is not None)
