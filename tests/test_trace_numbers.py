@@ -185,15 +185,22 @@ def test_a_lag_is_told_right_where_commands_come_within_steps():
     assert lag == pytest.approx(0.112, abs=5e-4)
 
 
-def test_an_interval_takes_up_what_is_not_known_of_when_within_a_step_a_command_came():
-    """A ramp begins with the part of a step in which its command comes: the rate looks lower than it is."""
+def test_a_rate_is_told_right_where_commands_come_within_steps():
+    """A mean of before and after, taken for a command, would be followed before it came: the rate looked low by a hundredth."""
     given, fit = _within_steps(input_rate_limit={"rate": 9.0})
+    (low, high) = intervals(given, fit)[Slot(0, "rate")]
+    assert low < 9.0 < high < low + 0.01
+
+
+def test_an_interval_takes_up_what_is_not_known_of_when_within_a_step_a_command_came():
+    """What a limit cuts off of a mean of before and after is less than what it cuts off of both: it looks low."""
+    given, fit = _within_steps(input_saturation={"low": -0.5, "high": 0.5})
     found = intervals(given, fit)
-    low, high = found[Slot(0, "rate")]
-    assert high < 9.0
-    wider = widened(given, fit, dict(found))[Slot(0, "rate")]
+    low, high = found[Slot(0, "high")]
+    assert high < 0.5
+    wider = widened(given, fit, dict(found))[Slot(0, "high")]
     assert wider[0] == low
-    assert 9.0 < wider[1] < 9.0 + 3.0 * (9.0 - low)
+    assert 0.5 < wider[1] < 0.5 + 3.0 * (0.5 - low)
 
 
 def test_what_a_grid_adds_stays_within_what_a_number_may_be(monkeypatch):

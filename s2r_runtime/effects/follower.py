@@ -14,9 +14,12 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from s2r_runtime.effects.input_effect import Array, InputEffect, Values, columns, replaced
 from s2r_runtime.hookspecs import NominalModel
+
+Index = NDArray[np.int64]
 
 SHORT = 2
 """Rows a column below which a row at a time is faster than a column at a time."""
@@ -24,6 +27,8 @@ SHORT = 2
 
 class Follower(InputEffect):
     """Override `after`, `mean` (arrays, broadcast) and `begins` (lists of floats)."""
+
+    takes_mixed = True
 
     def after(self, y: Array, u: Array, steps: Array | float, dt: float, p: Values) -> Array:
         """y -> y after so many steps of the same u."""
@@ -46,32 +51,55 @@ class Follower(InputEffect):
         given = u[:, columns(model, channel)]
         return replaced(u, model, channel, self.mean(z, given, dt, p)), self.after(z, given, 1, dt, p)
 
-    def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
-        """u (T, nu) or (T, runs, nu), from rest."""
+    def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float | Array, p: Values, *, mixed: bool = False) -> Array:
+        """u (T, nu) or (T, runs, nu), from rest. mixed: a row between two that hold may be the mean of what comes before and after a change
+        within it, and is taken as both.
+        """
         given = u[..., columns(model, channel)].reshape(len(u), -1)
         usual = float(np.median(dt))
         lasts = np.broadcast_to(dt / usual, (len(u),))
-        y = self._by_rows(given, lasts, usual, p) if SHORT * given.shape[1] >= len(u) else self._by_stretches(given, lasts, usual, p)
+        rows, many = given.shape
+        flat = given.T.ravel()
+        at = mixtures(flat, rows) if mixed else np.zeros(0, dtype=np.int64)
+        if len(at):
+            return replaced(
+                u, model, channel, self._mean_of_both(flat, lasts, usual, p, at).reshape(many, rows).T.reshape(*u.shape[:-1], -1)
+            )
+        if SHORT * many >= rows:
+            y = self._by_rows(given, lasts, usual, p)
+        else:
+            y = self._by_stretches(flat, np.tile(lasts, many), rows * np.arange(many), usual, p).reshape(many, rows).T
         each = dt[:, None] if isinstance(dt, np.ndarray) else dt
         return replaced(u, model, channel, self.mean(y, given, each, p).reshape(*u.shape[:-1], -1))
 
-    def _by_stretches(self, u: Array, lasts: Array, dt: float, p: Values) -> Array:
-        """u (T, m), rows of so many steps (T,) -> y at the start of each, (T, m)."""
-        rows, many = u.shape
-        flat = u.T.ravel()
+    def _mean_of_both(self, flat: Array, lasts: Array, dt: float, p: Values, at: Index) -> Array:
+        """u of columns end to end, rows of so many steps (T,) -> means of what acts; rows `at` in two parts, each of what is held."""
+        share = (flat[at] - flat[at - 1]) / (flat[at + 1] - flat[at - 1])
+        parts = np.ones(len(flat), dtype=np.int64)
+        parts[at] = 2
+        first = np.cumsum(parts) - parts
+        u, long = np.repeat(flat, parts), np.repeat(np.tile(lasts, len(flat) // len(lasts)), parts)
+        u[first[at]], u[first[at] + 1] = flat[at - 1], flat[at + 1]
+        long[first[at]] *= 1.0 - share
+        long[first[at] + 1] *= share
+        y = self._by_stretches(u, long, first[:: len(lasts)], dt, p)
+        acting = self.mean(y[:, None], u[:, None], long[:, None] * dt, p)[:, 0]
+        return np.asarray(np.add.reduceat(acting * long, first) / np.add.reduceat(long, first))
+
+    def _by_stretches(self, flat: Array, lasts: Array, begins: Index, dt: float, p: Values) -> Array:
+        """u of columns end to end, (rows,), each row so many steps (rows,), columns from `begins` on -> y at the start of each row."""
         new = np.append(True, flat[1:] != flat[:-1])
-        new[::rows] = True
+        new[begins] = True
         first = np.flatnonzero(new)
         number = np.diff(np.append(first, len(flat)))
-        until = np.cumsum(np.tile(lasts, many))
+        until = np.cumsum(lasts)
         ends = until[first + number - 1]
         held, counts, begun = flat[first].tolist(), np.diff(ends, prepend=0.0).tolist(), []
-        for a, b in pairwise(np.searchsorted(first, rows * np.arange(many + 1)).tolist()):
+        for a, b in pairwise(np.searchsorted(first, np.append(begins, len(flat))).tolist()):
             begun += self.begins(held[a:b], counts[a:b], dt, p)
         since = np.append(0.0, until[:-1])
         since -= np.repeat(since[first], number)
-        y = self.after(np.repeat(np.array(begun), number), flat, since, dt, p)
-        return y.reshape(many, rows).T
+        return self.after(np.repeat(np.array(begun), number), flat, since, dt, p)
 
     def _by_rows(self, u: Array, lasts: Array, dt: float, p: Values) -> Array:
         """The same, a row at a time."""
@@ -81,3 +109,14 @@ class Follower(InputEffect):
             y[k] = now
             now = self.after(now, row, steps, dt, p)
         return y
+
+
+def mixtures(flat: Array, rows: int) -> Index:
+    """Rows, of columns of so many rows end to end, that lie between two values of which each is held for two rows or more: where an input
+    changes within a row, that has the mean of before and after.
+    """
+    changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
+    k = changes[:-1][np.diff(changes) == 1]
+    k = k[(k % rows >= 2) & (k % rows < rows - 2)]
+    alone = (flat[k - 2] == flat[k - 1]) & (flat[k + 1] == flat[k + 2]) & ((flat[k] - flat[k - 1]) * (flat[k + 1] - flat[k]) > 0.0)
+    return np.asarray(k[alone])

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from s2r_runtime.effects.follower import Follower
+from s2r_runtime.effects.follower import Follower, mixtures
 from s2r_runtime.effects.input_effect import Array, Values, columns, replaced
 from s2r_runtime.hookspecs import NominalModel, Parameter
 
@@ -54,11 +54,20 @@ class InputRateLimit(Follower):
     def at_end(
         self, tables: tuple[Array, Array, Array], before: Array | None, model: NominalModel, channel: str, dt: float | Array, p: Values
     ) -> Array:
-        """The ramp's end, from its mean: half a step's ramp further, and u where it got there (the mean is less than that short of it)."""
+        """The ramp's end, from its mean: half a step's ramp further, and u where it got there (the mean is less than that short of it).
+        Where u changed within the row (`mixtures`), the ramp's beginning in the next one, from the mean of that.
+        """
         given, acting, _ = tables
         u, mean = given[..., columns(model, channel)], acting[..., columns(model, channel)]
         up, down = _limits(p, dt)
-        return replaced(acting, model, channel, mean + np.minimum(np.maximum(u - mean, -0.5 * down), 0.5 * up))
+        end = np.ascontiguousarray(mean + np.minimum(np.maximum(u - mean, -0.5 * down), 0.5 * up))
+        if before is None:
+            rows, flat = len(u), u.reshape(len(u), -1).T.ravel()
+            at = mixtures(flat, rows)
+            after = (at + 1) % rows, at // rows
+            short, reach = (np.broadcast_to(e, u.shape).reshape(rows, -1)[after] for e in (u - mean, np.where(u > mean, up, down)))
+            end.reshape(rows, -1)[at % rows, at // rows] = flat[at + 1] - np.sign(short) * _before(np.abs(short), reach)
+        return replaced(acting, model, channel, end)
 
     def begins(self, held: list[float], steps: Sequence[float], dt: float, p: Values) -> list[float]:
         """One ramp a stretch."""
@@ -85,6 +94,11 @@ class InputRateLimit(Follower):
     def fuller(self, p: Values) -> Values | None:
         """One for each direction."""
         return None if "rate_down" in p else {**p, "rate_down": p["rate"]}
+
+
+def _before(short: Array, reach: Array) -> Array:
+    """How far a row's beginning is from the input that its mean falls short of, by so much; reach: how far the ramp gets in a row."""
+    return np.where(short < 0.5 * reach, np.sqrt(2.0 * reach * short), short + 0.5 * reach)
 
 
 def _limits(p: Values, dt: Any) -> tuple[Any, Any]:

@@ -48,10 +48,15 @@ class _Same:
 
 
 class Inputs:
-    """Held inputs of runs, (T_i, nu) each, in rows of dt; starts: of the runs, s. lasts: (T_i,) s, of each row, where they differ."""
+    """Held inputs of runs, (T_i, nu) each, in rows of dt; starts: of the runs, s. lasts: (T_i,) s, of each row, where they differ. parts:
+    rows in a step of the model; where there are several, an input that changes within one has a mean there that nobody commanded.
+    """
 
-    def __init__(self, inputs: Sequence[Array], dt: float, starts: Sequence[float], lasts: Sequence[Array] | None = None) -> None:
+    def __init__(
+        self, inputs: Sequence[Array], dt: float, starts: Sequence[float], lasts: Sequence[Array] | None = None, parts: int = 1
+    ) -> None:
         self._dt = dt
+        self._mixed = parts > 1
         self._lasts = None if lasts is None else _end_to_end([e[:, None] for e in lasts], REST_S)[:, 0]
         begins = [] if lasts is None else [s + np.cumsum(e) - e for s, e in zip(starts, lasts, strict=True)]
         self._begins = _end_to_end([b[:, None] for b in begins], 0.0)[:, 0] if begins else np.zeros(0)
@@ -165,8 +170,8 @@ class Inputs:
         """What acts."""
         if self._lasts is not None and getattr(a.effect, "uneven", False):
             given = _end_to_end(self._split(tables), 0.0)
-            timed = {"start": self._begins} if getattr(a.effect, "timed", False) else {}
-            return self._tabled(a.effect.input_sequence(given, model.nominal, a.channel, self._lasts, a.p, **timed))  # type: ignore[arg-type]
+            also = {"start": self._begins} if getattr(a.effect, "timed", False) else self._also(a)
+            return self._tabled(a.effect.input_sequence(given, model.nominal, a.channel, self._lasts, a.p, **also))  # type: ignore[arg-type]
         if self._rows is None or getattr(a.effect, "side_by_side", False):
             return [self._over_time(a, u, model, start) for u, start in zip(tables, self._starts, strict=True)]
         z, done = a.effect.hidden(tables[0].shape[1], model.nominal, a.channel, self._dt, a.p), []
@@ -193,7 +198,11 @@ class Inputs:
         """`input_sequence`; an effect that depends on time is told when the first row is."""
         if getattr(a.effect, "timed", False):
             return a.effect.input_sequence(u, model.nominal, a.channel, self._dt, a.p, start=start)  # type: ignore[call-arg]
-        return a.effect.input_sequence(u, model.nominal, a.channel, self._dt, a.p)
+        return a.effect.input_sequence(u, model.nominal, a.channel, self._dt, a.p, **self._also(a))
+
+    def _also(self, a: AppliedEffect) -> dict[str, bool]:
+        """What an effect is told that knows what to make of rows within which an input changes."""
+        return {"mixed": True} if self._mixed and getattr(a.effect, "takes_mixed", False) else {}
 
     def _keep(self, key: Key, found: list[Array]) -> None:
         self._kept[key] = found

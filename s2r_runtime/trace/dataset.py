@@ -150,7 +150,7 @@ class Dataset:
     def chains(self) -> Inputs:
         """The inputs of its runs, for chains of effects."""
         lasts = [np.repeat(run.durations(self.dt) / self.substeps, self.substeps) for run in self.runs] if self.uneven else None
-        return Inputs([run.u for run in self.runs], self.dt / self.substeps, [run.start_s for run in self.runs], lasts)
+        return Inputs([run.u for run in self.runs], self.dt / self.substeps, [run.start_s for run in self.runs], lasts, self.substeps)
 
     @property
     def uneven(self) -> bool:

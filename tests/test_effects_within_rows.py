@@ -1,0 +1,58 @@
+"""Inputs that change within a row: a follower (a rate limit, a play) takes the row's mean as what it is the mean of."""
+
+import numpy as np
+import pytest
+
+from s2r_runtime.models.composed import AppliedEffect, compose
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.plugins import registry
+from s2r_runtime.trace.chains import Inputs
+
+DT, FINE, LATE = 0.01, 50, 13
+"""Rows, fine rows in one, and the fine row of each in which the input changes."""
+
+UP, DOWN = {"rate": 3.0, "rate_down": 7.0}, {"rate": 40.0}
+
+
+def _held(rng, columns):
+    """(T FINE, columns) in which every input is held for some rows, and changes within one."""
+    made = []
+    for _ in range(columns):
+        values, rows = rng.uniform(-1.0, 1.0, 40), rng.integers(5, 12, 40)
+        made.append(np.concatenate([np.zeros(3 * FINE + LATE), np.repeat(values, rows * FINE)]))
+    end = min(map(len, made)) // FINE * FINE
+    return np.stack([column[:end] for column in made], axis=1)
+
+
+def _wheels():
+    return compose(ModelSpec("differential_drive", DT, {"wheel_radius": 0.1, "track": 0.3}))
+
+
+def _through(name, p, runs, dt, parts):
+    model = _wheels()
+    chain = [AppliedEffect(registry().get("effects", name), "cmd_left", p)]
+    return Inputs(runs, dt, [0.0] * len(runs), parts=parts).with_ends(model, chain)
+
+
+@pytest.mark.parametrize(("name", "p"), [("input_rate_limit", UP), ("input_rate_limit", DOWN), ("input_backlash", {"width": 0.3})])
+@pytest.mark.parametrize("runs", [1, 6])
+def test_a_change_within_a_row_is_followed_from_when_it_comes(name, p, runs):
+    fine = [_held(np.random.default_rng(seed), 2) for seed in range(runs)]
+    end = min(map(len, fine))
+    fine = [u[:end] for u in fine]
+    rows = [u.reshape(-1, FINE, 2).mean(axis=1) for u in fine]
+    exact, ends = _through(name, p, fine, DT / FINE, 1)
+    mean, last = _through(name, p, rows, DT, 10)
+    known = np.arange(len(mean)) % (end // FINE) < end // FINE - 2  # at the end of a run nobody knows what comes
+    assert mean[known] == pytest.approx(exact.reshape(-1, FINE, 2).mean(axis=1)[known], abs=1e-9)
+    if name == "input_rate_limit":
+        assert last[known, 0] == pytest.approx(ends[FINE - 1 :: FINE][known, 0], abs=1e-6)
+    plain, _ = _through(name, p, rows, DT, 1)
+    assert np.max(np.abs(plain - mean)) > 0.01  # as a row of its own it is another command
+
+
+def test_what_is_commanded_for_a_row_of_a_ramp_or_a_peak_is_a_command():
+    u = np.zeros((12, 2))
+    u[3:, 0] = [0.1, 0.2, 0.3, 0.4, 0.5, 0.5, 0.9, 0.5, 0.5]
+    each = [_through("input_rate_limit", UP, [u], DT, parts)[0] for parts in (1, 10)]
+    assert each[0] == pytest.approx(each[1], abs=1e-12)
