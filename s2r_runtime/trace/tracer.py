@@ -375,6 +375,9 @@ class _Whole:
         if looks.most <= NOTHING and not found.matters:  # what explained more than the names would explain something beside them
             return found
         best = fitted(self.given, fit, fit.model, 2)  # what it is compared with is fitted to all of the recording, too
+        if found.matters and gain(best, fit) > ALIKE:  # numbers of the fit's part are a little off elsewhere: that is no structure
+            looks = Looks(left_of(self.given, best))
+            found = lack_of_fit(looks, self.nominal, self._horizon)
         if (looks.most > ALIKE or found.matters) and self._explained_without(best, found):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
         if found.matters and _bent(found, best, self.nominal):
