@@ -8,7 +8,7 @@ relevant      some rollout's rms error falls by RELEVANT, on blocks that the par
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -117,7 +117,7 @@ def called_for(
         chosen = next((s.fit for s in found if s.fit is not None and accepted(given, s.fit, fit, tried, horizon, bar)), None)
         if chosen is None:
             break
-        chosen = enriched(given, fitted(given, chosen, chosen.model), bar)
+        chosen = parted(given, enriched(given, fitted(given, chosen, chosen.model), bar), ranking, bar)
         fit = exchanged(given, chosen, bar) if 1 < len(chosen.added) <= EXCHANGED else chosen
         if crowded(fit):
             break
@@ -327,6 +327,27 @@ def enriched(given: Problem, fit: Fit, bar: Bar) -> Fit:
             other = fitted(given, fit, model)
             if gain(other, fit) > bar.price(other.k - fit.k, len(given.steps)) + CLOSE:
                 fit = other
+    return fit
+
+
+def parted(given: Problem, fit: Fit, ranking: Sequence[Scored], bar: Bar) -> Fit:
+    """With another effect on one input, and what was found on all of them on the others only, where that explains more: a delay of all is
+    much like a delay of one and a lag of the other. ranking: on the model as given; it must have something on that input that does better
+    there than what was found on all.
+    """
+    for place in fit.added:
+        a = fit.model.effects[place]
+        for name in fit.model.inputs if a.channel == "*" and getattr(a.effect, "all_alike", False) else ():
+            own = max((s.score for s in ranking if (s.name, s.channel) == (a.effect.name, name)), default=0.0)
+            best = next((s for s in ranking if s.channel == name), None)  # the ranking has the best one first
+            if best is None or best.fit is None or best.name == a.effect.name or best.score <= own + CLOSE:
+                continue
+            instead = [b for b in best.fit.model.effects if isinstance(b, Added) and name_of(b) == (best.name, name)]
+            apart = [*(Added(a.effect, other, a.p) for other in fit.model.inputs if other != name), *instead]
+            there = fit.model.effects
+            other = fitted(given, fit, replace(fit.model, effects=(*there[:place], *apart, *there[place + 1 :])))
+            if gain(other, fit) > bar.price(other.k - fit.k, len(given.steps)) + CLOSE:
+                return other
     return fit
 
 
