@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.reach import SIGMAS, Fault, Reach, predicted
+from s2r_runtime.trace.reach import ONE_IN, SIGMAS, Fault, Reach, predicted
 from s2r_runtime.trace.residual import Acting
 
 Array = NDArray[np.float64]
@@ -27,6 +27,9 @@ TAIL_SIGMAS = 3.5
 
 WILD_SIGMAS = 6.0
 """As TAIL_SIGMAS, from which a row is left out where tails are known to be heavy; an effect hardly takes a state away for one row alone."""
+
+FEW = 3
+"""Rows beyond TAIL_SIGMAS that are no spikes from which on they have a law."""
 
 BEYOND = 2.2
 """Times the largest move in a step: a command that reverses and is late, or followed with a lag, leaves up to twice that."""
@@ -63,6 +66,7 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
         series = np.nan_to_num(change[:, j] if reach.instant[j] else e[:, j])
         limit = SIGMAS * reach.noise[j] + BEYOND * reach.move[j]
         for_one_step = SIGMAS * reach.noise[j] + BEYOND * (reach.turn if name in pose else reach.move)[j]
+        tail = max(float(reach.tail[j]), _reached(series, float(reach.noise[j]), float(for_one_step)))
         lost = np.isnan(run.y[:, j])
         single: list[int] = []
         for k in np.flatnonzero(np.abs(series) > for_one_step).tolist():
@@ -73,7 +77,7 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
                 continue
             if rows is not None:
                 bad[rows[0] : rows[1] + 1, j] = True
-                kind = found.spikes if abs(float(series[k])) > reach.tail[j] else found.tails
+                kind = found.spikes if abs(float(series[k])) > tail else found.tails
                 kind.append(Fault(run.start_s + data.dt * rows[0], run.start_s + data.dt * rows[1], name, "spike"))
             elif _alone(series, k) and not np.any((lost | bad[:, j])[max(k - 1, 0) : k + 3]):  # where rows lack, the way back is not seen
                 single.append(k)
@@ -81,6 +85,19 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
             for k, back in _offsets(series, single):
                 _take_out(found, model, data, i, j, k, back, bad)
     return found
+
+
+def _reached(series: Array, noise: float, least: float) -> float:
+    """What noise whose rarest values are off by less than `least` may reach in one recording of a hundred, by the power law of those beyond
+    TAIL_SIGMAS (B. Hill, Annals of Statistics 3(5), 1975): a few wild rows in a thousand are no matter of the quantiles. 0 where there are
+    next to none: white noise has none.
+    """
+    legs = np.minimum(np.abs(series[:-1]), np.abs(series[1:]))
+    back = np.abs(series[:-1] + series[1:]) < 0.35 * np.maximum(np.abs(series[:-1]), np.abs(series[1:]))
+    wild = legs[back & (legs > TAIL_SIGMAS * noise) & (legs <= least)] / (TAIL_SIGMAS * noise)
+    if len(wild) < FEW:
+        return 0.0
+    return float(TAIL_SIGMAS * noise * (ONE_IN * len(wild)) ** np.mean(np.log(wild)))
 
 
 def _alone(series: Array, k: int) -> bool:
