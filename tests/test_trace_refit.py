@@ -81,3 +81,12 @@ def test_a_delay_of_all_inputs_is_one_of_some_where_another_input_lags(lacks, fo
     ranking, _ = best_candidates(given, nominal)
     late = fitted(given, nominal, _named(model, "input_delay", "*", {"delay": 0.12}))
     assert names(parted(given, late, ranking, STRICT).model) == found
+
+
+def test_what_acts_on_all_inputs_together_is_not_parted():
+    model, data = _recorded(("wheel_saturation", "*", {"speed": 0.25, "track": 0.4}), ("input_lag", "v", {"time_constant": 0.3}))
+    given = problem(data, steps_of(data))
+    nominal = evaluate(given, model)
+    ranking, _ = best_candidates(given, nominal)
+    fit = fitted(given, nominal, _named(model, "wheel_saturation", "*", {"speed": 0.25, "track": 0.4}))
+    assert parted(given, fit, ranking, STRICT) is fit

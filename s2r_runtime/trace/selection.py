@@ -337,7 +337,8 @@ def parted(given: Problem, fit: Fit, ranking: Sequence[Scored], bar: Bar) -> Fit
     """
     for place in fit.added:
         a = fit.model.effects[place]
-        for name in fit.model.inputs if a.channel == "*" and getattr(a.effect, "all_alike", False) else ():
+        each = set(fit.model.inputs) <= set(a.effect.channels(fit.model.nominal))
+        for name in fit.model.inputs if a.channel == "*" and each else ():
             own = max((s.score for s in ranking if (s.name, s.channel) == (a.effect.name, name)), default=0.0)
             best = next((s for s in ranking if s.channel == name), None)  # the ranking has the best one first
             if best is None or best.fit is None or best.name == a.effect.name or best.score <= own + CLOSE:
