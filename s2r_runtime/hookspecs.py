@@ -185,7 +185,6 @@ class Effect(Protocol):
     - `same_as(model, channel) -> tuple[tuple[str, str, convert], ...]`: effects that it is identical to on this model: name, channel, and
       a function of its values that gives theirs. The tracer looks for the first of them instead (`effects.classes` has the built-in ones);
     - `simpler(p) -> (name, p)`: the effect with fewer numbers that it is if its own agree, on the same channel;
-    - `richer(p) -> p`: the same with numbers that it can do without, so that it does what it did; the tracer goes on from there;
     - `takes(model, channel) -> tuple[str, ...]`: names of the parameters that it has there (default: all);
     - `frame(model, channel) -> str` (stage `step`): "body" if it changes the motion of the body (it then applies before a pose is
       integrated along it), "sliding" if it depends on that motion (after "body"), "world" if it adds to the motion along the world's

@@ -10,7 +10,7 @@ from s2r_runtime.hookspecs import Parameter
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import grid_errors
+from s2r_runtime.trace import coarse, grid_errors
 from s2r_runtime.trace.dataset import Run, from_arrays, from_streams
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem, told
 from s2r_runtime.trace.grid_errors import widened
@@ -268,8 +268,8 @@ def _coarse_speed(step, speeds):
 
 def test_what_changes_within_a_coarse_part_is_over_by_its_end_only_if_the_next_one_holds():
     u = np.array([[0.0, 0.0, 0.0, 1.0], [1.0, 1.0, 1.0, 2.0], [2.0, 3.0, 3.0, 3.0]]).reshape(-1, 1)
-    pairs = grid_errors._in_pairs(Run(0.0, np.zeros((4, 1)), u), 4)
+    pairs = coarse._joined(Run(0.0, np.zeros((4, 1)), u), 4, 2)
     assert pairs.turned[:, 0].tolist() == [True, False, False]
     fine = Run(0.0, np.zeros((4, 1)), u, turned=np.array([[False], [True], [False]]))
-    assert grid_errors._in_pairs(fine, 4).turned[:, 0].tolist() == [True, False, False]
+    assert coarse._joined(fine, 4, 2).turned[:, 0].tolist() == [True, False, False]
     assert pairs.u[:, 0].tolist() == [0.0, 0.5, 1.0, 1.5, 2.5, 3.0]

@@ -13,7 +13,7 @@ from s2r_runtime.trace.faults import check
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.scores import STRICT, best_candidates, names
-from s2r_runtime.trace.selection import Selection, enriched, parted
+from s2r_runtime.trace.selection import Selection, parted
 from s2r_runtime.trace.tracer import _Whole
 
 DT, NOISE = 0.05, np.array([0.001, 0.001, 0.003])
@@ -40,8 +40,7 @@ def _named(model, name, channel, p):
 def test_a_limit_gets_a_rate_down_of_its_own_where_that_explains_more(rates, told):
     model, data = _recorded(("input_rate_limit", "w", rates))
     given = problem(data, steps_of(data))
-    one = fitted(given, evaluate(given, model), _named(model, "input_rate_limit", "w", {"rate": 4.0}))
-    p = enriched(given, one, STRICT).model.effects[0].p
+    p = next(s.fit for s in best_candidates(given, evaluate(given, model))[0] if s.name == "input_rate_limit").model.effects[0].p
     assert ("rate_down" in p) == told
     assert p == pytest.approx(rates, rel=0.05)
 

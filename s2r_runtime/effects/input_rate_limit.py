@@ -33,10 +33,6 @@ class InputRateLimit(Follower):
     optional = ("rate_down",)
     uneven = True
 
-    def richer(self, p: Values) -> Values:
-        """Each direction with a rate of its own."""
-        return {**p, "rate_down": p.get("rate_down", p["rate"])}
-
     def within_step(self, dt: float, p: Values) -> bool:
         """A ramp goes on over the step."""
         return True

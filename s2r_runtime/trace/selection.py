@@ -117,7 +117,7 @@ def called_for(
         chosen = next((s.fit for s in found if s.fit is not None and accepted(given, s.fit, fit, tried, horizon, bar)), None)
         if chosen is None:
             break
-        chosen = parted(given, enriched(given, fitted(given, chosen, chosen.model), bar), ranking, bar)
+        chosen = parted(given, fitted(given, chosen, chosen.model), ranking, bar)
         fit = exchanged(given, chosen, bar) if 1 < len(chosen.added) <= EXCHANGED else chosen
         if crowded(fit):
             break
@@ -312,21 +312,6 @@ def exchanged(given: Problem, fit: Fit, bar: Bar) -> Fit:
         margin = CLOSE if best.k >= fit.k else 0.0  # a simpler one that does as well needs no more than that
         if gain(best, fit) > bar.price(best.k - fit.k, len(given.steps)) + margin:
             fit = fitted(given, best, best.model)
-    return fit
-
-
-def enriched(given: Problem, fit: Fit, bar: Bar) -> Fit:
-    """With numbers of an effect's own that it can do without, where they explain more from those that were found without them: a start far
-    from both of two rates leads to neither.
-    """
-    for place in fit.added:
-        a = fit.model.effects[place]
-        if hasattr(a.effect, "richer") and (p := a.effect.richer(a.p)) != a.p:
-            there = fit.model.effects
-            model = replace(fit.model, effects=(*there[:place], Added(a.effect, a.channel, p), *there[place + 1 :]))
-            other = fitted(given, fit, model)
-            if gain(other, fit) > bar.price(other.k - fit.k, len(given.steps)) + CLOSE:
-                fit = other
     return fit
 
 

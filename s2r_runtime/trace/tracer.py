@@ -357,39 +357,41 @@ class _Whole:
 
     def structure(self, chosen: Selection) -> Structure:
         """What the chosen model leaves."""
-        fit = evaluate(self.given, chosen.fit.model) if chosen.fit.added else self.nominal
-        looks = Looks(left_of(self.given, fit)) if fit.added else self._looks
+        if not chosen.fit.added:
+            return self._of_nominal()
+        fit = evaluate(self.given, chosen.fit.model)
+        fit = fitted(self.given, fit, fit.model, 2)  # numbers of the fit's part are a little off elsewhere: that is no structure
+        looks = Looks(left_of(self.given, fit))
         found = lack_of_fit(looks, self.nominal, self._horizon)
-        if not fit.added:
-            seen = found.matters and not found.for_a_while and not found.varies
-            if seen and self.unnamed.gain > CLEAR:
-                tokens = self._looks_like
-            elif seen and self._field is not None and self._field.beyond > CLEAR:
-                tokens = self._field.tokens  # it was seen by sliding only, which names what it tries
-            else:
-                tokens = () if self._shape is None else (self._shape.token,)
-            named = tuple(dict.fromkeys((*tokens, *found.tokens)))
-            return replace(found, tokens=named, matters=True, share=1.0) if tokens else found
         if crowded(fit):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
         if looks.most <= NOTHING and not found.matters:  # what explained more than the names would explain something beside them
             return found
-        best = fitted(self.given, fit, fit.model, 2)  # what it is compared with is fitted to all of the recording, too
-        if found.matters and gain(best, fit) > ALIKE:  # numbers of the fit's part are a little off elsewhere: that is no structure
-            looks = Looks(left_of(self.given, best))
-            found = lack_of_fit(looks, self.nominal, self._horizon)
-        if (looks.most > ALIKE or found.matters) and self._explained_without(best, found):
+        if (looks.most > ALIKE or found.matters) and self._explained_without(fit, looks.left, found):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
-        if found.matters and _bent(found, best, self.nominal):
+        if found.matters and _bent(found, fit, self.nominal):
             return replace(found, share=1.0)
-        better = better_shape(self.given, best, self._horizon)
+        better = better_shape(self.given, fit, self._horizon)
         return found if better is None else replace(found, tokens=(better.token,), matters=True, share=1.0, nameless=True)
 
-    def _explained_without(self, best: Fit, found: Structure) -> bool:
+    def _of_nominal(self) -> Structure:
+        """What the model as given leaves."""
+        found = lack_of_fit(self._looks, self.nominal, self._horizon)
+        seen = found.matters and not found.for_a_while and not found.varies
+        if seen and self.unnamed.gain > CLEAR:
+            tokens = self._looks_like
+        elif seen and self._field is not None and self._field.beyond > CLEAR:
+            tokens = self._field.tokens  # it was seen by sliding only, which names what it tries
+        else:
+            tokens = () if self._shape is None else (self._shape.token,)
+        named = tuple(dict.fromkeys((*tokens, *found.tokens)))
+        return replace(found, tokens=named, matters=True, share=1.0) if tokens else found
+
+    def _explained_without(self, fit: Fit, left: Left, found: Structure) -> bool:
         """Whether something without a name explains more than what was named."""
-        if self._unnamed_explains_more(best, found.matters):
+        if self._unnamed_explains_more(fit, found.matters):
             return True
-        return not self.given.floor.axes and self._no_name(found, left_of(self.given, best))
+        return not self.given.floor.axes and self._no_name(found, left)
 
     def _no_name(self, found: Structure, named: Left) -> bool:
         """Whether a field explains more than what was named, or a push that wanders as much."""
