@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.begun import begun, measured
+from s2r_runtime.trace.constancy import uneven
 from s2r_runtime.trace.episodes import episodes, may_depend_on
 from s2r_runtime.trace.evidence import evidence, margin
 from s2r_runtime.trace.fields import Field, as_noise, field, nats_of
@@ -119,6 +120,7 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     """Structure left by a model; how much of what `nominal` leaves that is."""
     left, found = looks.left, looks.found
     chosen, gains = _forward(looks) if found else ([], {})
+    number = uneven(left)
     wanders = left.law is not None and np.any(left.law.slow.sum(axis=1) > 0.0)  # else what is left is steadier than white noise
     coloured = ("noise",) if np.any(left.fit.colour.strength > COLOURED) or wanders else ()
     windows: Judged | None = None
@@ -129,18 +131,29 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     if chosen:
         matters, share = _weight_of(left, nominal, chosen[-1], horizon)
         if matters and not _wanders(left, chosen[-1], SLOW * math.log(len(looks.found) / ALPHA)):
-            tokens = tuple(dict.fromkeys(TOKENS.get(judged.token, judged.token) for judged in chosen))
+            first = [] if number is None or number.gain <= chosen[-1].gain else [number]
+            tokens = tuple(dict.fromkeys(TOKENS.get(judged.token, judged.token) for judged in [*first, *chosen]))
             return Structure(tokens, True, share, gains, noise=_beside(left, chosen[-1]))
     varied = looks.field
     if varied is not None and varied.beyond > 0.0:
         matters, share = _weight_of(left, nominal, varied.judged, horizon)
         if matters:
             return Structure(varied.tokens, True, share, gains, varies=True, noise=_beside(left, varied.judged))
+    if number is not None and not (_goes_slowly(number) and _wanders(left, number, math.inf)):
+        matters, share = _weight_of(left, nominal, number, horizon)
+        if matters:
+            gains[number.token] = max(gains.get(number.token, 0.0), number.gain)
+            return Structure((number.token,), True, share, gains, noise=_beside(left, number))
     windows = None if chosen else windows or _for_a_while(left)
     matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
     if windows is None or not matters:
         return Structure(coloured, False, 0.0, gains)
     return Structure(may_depend_on(left, windows, found), True, share, gains, for_a_while=True, noise=_beside(left, windows))
+
+
+def _goes_slowly(judged: Judged) -> bool:
+    """Whether what a number varies with is as slow as what wanders."""
+    return judged.token.startswith("time") or judged.token in {"position", "heading"}
 
 
 def _for_a_while(left: Left) -> Judged | None:

@@ -1,0 +1,80 @@
+"""A named number is one number everywhere; one that is more here and less there is told by what it goes with."""
+
+import math
+
+import numpy as np
+import pytest
+
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.trace.constancy import ALPHA, uneven
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
+from s2r_runtime.trace.lack_of_fit import left_of
+from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.tracer import trace
+
+DT = 0.05
+NOISE = np.array([0.0008, 0.0008, 0.002])
+
+
+def _driven(rng, steps, gain):
+    """(steps + 1, 3) measured and (steps, 2) commands of a robot that does gain(x, v, w) of w."""
+    u = np.repeat(rng.uniform([0.1, -1.5], [0.5, 1.5], (steps // 15 + 1, 2)), 15, axis=0)[:steps]
+    x = np.zeros(3)
+    rows = [x]
+    for v, w in u:
+        x = x + DT * np.array([v * math.cos(x[2]), v * math.sin(x[2]), w * gain(x, v, w)])
+        rows.append(x)
+    return np.array(rows) + rng.normal(size=(len(rows), 3)) * NOISE, u
+
+
+def _left(rng, steps, gain):
+    """What a gain of w, fitted, leaves."""
+    bare = compose(ModelSpec("unicycle", DT, {}, ()))
+    named = compose(ModelSpec("unicycle", DT, {}, (EffectSpec("input_gain", "w", {"gain": 0.8}),)))
+    data = from_arrays(bare, [_driven(rng, steps, gain)])
+    given = problem(data, steps_of(data))
+    model = insert(bare, named.effects[0], 0)
+    return left_of(given, fitted(given, evaluate(given, model), model))
+
+
+@pytest.mark.parametrize(
+    ("gain", "token"),
+    [
+        (lambda x, v, w: 0.75 + 0.5 * (v - 0.3), "w*v"),
+        (lambda x, v, w: 0.75 + 0.1 * math.cos(x[2]), "heading"),
+        (lambda x, v, w: 0.75 + 0.1 * abs(w), "w"),
+    ],
+)
+def test_a_gain_that_is_more_here_and_less_there_is_no_gain(gain, token):
+    found = uneven(_left(np.random.default_rng(1), 700, gain))
+    assert found is not None
+    assert found.token == token
+
+
+def test_a_gain_that_is_one_number_is_not_told_to_vary():
+    """The looks of 40 drives together have a chance of 40 ALPHA at most."""
+    found = [uneven(_left(np.random.default_rng(seed), 400, lambda x, v, w: 0.75)) for seed in range(40)]
+    assert sum(one is not None for one in found) <= 1 < 1.0 / (40 * ALPHA)
+
+
+def test_a_number_that_varies_a_little_is_one_number_for_all_that_matters():
+    """On many rows it is told beyond doubt, and explains next to nothing of what the gain does."""
+    assert uneven(_left(np.random.default_rng(2), 6000, lambda x, v, w: 0.75 + 0.05 * (v - 0.3))) is None
+
+
+def test_friction_that_is_more_at_some_places_is_not_told_as_friction_alone():
+    """A joint on a guide that is dirty at one end."""
+    rng, dt = np.random.default_rng(6), 1.0 / 30.0
+    model = compose(ModelSpec("joint", dt, {"mass": 1.0}, ()))
+    force = np.repeat(rng.uniform(-1.0, 1.0, 120), 10)
+    q = qd = 0.0
+    rows = [(q, qd)]
+    for f in force:
+        for _ in range(10):
+            q, qd = q + 0.1 * dt * qd, qd + 0.1 * dt * (f - (0.6 + 0.25 * math.tanh(2.0 * q)) * qd)
+        rows.append((q, qd))
+    y = np.array(rows) + rng.normal(size=(len(rows), 2)) * [0.004, 0.02]
+    result = trace(from_arrays(model, [(y, force[:, None])]), model)
+    assert "position" in result.depends_on
