@@ -1,4 +1,4 @@
-"""A named number is one number everywhere; one that is more here and less there is told by what it goes with."""
+"""A named number is one number everywhere; one that is more here and less there is told by what it goes with, as a drifting heading is."""
 
 import math
 
@@ -78,3 +78,19 @@ def test_friction_that_is_more_at_some_places_is_not_told_as_friction_alone():
     y = np.array(rows) + rng.normal(size=(len(rows), 2)) * [0.004, 0.02]
     result = trace(from_arrays(model, [(y, force[:, None])]), model)
     assert "position" in result.depends_on
+
+
+def test_a_heading_that_drifts_goes_with_time():
+    """A gyroscope on a robot with wheels: its way turns aside, and it seems to turn."""
+    rng = np.random.default_rng(3)
+    model = compose(ModelSpec("differential_drive", DT, {"wheel_radius": 0.05, "track": 0.3}, ()))
+    u = np.repeat(rng.uniform(-6.0, 8.0, (40, 2)), 20, axis=0)
+    x, hidden = np.zeros((1, len(model.states))), model.at_rest(1)
+    rows = [x[0]]
+    for k in range(len(u)):
+        x, hidden = model.step(x, u[k : k + 1], hidden)
+        rows.append(x[0])
+    y = np.array(rows) + rng.normal(size=(len(rows), len(model.states))) * [0.001, 0.001, 0.003, 0.05, 0.05]
+    y[:, 2] += 0.8 * np.linspace(0.0, 1.0, len(y))
+    result = trace(from_arrays(model, [(y, u)]), model)
+    assert result.depends_on[:1] == ("time",)

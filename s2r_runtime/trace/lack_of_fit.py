@@ -135,15 +135,14 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
             tokens = tuple(dict.fromkeys(TOKENS.get(judged.token, judged.token) for judged in [*first, *chosen]))
             return Structure(tokens, True, share, gains, noise=_beside(left, chosen[-1]))
     varied = looks.field
-    if varied is not None and varied.beyond > 0.0:
-        matters, share = _weight_of(left, nominal, varied.judged, horizon)
-        if matters:
-            return Structure(varied.tokens, True, share, gains, varies=True, noise=_beside(left, varied.judged))
+    told = [] if varied is None or varied.beyond <= 0.0 else [(varied.nats, varied.judged, varied.tokens, True)]
     if number is not None and not (_goes_slowly(number) and _wanders(left, number, math.inf)):
-        matters, share = _weight_of(left, nominal, number, horizon)
+        gains[number.token] = max(gains.get(number.token, 0.0), number.gain)
+        told.append((number.gain, number, (number.token,), False))
+    for _, judged, tokens, varies in sorted(told, key=lambda t: -t[0]):
+        matters, share = _weight_of(left, nominal, judged, horizon)
         if matters:
-            gains[number.token] = max(gains.get(number.token, 0.0), number.gain)
-            return Structure((number.token,), True, share, gains, noise=_beside(left, number))
+            return Structure(tokens, True, share, gains, varies=varies, noise=_beside(left, judged))
     windows = None if chosen else windows or _for_a_while(left)
     matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
     if windows is None or not matters:

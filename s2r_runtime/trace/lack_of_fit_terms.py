@@ -89,6 +89,8 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
         return
     for name, push in zip(model.inputs, pushes, strict=True):
         yield from ((f"time*{name}", [push, *(wave[:, None] * push for wave in waves)]) for waves in _hum(r, given, [push]))
+    if {"x", "y", "theta"} <= set(model.states):
+        yield from (("time", drift) for drift in _drifting_heading(steps, model, t))
     yield "time", _push([one, t], [*body, *world])
     yield "time", _push([one, *(f(2.0 * np.pi * k * t) for k in (0.5, 1.0, 1.5, 2.0) for f in (np.sin, np.cos))], [*body, *world])
     yield "time", _push([one, *(np.where(t > s, one, 0.0) for s in np.linspace(0.1, 0.9, 9))], body)
@@ -145,6 +147,20 @@ def _varying(given: Problem, model: ComposedModel, t: Array, u: Array) -> Iterat
             yield token, [np.abs(u[:, j])[:, None] * m for m in own]
         if speed:
             yield f"memory({channel})" if remembers else "speed", [v[:, None] * m for m in own for v in speed]
+
+
+def _drifting_heading(steps: Steps, model: ComposedModel, t: Array) -> Iterator[Terms]:
+    """A heading that is measured ever further off, by c(t): it turns by c', and goes aside by c of its way (t from 0 to 1; c: a line, and
+    waves).
+    """
+    x, y, theta = (model.states.index(name) for name in ("x", "y", "theta"))
+    aside = np.zeros_like(steps.y0)
+    aside[:, x], aside[:, y] = steps.y1[:, y] - steps.y0[:, y], steps.y0[:, x] - steps.y1[:, x]
+    about = np.zeros_like(aside)
+    about[:, theta] = np.median(np.diff(t)) if len(t) > 1 else 0.0
+    waves = [(f(w * t), w * df(w * t)) for w in np.pi * np.arange(1, 5) for f, df in ((np.sin, np.cos), (np.cos, lambda a: -np.sin(a)))]
+    yield [t[:, None] * aside + about, aside]
+    yield [aside, *(c[:, None] * aside + rate[:, None] * about for c, rate in [(t, np.ones(len(t))), *waves])]
 
 
 def _over_time(t: Array, u: Array) -> Iterator[Terms]:
