@@ -46,6 +46,16 @@ def test_rows_a_fraction_of_a_step_apart_are_picked_and_inputs_averaged():
     assert np.allclose(mean, inputs.values[:40].reshape(10, 4, 2).mean(axis=1))
 
 
+def test_times_count_from_the_first_row_that_has_any_state():
+    t = 3.0 + 0.05 * np.arange(100)
+    values = np.random.default_rng(0).normal(size=(100, 3))
+    values[::2, 2], values[1::2, :2] = np.nan, np.nan  # the heading comes half a step after the position, and first of all there is none
+    data = from_streams(_model(), [(Stream(t, values), Stream(t, np.zeros((100, 2))))], "here")
+    assert data.origin_s == 3.0
+    measured = int(np.flatnonzero(~np.isnan(data.runs[0].y).any(axis=1))[0])
+    assert data.runs[0].begins(data.dt)[measured] == pytest.approx(0.1)
+
+
 @pytest.mark.parametrize(("rows", "parts"), [(0.6, 10), (9.4, 10), (10.4, 12), (11.45, 12), (13.7, 12)])
 def test_a_step_within_which_commands_change_has_parts_in_pairs(rows, parts):
     """A grid half as fine tells what is left of the finer one: rows of commands (in a step) off the grid."""

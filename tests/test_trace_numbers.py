@@ -12,9 +12,10 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import coarse, grid_errors
 from s2r_runtime.trace.dataset import Run, from_arrays, from_streams
-from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem, told
+from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem, sensitivities, told
 from s2r_runtime.trace.grid_errors import widened
 from s2r_runtime.trace.intervals import intervals
+from s2r_runtime.trace.noise_doubt import doubted
 from s2r_runtime.trace.orders import in_either_order
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.residual_noise import Colour, no_colour, no_steadier
@@ -24,6 +25,7 @@ from s2r_runtime.trace.slots import Slot, bounds_of, values_of
 from s2r_runtime.trace.streams import Stream
 
 DRY, VISCOUS = 0.5, 0.4
+WIND = 0.05
 
 
 def _recorded(seed, rounded):
@@ -156,6 +158,66 @@ def test_a_sine_before_a_gain_is_another_one_than_behind_it():
 def test_where_the_order_shows_intervals_are_those_of_it():
     given, fit = _two((("input_lag", {"time_constant": 0.2}), ("input_saturation", {"low": -0.4, "high": 0.4})))
     assert in_either_order(given, fit) == intervals(given, fit)
+
+
+def _blown(seed, rows=200):
+    """A unicycle that the wind pushes sideways, and much less than its position is measured, anything else."""
+    model = compose(ModelSpec("unicycle", 0.05))
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-1.0, 1.0, (rows // 4, 2)), 4, axis=0)
+    x, hidden, at = np.zeros((1, 3)), model.at_rest(1), [np.zeros(3)]
+    for k in range(len(u)):
+        x, hidden = model.step(x, u[k : k + 1], hidden)
+        x = x + [0.0, 0.05 * WIND, 0.0] + rng.normal(size=3) * [3e-4, 3e-4, 0.0]
+        at.append(x[0])
+    data = from_arrays(model, [(np.array(at) + rng.normal(size=(len(at), 3)) * 0.01, u)])
+    given = problem(data, steps_of(data))
+    wind = AppliedEffect(registry().get("effects", "constant_disturbance"), "world", {"x": 0.0, "y": WIND})
+    return given, fitted(given, evaluate(given, model), insert(model, wind, 0))
+
+
+def test_what_drifts_by_less_than_is_measured_does_not_make_a_number_known_that_is_not():
+    """The likeliest drift is often none at all: then the whole recording were one measurement of the wind."""
+    covered, sure = 0, 0
+    for seed in range(40):
+        given, fit = _blown(seed)
+        low, high = intervals(given, fit)[Slot(0, "y")]
+        covered += low <= WIND <= high
+        j = sensitivities(given, fit, fit.model, fit.free)
+        sure += abs(values_of(fit.model, fit.free)[1] - WIND) < 1.96 * np.sqrt(np.linalg.inv(j.T @ j)[1, 1])
+    assert sure <= 33  # what the likelihood alone would say
+    assert covered >= 36  # of 40 at 95 %: fewer in one of 60 draws
+
+
+def test_drift_that_is_well_known_makes_intervals_no_wider():
+    given, fit = _blown(0, 3000)
+    noisier = replace(given, steps=replace(given.steps, y1=given.steps.y1 + np.random.default_rng(1).normal(size=(3000, 3)) * 0.05))
+    assert np.all(doubted(noisier, evaluate(noisier, fit.model)) < 1.02)
+
+
+def test_a_slip_is_known_no_better_than_whether_the_robot_moves_on_arcs():
+    model = compose(ModelSpec("unicycle", 0.05))
+    effects = (
+        EffectSpec("integration_scheme", "*", {"scheme": "exact"}),
+        EffectSpec("lateral_slip", "*", {"coefficient": 0.1}),
+    )
+    robot = compose(ModelSpec("unicycle", 0.05, {}, effects))
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-1.0, 1.0, (100, 2)), 4, axis=0)
+    x, hidden, rows = np.zeros((1, 3)), robot.at_rest(1), [np.zeros(3)]
+    for k in range(len(u)):
+        x, hidden = robot.step(x, u[k : k + 1], hidden)
+        rows.append(x[0])
+    data = from_arrays(model, [(np.array(rows) + rng.normal(size=(len(rows), 3)) * 0.003, u)])
+    given = problem(data, steps_of(data))
+    slip = AppliedEffect(registry().get("effects", "lateral_slip"), "*", {"coefficient": 0.1})
+    fit = fitted(given, evaluate(given, model), insert(model, slip, 0))
+    slot = Slot(0, "coefficient")
+    low, high = intervals(given, fit)[slot]
+    assert low > 0.1  # half a step more, by a model that moves in straight pieces
+    low, high = in_either_order(given, fit)[slot]
+    assert low < 0.1
+    assert 0.125 < high < 0.14
 
 
 def _within_steps(**effects):

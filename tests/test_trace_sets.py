@@ -186,6 +186,13 @@ def test_understeer_slip_and_wind_bend_the_path_as_their_formulas_say():
     assert np.allclose(y[-1, :2], [-0.2, 0.0])
 
 
+def test_what_pulls_downhill_goes_with_the_heading_that_a_fast_turn_has_on_the_way():
+    w, n = 8.0, 100
+    t = DT * np.arange(n + 1)
+    y = driven(plants.unicycle(), constant(n, 0.0, w), ("gravity_slope", "*", {"x": 0.0, "y": 0.3}))
+    assert np.allclose(y[:, 0], 0.3 * np.sin(w * t) ** 2 / (2.0 * w), atol=2e-6)  # 6e-4 off with the heading at the start of each part
+
+
 def test_times_count_from_the_recordings_first_stamp_in_every_run():
     change = ("regime_change", "v", {"time": 1.5, "gain": 0.5})
     second = driven(plants.unicycle(), constant(50, 1.0, 0.0), change, runs=2)

@@ -226,7 +226,7 @@ def from_streams(
     exact = all(on_grid(states.t, dt) for states, _ in stretches)
     as_they_are = not exact and spacing <= NEAREST * dt
     parts = in_parts or _parts(model, stretches, exact, as_they_are)
-    origin = min(float(states.t[0]) for states, _ in stretches)
+    origin = min(_first(states) for states, _ in segments)
     runs: list[Run] = []
     pauses: list[Pause] = []
     for states, inputs in stretches:
@@ -290,6 +290,12 @@ def least_parts(model: ComposedModel) -> int:
 def columns_of(model: ComposedModel, columns: Mapping[str, str]) -> dict[str, str]:
     """Name in the model -> column of the recording."""
     return {name: columns.get(name, name) for name in (*model.states, *model.inputs)}
+
+
+def _first(states: Stream) -> float:
+    """Stamp of the first measured state, s; infinity if there is none. Another state may come on rows of its own, a little later."""
+    there = ~np.isnan(states.values).all(axis=1)
+    return float(states.t[np.argmax(there)]) if there.any() else math.inf
 
 
 def _check_same_clock(states: Stream, inputs: Stream, source: str) -> None:

@@ -1,8 +1,9 @@
 """95 % intervals of fitted parameters.
 
 Smooth parameters: value ± 1.96 s, s from Gauss-Newton, widened by the ratio in which the scores of blocks of time scatter more than
-the likelihood says (a sandwich; never narrowed). Parameters that enter with a kink (delays, limits): profile likelihood, where the log
-likelihood, the other parameters refitted, has fallen by 1.92 (3.68 for the time of a change) times the square of that ratio.
+the likelihood says (a sandwich; never narrowed), or for noise that is not known, if that is more (`noise_doubt`). Parameters that enter
+with a kink (delays, limits): profile likelihood, where the log likelihood, the other parameters refitted, has fallen by 1.92 (3.68 for the
+time of a change) times the square of that ratio.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.fitting import Fit, Problem, objective, sensitivities, widening
+from s2r_runtime.trace.noise_doubt import doubted
 from s2r_runtime.trace.retimed import is_time, spread
 from s2r_runtime.trace.slots import Free, Slot, bounds_of, values_of, with_values
 
@@ -41,6 +43,7 @@ def intervals(given: Problem, fit: Fit) -> dict[Slot, tuple[float, float]]:
     normal = j.T @ (j * w[:, None])
     covariance = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     wider = widening(j * (w * z.ravel())[:, None], np.asarray(covariance), z.shape[1], BLOCKS)
+    wider = np.maximum(wider, doubted(given, fit))
     found = {}
     values = values_of(fit.model, fit.free)
     for index, slot in enumerate(fit.free):

@@ -1,8 +1,10 @@
-"""95 % intervals where these data do not tell which of two effects on an input comes first.
+"""95 % intervals where these data do not tell which of two effects on an input comes first, or whether one without a number is there.
 
 A coupling c before a gain g does what g c does behind it; a limit before an offset, what a limit moved by that does behind it. Where a
 model with the two exchanged, fitted anew, is as likely, the order is one more thing that is not known, and an interval covers the numbers
-of both: a profile likelihood over the order, too. Which comes first changes what a number means, not what the robot does.
+of both: a profile likelihood over the order, too. Which comes first changes what a number means, not what the robot does. So it is with an
+effect that has no number: a robot that slides sideways by k beside a model that moves in straight pieces may slide by k less half a step,
+and move on arcs.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from s2r_runtime.trace.fitting import NEXT, Fit, Problem, fitted, foretold, gain
 from s2r_runtime.trace.intervals import intervals
 from s2r_runtime.trace.rivals import CLOSE
 from s2r_runtime.trace.scores import limited
+from s2r_runtime.trace.selection import numberless
 from s2r_runtime.trace.slots import Slot
 
 ROUNDS = 3
@@ -34,6 +37,12 @@ def in_either_order(given: Problem, fit: Fit) -> dict[Slot, tuple[float, float]]
         for slot, (low, high) in intervals(given, other).items():
             mine = slot._replace(place={i: j, j: i}.get(slot.place, slot.place))
             found[mine] = min(low, found[mine][0]), max(high, found[mine][1])
+    for model in numberless(given, fit):
+        other = fitted(given, fit, model, ROUNDS)
+        if gain(fit, other) > CLOSE or not limited(other):
+            continue
+        for slot, (low, high) in intervals(given, other).items():
+            found[slot] = min(low, found[slot][0]), max(high, found[slot][1])
     return found
 
 

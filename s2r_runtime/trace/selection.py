@@ -367,14 +367,19 @@ def unbent(given: Problem, fit: Fit, tried: int, bar: Bar) -> Fit:
     """With an effect that has no number, where the data call for it and numbers took up what it does: a car that moves on arcs slides less
     by half a step times its speed than a model that moves in straight pieces says. Rollouts need not get better by it; the numbers do.
     """
-    if not any(_of_body(fit.model, place) for place in fit.added):
-        return fit
-    plain = [c for c in candidates(fit.model, given.data) if c.replaced < 0 and not any(slots_of(start, 0) for start in c.starts)]
-    for other in sorted((fitted(given, fit, m, 1) for c in plain for m in c.models(fit.model)), key=lambda other: -gain(other, fit)):
+    for other in sorted((fitted(given, fit, m, 1) for m in numberless(given, fit)), key=lambda other: -gain(other, fit)):
         if significant(given, other, fit, tried, bar):
             apart = np.abs(values_of(other.model, other.free) - values_of(fit.model, fit.free))
             return other if np.any(apart > BENT * _deviations(given, other)) else fit
     return fit
+
+
+def numberless(given: Problem, fit: Fit) -> list[ComposedModel]:
+    """The model with one more effect that has no number each, where what was found changes the motion of a body, as such a one may, too."""
+    if not any(_of_body(fit.model, place) for place in fit.added):
+        return []
+    plain = [c for c in candidates(fit.model, given.data) if c.replaced < 0 and not any(slots_of(start, 0) for start in c.starts)]
+    return [m for c in plain for m in c.models(fit.model)]
 
 
 def _of_body(model: ComposedModel, place: int) -> bool:

@@ -178,7 +178,8 @@ class Slope(OnPlant):
     """Speed (or acceleration) along the body from a tilt of the world."""
 
     def turn(self, s: Moment, x: Numbers, q: Numbers, m: Numbers) -> None:
-        q[0] += self.p["x"] * math.cos(x[2]) + self.p["y"] * math.sin(x[2])
+        heading = x[2] + 0.5 * s.h * q[1] if s.frozen is None else s.frozen  # that of the part's move
+        q[0] += self.p["x"] * math.cos(heading) + self.p["y"] * math.sin(heading)
 
 
 class LateralSlip(OnPlant):
