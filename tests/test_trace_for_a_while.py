@@ -148,6 +148,18 @@ def test_of_explanations_that_tie_the_mildest_elsewhere_is_gone_on_with(seed):
     assert moved == pytest.approx(0.85 * 0.75 * DT, rel=0.15)
 
 
+@pytest.mark.parametrize("rests", [False, True])
+def test_of_what_ties_at_one_speed_the_one_is_gone_on_with_that_is_wrong_by_least_at_lower_and_at_higher_ones(rests):
+    """A deadband is the mildest at three times the speed, and the worst of all at a third of it."""
+    rng = np.random.default_rng(0)
+    steps = np.repeat(0.3 * rng.integers(0, 2, 30) if rests else np.full(30, 0.3), 20)
+    u = np.column_stack([steps, _held(rng, 600, [-1.0], [1.0])[:, 0]])
+    result = _traced(_unicycle(rng, u, lambda k, x: 0.8, "euler"), u)
+    names = {(e.name, e.channel) for e in (*result.effects, *result.ambiguous_with)}
+    assert {("input_gain", "v"), ("input_saturation", "v"), ("input_deadband", "v")} <= names
+    assert [(e.name, e.channel) for e in result.effects] == [("input_gain", "v")]
+
+
 def test_two_gains_that_agree_are_one():
     """A gyro's scale that differs by sign in the fourth digit only, and long data: significant, and nothing to anybody."""
     rng = np.random.default_rng(8)

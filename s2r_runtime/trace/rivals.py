@@ -155,9 +155,9 @@ def _without_number(given: Problem, fit: Fit, place: int) -> list[ComposedModel]
 
 
 def representative(given: Problem, fit: Fit, found: list[Scored]) -> tuple[Fit, list[Scored]]:
-    """Of explanations that tie, the one to go on with, and the others: that which is at worst least far from what the others do on inputs
-    BEYOND these, as a share of what they do. Where a limit, a deadband and a gain say the same, a gain is wrong by least elsewhere. One
-    that is behind by CLOSE with its numbers paid for is not gone on with.
+    """Of explanations that tie, the one to go on with, and the others: that which is at worst least far from what the others do, as a share
+    of what they do, on inputs as large as these and BEYOND them. Where a limit, a deadband and a gain say the same, a gain is wrong by
+    least elsewhere. One that is behind by CLOSE with its numbers paid for is not gone on with.
 
     Nothing changes where more than one effect has rivals.
     """
@@ -169,10 +169,8 @@ def representative(given: Problem, fit: Fit, found: list[Scored]) -> tuple[Fit, 
         return fit, found
     name = gone.pop()
     less = without(fit.model, mine[name])
-    rich = _rich(given, fit.model, BEYOND)
     models = [fit.model, *(other.model for other in tied)]
-    done = [max(rich.apart(model, less), 1e-300) for model in models]
-    worst = [max(rich.apart(one, other) / size for other, size in zip(models, done, strict=True)) for one in models]
+    worst = np.max([_rich(given, fit.model, reach).worst(models, less) for reach in (1.0, BEYOND)], axis=0)
     dear = [STRICT.price(one.k - fit.k, n) - gain(one, fit) > CLOSE for one in (fit, *tied)]
     best = int(np.argmin(np.where(dear, np.inf, worst)))
     if best == 0 or not np.all(np.isfinite(worst)) or worst[best] > BETTER * worst[0]:
@@ -191,6 +189,11 @@ class _Rich:
     def same(self, one: ComposedModel, other: ComposedModel, less: ComposedModel, near: float = ALIKE) -> bool:
         """Whether two models differ by next to nothing of what the other one adds to `less`. False where that cannot be told."""
         return self.apart(one, other) <= near * self.apart(other, less)
+
+    def worst(self, models: Sequence[ComposedModel], less: ComposedModel) -> Array:
+        """(m,) of each model, how far it is at most from one of them, as a share of what that one adds to `less`."""
+        done = [max(self.apart(model, less), 1e-300) for model in models]
+        return np.array([max(self.apart(one, other) / size for other, size in zip(models, done, strict=True)) for one in models])
 
     def apart(self, one: ComposedModel, other: ComposedModel) -> float:
         """Mean square difference of their steps, on the scale of the steps themselves; NaN where a user's own model does not step there."""
