@@ -105,7 +105,7 @@ def several(model: NominalModel, name: str, channel: str, p: Values) -> list[lis
             constant = ("constant_disturbance", "world", {k: push if k == here else 0.0 for k in along})
             found += [[(name, channel, {"force": mean}), one] for one in [constant, *same(model, *constant)]]
     if name in {"constant_disturbance", "gravity_slope"} and {"x", "y"} <= set(p):
-        parts = [same(model, name, channel, {**dict.fromkeys(p, 0.0), key: p[key]}) for key in ("x", "y")]
+        parts = [same(model, name, channel, {**dict.fromkeys(p, 0.0), key: p[key]}) for key in p]
         biases = [[one for one in part if one[0] == "input_bias"] for part in parts]
         if all(biases):
             found.append([one[0] for one in biases])
@@ -147,6 +147,7 @@ def _rows(model: NominalModel) -> tuple[Row, ...]:
 def _proposed(model: BoundModel) -> Iterator[Row]:
     """All rows that could hold, by the names of channels."""
     changeable = [name for name in PARAMETER.channels(model) if model.parameters[name]]
+    along = registry().get("effects", "constant_disturbance").takes(model, "world")
     for i in model.inputs:
         yield Row("track_scale", "theta", "input_gain", i, _renamed("gain", "gain"), _renamed("gain", "gain"), {"gain": 0.7})
         yield Row("longitudinal_slip", "*", "input_gain", i, _slip_to_gain, _gain_to_slip, {"ratio": 0.3})
@@ -156,10 +157,12 @@ def _proposed(model: BoundModel) -> Iterator[Row]:
         yield Row("mass_change", "*", "input_gain", i, _mass_to_gain(model), _gain_to_mass, {"ratio": 1.4})
         if "y" not in model.states:
             yield Row("constant_disturbance", "world", "input_bias", i, _renamed("x", "bias"), _renamed("bias", "x"), {"x": 0.3})
-        for key, zero in (("x", "y"), ("y", "x")) if "y" in model.states else ():
-            there, back = _alone(key, zero), _alone_back(key, zero)
+        for key in along if "y" in model.states else ():
+            rest = dict.fromkeys(along, 0.0)
             for channel in ("world", "body"):
-                yield Row("constant_disturbance", channel, "input_bias", i, there, back, {key: 0.3, zero: 0.0}, always=False)
+                yield Row(
+                    "constant_disturbance", channel, "input_bias", i, _alone(key), _alone_back(key, rest), {**rest, key: 0.3}, always=False
+                )
         for j in model.inputs:
             if j != i and model.integration == "exact":
                 there, back = _arm_to_coupling(j), _coupling_to_arm(j)
@@ -168,8 +171,7 @@ def _proposed(model: BoundModel) -> Iterator[Row]:
         for other in changeable[:late]:
             yield Row("parameter_change", name, "parameter_change", other, dict, dict, {"ratio": 1.4})
             yield Row("parameter_change", name, "parameter_change", other, _inverse, _inverse, {"ratio": 1.4})
-    push = {"x": 0.3, "y": 0.2} if "y" in model.states else {"x": 0.3}
-    yield Row("gravity_slope", "*", "constant_disturbance", "world", dict, dict, push)
+    yield Row("gravity_slope", "*", "constant_disturbance", "world", dict, dict, dict.fromkeys(along, 0.3))
     yield Row(
         "sensor_offset", "theta", "heading_offset", "theta", _renamed("offset", "angle"), _renamed("angle", "offset"), {"offset": 0.3}
     )
@@ -284,12 +286,12 @@ def _inverse(p: Values) -> Values | None:
     return {"ratio": 1.0 / p["ratio"]} if "ratio" in p else None
 
 
-def _alone(key: str, zero: str) -> Convert:
-    return lambda p: {"bias": p[key]} if key in p and p.get(zero) == 0.0 else None
+def _alone(key: str) -> Convert:
+    return lambda p: {"bias": p[key]} if key in p and not any(v for k, v in p.items() if k != key) else None
 
 
-def _alone_back(key: str, zero: str) -> Convert:
-    return lambda p: {key: p["bias"], zero: 0.0}
+def _alone_back(key: str, rest: Values) -> Convert:
+    return lambda p: {**rest, key: p["bias"]}
 
 
 def _arm_to_coupling(other: str) -> Convert:

@@ -1,7 +1,7 @@
 """Something pushes all the time: wind, a current, a slope under a cart, a cable.
 
 poses                 world: (x, y)+ += dt (x, y) m/s;      body: the same along the heading that holds during the step
-axes x, y             (vx, vy)' += (x, y) m/s²
+axes x, y (, z)       (vx, vy, vz)' += (x, y, z) m/s²
 a single axis         x: a force, v' += x/mass
 """
 
@@ -17,10 +17,10 @@ SHARE = 0.05
 
 
 class ConstantDisturbance(ForceEffect):
-    """x, y: one rate (m/s), acceleration (m/s²) or force (N) an axis; 0 is none. A single axis has x only."""
+    """x, y, z: one rate (m/s), acceleration (m/s²) or force (N) an axis; 0 is none. A single axis has x only."""
 
     name = "constant_disturbance"
-    parameters = (Parameter("x", "m/s", -1e6, 1e6, neutral=0.0), Parameter("y", "m/s", -1e6, 1e6, neutral=0.0))
+    parameters = tuple(Parameter(name, "m/s", -1e6, 1e6, neutral=0.0) for name in ("x", "y", "z"))
     uneven = True
     additive = True
 
@@ -31,7 +31,7 @@ class ConstantDisturbance(ForceEffect):
         return ("world", "body") if has_pose(model) and not axes(model) else ("world",)
 
     def takes(self, model: NominalModel, channel: str) -> tuple[str, ...]:
-        """x, y; x alone on a single axis."""
+        """x, y, and z where it can go up; x alone on a single axis."""
         return directions(model)
 
     def unit(self, model: NominalModel, channel: str, parameter: str) -> str:
@@ -43,8 +43,9 @@ class ConstantDisturbance(ForceEffect):
         return channel
 
     def push(self, x: Array, axis: Axis, model: NominalModel, channel: str, p: Values) -> Push | None:
-        """Its acceleration on this axis."""
-        return Push(drive=float(p[direction(model, axis)]) / mass(model))
+        """Its acceleration on this axis; None where nothing of that name pushes."""
+        along = direction(model, axis)
+        return Push(drive=float(p[along]) / mass(model)) if along in p else None
 
     def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """Rates on a pose, forces on axes."""
@@ -63,10 +64,10 @@ class ConstantDisturbance(ForceEffect):
 
 
 def directions(model: NominalModel) -> tuple[str, ...]:
-    """In which something can push: x and y of a position in the plane, x of a single axis; else none."""
+    """In which something can push: x and y of a position in the plane, z above it, x of a single axis; else none."""
     if {"x", "y"} <= {*model.states}:
         moving = {model.states[axis.position] for axis in axes(model)}
-        return ("x", "y") if not moving or {"x", "y"} <= moving else ()
+        return tuple(name for name in "xyz" if name in (moving or "xy")) if not moving or {"x", "y"} <= moving else ()
     return ("x",) if len(axes(model)) == 1 else ()
 
 

@@ -6,7 +6,7 @@ v' = a - (force/mass) sign(v); it stops a motion and holds it as long as |a| <= 
 from __future__ import annotations
 
 from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, force_unit, size_of
-from s2r_runtime.effects.viscous_friction import by_direction, one_or_two
+from s2r_runtime.effects.viscous_friction import by_direction, either_way, one_or_two
 from s2r_runtime.hookspecs import NominalModel, Parameter
 from s2r_runtime.models.forces import Axis, Push, mass
 
@@ -34,6 +34,10 @@ class CoulombFriction(ForceEffect):
     def push(self, x: Array, axis: Axis, model: NominalModel, channel: str, p: Values) -> Push | None:
         """Its deceleration."""
         return Push(dry=by_direction(p, "force", mass(model))) if model.states[axis.velocity] == channel else None
+
+    def simpler(self, p: Values) -> tuple[str, Values]:
+        """The same either way."""
+        return self.name, either_way(p, "force")
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
         """Two sizes, and one by direction."""

@@ -30,7 +30,7 @@ class GravitySlope(ConstantDisturbance):
     def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """Rates on a pose, forces on axes."""
         if self.pushes(model, channel):
-            return pushed(x, x_next, model, [(self, channel, p)], dt)
+            return pushed(x, u, x_next, model, [(self, channel, p)], dt)
         px, py = float(p["x"]), float(p["y"])
         c, s = mean_of_twice(x, x_next, model)
         return shifted(x_next, model, 0.5 * dt * (px + px * c + py * s), 0.5 * dt * (py + px * s - py * c))

@@ -36,7 +36,7 @@ class PositionField(ForceEffect):
 
     def channels(self, model: NominalModel) -> tuple[str, ...]:
         """`*` where there is a position in the plane."""
-        return ("*",) if directions(model) == ("x", "y") else ()
+        return ("*",) if directions(model)[:2] == ("x", "y") else ()
 
     def unit(self, model: NominalModel, channel: str, parameter: str) -> str:
         """Of a rate, or of an acceleration, over a length."""

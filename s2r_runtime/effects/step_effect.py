@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.hookspecs import NominalModel, Parameter
-from s2r_runtime.models.forces import Axis, Push, axes, mass, mass_name, pushed
+from s2r_runtime.models.forces import Axis, Push, axes, coupled, mass, mass_name, pushed
 
 Array = NDArray[np.float64]
 Values = dict[str, Any]
@@ -76,7 +76,7 @@ class ForceEffect(StepEffect):
 
     def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """The step with this force alone."""
-        return pushed(x, x_next, model, [(self, channel, p)], dt) if self.pushes(model, channel) else x_next
+        return pushed(x, u, x_next, model, [(self, channel, p)], dt) if self.pushes(model, channel) else x_next
 
 
 class SensorEffect(StepEffect):
@@ -101,6 +101,8 @@ def has_pose(model: NominalModel) -> bool:
 def force_unit(model: NominalModel) -> str:
     """Of what acts on an axis: the input's where it is divided by a mass, an acceleration otherwise."""
     units: dict[str, str] = getattr(model, "units", {})
+    if coupled(model):
+        return units.get(model.inputs[0], "input's unit")
     if not mass_name(model):
         return "m/s²"
     return units.get(model.inputs[0], "N m" if mass_name(model) == "inertia" else "N")
@@ -109,6 +111,8 @@ def force_unit(model: NominalModel) -> str:
 def length_unit(model: NominalModel, axis: Axis) -> str:
     """Of an axis' position."""
     units: dict[str, str] = getattr(model, "units", {})
+    if coupled(model):
+        return units.get(model.states[axis.position], f"{model.states[axis.position]}'s unit")
     return units.get(model.states[axis.position], "rad" if mass_name(model) == "inertia" else "m")
 
 

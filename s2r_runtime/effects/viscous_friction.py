@@ -70,6 +70,10 @@ class ViscousFriction(ForceEffect):
         after[:, speed] = x_next[:, speed] * np.exp(-z)
         return after
 
+    def simpler(self, p: Values) -> tuple[str, Values]:
+        """The same either way."""
+        return self.name, either_way(p, "coefficient")
+
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
         """One each way of saying it: the response is linear."""
         c = START_RATE * (mass(model) if axes(model) else 1.0)
@@ -82,6 +86,11 @@ def by_direction(p: Values, name: str, over: float) -> tuple[float, float]:
         one = float(p[name]) / over
         return one, one
     return float(p[f"{name}_positive"]) / over, float(p[f"{name}_negative"]) / over
+
+
+def either_way(p: Values, name: str) -> Values:
+    """One number for both directions, their mean."""
+    return p if name in p else {name: 0.5 * (float(p[f"{name}_positive"]) + float(p[f"{name}_negative"]))}
 
 
 def one_or_two(p: Values, name: str) -> str:

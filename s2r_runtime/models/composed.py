@@ -213,7 +213,7 @@ class ComposedModel:
         dt = self.dt if dt is None else dt
         for a in self._after:
             x_next = a.effect.after_step(x, u, x_next, given, a.channel, dt, a.p)
-        return pushed(x, x_next, given, self._forces, dt) if self._forces else x_next
+        return pushed(x, u, x_next, given, self._forces, dt) if self._forces else x_next
 
     def true(self, x: Array) -> Array:
         """Measured states (n, nx) -> true ones."""

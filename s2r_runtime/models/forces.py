@@ -9,6 +9,11 @@ With constant coefficients this has an exact solution: one exponential up to the
 So dry friction stops a motion and never turns it, whatever the step. Coefficients that depend on the state are taken at the middle
 of parts of the step (second order; a position there is that at the part's start and half a part of the speed there, which keeps the
 energy of a spring). Positions move by the integral of v. All accelerations: of a force over the mass, if there is one.
+
+Joints of an arm move one another: in somebody's own model with an input on every axis, the inverse W(x) of its mass matrix (`mobility`)
+says what a force on one does to all. A force F on each axis, in the unit of its input, then adds W F to the accelerations. Each axis in
+turn is moved as above under what the others' forces make of its drive, until none changes (projected Gauss-Seidel sweeps, which find what
+friction holds on several axes at once: J. J. Moreau, "Unilateral contact and dry friction in finite freedom dynamics", 1988).
 """
 
 from __future__ import annotations
@@ -22,6 +27,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import NominalModel
 from s2r_runtime.models.bound import BoundModel
 
@@ -40,6 +46,21 @@ LEAST = -50.0
 
 SMALL = 1e-3
 """Of rate times time: below it a series of four terms is exact to rounding."""
+
+PROBE_S, PROBE = 1e-3, 1e-3
+"""Step within which a bit of an input says whether inputs are forces, s: short against any motion, long against rounding; and that bit,
+over the inputs.
+"""
+
+COUPLED, SYMMETRIC = 1e-3, 0.02
+"""Of the geometric mean of two axes' own mobilities: from where on one moves the other, and how far a mass matrix may be off symmetry by
+what changes within two probes.
+"""
+
+SWEEPS, SETTLED = 40, 1e-9
+"""Most sweeps over axes that move one another, and the change of what friction does, over the largest, at which they are done. Two thirds
+of the error are left by one where two links hold each other, and next to none where they move.
+"""
 
 NAMED_RATES = {"vx": "x", "vy": "y", "vz": "z", "qd": "q"}
 """Rates by their names, in models that do not say whose rates their states are. With a heading, vx could be along the body: it must say."""
@@ -99,8 +120,68 @@ def mass(model: NominalModel) -> float:
     return float(model.parameters[name]) if name else 1.0
 
 
-def pushed(x: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushing], dt: float | Array) -> Array:
-    """The result of the step without these effects, x_next (n, nx), with all of them. dt: also of each row, (n,)."""
+def coupled(model: NominalModel) -> bool:
+    """Whether its inputs are forces on its axes, one each in their order, that move one another: their mobility is the inverse of a mass
+    matrix, symmetric and positive definite, and not diagonal, wherever it is looked at.
+    """
+    if not isinstance(model, BoundModel):
+        return False
+    if model not in _COUPLED:
+        _COUPLED[model] = _coupled(model)
+    return _COUPLED[model]
+
+
+_COUPLED: WeakKeyDictionary[BoundModel, bool] = WeakKeyDictionary()
+
+
+def _coupled(model: BoundModel) -> bool:
+    if len(axes(model)) < 2 or len(axes(model)) != len(model.inputs):
+        return False
+    x = np.random.default_rng(0).uniform(-1.0, 1.0, (8, len(model.states)))
+    rates, u = [axis.velocity for axis in axes(model)], np.ones((len(x), len(model.inputs)))
+    try:
+        w, later, back = (
+            response(x, u, model, dt, size)[:, rates] / dt for dt, size in ((PROBE_S, 1.0), (2.0 * PROBE_S, 1.0), (PROBE_S, -1.0))
+        )
+    except ConfigError:  # a user's model that cannot be stepped just anywhere
+        return False
+    own = np.sqrt(np.abs(np.einsum("nii->ni", w)))
+    size = own[:, :, None] * own[:, None, :]
+    alike = all(np.all(np.abs(w - other) <= SYMMETRIC * size) for other in (later, back, w.transpose(0, 2, 1)))
+    if not alike or not np.all(np.linalg.eigvalsh(0.5 * (w + w.transpose(0, 2, 1))) > 0.0):
+        return False
+    return bool(np.any(np.abs(w) * (1.0 - np.eye(len(axes(model)))) > COUPLED * size))
+
+
+def response(x: Array, u: Array, model: NominalModel, dt: float, size: float = 1.0) -> Array:
+    """(n, nx, nu) what a unit more of each input makes of x (n, nx) over a step under u (n, nu); size: of the probe, over the inputs'."""
+    probe = size * PROBE * max(float(np.max(np.abs(u), initial=0.0)), PROBE)
+    usual = model.step(x, u, dt, model.parameters)
+    made = []
+    for j in range(u.shape[1]):
+        more = u.copy()
+        more[:, j] += probe
+        made.append((model.step(x, more, dt, model.parameters) - usual) / probe)
+    return np.stack(made, axis=2)
+
+
+_LAST: WeakKeyDictionary[BoundModel, tuple[float, Array, Array, Array]] = WeakKeyDictionary()
+
+
+def _response(x: Array, u: Array, model: BoundModel, dt: float) -> Array:
+    """`response`, kept for the last rows asked for: a fit asks of the same ones again and again."""
+    if model in _LAST:
+        there, at, under, found = _LAST[model]
+        if there == dt and np.array_equal(at, x) and np.array_equal(under, u):
+            return found
+    _LAST[model] = (dt, x.copy(), u.copy(), response(x, u, model, dt))
+    return _LAST[model][-1]
+
+
+def pushed(x: Array, u: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushing], dt: float | Array) -> Array:
+    """The result of the step under u without these effects, x_next (n, nx), with all of them. dt: also of each row, (n,)."""
+    if isinstance(model, BoundModel) and not isinstance(dt, np.ndarray) and coupled(model):
+        return _pushed_together(x, u, x_next, model, pushing, dt)
     varies = any(effect.varies for effect, _, _ in pushing)
     moved = [k for k in axes(model) if any(effect.push(x[:1], k, model, channel, p) is not None for effect, channel, p in pushing)]
     given = [(x_next[:, k.velocity] - x[:, k.velocity]) / dt for k in moved]
@@ -125,6 +206,60 @@ def pushed(x: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushi
         after[:, k.position] += way - (dt * v + 0.5 * dt * dt * g)
         after[:, k.velocity] = end
     return after
+
+
+def _pushed_together(x: Array, u: Array, x_next: Array, model: BoundModel, pushing: Sequence[Pushing], dt: float) -> Array:
+    """The same where axes move one another: forces act as the inputs u do, so that what they change turns what else depends on speeds."""
+    among = axes(model)
+    does = mass(model) * _response(x, u, model, dt)
+    w = does[:, [k.velocity for k in among]] / dt
+    given = [(x_next[:, k.velocity] - x[:, k.velocity]) / dt for k in among]
+    varies = any(effect.varies for effect, _, _ in pushing)
+    parts = max(1, math.ceil(dt / PART_S - 1e-9)) if varies else 1
+    h = dt / parts
+    now, mean = x.copy(), np.zeros((len(among), len(x)))
+    for _ in range(parts):
+        at = now.copy()
+        for k, g in zip(among if varies else (), given, strict=False):
+            at[:, k.position] += 0.5 * h * now[:, k.velocity]
+            at[:, k.velocity] += 0.5 * h * g
+        pushes = [_times(_together(at, k, model, pushing), w[:, i, i]) for i, k in enumerate(among)]
+        forces, moved = _swept([np.ascontiguousarray(now[:, k.velocity]) for k in among], given, pushes, w, h)
+        mean += forces / parts
+        for k, (end, way) in zip(among, moved, strict=True):
+            now[:, k.velocity] = end
+            now[:, k.position] += way
+    after = np.asarray(x_next + np.einsum("nij,jn->ni", does, mean))
+    for i, (k, g) in enumerate(zip(among, given, strict=True)):  # a force that changes within the step makes another way than its mean
+        steady = dt * x[:, k.velocity] + 0.5 * dt * dt * (g + np.einsum("nj,jn->n", w[:, i], mean))
+        after[:, k.position] += now[:, k.position] - x[:, k.position] - steady
+    return after
+
+
+def _swept(speeds: list[Array], given: list[Array], pushes: list[Push], w: Array, h: float) -> tuple[Array, list[tuple[Array, Array]]]:
+    """Mean force of the pushes on each axis over h seconds, (axes, n), and each axis' speed then with the way made, all at once."""
+    forces = np.zeros((len(speeds), len(speeds[0])))
+    moved = [(v, v) for v in speeds]
+    for _ in range(SWEEPS):
+        before = forces.copy()
+        for i, (v, g, push) in enumerate(zip(speeds, given, pushes, strict=True)):
+            drive = g + sum(w[:, i, j] * forces[j] for j in range(len(speeds)) if j != i)
+            moved[i] = _glide(v, drive, push, h)
+            forces[i] = ((moved[i][0] - v) / h - drive) / w[:, i, i]
+        if np.max(np.abs(forces - before), initial=0.0) <= SETTLED * np.max(np.abs(forces), initial=1e-300):
+            break
+    return forces, moved
+
+
+def _times(push: Push, w: Array) -> Push:
+    """As accelerations, of what is over the mass (n,) or the model's."""
+    dry = _both(push.dry, w)
+    return Push(push.drive * w, _both(push.rate, w), dry, None if push.hold is None else _both(push.hold, w))
+
+
+def _both(pair: Pair, w: Array) -> Pair:
+    first = pair[0] * w
+    return first, first if _alike(pair) else pair[1] * w
 
 
 def _together(x: Array, axis: Axis, model: NominalModel, pushing: Sequence[Pushing]) -> Push:

@@ -139,7 +139,8 @@ def _agreeing(fit: Fit, place: int) -> list[ComposedModel]:
     name, p = a.effect.simpler(a.p)  # type: ignore[attr-defined]
     name, channel = canonical(fit.model.for_effects, name, a.channel)
     effect = registry().get("effects", name)
-    if (name, channel) in {name_of(other) for other in fit.model.effects} or not set(p) <= {q.name for q in effect.parameters}:
+    others = {name_of(other) for i, other in enumerate(fit.model.effects) if i != place}
+    if p == a.p or (name, channel) in others or not set(p) <= {q.name for q in effect.parameters}:
         return []
     return [replace(fit.model, effects=(*fit.model.effects[:place], Added(effect, channel, p), *fit.model.effects[place + 1 :]))]
 

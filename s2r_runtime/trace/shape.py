@@ -27,6 +27,9 @@ BINS = 24
 
 FEWEST = 30
 
+OF_TIME = 6
+"""Bins of time at most: whatever goes smoothly is a function of time in many."""
+
 RECENT_S = (0.0, 0.1, 0.4, 1.5)
 """Times over which an input's past is averaged, s (0: the step before): a residual with memory follows how the input changed."""
 
@@ -186,9 +189,9 @@ def _bins(x: Array, count: int) -> NDArray[np.int64]:
     return np.asarray(np.unique(place, return_inverse=True)[1], dtype=np.int64)
 
 
-def share(x: Array, e: Array, floor: float, per: Array | None = None) -> float:
+def share(x: Array, e: Array, floor: float, per: Array | None = None, most: int = BINS) -> float:
     """Of e's mean square beyond the floor: what its means over bins of x account for, less what chance would."""
-    bins = binned(x, e, per)
+    bins = binned(x, e, per, most)
     return 0.0 if bins is None else _part(float(np.sum(bins.size * (bins.mean**2 - bins.error**2))) / len(e), e, floor)
 
 
@@ -202,11 +205,16 @@ def shape_of(part: Component, over: Sequence[Variable], inputs: Sequence[Variabl
     e = part.after if after else part.before
     constant = float(np.mean(e))
     best = Shape(part, None, None, _part(constant**2 - float(np.var(e)) / len(e), e, part.floor))
-    shapes = [Shape(part, v, None, share(v.values, e, part.floor)) for v in over]
+    shapes = [Shape(part, v, None, share(v.values, e, part.floor, None, _most(v))) for v in over]
     best = max([best, *(s for s in shapes if s.share > best.share + BETTER)], key=lambda s: s.share)
     pairs = [(v, u) for v in over for u in inputs if v.token != u.token and not v.token.startswith("memory")]
-    shapes = [Shape(part, v, u, share(v.values, e, part.floor, u.values)) for v, u in pairs]
+    shapes = [Shape(part, v, u, share(v.values, e, part.floor, u.values, _most(v))) for v, u in pairs]
     return max([best, *(s for s in shapes if s.share > best.share + BETTER)], key=lambda s: s.share)
+
+
+def _most(v: Variable) -> int:
+    """Bins of a variable."""
+    return OF_TIME if v.name == "time" else BINS
 
 
 def strongest(parts: Sequence[Component], over: Sequence[Variable], inputs: Sequence[Variable], *, after: bool = False) -> list[Shape]:

@@ -1,0 +1,145 @@
+"""Robots with several axes in a model of one's own: links that move one another, and a body that moves up as well."""
+
+import numpy as np
+import pytest
+
+from s2r_runtime.models.composed import compose
+from s2r_runtime.models.forces import coupled
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.fitting import problem
+from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.result import TraceResult
+from s2r_runtime.trace.selection import select
+from s2r_runtime.trace.tracer import trace
+
+DT_S, PARTS = 0.01, 20
+ARM = """
+import numpy as np
+
+STATES = ("q1", "q2", "dq1", "dq2")
+INPUTS = ("tau1", "tau2")
+PARAMS = {"near": 1.2, "far": 0.15, "lever": 0.2}
+RATES = {"dq1": "q1", "dq2": "q2"}
+
+
+def rates(x, u, params):
+    \"\"\"Two links in a horizontal plane.\"\"\"
+    v, w, c, s = x[:, 2], x[:, 3], np.cos(x[:, 1]), params["lever"] * np.sin(x[:, 1])
+    a, b, d = params["near"] + 2 * params["lever"] * c, params["far"] + params["lever"] * c, params["far"]
+    one, two = u[:, 0] + s * (2 * v * w + w * w), u[:, 1] - s * v * v
+    return np.column_stack([v, w, (d * one - b * two) / (a * d - b * b), (a * two - b * one) / (a * d - b * b)])
+
+
+def step(x, u, dt, params):
+    for _ in range(4):
+        x = x + dt / 4 * rates(x + dt / 8 * rates(x, u, params), u, params)
+    return x
+"""
+QUADROTOR = """
+import numpy as np
+
+STATES = ("x", "y", "z", "vx", "vy", "vz")
+INPUTS = ("roll", "pitch", "thrust")
+PARAMS = {"g": 9.81}
+RATES = {"vx": "x", "vy": "y", "vz": "z"}
+
+
+def step(x, u, dt, params):
+    roll, pitch, thrust = u.T
+    tilt = np.column_stack([np.sin(pitch) * np.cos(roll), -np.sin(roll), np.cos(roll) * np.cos(pitch)])
+    a = thrust[:, None] * tilt - [0.0, 0.0, params["g"]]
+    return np.hstack([x[:, :3] + dt * x[:, 3:] + dt * dt / 2 * a, x[:, 3:] + dt * a])
+"""
+
+
+def _model(folder, source, *effects):
+    path = folder / "robot.py"
+    path.write_text(source)
+    return compose(ModelSpec(str(path), DT_S, {}, tuple(effects)))
+
+
+def _brake(v, viscous, dry):
+    return np.array(viscous) * v + np.array(dry) * np.tanh(v / 1e-4)
+
+
+def _arm_step(model, x, u, viscous, dry, parts=PARTS):
+    """The arm with friction in its joints, in parts so small that what is asked of the model is its accelerations."""
+    h = DT_S / parts
+    for _ in range(parts):
+        held = u - _brake(x[:, 2:], viscous, dry)
+        x = model.nominal.step(x, held, h, model.parameters)
+    return x
+
+
+def test_links_that_move_one_another_are_told_from_axes_that_do_not(tmp_path):
+    assert coupled(_model(tmp_path, ARM).nominal)
+    assert not coupled(_model(tmp_path, QUADROTOR).nominal)
+    assert not coupled(compose(ModelSpec("double_integrator", DT_S)).nominal)
+
+
+@pytest.mark.parametrize(("viscous", "dry"), [((1.0, 0.3), (0.0, 0.0)), ((0.0, 0.0), (0.4, 0.1))])
+def test_friction_in_the_joints_of_an_arm_acts_as_its_torques_do(tmp_path, viscous, dry):
+    name, key, sizes = ("viscous_friction", "coefficient", viscous) if any(viscous) else ("coulomb_friction", "force", dry)
+    braked = _model(tmp_path, ARM, *(EffectSpec(name, f"dq{i + 1}", {key: size}) for i, size in enumerate(sizes)))
+    rng = np.random.default_rng(0)
+    x, u = rng.uniform(-1.0, 1.0, (400, 4)), rng.uniform(-1.0, 1.0, (400, 2))
+    x[:, 2:] += 0.3 * np.sign(x[:, 2:])  # none of them stops within the step
+    does = braked.step(x, u, braked.at_rest(400))[0]
+    free = braked.nominal.step(x, u, DT_S, braked.parameters)
+    true = _arm_step(braked, x, u, viscous, dry, 400)
+    assert np.all(np.max(np.abs(does - true), axis=0) < 0.05 * np.max(np.abs(true - free), axis=0))
+
+
+def test_dry_friction_holds_all_links_at_once(tmp_path):
+    held = _model(tmp_path, ARM, *(EffectSpec("coulomb_friction", f"dq{i}", {"force": 0.5}) for i in (1, 2)))
+    x = np.column_stack([np.zeros((50, 1)), np.linspace(-2.0, 2.0, 50)[:, None], np.zeros((50, 2))])
+    moved = held.step(x, np.tile([0.4, -0.4], (50, 1)), held.at_rest(50))[0] - x
+    assert np.max(np.abs(moved)) < 1e-6
+
+
+def test_friction_in_the_joints_of_an_arm_is_named(tmp_path):
+    model, rng = _model(tmp_path, ARM), np.random.default_rng(1)
+    f, size, phase = rng.uniform(0.2, 0.9, (2, 3)), rng.uniform(0.2, 0.5, (2, 3)), rng.uniform(0.0, 6.0, (2, 3))
+    x, states, inputs = np.zeros((1, 4)), [], []
+    for k in range(1000):
+        angle = 2.0 * np.pi * f * k * DT_S + phase
+        q, v = np.sum(size * np.sin(angle), axis=1), np.sum(size * 2.0 * np.pi * f * np.cos(angle), axis=1)
+        if k == 0:
+            x[0] = *q, *v
+        u = np.array([[20.0, 4.0]]) * (q - x[:, :2]) + np.array([[5.0, 0.8]]) * (v - x[:, 2:])
+        states.append(x[0])
+        inputs.append(u[0])
+        x = _arm_step(model, x, u, (1.0, 0.3), (0.0, 0.0))
+    noise = rng.normal(size=(1000, 4)) * [1e-3, 1e-3, 0.01, 0.01]
+    data = from_arrays(model, [(np.array(states) + noise, np.array(inputs[:-1]))])
+    found = select(problem(data, steps_of(data)), model, 50, lambda share: None).fit.model.effects
+    assert {(a.effect.name, a.channel) for a in found} == {("viscous_friction", "dq1"), ("viscous_friction", "dq2")}
+    sizes = {a.channel: a.p["coefficient"] for a in found}  # one number: it is the same either way
+    assert sizes == pytest.approx({"dq1": 1.0, "dq2": 0.3}, rel=0.05)
+
+
+def _flown(folder, sag, wind) -> TraceResult:
+    model, rng = _model(folder, QUADROTOR), np.random.default_rng(2)
+    goal = np.repeat(rng.uniform(-2.0, 2.0, (10, 3)), 100, axis=0)
+    x, states, inputs = np.zeros((1, 6)), [], []
+    for k in range(1000):
+        a = np.clip(1.8 * (goal[k] - x[0, :3]) - 2.2 * x[0, 3:] + 0.1 * rng.normal(size=3), -4.0, 4.0)
+        u = np.array([[-a[1] / 9.81, a[0] / 9.81, 9.81 + a[2]]])
+        states.append(x[0])
+        inputs.append(u[0])
+        x = model.nominal.step(x, u * [1.0, 1.0, 1.0 + sag], DT_S, model.parameters)
+        x[0] += np.concatenate([0.5 * DT_S * DT_S * np.array(wind), DT_S * np.array(wind)])
+    noise = rng.normal(size=(1000, 6)) * [0.002, 0.002, 0.002, 0.03, 0.03, 0.03]
+    return trace(from_arrays(model, [(np.array(states) + noise, np.array(inputs[:-1]))]), model)
+
+
+def test_a_robot_that_moves_up_as_well_is_traced(tmp_path):
+    found = _flown(tmp_path, -0.06, (0.0, 0.0, 0.0))
+    assert [(e.name, e.channel) for e in found.effects] == [("input_gain", "thrust")]
+
+
+def test_wind_may_blow_downwards(tmp_path):
+    (found,) = _flown(tmp_path, 0.0, (0.3, 0.0, -0.2)).effects
+    assert (found.name, found.channel) == ("constant_disturbance", "world")
+    assert [found.parameters[k][0] for k in "xyz"] == pytest.approx([0.3, 0.0, -0.2], abs=0.02)
