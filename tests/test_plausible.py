@@ -49,6 +49,13 @@ MISTAKES = {
     "compass in degrees": ("unicycle", lambda y, u: (np.column_stack([y[:, :2], 90 - np.degrees(y[:, 2])]), u), "degrees clockwise from y"),
     "km/h": ("bicycle", lambda y, u: (y * [1, 1, 1, 3.6], u), "speed seems to be in km/h"),
     "wheels in rpm": ("differential_drive", lambda y, u: (y * [1, 1, 1, 30 / np.pi, 30 / np.pi], u), "wheel_.* revolutions a minute"),
+    "both in km/h": ("bicycle", lambda y, u: (y * [1, 1, 1, 3.6], u * [1, 3.6]), "speed and speed_cmd seem to be in km/h"),
+    "all wheels in rpm": (
+        "differential_drive",
+        lambda y, u: (y * [1, 1, 1, 30 / np.pi, 30 / np.pi], u * 30 / np.pi),
+        "wheel_left, wheel_right, cmd_left and cmd_right seem to be in revolutions a minute",
+    ),
+    "steering wheel": ("bicycle", lambda y, u: (y, u * [15 * 180 / np.pi, 1]), "steer_cmd goes to .* steering wheel"),
     "steer in degrees": ("bicycle", lambda y, u: (y, u * [180 / np.pi, 1]), "steer_cmd seems to be in degrees"),
 }
 

@@ -159,3 +159,21 @@ def test_what_gives_no_numbers_on_held_out_data_is_out_of_the_question_there(tmp
     with np.errstate(invalid="ignore"):
         assert _ahead(here, fits) == [0.0, -math.inf]
         assert _ahead(here, fits[::-1]) == [0.0, 0.0]
+
+
+def test_a_valve_that_sticks_and_jumps_is_no_play(tmp_path):
+    """It stays until it is asked for something far enough away; a play follows every change but the first part of it."""
+    model, rng = _model(tmp_path), np.random.default_rng(2)
+    goal = np.repeat(rng.uniform(1.5, 6.0, 15), 100)
+    level, at, total, levels, asked = 4.0, 1.5, 1.5, [4.0], []
+    for wanted in goal:
+        off = wanted - levels[-1]
+        total = float(np.clip(total + 0.01 * off, 0.0, 4.0))
+        asked.append(float(np.clip(0.5 * off + total, 0.0, 4.0)))
+        at = asked[-1] if abs(asked[-1] - at) > 0.15 else at
+        for _ in range(PARTS):
+            level += DT_S / PARTS * (0.05 * at - 0.04 * np.sqrt(max(level, 0.0)))
+        levels.append(level + NOISE_M * rng.normal())
+    found = trace(from_arrays(model, [(np.array(levels)[:, None], np.array(asked)[:, None])]), model)
+    assert found.verdict == "unexplained"
+    assert "memory(pump)" in found.depends_on

@@ -5,6 +5,8 @@ speed+ = speed_cmd,  x+ = x + dt speed+ cos(theta),  y+ = y + dt speed+ sin(thet
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +33,8 @@ class Bicycle:
     units = {"x": "m", "y": "m", "theta": "rad", "speed": "m/s", "steer_cmd": "rad", "speed_cmd": "m/s"}
     integration = "euler"
     reached = {"speed": "speed_cmd"}
+    within = {"steer_cmd": math.pi / 2.0}
+    """Below which an input means something: tan."""
 
     def step(self, x: Array, u: Array, dt: float | Array, parameters: dict[str, float]) -> Array:
         """One step of dt seconds, (n, 4); theta is not wrapped."""

@@ -94,7 +94,7 @@ def _challenge(given: Problem, fit: Fit, channel: str, horizon: int) -> Better |
             bare = without(bare, i)
     base = fitted(given, fit, bare, 1)
     here = gain(fit, base)
-    for shape in _fits(given, base, channel, REACHES * here, _times(fit, channel)):
+    for shape in _fits(given, base, channel, REACHES * here, _times(fit, channel), _plays(fit, channel)):
         ahead = gain(shape, base) - here
         needed = max(_price(given, shape, fit), 0.0) + math.log(len(SHAPES) / ALPHA)
         if ahead > max(needed, MORE * here) and _lower(given, fit, shape, horizon):
@@ -117,9 +117,17 @@ def _times(fit: Fit, channel: str) -> list[float]:
     return found
 
 
-def _fits(given: Problem, base: Fit, channel: str, least: float = LEAST, near: Sequence[float] = ()) -> list[Fit]:
+def _plays(fit: Fit, channel: str) -> list[float]:
+    """How wide the plays named on an input are."""
+    named = [fit.model.effects[i] for i in fit.added]
+    return [float(a.p["width"]) for a in named if a.effect.name == "input_backlash" and a.channel == channel]
+
+
+def _fits(
+    given: Problem, base: Fit, channel: str, least: float = LEAST, near: Sequence[float] = (), plays: Sequence[float] = ()
+) -> list[Fit]:
     """Shapes on one input, beside what the model has, that do best, the best first. least: nats that screening must give them; near:
-    times from which some begin, s.
+    times from which some begin, s; plays: how far what is named on the input gives.
     """
     model = base.model
     u = given.data.chains.through(model, [a for a in model.effects if a.effect.stage == "input"])
@@ -127,7 +135,7 @@ def _fits(given: Problem, base: Fit, channel: str, least: float = LEAST, near: S
     offered = [
         Candidate(shape.name, channel, end, tuple(AppliedEffect(cast(Effect, shape), channel, p) for p in starts))
         for shape in SHAPES
-        if (starts := shape.starts(u, model.nominal, channel, given.data.dt, near))
+        if (starts := shape.starts(u, model.nominal, channel, given.data.dt, near, plays))
     ]
     screened, _ = screen(given, base, offered, math.inf) if offered else ([], 0)  # from few starts
     enough = max(least, NEARLY * screened[0].value) if screened else least

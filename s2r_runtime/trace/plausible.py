@@ -53,6 +53,9 @@ SURELY = 0.1
 DEAD = 0.7
 """Of E with an input that does nothing, which E must be below: a motor that hardly turns is in no other unit."""
 
+BEYOND = 0.01
+"""Share of an input's rows beyond what it can be, from which they are no outliers."""
+
 EXACTLY, FEWEST_STEPS = 0.02, 60
 """How near to a unit's factor a speed must be to its command's multiple, and on how many steps at least."""
 
@@ -116,6 +119,7 @@ def check_plausible(model: ComposedModel, data: Dataset) -> None:
     """Raises RecordingError if the columns are clearly not what they say, with what they seem to be."""
     check_measured(model, data)
     _check_columns(model, data)
+    _check_angles(model, data)
     _check_scales(model, data)
     _check_speeds(model, data)
     _check_clocks(model, data)
@@ -134,6 +138,17 @@ def _check_columns(model: ComposedModel, data: Dataset) -> None:
         best, said = min([(float(measure(e)), m.said) for e, m in tried if measure(e) < m.well], default=(math.inf, ""))
         if as_it_is > nothing and best < min([BETTER * as_it_is, *(DEAD * float(measure(e)) for e in otherwise)]):
             raise RecordingError(f"{data.source}: {said}: so read, the model errs by {best:.0%} of the motion; as it is, by {as_it_is:.0%}")
+
+
+def _check_angles(model: ComposedModel, data: Dataset) -> None:
+    """Raises RecordingError if an input is where it means nothing: wheels are not steered by a quarter turn."""
+    for name, most in getattr(model.nominal.shared, "within", {}).items():
+        u = np.concatenate([inputs.values[:, model.inputs.index(name)] for _, inputs in data.segments] or [np.zeros(0)])
+        if np.mean(np.abs(u) >= most) > BEYOND:
+            raise RecordingError(
+                f"{data.source}: {name} goes to {np.nanmax(np.abs(u)):.4g}, must be below {most:.4g} rad: it seems to be in degrees, or "
+                "the angle of a steering wheel and not of the wheels on the road"
+            )
 
 
 def _check_scales(model: ComposedModel, data: Dataset) -> None:
@@ -285,6 +300,7 @@ def _mistakes(model: ComposedModel) -> Iterator[_Mistake]:
                 yield _mistake(kind, f"{name} seems to be in {unit}, must be in {right}", partial(_scaled, [j], factor), well)
             if kind == "inputs":
                 yield _mistake(kind, f"{name} seems to have the other sign", partial(_scaled, [j], -1.0))
+    yield from _speeds_together(model, units)
     if {"x", "y"} <= set(model.states):
         both = [model.states.index("x"), model.states.index("y")]
         yield _mistake("states", "x and y seem to be in mm, must be in m", partial(_scaled, both, 1e-3))
@@ -298,6 +314,24 @@ def _mistakes(model: ComposedModel) -> Iterator[_Mistake]:
 
     for one, other in combinations(axis_pairs(model), 2):
         yield _exchanged("states", model.states, tuple((model.states[j], model.states[k]) for j, k in zip(one, other, strict=True)))
+
+
+def _speeds_together(model: ComposedModel, units: dict[str, str]) -> Iterator[_Mistake]:
+    """Speeds that are asked for, all of a unit and with what is measured of them, in another one."""
+    for of in dict.fromkeys(units.get(name, "") for name in model.inputs):
+        inputs = [j for j, name in enumerate(model.inputs) if units.get(name, "") == of]
+        states = [model.states.index(s) for s, i in model.nominal.reached.items() if s in model.states and model.inputs.index(i) in inputs]
+        if len(inputs) + len(states) < 2:
+            continue
+        names = [*(model.states[j] for j in states), *(model.inputs[j] for j in inputs)]
+        said = ", ".join(names[:-1]) + " and " + names[-1]
+        for unit, right, factor, _ in (*_UNITS.get(of, ()), *(_OF_STATES.get(of, ()) if states else ())):
+            yield _Mistake(
+                f"{said} seem to be in {unit}, must be in {right}",
+                partial(_scaled, states, factor) if states else None,
+                partial(_scaled, inputs, factor),
+                SURELY,
+            )
 
 
 def _exchanged(kind: str, names: tuple[str, ...], pairs: tuple[tuple[str, str], ...]) -> _Mistake:

@@ -34,6 +34,11 @@ TIMES = (1.5, 4.0, 12.0, 40.0)
 
 SMALL = 1e-6
 
+REACHES = np.geomspace(0.8, 1.8, 40)
+"""Of a play that was named: what reaches of something that sticks and jumps are tried in its place. Which way it goes changes at once with
+its reach, so that there is no slope to follow to it; by a fiftieth more, it jumps mostly where it did.
+"""
+
 
 class Shape(InputEffect):
     """An input (T,) -> what acts, (T,): `over`. memory: it depends on what was asked before."""
@@ -65,11 +70,16 @@ class Shape(InputEffect):
         """(n, 1) with memory, (n, 0) without."""
         return np.zeros((n, 1 if self.memory else 0))
 
-    def starts(self, u: Array, model: NominalModel, channel: str, dt: float, near: Sequence[float] = ()) -> list[Values]:
-        """Values from which a fit begins. u: (T, nu); near: times (s) that named effects on the channel take, if any do."""
+    def starts(
+        self, u: Array, model: NominalModel, channel: str, dt: float, near: Sequence[float] = (), plays: Sequence[float] = ()
+    ) -> list[Values]:
+        """Values from which a fit begins. u: (T, nu); near: times (s) that named effects on the channel take, if any do; plays: theirs."""
         most = float(np.max(np.abs(u[:, model.inputs.index(channel)]), initial=0.0))
+        if most == 0.0:
+            return []
         times = [s for s in near if s > SMALL] or [k * dt for k in TIMES]
-        return [{**p, "most": most} for p in self._starts(dt, times)] if most > 0.0 else []
+        more = [{"reach": float(k * play / most)} for play in plays for k in REACHES] if self.name == "sticking" else []
+        return [{**p, "most": most} for p in (*self._starts(dt, times), *more)]
 
     def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """u (T, nu) or (T, runs, nu), from rest."""
