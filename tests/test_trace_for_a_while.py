@@ -160,6 +160,22 @@ def test_of_what_ties_at_one_speed_the_one_is_gone_on_with_that_is_wrong_by_leas
     assert [(e.name, e.channel) for e in result.effects] == [("input_gain", "v")]
 
 
+@pytest.mark.parametrize(("push", "repaired"), [(0.001, False), (0.003, True)])
+def test_what_ties_and_does_little_is_left_out_of_the_model_where_it_may_do_harm(push, repaired):
+    """A push that the world gives, or that the body gives: on a robot that went one way only nobody can tell. On the way back one is worse
+    than none.
+    """
+    rng = np.random.default_rng(0)
+    u = np.column_stack([np.repeat(rng.uniform(0.1, 0.3, 30), 20), 0.05 * np.tile(np.repeat([1.0, -1.0], 20), 15)])
+    x = _unicycle(rng, u, lambda k, x: 1.0, "euler")
+    x[:, 1] += push * DT * np.arange(len(x))
+    result = _traced(x, u)
+    assert result.verdict == "ambiguous"
+    assert {e.channel for e in (*result.effects, *result.ambiguous_with)} == {"world", "body"}
+    assert bool(result.spec.effects) is repaired
+    assert ("the model stays as it was given" in result.text()) is not repaired
+
+
 def test_two_gains_that_agree_are_one():
     """A gyro's scale that differs by sign in the fourth digit only, and long data: significant, and nothing to anybody."""
     rng = np.random.default_rng(8)
@@ -181,7 +197,7 @@ def test_explanations_that_do_the_very_same_stay_in_their_order():
     same = AppliedEffect(registry().get("effects", "input_gain_asymmetry"), "v", {"gain_positive": 0.8, "gain_negative": 0.8})
     first, second = (evaluate(given, insert(model, e, 0)) for e in (gain, same))
     found = [Scored("input_gain_asymmetry", "v", 1.0, second)]
-    assert representative(given, first, found) == (first, found)
+    assert representative(given, first, found) == (first, found, False)
 
 
 def test_what_is_wild_at_the_end_of_a_run_and_at_the_start_of_the_next_one_is_no_lost_command():

@@ -27,7 +27,8 @@ __all__ = ["Found", "Limit", "TraceResult"]
 
 @dataclass(frozen=True)
 class TraceResult:
-    """`spec`: the repaired model (the given one, if nothing was added). `partial`: effects found on the way whose names were withdrawn.
+    """`spec`: the repaired model; the given one, if nothing was added, or if what ties does little here and may do harm elsewhere.
+    `partial`: effects found on the way whose names were withdrawn.
 
     `depends_on`, `share_left`: of what the final model leaves. `floor`: what noise alone makes, (one step, rollout), (nx,) each.
     """
@@ -86,6 +87,11 @@ class TraceResult:
         return tuple((v.name, v.channel) for v in self.could_see if v.size is None and v.channel not in there)
 
     @property
+    def left_as_given(self) -> bool:
+        """Whether the model does without what was found."""
+        return bool(self.effects) and self.spec.effects == self.nominal.spec.effects
+
+    @property
     def done_to_data(self) -> tuple[str, ...]:
         """What stands between the measurements and what was fitted, one line each."""
         lines = [] if self.reconstruction is None else self.reconstruction.text()
@@ -95,6 +101,8 @@ class TraceResult:
         if self.unconfirmed:
             names = ", ".join(f"{name} on {channel}" for name, channel in self.unconfirmed)
             lines.append(f"not confirmed: {names}; what it was judged on never asks for that, the fit alone speaks for it")
+        if self.left_as_given:
+            lines.append("the model stays as it was given: what ties does little here, and on another drive it may do more harm than good")
         if self.nominal.dt != self.spec.dt:
             longer = f"fitted and judged on steps of {self.nominal.dt:g} s, the shortest that are independent"
             lines.append(f"{longer}; the model's are {self.spec.dt:g} s")
@@ -141,7 +149,7 @@ class TraceResult:
 
     def comments(self) -> tuple[str, ...]:
         """For the head of the model's TOML."""
-        found = tuple(e.text() for e in self.effects)
+        found = () if self.left_as_given else tuple(e.text() for e in self.effects)
         return (
             (f"Repaired by s2r trace on {self.source}: {self.verdict}", *found)
             if found

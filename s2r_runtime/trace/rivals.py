@@ -155,10 +155,11 @@ def _without_number(given: Problem, fit: Fit, place: int) -> list[ComposedModel]
     return [model for c in found if not any(slots_of(start, 0) for start in c.starts) for model in c.models(less)]
 
 
-def representative(given: Problem, fit: Fit, found: list[Scored]) -> tuple[Fit, list[Scored]]:
+def representative(given: Problem, fit: Fit, found: list[Scored]) -> tuple[Fit, list[Scored], bool]:
     """Of explanations that tie, the one to go on with, and the others: that which is at worst least far from what the others do, as a share
     of what they do, on inputs as large as these and BEYOND them. Where a limit, a deadband and a gain say the same, a gain is wrong by
-    least elsewhere. One that is behind by CLOSE with its numbers paid for is not gone on with.
+    least elsewhere. One that is behind by CLOSE with its numbers paid for is not gone on with. And whether even that one may be farther off
+    there than none at all.
 
     Nothing changes where more than one effect has rivals.
     """
@@ -167,7 +168,7 @@ def representative(given: Problem, fit: Fit, found: list[Scored]) -> tuple[Fit, 
     mine = {name_of(fit.model.effects[place]): place for place in fit.added}
     gone = {name for other in tied for name in mine.keys() - {name_of(other.model.effects[p]) for p in other.added}}
     if len(gone) != 1:
-        return fit, found
+        return fit, found, False
     name = gone.pop()
     less = without(fit.model, mine[name])
     models = [fit.model, *(other.model for other in tied)]
@@ -175,9 +176,9 @@ def representative(given: Problem, fit: Fit, found: list[Scored]) -> tuple[Fit, 
     dear = [STRICT.price(one.k - fit.k, n) - gain(one, fit) > CLOSE for one in (fit, *tied)]
     best = int(np.argmin(np.where(dear, np.inf, worst)))
     if best == 0 or not np.all(np.isfinite(worst)) or worst[best] > BETTER * worst[0]:
-        return fit, found
+        return fit, found, bool(worst[0] > 1.0)
     chosen = tied[best - 1]
-    return chosen, [Scored(*name, found[0].score, fit), *(s for s in found if s.fit is not chosen)]
+    return chosen, [Scored(*name, found[0].score, fit), *(s for s in found if s.fit is not chosen)], bool(worst[best] > 1.0)
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,8 @@ STARTS = 1200
 @dataclass(frozen=True)
 class Selection:
     """fit: the model chosen; nominal: as given. tried: columns paid for; ranking: best score of each (effect, channel) on the nominal
-    model; rivals: models that replace one effect and explain as much.
+    model; rivals: models that replace one effect and explain as much. risky: if one of these is
+    true, what was chosen does more harm than good elsewhere.
     """
 
     nominal: Fit
@@ -86,6 +87,7 @@ class Selection:
     tried: int
     ranking: tuple[Scored, ...]
     rivals: tuple[Scored, ...]
+    risky: bool = False
 
 
 def select(given: Problem, model: ComposedModel, horizon: int, progress: Callable[[float], None]) -> Selection:

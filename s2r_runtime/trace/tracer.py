@@ -51,7 +51,7 @@ from s2r_runtime.trace.scores import LENIENT, STRICT, names
 from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded, select
 from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.unseen import alike
-from s2r_runtime.trace.verdict import asked, confirmed, curves_of, final_fit, foretold_too, verdict_of
+from s2r_runtime.trace.verdict import asked, confirmed, curves_of, final_fit, foretold_too, verdict_of, worth_its_risk
 
 __all__ = ["Dataset", "TraceResult", "load_dataset", "trace", "usual_horizon"]
 
@@ -248,7 +248,7 @@ def _result(
         suggested_excitation=advice(model, [(f.name, f.channel) for f in (*effects, *ties)]) if ties else None,
         faults=checked.faults,
         outliers=checked.outliers + int(np.count_nonzero(np.abs(final.z).max(axis=1) > WILD)),
-        spec=_spec(model, final, dataset),
+        spec=_spec(model, final if worth_its_risk(chosen, before, after) else chosen.nominal, dataset),
         model=final.model,
         nominal=model,
         before=before,

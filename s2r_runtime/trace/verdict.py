@@ -55,6 +55,9 @@ FORETELLS, NEARER = 0.7, 0.95
 WORSE = 1.1
 """Times the error of rollouts without what was found from which on it is no repair."""
 
+MATTERS = 1.5
+"""Times that rollouts are farther off without an effect, in some state, from which on it matters to somebody who drives as was recorded."""
+
 MANY = 0.9
 """Share of the rollouts that must go far for that to be no matter of outliers."""
 
@@ -74,11 +77,12 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
                 fit, again = less, True
                 break
     found = list(chosen.rivals) if fit is chosen.fit else rivals(given, fit)  # those of a model with more effects are none of this one
+    risky = False
     if found:
         fits = [fit, *(s.fit for s in found if s.fit is not None)]
-        fit, found = representative(given, *tied(given, fit, found, _ahead(judged_on, fits)))
+        fit, found, risky = representative(given, *tied(given, fit, found, _ahead(judged_on, fits)))
     fit = fit if fit is chosen.fit else plainly(given, fit)
-    return replace(chosen, fit=fit, rivals=tuple(found))
+    return replace(chosen, fit=fit, rivals=tuple(found), risky=risky)
 
 
 def foretold_too(given: Problem, chosen: Selection, judged_on: Held, horizon: int) -> Selection:
@@ -184,6 +188,15 @@ def harms(before: Judged, after: Judged, floor: Array) -> bool:
         return False
     was, now = (float(np.sqrt(np.sum((rms(judged.ends) / np.maximum(floor, 1e-300)) ** 2))) for judged in (before, after))
     return now > WORSE * was
+
+
+def worth_its_risk(chosen: Selection, before: Judged, after: Judged) -> bool:
+    """Whether what was chosen goes into the model: not if it stands for several things that tie, of which one says that it does more harm
+    than good elsewhere, and if it does little here.
+    """
+    if not chosen.risky or len(chosen.fit.added) != 1 or not len(before.ends):
+        return True
+    return bool(np.any(rms(before.ends) > MATTERS * rms(after.ends)))
 
 
 def foretells_nothing(judged: Judged, given: Held, floor: Array) -> bool:
