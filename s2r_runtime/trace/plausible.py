@@ -142,8 +142,8 @@ def _check_columns(model: ComposedModel, data: Dataset) -> None:
 
 def _check_angles(model: ComposedModel, data: Dataset) -> None:
     """Raises RecordingError if an input is where it means nothing: wheels are not steered by a quarter turn."""
-    for name, most in getattr(model.nominal.shared, "within", {}).items():
-        u = np.concatenate([inputs.values[:, model.inputs.index(name)] for _, inputs in data.segments] or [np.zeros(0)])
+    for name, most in getattr(model.nominal.shared, "within", {}).items() if data.segments else ():
+        u = np.concatenate([inputs.values[:, model.inputs.index(name)] for _, inputs in data.segments])
         if np.mean(np.abs(u) >= most) > BEYOND:
             raise RecordingError(
                 f"{data.source}: {name} goes to {np.nanmax(np.abs(u)):.4g}, must be below {most:.4g} rad: it seems to be in degrees, or "
