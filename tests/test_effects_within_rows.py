@@ -56,3 +56,12 @@ def test_what_is_commanded_for_a_row_of_a_ramp_or_a_peak_is_a_command():
     u[3:, 0] = [0.1, 0.2, 0.3, 0.4, 0.5, 0.5, 0.9, 0.5, 0.5]
     each = [_through("input_rate_limit", UP, [u], DT, parts)[0] for parts in (1, 10)]
     assert each[0] == pytest.approx(each[1], abs=1e-12)
+
+
+def test_a_change_on_a_row_but_for_rounding_is_none_within_it():
+    u = np.zeros((12, 2))
+    u[4:, 0] = 0.3
+    u[4, 0] -= 1e-12
+    mean, _ = _through("input_rate_limit", UP, [u], DT, 10)
+    u[4, 0] = 0.3
+    assert mean == pytest.approx(_through("input_rate_limit", UP, [u], DT, 1)[0], abs=1e-9)

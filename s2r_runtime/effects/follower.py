@@ -25,6 +25,10 @@ SHORT = 2
 """Rows a column below which a row at a time is faster than a column at a time."""
 
 
+LEAST = 1e-6
+"""Of a row: what comes that much after its beginning, or before its end, is on it but for rounding."""
+
+
 class Follower(InputEffect):
     """Override `after`, `mean` (arrays, broadcast) and `begins` (lists of floats)."""
 
@@ -118,5 +122,7 @@ def mixtures(flat: Array, rows: int) -> Index:
     changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
     k = changes[:-1][np.diff(changes) == 1]
     k = k[(k % rows >= 2) & (k % rows < rows - 2)]
-    alone = (flat[k - 2] == flat[k - 1]) & (flat[k + 1] == flat[k + 2]) & ((flat[k] - flat[k - 1]) * (flat[k + 1] - flat[k]) > 0.0)
-    return np.asarray(k[alone])
+    held = (flat[k - 2] == flat[k - 1]) & (flat[k + 1] == flat[k + 2])
+    span = flat[k + 1] - flat[k - 1]
+    share = (flat[k] - flat[k - 1]) / np.where(span != 0.0, span, np.inf)  # there and back is a peak
+    return np.asarray(k[held & (share > LEAST) & (share < 1.0 - LEAST)])
