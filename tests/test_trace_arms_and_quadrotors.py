@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from s2r_runtime.effects.viscous_friction import ViscousFriction
 from s2r_runtime.models.composed import compose
 from s2r_runtime.models.forces import coupled
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
@@ -143,3 +144,37 @@ def test_wind_may_blow_downwards(tmp_path):
     (found,) = _flown(tmp_path, 0.0, (0.3, 0.0, -0.2)).effects
     assert (found.name, found.channel) == ("constant_disturbance", "world")
     assert [found.parameters[k][0] for k in "xyz"] == pytest.approx([0.3, 0.0, -0.2], abs=0.02)
+
+
+SPEEDS_ONLY = """
+import numpy as np
+
+STATES = ("vx", "vy")
+INPUTS = ("tilt_x", "tilt_y")
+PARAMS = {"g": 9.81, "drag": DRAG}
+
+
+def step(x, u, dt, params):
+    return x + dt * (params["g"] * np.tan(u) - params["drag"] * x)
+"""
+
+
+def test_drag_on_speeds_without_positions_is_named(tmp_path):
+    model, rng = _model(tmp_path, SPEEDS_ONLY.replace("DRAG", "0.0")), np.random.default_rng(3)
+    u = np.repeat(rng.uniform(-0.2, 0.2, (40, 2)), 25, axis=0)
+    v = [np.zeros((1, 2))]
+    for tilt in u:
+        v.append(v[-1])
+        for _ in range(PARTS):
+            v[-1] = v[-1] + DT_S / PARTS * (9.81 * np.tan(tilt) - np.array([0.4, 0.3]) * v[-1])
+    y = np.concatenate(v) + 0.02 * rng.normal(size=(1001, 2))
+    found = trace(from_arrays(model, [(y, u)]), model)
+    assert {(e.name, e.channel, round(e.parameters["coefficient"][0], 1)) for e in found.effects} == {
+        ("viscous_friction", "vx", 0.4),
+        ("viscous_friction", "vy", 0.3),
+    }
+
+
+def test_a_model_that_slows_its_speeds_down_has_a_parameter_for_it(tmp_path):
+    drags = [ViscousFriction().channels(_model(tmp_path, SPEEDS_ONLY.replace("DRAG", drag)).nominal) for drag in ("0.0", "0.2")]
+    assert drags == [("vx", "vy"), ()]
