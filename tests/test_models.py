@@ -120,3 +120,17 @@ def test_an_effect_that_may_stand_once_is_refused_twice():
 def test_bad_parameters_of_an_effect_are_named(effect, said):
     with pytest.raises(ConfigError, match=said):
         _model("unicycle", 0.1, [effect])
+
+
+@pytest.mark.parametrize(
+    ("name", "parameter", "value"),
+    [
+        ("differential_drive", "wheel_radius", 0.0),
+        ("differential_drive", "track", -0.5),
+        ("bicycle", "wheel_base", math.inf),
+        ("joint", "mass", 0.0),
+    ],
+)
+def test_a_size_that_no_body_has_is_refused(name, parameter, value):
+    with pytest.raises(ConfigError, match=f"{parameter} is .*, must be > 0"):
+        _model(name, **{parameter: value})

@@ -276,6 +276,10 @@ class ComposedModel:
         return e
 
 
+SIZES = ("wheel_radius", "track", "wheel_base", "mass", "inertia")
+"""Parameters of which no body has none: what it does would be no number, or nothing."""
+
+
 def delays_first(nominal: BoundModel, chain: Sequence[T], of: Callable[[T], AppliedEffect]) -> list[T]:
     """A chain with each delay before what does not mind being delayed: the same, but what comes in is held yet, so that it is known to
     the instant what acts at the end of a step. As it is, where nothing depends on that.
@@ -304,6 +308,8 @@ def compose(spec: ModelSpec, where: str = "model") -> ComposedModel:
         if name not in shared.parameters:
             known = ", ".join(shared.parameters) or "none"
             raise ConfigError(f"{where}.parameters.{name}: model {spec.name!r} has no such parameter; it has: {known}")
+        if name in SIZES and not 0.0 < spec.parameters[name] < math.inf:
+            raise ConfigError(f"{where}.parameters.{name} is {spec.parameters[name]:g}, must be > 0")
     nominal = bind(shared, spec.parameters)
     applied: list[AppliedEffect] = []
     for index, entry in enumerate(spec.effects):
