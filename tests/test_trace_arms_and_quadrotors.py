@@ -120,7 +120,7 @@ def test_friction_in_the_joints_of_an_arm_is_named(tmp_path):
     assert sizes == pytest.approx({"dq1": 1.0, "dq2": 0.3}, rel=0.05)
 
 
-def _flown(folder, sag, wind) -> TraceResult:
+def _flown(folder, sag, wind, lost=()) -> TraceResult:
     model, rng = _model(folder, QUADROTOR), np.random.default_rng(2)
     goal = np.repeat(rng.uniform(-2.0, 2.0, (10, 3)), 100, axis=0)
     x, states, inputs = np.zeros((1, 6)), [], []
@@ -132,7 +132,10 @@ def _flown(folder, sag, wind) -> TraceResult:
         x = model.nominal.step(x, u * [1.0, 1.0, 1.0 + sag], DT_S, model.parameters)
         x[0] += np.concatenate([0.5 * DT_S * DT_S * np.array(wind), DT_S * np.array(wind)])
     noise = rng.normal(size=(1000, 6)) * [0.002, 0.002, 0.002, 0.03, 0.03, 0.03]
-    return trace(from_arrays(model, [(np.array(states) + noise, np.array(inputs[:-1]))]), model)
+    y = np.array(states) + noise
+    for first in lost:
+        y[first : first + 40] = y[first - 1]
+    return trace(from_arrays(model, [(y, np.array(inputs[:-1]))]), model)
 
 
 def test_a_robot_that_moves_up_as_well_is_traced(tmp_path):
@@ -144,6 +147,13 @@ def test_wind_may_blow_downwards(tmp_path):
     (found,) = _flown(tmp_path, 0.0, (0.3, 0.0, -0.2)).effects
     assert (found.name, found.channel) == ("constant_disturbance", "world")
     assert [found.parameters[k][0] for k in "xyz"] == pytest.approx([0.3, 0.0, -0.2], abs=0.02)
+
+
+def test_a_message_that_repeats_is_frozen_in_all_that_it_says(tmp_path):
+    found = _flown(tmp_path, 0.0, (0.0, 0.0, 0.0), lost=(300, 700))
+    assert found.verdict == "sensor_fault"
+    assert sorted(f.channel for f in found.faults) == sorted(2 * ["x", "y", "z", "vx", "vy", "vz"])
+    assert {f.kind for f in found.faults} == {"frozen"}
 
 
 SPEEDS_ONLY = """

@@ -20,7 +20,7 @@ from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import NominalModel, Parameter
 from s2r_runtime.models.bound import BoundModel
 from s2r_runtime.models.file_model import FileModel
-from s2r_runtime.models.forces import PROBE_S, Axis, Push, axes, mass
+from s2r_runtime.models.forces import PROBE_S, Axis, Push, axes, coupled, mass
 
 START_RATE = 0.5
 """1/s: a slow loss; what it does to a step is in proportion to it."""
@@ -46,6 +46,8 @@ class ViscousFriction(ForceEffect):
         """Of force over speed."""
         axis = axis_of(model, channel)
         force = force_unit(model)
+        if axis is not None and coupled(model) and not getattr(model, "units", {}):
+            return f"{model.inputs[axes(model).index(axis)]}/{channel}"  # one's own units, whatever they are
         return "1/s" if axis is None or force == "m/s²" else f"{force} s/{length_unit(model, axis)}"
 
     def wrong(self, p: Values) -> str:

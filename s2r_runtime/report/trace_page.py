@@ -36,7 +36,7 @@ def trace_page(result: TraceResult, suggested: Any = None) -> str:
     """The page of `s2r trace --report`. suggested: the sequence of inputs that --suggest wrote, if it did."""
     r = result
     model = r.nominal.spec.name.rsplit("/", 1)[-1]
-    page = Page("Residual, traced", f"{r.source} · {r.n_rows} rows · {model}, step {r.nominal.dt:g} s", wide=True)
+    page = Page("Residual, traced", f"{r.source} · {r.n_rows} rows · {model}, step {r.nominal.dt:.4g} s", wide=True)
     changed = r.model.effects != r.nominal.effects
     trace = r.to_json()
     add_trace(page, trace)
@@ -113,7 +113,7 @@ def _rollouts(page: Page, r: TraceResult, changed: bool) -> None:
     units: dict[str, str] = getattr(r.nominal.nominal, "units", {})
     page.heading("Rollouts against measurement")
     page.text(
-        f"Rollouts of {r.horizon_s:g} s, each begun at the measured state (dots), on held-out data. Grey: the one that is meant.", "soft"
+        f"Rollouts of {r.horizon_s:.4g} s, each begun at the measured state (dots), on held-out data. Grey: the one that is meant.", "soft"
     )
     page.key([("measured", "ink"), *(BEFORE_AFTER if changed else [("the model", "blue")])])
     for stretch in found:

@@ -153,7 +153,7 @@ def _away(r: TraceResult, ends: Array, least: float) -> str:
     usual = np.sort(np.abs(ends[:, worst]))[: max(1, round(USUAL * len(ends)))]  # a few wild rows are outliers, and counted
     if min(ratio[worst], float(np.sqrt(np.mean(usual**2))) / max(float(r.floor[1][worst]), 1e-300)) <= least:
         return ""
-    return f"{r.nominal.states[worst]} ends {float(ratio[worst]):.3g} x the noise away after {r.horizon_s:g} s"
+    return f"{r.nominal.states[worst]} ends {float(ratio[worst]):.3g} x the noise away after {r.horizon_s:.4g} s"
 
 
 def _table(r: TraceResult) -> list[str]:
@@ -164,7 +164,7 @@ def _table(r: TraceResult) -> list[str]:
         pairs.append((rms(r.before.ends), rms(r.after.ends), r.floor[1]))
     changed = r.model.effects != r.nominal.effects
     what = f"before {ARROW} after" if changed else "error"
-    over = [f"one step ({r.nominal.dt:g} s)", f"over {r.horizon_s:g} s"][: len(pairs)]
+    over = [f"one step ({r.nominal.dt:.4g} s)", f"over {r.horizon_s:.4g} s"][: len(pairs)]
     head = [f"{'error, rms':<18}" + "".join(f"{text:^38}" for text in over).rstrip(), f"{'':<18}" + f"{what:>24}{'noise':>14}" * len(pairs)]
     rows = []
     for i, state in enumerate(r.nominal.states):

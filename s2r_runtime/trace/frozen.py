@@ -75,6 +75,24 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
             if caught_up or (b - a > LONG_FROZEN and jitters and far > 10.0 * reach.move[j]):
                 bad[a + 1 : b + 1, j] = True
                 found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
+    return found + _with_them(model, data, i, bad)
+
+
+def _with_them(model: ComposedModel, data: Dataset, i: int, bad: Mask) -> list[Fault]:
+    """States that repeat exactly on rows on which others were found frozen, although they hardly ever do elsewhere: they came in the same
+    message, however little they had to move.
+    """
+    run = data.runs[i]
+    still, there = np.diff(run.y, axis=0) == 0.0, np.any(bad[1:], axis=1)
+    if not np.any(there) or np.all(there):
+        return []
+    hardly = np.mean(still[~there], axis=0) < REPEATS
+    found = []
+    for a, b in _stretches(there):
+        for j, name in enumerate(model.states):
+            if hardly[j] and not np.any(bad[a + 1 : b + 1, j]) and np.all(still[a:b, j]):
+                bad[a + 1 : b + 1, j] = True
+                found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
     return found
 
 
