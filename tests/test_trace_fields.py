@@ -137,7 +137,7 @@ def test_only_fields_that_stand_out_are_looked_at(monkeypatch):
         left = left_of(given, evaluate(given, model))
         flipped = fields._flipped(left)
         offered = list(fields._offered(left))
-        standing = [offer for offer in offered if fields._stands_out(offer, flipped) > SEEN]
+        standing = [offer for offer in offered if fields._stands_out(offer, np.einsum("ki,kis->ks", offer.push, flipped)) > SEEN]
         looked.clear()
         found = field(left)
         assert slips or len(looked) <= 2 * (fields.LOOKED_AT + fields.FITTED)  # fields, and pushes that wander

@@ -161,7 +161,9 @@ def _looked(
 ) -> tuple[list[tuple[float, _Offer]], int]:
     """(nats at first look, offer), the best first, of those that stand out most, or beyond doubt; and how many were offered."""
     flipped = _flipped(left)
-    scored = [(_stands_out(offer, flipped), offer) for offer in offered]
+    every = list(offered)
+    along = {id(offer.push): np.einsum("ki,kis->ks", offer.push, flipped) for offer in {id(o.push): o for o in every}.values()}
+    scored = [(_stands_out(offer, along[id(offer.push)]), offer) for offer in every]  # the same pushes go with many coordinates
     best = sorted((pair for pair in scored if pair[0] > SEEN), key=lambda pair: -pair[0])
     looked = [(_marginal(left, offer.x, 1)[0] - bare, offer) for k, (far, offer) in enumerate(best) if k < most or far > sure]
     return sorted(looked, key=lambda pair: -pair[0]), len(scored)
@@ -175,11 +177,12 @@ def _flipped(left: Left) -> Array:
     return left.fit.whiten.back(np.concatenate([push[:, :, None], push[:, :, None] * signs], axis=2))
 
 
-def _stands_out(offer: _Offer, flipped: Array) -> float:
+def _stands_out(offer: _Offer, along: Array) -> float:
     """Score test of tau = 0: standard deviations by which the size of the slopes, each on the scale that chance gives it, is above that by
     chance. It needs no whitened bumps, so a field that is not there costs next to nothing (X. Lin, Biometrika 84, 1997, on such tests).
+    along: (n, 1 + FLIPS), what was `_flipped` along its push.
     """
-    slopes = offer.bumps.T @ np.einsum("ki,kis->ks", offer.push, flipped)
+    slopes = offer.bumps.T @ along
     size = np.sum(slopes**2 / np.maximum(np.mean(slopes[:, 1:] ** 2, axis=1, keepdims=True), 1e-300), axis=0)
     return float((size[0] - np.mean(size[1:])) / max(float(np.std(size[1:])), 1e-300))
 
@@ -308,17 +311,25 @@ def _named(left: Left) -> list[Array]:
 def _bumps(c: Array, at_most: Sequence[int]) -> Iterator[Array]:
     """(n, cells) bumps over where c (n, d) was, the coarse ones first."""
     span = float(np.max(np.ptp(c, axis=0)))
-    before = 0
+    from_least, before, found = c - c.min(axis=0), 0, {}
     for most in at_most if span > 0.0 else ():
         for along in GRIDS:
-            wide = span / along
-            cells = np.unique(np.rint((c - c.min(axis=0)) / wide), axis=0)
+            if along not in found:
+                found[along] = _cells(from_least * (along / span), along)
+            cells = found[along]
             if len(cells) <= min(most, len(c) // SPARE):
                 break
         if before < len(cells) <= min(most, len(c) // SPARE):
             before = len(cells)
-            away = (c - c.min(axis=0))[:, None, :] / wide - cells
+            away = from_least[:, None, :] * (along / span) - cells
             yield np.exp(-0.5 * np.sum((away / WIDE) ** 2, axis=2))
+
+
+def _cells(place: Array, along: int) -> Array:
+    """(cells, d) whole numbers nearest to places (n, d) between 0 and `along`, each once."""
+    sides = (along + 1) ** np.arange(place.shape[1])[::-1]
+    numbers = np.unique(np.rint(place).astype(np.int64) @ sides)
+    return np.asarray(numbers[:, None] // sides % (along + 1), dtype=np.float64)
 
 
 def _marginal(left: Left, x: Array, passes: int) -> tuple[float, Array]:

@@ -221,7 +221,9 @@ def _levels(r: Array, u: Array, directions: Terms) -> Iterator[Terms]:
     steps = np.arange(FEWEST_LEVELS, MOST_LEVELS + 0.5, 0.5)
     seen = np.stack([np.sum(r * d, axis=1) for d in directions], axis=1)
     seen = np.clip(seen - np.median(seen, axis=0), *(sign * 4.0 * np.median(np.abs(seen), axis=0) for sign in (-1, 1)))
-    power = np.abs(np.exp(-1j * np.pi * np.outer(steps, u)) @ seen) ** 2
+    turns = np.tile(np.exp(-0.5j * np.pi * u), (len(steps), 1))
+    turns[0] = np.exp(-1j * np.pi * steps[0] * u)
+    power = np.abs(np.multiply.accumulate(turns) @ seen) ** 2
     ratio = power / np.maximum(np.median(power, axis=0) / math.log(2.0), 1e-300)
     k, c = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
     if ratio[k, c] > LINE:
