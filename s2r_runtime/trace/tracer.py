@@ -339,6 +339,7 @@ class _Whole:
         self.given = problem(everything.data, everything.steps)
         self.nominal = evaluate(self.given, nominal)
         self._horizon = horizon
+        self._known: dict[int, tuple[Fit, Structure]] = {}
 
     @cached_property
     def _looks(self) -> Looks:
@@ -356,10 +357,16 @@ class _Whole:
         return explains_more(self._looks, self.unnamed, fit, self._horizon, left=left)
 
     def structure(self, chosen: Selection) -> Structure:
-        """What the chosen model leaves."""
-        if not chosen.fit.added:
+        """What the chosen model leaves. It is asked again of a pair that a selection went on from and added nothing to."""
+        fit = chosen.fit
+        if id(fit) not in self._known:
+            self._known[id(fit)] = fit, self._structure(fit)
+        return self._known[id(fit)][1]
+
+    def _structure(self, chosen: Fit) -> Structure:
+        if not chosen.added:
             return self._of_nominal()
-        fit = evaluate(self.given, chosen.fit.model)
+        fit = evaluate(self.given, chosen.model)
         fit = fitted(self.given, fit, fit.model, 2)  # numbers of the fit's part are a little off elsewhere: that is no structure
         looks = Looks(left_of(self.given, fit))
         found = lack_of_fit(looks, self.nominal, self._horizon)
