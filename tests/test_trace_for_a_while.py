@@ -174,6 +174,7 @@ def test_what_ties_and_does_little_is_left_out_of_the_model_where_it_may_do_harm
     assert {e.channel for e in (*result.effects, *result.ambiguous_with)} == {"world", "body"}
     assert bool(result.spec.effects) is repaired
     assert ("the model stays as it was given" in result.text()) is not repaired
+    assert result.to_json()["left_as_given"] is not repaired
 
 
 def test_two_gains_that_agree_are_one():

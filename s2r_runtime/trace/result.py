@@ -122,6 +122,7 @@ class TraceResult:
             "verdict": self.verdict,
             "effects": [e.to_json() for e in self.effects],
             "candidates": [{"name": n, "channel": c, "score": round(s, 3)} for n, c, s in self.candidates],
+            "left_as_given": self.left_as_given,
             "ambiguous_with": [{**e.to_json(), "same_thing": e in alike} for e in self.ambiguous_with],
             "partial": [e.to_json() for e in self.partial],
             "depends_on": list(self.depends_on),
