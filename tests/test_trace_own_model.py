@@ -9,10 +9,14 @@ from s2r_runtime.effects.classes import same
 from s2r_runtime.errors import NotEnoughEvidence
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.trace import screening
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import held
 from s2r_runtime.trace.fitting import evaluate, problem
+from s2r_runtime.trace.hidden_pairs import two_together
 from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.scores import names
+from s2r_runtime.trace.selection import Selection
 from s2r_runtime.trace.tracer import trace, usual_horizon
 from s2r_runtime.trace.verdict import _ahead
 
@@ -177,3 +181,45 @@ def test_a_valve_that_sticks_and_jumps_is_no_play(tmp_path):
     found = trace(from_arrays(model, [(np.array(levels)[:, None], np.array(asked)[:, None])]), model)
     assert found.verdict == "unexplained"
     assert "memory(pump)" in found.depends_on
+
+
+NARROW = """
+import numpy as np
+
+STATES = ("level",)
+INPUTS = ("pump", "valve")
+PARAMS = {"lift": 0.3, "outflow": 0.2}
+
+
+def step(x, u, dt, params):
+    if np.any(u < LEAST) or np.any(u > 1.0 - LEAST):
+        raise ValueError("no such opening")
+    return x + dt * (params["lift"] * u[:, :1] - params["outflow"] * u[:, 1:] * np.sqrt(np.maximum(x, 0.0)))
+"""
+
+
+@pytest.mark.parametrize("least", [0.05, 0.2])
+def test_two_effects_may_lead_together_to_where_somebodys_model_does_not_step_although_neither_does_alone(tmp_path, least):
+    path = tmp_path / "narrow.py"
+    path.write_text(NARROW.replace("LEAST", repr(least)))
+    model, rng = compose(ModelSpec(str(path), 0.1)), np.random.default_rng(0)
+    u = np.repeat(rng.uniform(0.2, 0.8, (40, 2)), 15, axis=0)
+    levels = [2.0]
+    for pump, valve in u:
+        levels.append(levels[-1] + 0.1 * (0.3 * (0.1 + 0.8 * pump) - 0.2 * valve * math.sqrt(levels[-1])))
+    data = from_arrays(model, [(np.array(levels)[:, None] + 1e-3 * rng.normal(size=(601, 1)), u)])
+    given = problem(data, steps_of(data))
+    base = evaluate(given, model)
+    pair = two_together(given, Selection(base, base, 100, (), ()))
+    assert pair is not None
+    if least < 0.1:
+        assert names(pair.fit.model) == (("input_bias", "pump"), ("input_gain", "pump"))
+
+
+def test_where_somebodys_model_steps_nowhere_else_no_two_effects_are_promising(monkeypatch, tmp_path):
+    model = _model(tmp_path)
+    data = _drive(model, rows=100)
+    given = problem(data, steps_of(data))
+    base = evaluate(given, model)
+    monkeypatch.setattr(screening, "foretold", lambda given, model: None)
+    assert two_together(given, Selection(base, base, 100, (), ())) is None

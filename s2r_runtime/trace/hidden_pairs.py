@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.candidates import candidates, places
-from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, insert
+from s2r_runtime.trace.fitting import Fit, Problem, fitted, foretold, gain, insert
 from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.residual import acting, predicted
 from s2r_runtime.trace.scores import STRICT, name_of, names
@@ -50,7 +50,8 @@ def two_together(given: Problem, chosen: Selection) -> Selection | None:
     def worth(fit: Fit) -> float:
         return gain(fit, base) - STRICT.price(fit.k - base.k, n)
 
-    fits = [fitted(given, base, model, 2) for pair in _promising(given, chosen) for model in _together(*pair)]
+    models = [model for pair in _promising(given, chosen) for model in _together(*pair)]
+    fits = [fitted(given, base, model, 2) for model in models if foretold(given, model) is not None]  # each alone may be where both are not
     best = max(fits, key=worth, default=None)
     if best is None or worth(best) - worth(chosen.fit) <= STRICT.needed(chosen.tried, 0, n):
         return None
@@ -63,6 +64,8 @@ def _promising(given: Problem, chosen: Selection) -> list[tuple[Probe, Probe]]:
     before = predicted(base.model, given.steps, acting(base.model, given.data))
     probes = probes_of(base.model, candidates(base.model, given.data, Leftover(given, base)))
     found = [(probe, i, c[:, i]) for probe, c in columns(given, base, probes, before) for i in range(c.shape[1])]
+    if not found:  # a user's own model may step nowhere else
+        return []
     root = np.sqrt(noises.weight(base.z.ravel()))
     table = np.array([c for _, _, c in found]).reshape(len(found), -1) * root
     size = np.linalg.norm(table, axis=1)

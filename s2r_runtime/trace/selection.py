@@ -24,6 +24,7 @@ from s2r_runtime.trace.fitting import (
     Problem,
     evaluate,
     fitted,
+    foretold,
     gain,
     objective,
     plainly,
@@ -333,7 +334,10 @@ def parted(given: Problem, fit: Fit, ranking: Sequence[Scored], bar: Bar) -> Fit
             instead = [b for b in best.fit.model.effects if isinstance(b, Added) and name_of(b) == (best.name, name)]
             apart = [*(Added(a.effect, other, a.p) for other in fit.model.inputs if other != name), *instead]
             there = fit.model.effects
-            other = fitted(given, fit, replace(fit.model, effects=(*there[:place], *apart, *there[place + 1 :])))
+            model = replace(fit.model, effects=(*there[:place], *apart, *there[place + 1 :]))
+            if foretold(given, model) is None:  # a user's own model may not go where both take it
+                continue
+            other = fitted(given, fit, model)
             if gain(other, fit) > bar.price(other.k - fit.k, len(given.steps)) + CLOSE:
                 return other
     return fit
