@@ -121,6 +121,17 @@ def test_sensors_that_are_steadier_than_a_model_is_believed_to_be_are_no_noise_t
     assert (result.verdict, result.depends_on) == ("none", ())
 
 
+def test_what_is_known_of_what_a_model_leaves_is_forgotten_with_another_fit():
+    rng = np.random.default_rng(4)
+    u = _held(rng, 100, [-0.5, -1.5], [0.5, 1.5])
+    data, model = _recording(_driven(rng, u, lambda k, x, v, w: (v, w)), u)
+    given = problem(data, steps_of(data))
+    left = left_of(given, evaluate(given, model))
+    noisier = replace(left, fit=replace(left.fit, z=2.0 * left.fit.z))
+    assert fields.bare_nats(left) > fields.bare_nats(noisier) + 1.0
+    assert fields.bare_nats(replace(left, fit=noisier.fit)) == fields.bare_nats(noisier)
+
+
 def test_only_fields_that_stand_out_are_looked_at(monkeypatch):
     """The score test lets a field through that is there; of those by chance, a share of noise above SEEN = 1 standard deviation: less than
     half of them, whatever the tails (Cantelli: 1 / (1 + SEEN^2)).

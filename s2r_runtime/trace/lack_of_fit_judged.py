@@ -63,7 +63,7 @@ class Left:
     f: Array
     block: NDArray[np.int64]
     clipped: Array | None
-    known: dict[str, float] = field(default_factory=dict, repr=False, compare=False)
+    known: dict[str, float] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @cached_property
     def law(self) -> Colour | None:
