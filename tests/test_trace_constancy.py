@@ -7,7 +7,7 @@ import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace.constancy import ALPHA, uneven
+from s2r_runtime.trace.constancy import ALPHA, _recently, uneven
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
 from s2r_runtime.trace.lack_of_fit import left_of
@@ -57,6 +57,11 @@ def test_a_gain_that_is_one_number_is_not_told_to_vary():
     """The looks of 40 drives together have a chance of 40 ALPHA at most."""
     found = [uneven(_left(np.random.default_rng(seed), 400, lambda x, v, w: 0.75)) for seed in range(40)]
     assert sum(one is not None for one in found) <= 1 < 1.0 / (40 * ALPHA)
+
+
+def test_what_an_input_recently_was_begins_anew_with_each_run():
+    first = np.repeat([0, 3], [3, 4])
+    assert _recently(np.array([1.0, 3.0, 5.0, 0.0, 2.0, 4.0, 6.0]), 2, first).tolist() == [1.0, 2.0, 4.0, 0.0, 1.0, 3.0, 5.0]
 
 
 def test_a_number_that_varies_a_little_is_one_number_for_all_that_matters():

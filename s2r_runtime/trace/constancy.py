@@ -24,7 +24,7 @@ from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.fitting import evaluate, gain, slopes, without
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
 from s2r_runtime.trace.lack_of_fit_terms import VELOCITIES, quieter
-from s2r_runtime.trace.residual import acting
+from s2r_runtime.trace.residual import acting, first_steps
 
 Array = NDArray[np.float64]
 
@@ -116,6 +116,8 @@ def _coordinates(left: Left) -> Iterator[_Along]:
     given, model = left.given, left.fit.model
     y = quieter(given.steps, left.fit.noise)
     act = acting(model, given.data).mean
+    first = first_steps(given.data)
+    begin = np.repeat(first[:-1], np.diff(first))
     if given.data.in_order:
         yield _Along("time", given.steps.t)
     for i, name in enumerate(model.states):
@@ -132,15 +134,15 @@ def _coordinates(left: Left) -> Iterator[_Along]:
         yield _Along(name, u)
         yield _Along(name, np.abs(u))
         for steps in RECENT:
-            changes = (act[:, i] - _recently(act[:, i], steps))[given.steps.place]
+            changes = (act[:, i] - _recently(act[:, i], steps, begin))[given.steps.place]
             yield _Along(f"memory({name})", changes * np.sign(u))
 
 
-def _recently(u: Array, steps: int) -> Array:
-    """Mean of the values (n,) before each, and of it."""
+def _recently(u: Array, steps: int, first: NDArray[np.int64]) -> Array:
+    """Mean of the values (n,) before each, and of it. first: (n,) where the run of each begins."""
     total = np.concatenate([[0.0], np.cumsum(u)])
     end = np.arange(1, len(u) + 1)
-    begin = np.maximum(end - steps, 0)
+    begin = np.maximum(end - steps, first)
     return np.asarray((total[end] - total[begin]) / (end - begin))
 
 
