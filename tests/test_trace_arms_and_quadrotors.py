@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from s2r_runtime.effects.viscous_friction import ViscousFriction
+from s2r_runtime.effects.viscous_friction import START_RATE, ViscousFriction
 from s2r_runtime.models.composed import compose
 from s2r_runtime.models.forces import coupled
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
@@ -183,6 +183,28 @@ def test_drag_on_speeds_without_positions_is_named(tmp_path):
         ("viscous_friction", "vx", 0.4),
         ("viscous_friction", "vy", 0.3),
     }
+
+
+TURNTABLE = """
+import numpy as np
+
+STATES = ("q", "qd", "omega")
+INPUTS = ("force", "spin")
+PARAMS = {"mass": 2000.0}
+
+
+def step(x, u, dt, params):
+    a = u[:, :1] / params["mass"]
+    return x + dt * np.hstack([x[:, 1:2] + dt / 2 * a, a, u[:, 1:]])
+"""
+
+
+def test_drag_on_a_speed_without_a_position_begins_at_a_rate_whatever_the_mass(tmp_path):
+    model = _model(tmp_path, TURNTABLE).nominal
+    drag, u = ViscousFriction(), np.ones((10, 2))
+    assert drag.channels(model) == ("qd", "omega")
+    assert drag.starts(u, model, "qd", DT_S)[0] == {"coefficient": START_RATE * 2000.0}
+    assert drag.starts(u, model, "omega", DT_S)[0] == {"coefficient": START_RATE}
 
 
 def test_a_model_that_slows_its_speeds_down_has_a_parameter_for_it(tmp_path):

@@ -89,7 +89,7 @@ class ViscousFriction(ForceEffect):
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
         """One each way of saying it: the response is linear."""
-        c = START_RATE * (mass(model) if axes(model) else 1.0)
+        c = START_RATE * (mass(model) if self.pushes(model, channel) else 1.0)
         return [{"coefficient": c}, {"coefficient_positive": c, "coefficient_negative": c}]
 
 
