@@ -309,7 +309,7 @@ def compose(spec: ModelSpec, where: str = "model") -> ComposedModel:
             known = ", ".join(shared.parameters) or "none"
             raise ConfigError(f"{where}.parameters.{name}: model {spec.name!r} has no such parameter; it has: {known}")
         if name in SIZES and not 0.0 < spec.parameters[name] < math.inf:
-            raise ConfigError(f"{where}.parameters.{name} is {spec.parameters[name]:g}, must be > 0")
+            raise ConfigError(f"{where}.parameters.{name} is {spec.parameters[name]:g}, must be > 0 and finite")
     nominal = bind(shared, spec.parameters)
     applied: list[AppliedEffect] = []
     for index, entry in enumerate(spec.effects):
