@@ -137,7 +137,8 @@ class NominalModel(Protocol):
     It may also have: `units` (name of a state or input -> SI unit, for reports); `integration` = "euler" if it has a planar pose (x, y,
     theta) that is moved along the heading at the start of the step; `reached` (state -> the input that it is set to at once: such
     a state is compared with the input as it acts at the *end* of the step, the others with its mean over the step); `follows` (state that
-    a recording may lack -> the states that it follows from, and how: `Follows`); `uneven` = True: `step` also takes dt as (n,), one a row.
+    a recording may lack -> the states that it follows from, and how: `Follows`); `uneven` = True: `step` also takes dt as (n,), one a row;
+    `within` (input, an angle -> below which size it means something, rad: a recording in which it goes beyond is refused).
     """
 
     name: str

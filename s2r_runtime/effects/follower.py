@@ -30,7 +30,9 @@ LEAST = 1e-6
 
 
 class Follower(InputEffect):
-    """Override `after`, `mean` (arrays, broadcast) and `begins` (lists of floats)."""
+    """Override `after`, `mean` (arrays, broadcast) and `begins` (lists of floats). Steps may be parts of one, and dt those of each row. One
+    that overrides `input_sequence`, too, takes `mixed` there, or says takes_mixed = False.
+    """
 
     takes_mixed = True
 
