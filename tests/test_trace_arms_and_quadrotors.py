@@ -37,6 +37,7 @@ def step(x, u, dt, params):
         x = x + dt / 4 * rates(x + dt / 8 * rates(x, u, params), u, params)
     return x
 """
+FINGER = ARM.replace('{"near": 1.2, "far": 0.15, "lever": 0.2}', '{"near": 1.2e-5, "far": 1.5e-6, "lever": 2e-6}')
 QUADROTOR = """
 import numpy as np
 
@@ -75,6 +76,7 @@ def _arm_step(model, x, u, viscous, dry, parts=PARTS):
 
 def test_links_that_move_one_another_are_told_from_axes_that_do_not(tmp_path):
     assert coupled(_model(tmp_path, ARM).nominal)
+    assert coupled(_model(tmp_path, FINGER).nominal)
     assert not coupled(_model(tmp_path, QUADROTOR).nominal)
     assert not coupled(compose(ModelSpec("double_integrator", DT_S)).nominal)
 

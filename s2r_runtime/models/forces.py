@@ -138,10 +138,11 @@ def _coupled(model: BoundModel) -> bool:
     if len(axes(model)) < 2 or len(axes(model)) != len(model.inputs):
         return False
     x = np.random.default_rng(0).uniform(-1.0, 1.0, (8, len(model.states)))
-    rates, u = [axis.velocity for axis in axes(model)], np.ones((len(x), len(model.inputs)))
+    rates, rest = [axis.velocity for axis in axes(model)], np.zeros((len(x), len(model.inputs)))  # what 1 N m does to a finger is no bit
     try:
         w, later, back = (
-            response(x, u, model, dt, size)[:, rates] / dt for dt, size in ((PROBE_S, 1.0), (2.0 * PROBE_S, 1.0), (PROBE_S, -1.0))
+            response(x, rest, model, dt, sign / PROBE)[:, rates] / dt
+            for dt, sign in ((PROBE_S, 1.0), (2.0 * PROBE_S, 1.0), (PROBE_S, -1.0))
         )
     except ConfigError:  # a user's model that cannot be stepped just anywhere
         return False
