@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from s2r_runtime.effects.follower import mixtures
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
@@ -63,5 +64,8 @@ def test_a_change_on_a_row_but_for_rounding_is_none_within_it():
     u[4:, 0] = 0.3
     u[4, 0] -= 1e-12
     mean, _ = _through("input_rate_limit", UP, [u], DT, 10)
+    assert not len(mixtures(u[:, 0], 12))
+    u[4, 0] = 0.2
+    assert mixtures(u[:, 0], 12).tolist() == [4]
     u[4, 0] = 0.3
     assert mean == pytest.approx(_through("input_rate_limit", UP, [u], DT, 1)[0], abs=1e-9)

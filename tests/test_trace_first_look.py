@@ -1,5 +1,7 @@
 """The first look at candidates and at pairs of them, by columns: which starts lead to a fit."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from test_trace_for_a_while import DT, _held
@@ -11,10 +13,10 @@ from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.coarse import FEW, coarse, coarser
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
-from s2r_runtime.trace.hidden_pairs import TAKEN, _nats, two_together
+from s2r_runtime.trace.hidden_pairs import TAKEN, _nats, _together, two_together
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.scores import names
-from s2r_runtime.trace.screening import screen
+from s2r_runtime.trace.screening import probes_of, screen
 from s2r_runtime.trace.selection import Selection
 
 JOINT, WHEELS = ModelSpec("joint", DT, {"mass": 1.0}, ()), ModelSpec("differential_drive", DT, {}, ())
@@ -84,6 +86,20 @@ def test_two_effects_of_which_either_alone_shows_little_are_found_together():
     pair = two_together(given, nothing)
     assert names(pair.fit.model) == (("input_bias", "force"), ("viscous_friction", "qd"))
     assert two_together(given, Selection(base, pair.fit, 100, (), ())) is None  # nothing explains more than they do
+
+
+def test_a_pair_has_both_and_all_that_the_user_declared():
+    """An effect that is inserted before a declared one moves its place, at which another scheme would replace it."""
+    declared = (EffectSpec("input_lag", "v", {"time_constant": 0.1}), EffectSpec("integration_scheme", "*", {"scheme": "euler"}))
+    model = compose(ModelSpec("unicycle", DT, {}, declared))
+    data = from_arrays(model, [(np.zeros((101, 3)), _held(np.random.default_rng(29), 100, [-0.5, -2.0], [0.5, 2.0]))])
+    probes = probes_of(model, candidates(model, data))
+    others = [p for p in probes if p.candidate.replaced >= 0]
+    assert others
+    assert any(p.candidate.place == 0 and p.candidate.replaced < 0 for p in probes)
+    for one, other in product(probes, others):
+        for both in _together(one, other):
+            assert {one.candidate.name, other.candidate.name, "input_lag"} <= {a.effect.name for a in both.effects}
 
 
 def test_one_that_is_inserted_before_it_leaves_the_users_own_effect_where_it_is():

@@ -52,5 +52,6 @@ def test_starts_that_differ_are_kept_even_if_a_brake_takes_them_back(brake):
 
 
 def test_few_runs_say_nothing_of_where_runs_begin():
-    data = from_arrays(_joint(), _runs(_joint(), np.zeros((8, 2)), steps=20))
+    """By eight of this seed it would seem to be told."""
+    data = from_arrays(_joint(), _runs(_joint(), np.zeros((8, 2)), seed=6, steps=20))
     assert from_one_place(_joint(), data) is data

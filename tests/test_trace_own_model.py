@@ -7,12 +7,14 @@ import pytest
 
 from s2r_runtime.effects.classes import same
 from s2r_runtime.errors import NotEnoughEvidence
-from s2r_runtime.models.composed import compose
+from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.plugins import registry
 from s2r_runtime.trace import screening
+from s2r_runtime.trace.challenge import better_shape
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import held
-from s2r_runtime.trace.fitting import evaluate, problem
+from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
 from s2r_runtime.trace.hidden_pairs import two_together
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.scores import names
@@ -165,9 +167,9 @@ def test_what_gives_no_numbers_on_held_out_data_is_out_of_the_question_there(tmp
         assert _ahead(here, fits[::-1]) == [0.0, 0.0]
 
 
-def test_a_valve_that_sticks_and_jumps_is_no_play(tmp_path):
-    """It stays until it is asked for something far enough away; a play follows every change but the first part of it."""
-    model, rng = _model(tmp_path), np.random.default_rng(2)
+def _stuck(model):
+    """A tank whose valve stays until it is asked for something far enough away."""
+    rng = np.random.default_rng(2)
     goal = np.repeat(rng.uniform(1.5, 6.0, 15), 100)
     level, at, total, levels, asked = 4.0, 1.5, 1.5, [4.0], []
     for wanted in goal:
@@ -178,9 +180,26 @@ def test_a_valve_that_sticks_and_jumps_is_no_play(tmp_path):
         for _ in range(PARTS):
             level += DT_S / PARTS * (0.05 * at - 0.04 * np.sqrt(max(level, 0.0)))
         levels.append(level + NOISE_M * rng.normal())
-    found = trace(from_arrays(model, [(np.array(levels)[:, None], np.array(asked)[:, None])]), model)
+    return from_arrays(model, [(np.array(levels)[:, None], np.array(asked)[:, None])])
+
+
+def test_a_valve_that_sticks_and_jumps_is_no_play(tmp_path):
+    """A play follows every change but the first part of it."""
+    model = _model(tmp_path)
+    found = trace(_stuck(model), model)
     assert found.verdict == "unexplained"
     assert "memory(pump)" in found.depends_on
+
+
+def test_a_play_is_challenged_by_what_sticks_from_reaches_near_its_own(tmp_path):
+    """From those that know nothing of the play, no search comes there."""
+    model = _model(tmp_path)
+    data = _stuck(model)
+    given = problem(data, steps_of(data))
+    play = AppliedEffect(registry().get("effects", "input_backlash"), "pump", {"width": 0.15})
+    better = better_shape(given, fitted(given, evaluate(given, model), insert(model, play, 0)), 20)
+    assert better is not None
+    assert "memory(pump)" in better.token
 
 
 NARROW = """
