@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from s2r_runtime.effects.follower import mixtures
+from s2r_runtime.effects.input_backlash import InputBacklash
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
@@ -69,3 +70,25 @@ def test_a_change_on_a_row_but_for_rounding_is_none_within_it():
     assert mixtures(u[:, 0], 12).tolist() == [4]
     u[4, 0] = 0.3
     assert mean == pytest.approx(_through("input_rate_limit", UP, [u], DT, 1)[0], abs=1e-9)
+
+
+class _Doubled(InputBacklash):
+    """A play of a third party's, that goes over recordings in its own way and knows nothing of rows that are two commands."""
+
+    name = "doubled"
+
+    def input_sequence(self, u, model, channel, dt, p):
+        return 2.0 * super().input_sequence(u, model, channel, dt, p)
+
+
+def test_a_follower_that_goes_its_own_way_is_told_of_mixed_rows_only_if_it_asks():
+    u = np.zeros((12, 2))
+    u[4:, 0] = [0.2, *[0.3] * 7]
+    model = _wheels()
+    acts = [
+        Inputs([u], DT, [0.0], parts=10).with_ends(model, [AppliedEffect(effect, "cmd_left", {"width": 0.1})])[0]
+        for effect in (InputBacklash(), _Doubled())
+    ]
+    assert acts[1][:4, 0] == pytest.approx(2.0 * acts[0][:4, 0])
+    assert not _Doubled.takes_mixed
+    assert InputBacklash.takes_mixed

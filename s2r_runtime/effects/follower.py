@@ -11,6 +11,7 @@ Hidden state: y, zero at rest. An input that never holds costs one turn of the l
 from __future__ import annotations
 
 from collections.abc import Sequence
+from inspect import signature
 from itertools import pairwise
 
 import numpy as np
@@ -31,10 +32,15 @@ LEAST = 1e-6
 
 class Follower(InputEffect):
     """Override `after`, `mean` (arrays, broadcast) and `begins` (lists of floats). Steps may be parts of one, and dt those of each row. One
-    that overrides `input_sequence`, too, takes `mixed` there, or says takes_mixed = False.
+    that overrides `input_sequence`, too, is told of mixed rows if it takes `mixed` there.
     """
 
     takes_mixed = True
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "input_sequence" in vars(cls) and "takes_mixed" not in vars(cls):
+            cls.takes_mixed = "mixed" in signature(cls.input_sequence).parameters
 
     def after(self, y: Array, u: Array, steps: Array | float, dt: float, p: Values) -> Array:
         """y -> y after so many steps of the same u."""

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.fitting import evaluate, gain, slopes, without
+from s2r_runtime.trace.fitting import evaluate, foretold, gain, slopes, without
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
 from s2r_runtime.trace.lack_of_fit_terms import VELOCITIES, quieter
 from s2r_runtime.trace.residual import acting, first_steps
@@ -203,8 +203,10 @@ def _judged(left: Left, scores: _Scores, moved: Array, varies: _Varies, price: f
     surprise, m = _surprise(slope**2 / np.maximum(varied, 1.0))
     nats = 0.5 * float(np.sum(slope[:m] ** 2) - m)
     place = left.fit.free[p].place
-    less = evaluate(left.given, without(left.fit.model, place), left.fit.noise)
-    if surprise < price or nats < MORE * gain(left.fit, less):
+    without_it = without(left.fit.model, place)
+    if surprise < price or foretold(left.given, without_it) is None:  # somebody's own model may not step without it
+        return None
+    if nats < MORE * gain(left.fit, evaluate(left.given, without_it, left.fit.noise)):
         return None
     beta = np.linalg.solve(root[:m, :m].T, slope[:m])
     push = moved[:, :, p, None] * terms[:, None, :m] - moved @ beside[:, :m]

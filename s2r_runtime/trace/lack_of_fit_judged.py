@@ -99,7 +99,7 @@ def judge(left: Left, token: str, x: Array) -> Judged:
     joined = left.given.steps.joined
     betas: Array | None = None
     gain, scatter = 0.0, 1.0
-    for _ in range(PASSES):
+    for again in range(PASSES):
         betas_now = _betas(left, x, whiten, colour)
         betas = betas_now if betas is None else betas
         rest = left.r - np.einsum("kim,km->ki", x, betas_now[left.block])
@@ -111,6 +111,8 @@ def judge(left: Left, token: str, x: Array) -> Judged:
         # without the terms, under the same noise: a better estimate of the noise alone is no structure
         bare = max(left.fit.coloured, *(noises.log_likelihood(whiten(left.r), whiten, c, joined) for c in (colour, left.fit.colour)))
         more = min(reached - bare, _beyond_wandering(left, token, z, whiten, colour))
+        if more <= gain and again:
+            break
         if more > gain:
             push = colour(whiten(left.r - rest), joined)
             z = colour(z, joined)

@@ -200,6 +200,8 @@ class Colour:
 
     def __call__(self, z: Array, joined: Mask) -> Array:
         """What of z (n, nx) or (n, nx, m) the past does not foretell, in standard deviations."""
+        if not self.slow.size and not np.any(self.coefficients):
+            return z if np.all(self.scale == 1.0) else np.asarray(z / self.scale.reshape((1, -1) + (1,) * (z.ndim - 2)))
         out = z.copy()
         for k, memory in enumerate(MEMORIES if self.slow.size else ()):
             out -= self.slow[:, k].reshape((1, -1) + (1,) * (z.ndim - 2)) * _recently(z, joined, memory)

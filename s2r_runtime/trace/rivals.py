@@ -176,7 +176,7 @@ def representative(given: Problem, fit: Fit, found: list[Scored]) -> tuple[Fit, 
     dear = [STRICT.price(one.k - fit.k, n) - gain(one, fit) > CLOSE for one in (fit, *tied)]
     best = int(np.argmin(np.where(dear, np.inf, worst)))
     if best == 0 or not np.all(np.isfinite(worst)) or worst[best] > BETTER * worst[0]:
-        return fit, found, bool(worst[0] > 1.0)
+        return fit, found, not worst[0] <= 1.0  # what cannot be told is no less a risk
     chosen = tied[best - 1]
     return chosen, [Scored(*name, found[0].score, fit), *(s for s in found if s.fit is not chosen)], bool(worst[best] > 1.0)
 
@@ -193,9 +193,9 @@ class _Rich:
         return self.apart(one, other) <= near * self.apart(other, less)
 
     def worst(self, models: Sequence[ComposedModel], less: ComposedModel) -> Array:
-        """(m,) of each model, how far it is at most from one of them, as a share of what that one adds to `less`."""
+        """(m,) of each model, how far it is at most from one of them, as a share of what that one adds to `less`; NaN if unknown."""
         done = [max(self.apart(model, less), 1e-300) for model in models]
-        return np.array([max(self.apart(one, other) / size for other, size in zip(models, done, strict=True)) for one in models])
+        return np.array([np.max([self.apart(one, other) / size for other, size in zip(models, done, strict=True)]) for one in models])
 
     def apart(self, one: ComposedModel, other: ComposedModel) -> float:
         """Mean square difference of their steps, on the scale of the steps themselves; NaN where a user's own model does not step there."""

@@ -385,7 +385,7 @@ def numberless(given: Problem, fit: Fit) -> list[ComposedModel]:
     if not any(_of_body(fit.model, place) for place in fit.added):
         return []
     plain = [c for c in candidates(fit.model, given.data) if c.replaced < 0 and not any(slots_of(start, 0) for start in c.starts)]
-    return [m for c in plain for m in c.models(fit.model)]
+    return [m for c in plain for m in c.models(fit.model) if foretold(given, m) is not None]
 
 
 def _of_body(model: ComposedModel, place: int) -> bool:
