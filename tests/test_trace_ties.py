@@ -171,3 +171,19 @@ def test_a_search_beside_another_scheme_is_another_one():
     ways = [_with(given, model, "integration_scheme", "*", scheme=scheme) for scheme in ("exact", "rk4")]
     assert _search(given, ways[0]) is not _search(given, ways[1])
     assert _search(given, ways[0]) is _search(given, ways[0])
+
+
+@pytest.mark.parametrize(("back", "told"), [(0.402, {"force"}), (0.41, {"force_positive", "force_negative"})])
+def test_friction_that_is_a_fortieth_more_one_way_has_two_numbers(back, told):
+    """As a measured joint of a robot has it; to a hundredth, one number says as much."""
+    model = compose(ModelSpec("joint", DT, {"mass": 1.0}, ()))
+    robot = insert(
+        model, AppliedEffect(registry().get("effects", "coulomb_friction"), "qd", {"force_positive": 0.4, "force_negative": back}), 0
+    )
+    u = np.repeat(np.random.default_rng(17).uniform(-2.0, 2.0, (40, 1)), 10, axis=0)
+    rows = [np.zeros((1, 2))]
+    for k in range(len(u)):
+        rows.append(robot.advance(rows[-1], u[k : k + 1], u[k : k + 1]))
+    data = from_arrays(model, [(np.concatenate(rows), u)])
+    given = problem(data, steps_of(data))
+    assert set(simplified(given, evaluate(given, robot)).model.effects[0].p) == told

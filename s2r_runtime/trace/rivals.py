@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.effects.classes import canonical
-from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.dataset import Dataset, Run
@@ -58,6 +58,9 @@ BEYOND = 3.0
 
 EQUAL = 0.0025
 """As ALIKE, for numbers of one effect that agree: to a twentieth of what it does."""
+
+ITSELF = 1e-4
+"""The same, for an effect that stays what it is with a number less: to a hundredth. Friction that is a fortieth more one way exists."""
 
 PROBES, PROBE_STEPS = 8, 120
 """Runs and steps of the rich inputs."""
@@ -126,11 +129,18 @@ def simplified(given: Problem, fit: Fit) -> Fit:
         a = fit.model.effects[place]
         instead = _agreeing(fit, place) if hasattr(a.effect, "simpler") else _without_number(given, fit, place)
         rich = _rich(given, fit.model) if instead else None
-        near = EQUAL if hasattr(a.effect, "simpler") else ALIKE
         for model in instead:
+            near = _near(a, model)
             if rich is not None and rich.same(model, fit.model, without(fit.model, place), near):
                 return simplified(given, fitted(given, evaluate(given, model), model))
     return fit
+
+
+def _near(a: AppliedEffect, model: ComposedModel) -> float:
+    """How near a model must come that has a simpler effect instead."""
+    if not hasattr(a.effect, "simpler"):
+        return ALIKE
+    return ITSELF if any(isinstance(other, Added) and name_of(other) == name_of(a) for other in model.effects) else EQUAL
 
 
 def _agreeing(fit: Fit, place: int) -> list[ComposedModel]:
