@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from s2r_runtime.effects.viscous_friction import START_RATE, ViscousFriction
+from s2r_runtime.models import forces
 from s2r_runtime.models.composed import compose
 from s2r_runtime.models.forces import coupled
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
@@ -212,3 +213,19 @@ def test_drag_on_a_speed_without_a_position_begins_at_a_rate_whatever_the_mass(t
 def test_a_model_that_slows_its_speeds_down_has_a_parameter_for_it(tmp_path):
     drags = [ViscousFriction().channels(_model(tmp_path, SPEEDS_ONLY.replace("DRAG", drag)).nominal) for drag in ("0.0", "0.2")]
     assert drags == [("vx", "vy"), ()]
+
+
+def test_another_thread_that_asks_of_the_same_arm_changes_no_answer(tmp_path, monkeypatch):
+    """The daemon steps a model in its worker, too: the rows of another are kept last, between question and answer."""
+    model, rng = _model(tmp_path, ARM).nominal, np.random.default_rng(7)
+    one, other = (rng.uniform(-1.0, 1.0, (6, 4)) for _ in range(2))
+    u, usual = np.ones((6, 2)), forces.response
+    alone = usual(one, u, model, DT_S)
+
+    class Shared(dict):
+        def __setitem__(self, key, value):
+            super().__setitem__(key, value)
+            super().__setitem__(key, (DT_S, other, u, usual(other, u, model, DT_S)))
+
+    monkeypatch.setattr(forces, "_LAST", Shared())
+    assert np.array_equal(forces._response(one, u, model, DT_S), alone)

@@ -170,13 +170,13 @@ _LAST: WeakKeyDictionary[BoundModel, tuple[float, Array, Array, Array]] = WeakKe
 
 
 def _response(x: Array, u: Array, model: BoundModel, dt: float) -> Array:
-    """`response`, kept for the last rows asked for: a fit asks of the same ones again and again."""
-    if model in _LAST:
-        there, at, under, found = _LAST[model]
-        if there == dt and np.array_equal(at, x) and np.array_equal(under, u):
-            return found
-    _LAST[model] = (dt, x.copy(), u.copy(), response(x, u, model, dt))
-    return _LAST[model][-1]
+    """`response`, kept for the last rows asked for, as a fit asks of the same ones again. What another thread keeps is not returned."""
+    known = _LAST.get(model)
+    if known is not None and known[0] == dt and np.array_equal(known[1], x) and np.array_equal(known[2], u):
+        return known[3]
+    found = response(x, u, model, dt)
+    _LAST[model] = (dt, x.copy(), u.copy(), found)
+    return found
 
 
 def pushed(x: Array, u: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushing], dt: float | Array) -> Array:
