@@ -47,6 +47,22 @@ def test_what_was_not_fitted_decides_between_explanations_that_tie():
     assert [(s.name, s.channel, s.fit) for s in rest] == [("input_gain", "v", one)]
 
 
+def test_what_ties_is_seen_however_large_the_error_was():
+    """A force of two values on a mass, measured to a ten-thousandth: under the noise that the mass as given needs, everything looks like
+    next to nothing of what it explains under its own.
+    """
+    rng = np.random.default_rng(5)
+    u = np.where(np.repeat(rng.random(60) < 0.5, 15), -0.5, 0.5)[:, None]
+    model = compose(ModelSpec("joint", 0.1, {"mass": 2.0}, ()))
+    y = np.zeros((len(u) + 1, 2))
+    for k, force in enumerate(0.8 * u[:, 0]):
+        y[k + 1] = y[k] + [0.1 * y[k, 1] + 0.005 * force / 2.0, 0.1 * force / 2.0]
+    found = trace(from_arrays(model, [(y + rng.normal(0.0, 1e-4, y.shape), u)]), model)
+    assert found.verdict == "ambiguous"
+    there = {(e.name, e.channel) for e in (*found.effects, *found.ambiguous_with)}
+    assert {("input_gain", "force"), ("input_deadband", "force"), ("input_saturation", "force")} <= there
+
+
 def test_four_numbers_that_come_near_to_one_are_no_rival_of_it():
     """A sine of any frequency, size and phase, on a drive in which the speed goes up and down: one gain foretold that."""
     u = np.column_stack([0.3 + 0.2 * np.sin(0.1 * np.arange(400)), _held(np.random.default_rng(11), 400, [-1.0], [1.0])[:, 0]])

@@ -25,6 +25,7 @@ from s2r_runtime.trace.begun import begun, measured
 from s2r_runtime.trace.candidates import Candidate
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, without
 from s2r_runtime.trace.residual import acting, covered, first_steps, rms, rollout, rollout_starts
+from s2r_runtime.trace.scores import at_first_look
 from s2r_runtime.trace.screening import screen
 from s2r_runtime.trace.selection import accepted
 from s2r_runtime.trace.shapes import SHAPES
@@ -94,7 +95,7 @@ def _challenge(given: Problem, fit: Fit, channel: str, horizon: int) -> Better |
             bare = without(bare, i)
     base = fitted(given, fit, bare, 1)
     here = gain(fit, base)
-    for shape in _fits(given, base, channel, REACHES * here, _times(fit, channel), _plays(fit, channel)):
+    for shape in _fits(given, base, channel, REACHES * at_first_look(given, fit, base), _times(fit, channel), _plays(fit, channel)):
         ahead = gain(shape, base) - here
         needed = max(_price(given, shape, fit), 0.0) + math.log(len(SHAPES) / ALPHA)
         if ahead > max(needed, MORE * here) and _lower(given, fit, shape, horizon):

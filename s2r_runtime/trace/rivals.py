@@ -25,7 +25,7 @@ from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.dataset import Dataset, Run
 from s2r_runtime.trace.fitting import SETTLED, Fit, Problem, evaluate, fitted, foretold, gain, problem, scatter, without
 from s2r_runtime.trace.residual import steps_of
-from s2r_runtime.trace.scores import STRICT, Scored, best_candidates, limited, name_of
+from s2r_runtime.trace.scores import STRICT, Scored, at_first_look, best_candidates, limited, name_of
 from s2r_runtime.trace.slots import Added, slots_of
 
 Array = NDArray[np.float64]
@@ -74,7 +74,7 @@ def rivals(given: Problem, fit: Fit) -> list[Scored]:
         mine = name_of(fit.model.effects[place])
         base = fitted(given, fit, without(fit.model, place), 1)
         here = gain(fit, base)
-        for s in best_candidates(given, base, FITTED, against=here - NEAR)[0]:
+        for s in best_candidates(given, base, FITTED, against=at_first_look(given, fit, base) - NEAR)[0]:
             if s.fit is None or (s.name, s.channel) == mine or not limited(s.fit) or not _contends(given, s.fit, fit, base):
                 continue
             numberless = not slots_of(fit.model.effects[place], place)

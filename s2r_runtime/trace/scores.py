@@ -87,9 +87,16 @@ LENIENT = Bar(0.3, 1.5)
 """For where structure is shown already."""
 
 
+def at_first_look(given: Problem, fit: Fit, base: Fit) -> float:
+    """Nats that a model explains beyond another one, as its effect is seen beside that one first: under the other one's noise, which has
+    taken up most of what is large. At most what it explains once the noise is its own.
+    """
+    return min(gain(fit, base), under_noise(given, fit.model, base.noise).white - base.white)
+
+
 def best_candidates(given: Problem, base: Fit, few: int = FEW, bar: Bar = STRICT, against: float = 0.0) -> tuple[list[Scored], int]:
-    """The candidates for one more effect, fitted, best score first; and how many starts were looked at. against: nats of gain that
-    they must come up to.
+    """The candidates for one more effect, fitted, best score first; and how many starts were looked at. against: nats that
+    they must come up to, `at_first_look`.
     """
     search = _search(given, base)
     scored: dict[tuple[str, str], Scored] = {}

@@ -37,7 +37,7 @@ from s2r_runtime.trace.fitting import (
 )
 from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
 from s2r_runtime.trace.rivals import CLOSE, rivals, simplified
-from s2r_runtime.trace.scores import STRICT, Bar, Scored, best_candidates, limited, name_of, names, rescored, unlimited
+from s2r_runtime.trace.scores import STRICT, Bar, Scored, at_first_look, best_candidates, limited, name_of, names, rescored, unlimited
 from s2r_runtime.trace.slots import Added, bounds_of, slots_of, values_of, with_values
 
 Array = NDArray[np.float64]
@@ -308,7 +308,7 @@ def exchanged(given: Problem, fit: Fit, bar: Bar) -> Fit:
         if place is None:  # its place is another one after every exchange, and one of the user's own may stand there
             continue
         base = fitted(given, fit, without(fit.model, place), 1)
-        found, _ = best_candidates(given, base, 4, bar, gain(fit, base))
+        found, _ = best_candidates(given, base, 4, bar, at_first_look(given, fit, base))
         best = found[0].fit if found else None
         if best is None:
             continue
