@@ -177,6 +177,30 @@ def test_what_ties_and_does_little_is_left_out_of_the_model_where_it_may_do_harm
     assert result.to_json()["left_as_given"] is not repaired
 
 
+def test_when_something_broke_is_told_by_what_was_held_out_if_it_happened_there():
+    """In the stretch between 30 % and 50 % of the time, which no fit sees: there it stood in the middle, wherever it was."""
+    u = _held(np.random.default_rng(20), 1000, [0.1, -1.0], [0.5, 1.0])
+    y = _unicycle(np.random.default_rng(21), u, lambda k, x: 0.6 if k >= 330 else 1.0, "euler")
+    result = _traced(y, u)
+    assert [(e.name, e.channel) for e in result.effects] == [("regime_change", "v")]
+    assert result.effects[0].parameters["time"][0] == pytest.approx(330 * DT, abs=2 * DT)
+    assert result.depends_on == ()
+
+
+def test_a_heading_that_nobody_steers_takes_no_name_away():
+    """It wanders, by a push that nobody commands, and no model foretells it; that the wheels turn too slowly is told all the same."""
+    rng = np.random.default_rng(22)
+    u = np.column_stack([_held(rng, 1000, [0.2], [0.6])[:, 0], np.zeros(1000)])
+    x, rows = np.array([0.0, 0.0, 0.4]), []
+    for v, _ in u:
+        rows.append(x)
+        x = x + DT * np.array([0.8 * v * math.cos(x[2]), 0.8 * v * math.sin(x[2]), 0.0]) + [0.0, 0.0, 0.006 * rng.normal()]
+    y = np.array([*rows, x]) + rng.normal(size=(1001, 3)) * NOISE * [1.0, 1.0, 0.2]
+    model = compose(ModelSpec("unicycle", DT, {}, ()))
+    result = trace(from_arrays(model, [(y, u)]), model, horizon=3.0)
+    assert ("input_gain", "v") in {(e.name, e.channel) for e in (*result.effects, *result.ambiguous_with)}
+
+
 def test_two_gains_that_agree_are_one():
     """A gyro's scale that differs by sign in the fourth digit only, and long data: significant, and nothing to anybody."""
     rng = np.random.default_rng(8)

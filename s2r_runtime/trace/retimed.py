@@ -28,6 +28,9 @@ ALL, NEAR = 80, 40
 middles.
 """
 
+WITHIN = 1.5
+"""Steps between rows from which on there is a gap."""
+
 
 def retimed(given: Problem, fit: Fit) -> Fit:
     """The fit with every time at its highest peak."""
@@ -38,6 +41,26 @@ def retimed(given: Problem, fit: Fit) -> Fit:
         if moved is not None and nats[best] > nats[-1] + CLEARER:
             other = evaluate(given, refine(given, fit, moved), fit.noise)
             fit = other if other.white > fit.white else fit
+    return fit
+
+
+def dated(given: Problem, everything: Problem, fit: Fit) -> Fit:
+    """The fit with every time that lies where nothing was fitted as the rest of the recording says: between two rows that were, one time is
+    as good as another. everything: all transitions. A gap without any is as many times likelier as steps would fit into it.
+    """
+    for slot in [slot for slot in fit.free if is_time(fit.model, slot)]:
+        now, dt, t = float(values_of(fit.model, (slot,))[0]), given.data.dt, given.steps.t
+        k = int(np.searchsorted(t, now))
+        if not 0 < k < len(t) or t[k] - t[k - 1] < WITHIN * dt:
+            continue
+        rows = everything.steps.t[(everything.steps.t >= t[k - 1]) & (everything.steps.t <= t[k])]
+        gone = np.diff(rows)
+        times = np.append(now, np.where(gone < WITHIN * dt, rows[1:], 0.5 * (rows[:-1] + dt + rows[1:])))
+        ways = np.append(0.0, np.log(np.maximum(gone / dt, 1.0)))
+        whole = evaluate(everything, fit.model, fit.noise)
+        base = under_noise(everything, without(fit.model, slot.place), whole.noise)
+        moved = _at(fit.model, slot, float(times[int(np.argmax(_nats(everything, whole, base, slot, times) + ways))]))
+        fit = fit if moved is None else evaluate(given, moved, fit.noise)
     return fit
 
 

@@ -46,7 +46,7 @@ from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.residual import Mask, acting, first_steps, rms, steps_of
 from s2r_runtime.trace.residual_noise import no_colour
 from s2r_runtime.trace.result import Found, Limit, TraceResult
-from s2r_runtime.trace.retimed import retimed
+from s2r_runtime.trace.retimed import dated, retimed
 from s2r_runtime.trace.scores import LENIENT, STRICT, names
 from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded, select
 from s2r_runtime.trace.slots import Slot
@@ -152,9 +152,10 @@ def _traced(
         judged_on = _held_out(checked, seen, test, model, horizon)
         given = problem(fit_part.data, fit_part.steps)
         chosen = select(given, model, ahead, lambda share: say(60.0 + 20.0 * share, 100.0, "looking for effects"))
-    chosen = confirmed(given, foretold_too(given, chosen, judged_on, ahead), judged_on)
-    say(80.0, 100.0, "testing what is left")
     whole = _Whole(checked, model, ahead)
+    chosen = foretold_too(given, chosen, judged_on, ahead)
+    chosen = confirmed(given, replace(chosen, fit=dated(given, whole.given, chosen.fit)), judged_on)
+    say(80.0, 100.0, "testing what is left")
     structure = whole.structure(chosen)
     if structure.matters and not structure.nameless:
         chosen, structure = _once_more(given, whole, chosen, structure, judged_on, ahead)

@@ -25,7 +25,7 @@ from s2r_runtime.trace.errors import Held, Judged, better, displacement
 from s2r_runtime.trace.faults import Fault
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, foretold, gain, plainly, problem, without
 from s2r_runtime.trace.lack_of_fit import Structure
-from s2r_runtime.trace.residual import acting, predicted, rms
+from s2r_runtime.trace.residual import Mask, acting, predicted, rms
 from s2r_runtime.trace.rivals import representative, rivals, tied
 from s2r_runtime.trace.selection import Selection, one_more
 from s2r_runtime.trace.slots import slots_of
@@ -142,7 +142,7 @@ def verdict_of(
     if not chosen.fit.added:
         nothing = away or foretells_nothing(after, given, floors[1])
         return "unexplained" if structure.matters or nothing else "sensor_fault" if faulty else "none"
-    if away or not foretells(after, given) or _withdrawn(chosen.fit, structure) or harms(before, after, floor):
+    if away or not foretells(after, given, floors[0]) or _withdrawn(chosen.fit, structure) or harms(before, after, floor):
         return "unexplained"
     return "ambiguous" if chosen.rivals else "traced"
 
@@ -154,16 +154,18 @@ def _withdrawn(fit: Fit, structure: Structure) -> bool:
     return structure.matters and structure.share > limit
 
 
-def foretells(judged: Judged, given: Held) -> bool:
+def foretells(judged: Judged, given: Held, floor: Array) -> bool:
     """Whether rollouts end nearer to the measurement than the state was from which they began: clearly in some state, and in every one that
-    goes somewhere (much farther in the horizon than in a step, which noise does not). A position counts as one: a robot that drives
-    straight on goes nowhere sideways.
+    goes somewhere (much farther in the horizon than in a step, which noise does not) and not where noise takes it (a heading that nobody
+    steers wanders). A position counts as one: a robot that drives straight on goes nowhere sideways. floor: (nx,) what noise alone makes
+    of the ends of rollouts.
     """
     if not len(judged.ends):
         return True
     share = _off(judged, given)
-    share = share[~np.isnan(share)]
-    return not len(share) or bool(np.any(share < FORETELLS) and np.all(share < NEARER))
+    goes = ~np.isnan(share)
+    by_noise = np.logical_not(_beyond_noise(judged, given, floor))
+    return not goes.any() or bool(np.any(share[goes] < FORETELLS) and np.all((share[goes] < NEARER) | by_noise[goes]))
 
 
 def goes_astray(model: ComposedModel, before: Judged, after: Judged, floor: Array) -> bool:
@@ -205,9 +207,14 @@ def foretells_nothing(judged: Judged, given: Held, floor: Array) -> bool:
     """
     if not len(judged.ends):
         return False
+    return bool(np.any((_off(judged, given) > NEARER) & _beyond_noise(judged, given, floor)))
+
+
+def _beyond_noise(judged: Judged, given: Held, floor: Array) -> Mask:
+    """(groups,) whether rollouts end farther off than noise takes them."""
     columns = _together(given.data.states)
     by_noise = np.array([float(np.sqrt(np.sum(floor[group] ** 2))) for group in columns])
-    return bool(np.any((_off(judged, given) > NEARER) & (_lengths(judged.ends, columns) > NOISIER * by_noise)))
+    return np.asarray(_lengths(judged.ends, columns) > NOISIER * by_noise, dtype=bool)
 
 
 def _off(judged: Judged, given: Held) -> Array:
