@@ -209,6 +209,8 @@ def test_the_step_of_rounding_is_found_or_there_is_none():
         assert quantum(rounded[:-1], rounded[1:]) == pytest.approx(step, rel=1e-6)
     for column in (wandering, np.zeros(500), np.full(500, np.nan), np.zeros(0), np.repeat([0.0, 1.0], 250)):
         assert quantum(column[:-1], column[1:]) == 0.0
+    turning = np.cumsum(-0.03 + 1e-4 * rng.normal(size=500))  # as fast as it can
+    assert quantum(turning[:-1], turning[1:]) == 0.0
 
 
 @pytest.mark.parametrize("begin", [0.0, 1.7e9], ids=["from zero", "since 1970"])

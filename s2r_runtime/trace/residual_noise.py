@@ -341,6 +341,7 @@ def quantum(before: Array, after: Array) -> float:
     """The step in which a measured state is rounded; 0 if it is not. (n,) at the start and at the end of steps, angles unwrapped.
 
     An angle that was rounded within a turn is rounded afresh where it passes the turn's end, at pi or at zero: that change is no multiple.
+    Changes that are nearly all as large as one another are no steps of rounding: a robot turns as fast as it can.
     """
     change = after - before
     afresh = (np.floor(before / math.pi) != np.floor(after / math.pi)) & (np.abs(change) < math.pi)
@@ -350,4 +351,5 @@ def quantum(before: Array, after: Array) -> float:
     least = float(np.min(sizes))
     sizes = sizes[sizes < 1000.0 * least] / least
     whole = np.abs(sizes - np.rint(sizes)) < 0.02
-    return least if len(sizes) >= ROUNDED and np.mean(whole) > 0.95 else 0.0
+    alike = np.rint(np.abs(change) / least) == 1.0
+    return least if len(sizes) >= ROUNDED and np.mean(whole) > 0.95 and np.mean(alike) < 0.95 else 0.0

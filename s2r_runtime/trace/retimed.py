@@ -28,6 +28,9 @@ ALL, NEAR = 80, 40
 middles.
 """
 
+ALIKE = 3.0
+"""Nats within which a fit cannot tell one time from another."""
+
 WITHIN = 1.5
 """Steps between rows from which on there is a gap."""
 
@@ -45,17 +48,21 @@ def retimed(given: Problem, fit: Fit) -> Fit:
 
 
 def dated(given: Problem, everything: Problem, fit: Fit) -> Fit:
-    """The fit with every time that lies where nothing was fitted as the rest of the recording says: between two rows that were, one time is
-    as good as another. everything: all transitions. A gap without any is as many times likelier as steps would fit into it.
+    """The fit with every time at its highest peak. Of times that it cannot tell apart, some of them where nothing was fitted, the
+    one that all of the recording says; a gap without any rows is as many times likelier as steps would fit into it.
     """
+    fit = retimed(given, fit)
+    dt, t, rows = given.data.dt, given.steps.t, everything.steps.t
+    gaps = np.flatnonzero(np.diff(t) > WITHIN * dt)
     for slot in [slot for slot in fit.free if is_time(fit.model, slot)]:
-        now, dt, t = float(values_of(fit.model, (slot,))[0]), given.data.dt, given.steps.t
-        k = int(np.searchsorted(t, now))
-        if not 0 < k < len(t) or t[k] - t[k - 1] < WITHIN * dt:
+        now = float(values_of(fit.model, (slot,))[0])
+        if not np.any((t[gaps] - NEAR * dt < now) & (now < t[gaps + 1] + NEAR * dt)):
             continue
-        rows = everything.steps.t[(everything.steps.t >= t[k - 1]) & (everything.steps.t <= t[k])]
-        gone = np.diff(rows)
-        times = np.append(now, np.where(gone < WITHIN * dt, rows[1:], 0.5 * (rows[:-1] + dt + rows[1:])))
+        low, high = spread(given, fit, slot, ALIKE)
+        first, last = (int(np.searchsorted(t, when)) for when in (low, high))  # of a gap, one end says what the other says
+        inside = rows[(rows >= t[max(first - 1, 0)]) & (rows <= t[min(last, len(t) - 1)])]
+        gone = np.diff(inside)
+        times = np.append(now, np.where(gone < WITHIN * dt, inside[1:], 0.5 * (inside[:-1] + dt + inside[1:])))
         ways = np.append(0.0, np.log(np.maximum(gone / dt, 1.0)))
         whole = evaluate(everything, fit.model, fit.noise)
         base = under_noise(everything, without(fit.model, slot.place), whole.noise)

@@ -185,7 +185,7 @@ def _told_by_stamps(given: Problem, fit: Fit, base: Fit) -> bool:
         for slot, value in zip(fit.free, values.tolist(), strict=True)
         if name_of(fit.model.effects[slot.place]) not in there
     ]
-    return all(p.unit != "s" or p.neutral != 0.0 or value > WITHIN * data.dt for p, value in new)
+    return all(p.unit != "s" or p.neutral != 0.0 or abs(value) > WITHIN * data.dt for p, value in new)
 
 
 def _beyond_rounding(given: Problem, fit: Fit, base: Fit) -> bool:

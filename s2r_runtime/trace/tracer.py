@@ -46,7 +46,7 @@ from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.residual import Mask, acting, first_steps, rms, steps_of
 from s2r_runtime.trace.residual_noise import no_colour
 from s2r_runtime.trace.result import Found, Limit, TraceResult
-from s2r_runtime.trace.retimed import dated, retimed
+from s2r_runtime.trace.retimed import dated
 from s2r_runtime.trace.scores import LENIENT, STRICT, names
 from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded, select
 from s2r_runtime.trace.slots import Slot
@@ -216,7 +216,7 @@ def _result(
     model = chosen.nominal.model
     there, near = given, chosen.fit
     if dataset.reconstruction is None:  # what a filter leaves has the filter's law, not the noise's
-        fit, there, near = told(given, retimed(given, chosen.fit))
+        fit, there, near = told(given, chosen.fit)
         chosen = replace(chosen, fit=fit)
     before, after = judge(model, judged_on), judge(chosen.fit.model, judged_on)
     floor = noise_floor(chosen.fit, judged_on, seed)
