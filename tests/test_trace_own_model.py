@@ -20,7 +20,7 @@ from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.scores import names
 from s2r_runtime.trace.selection import Selection
 from s2r_runtime.trace.tracer import trace, usual_horizon
-from s2r_runtime.trace.verdict import _ahead
+from s2r_runtime.trace.verdict import foretelling
 
 DT_S, NOISE_M, PARTS = 2.0, 0.01, 20
 TANK = """
@@ -163,8 +163,8 @@ def test_what_gives_no_numbers_on_held_out_data_is_out_of_the_question_there(tmp
     off = compose(ModelSpec(str(path), DT_S, {}, (EffectSpec("input_bias", "pump", {"bias": -60.0}),)))
     fits = [evaluate(given, model), evaluate(given, off)]
     with np.errstate(invalid="ignore"):
-        assert _ahead(here, fits) == [0.0, -math.inf]
-        assert _ahead(here, fits[::-1]) == [0.0, 0.0]
+        assert foretelling(here, fits) == [0.0, -math.inf]
+        assert foretelling(here, fits[::-1]) == [0.0, 0.0]
 
 
 def _stuck(model):

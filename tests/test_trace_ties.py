@@ -8,6 +8,7 @@ from trace_sets.families import make
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
+from s2r_runtime.trace import tracer
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import Judged, held
 from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
@@ -120,13 +121,25 @@ def test_the_second_of_two_effects_is_found(tmp_path, seed, names):
     """On a joint: a steady push and one that swings, beside either of which what is left scatters too much for the other; and a spring that
     only all of the recording shows.
     """
-    made = make("pair", seed)
-    path, _ = made.write(tmp_path)
-    m = made.model
-    model = compose(ModelSpec(m["name"], m["dt"], m["parameters"], tuple(EffectSpec(**e) for e in m["effects"])))
-    found = trace(load_dataset(path, model), model)
+    found = _traced_pair(tmp_path, seed)
     assert found.verdict == "traced"
     assert {e.name for e in found.effects} == names
+
+
+def test_two_effects_that_foretell_no_better_what_was_not_fitted_are_not_taken(tmp_path, monkeypatch):
+    """However little structure they leave."""
+    monkeypatch.setattr(tracer, "foretelling", lambda judged_on, fits: [0.0, -1.0])
+    found = _traced_pair(tmp_path, 20014)
+    assert not found.effects
+    assert found.verdict == "unexplained"
+
+
+def _traced_pair(folder, seed):
+    made = make("pair", seed)
+    path, _ = made.write(folder)
+    m = made.model
+    model = compose(ModelSpec(m["name"], m["dt"], m["parameters"], tuple(EffectSpec(**e) for e in m["effects"])))
+    return trace(load_dataset(path, model), model)
 
 
 def test_a_repair_that_makes_rollouts_worse_is_none():

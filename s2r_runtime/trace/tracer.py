@@ -51,7 +51,7 @@ from s2r_runtime.trace.scores import LENIENT, STRICT, names
 from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded, select
 from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.unseen import alike
-from s2r_runtime.trace.verdict import asked, confirmed, curves_of, final_fit, foretold_too, verdict_of, worth_its_risk
+from s2r_runtime.trace.verdict import asked, confirmed, curves_of, final_fit, foretelling, foretold_too, verdict_of, worth_its_risk
 
 __all__ = ["Dataset", "TraceResult", "load_dataset", "trace", "usual_horizon"]
 
@@ -174,7 +174,8 @@ def _once_more(
     given: Problem, whole: _Whole, chosen: Selection, structure: Structure, judged_on: Held, ahead: int
 ) -> tuple[Selection, Structure]:
     """Where structure is left, something is there: two effects together that leave nothing, coloured noise neither (two take up a part of
-    anything, and the rest looks like that); or what is found with a lower bar, if that leaves nothing.
+    anything, and the rest looks like that); or what is found with a lower bar, if that leaves nothing. What was not fitted must be
+    foretold no worse.
     """
     pair = two_together(given, chosen)
     hidden = pair is not None and not whole.structure(pair).tokens
@@ -188,7 +189,7 @@ def _once_more(
         other = confirmed(given, against_rivals(given, alone, bar), judged_on)
         if other.fit is not alone.fit:
             rest = _all_explained(whole, other, chosen, may_be_left)
-        if rest is not None:
+        if rest is not None and foretelling(judged_on, [chosen.fit, other.fit])[1] >= 0.0:
             return other, rest
     return chosen, structure
 

@@ -80,30 +80,30 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
     risky = False
     if found:
         fits = [fit, *(s.fit for s in found if s.fit is not None)]
-        fit, found, risky = representative(given, *tied(given, fit, found, _ahead(judged_on, fits)))
+        fit, found, risky = representative(given, *tied(given, fit, found, foretelling(judged_on, fits)))
     fit = fit if fit is chosen.fit else plainly(given, fit)
     return replace(chosen, fit=fit, rivals=tuple(found), risky=risky)
 
 
 def foretold_too(given: Problem, chosen: Selection, judged_on: Held, horizon: int) -> Selection:
     """With an effect besides that only all of the recording shows."""
-    return one_more(given, chosen, horizon, lambda fit, base: _ahead(judged_on, [base, fit])[1])
+    return one_more(given, chosen, horizon, lambda fit, base: foretelling(judged_on, [base, fit])[1])
 
 
-def _ahead(judged_on: Held, fits: list[Fit]) -> list[float]:
+def foretelling(judged_on: Held, fits: list[Fit]) -> list[float]:
     """Nats by which each foretells what is held out better than the first one. What a user's own model gives no numbers for there is out of
     the question; if that is so of the first one, nothing is known.
     """
     here = problem(judged_on.data, judged_on.steps)
-    foretelling = [None if foretold(here, one.model) is None else evaluate(here, one.model) for one in fits]
-    first = foretelling[0]
-    return [0.0 if first is None else -math.inf if one is None else gain(one, first) for one in foretelling]
+    there = [None if foretold(here, one.model) is None else evaluate(here, one.model) for one in fits]
+    first = there[0]
+    return [0.0 if first is None else -math.inf if one is None else gain(one, first) for one in there]
 
 
 def _holds(judged_on: Held, fit: Fit, less: Fit, place: int) -> bool:
     """Whether held-out data are foretold better with an effect; if it has no number, whether they are likelier."""
     if len(fit.added) > 1 and not slots_of(fit.model.effects[place], place) and len(judged_on.steps):
-        return _ahead(judged_on, [less, fit])[1] > 0.0
+        return foretelling(judged_on, [less, fit])[1] > 0.0
     return better(judged_on, fit.model, less.model, CONFIRMED)
 
 
