@@ -9,6 +9,7 @@ from trace_robots import declared, recordings
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace import tracer
+from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.shapes import SHAPES
 from s2r_runtime.trace.tracer import trace
 
@@ -186,3 +187,30 @@ def test_names_are_challenged_where_they_leave_something_and_only_there(physics,
     found = trace(data, declared())
     assert bool(asked) == left
     assert (found.verdict == "unexplained") == left
+
+
+def _ramped(seed, name, p, loud):
+    """A unicycle whose w passes through a shape, asked to change steadily from value to value."""
+    rng, n = np.random.default_rng(seed), 1200
+    u = np.repeat(rng.uniform([0.1, -0.8], [0.5, 0.8], (n // 40 + 1, 2)), 40, axis=0)[:n]
+    u[:, 1] = np.interp(np.arange(n), np.arange(0, n + 40, 40), rng.uniform(-0.8, 0.8, n // 40 + 1))
+    x = np.zeros(3)
+    rows = [x]
+    for v, w in _acts(name, u, **p):
+        x = x + DT * np.array([v * math.cos(x[2]), v * math.sin(x[2]), w])
+        rows.append(x)
+    return from_arrays(UNICYCLE, [(np.array(rows) + loud * rng.normal(size=(n + 1, 3)) * [0.001, 0.001, 0.006], u)])
+
+
+@pytest.mark.parametrize("loud", [1, 3])
+def test_two_names_on_one_input_that_leave_nothing_are_held_against_one_that_has_no_name(loud):
+    """Play and a gain by sign together come near to a loop."""
+    result = trace(_ramped(1, "a loop", {"share": 0.2, "width": 0.4}, loud), UNICYCLE)
+    assert result.depends_on[:1] == ("memory(w)",)
+
+
+def test_a_name_that_repairs_as_well_as_a_likelier_shape_is_kept_and_the_shape_told():
+    """No rollout shows that it is a bend and no limit."""
+    result = trace(_ramped(2, "a bend", {"gain": 1.1, "cubic": -0.3}, 6), UNICYCLE)
+    assert [(e.name, e.channel) for e in result.effects] == [("input_saturation", "w")]
+    assert result.depends_on == ("w",)

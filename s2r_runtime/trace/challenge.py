@@ -4,10 +4,12 @@ The effects that were found on an input are taken out, and each shape (`shapes`)
 of the recording, noise re-estimated for each, the smaller of white and coloured, and a price per number,
 
     shape wins     L(shape) - L(named) > log(tried / ALPHA) + the price of numbers that it has more than they,
-                   and by MORE of all that the named effects explain; and some rollout's error is lower by LOWER
+                   and by MORE of all that the named effects explain
+    it shows       some rollout's error is lower by LOWER
 
-A name that loses is not given: the recording does not look like what it means. A shape that has the named effect in it (two lags that are
-alike) costs a name nothing, as it explains no more.
+A name that loses to a shape that shows is not given: the recording does not look like what it means. Beside one that loses to a shape that
+does not, what the shape depends on is told: the repair is as good, and the name may be wrong. A shape that has the named effect in it (two
+lags that are alike) costs a name nothing, as it explains no more.
 """
 
 from __future__ import annotations
@@ -59,16 +61,19 @@ SECONDS = ("out", "back", "up", "down", "small", "large", "time_constant")
 
 @dataclass(frozen=True)
 class Better:
-    """A shape that does. nats: beyond the model without anything on that input, its numbers paid for."""
+    """A shape that does. nats: beyond the model without anything on that input, its numbers paid for. shows: in some rollout, beside the
+    effects that were named.
+    """
 
     token: str
     nats: float
+    shows: bool = True
 
 
 def better_shape(given: Problem, fit: Fit, horizon: int) -> Better | None:
-    """The shape that explains most beyond the effects named on its input; None if none wins."""
+    """The shape that explains most beyond the effects named on its input, of those that show, if any do; None if none wins."""
     won = [found for channel in _inputs(fit) for found in [_challenge(given, fit, channel, horizon)] if found is not None]
-    return max(won, key=lambda better: better.nats, default=None)
+    return max(won, key=lambda better: (better.shows, better.nats), default=None)
 
 
 def best_shape(given: Problem, base: Fit, horizon: int) -> Better | None:
@@ -95,12 +100,13 @@ def _challenge(given: Problem, fit: Fit, channel: str, horizon: int) -> Better |
             bare = without(bare, i)
     base = fitted(given, fit, bare, 1)
     here = gain(fit, base)
+    won: list[Better] = []
     for shape in _fits(given, base, channel, REACHES * at_first_look(given, fit, base), _times(fit, channel), _plays(fit, channel)):
         ahead = gain(shape, base) - here
         needed = max(_price(given, shape, fit), 0.0) + math.log(len(SHAPES) / ALPHA)
-        if ahead > max(needed, MORE * here) and _lower(given, fit, shape, horizon):
-            return Better(_token(shape), gain(shape, base) - _price(given, shape, base))
-    return None
+        if ahead > max(needed, MORE * here):
+            won.append(Better(_token(shape), gain(shape, base) - _price(given, shape, base), _lower(given, fit, shape, horizon)))
+    return max(won, key=lambda better: (better.shows, better.nats), default=None)
 
 
 def _price(given: Problem, fit: Fit, base: Fit) -> float:

@@ -8,7 +8,7 @@ z what is left, terms are offered in which a number p varies along a coordinate 
 and whether b = 0 is asked by their scores, less what other numbers do as well (efficient scores, C. Rao, 1948; of numbers that vary: J.
 Nyblom, JASA 84, 1989; B. Hansen, Journal of Policy Modeling 14, 1992). The sum of the first m squares is chi-square with m degrees; of
 m = 1 to WAVES the least likely counts (J. Neyman, 1937; T. Ledwina, JASA 89, 1994), all that was tried paid for (Bonferroni), and under
-variances over blocks of time (each beside the slope itself; H. White, 1980), too.
+variances over blocks of time of what is left beside them (H. White, 1980), too.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.evidence import margin
 from s2r_runtime.trace.fitting import evaluate, foretold, gain, slopes, without
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
 from s2r_runtime.trace.lack_of_fit_terms import VELOCITIES, quieter
@@ -195,22 +196,35 @@ def _judged(left: Left, scores: _Scores, moved: Array, varies: _Varies, price: f
     beside = np.linalg.pinv(scores.info.sum(axis=0), rcond=1e-12, hermitian=True) @ (j.T @ weighted)
     x -= j @ beside
     root = _root(x.T @ (x * w[:, None]), float(scores.info[:, p, p].sum()))
-    along = np.linalg.solve(root, x.T).T
-    edges = np.unique(np.linspace(0, n, TIMES + 1).astype(int))[:-1] * nx
-    a, size = (np.add.reduceat(e, edges, axis=0) for e in (along * (w * z)[:, None], along**2 * w[:, None]))
-    slope = a.sum(axis=0)
-    varied = np.sum((a - size * slope) ** 2, axis=0) * len(edges) / max(len(edges) - 1, 1)
-    surprise, m = _surprise(slope**2 / np.maximum(varied, 1.0))
+    along: Array = np.asarray(np.linalg.solve(root, x.T).T, dtype=np.float64)
+    slope = along.T @ (w * z)
+    m = _surprise(slope**2)[1]
+    surprise, _ = _surprise(slope**2 / np.maximum(_varied(scores, along, slope, m), 1.0))
     nats = 0.5 * float(np.sum(slope[:m] ** 2) - m)
     place = left.fit.free[p].place
     without_it = without(left.fit.model, place)
-    if surprise < price or foretold(left.given, without_it) is None:  # somebody's own model may not step without it
+    if surprise < price or margin(along[:, :m].reshape(n, nx, m), scores.z, scores.weight, 0.0) <= 0.0:
+        return None
+    if foretold(left.given, without_it) is None:  # somebody's own model may not step without it
         return None
     if nats < MORE * gain(left.fit, evaluate(left.given, without_it, left.fit.noise)):
         return None
     beta = np.linalg.solve(root[:m, :m].T, slope[:m])
     push = moved[:, :, p, None] * terms[:, None, :m] - moved @ beside[:, :m]
     return Judged(_token(left, varies.along, place), push, nats - m * math.log(n) / 2.0, 1.0, np.tile(beta, (BLOCKS, 1)))
+
+
+def _varied(scores: _Scores, along: Array, slope: Array, m: int) -> Array:
+    """Variances of scores over blocks of time, beside all that the first m terms and the other numbers explain: a variation that is there
+    is no noise, and what one wave of it explains would be noise to the others. along: (n nx, terms), orthonormal; slope: of each.
+    """
+    j, z, w = scores.j.reshape(len(along), -1), scores.z.ravel(), scores.weight.ravel()
+    moved = np.linalg.pinv(scores.info.sum(axis=0), rcond=1e-12, hermitian=True) @ (j.T @ (w * z))
+    rest = z - along[:, :m] @ slope[:m] - j @ moved
+    n, nx = scores.z.shape
+    edges = np.unique(np.linspace(0, n, TIMES + 1).astype(int))[:-1] * nx
+    a = np.add.reduceat(along * (w * rest)[:, None], edges, axis=0)
+    return np.asarray(np.sum(a**2, axis=0) * len(edges) / max(len(edges) - 1 - m, 1))
 
 
 def _token(left: Left, along: _Along, place: int) -> str:

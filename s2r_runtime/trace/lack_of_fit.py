@@ -136,7 +136,7 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
             return Structure(tokens, True, share, gains, noise=_beside(left, chosen[-1]))
     varied = looks.field
     told = [] if varied is None or varied.beyond <= 0.0 else [(varied.nats, varied.judged, varied.tokens, True)]
-    if number is not None and not (_goes_slowly(number) and _wanders(left, number, math.inf)):
+    if number is not None:
         gains[number.token] = max(gains.get(number.token, 0.0), number.gain)
         told.append((number.gain, number, (number.token,), False))
     for _, judged, tokens, varies in sorted(told, key=lambda t: -t[0]):
@@ -145,14 +145,9 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
             return Structure(tokens, True, share, gains, varies=varies, noise=_beside(left, judged))
     windows = None if chosen else windows or _for_a_while(left)
     matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
-    if windows is None or not matters:
-        return Structure(coloured, False, 0.0, gains)
+    if windows is None or not matters:  # a number that varies is told with the name, if no rollout shows it
+        return Structure((*(() if number is None else (number.token,)), *coloured), False, 0.0, gains)
     return Structure(may_depend_on(left, windows, found), True, share, gains, for_a_while=True, noise=_beside(left, windows))
-
-
-def _goes_slowly(judged: Judged) -> bool:
-    """Whether what a number varies with is as slow as what wanders."""
-    return judged.token.startswith("time") or judged.token in {"position", "heading"}
 
 
 def _for_a_while(left: Left) -> Judged | None:

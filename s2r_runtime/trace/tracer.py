@@ -374,14 +374,20 @@ class _Whole:
         found = lack_of_fit(looks, self.nominal, self._horizon)
         if crowded(fit):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
-        if looks.most <= NOTHING and not found.matters:  # what explained more than the names would explain something beside them
+        if (
+            looks.most <= NOTHING and not found.matters and not _twice(fit)
+        ):  # what explained more than a name would explain something beside
             return found
         if (looks.most > ALIKE or found.matters) and self._explained_without(fit, looks.left, found):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
         if found.matters and _bent(found, fit, self.nominal):
             return replace(found, share=1.0)
         better = better_shape(self.given, fit, self._horizon)
-        return found if better is None else replace(found, tokens=(better.token,), matters=True, share=1.0, nameless=True)
+        if better is None:
+            return found
+        if not better.shows:  # the repair is as good, whatever its name
+            return replace(found, tokens=tuple(dict.fromkeys((better.token, *found.tokens))))
+        return replace(found, tokens=(better.token,), matters=True, share=1.0, nameless=True)
 
     def _of_nominal(self) -> Structure:
         """What the model as given leaves."""
@@ -430,6 +436,12 @@ class _Whole:
     def _shape(self) -> Better | None:
         """The shape that explains most of it."""
         return best_shape(self.given, self.nominal, self._horizon)
+
+
+def _twice(fit: Fit) -> bool:
+    """Whether two effects were named on one input: they may be one thing that has no name, and leave nothing of it."""
+    channels = [fit.model.effects[i].channel for i in fit.added if fit.model.effects[i].effect.stage == "input"]
+    return len({*channels}) < len(channels)
 
 
 def _bent(found: Structure, best: Fit, nominal: Fit) -> bool:

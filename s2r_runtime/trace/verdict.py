@@ -137,7 +137,7 @@ def verdict_of(
     before, after = judged
     floor = floors[0].copy()
     floor[[speed for _, speed in given.data.axes_without_speed]] = np.inf  # nobody measured how far off these are
-    away = structure.tokens == ("noise",) and goes_astray(chosen.fit.model, before, after, floor)
+    away = "noise" in structure.tokens and not structure.matters and goes_astray(chosen.fit.model, before, after, floor)
     faulty = any(fault.kind != "dropout" for fault in faults)
     if not chosen.fit.added:
         nothing = away or foretells_nothing(after, given, floors[1])
