@@ -102,6 +102,21 @@ def test_dry_friction_holds_all_links_at_once(tmp_path):
     assert np.max(np.abs(moved)) < 1e-6
 
 
+def test_what_friction_holds_on_links_takes_a_few_rounds_and_only_of_the_rows_that_it_holds(tmp_path, monkeypatch):
+    held = _model(tmp_path, ARM, *(EffectSpec("coulomb_friction", f"dq{i}", {"force": 0.5}) for i in (1, 2)))
+    rng, glide, rows = np.random.default_rng(0), forces._glide, []
+    monkeypatch.setattr(forces, "_glide", lambda v, *rest: (rows.append(len(v)), glide(v, *rest))[1])
+    x, u = rng.uniform(-2.0, 2.0, (1000, 4)), rng.uniform(-0.4, 0.4, (1000, 2))
+    x[::10, 2:] = 0.0
+    found = held.step(x, u, held.at_rest(1000))[0]
+    assert (
+        sum(rows) < 20 * 1000
+    )  # 50 times, if every row is swept until the last one is done, each time by as much as the sweep makes of it
+    monkeypatch.setattr(forces, "SETTLED", 1e-14)
+    monkeypatch.setattr(forces, "SWEEPS", 400)
+    assert np.allclose(held.step(x, u, held.at_rest(1000))[0], found, rtol=0.0, atol=1e-9)
+
+
 def test_friction_in_the_joints_of_an_arm_is_named(tmp_path):
     model, rng = _model(tmp_path, ARM), np.random.default_rng(1)
     f, size, phase = rng.uniform(0.2, 0.9, (2, 3)), rng.uniform(0.2, 0.5, (2, 3)), rng.uniform(0.0, 6.0, (2, 3))
