@@ -184,6 +184,18 @@ def test_long_recordings_are_taken_in_longer_steps(tmp_path):
     assert np.sqrt(evaluate(problem(thin, steps_of(thin)), longer).noise.r[0]) < 0.8e-4  # three rows are in each
 
 
+def test_a_force_that_flickers_within_parts_of_a_step_is_no_structure(tmp_path):
+    """A controller at 1 kHz behind a coarse encoder: a part of a step has the force's mean, and where the joint is needs more."""
+    rng, ms = np.random.default_rng(12), 1e-3
+    u = _reversing(rng, 8000, ms)[:, 0] + rng.normal(size=8000)
+    v = np.concatenate([[0.0], np.cumsum(u * ms / MASS)])[:-1]
+    q = np.concatenate([[0.0], np.cumsum(v * ms + 0.5 * u * ms**2 / MASS)])[:-1]
+    path = tmp_path / "run.csv"
+    path.write_text("\n".join(["t,q,force", *(f"{k * ms:.9g},{round(q[k], 5):.9g},{u[k]:.9g}" for k in range(8000))]) + "\n")
+    model = _joint(0.02)
+    assert trace(load_dataset(path, model), model).verdict == "none"
+
+
 def test_rows_that_lack_are_bridged_and_long_gaps_are_not(tmp_path):
     model, path, y = _recorded(tmp_path, 10, noise=1e-6, keep=lambda k: k % 40 or not k, wild=())
     data = load_dataset(path, model)

@@ -77,6 +77,9 @@ MOST_PARTS = 2
 as much more and ask of a measured robot what no model of it holds.
 """
 
+FINER_PARTS = 8
+"""The same, where what is left may be of what an input does within such parts."""
+
 LONG_S = 0.04
 """Steps longer than this are taken in parts where speeds were not measured: a position says when within a step a force acted."""
 
@@ -271,14 +274,27 @@ def regridded(data: Dataset, model: ComposedModel, in_parts: int = 0) -> Dataset
     return from_streams(model, data.segments, data.source, data.digests, data.paths, data.reconstruction, in_parts)
 
 
-def thinned(model: ComposedModel, data: Dataset, test: Dataset | None = None) -> tuple[ComposedModel, Dataset, Dataset | None]:
-    """The same on the shortest steps that are independent of each other in both: unchanged, if they are."""
+def thinned(
+    model: ComposedModel, data: Dataset, test: Dataset | None = None, parts: int = MOST_PARTS
+) -> tuple[ComposedModel, Dataset, Dataset | None]:
+    """The same on the shortest steps that are independent of each other in both: unchanged, if they are. parts: S, where there are any."""
     apart = max(data.apart, test.apart if test else 1)
     whole = data.reconstruction is None or data.interval * MOST_PARTS > data.dt
     if apart == 1 and whole and not (data.reconstruction and data.reconstruction.axes and data.dt > LONG_S):
         return model, data, test
-    longer, parts = at_step(model, apart * model.dt), MOST_PARTS
+    longer = at_step(model, apart * model.dt)
     return longer, regridded(data, longer, parts), regridded(test, longer, parts) if test else None
+
+
+def in_finer_parts(data: Dataset, model: ComposedModel) -> Dataset | None:
+    """The same with steps in more parts, if inputs change within those that it has."""
+    rows = [np.diff(inputs.t) for _, inputs in data.segments]
+    spacing = float(np.median(np.concatenate(rows))) if rows else 0.0
+    many = math.floor(min(FINER_PARTS, data.dt / spacing + ALIGNED) / data.substeps) if spacing > 0.0 else 0
+    if not data.in_parts or many < 2:
+        return None
+    finer = regridded(data, model, many * data.substeps)
+    return finer if any(np.any(np.ptp(run.u.reshape(-1, many, run.u.shape[1]), axis=1)) for run in finer.runs) else None
 
 
 def least_parts(model: ComposedModel) -> int:

@@ -27,7 +27,7 @@ from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.begun import begun
 from s2r_runtime.trace.challenge import MORE as SHAPED
 from s2r_runtime.trace.challenge import Better, best_shape, better_shape
-from s2r_runtime.trace.dataset import Dataset, thinned
+from s2r_runtime.trace.dataset import MOST_PARTS, Dataset, in_finer_parts, thinned
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge, noise_floor
 from s2r_runtime.trace.excitation import advice
@@ -124,16 +124,18 @@ def _traced(
     seed: int,
     say: Progress,
     norm: tuple[tuple[float, ...] | None, Kind],
+    parts: int = MOST_PARTS,
 ) -> TraceResult:
+    """parts: S, of a thinned recording."""
     weights, kind = norm
-    asked = model
+    asked, as_recorded = model, (dataset, test)
     if not model.inputs:
         raise NotEnoughEvidence(f"{dataset.source}: the model has no inputs; nothing can be traced of a robot that is asked nothing")
     model, dataset, test = alike(model, dataset, test)
     _belongs(dataset, model)
     if test is not None:
         _belongs(test, model)
-    model, dataset, test = thinned(model, dataset, test)
+    model, dataset, test = thinned(model, dataset, test, parts)
     check_plausible(model, dataset)
     dataset, test = from_one_place(model, dataset), None if test is None else from_one_place(model, test)
     say(0.0, 100.0, "looking for faults of measurement")
@@ -159,6 +161,10 @@ def _traced(
     structure = whole.structure(chosen)
     if structure.matters and not structure.nameless:
         chosen, structure = _once_more(given, whole, chosen, structure, judged_on, ahead)
+    if structure.matters and parts == MOST_PARTS:
+        finer = _finer(dataset, model, chosen, ahead)
+        if finer is not None:
+            return _traced(as_recorded[0], asked, as_recorded[1], horizon, seed, say, norm, finer)
     say(90.0, 100.0, "judging on held-out data")
     w = np.ones(len(model.states)) if weights is None else np.array([weights[asked.states.index(s)] for s in model.states])
     result = _result(dataset, checked, given, chosen, structure, judged_on, seed, w, kind)
@@ -168,6 +174,20 @@ def _traced(
     result = replace(result, spec=msgspec.structs.replace(result.spec, dt=asked.dt), unseen=unseen)
     say(100.0, 100.0, result.verdict)
     return result
+
+
+def _finer(dataset: Dataset, model: ComposedModel, chosen: Selection, ahead: int) -> int | None:
+    """Parts of a step in which nothing is left by what was found, or by the model as given, if there are such: then it is what inputs do
+    within the parts there are. Of what they do a part has the mean, and a position more.
+    """
+    data = in_finer_parts(dataset, model)
+    if data is None:
+        return None
+    checked = check(model, with_history(model, data))
+    whole = _Whole(checked, model, ahead)
+    nominal = whole.nominal
+    fit = nominal if not chosen.fit.added else fitted(whole.given, nominal, chosen.fit.model)
+    return None if whole.structure(replace(chosen, nominal=nominal, fit=fit)).matters else data.substeps
 
 
 def _once_more(
