@@ -323,3 +323,32 @@ def test_a_rival_that_explains_clearly_more_takes_the_place_of_what_was_found():
     assert [(found.model.effects[i].effect.name, found.model.effects[i].channel) for i in found.added] == [("input_delay", "w")]
     assert found.white > first.white + 10.0
     assert ("input_lag", "w") not in {(s.name, s.channel) for s in rivals}
+
+
+def test_a_sine_begins_at_the_phase_that_it_has_where_noise_is_of_the_sensors():
+    """Whitened, a push that lasts is felt ever more: a sine in the residual lags behind by up to a quarter of a turn."""
+    told = {"frequency": 1.145, "amplitude": 0.5, "phase": -1.5}
+    model, robot = (
+        compose(ModelSpec("joint", 0.1, {"mass": 1.0}, effects)) for effects in ((), (EffectSpec("periodic_disturbance", "force", told),))
+    )
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-1.0, 1.0, 60), 5)[:, None]
+    u -= u.mean()
+    x, hidden, rows = np.zeros((1, 2)), robot.at_rest(1), [np.zeros(2)]
+    for k in range(len(u)):
+        x, hidden = robot.step(x, u[k : k + 1], hidden)
+        rows.append(x[0])
+    data = from_arrays(model, [(np.array(rows) + rng.normal(size=(len(rows), 2)) * [0.01, 0.05], u)])
+    given = problem(data, steps_of(data))
+    first = Leftover(given, evaluate(given, model)).starts(registry().get("effects", "periodic_disturbance"), "force")[0]
+    assert first["frequency"] == pytest.approx(told["frequency"], abs=0.01)
+    assert first["amplitude"] == pytest.approx(told["amplitude"], rel=0.2)
+    assert abs(np.angle(np.exp(1j * (first["phase"] - told["phase"])))) < 0.5
+
+
+def test_a_model_less_what_stands_in_for_one_of_its_effects_is_the_model_as_given():
+    model = compose(ModelSpec("unicycle", 0.05, {}, (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),)))
+    data = from_arrays(model, [(np.zeros((80, 3)), np.ones((79, 2)))])
+    instead = next(c for c in candidates(model, data) if c.replaced >= 0)
+    for other in instead.models(model):
+        assert fitting.without(other, instead.replaced) == model

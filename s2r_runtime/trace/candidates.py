@@ -38,7 +38,7 @@ class Candidate:
         """The model with the effect, once a start."""
         if self.replaced >= 0:
             there = model.effects
-            made = [Added(s.effect, s.channel, s.p) for s in self.starts]
+            made = [Added(s.effect, s.channel, s.p, instead=there[self.replaced]) for s in self.starts]
             return [replace(model, effects=(*there[: self.replaced], a, *there[self.replaced + 1 :])) for a in made]
         return [insert(model, start, self.place) for start in self.starts]
 

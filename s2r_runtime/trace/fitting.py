@@ -349,5 +349,7 @@ def insert(model: ComposedModel, effect: AppliedEffect, place: int) -> ComposedM
 
 
 def without(model: ComposedModel, place: int) -> ComposedModel:
-    """The model less one effect."""
-    return replace(model, effects=(*model.effects[:place], *model.effects[place + 1 :]))
+    """The model less one effect; with the one that was given in its place, if there was one."""
+    a = model.effects[place]
+    given = (a.instead,) if isinstance(a, Added) and a.instead is not None else ()
+    return replace(model, effects=(*model.effects[:place], *given, *model.effects[place + 1 :]))

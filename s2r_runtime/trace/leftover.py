@@ -35,18 +35,22 @@ class Leftover:
         if not hasattr(effect, "starts_from_residual") or channel not in {*model.inputs, "*"}:  # a state has no input that pushes
             return []
         pushes = self._pushes(channel, proportional=bool(getattr(effect, "proportional", False)))
-        if (
-            self.given.floor.axes
-        ):  # whitened, a push is felt for long after: its score at every step is p' S^-1 r, and its size is told apart
+        wave = {"frequency", "phase"} <= {p.name for p in effect.parameters}
+        if self.given.floor.axes or wave:
+            # whitened, a push is felt for long after, a sine at another phase: its score at every step is p' S^-1 r, its size is told apart
             pulled = self.fit.whiten.back(self.fit.z * noises.weight(self.fit.z))
             found = effect.starts_from_residual(pulled, steps.t, pushes, model.nominal, channel, model.dt)
-            return [self._sized(effect, channel, p) for p in found]
+            return [self._sized(effect, channel, p, pushes) for p in found]
         return list(effect.starts_from_residual(self.fit.z, steps.t, self.fit.whiten(pushes), model.nominal, channel, model.dt))
 
-    def _sized(self, effect: Effect, channel: str, p: dict[str, Any]) -> dict[str, Any]:
+    def _sized(self, effect: Effect, channel: str, p: dict[str, Any], pushes: Array) -> dict[str, Any]:
         """The same as large as it explains most: by least squares of what it changes, a sine's phase being free."""
-        turned = [{**p, "phase": float(p["phase"]) + shift} for shift in (0.0, 0.5 * math.pi)] if "phase" in p else [p]
-        columns = np.stack([self._changed(effect, channel, q).ravel() for q in turned], axis=1)
+        if "phase" in p:
+            angle = math.tau * float(p["frequency"]) * (self.given.steps.t + 0.5 * self.fit.model.dt) + float(p["phase"])
+            waves = float(p["amplitude"]) * np.stack([np.sin(angle), np.cos(angle)], axis=1)
+            columns = self.fit.whiten(pushes[:, :, None] * waves[:, None, :]).reshape(-1, 2)
+        else:
+            columns = self._changed(effect, channel, p).reshape(-1, 1)
         size = np.linalg.lstsq(columns, self.fit.z.ravel(), rcond=None)[0]
         sized = dict(p)
         if "phase" in p:

@@ -27,7 +27,9 @@ Free = tuple[Slot, ...]
 
 @dataclass(frozen=True)
 class Added(AppliedEffect):
-    """An effect that the tracer added."""
+    """An effect that the tracer added. instead: the one of the model as given in whose place it stands, if it does."""
+
+    instead: AppliedEffect | None = None
 
 
 def free_of(model: ComposedModel) -> Free:
