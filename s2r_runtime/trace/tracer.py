@@ -394,9 +394,8 @@ class _Whole:
         found = lack_of_fit(looks, self.nominal, self._horizon)
         if crowded(fit):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
-        if (
-            looks.most <= NOTHING and not found.matters and not _twice(fit)
-        ):  # what explained more than a name would explain something beside
+        quiet = looks.most <= NOTHING and not found.matters  # what explained more than a name would explain something beside it
+        if quiet and not _twice(fit):
             return found
         if (looks.most > ALIKE or found.matters) and self._explained_without(fit, looks.left, found):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
