@@ -153,3 +153,11 @@ def test_an_effect_of_the_tracers_is_at_the_place_at_which_it_was_looked_at():
     for s in screen(given, evaluate(given, model), candidates(model, given.data))[0]:
         place = s.candidate.place if s.candidate.replaced < 0 else s.candidate.replaced
         assert (s.start.effects[place].effect.name, s.start.effects[place].channel) == (s.candidate.name, s.candidate.channel)
+
+
+def test_a_limit_that_is_hardly_met_is_begun_from_near_it():
+    """The largest commands are cut by a fortieth, on one side: starts that cut them by a tenth and more are worse than none."""
+    u = 2.0 * np.sin(0.001 * np.arange(300) ** 2)[:, None]
+    given, model = _drive(JOINT, [("input_saturation", "force", {"high": 1.95})], u, 1e-4)
+    best = screen(given, evaluate(given, model), candidates(model, given.data))[0][0]
+    assert (best.candidate.name, best.candidate.channel) == ("input_saturation", "force")

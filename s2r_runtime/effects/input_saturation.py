@@ -7,9 +7,9 @@ import numpy as np
 from s2r_runtime.effects.input_effect import Array, InputEffect, Values, columns
 from s2r_runtime.hookspecs import NominalModel, Parameter
 
-BOTH = (0.9, 0.7, 0.5, 0.3)
-ONE = (0.85, 0.5)
-ALONE = (0.95, 0.85, 0.7, 0.5, 0.3)
+BOTH = (0.97, 0.9, 0.7, 0.5, 0.3)
+ONE = (0.97, 0.85, 0.5)
+ALONE = (0.97, 0.85, 0.7, 0.5, 0.3)
 """Of what was asked for in that direction: limits from which the tracer begins. Two at once; one of two; the only one that can be met."""
 
 
