@@ -4,8 +4,8 @@ The effects that were found on an input are taken out, and each shape (`shapes`)
 of the recording, noise re-estimated for each, the smaller of white and coloured, and a price per number,
 
     shape wins     L(shape) - L(named) > log(tried / ALPHA) + the price of numbers that it has more than they,
-                   and by MORE of all that the named effects explain
-    it shows       some rollout's error is lower by LOWER
+                   and by LITTLE of all that the named effects explain
+    it shows       by MORE of that, and some rollout's error is lower by LOWER
 
 A name that loses to a shape that shows is not given: the recording does not look like what it means. Beside one that loses to a shape that
 does not, what the shape depends on is told: the repair is as good, and the name may be wrong. A shape that has the named effect in it (two
@@ -38,6 +38,9 @@ ALPHA = 1e-3
 
 MORE = 0.05
 """Of what is explained: less than this is how any model differs from any robot."""
+
+LITTLE = 0.01
+"""The same where it takes no name away, and is only told: less than this is how steps are cut."""
 
 LOWER = 0.05
 """As for effects: what lowers no rollout's error by this share, nobody would notice."""
@@ -104,8 +107,9 @@ def _challenge(given: Problem, fit: Fit, channel: str, horizon: int) -> Better |
     for shape in _fits(given, base, channel, REACHES * at_first_look(given, fit, base), _times(fit, channel), _plays(fit, channel)):
         ahead = gain(shape, base) - here
         needed = max(_price(given, shape, fit), 0.0) + math.log(len(SHAPES) / ALPHA)
-        if ahead > max(needed, MORE * here):
-            won.append(Better(_token(shape), gain(shape, base) - _price(given, shape, base), _lower(given, fit, shape, horizon)))
+        if ahead > max(needed, LITTLE * here):
+            shows = ahead > MORE * here and _lower(given, fit, shape, horizon)
+            won.append(Better(_token(shape), gain(shape, base) - _price(given, shape, base), shows))
     return max(won, key=lambda better: (better.shows, better.nats), default=None)
 
 

@@ -44,6 +44,12 @@ ALPHA = 1e-3
 MORE = 0.05
 """Of what an effect explains that its variation must explain (`challenge`): a number that differs by a fifth of itself."""
 
+TOLD, LITTLE = 0.05, 0.01
+"""The same where no name is at stake, and what a number seems to go with is only told beside it: a number that differs by a tenth."""
+
+LESS = math.log(TOLD / ALPHA)
+"""Of the price, in nats, what is told costs less."""
+
 LOOKED_AT = 6
 """That stand out most, and are looked at under variances over blocks of time."""
 
@@ -87,8 +93,16 @@ class _Varies:
     surprise: float
 
 
-def uneven(left: Left) -> Judged | None:
-    """What varies most surely of the numbers of what was named, by as much as matters; None if nothing does."""
+@dataclass(frozen=True)
+class Uneven:
+    """How a number varies. sure: beyond ALPHA, and by MORE; else it is only told."""
+
+    judged: Judged
+    sure: bool
+
+
+def uneven(left: Left) -> Uneven | None:
+    """What varies most surely of the numbers of what was named, by as much as is told; None if nothing does."""
     fit = left.fit
     if not fit.free or left.given.floor.axes:
         return None
@@ -96,9 +110,9 @@ def uneven(left: Left) -> Judged | None:
     scores = _scores(left, moved)
     offered = [varies for along in _coordinates(left) for varies in _offered(scores, along)]
     price = math.log(max(len(offered), 1) * WAVES / ALPHA)
-    best = sorted((v for v in offered if v.surprise > price), key=lambda v: -v.surprise)[:LOOKED_AT]
-    sure = [judged for varies in best for judged in [_judged(left, scores, moved, varies, price)] if judged is not None]
-    return max(sure, key=lambda judged: judged.gain, default=None)
+    best = sorted((v for v in offered if v.surprise > price - LESS), key=lambda v: -v.surprise)[:LOOKED_AT]
+    found = [one for varies in best for one in [_judged(left, scores, moved, varies, price)] if one is not None]
+    return max(found, key=lambda one: (one.sure, one.judged.gain), default=None)
 
 
 def _scores(left: Left, moved: Array) -> _Scores:
@@ -187,8 +201,10 @@ def _surprise(squares: Array) -> tuple[float, int]:
     return float(np.max(told)), int(np.argmax(told)) + 1
 
 
-def _judged(left: Left, scores: _Scores, moved: Array, varies: _Varies, price: float) -> Judged | None:
-    """Under variances over blocks of time; None if it may be chance then, or explains too little of what the effect does."""
+def _judged(left: Left, scores: _Scores, moved: Array, varies: _Varies, price: float) -> Uneven | None:
+    """Under variances over blocks of time; None if it may be chance then, or explains too little of what the effect does. Sure is what
+    the same residual slid along the recording does not show.
+    """
     p, terms, (n, nx, k) = varies.p, varies.waves[varies.cell], moved.shape
     j, z, w = scores.j.reshape(-1, k), scores.z.ravel(), scores.weight.ravel()
     x = (scores.j[:, :, p, None] * terms[:, None, :]).reshape(n * nx, -1)
@@ -203,15 +219,17 @@ def _judged(left: Left, scores: _Scores, moved: Array, varies: _Varies, price: f
     nats = 0.5 * float(np.sum(slope[:m] ** 2) - m)
     place = left.fit.free[p].place
     without_it = without(left.fit.model, place)
-    if surprise < price or margin(along[:, :m].reshape(n, nx, m), scores.z, scores.weight, 0.0) <= 0.0:
+    if surprise < price - LESS or foretold(left.given, without_it) is None:  # somebody's own model may not step without it
         return None
-    if foretold(left.given, without_it) is None:  # somebody's own model may not step without it
+    share = nats / max(gain(left.fit, evaluate(left.given, without_it, left.fit.noise)), 1e-300)
+    if share < LITTLE:
         return None
-    if nats < MORE * gain(left.fit, evaluate(left.given, without_it, left.fit.noise)):
-        return None
+    sure = share >= MORE and min(varies.surprise, surprise) > price
+    sure = sure and margin(along[:, :m].reshape(n, nx, m), scores.z, scores.weight, 0.0) > 0.0
     beta = np.linalg.solve(root[:m, :m].T, slope[:m])
     push = moved[:, :, p, None] * terms[:, None, :m] - moved @ beside[:, :m]
-    return Judged(_token(left, varies.along, place), push, nats - m * math.log(n) / 2.0, 1.0, np.tile(beta, (BLOCKS, 1)))
+    judged = Judged(_token(left, varies.along, place), push, nats - m * math.log(n) / 2.0, 1.0, np.tile(beta, (BLOCKS, 1)))
+    return Uneven(judged, sure)
 
 
 def _varied(scores: _Scores, along: Array, slope: Array, m: int) -> Array:

@@ -120,7 +120,8 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     """Structure left by a model; how much of what `nominal` leaves that is."""
     left, found = looks.left, looks.found
     chosen, gains = _forward(looks) if found else ([], {})
-    number = uneven(left)
+    varying = uneven(left)
+    number = varying.judged if varying is not None and varying.sure else None
     wanders = left.law is not None and np.any(left.law.slow.sum(axis=1) > 0.0)  # else what is left is steadier than white noise
     coloured = ("noise",) if np.any(left.fit.colour.strength > COLOURED) or wanders else ()
     windows: Judged | None = None
@@ -145,8 +146,8 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
             return Structure(tokens, True, share, gains, varies=varies, noise=_beside(left, judged))
     windows = None if chosen else windows or _for_a_while(left)
     matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
-    if windows is None or not matters:  # a number that varies is told with the name, if no rollout shows it
-        return Structure((*(() if number is None else (number.token,)), *coloured), False, 0.0, gains)
+    if windows is None or not matters:  # a number that may vary is told with the name, if no rollout shows it
+        return Structure((*(() if varying is None else (varying.judged.token,)), *coloured), False, 0.0, gains)
     return Structure(may_depend_on(left, windows, found), True, share, gains, for_a_while=True, noise=_beside(left, windows))
 
 
