@@ -62,11 +62,12 @@ class Scored:
 @dataclass(frozen=True)
 class Bar:
     """What an effect must clear. alpha: chance of naming anything where nothing is, as far as the likelihood is right; each: nats a
-    parameter costs, None for Schwarz's price.
+    parameter costs, None for Schwarz's price; share: by which some rollout's error must fall, so that somebody would notice.
     """
 
     alpha: float
     each: float | None = None
+    share: float = 0.05
 
     def price(self, k: int, n: int) -> float:
         """Of k parameters on n transitions."""
@@ -83,8 +84,10 @@ CONTENDS, SETTLES = 15.0, 6
 """
 
 STRICT = Bar(1e-3)
-LENIENT = Bar(0.3, 1.5)
-"""For where structure is shown already."""
+LENIENT, ALONE = Bar(0.3, 1.5), Bar(0.3, 1.5, 0.01)
+"""For where structure is shown already, beside what was named and where nothing was: it shows in rollouts, so what leaves nothing of it may
+do a little less on a part of the data.
+"""
 
 
 def at_first_look(given: Problem, fit: Fit, base: Fit) -> float:

@@ -3,7 +3,7 @@
 gain          of a model over the one without the effect, the smaller of white and coloured (`scores`): "just more noise" and
               "coloured noise" are rivals
 significant   gain > log(tried / alpha) + price                   (everything tried is paid for; `scores.Bar`)
-relevant      some rollout's rms error falls by RELEVANT, on blocks that the parameters (all but those blocks) never saw
+relevant      some rollout's rms error falls by the bar's share, on blocks that the parameters (all but those blocks) never saw
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.plugins import registry
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.begun import begun, uncertain
 from s2r_runtime.trace.candidates import candidates
@@ -41,9 +42,6 @@ from s2r_runtime.trace.scores import STRICT, Bar, Scored, at_first_look, best_ca
 from s2r_runtime.trace.slots import Added, bounds_of, slots_of, values_of, with_values
 
 Array = NDArray[np.float64]
-
-RELEVANT = 0.05
-"""An effect that lowers no rollout error by this share is left out: nobody would notice it."""
 
 WITHIN = 0.4
 """Of a step: what stamps off the grid can look like."""
@@ -169,7 +167,7 @@ def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int, bar:
         and _told_by_stamps(given, fit, base)
         and _beyond_rounding(given, fit, base)
         and _happens(given, fit)
-        and relevant(given, fit, base, horizon)
+        and relevant(given, fit, base, horizon, bar)
     )
 
 
@@ -253,12 +251,12 @@ def _beyond_wandering(given: Problem, fit: Fit, base: Fit, needed: float) -> boo
     return reached[0] - reached[1] > needed
 
 
-def relevant(given: Problem, fit: Fit, base: Fit, horizon: int) -> bool:
-    """Whether some state's error at one step, a quarter of the horizon or all of it falls by RELEVANT, cross-validated."""
+def relevant(given: Problem, fit: Fit, base: Fit, horizon: int, bar: Bar = STRICT) -> bool:
+    """Whether some state's error at one step, a quarter of the horizon or all of it falls by the bar's share, cross-validated."""
     known = (begun(given, fit), uncertain(fit, given.data.dt)) if given.floor.axes else None
     for steps in sorted({1, max(1, horizon // 4), horizon}):
         before, after = held_out_errors(given, base, steps, known), held_out_errors(given, fit, steps, known)
-        if np.any(before > (1.0 + RELEVANT) * after):
+        if np.any(before > (1.0 + bar.share) * after):
             return True
     return False
 
@@ -340,6 +338,26 @@ def parted(given: Problem, fit: Fit, ranking: Sequence[Scored], bar: Bar) -> Fit
             model = replace(fit.model, effects=(*there[:place], *apart, *there[place + 1 :]))
             if foretold(given, model) is None:  # a user's own model may not go where both take it
                 continue
+            other = fitted(given, fit, model)
+            if gain(other, fit) > bar.price(other.k - fit.k, len(given.steps)) + CLOSE:
+                return other
+    return _lagging(given, fit, bar)
+
+
+def _lagging(given: Problem, fit: Fit, bar: Bar) -> Fit:
+    """With a lag of each input, as long as the delay of all that was found, where that explains more: they are late by as much, and one
+    delay is found before two lags.
+    """
+    lag = registry().get("effects", "input_lag")
+    for place in fit.added if len(fit.model.inputs) > 1 else ():
+        a = fit.model.effects[place]
+        if name_of(a) != ("input_delay", "*"):
+            continue
+        there = fit.model.effects
+        inputs = [name for name in fit.model.inputs if all(name_of(b) != (lag.name, name) for b in there)]
+        lags = [Added(lag, name, {"time_constant": a.p["delay"]}) for name in inputs]
+        model = replace(fit.model, effects=(*there[:place], *lags, *there[place + 1 :]))
+        if lags and foretold(given, model) is not None:
             other = fitted(given, fit, model)
             if gain(other, fit) > bar.price(other.k - fit.k, len(given.steps)) + CLOSE:
                 return other

@@ -47,7 +47,7 @@ from s2r_runtime.trace.residual import Mask, acting, first_steps, rms, steps_of
 from s2r_runtime.trace.residual_noise import no_colour
 from s2r_runtime.trace.result import Found, Limit, TraceResult
 from s2r_runtime.trace.retimed import dated
-from s2r_runtime.trace.scores import LENIENT, STRICT, names
+from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, names
 from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded, select
 from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.unseen import alike
@@ -199,7 +199,10 @@ def _once_more(
     """
     pair = two_together(given, chosen)
     hidden = pair is not None and not whole.structure(pair).tokens
-    for bar, before, may_be_left in ((STRICT, pair if hidden else None, set()), (LENIENT, chosen, {"noise"})):
+    for bar, before, may_be_left in (
+        (STRICT, pair if hidden else None, set()),
+        (LENIENT if chosen.fit.added else ALONE, chosen, {"noise"}),
+    ):
         if before is None:
             continue
         alone = called_for(given, chosen.nominal.model, ahead, lambda share: None, bar, before)
