@@ -142,7 +142,8 @@ def verdict_of(
     if not chosen.fit.added:
         nothing = away or foretells_nothing(after, given, floors[1])
         return "unexplained" if structure.matters or nothing else "sensor_fault" if faulty else "none"
-    if away or not foretells(after, given, floors[0]) or _withdrawn(chosen.fit, structure) or harms(before, after, floor):
+    by_noise = 0.0 * floors[0] if structure.matters else floors[0]  # what is left was taken for noise, too
+    if away or not foretells(after, given, by_noise) or _withdrawn(chosen.fit, structure) or harms(before, after, floor):
         return "unexplained"
     return "ambiguous" if chosen.rivals else "traced"
 
