@@ -14,7 +14,7 @@ from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.scores import STRICT, best_candidates, names
 from s2r_runtime.trace.selection import Selection, parted
-from s2r_runtime.trace.tracer import _Whole
+from s2r_runtime.trace.whole import Whole
 
 DT, NOISE = 0.05, np.array([0.001, 0.001, 0.003])
 
@@ -48,7 +48,7 @@ def test_a_limit_gets_a_rate_down_of_its_own_where_that_explains_more(rates, tol
 def test_numbers_that_are_a_little_off_elsewhere_are_no_structure():
     """A gain that was fitted to a part: the structure of what it leaves on all of the recording is that of its error."""
     model, data = _recorded(("input_gain", "w", {"gain": 0.8}))
-    whole = _Whole(check(model, data), model, 20)
+    whole = Whole(check(model, data), model, 20)
     off = evaluate(whole.given, _named(model, "input_gain", "w", {"gain": 0.77}))
     found = whole.structure(Selection(whole.nominal, off, 100, (), ()))
     assert (found.matters, found.tokens) == (False, ())
@@ -57,7 +57,7 @@ def test_numbers_that_are_a_little_off_elsewhere_are_no_structure():
 def test_structure_beside_a_number_stays_where_the_number_is_fitted_anew():
     model, data = _recorded(("input_gain", "w", {"gain": 0.8}))
     runs = tuple(replace(run, y=run.y + np.outer(0.02 * np.sin(0.05 * np.arange(len(run.y))), [1.0, 0.0, 0.0])) for run in data.runs)
-    whole = _Whole(check(model, replace(data, runs=runs)), model, 20)
+    whole = Whole(check(model, replace(data, runs=runs)), model, 20)
     off = evaluate(whole.given, _named(model, "input_gain", "w", {"gain": 0.77}))
     found = whole.structure(Selection(whole.nominal, off, 100, (), ()))
     assert found.matters

@@ -8,7 +8,7 @@ from trace_robots import declared, recordings
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace import tracer
+from s2r_runtime.trace import whole
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.shapes import SHAPES
 from s2r_runtime.trace.tracer import trace
@@ -181,8 +181,8 @@ def test_names_are_challenged_where_they_leave_something_and_only_there(physics,
     """What explained more than a name would explain something beside it: where nothing is left, nothing else is fitted."""
     asked = []
     for name in ("better_shape", "best_unnamed", "wanders"):
-        challenge = getattr(tracer, name)
-        monkeypatch.setattr(tracer, name, lambda *of, challenge=challenge: asked.append(challenge) or challenge(*of))
+        challenge = getattr(whole, name)
+        monkeypatch.setattr(whole, name, lambda *of, challenge=challenge: asked.append(challenge) or challenge(*of))
     (data,) = recordings([physics], 1, steps=1200, seed=61)
     found = trace(data, declared())
     assert bool(asked) == left

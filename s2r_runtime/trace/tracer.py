@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
 
 import msgspec
 import numpy as np
@@ -25,20 +24,16 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.begun import begun
-from s2r_runtime.trace.challenge import MORE as SHAPED
-from s2r_runtime.trace.challenge import Better, best_shape, better_shape
 from s2r_runtime.trace.dataset import MOST_PARTS, Dataset, in_finer_parts, thinned
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge, noise_floor
 from s2r_runtime.trace.excitation import advice
 from s2r_runtime.trace.faults import Checked, check
-from s2r_runtime.trace.fields import Field, beats, wanders
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, problem, told, without
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, problem, told, without
 from s2r_runtime.trace.grid_errors import widened
 from s2r_runtime.trace.hidden_pairs import two_together
 from s2r_runtime.trace.holdout import Part, fit_mask, part
-from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, NOTHING, Looks, Structure, best_unnamed, explains_more, lack_of_fit, left_of
-from s2r_runtime.trace.lack_of_fit_judged import Judged, Left
+from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.one_place import from_one_place
 from s2r_runtime.trace.orders import in_either_order
 from s2r_runtime.trace.plausible import check_plausible
@@ -51,7 +46,8 @@ from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, names
 from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded, select
 from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.unseen import alike
-from s2r_runtime.trace.verdict import asked, confirmed, curves_of, final_fit, foretelling, foretold_too, verdict_of, worth_its_risk
+from s2r_runtime.trace.verdict import asked, confirmed, final_fit, foretelling, foretold_too, verdict_of, worth_its_risk
+from s2r_runtime.trace.whole import Whole
 
 __all__ = ["Dataset", "TraceResult", "load_dataset", "trace", "usual_horizon"]
 
@@ -66,15 +62,6 @@ HORIZON_S, HORIZON_STEPS = 1.0, 10
 
 FIT_STEPS = 4000
 """Transitions that a fit uses at most; a parameter that matters is then known to about a per cent."""
-
-STRUCTURE_STEPS = 4000
-"""Transitions that the lack of fit is tested on at most."""
-
-CLEAR = 10.0
-"""Nats from which on a dictionary tells what structure depends on."""
-
-NEARLY = 0.4
-"""Of what effects explain: dictionaries that give less at first look are not judged."""
 
 FOLLOWS = 5.0
 """Standard deviations of the correlation of noise with an input, from which a state goes with the input."""
@@ -154,7 +141,7 @@ def _traced(
         judged_on = _held_out(checked, seen, test, model, horizon)
         given = problem(fit_part.data, fit_part.steps)
         chosen = select(given, model, ahead, lambda share: say(60.0 + 20.0 * share, 100.0, "looking for effects"))
-    whole = _Whole(checked, model, ahead)
+    whole = Whole(checked, model, ahead)
     chosen = foretold_too(given, chosen, judged_on, ahead)
     chosen = confirmed(given, replace(chosen, fit=dated(given, whole.given, chosen.fit)), judged_on)
     say(80.0, 100.0, "testing what is left")
@@ -184,14 +171,14 @@ def _finer(dataset: Dataset, model: ComposedModel, chosen: Selection, ahead: int
     if data is None:
         return None
     checked = check(model, with_history(model, data))
-    whole = _Whole(checked, model, ahead)
+    whole = Whole(checked, model, ahead)
     nominal = whole.nominal
     fit = nominal if not chosen.fit.added else fitted(whole.given, nominal, chosen.fit.model)
     return None if whole.structure(replace(chosen, nominal=nominal, fit=fit)).matters else data.substeps
 
 
 def _once_more(
-    given: Problem, whole: _Whole, chosen: Selection, structure: Structure, judged_on: Held, ahead: int
+    given: Problem, whole: Whole, chosen: Selection, structure: Structure, judged_on: Held, ahead: int
 ) -> tuple[Selection, Structure]:
     """Where structure is left, something is there: two effects together that leave nothing, coloured noise neither (two take up a part of
     anything, and the rest looks like that); or what is found with a lower bar, if that leaves nothing. What was not fitted must be
@@ -217,7 +204,7 @@ def _once_more(
     return chosen, structure
 
 
-def _all_explained(whole: _Whole, other: Selection, chosen: Selection, may_be_left: set[str]) -> Structure | None:
+def _all_explained(whole: Whole, other: Selection, chosen: Selection, may_be_left: set[str]) -> Structure | None:
     """What another selection leaves, if that is no more than may be left; None if it does leave more, or is no other one."""
     if names(other.fit.model) == names(chosen.fit.model) or crowded(other.fit):
         return None
@@ -354,124 +341,6 @@ def _follows(given: Part, model: ComposedModel) -> bool:
     u, y = (e - e.mean(axis=0) for e in (u, y))
     together, apart = np.abs(u.T @ y), np.outer(np.linalg.norm(u, axis=0), np.linalg.norm(y, axis=0))
     return bool(np.any(together > FOLLOWS / math.sqrt(len(y)) * apart + 1e-9))
-
-
-class _Whole:
-    """All of a recording, and what the nominal model leaves of it: a test for structure needs no data that the fit never saw."""
-
-    def __init__(self, checked: Checked, nominal: ComposedModel, horizon: int) -> None:
-        everything = part(checked.data, checked.left_out, np.ones(first_steps(checked.data)[-1], dtype=bool), STRUCTURE_STEPS)
-        self.given = problem(everything.data, everything.steps)
-        self.nominal = evaluate(self.given, nominal)
-        self._horizon = horizon
-        self._known: dict[int, tuple[Fit, Structure]] = {}
-
-    @cached_property
-    def _looks(self) -> Looks:
-        return Looks(left_of(self.given, self.nominal))
-
-    @cached_property
-    def unnamed(self) -> Judged:
-        """`best_unnamed`, for whatever was selected."""
-        return best_unnamed(self._looks)
-
-    def _unnamed_explains_more(self, fit: Fit, left: bool) -> bool:
-        """What at first look comes nowhere near it will not come up to it."""
-        if self._looks.most < NEARLY * gain(fit, self.nominal):
-            return False
-        return explains_more(self._looks, self.unnamed, fit, self._horizon, left=left)
-
-    def structure(self, chosen: Selection) -> Structure:
-        """What the chosen model leaves. It is asked again of a pair that a selection went on from and added nothing to."""
-        fit = chosen.fit
-        if id(fit) not in self._known:
-            self._known[id(fit)] = fit, self._structure(fit)
-        return self._known[id(fit)][1]
-
-    def _structure(self, chosen: Fit) -> Structure:
-        if not chosen.added:
-            return self._of_nominal()
-        fit = evaluate(self.given, chosen.model)
-        fit = fitted(self.given, fit, fit.model, 2)  # numbers of the fit's part are a little off elsewhere: that is no structure
-        looks = Looks(left_of(self.given, fit))
-        found = lack_of_fit(looks, self.nominal, self._horizon)
-        if crowded(fit):
-            return replace(found, tokens=self._looks_like, matters=True, share=1.0)
-        quiet = looks.most <= NOTHING and not found.matters  # what explained more than a name would explain something beside it
-        if quiet and not _twice(fit):
-            return found
-        if (looks.most > ALIKE or found.matters) and self._explained_without(fit, looks.left, found):
-            return replace(found, tokens=self._looks_like, matters=True, share=1.0)
-        if found.matters and _bent(found, fit, self.nominal):
-            return replace(found, share=1.0)
-        better = better_shape(self.given, fit, self._horizon)
-        if better is None:
-            return found
-        if not better.shows:  # the repair is as good, whatever its name
-            return replace(found, tokens=tuple(dict.fromkeys((better.token, *found.tokens))))
-        return replace(found, tokens=(better.token,), matters=True, share=1.0, nameless=True)
-
-    def _of_nominal(self) -> Structure:
-        """What the model as given leaves."""
-        found = lack_of_fit(self._looks, self.nominal, self._horizon)
-        seen = found.matters and not found.for_a_while and not found.varies
-        if seen and self.unnamed.gain > CLEAR:
-            tokens = self._looks_like
-        elif seen and self._field is not None and self._field.beyond > CLEAR:
-            tokens = self._field.tokens  # it was seen by sliding only, which names what it tries
-        else:
-            tokens = () if self._shape is None else (self._shape.token,)
-        named = tuple(dict.fromkeys((*tokens, *found.tokens)))
-        return replace(found, tokens=named, matters=True, share=1.0) if tokens else found
-
-    def _explained_without(self, fit: Fit, left: Left, found: Structure) -> bool:
-        """Whether something without a name explains more than what was named."""
-        if self._unnamed_explains_more(fit, found.matters):
-            return True
-        return not self.given.floor.axes and self._no_name(found, left)
-
-    def _no_name(self, found: Structure, named: Left) -> bool:
-        """Whether a field explains more than what was named, or a push that wanders as much."""
-        if found.varies and self._field is not None and self._field.beyond > 0.0 and beats(self._field, self._looks.left, named):
-            return True
-        return wanders(self._looks.left, named)
-
-    @property
-    def likeliest(self) -> tuple[str, ...]:
-        """What all that the nominal model lacks depends on most, if that is clear."""
-        return self._looks_like if self.unnamed.gain > CLEAR else ()
-
-    @cached_property
-    def _looks_like(self) -> tuple[str, ...]:
-        """What all that the nominal model lacks depends on most: by the best dictionary, or by a shape or a field that does better."""
-        token, nats = self.unnamed.token, self.unnamed.gain
-        if self._shape is not None and self._shape.nats >= MORE * nats + ALIKE:
-            token, nats = self._shape.token, self._shape.nats
-        return self._field.tokens if self._field is not None and self._field.nats > nats + CLEAR else (token,)
-
-    @property
-    def _field(self) -> Field | None:
-        """The field that explains most of it."""
-        return self._looks.field
-
-    @cached_property
-    def _shape(self) -> Better | None:
-        """The shape that explains most of it."""
-        return best_shape(self.given, self.nominal, self._horizon)
-
-
-def _twice(fit: Fit) -> bool:
-    """Whether two effects were named on one input: they may be one thing that has no name, and leave nothing of it."""
-    channels = [fit.model.effects[i].channel for i in fit.added if fit.model.effects[i].effect.stage == "input"]
-    return len({*channels}) < len(channels)
-
-
-def _bent(found: Structure, best: Fit, nominal: Fit) -> bool:
-    """Whether what is left goes with the very position or speed that a named effect goes with, by as large a part of what was explained as
-    that by which a shape must be better to win (`challenge`): then it is another curve. A spring is not what gravity does to a link.
-    """
-    left = max((nats for token, nats in found.gains.items() if token in found.tokens and token in curves_of(best)), default=0.0)
-    return left > SHAPED * max(gain(best, nominal), 0.0)
 
 
 def _new(fit: Fit, other: Fit) -> list[int]:

@@ -1,0 +1,148 @@
+"""All of a recording under a model: what is left in it, and whether something without a name explains that better than what was named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace.challenge import MORE as SHAPED
+from s2r_runtime.trace.challenge import Better, best_shape, better_shape
+from s2r_runtime.trace.faults import Checked
+from s2r_runtime.trace.fields import Field, beats, wanders
+from s2r_runtime.trace.fitting import Fit, evaluate, fitted, gain, problem
+from s2r_runtime.trace.holdout import part
+from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, NOTHING, Looks, Structure, best_unnamed, explains_more, lack_of_fit, left_of
+from s2r_runtime.trace.lack_of_fit_judged import Judged, Left
+from s2r_runtime.trace.residual import first_steps
+from s2r_runtime.trace.selection import Selection, crowded
+from s2r_runtime.trace.verdict import curves_of
+
+STRUCTURE_STEPS = 4000
+"""Transitions that the lack of fit is tested on at most."""
+
+CLEAR = 10.0
+"""Nats from which on a dictionary tells what structure depends on."""
+
+NEARLY = 0.4
+"""Of what effects explain: dictionaries that give less at first look are not judged."""
+
+
+class Whole:
+    """All of a recording, and what the nominal model leaves of it: a test for structure needs no data that the fit never saw."""
+
+    def __init__(self, checked: Checked, nominal: ComposedModel, horizon: int) -> None:
+        everything = part(checked.data, checked.left_out, np.ones(first_steps(checked.data)[-1], dtype=bool), STRUCTURE_STEPS)
+        self.given = problem(everything.data, everything.steps)
+        self.nominal = evaluate(self.given, nominal)
+        self._horizon = horizon
+        self._known: dict[int, tuple[Fit, Structure]] = {}
+
+    @cached_property
+    def _looks(self) -> Looks:
+        return Looks(left_of(self.given, self.nominal))
+
+    @cached_property
+    def unnamed(self) -> Judged:
+        """`best_unnamed`, for whatever was selected."""
+        return best_unnamed(self._looks)
+
+    def _unnamed_explains_more(self, fit: Fit, left: bool) -> bool:
+        """What at first look comes nowhere near it will not come up to it."""
+        if self._looks.most < NEARLY * gain(fit, self.nominal):
+            return False
+        return explains_more(self._looks, self.unnamed, fit, self._horizon, left=left)
+
+    def structure(self, chosen: Selection) -> Structure:
+        """What the chosen model leaves. It is asked again of a pair that a selection went on from and added nothing to."""
+        fit = chosen.fit
+        if id(fit) not in self._known:
+            self._known[id(fit)] = fit, self._structure(fit)
+        return self._known[id(fit)][1]
+
+    def _structure(self, chosen: Fit) -> Structure:
+        if not chosen.added:
+            return self._of_nominal()
+        fit = evaluate(self.given, chosen.model)
+        fit = fitted(self.given, fit, fit.model, 2)  # numbers of the fit's part are a little off elsewhere: that is no structure
+        looks = Looks(left_of(self.given, fit))
+        found = lack_of_fit(looks, self.nominal, self._horizon)
+        if crowded(fit):
+            return replace(found, tokens=self._looks_like, matters=True, share=1.0)
+        quiet = looks.most <= NOTHING and not found.matters  # what explained more than a name would explain something beside it
+        if quiet and not _twice(fit):
+            return found
+        if (looks.most > ALIKE or found.matters) and self._explained_without(fit, looks.left, found):
+            return replace(found, tokens=self._looks_like, matters=True, share=1.0)
+        if found.matters and _bent(found, fit, self.nominal):
+            return replace(found, share=1.0)
+        better = better_shape(self.given, fit, self._horizon)
+        if better is None:
+            return found
+        if not better.shows:  # the repair is as good, whatever its name
+            return replace(found, tokens=tuple(dict.fromkeys((better.token, *found.tokens))))
+        return replace(found, tokens=(better.token,), matters=True, share=1.0, nameless=True)
+
+    def _of_nominal(self) -> Structure:
+        """What the model as given leaves."""
+        found = lack_of_fit(self._looks, self.nominal, self._horizon)
+        seen = found.matters and not found.for_a_while and not found.varies
+        if seen and self.unnamed.gain > CLEAR:
+            tokens = self._looks_like
+        elif seen and self._field is not None and self._field.beyond > CLEAR:
+            tokens = self._field.tokens  # it was seen by sliding only, which names what it tries
+        else:
+            tokens = () if self._shape is None else (self._shape.token,)
+        named = tuple(dict.fromkeys((*tokens, *found.tokens)))
+        return replace(found, tokens=named, matters=True, share=1.0) if tokens else found
+
+    def _explained_without(self, fit: Fit, left: Left, found: Structure) -> bool:
+        """Whether something without a name explains more than what was named."""
+        if self._unnamed_explains_more(fit, found.matters):
+            return True
+        return not self.given.floor.axes and self._no_name(found, left)
+
+    def _no_name(self, found: Structure, named: Left) -> bool:
+        """Whether a field explains more than what was named, or a push that wanders as much."""
+        if found.varies and self._field is not None and self._field.beyond > 0.0 and beats(self._field, self._looks.left, named):
+            return True
+        return wanders(self._looks.left, named)
+
+    @property
+    def likeliest(self) -> tuple[str, ...]:
+        """What all that the nominal model lacks depends on most, if that is clear."""
+        return self._looks_like if self.unnamed.gain > CLEAR else ()
+
+    @cached_property
+    def _looks_like(self) -> tuple[str, ...]:
+        """What all that the nominal model lacks depends on most: by the best dictionary, or by a shape or a field that does better."""
+        token, nats = self.unnamed.token, self.unnamed.gain
+        if self._shape is not None and self._shape.nats >= MORE * nats + ALIKE:
+            token, nats = self._shape.token, self._shape.nats
+        return self._field.tokens if self._field is not None and self._field.nats > nats + CLEAR else (token,)
+
+    @property
+    def _field(self) -> Field | None:
+        """The field that explains most of it."""
+        return self._looks.field
+
+    @cached_property
+    def _shape(self) -> Better | None:
+        """The shape that explains most of it."""
+        return best_shape(self.given, self.nominal, self._horizon)
+
+
+def _twice(fit: Fit) -> bool:
+    """Whether two effects were named on one input: they may be one thing that has no name, and leave nothing of it."""
+    channels = [fit.model.effects[i].channel for i in fit.added if fit.model.effects[i].effect.stage == "input"]
+    return len({*channels}) < len(channels)
+
+
+def _bent(found: Structure, best: Fit, nominal: Fit) -> bool:
+    """Whether what is left goes with the very position or speed that a named effect goes with, by as large a part of what was explained as
+    that by which a shape must be better to win (`challenge`): then it is another curve. A spring is not what gravity does to a link.
+    """
+    left = max((nats for token, nats in found.gains.items() if token in found.tokens and token in curves_of(best)), default=0.0)
+    return left > SHAPED * max(gain(best, nominal), 0.0)
