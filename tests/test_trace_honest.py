@@ -14,11 +14,13 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import held, judge, noise_floor
 from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
-from s2r_runtime.trace.lack_of_fit import Structure
+from s2r_runtime.trace.lack_of_fit import Structure, _weight_of, left_of
+from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.residual_noise import MEMORIES
-from s2r_runtime.trace.tracer import _bent, trace
+from s2r_runtime.trace.tracer import trace
 from s2r_runtime.trace.verdict import curves_of, foretells_nothing
+from s2r_runtime.trace.whole import _bent
 
 STEPS = 700
 GAIN = [("input_gain", "w", {"gain": 0.75})]
@@ -123,6 +125,26 @@ def test_columns_that_are_not_what_they_say_get_no_effect_for_an_explanation(spo
     found = trace(from_arrays(declared(), [(y, u)]), declared())
     assert found.verdict == "unexplained"
     assert found.effects == ()
+
+
+@pytest.mark.parametrize(("beyond", "said"), [(0.0, False), (0.06, True)])
+def test_digits_that_rounding_cuts_off_are_no_structure_and_more_than_these_is(beyond, said):
+    """Wheels that turn as commanded and are told in coarse steps: what is cut off goes with the command. beyond: rad/s that one of them
+    turns faster or slower than commanded.
+    """
+    rng = np.random.default_rng(44)
+    u = np.clip(2.0 * np.sin(0.05 * np.arange(500)[:, None] + [0.0, 1.0]), -1.04, 1.04)  # as fast as it may, and what is between
+    turned = np.vstack([np.zeros(2), u + beyond * np.sign(np.sin(9.0 * u[:, :1])) * [1.0, 0.0]])
+    model = compose(ModelSpec("differential_drive", 0.1, {"wheel_radius": 0.1, "track": 0.5}))
+    y = np.column_stack([rng.normal(size=(501, 3)), 0.1 * np.rint((turned + 1e-4 * rng.normal(size=(501, 2))) / 0.1)])
+    data = from_arrays(model, [(y, u)])
+    given = problem(data, steps_of(data))
+    fit = evaluate(given, model)
+    left = left_of(given, fit)
+    x = np.zeros((500, 5, 1))
+    x[:, 3, 0] = left.r[:, 3]
+    told = Judged("cmd_left", x, 100.0, 1.0, np.ones((BLOCKS, 1)))
+    assert _weight_of(left, fit, told, 10)[0] == said
 
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])

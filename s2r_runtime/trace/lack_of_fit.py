@@ -33,7 +33,7 @@ from s2r_runtime.trace.fitting import Fit, Problem
 from s2r_runtime.trace.fitting import gain as explained
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, SLOWLY, Judged, Left, first_look, judge, leading
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
-from s2r_runtime.trace.residual import acting, covered, residual, rms, rollout, rollout_starts, state_jacobian
+from s2r_runtime.trace.residual import Mask, acting, covered, residual, rms, rollout, rollout_starts, state_jacobian
 from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
 
 Array = NDArray[np.float64]
@@ -83,6 +83,9 @@ TOKENS = {"wave": "time"}
 
 MOST_GROUPS = 3
 """Groups that are named at most."""
+
+ROUNDED, SLACK = 0.99, 0.05
+"""Share of a state's rows that must lie within half the step of its rounding, and how much more that may be: it is known from digits."""
 
 VANISHING = 1e-24
 """Mean square of a term that is none."""
@@ -338,12 +341,25 @@ def _weight_of(left: Left, nominal: Fit, judged: Judged, horizon: int, least: fl
     lacks it is.
     """
     matters, worst, share = False, 1.0 + MATTERS, 0.0
+    told = ~_to_their_rounding(left)
     for before, now, after in _rollouts(left, nominal, judged, horizon):
-        for b, n, a in zip(before, now, after, strict=True):
+        for b, n, a in zip(before[told], now[told], after[told], strict=True):
             matters = matters or bool(n > least * a)
             if a > 0.0 and max(b, n) > worst * a:
                 worst, share = max(b, n) / a, max(n * n - a * a, 0.0) / max(b * b - a * a, n * n - a * a)
     return matters, share
+
+
+def _to_their_rounding(left: Left) -> Mask:
+    """(nx,) whether a state that an input sets is foretold to half the step in which it is rounded: what is left goes with the input, as
+    the digits that rounding cuts off do. Of others the next value depends on the last one's rounding, too.
+    """
+    model, steps = left.fit.model, left.given.steps
+    found = np.zeros(left.r.shape[1], dtype=bool)
+    for j in [model.states.index(state) for state in getattr(model.nominal, "reached", {}) if state in model.states]:
+        step = noises.quantum(steps.y0[:, j], steps.y1[:, j])
+        found[j] = step > 0.0 and float(np.quantile(np.abs(left.r[:, j]), ROUNDED)) <= 0.5 * step * (1.0 + SLACK)
+    return found
 
 
 def _rollouts(left: Left, other: Fit, judged: Judged, horizon: int) -> Iterator[tuple[Array, Array, Array]]:
