@@ -18,6 +18,7 @@ from s2r_runtime.trace.lack_of_fit import Structure, _weight_of, left_of
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.residual_noise import MEMORIES
+from s2r_runtime.trace.selection import significant
 from s2r_runtime.trace.tracer import trace
 from s2r_runtime.trace.verdict import curves_of, foretells_nothing
 from s2r_runtime.trace.whole import _bent
@@ -145,6 +146,25 @@ def test_digits_that_rounding_cuts_off_are_no_structure_and_more_than_these_is(b
     x[:, 3, 0] = left.r[:, 3]
     told = Judged("cmd_left", x, 100.0, 1.0, np.ones((BLOCKS, 1)))
     assert _weight_of(left, fit, told, 10)[0] == said
+
+
+def test_what_one_step_alone_says_is_no_effect():
+    """The wheels are where the command was before its largest change, in the one row that was stamped at that very moment."""
+    rng = np.random.default_rng(45)
+    u = np.repeat(rng.uniform(-3.0, 3.0, (20, 2)), 12, axis=0)
+    u[120:132, 0], u[132:144, 0] = -4.0, 4.0
+    model = compose(ModelSpec("differential_drive", 0.02, {"wheel_radius": 0.1, "track": 0.5}))
+    x = np.zeros((241, 5))
+    for k, asked in enumerate(u):
+        x[k + 1] = model.step(x[k : k + 1], asked[None, :], model.at_rest(1))[0][0]
+    y = x + rng.normal(size=x.shape) * [1e-3, 1e-3, 1e-3, 0.01, 0.01]
+    y[133, 3] = y[132, 3]
+    given = problem(from_arrays(model, [(y, u)]), steps_of(from_arrays(model, [(y, u)])))
+    base = evaluate(given, model)
+    limit = AppliedEffect(registry().get("effects", "input_rate_limit"), "cmd_left", {"rate": 300.0})
+    fit = fitted(given, base, insert(model, limit, 0))
+    assert gain(fit, base) > 100.0
+    assert not significant(given, fit, base, 100)
 
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])

@@ -218,9 +218,14 @@ def _happens(given: Problem, fit: Fit) -> bool:
 
 
 def significant(given: Problem, fit: Fit, base: Fit, tried: int, bar: Bar = STRICT, ahead: float = 0.0) -> bool:
-    """Beyond chance, everything tried paid for; the gain shrunk by how much more than white noise the scores of blocks scatter."""
+    """Beyond chance, everything tried paid for, and not by one step alone: that may be the error of a stamp. The gain shrunk by how
+    much more than white noise the scores of blocks scatter.
+    """
     needed = bar.needed(tried, fit.k - base.k, len(given.steps))
     reached = gain(fit, base) + ahead
+    each = noises.log_density(fit.z).sum(axis=1) - noises.log_density(base.z).sum(axis=1)
+    if reached - max(float(np.max(each, initial=0.0)), 0.0) <= needed:
+        return False
     if reached > needed and not _beyond_wandering(given, fit, base, needed - ahead):
         return False
     if reached <= needed or reached > WIDEST**2 * needed or not fit.free:
