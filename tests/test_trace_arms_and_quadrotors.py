@@ -117,6 +117,26 @@ def test_what_friction_holds_on_links_takes_a_few_rounds_and_only_of_the_rows_th
     assert np.allclose(held.step(x, u, held.at_rest(1000))[0], found, rtol=0.0, atol=1e-9)
 
 
+def test_six_links_that_stick_and_slip_in_turn_come_to_rest(monkeypatch):
+    """Steps that go on to where sweeps seem to end would go round for ever where links change between sticking and slipping."""
+    monkeypatch.setattr(forces, "SWEEPS", 400)
+    rng, n, links = np.random.default_rng(6), 1000, 6
+    turned = np.cumsum(rng.uniform(-3.0, 3.0, (n, links)), axis=1)
+    beyond = np.arange(links)[:, None] <= np.arange(links)  # each link carries those after it
+    reach = np.stack([-np.sin(turned), np.cos(turned)], axis=1)  # (n, 2, links) of a link of 1 m
+    bodies = [np.einsum("nak,jk->naj", reach[:, :, : b + 1], beyond[:, : b + 1]) for b in range(links)]
+    mass = sum(m * np.einsum("nai,naj->nij", jacobian, jacobian) for m, jacobian in zip(rng.uniform(0.5, 2.0, links), bodies, strict=True))
+    w = np.linalg.inv(mass + 0.05 * np.eye(links))
+    speeds = [np.where(rng.random(n) < 0.5, 0.0, 0.1 * rng.normal(size=n)) for _ in range(links)]
+    given = [5.0 * rng.normal(size=n) for _ in range(links)]
+    pushes = [forces.Push(np.zeros(n), (0.1 * w[:, i, i],) * 2, (2.0 * w[:, i, i],) * 2, None) for i in range(links)]
+    found = forces._swept(speeds, given, pushes, w, 0.01)[0]
+    for i in range(links):
+        drive = given[i] + sum(w[:, i, j] * found[j] for j in range(links) if j != i)
+        again = ((forces._glide(speeds[i], drive, pushes[i], 0.01)[0] - speeds[i]) / 0.01 - drive) / w[:, i, i]
+        assert np.max(np.abs(again - found[i])) < 1e-6 * np.max(np.abs(found))
+
+
 def test_friction_in_the_joints_of_an_arm_is_named(tmp_path):
     model, rng = _model(tmp_path, ARM), np.random.default_rng(1)
     f, size, phase = rng.uniform(0.2, 0.9, (2, 3)), rng.uniform(0.2, 0.5, (2, 3)), rng.uniform(0.0, 6.0, (2, 3))

@@ -7,6 +7,7 @@ import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.trace import constancy
 from s2r_runtime.trace.constancy import ALPHA, TOLD, _recently, uneven
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
@@ -84,6 +85,13 @@ def test_what_wanders_is_no_number_that_varies():
         y[:, 2] += DT * np.cumsum(load)
         found.append(uneven(_of(y, u)))
     assert sum(one is not None and one.sure for one in found) <= 1
+
+
+def test_what_the_same_residual_shows_when_slid_along_the_recording_is_not_sure(monkeypatch):
+    monkeypatch.setattr(constancy, "margin", lambda *of: -1.0)
+    found = uneven(_left(np.random.default_rng(1), 700, lambda x, v, w: 0.75 + 0.5 * (v - 0.3)))
+    assert found is not None
+    assert not found.sure
 
 
 def test_what_an_input_recently_was_begins_anew_with_each_run():

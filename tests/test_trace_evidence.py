@@ -211,6 +211,8 @@ def test_the_step_of_rounding_is_found_or_there_is_none():
         assert quantum(column[:-1], column[1:]) == 0.0
     turning = np.cumsum(-0.03 + 1e-4 * rng.normal(size=500))  # as fast as it can
     assert quantum(turning[:-1], turning[1:]) == 0.0
+    ticking = 0.0123 * np.floor(0.98 * np.arange(500))  # about one tick a step
+    assert quantum(ticking[:-1], ticking[1:]) == pytest.approx(0.0123, rel=1e-6)
 
 
 @pytest.mark.parametrize("begin", [0.0, 1.7e9], ids=["from zero", "since 1970"])

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from test_trace_for_a_while import DT, _held
 
+from s2r_runtime.effects.input_effect import InputEffect
+from s2r_runtime.hookspecs import Parameter
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
@@ -14,6 +16,7 @@ from s2r_runtime.trace.coarse import FEW, coarse, coarser
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.hidden_pairs import TAKEN, _nats, _together, two_together
+from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.scores import names
 from s2r_runtime.trace.screening import probes_of, screen
@@ -153,6 +156,30 @@ def test_an_effect_of_the_tracers_is_at_the_place_at_which_it_was_looked_at():
     for s in screen(given, evaluate(given, model), candidates(model, given.data))[0]:
         place = s.candidate.place if s.candidate.replaced < 0 else s.candidate.replaced
         assert (s.start.effects[place].effect.name, s.start.effects[place].channel) == (s.candidate.name, s.candidate.channel)
+
+
+def test_a_sine_of_other_parameters_begins_as_it_says():
+    """Somebody's own effect with a frequency and a phase, and a share instead of an amplitude."""
+
+    class Ripple(InputEffect):
+        """u_act = u (1 + share sin(2 pi frequency t + phase))."""
+
+        name = "ripple"
+        parameters = (
+            Parameter("frequency", "Hz", 0.0, 100.0),
+            Parameter("share", "", 0.0, 1.0, neutral=0.0),
+            Parameter("phase", "rad", -10.0, 10.0),
+        )
+
+        def act(self, u, p):
+            return u * (1.0 + p["share"] * np.sin(np.arange(len(u))[:, None] + p["phase"]))
+
+        def starts_from_residual(self, residual, t, pushes, model, channel, dt):
+            return [{"frequency": 1.0, "share": 0.1, "phase": 0.5}]
+
+    given, model = _drive(JOINT, [], _held(np.random.default_rng(29), 200, [-1.0], [1.0]), 1e-3)
+    (found,) = Leftover(given, evaluate(given, model)).starts(Ripple(), "force")
+    assert found["frequency"] == 1.0
 
 
 def test_a_limit_that_is_hardly_met_is_begun_from_near_it():

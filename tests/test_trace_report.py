@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,15 @@ def _data(verdict):
 def results():
     """verdict -> result."""
     return {verdict: trace(_data(verdict), UNICYCLE) for verdict in VERDICTS}
+
+
+def test_what_no_rollout_shows_is_told_beside_a_name_and_takes_nothing_from_it(results):
+    r = replace(results["traced"], depends_on=("w",), may_depend_on=("w",))
+    assert r.text().splitlines()[0].endswith("explain what was left over")
+    assert "still there nothing beyond noise" in r.text()
+    assert "may depend on w" in " ".join(r.text().split())
+    assert r.to_json()["may_depend_on"] == ["w"]
+    assert "what it may depend on" in trace_page(r)
 
 
 @pytest.fixture(scope="module")

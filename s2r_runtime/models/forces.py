@@ -245,7 +245,8 @@ def _pushed_together(x: Array, u: Array, x_next: Array, model: BoundModel, pushi
 def _swept(speeds: list[Array], given: list[Array], pushes: list[Push], w: Array, h: float) -> tuple[Array, list[tuple[Array, Array]]]:
     """Mean force of the pushes on each axis over h seconds, (axes, n), and each axis' speed then with the way made, all at once. Rows that
     are done are swept no more: most are after two or three. In others, where friction holds links against each other, each sweep leaves
-    the same share of what the last one changed: every second one goes on to where that ends (A. Aitken, Proc. R. Soc. Edinburgh 46, 1926).
+    the same share of what the last one changed: every second one of the first half goes on to where that ends (A. Aitken, Proc. R. Soc.
+    Edinburgh 46, 1926).
     """
     forces = np.zeros((len(speeds), len(speeds[0])))
     moved = [(v, v) for v in speeds]
@@ -271,7 +272,7 @@ def _swept(speeds: list[Array], given: list[Array], pushes: list[Push], w: Array
             w, pushes = w[changing], [_rows(push, changing) for push in pushes]
             speeds, given = [v[changing] for v in speeds], [g[changing] for g in given]
             now, changed, last = now[:, changing], changed[:, changing], last[:, changing]
-        if sweep % 2:
+        if sweep % 2 and sweep < SWEEPS // 2:  # where links go on changing between stick and slip, steps so long never end
             share = np.sum(changed * last, axis=0) / np.maximum(np.sum(last**2, axis=0), 1e-300)
             share = np.clip(share, 0.0, LEFT)
             now = now + share / (1.0 - share) * changed

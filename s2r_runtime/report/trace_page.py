@@ -73,10 +73,12 @@ def _what_is_left(page: Page, r: TraceResult) -> None:
     tokens = [t for t in r.depends_on if t != "noise"]
     if not tokens:
         return
-    page.heading("What is left, and what it depends on")
+    sure = not {*tokens} <= {*r.may_depend_on}
+    page.heading(f"What is left, and what it {'depends' if sure else 'may depend'} on")
+    why = "has no name, because no effect in the library has this shape." if sure else "is so small that no rollout shows it."
     page.text(
-        "Means of the one-step residual on held-out data in bins of what it depends on, with their 95 % intervals. The shape is shown; it"
-        " has no name, because no effect in the library has this shape."
+        "Means of the one-step residual on held-out data in bins of what it depends on, with their 95 % intervals. The shape is shown; it "
+        + why
     )
     # what is left went into the estimate of the noise too: shares are of all that is left, noise included
     steps = [r.before.one_step, r.after.one_step, 0.0 * r.floor[0]]

@@ -72,7 +72,7 @@ def headline(r: TraceResult) -> str:
         return f"these data cannot decide between {1 + len(r.rivals)} explanations; the best is"
     if r.effects:
         count = len(r.effects)
-        all_of_it = not r.depends_on and not _away(r, r.after.ends, FAR_OFF)
+        all_of_it = not _shown(r) and not _away(r, r.after.ends, FAR_OFF)
         explain = f"{'explains' if count == 1 else 'explain'} {'what' if all_of_it else 'a part of what'} was left over"
         return f"the model lacks {'one effect' if count == 1 else f'{count} effects'}, which {explain}"
     return WANDERS if r.verdict == "none" and _wanders(r) else HEADLINES[r.verdict]
@@ -196,17 +196,28 @@ def _gap(r: TraceResult) -> list[str]:
     return lines
 
 
+def _shown(r: TraceResult) -> tuple[str, ...]:
+    """Of what is left, what it depends on beyond doubt."""
+    return tuple(token for token in r.depends_on if token not in r.may_depend_on)
+
+
 def _still_there(r: TraceResult) -> list[str]:
+    """What is left for sure, and what may be."""
+    beside = [f"no rollout shows it, but something may depend on {', '.join(r.may_depend_on)}: look at the name again"]
+    return [*_beyond_doubt(r), *(beside if r.may_depend_on else [])]
+
+
+def _beyond_doubt(r: TraceResult) -> list[str]:
     away = _away(r, r.after.ends, FAR_OFF)
-    if not r.depends_on:
+    if not _shown(r):
         if r.verdict == "unexplained":
             return ["structure; what it depends on cannot be told"]
         return [f"what no input and no state foretells: {away}"] if away else ["nothing beyond noise"]
-    if r.depends_on == ("noise",):
+    if _shown(r) == ("noise",):
         return ["coloured noise: correlated in time, whatever the inputs do", *([away] if away else [])]
     percent = f"{100.0 * r.share_left:.0f} %" if r.share_left >= 0.01 else "under 1 %"
     much = f" ({percent} of what the model lacked)" if r.effects else ""
-    lines = [f"structure{much} that depends on {', '.join(r.depends_on)}"]
+    lines = [f"structure{much} that depends on {', '.join(_shown(r))}"]
     return [*lines, "its shape is on the page that --report FILE.html writes"] if r.verdict == "unexplained" else lines
 
 

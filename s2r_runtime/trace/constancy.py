@@ -8,7 +8,8 @@ z what is left, terms are offered in which a number p varies along a coordinate 
 and whether b = 0 is asked by their scores, less what other numbers do as well (efficient scores, C. Rao, 1948; of numbers that vary: J.
 Nyblom, JASA 84, 1989; B. Hansen, Journal of Policy Modeling 14, 1992). The sum of the first m squares is chi-square with m degrees; of
 m = 1 to WAVES the least likely counts (J. Neyman, 1937; T. Ledwina, JASA 89, 1994), all that was tried paid for (Bonferroni), and under
-variances over blocks of time of what is left beside them (H. White, 1980), too.
+variances over blocks of time of what is left beside them (H. White, 1980), too. What is sure is also beyond the same residual slid along
+the recording.
 """
 
 from __future__ import annotations

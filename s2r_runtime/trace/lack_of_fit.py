@@ -100,7 +100,8 @@ class Structure:
 
     share: part of all that the nominal model lacks which is still left (0 where there is nothing). gains: nats by group. nameless: what
     was named looks more like something that has no name (`challenge`). for_a_while: it comes and goes (`episodes`). varies: it is a
-    field (`fields`). noise: what would be left beside the structure, and its colour; None where there is none that matters.
+    field (`fields`). beside: what it may depend on besides, which no rollout shows. noise: what would be left beside the structure, and
+    its colour; None where there is none that matters.
     """
 
     tokens: tuple[str, ...]
@@ -110,6 +111,7 @@ class Structure:
     nameless: bool = False
     for_a_while: bool = False
     varies: bool = False
+    beside: tuple[str, ...] = ()
     noise: tuple[Noise, Colour] | None = None
 
     @property
@@ -150,7 +152,7 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     windows = None if chosen else windows or _for_a_while(left)
     matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
     if windows is None or not matters:  # a number that may vary is told with the name, if no rollout shows it
-        return Structure((*(() if varying is None else (varying.judged.token,)), *coloured), False, 0.0, gains)
+        return Structure(coloured, False, 0.0, gains, beside=() if varying is None else (varying.judged.token,))
     return Structure(may_depend_on(left, windows, found), True, share, gains, for_a_while=True, noise=_beside(left, windows))
 
 

@@ -21,6 +21,9 @@ Array = NDArray[np.float64]
 NUDGE = 1e-4
 """Of an input's size, for differences: small against what bends, large against rounding."""
 
+WAVE = {"frequency", "amplitude", "phase"}
+"""Parameters of what adds a sine to an input."""
+
 
 @dataclass(frozen=True)
 class Leftover:
@@ -35,7 +38,7 @@ class Leftover:
         if not hasattr(effect, "starts_from_residual") or channel not in {*model.inputs, "*"}:  # a state has no input that pushes
             return []
         pushes = self._pushes(channel, proportional=bool(getattr(effect, "proportional", False)))
-        wave = {"frequency", "phase"} <= {p.name for p in effect.parameters}
+        wave = {p.name for p in effect.parameters} >= WAVE
         if self.given.floor.axes or wave:
             # whitened, a push is felt for long after, a sine at another phase: its score at every step is p' S^-1 r, its size is told apart
             pulled = self.fit.whiten.back(self.fit.z * noises.weight(self.fit.z))
@@ -45,7 +48,8 @@ class Leftover:
 
     def _sized(self, effect: Effect, channel: str, p: dict[str, Any], pushes: Array) -> dict[str, Any]:
         """The same as large as it explains most: by least squares of what it changes, a sine's phase being free."""
-        if "phase" in p:
+        wave = {*p} >= WAVE
+        if wave:
             angle = math.tau * float(p["frequency"]) * (self.given.steps.t + 0.5 * self.fit.model.dt) + float(p["phase"])
             waves = float(p["amplitude"]) * np.stack([np.sin(angle), np.cos(angle)], axis=1)
             columns = self.fit.whiten(pushes[:, :, None] * waves[:, None, :]).reshape(-1, 2)
@@ -53,11 +57,11 @@ class Leftover:
             columns = self._changed(effect, channel, p).reshape(-1, 1)
         size = np.linalg.lstsq(columns, self.fit.z.ravel(), rcond=None)[0]
         sized = dict(p)
-        if "phase" in p:
+        if wave:
             sized["phase"] = math.remainder(float(p["phase"]) + math.atan2(float(size[1]), float(size[0])), math.tau)
         for bounds in effect.parameters:
             if bounds.neutral is not None and isinstance(p.get(bounds.name), float):
-                share = float(np.hypot(*size)) if "phase" in p else float(size[0])
+                share = float(np.hypot(*size)) if wave else float(size[0])
                 sized[bounds.name] = float(np.clip(bounds.neutral + share * (p[bounds.name] - bounds.neutral), bounds.low, bounds.high))
         return sized
 

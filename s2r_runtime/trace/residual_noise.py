@@ -54,8 +54,10 @@ ENOUGH = 6000
 """Steps from which Q and R are estimated at most; their relative error is then about 2 %."""
 
 
-ROUNDED = 10
-"""Changes of a state that must be whole multiples of the smallest one before it counts as rounded."""
+ROUNDED, DIGITS = 10, 1e-3
+"""Changes of a state that must be whole multiples of the smallest one before it counts as rounded; and how far from one another those of
+one step of rounding are, of themselves, by the digits that are written: what a robot does lies farther apart.
+"""
 
 
 @dataclass(frozen=True)
@@ -341,7 +343,7 @@ def quantum(before: Array, after: Array) -> float:
     """The step in which a measured state is rounded; 0 if it is not. (n,) at the start and at the end of steps, angles unwrapped.
 
     An angle that was rounded within a turn is rounded afresh where it passes the turn's end, at pi or at zero: that change is no multiple.
-    Changes that are nearly all as large as one another are no steps of rounding: a robot turns as fast as it can.
+    Changes that are nearly all about as large, but not as digits are, are no steps of rounding: a robot turns as fast as it can.
     """
     change = after - before
     afresh = (np.floor(before / math.pi) != np.floor(after / math.pi)) & (np.abs(change) < math.pi)
@@ -351,5 +353,5 @@ def quantum(before: Array, after: Array) -> float:
     least = float(np.min(sizes))
     sizes = sizes[sizes < 1000.0 * least] / least
     whole = np.abs(sizes - np.rint(sizes)) < 0.02
-    alike = np.rint(np.abs(change) / least) == 1.0
-    return least if len(sizes) >= ROUNDED and np.mean(whole) > 0.95 and np.mean(alike) < 0.95 else 0.0
+    alike = np.mean(np.rint(np.abs(change) / least) == 1.0) >= 0.95 and float(np.quantile(sizes, 0.9)) > 1.0 + DIGITS
+    return least if len(sizes) >= ROUNDED and np.mean(whole) > 0.95 and not alike else 0.0

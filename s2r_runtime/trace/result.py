@@ -61,6 +61,8 @@ class TraceResult:
     """States of the model that were not measured, and that its motion does not need."""
     unconfirmed: tuple[tuple[str, str], ...] = ()
     """Name and channel of effects that what was held out never asks for: the fit alone speaks for them."""
+    may_depend_on: tuple[str, ...] = ()
+    """Of `depends_on`, beside a name: what no rollout shows, or what is less sure."""
 
     def same(self, found: Found) -> tuple[Found, ...]:
         """Of `ambiguous_with`: other names of the very same thing on this model."""
@@ -126,6 +128,7 @@ class TraceResult:
             "ambiguous_with": [{**e.to_json(), "same_thing": e in alike} for e in self.ambiguous_with],
             "partial": [e.to_json() for e in self.partial],
             "depends_on": list(self.depends_on),
+            "may_depend_on": list(self.may_depend_on),
             "suggested_excitation": self.suggested_excitation,
             "error": {
                 "unit": {s: units.get(s, "") for s in states},

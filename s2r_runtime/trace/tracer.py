@@ -151,7 +151,8 @@ def _traced(
     if structure.matters and parts == MOST_PARTS:
         finer = _finer(dataset, model, chosen, ahead)
         if finer is not None:
-            return _traced(as_recorded[0], asked, as_recorded[1], horizon, seed, say, norm, finer)
+            once_more = lambda done, total, detail: say(80.0 + 0.2 * done, total, detail)  # noqa: E731
+            return _traced(as_recorded[0], asked, as_recorded[1], horizon, seed, once_more, norm, finer)
     say(90.0, 100.0, "judging on held-out data")
     w = np.ones(len(model.states)) if weights is None else np.array([weights[asked.states.index(s)] for s in model.states])
     result = _result(dataset, checked, given, chosen, structure, judged_on, seed, w, kind)
@@ -196,7 +197,8 @@ def _once_more(
         rest = _all_explained(whole, alone, chosen, may_be_left)
         if rest is None:  # as it mostly is: no need to ask for rivals
             continue
-        other = confirmed(given, against_rivals(given, alone, bar), judged_on)
+        other = against_rivals(given, alone, bar)
+        other = confirmed(given, replace(other, fit=dated(given, whole.given, other.fit)), judged_on)
         if other.fit is not alone.fit:
             rest = _all_explained(whole, other, chosen, may_be_left)
         if rest is not None and foretelling(judged_on, [chosen.fit, other.fit])[1] >= 0.0:
@@ -255,7 +257,8 @@ def _result(
         partial=() if final is chosen.fit else tuple(_found(model, chosen.fit, place, {}) for place in chosen.fit.added),
         ambiguous_with=ties,
         candidates=tuple((s.name, s.channel, s.score) for s in chosen.ranking),
-        depends_on=structure.tokens,
+        depends_on=tuple(dict.fromkeys((*structure.beside, *structure.tokens))),
+        may_depend_on=() if verdict == "unexplained" else structure.beside,
         share_left=float(structure.share),
         suggested_excitation=advice(model, [(f.name, f.channel) for f in (*effects, *ties)]) if ties else None,
         faults=checked.faults,

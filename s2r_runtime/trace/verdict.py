@@ -137,13 +137,13 @@ def verdict_of(
     before, after = judged
     floor = floors[0].copy()
     floor[[speed for _, speed in given.data.axes_without_speed]] = np.inf  # nobody measured how far off these are
-    away = "noise" in structure.tokens and not structure.matters and goes_astray(chosen.fit.model, before, after, floor)
+    away = structure.tokens == ("noise",) and goes_astray(chosen.fit.model, before, after, floor)
     faulty = any(fault.kind != "dropout" for fault in faults)
     if not chosen.fit.added:
         nothing = away or foretells_nothing(after, given, floors[1])
         return "unexplained" if structure.matters or nothing else "sensor_fault" if faulty else "none"
-    by_noise = 0.0 * floors[0] if structure.matters else floors[0]  # what is left was taken for noise, too
-    if away or not foretells(after, given, by_noise) or _withdrawn(chosen.fit, structure) or harms(before, after, floor):
+    noise_alone = 0.0 * floors[0] if structure.matters else floors[0]  # what is left was taken for noise, too
+    if away or not foretells(after, given, noise_alone) or _withdrawn(chosen.fit, structure) or harms(before, after, floor):
         return "unexplained"
     return "ambiguous" if chosen.rivals else "traced"
 

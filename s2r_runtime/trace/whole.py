@@ -82,7 +82,7 @@ class Whole:
         if better is None:
             return found
         if not better.shows:  # the repair is as good, whatever its name
-            return replace(found, tokens=tuple(dict.fromkeys((better.token, *found.tokens))))
+            return replace(found, beside=tuple(dict.fromkeys((better.token, *found.beside))))
         return replace(found, tokens=(better.token,), matters=True, share=1.0, nameless=True)
 
     def _of_nominal(self) -> Structure:
