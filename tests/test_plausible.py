@@ -1,5 +1,7 @@
 """Columns that are not what they say are refused in one line that says what they seem to be; a robot with a strong effect is not."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from trace_robots import GEOMETRY, INPUTS, commands, drive
@@ -8,7 +10,7 @@ from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.dataset import Stream, from_streams
-from s2r_runtime.trace.plausible import check_plausible
+from s2r_runtime.trace.plausible import _if_each_taken_back, _if_taken_back, _mistake, _mistakes, _scaled, check_plausible
 from s2r_runtime.trace.tracer import trace
 
 DT, STEPS = 0.05, 700
@@ -65,6 +67,21 @@ def test_a_usual_mistake_is_named(case):
     name, spoil, said = MISTAKES[case]
     with pytest.raises(RecordingError, match=said):
         check_plausible(_model(name), _data(_model(name), *spoil(*_driven(name))))
+
+
+@pytest.mark.parametrize("name", BOUNDS)
+def test_mistakes_tried_at_once_say_what_each_says_by_itself(name):
+    """Commands come where they like: steps are taken in parts, but where all of them are zero."""
+    model, (y, u) = _model(name), _driven(name)
+    t = DT * np.arange(STEPS)
+    data = from_streams(model, [(Stream(t, y), Stream(np.append(0.0, t[1:] + 0.95 * DT), u))], "here.csv")
+    dead = [_mistake("inputs", "", partial(_scaled, [*range(j)], 0.0)) for j in range(1, len(model.inputs) + 1)]
+    tried = [*_mistakes(model), *dead]
+    together = _if_each_taken_back(model, data, tried)
+    for mistake, found in zip(tried, together, strict=True):
+        alone = _if_taken_back(model, data, mistake)
+        assert (alone is None) == (found is None)
+        assert alone is None or np.allclose(alone, found, rtol=1e-12)
 
 
 def test_the_tracer_says_so_instead_of_looking_for_an_effect():

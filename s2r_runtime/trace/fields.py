@@ -69,8 +69,10 @@ FITTED = 3
 FLIPS = 24
 """Draws of what is left with signs by chance, step by step: what fields would see in noise alone."""
 
-SEEN, LOOKED_AT = 1.0, 8
-"""Standard deviations above those from which on a field is looked at, and how many are: the ones that stand out most."""
+SEEN, LOOKED_AT = 3.0, 8
+"""Standard deviations above those from which on a field is looked at (the fields that were beyond their price stood out by 4 or more), and
+how many are: the ones that stand out most.
+"""
 
 SURE = 10.0
 """Those from which on all are: where all have a mean in them that is there, the finest stands out least, and may explain most."""

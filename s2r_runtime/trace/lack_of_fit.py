@@ -156,6 +156,16 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     return Structure(may_depend_on(left, windows, found), True, share, gains, for_a_while=True, noise=_beside(left, windows))
 
 
+def still_left(left: Left, tokens: tuple[str, ...], nominal: Fit, horizon: int) -> bool:
+    """Whether dictionaries of these tokens show structure that matters: where another model left it, little time tells that this one does.
+    False says nothing.
+    """
+    looks = Looks(left, tokens)
+    chosen = _forward(looks)[0] if looks.looked else []
+    sure = chosen and chosen[-1].gain > SLOW * math.log(len(looks.found) / ALPHA)
+    return bool(sure) and _weight_of(left, nominal, chosen[-1], horizon)[0]
+
+
 def _for_a_while(left: Left) -> Judged | None:
     """What happens for a while and in no other block of time, if rows are in order."""
     return episodes(left) if left.given.data.in_order else None
@@ -178,9 +188,10 @@ def _beside(left: Left, judged: Judged) -> tuple[Noise, Colour]:
 
 @dataclass(frozen=True)
 class Looks:
-    """A first look at what dictionaries say of what a model leaves."""
+    """A first look at what dictionaries say of what a model leaves. only: of these tokens; of all, if None."""
 
     left: Left
+    only: tuple[str, ...] | None = None
 
     @cached_property
     def found(self) -> list[tuple[str, Array]]:
@@ -190,7 +201,8 @@ class Looks:
     @cached_property
     def looked(self) -> list[tuple[float, int]]:
         """(nats, place in `found`), the best first."""
-        return sorted(((first_look(self.left, x), i) for i, (_, x) in enumerate(self.found)), reverse=True)
+        asked = [i for i, (token, _) in enumerate(self.found) if self.only is None or TOKENS.get(token, token) in self.only]
+        return sorted(((first_look(self.left, self.found[i][1]), i) for i in asked), reverse=True)
 
     @property
     def most(self) -> float:

@@ -19,7 +19,7 @@ Where it holds the mass, for a while or from then on, inputs do nothing, and tha
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -32,7 +32,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.dataset import Dataset, Run, regridded
 from s2r_runtime.trace.never_measured import check_measured
-from s2r_runtime.trace.residual import Index, acting, predicted, rollout, rollout_starts, steps_of
+from s2r_runtime.trace.residual import Index, acting, first_steps, predicted, rollout, rollout_starts, steps_of
 from s2r_runtime.trace.scales import SCALES, Scale, axis_pairs, groups
 from s2r_runtime.trace.streams import Stream
 
@@ -74,8 +74,14 @@ SLOW_STEPS = 10
 STARTS = 300
 """Rollouts: their mean error is then known to a few per cent."""
 
+FEWEST_STARTS = 20
+"""Fewer say nothing."""
+
 ROWS = 6000
 """Rows of each segment that are looked at."""
+
+AT_ONCE = 100_000
+"""Rows of recordings that are rolled out at once: some megabytes."""
 
 GOES = 5.0
 """Standard deviations of its noise that a state must go in the horizon to count."""
@@ -131,7 +137,9 @@ def _check_columns(model: ComposedModel, data: Dataset) -> None:
     if every is None or not data.segments or (np.mean(every) <= NOTHING and np.max(every) <= NOTHING_ALONE):
         return
     few = _few(model, data)
-    tried = [(e, m) for m in _mistakes(model) if (e := _if_taken_back(model, few, m)) is not None and _moves_as_well(model, few, m)]
+    mistakes = list(_mistakes(model))
+    known = zip(_if_each_taken_back(model, few, mistakes), mistakes, strict=True)
+    tried = [(e, m) for e, m in known if e is not None and _moves_as_well(model, few, m)]
     otherwise = _otherwise(model, few)
     for measure, nothing in ((np.mean, NOTHING), (np.max, NOTHING_ALONE)):
         as_it_is = float(measure(every))
@@ -157,15 +165,13 @@ def _check_scales(model: ComposedModel, data: Dataset) -> None:
     if every is None or not data.segments or (np.mean(every) <= NOTHING and np.max(every) <= NOTHING_ALONE):
         return
     few, every_input = _few(model, data), list(range(len(model.inputs)))
-    still = DEAD * min(_err(model, few, inputs=partial(_scaled, some, 0.0)) for some in (every_input, *([j] for j in every_input)))
+    dead = [_Mistake("", None, partial(_scaled, some, 0.0), WELL) for some in (every_input, *([j] for j in every_input))]
+    still = DEAD * min(_errs(model, few, dead))
     pushed = DEAD * min((float(np.mean(e)) for e in _otherwise(model, few)[-1:]), default=math.inf)
     limit = min(WELL, BETTER * float(np.mean(every)), still)
-    tried = [
-        (_err(model, few, partial(_rescaled, list(group), 1.0 / scale.times, scale.zero)), group, scale)
-        for group in groups(model)
-        for scale in SCALES
-    ]
-    for e, group, scale in sorted(tried, key=lambda one: one[0]):
+    offered = [(group, scale) for group in groups(model) for scale in SCALES]
+    changes = [_Mistake("", partial(_rescaled, list(group), 1.0 / scale.times, scale.zero), None, WELL) for group, scale in offered]
+    for e, (group, scale) in sorted(zip(_errs(model, few, changes), offered, strict=True), key=lambda one: one[0]):
         if not e < (limit if scale.times >= FAR else min(limit, SURELY)):
             return
         if scale.zero == 0.0 and not e < pushed:  # another zero is a steady push, told from others by its number
@@ -185,10 +191,14 @@ def _exactly(model: ComposedModel, data: Dataset, group: tuple[int, ...], scale:
     return abs(int(np.argmin([_err(model, data, partial(_rescaled, list(group), *one)) for one in off])) - 2) <= 1
 
 
-def _err(model: ComposedModel, data: Dataset, states: Change | None = None, inputs: Change | None = None) -> float:
+def _errs(model: ComposedModel, data: Dataset, changes: Sequence[_Mistake]) -> list[float]:
     """Mean E with columns changed; infinite where nothing goes anywhere then."""
-    e = _if_taken_back(model, data, _Mistake("", states, inputs, WELL))
-    return math.inf if e is None else float(np.mean(e))
+    return [math.inf if e is None else float(np.mean(e)) for e in _if_each_taken_back(model, data, changes)]
+
+
+def _err(model: ComposedModel, data: Dataset, states: Change | None = None, inputs: Change | None = None) -> float:
+    """The same of one change."""
+    return _errs(model, data, [_Mistake("", states, inputs, WELL)])[0]
 
 
 def _check_speeds(model: ComposedModel, data: Dataset) -> None:
@@ -261,22 +271,57 @@ def _if_taken_back(model: ComposedModel, data: Dataset, mistake: _Mistake) -> Ar
         return None
 
 
+def _if_each_taken_back(model: ComposedModel, data: Dataset, mistakes: Sequence[_Mistake]) -> list[Array | None]:
+    """The same of each of some by itself, many rolled out at once: what a step costs hardly depends on how many take it."""
+    count = max(1, AT_ONCE // max(1, sum(len(run.y) for run in data.runs)))
+    found: list[Array | None] = []
+    for some in (mistakes[k : k + count] for k in range(0, len(mistakes), count)):
+        try:
+            changed = [_taken_back(model, data, mistake) for mistake in some]
+            alike = len({one.substeps for one in changed}) == 1  # inputs that never change have no parts of a step
+            found += _each_foretold(model, changed) if alike else [_foretold(model, one) for one in changed]
+        except ConfigError:
+            found += [_if_taken_back(model, data, mistake) for mistake in some]
+    return found
+
+
 def _foretold(model: ComposedModel, data: Dataset, among: list[int] | None = None, *, pushed: bool = False) -> Array | None:
     """The share that E is the mean of, of each state (or of these) that goes somewhere; None where nothing goes anywhere. pushed: less a
     steady push on each state.
     """
-    ahead = _ahead(data)
-    starts = rollout_starts(data, ahead)
+    return _each_foretold(model, [data], among, pushed=pushed)[0]
+
+
+def _each_foretold(
+    model: ComposedModel, each: Sequence[Dataset], among: list[int] | None = None, *, pushed: bool = False
+) -> list[Array | None]:
+    """`_foretold` of recordings with one step."""
+    starts = [_some_starts(data) for data in each]
+    begin = np.cumsum([0] + [int(first_steps(data)[-1]) for data in each])
+    together = replace(each[0], runs=tuple(run for data in each for run in data.runs))
+    places = np.concatenate([b + s for b, s in zip(begin[:-1], starts, strict=True)])
+    with np.errstate(all="ignore"):
+        errors = rollout(model, together, acting(model, together), places, _ahead(together)).error
+    parts = np.split(errors, np.cumsum([len(s) for s in starts])[:-1])
+    return [_shares(model, data, s, e, among, pushed) for data, s, e in zip(each, starts, parts, strict=True)]
+
+
+def _some_starts(data: Dataset) -> Index:
+    """Of rollouts; none if there are too few."""
+    starts = rollout_starts(data, _ahead(data))
     starts = starts[:: max(1, len(starts) // STARTS)]
-    if len(starts) < 20:
+    return starts if len(starts) >= FEWEST_STARTS else starts[:0]
+
+
+def _shares(model: ComposedModel, data: Dataset, starts: Index, error: Array, among: list[int] | None, pushed: bool) -> Array | None:
+    """Errors (n, nx) over how far each state goes."""
+    if not len(starts):
         return None
-    begin = np.cumsum([0] + [len(run.y) - 1 for run in data.runs])
+    begin = first_steps(data)
     rows = starts + np.searchsorted(begin, starts, side="right") - 1
     y = np.concatenate([run.y for run in data.runs])
-    with np.errstate(all="ignore"):
-        error = rollout(model, data, acting(model, data), starts, ahead).error
     error = _trimmed(error - np.median(error, axis=0) if pushed else error)
-    gone = _trimmed(model.difference(y[rows + ahead].copy(), y[rows]))
+    gone = _trimmed(model.difference(y[rows + _ahead(data)].copy(), y[rows]))
     bent = np.concatenate([np.diff(run.y, 2, axis=0) for run in data.runs])
     noise = np.nanmedian(np.abs(bent), axis=0) / 0.6745 / math.sqrt(6.0)
     goes = gone > GOES * noise + 1e-12
@@ -354,7 +399,7 @@ def _exchanged(kind: str, names: tuple[str, ...], pairs: tuple[tuple[str, str], 
 
 def _otherwise(model: ComposedModel, data: Dataset) -> list[Array]:
     """E where it is no mistake: each input by itself does nothing; something pushes steadily (wind, a slope)."""
-    dead = [_if_taken_back(model, data, _mistake("inputs", "", partial(_scaled, [j], 0.0))) for j in range(len(model.inputs))]
+    dead = _if_each_taken_back(model, data, [_mistake("inputs", "", partial(_scaled, [j], 0.0)) for j in range(len(model.inputs))])
     return [e for e in (*dead, _foretold(model, data, pushed=True)) if e is not None]
 
 
@@ -432,7 +477,7 @@ def _check_clocks(model: ComposedModel, data: Dataset) -> None:
     ahead = int(np.clip(round(GLANCE_S / data.dt), 1, 50))
     starts = rollout_starts(few, ahead)
     starts = starts[:: max(1, len(starts) // GLANCES)]
-    if len(starts) < 20:
+    if len(starts) < FEWEST_STARTS:
         return
     size = np.median(np.abs(_errors(model, few, 0, starts, ahead)), axis=0) / 0.6745 + 1e-12
     aside = _pushed_aside(model, few, starts)

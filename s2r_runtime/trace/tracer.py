@@ -185,33 +185,40 @@ def _once_more(
     anything, and the rest looks like that); or what is found with a lower bar, if that leaves nothing. What was not fitted must be
     foretold no worse.
     """
-    pair = two_together(given, chosen)
-    hidden = pair is not None and not whole.structure(pair).tokens
+    pair, refused = two_together(given, chosen), {names(chosen.fit.model)}
+    told = None if pair is None else _all_explained(whole, pair, structure, refused)
     for bar, before, may_be_left in (
-        (STRICT, pair if hidden else None, set()),
+        (STRICT, pair if told is not None and not told.tokens else None, set()),
         (LENIENT if chosen.fit.added else ALONE, chosen, {"noise"}),
     ):
         if before is None:
             continue
         alone = called_for(given, chosen.nominal.model, ahead, lambda share: None, bar, before)
-        rest = _all_explained(whole, alone, chosen, may_be_left)
-        if rest is None:  # as it mostly is: no need to ask for rivals
+        rest = _all_explained(whole, alone, structure, refused)
+        if rest is None or not {*rest.tokens} <= may_be_left:  # as it mostly is: no need to ask for rivals
             continue
         other = against_rivals(given, alone, bar)
         other = confirmed(given, replace(other, fit=dated(given, whole.given, other.fit)), judged_on)
         if other.fit is not alone.fit:
-            rest = _all_explained(whole, other, chosen, may_be_left)
-        if rest is not None and foretelling(judged_on, [chosen.fit, other.fit])[1] >= 0.0:
+            rest = _all_explained(whole, other, structure, refused)
+        if rest is None or not {*rest.tokens} <= may_be_left:
+            continue
+        if foretelling(judged_on, [chosen.fit, other.fit])[1] >= 0.0:
             return other, rest
     return chosen, structure
 
 
-def _all_explained(whole: Whole, other: Selection, chosen: Selection, may_be_left: set[str]) -> Structure | None:
-    """What another selection leaves, if that is no more than may be left; None if it does leave more, or is no other one."""
-    if names(other.fit.model) == names(chosen.fit.model) or crowded(other.fit):
+def _all_explained(whole: Whole, other: Selection, structure: Structure, refused: set[tuple[tuple[str, str], ...]]) -> Structure | None:
+    """What another selection leaves, if it shows in no rollout; None if it does. refused: effects that were asked about and leave more.
+    structure: what was left before: that is asked for first, as it mostly still is there.
+    """
+    if names(other.fit.model) in refused or crowded(other.fit):
         return None
-    rest = whole.structure(other)
-    return None if rest.matters or not {*rest.tokens} <= may_be_left else rest
+    rest = None if whole.still(other, structure) else whole.structure(other)
+    if rest is not None and not rest.matters:
+        return rest
+    refused.add(names(other.fit.model))
+    return None
 
 
 def _result(

@@ -14,7 +14,18 @@ from s2r_runtime.trace.faults import Checked
 from s2r_runtime.trace.fields import Field, beats, wanders
 from s2r_runtime.trace.fitting import Fit, evaluate, fitted, gain, problem
 from s2r_runtime.trace.holdout import part
-from s2r_runtime.trace.lack_of_fit import ALIKE, MORE, NOTHING, Looks, Structure, best_unnamed, explains_more, lack_of_fit, left_of
+from s2r_runtime.trace.lack_of_fit import (
+    ALIKE,
+    MORE,
+    NOTHING,
+    Looks,
+    Structure,
+    best_unnamed,
+    explains_more,
+    lack_of_fit,
+    left_of,
+    still_left,
+)
 from s2r_runtime.trace.lack_of_fit_judged import Judged, Left
 from s2r_runtime.trace.residual import first_steps
 from s2r_runtime.trace.selection import Selection, crowded
@@ -62,11 +73,20 @@ class Whole:
             self._known[id(fit)] = fit, self._structure(fit)
         return self._known[id(fit)][1]
 
+    def still(self, other: Selection, structure: Structure) -> bool:
+        """Whether another selection clearly leaves what was told as structure before."""
+        fit = self._everywhere(other.fit)
+        return still_left(left_of(self.given, fit), structure.tokens, self.nominal, self._horizon)
+
+    def _everywhere(self, fit: Fit) -> Fit:
+        """Fitted to all of the recording: numbers of a part are a little off elsewhere, and that is no structure."""
+        fit = evaluate(self.given, fit.model)
+        return fitted(self.given, fit, fit.model, 2)
+
     def _structure(self, chosen: Fit) -> Structure:
         if not chosen.added:
             return self._of_nominal()
-        fit = evaluate(self.given, chosen.model)
-        fit = fitted(self.given, fit, fit.model, 2)  # numbers of the fit's part are a little off elsewhere: that is no structure
+        fit = self._everywhere(chosen)
         looks = Looks(left_of(self.given, fit))
         found = lack_of_fit(looks, self.nominal, self._horizon)
         if crowded(fit):
