@@ -15,7 +15,7 @@ from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.coarse import FEW, coarse, coarser
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
-from s2r_runtime.trace.hidden_pairs import TAKEN, _nats, _together, two_together
+from s2r_runtime.trace.hidden_pairs import TAKEN, _nats, _nats_beside, _nats_of_spans, _span, _together, two_together
 from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.scores import names
@@ -77,6 +77,39 @@ def test_nats_of_two_columns_are_those_of_a_least_squares_fit():
     ranges = np.tile([-np.inf, np.inf], (5, 1))
     ranges[0] = sorted((0.0, -both[0]))
     assert _nats(c, z, ranges)[0, 1] == 0.0  # the other way round than it may be
+
+
+def test_nats_of_several_columns_are_those_of_a_least_squares_fit():
+    rng = np.random.default_rng(30)
+    one, other, c, z = rng.normal(size=(200, 2)), rng.normal(size=(200, 3)), rng.normal(size=(4, 200)), rng.normal(size=200)
+    other[:, 2] = other[:, 1] + 0.3 * one[:, 0]  # of both together, five columns span four directions
+    c[1] = c[0] + 0.1 * one[:, 1]
+    c[3] = one[:, 0] - 2.0 * one[:, 1]
+    c /= np.linalg.norm(c, axis=1)[:, None]
+
+    def explained(x):
+        rest = z - x @ np.linalg.lstsq(x, z, rcond=1e-9)[0]
+        return 0.5 * (z @ z - rest @ rest)
+
+    assert _nats_of_spans(_span(one), _span(other), z) == pytest.approx(explained(np.hstack([one, other])), rel=1e-6)
+    anything = np.tile([-np.inf, np.inf], (4, 1))
+    nats = _nats_beside(_span(one), c, z, anything)
+    assert nats[:3] == pytest.approx([explained(np.column_stack([one, single])) for single in c[:3]], rel=1e-6)
+    assert nats[3] == 0.0  # it adds nothing to them
+    beta = np.linalg.lstsq(np.column_stack([one, c[0]]), z, rcond=None)[0][2]
+    anything[0] = sorted((0.0, -beta))
+    assert _nats_beside(_span(one), c, z, anything)[0] == 0.0  # the other way round than it may be
+
+
+@pytest.mark.parametrize("seed", [2, 8])
+def test_a_slope_along_both_axes_is_found_beside_a_heading_that_is_off(seed):
+    """By one of its two numbers at a time, a slope does less than a pair that takes up a part of everything."""
+    u = _held(np.random.default_rng(seed), 300, [0.05, -0.6], [0.4, 0.6])
+    effects = [("heading_offset", "theta", {"angle": 0.05}), ("gravity_slope", "*", {"x": 0.04, "y": 0.04})]
+    given, model = _drive(ModelSpec("unicycle", DT, {}, ()), effects, u, [1e-3, 1e-3, 4e-3], seed)
+    base = evaluate(given, model)
+    pair = two_together(given, Selection(base, base, 100, (), ()))
+    assert set(names(pair.fit.model)) == {("gravity_slope", "*"), ("heading_offset", "theta")}
 
 
 def test_two_effects_of_which_either_alone_shows_little_are_found_together():

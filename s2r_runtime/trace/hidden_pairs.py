@@ -6,7 +6,8 @@ left, z,
 
     b = (c_i'z, c_j'z),  k = c_i'c_j:    nats of both = (b_i^2 - 2 k b_i b_j + b_j^2) / (2 (1 - k^2))
 
-as far as effects enter linearly and their numbers stay inside their bounds. The best few are fitted.
+as far as effects enter linearly and their numbers stay inside their bounds. An effect of several numbers that all enter linearly (a slope
+along x and y) counts with all its columns, as nats of a projection, numbers paid for. The best few are fitted.
 """
 
 from __future__ import annotations
@@ -34,6 +35,9 @@ TAKEN = 0.3, 3.0
 
 ALIKE = 0.9999
 """Square of the cosine between two columns from which on they are one."""
+
+SPANNED = 1e-6
+"""Of the largest singular value of an effect's columns, from which on one of them is there."""
 
 FITTED = 4
 """Pairs that are fitted, of those with an effect that was chosen already (beside which anything makes a good pair), and of others."""
@@ -63,17 +67,48 @@ def _promising(given: Problem, chosen: Selection) -> list[tuple[Probe, Probe]]:
     base, given = chosen.nominal, given.coarse
     before = predicted(base.model, given.steps, acting(base.model, given.data))
     probes = probes_of(base.model, candidates(base.model, given.data, Leftover(given, base)))
-    found = [(probe, i, c[:, i]) for probe, c in columns(given, base, probes, before) for i in range(c.shape[1])]
+    root = np.sqrt(noises.weight(base.z.ravel()))
+    found = [(probe, c * root[:, None]) for probe, c in columns(given, base, probes, before)]
+    least = 1e-9 * max((float(np.linalg.norm(c)) for _, c in found), default=0.0)
+    found = [(probe, c) for probe, c in found if np.linalg.norm(c) > least]
     if not found:  # a user's own model may step nowhere else
         return []
-    root = np.sqrt(noises.weight(base.z.ravel()))
-    table = np.array([c for _, _, c in found]).reshape(len(found), -1) * root
-    size = np.linalg.norm(table, axis=1)
-    there = np.flatnonzero(size > 1e-9 * np.max(size, initial=0.0))
-    who = [found[i][0] for i in there.tolist()]
-    ranges = np.array([_range(*found[i][:2]) for i in there.tolist()]).reshape(-1, 2) * size[there, None]
-    nats = _nats(table[there] / size[there, None], root * base.z.ravel(), ranges)
-    return _best(nats, who, set(names(chosen.fit.model)))
+    z = root * base.z.ravel()
+    ones, several = ([one for one in found if (one[1].shape[1] > 1) == more] for more in (False, True))
+    size = np.array([np.linalg.norm(c) for _, c in ones])
+    table = np.array([c[:, 0] for _, c in ones]).reshape(len(ones), len(z)) / size[:, None]
+    ranges = np.array([_range(probe) for probe, _ in ones]).reshape(-1, 2) * size[:, None]
+    spans = [_span(c) for _, c in several]
+    nats = np.zeros((len(found), len(found)))
+    nats[: len(ones), : len(ones)] = _nats(table, z, ranges)
+    for i, span in enumerate(spans, len(ones)):
+        price = STRICT.price(len(span) - 1, len(given.steps))
+        nats[: len(ones), i] = _nats_beside(span, table, z, ranges) - price
+        for j, other in enumerate(spans[: i - len(ones)], len(ones)):
+            nats[j, i] = _nats_of_spans(span, other, z) - price - STRICT.price(len(other) - 1, len(given.steps))
+    return _best(nats, [probe for probe, _ in (*ones, *several)], set(names(chosen.fit.model)))
+
+
+def _span(c: Array) -> Array:
+    """(p, n), orthonormal, of what columns (n, p) span."""
+    u, s, _ = np.linalg.svd(c, full_matrices=False)
+    return np.asarray(u[:, s > SPANNED * s[0]].T)
+
+
+def _nats_beside(span: Array, c: Array, z: Array, ranges: Array) -> Array:
+    """(m,) what a span (p, n) explains of z (n,) together with each of c (m, n); 0 where that takes the latter out of its range (m, 2)."""
+    k, own = c @ span.T, span @ z
+    apart = 1.0 - np.minimum(np.sum(k * k, axis=1), ALIKE)
+    beta = (c @ z - k @ own) / apart
+    inside = (beta >= ranges[:, 0]) & (beta <= ranges[:, 1]) & (apart > 1.0 - ALIKE)
+    return np.asarray(np.where(inside, 0.5 * (own @ own + beta * beta * apart), 0.0))
+
+
+def _nats_of_spans(one: Array, other: Array, z: Array) -> float:
+    """What two spans (p, n) explain of z (n,) together."""
+    rest = other - other @ one.T @ one
+    own, more = one @ z, rest @ z
+    return 0.5 * float(own @ own + more @ np.linalg.pinv(rest @ rest.T, rcond=1.0 - ALIKE, hermitian=True) @ more)
 
 
 def _nats(c: Array, z: Array, ranges: Array) -> Array:
@@ -86,11 +121,11 @@ def _nats(c: Array, z: Array, ranges: Array) -> Array:
     return np.asarray(np.where(inside & inside.T & (k * k < ALIKE), nats, 0.0))
 
 
-def _range(probe: Probe, i: int) -> tuple[float, float]:
-    """Scales of a probe's column i at which its number is inside its bounds; behind a kink it is no line for long."""
+def _range(probe: Probe) -> tuple[float, float]:
+    """Scales of a probe's column at which its number is inside its bounds; behind a kink it is no line for long."""
     if not probe.free:
         return TAKEN
-    slot = probe.free[i]
+    slot = probe.free[0]
     p, value = bounds_of(probe.start, slot), float(values_of(probe.start, (slot,))[0])
     neutral = p.neutral or 0.0
     away = value - neutral
