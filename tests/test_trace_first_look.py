@@ -39,6 +39,11 @@ def _drive(spec, effects, u, sigma, seed=21):
     return problem(data, steps_of(data)), model
 
 
+def _alike(fits):
+    """Where what was not fitted is foretold as well by each."""
+    return [0.0] * len(fits)
+
+
 def test_a_limit_that_depends_on_the_direction_is_fitted_from_one_that_does_not():
     """Where there is next to no noise, a search from anywhere else ends in a number of its own."""
     u = _held(np.random.default_rng(22), 500, [-4.0, -4.0], [4.0, 4.0])
@@ -108,8 +113,19 @@ def test_a_slope_along_both_axes_is_found_beside_a_heading_that_is_off(seed):
     effects = [("heading_offset", "theta", {"angle": 0.05}), ("gravity_slope", "*", {"x": 0.04, "y": 0.04})]
     given, model = _drive(ModelSpec("unicycle", DT, {}, ()), effects, u, [1e-3, 1e-3, 4e-3], seed)
     base = evaluate(given, model)
-    pair = two_together(given, Selection(base, base, 100, (), ()))
+    pair = two_together(given, Selection(base, base, 100, (), ()), _alike)
     assert set(names(pair.fit.model)) == {("gravity_slope", "*"), ("heading_offset", "theta")}
+
+
+@pytest.mark.parametrize("other", ["input_gain", "input_bias"])
+def test_pairs_that_explain_as_much_are_told_apart_by_what_was_not_fitted(other):
+    """At one speed, a gain and a bias do the same."""
+    u = np.column_stack([np.full(300, 0.3), _held(np.random.default_rng(31), 300, [-0.8], [0.8])[:, 0]])
+    effects = [("input_bias", "v", {"bias": 0.05}), ("input_gain", "w", {"gain": 0.8})]
+    given, model = _drive(ModelSpec("unicycle", DT, {}, ()), effects, u, 1e-3)
+    base = evaluate(given, model)
+    foretells = lambda fits: [5.0 * ((other, "v") in names(fit.model)) for fit in fits]  # noqa: E731
+    assert (other, "v") in names(two_together(given, Selection(base, base, 100, (), ()), foretells).fit.model)
 
 
 def test_two_effects_of_which_either_alone_shows_little_are_found_together():
@@ -119,9 +135,9 @@ def test_two_effects_of_which_either_alone_shows_little_are_found_together():
     given, model = _drive(JOINT, effects, u, 2e-3)
     base = evaluate(given, model)
     nothing = Selection(base, base, 100, (), ())
-    pair = two_together(given, nothing)
+    pair = two_together(given, nothing, _alike)
     assert names(pair.fit.model) == (("input_bias", "force"), ("viscous_friction", "qd"))
-    assert two_together(given, Selection(base, pair.fit, 100, (), ())) is None  # nothing explains more than they do
+    assert two_together(given, Selection(base, pair.fit, 100, (), ()), _alike) is None  # nothing explains more than they do
 
 
 def test_a_pair_has_both_and_all_that_the_user_declared():
@@ -145,7 +161,7 @@ def test_one_that_is_inserted_before_it_leaves_the_users_own_effect_where_it_is(
     given, _ = _drive(ModelSpec("unicycle", DT, {}, ()), [("input_gain", "v", {"gain": 0.8}), ("input_bias", "w", {"bias": 0.2})], u, 1e-4)
     model = compose(spec)
     base = evaluate(given, model)
-    pair = two_together(given, Selection(base, base, 100, (), ()))
+    pair = two_together(given, Selection(base, base, 100, (), ()), _alike)
     assert pair is not None
     assert gain(pair.fit, base) > 0.0
     assert sum(a.effect.name == "integration_scheme" for a in pair.fit.model.effects) == 1

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from test_trace_first_look import _alike
 
 from s2r_runtime.effects.classes import same
 from s2r_runtime.errors import NotEnoughEvidence
@@ -229,7 +230,7 @@ def test_two_effects_may_lead_together_to_where_somebodys_model_does_not_step_al
     data = from_arrays(model, [(np.array(levels)[:, None] + 1e-3 * rng.normal(size=(601, 1)), u)])
     given = problem(data, steps_of(data))
     base = evaluate(given, model)
-    pair = two_together(given, Selection(base, base, 100, (), ()))
+    pair = two_together(given, Selection(base, base, 100, (), ()), _alike)
     assert pair is not None
     if least < 0.1:
         assert names(pair.fit.model) == (("input_bias", "pump"), ("input_gain", "pump"))
@@ -241,4 +242,4 @@ def test_where_somebodys_model_steps_nowhere_else_no_two_effects_are_promising(m
     given = problem(data, steps_of(data))
     base = evaluate(given, model)
     monkeypatch.setattr(screening, "foretold", lambda given, model: None)
-    assert two_together(given, Selection(base, base, 100, (), ())) is None
+    assert two_together(given, Selection(base, base, 100, (), ()), _alike) is None

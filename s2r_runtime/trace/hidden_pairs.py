@@ -7,11 +7,13 @@ left, z,
     b = (c_i'z, c_j'z),  k = c_i'c_j:    nats of both = (b_i^2 - 2 k b_i b_j + b_j^2) / (2 (1 - k^2))
 
 as far as effects enter linearly and their numbers stay inside their bounds. An effect of several numbers that all enter linearly (a slope
-along x and y) counts with all its columns, as nats of a projection, numbers paid for. The best few are fitted.
+along x and y) counts with all its columns, as nats of a projection. The best few, their numbers paid for, are fitted.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -20,13 +22,14 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.candidates import candidates, places
-from s2r_runtime.trace.fitting import Fit, Problem, fitted, foretold, gain, insert
+from s2r_runtime.trace.fitting import Fit, Problem, fitted, foretold, gain, insert, sought
 from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.residual import acting, predicted
+from s2r_runtime.trace.rivals import NEAR
 from s2r_runtime.trace.scores import STRICT, name_of, names
 from s2r_runtime.trace.screening import Probe, columns, probes_of
 from s2r_runtime.trace.selection import Selection
-from s2r_runtime.trace.slots import bounds_of, values_of
+from s2r_runtime.trace.slots import bounds_of, slots_of, values_of
 
 Array = NDArray[np.float64]
 
@@ -43,9 +46,10 @@ FITTED = 4
 """Pairs that are fitted, of those with an effect that was chosen already (beside which anything makes a good pair), and of others."""
 
 
-def two_together(given: Problem, chosen: Selection) -> Selection | None:
+def two_together(given: Problem, chosen: Selection, foretells: Callable[[list[Fit]], list[float]]) -> Selection | None:
     """The two that explain most together. `called_for` goes on from them. None where no such two explain more than what was chosen, every
-    start tried paid for, or where this is more than two already.
+    start tried paid for, or where this is more than two already. foretells: nats by which each foretells what was not fitted better than
+    the first one, which tells those apart that explain as much.
     """
     if len(chosen.fit.added) > 2:
         return None
@@ -56,9 +60,11 @@ def two_together(given: Problem, chosen: Selection) -> Selection | None:
 
     models = [model for pair in _promising(given, chosen) for model in _together(*pair)]
     fits = [fitted(given, base, model, 2) for model in models if foretold(given, model) is not None]  # each alone may be where both are not
-    best = max(fits, key=worth, default=None)
-    if best is None or worth(best) - worth(chosen.fit) <= STRICT.needed(chosen.tried, 0, n):
+    most = max((worth(fit) for fit in fits), default=-math.inf)
+    if most - worth(chosen.fit) <= STRICT.needed(chosen.tried, 0, n):
         return None
+    near = [fit for fit in fits if worth(fit) > most - NEAR]
+    best = near[int(np.argmax([worth(fit) + ahead for fit, ahead in zip(near, foretells(near), strict=True)]))]
     return replace(chosen, fit=fitted(given, best, best.model), rivals=())
 
 
@@ -82,11 +88,19 @@ def _promising(given: Problem, chosen: Selection) -> list[tuple[Probe, Probe]]:
     nats = np.zeros((len(found), len(found)))
     nats[: len(ones), : len(ones)] = _nats(table, z, ranges)
     for i, span in enumerate(spans, len(ones)):
-        price = STRICT.price(len(span) - 1, len(given.steps))
-        nats[: len(ones), i] = _nats_beside(span, table, z, ranges) - price
-        for j, other in enumerate(spans[: i - len(ones)], len(ones)):
-            nats[j, i] = _nats_of_spans(span, other, z) - price - STRICT.price(len(other) - 1, len(given.steps))
-    return _best(nats, [probe for probe, _ in (*ones, *several)], set(names(chosen.fit.model)))
+        nats[: len(ones), i] = _nats_beside(span, table, z, ranges)
+        nats[len(ones) : i, i] = [_nats_of_spans(span, other, z) for other in spans[: i - len(ones)]]
+    who = [probe for probe, _ in (*ones, *several)]
+    price = np.array([STRICT.price(_numbers(probe), len(given.steps)) for probe in who])
+    return _best(nats - price[:, None] - price, who, set(names(chosen.fit.model)))
+
+
+def _numbers(probe: Probe) -> int:
+    """Of its effect, as `Fit.k` counts them."""
+    c, model = probe.candidate, probe.start
+    place = c.place if c.replaced < 0 else c.replaced
+    slots = list(slots_of(model.effects[place], place))
+    return max(len(slots), 1) + sum(sought(model, slot) for slot in slots)
 
 
 def _span(c: Array) -> Array:

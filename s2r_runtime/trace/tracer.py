@@ -185,7 +185,8 @@ def _once_more(
     anything, and the rest looks like that); or what is found with a lower bar, if that leaves nothing. What was not fitted must be
     foretold no worse.
     """
-    pair, refused = two_together(given, chosen), {names(chosen.fit.model)}
+    pair = two_together(given, chosen, lambda fits: foretelling(judged_on, fits))
+    refused = {names(chosen.fit.model)}
     told = None if pair is None else _all_explained(whole, pair, structure, refused)
     for bar, before, may_be_left in (
         (STRICT, pair if told is not None and not told.tokens else None, set()),
