@@ -20,7 +20,7 @@ from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.residual_noise import MEMORIES
 from s2r_runtime.trace.selection import significant
 from s2r_runtime.trace.tracer import trace
-from s2r_runtime.trace.verdict import curves_of, foretells_nothing
+from s2r_runtime.trace.verdict import curves_of, misses
 from s2r_runtime.trace.whole import _bent
 
 STEPS = 700
@@ -232,8 +232,24 @@ def test_a_model_whose_rollouts_end_nowhere_near_is_another_robots_and_not_one_t
         data = from_arrays(declared(), [(y, u)])
         given = held(declared(), data, steps_of(data), (), np.ones(len(u), dtype=bool), 1.0)
         judged = judge(declared(), given)
-        assert foretells_nothing(judged, given, NOISE) == nothing
-        assert not foretells_nothing(judged, given, 100.0 + NOISE)
+        assert misses(judged, given, NOISE) == nothing
+        assert not misses(judged, given, 100.0 + NOISE)
+
+
+@pytest.mark.parametrize(("strong", "missing"), [(0.25, False), (1.5, True)])
+def test_something_is_missing_where_most_of_the_way_is_although_it_looks_like_noise_that_wanders(strong, missing):
+    """A wind from changing sides, strong over the speed, whatever is asked."""
+    rng = np.random.default_rng(4)
+    ways = np.repeat(rng.uniform(-math.pi, math.pi, 40), 25)
+    u = np.column_stack([np.full(1000, 0.2), rng.normal(size=1000)])
+    theta = DT * np.cumsum(np.append(0.0, u[:, 1]))
+    push = DT * 0.2 * strong * np.column_stack([np.cos(ways), np.sin(ways)])
+    steps = DT * 0.2 * np.column_stack([np.cos(theta[:-1]), np.sin(theta[:-1])]) + push
+    y = np.column_stack([np.concatenate([[[0.0, 0.0]], np.cumsum(steps, axis=0)]), theta]) + NOISE * rng.normal(size=(1001, 3))
+    model = compose(ModelSpec("unicycle", DT))
+    data = from_arrays(model, [(y, u)])
+    given = held(model, data, steps_of(data), (), np.ones(1000, dtype=bool), 1.0)
+    assert misses(judge(model, given), given, NOISE) == missing
 
 
 def test_a_model_that_nothing_can_ask_to_move_is_refused_in_a_line(tmp_path):

@@ -194,12 +194,30 @@ def _ramped(seed, name, p, loud):
     rng, n = np.random.default_rng(seed), 1200
     u = np.repeat(rng.uniform([0.1, -0.8], [0.5, 0.8], (n // 40 + 1, 2)), 40, axis=0)[:n]
     u[:, 1] = np.interp(np.arange(n), np.arange(0, n + 40, 40), rng.uniform(-0.8, 0.8, n // 40 + 1))
+    return _measured(rng, u, _acts(name, u, **p), loud)
+
+
+def _measured(rng, u, acted, loud):
+    """A unicycle that was asked for u and does what acted says."""
     x = np.zeros(3)
     rows = [x]
-    for v, w in _acts(name, u, **p):
+    for v, w in acted:
         x = x + DT * np.array([v * math.cos(x[2]), v * math.sin(x[2]), w])
         rows.append(x)
-    return from_arrays(UNICYCLE, [(np.array(rows) + loud * rng.normal(size=(n + 1, 3)) * [0.001, 0.001, 0.006], u)])
+    return from_arrays(UNICYCLE, [(np.array(rows) + loud * rng.normal(size=(len(rows), 3)) * [0.001, 0.001, 0.006], u)])
+
+
+def _wrong_way(v, s, h):
+    s["z"] = s.get("z", 0.0) + h / 0.045 * (v - s.get("z", 0.0))
+    return 2.0 * s["z"] - v
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_first_goes_the_other_way_is_no_lag_behind_a_delay(seed):
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform([0.1, -0.8], [0.5, 0.8], (60, 2)), 20, axis=0)
+    result = trace(_measured(rng, u, np.column_stack([u[:, 0], _fine(u[:, 1], _wrong_way)]), 1.0), UNICYCLE)
+    assert (result.verdict, result.effects, result.depends_on[:1]) == ("unexplained", (), ("memory(w)",))
 
 
 @pytest.mark.parametrize("loud", [1, 3])

@@ -4,7 +4,8 @@ A name says what happens, and a recording can only say that what happens looks l
 asked of shapes that stand near the named ones, each with numbers that are fitted like an effect's:
 
     memory      two lags (out and back, up and down), a lag or a delay that goes with the input's size, an actuator that rings, one that
-                boosts what changes, one that sticks and jumps, a loop, a gain that fades with what was asked lately, or ever
+                boosts what changes or first goes the other way, one that sticks and jumps, a loop, a gain that fades with what was
+                asked lately, or ever
     the input   a bend (cubic), steps
 
 A shape is never handed on: it has no name, belongs to no model that is saved, and runs over whole recordings only. Its scale is `most`, the
@@ -182,7 +183,7 @@ def _rings(u: Array, dt: Lasts, p: Values) -> Numbers:
 
 
 def _boosts(u: Array, dt: Lasts, p: Values) -> Array:
-    """u + share (u - its slow mean)."""
+    """u + share (u - its slow mean): with a share of -1 a lag, below that it first goes the other way."""
     return np.asarray(u + p["share"] * (u - _mean(u, dt, p["time_constant"])))
 
 
@@ -261,7 +262,7 @@ SHAPES = (
     Shape(
         "a boost of what changes",
         True,
-        (_number("share", -1.0, 10.0, 0.0), _second("time_constant")),
+        (_number("share", -10.0, 10.0, 0.0), _second("time_constant")),
         _boosts,
         lambda dt, times: [{"share": share, "time_constant": s} for s in times for share in (-0.4, 0.4)],
     ),

@@ -5,7 +5,7 @@ none           nothing beyond noise
 unexplained    structure is left that no effect accounts for: nothing was found; or what was found leaves a large part, or has the
                wrong shape for what it acts on; or the model (with it) foretells the held-out data no better than `stays where it is`;
                or with what was found rollouts are worse than without;
-               or what is left looks like noise, step by step, and takes rollouts much farther than noise does
+               or what is left looks like noise, step by step, and takes rollouts much farther than noise does, or half of the way
 ambiguous      rivals explain as much
 traced         otherwise
 """
@@ -51,6 +51,9 @@ ASKED = 0.1
 
 FORETELLS, NEARER = 0.7, 0.95
 """A model whose rollouts end farther off than these shares of the way that the robot went foretells nothing worth a name."""
+
+MISSES = 0.5
+"""Share of the way that the robot went by which rollouts must be off for something to be missing that looks like noise step by step."""
 
 WORSE = 1.1
 """Times the error of rollouts without what was found from which on it is no repair."""
@@ -140,7 +143,7 @@ def verdict_of(
     away = structure.tokens == ("noise",) and goes_astray(chosen.fit.model, before, after, floor)
     faulty = any(fault.kind != "dropout" for fault in faults)
     if not chosen.fit.added:
-        nothing = away or foretells_nothing(after, given, floors[1])
+        nothing = away or misses(after, given, floors[1])
         return "unexplained" if structure.matters or nothing else "sensor_fault" if faulty else "none"
     noise_alone = 0.0 * floors[0] if structure.matters else floors[0]  # what is left was taken for noise, too
     if away or not foretells(after, given, noise_alone) or _withdrawn(chosen.fit, structure) or harms(before, after, floor):
@@ -202,13 +205,13 @@ def worth_its_risk(chosen: Selection, before: Judged, after: Judged) -> bool:
     return bool(np.any(rms(before.ends) > MATTERS * rms(after.ends)))
 
 
-def foretells_nothing(judged: Judged, given: Held, floor: Array) -> bool:
-    """Whether rollouts end no nearer in some state that goes somewhere, and not because noise takes it there: the model is another
-    robot's, whatever its residual looks like. floor: (nx,) what noise alone makes of the ends of rollouts.
+def misses(judged: Judged, given: Held, floor: Array) -> bool:
+    """Whether rollouts miss a large part of the way in some state that goes somewhere, and not because noise takes it there: the model
+    lacks that part, whatever its residual looks like. floor: (nx,) what noise alone makes of the ends of rollouts.
     """
     if not len(judged.ends):
         return False
-    return bool(np.any((_off(judged, given) > NEARER) & _beyond_noise(judged, given, floor)))
+    return bool(np.any((_off(judged, given) > MISSES) & _beyond_noise(judged, given, floor)))
 
 
 def _beyond_noise(judged: Judged, given: Held, floor: Array) -> Mask:
