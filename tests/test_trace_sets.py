@@ -478,6 +478,13 @@ def test_errors_reached_are_shares_of_what_the_oracle_reaches():
     assert row([worse], "repaired model worse").met is False
 
 
+def test_a_drive_on_which_nothing_can_be_reached_is_no_share():
+    """A limit that it never meets: nominal, repaired and true models do the same."""
+    rounded = {"noisy": [0.13076694009739698, 0.13076694009739698, 0.13076694009739697], "clean": [9e-15, 9e-15, 0.0]}
+    assert targets.reached(record_of("one", "right", again=rounded)) is None
+    assert row([record_of("one", "right", verdict="traced", again=rounded)], "error reduction reached, 10th").met is None
+
+
 def test_a_crash_is_never_left_out():
     records = [record_of("clean", "clean")] * 99 + [record_of("clean", "crash")]
     assert row(records, "crashed").met is False

@@ -20,6 +20,8 @@ Record = dict[str, Any]
 RIGHT, NOT_WRONG = {"right"}, {"right", "tie", "none"}
 LARGE = 50_000
 """Steps of a long set."""
+NOTHING = 1e-9
+"""Of the nominal model's error: a reduction that is rounding."""
 WHITE = {"clean", "clean_closed", "clean_poor", "long_clean"}
 ROUGH = {"clean_coloured", "clean_outliers", "clean_student", "clean_quantised", "clean_jittered"}
 
@@ -72,12 +74,15 @@ def _figure(
 
 
 def reached(record: Record, kind: str = "noisy") -> float | None:
-    """Share of the error reduction that was there to be reached."""
+    """Share of the error reduction that was there to be reached; None where none was: the new drive never asks for what is missing (a limit
+    beyond its commands).
+    """
     again = record.get("again")
     if not again:
         return None
     nominal, repaired, oracle = again[kind]
-    return float((nominal - repaired) / max(nominal - oracle, 1e-12))
+    there = nominal - oracle
+    return float((nominal - repaired) / there) if there > NOTHING * nominal else None
 
 
 def rows(records: list[Record]) -> list[Row]:
