@@ -128,7 +128,7 @@ def test_the_second_of_two_effects_is_found(tmp_path, seed, names):
 
 def test_two_effects_that_foretell_no_better_what_was_not_fitted_are_not_taken(tmp_path, monkeypatch):
     """However little structure they leave."""
-    monkeypatch.setattr(tracer, "foretelling", lambda judged_on, fits: [0.0, -1.0])
+    monkeypatch.setattr(tracer, "foretelling", lambda judged_on, fits: [0.0] + [-1.0] * (len(fits) - 1))
     found = _traced_pair(tmp_path, 20014)
     assert not found.effects
     assert found.verdict == "unexplained"
