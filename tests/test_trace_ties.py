@@ -142,6 +142,13 @@ def _traced_pair(folder, seed):
     return trace(load_dataset(path, model), model)
 
 
+def test_what_is_named_is_asked_again_where_rollouts_go_astray(tmp_path):
+    """A drift of all inputs, and a change that undoes it on one, leave what looks like noise; a drift and a gain leave nothing."""
+    found = _traced_pair(tmp_path, 68110)
+    assert found.verdict == "traced"
+    assert {(e.name, e.channel) for e in found.effects} == {("input_gain_drift", "v"), ("input_gain", "w")}
+
+
 def test_a_repair_that_makes_rollouts_worse_is_none():
     """However much better a single step is; a speed that nobody measured says nothing."""
     rng = np.random.default_rng(15)

@@ -46,7 +46,7 @@ from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, names
 from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded, select
 from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.unseen import alike
-from s2r_runtime.trace.verdict import asked, confirmed, final_fit, foretelling, foretold_too, verdict_of, worth_its_risk
+from s2r_runtime.trace.verdict import asked, confirmed, final_fit, foretelling, foretold_too, takes_far, verdict_of, worth_its_risk
 from s2r_runtime.trace.whole import Whole
 
 __all__ = ["Dataset", "TraceResult", "load_dataset", "trace", "usual_horizon"]
@@ -146,7 +146,7 @@ def _traced(
     chosen = confirmed(given, replace(chosen, fit=dated(given, whole.given, chosen.fit)), judged_on)
     say(80.0, 100.0, "testing what is left")
     structure = whole.structure(chosen)
-    if structure.matters and not structure.nameless:
+    if (structure.matters and not structure.nameless) or _astray(chosen, structure, judged_on, seed):
         chosen, structure = _once_more(given, whole, chosen, structure, judged_on, ahead)
     if structure.matters and parts == MOST_PARTS:
         finer = _finer(dataset, model, chosen, ahead)
@@ -176,6 +176,16 @@ def _finer(dataset: Dataset, model: ComposedModel, chosen: Selection, ahead: int
     nominal = whole.nominal
     fit = nominal if not chosen.fit.added else fitted(whole.given, nominal, chosen.fit.model)
     return None if whole.structure(replace(chosen, nominal=nominal, fit=fit)).matters else data.substeps
+
+
+def _astray(chosen: Selection, structure: Structure, judged_on: Held, seed: int) -> bool:
+    """Whether what is left beside names is no noise, although it looks like noise step by step. Where nothing was named, a second look
+    with a lower bar would name what wanders by itself.
+    """
+    if not chosen.fit.added or structure.tokens != ("noise",):  # as it mostly is: no need for rollouts
+        return False
+    judged = judge(chosen.nominal.model, judged_on), judge(chosen.fit.model, judged_on)
+    return takes_far(chosen, structure, judged, judged_on, noise_floor(chosen.fit, judged_on, seed)[1])
 
 
 def _once_more(

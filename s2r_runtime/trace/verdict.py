@@ -138,9 +138,8 @@ def verdict_of(
     own law, and by noise that remembers nothing.
     """
     before, after = judged
-    floor = floors[0].copy()
-    floor[[speed for _, speed in given.data.axes_without_speed]] = np.inf  # nobody measured how far off these are
-    away = structure.tokens == ("noise",) and goes_astray(chosen.fit.model, before, after, floor)
+    floor = _where_measured(floors[0], given)
+    away = takes_far(chosen, structure, judged, given, floors[0])
     faulty = any(fault.kind != "dropout" for fault in faults)
     if not chosen.fit.added:
         nothing = away or misses(after, given, floors[1])
@@ -170,6 +169,20 @@ def foretells(judged: Judged, given: Held, floor: Array) -> bool:
     goes = ~np.isnan(share)
     by_noise = np.logical_not(_beyond_noise(judged, given, floor))
     return not goes.any() or bool(np.any(share[goes] < FORETELLS) and np.all((share[goes] < NEARER) | by_noise[goes]))
+
+
+def _where_measured(floor: Array, given: Held) -> Array:
+    """(nx,), without end where a speed was not: nobody knows how far off that is."""
+    measured = floor.copy()
+    measured[[speed for _, speed in given.data.axes_without_speed]] = np.inf
+    return measured
+
+
+def takes_far(chosen: Selection, structure: Structure, judged: tuple[Judged, Judged], given: Held, floor: Array) -> bool:
+    """Whether what is left looks like noise step by step, and takes rollouts much farther. judged: the nominal model and what was chosen;
+    floor: (nx,) what noise alone makes of the ends of rollouts.
+    """
+    return structure.tokens == ("noise",) and goes_astray(chosen.fit.model, *judged, _where_measured(floor, given))
 
 
 def goes_astray(model: ComposedModel, before: Judged, after: Judged, floor: Array) -> bool:
