@@ -151,8 +151,7 @@ def _traced(
     if structure.matters and parts == MOST_PARTS:
         finer = _finer(dataset, model, chosen, ahead)
         if finer is not None:
-            once_more = lambda done, total, detail: say(80.0 + 0.2 * done, total, detail)  # noqa: E731
-            return _traced(as_recorded[0], asked, as_recorded[1], horizon, seed, once_more, norm, finer)
+            return _traced(as_recorded[0], asked, as_recorded[1], horizon, seed, _from(80.0, say), norm, finer)
     say(90.0, 100.0, "judging on held-out data")
     w = np.ones(len(model.states)) if weights is None else np.array([weights[asked.states.index(s)] for s in model.states])
     result = _result(dataset, checked, given, chosen, structure, judged_on, seed, w, kind)
@@ -162,6 +161,11 @@ def _traced(
     result = replace(result, spec=msgspec.structs.replace(result.spec, dt=asked.dt), unseen=unseen)
     say(100.0, 100.0, result.verdict)
     return result
+
+
+def _from(begun: float, say: Progress) -> Progress:
+    """Progress of what is still to do when so much of 100 is done."""
+    return lambda done, total, detail: say(begun + (1.0 - begun / 100.0) * done, total, detail)
 
 
 def _finer(dataset: Dataset, model: ComposedModel, chosen: Selection, ahead: int) -> int | None:
