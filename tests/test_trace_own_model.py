@@ -243,3 +243,36 @@ def test_where_somebodys_model_steps_nowhere_else_no_two_effects_are_promising(m
     base = evaluate(given, model)
     monkeypatch.setattr(screening, "foretold", lambda given, model: None)
     assert two_together(given, Selection(base, base, 100, (), ()), _alike) is None
+
+    assert two_together(given, Selection(base, base, 100, (), ())) is None
+
+
+FLYING = """
+import numpy as np
+
+STATES = ("vx", "vy", "vz")
+INPUTS = ("tilt_x", "tilt_y", "thrust")
+PARAMS = {"g": 9.81}
+
+
+def step(x, u, dt, params):
+    f = u[:, 2]
+    return x + dt * np.column_stack([f * np.sin(u[:, 0]), f * np.sin(u[:, 1]), f * np.cos(u[:, 0]) * np.cos(u[:, 1]) - params["g"]])
+"""
+
+
+def test_a_push_on_a_flying_robot_of_which_only_speeds_are_known(tmp_path):
+    path = tmp_path / "flying.py"
+    path.write_text(FLYING)
+    model, rng, dt, rows = compose(ModelSpec(str(path), 0.02)), np.random.default_rng(4), 0.02, 1500
+    v, wanted, states, inputs = np.zeros(3), np.zeros(3), [np.zeros(3)], []
+    for k in range(rows):
+        wanted = rng.uniform([-4.0, -4.0, -1.0], [4.0, 4.0, 1.0]) if k % 100 == 0 else wanted
+        tilt = np.clip(0.12 * (wanted - states[-1])[:2], -0.4, 0.4)
+        u = np.array([*tilt, 9.81 + (wanted - states[-1])[2]])
+        v = v + dt * np.array([u[2] * np.sin(u[0]) + 1.2, u[2] * np.sin(u[1]) - 0.6, u[2] * np.cos(u[0]) * np.cos(u[1]) - 9.81])
+        inputs.append(u)
+        states.append(v + 0.01 * rng.normal(size=3))
+    (found,) = trace(from_arrays(model, [(np.array(states), np.array(inputs))]), model).effects
+    assert (found.name, found.channel, found.parameters["x"][3]) == ("constant_disturbance", "world", "m/s²")
+    assert found.values == pytest.approx({"x": 1.2, "y": -0.6}, abs=0.02)

@@ -155,9 +155,9 @@ def _proposed(model: BoundModel) -> Iterator[Row]:
             for to_gain, from_gain in ((_ratio_to_gain, _gain_to_ratio), (_ratio_to_inverse, _gain_to_mass)):
                 yield Row("parameter_change", name, "input_gain", i, to_gain, from_gain, {"ratio": 1.4})
         yield Row("mass_change", "*", "input_gain", i, _mass_to_gain(model), _gain_to_mass, {"ratio": 1.4})
-        if "y" not in model.states:
+        if "y" not in along:
             yield Row("constant_disturbance", "world", "input_bias", i, _renamed("x", "bias"), _renamed("bias", "x"), {"x": 0.3})
-        for key in along if "y" in model.states else ():
+        for key in along if "y" in along else ():
             rest = dict.fromkeys(along, 0.0)
             for channel in ("world", "body"):
                 yield Row(

@@ -3,12 +3,16 @@
 poses                 world: (x, y)+ += dt (x, y) m/s;      body: the same along the heading that holds during the step
 axes x, y (, z)       (vx, vy, vz)' += (x, y, z) m/s²
 a single axis         x: a force, v' += x/mass
+speeds vx, vy without a position, in somebody's own model (a flying robot's in the wind)    (vx, vy)' += (x, y) m/s²
 """
 
 from __future__ import annotations
 
+import numpy as np
+
 from s2r_runtime.effects.body_motion import body_motion, moved
 from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, force_unit, has_pose, size_of
+from s2r_runtime.effects.viscous_friction import lone_speeds
 from s2r_runtime.hookspecs import NominalModel, Parameter
 from s2r_runtime.models.forces import Axis, Push, axes, mass
 
@@ -25,18 +29,20 @@ class ConstantDisturbance(ForceEffect):
     additive = True
 
     def channels(self, model: NominalModel) -> tuple[str, ...]:
-        """The world's axes; the body's, where rates act on a pose."""
+        """The world's axes, or those of speeds without a position; the body's, where rates act on a pose."""
+        if level_speeds(model):
+            return ("world",)
         if not directions(model):
             return ()
         return ("world", "body") if has_pose(model) and not axes(model) else ("world",)
 
     def takes(self, model: NominalModel, channel: str) -> tuple[str, ...]:
         """x, y, and z where it can go up; x alone on a single axis."""
-        return directions(model)
+        return directions(model) or tuple("xy" if level_speeds(model) else "")
 
     def unit(self, model: NominalModel, channel: str, parameter: str) -> str:
         """A rate, or what acts on an axis."""
-        return force_unit(model) if axes(model) else "m/s"
+        return force_unit(model) if axes(model) else "m/s²" if level_speeds(model) else "m/s"
 
     def frame(self, model: NominalModel, channel: str) -> str:
         """In which axes it adds to the motion of a pose."""
@@ -51,6 +57,10 @@ class ConstantDisturbance(ForceEffect):
         """Rates on a pose, forces on axes."""
         if self.pushes(model, channel):
             return super().after_step(x, u, x_next, model, channel, dt, p)
+        if speeds := level_speeds(model):
+            after = x_next.copy()
+            after[:, speeds] += np.multiply.outer(dt, [float(p[name]) for name in "xy"])
+            return after
         if channel == "body":
             motion = body_motion(x, x_next, model)
             return moved(
@@ -60,7 +70,7 @@ class ConstantDisturbance(ForceEffect):
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
         """One is enough: the response is linear."""
-        return [dict.fromkeys(directions(model), SHARE * size_of(u))]
+        return [dict.fromkeys(self.takes(model, channel), SHARE * size_of(u))]
 
 
 def directions(model: NominalModel) -> tuple[str, ...]:
@@ -69,6 +79,13 @@ def directions(model: NominalModel) -> tuple[str, ...]:
         moving = {model.states[axis.position] for axis in axes(model)}
         return tuple(name for name in "xyz" if name in (moving or "xy")) if not moving or {"x", "y"} <= moving else ()
     return ("x",) if len(axes(model)) == 1 else ()
+
+
+def level_speeds(model: NominalModel) -> list[int]:
+    """Where, among the states, the speeds along x and y without a position are. Upwards gravity, or a gain of thrust, says the same."""
+    lone = lone_speeds(model)
+    named = [[name for name in lone if name.lower().endswith(letter)] for letter in "xy"]
+    return [model.states.index(one) for (one,) in named] if all(len(n) == 1 for n in named) else []
 
 
 def direction(model: NominalModel, axis: Axis) -> str:
