@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -148,6 +148,8 @@ class Dataset:
     in_parts: bool = False
     """The model takes each of the S parts of a step by itself: its own steps are that much shorter."""
     campaign: Transitions | None = field(default=None, repr=False)
+    straight: float = 0.0
+    """Share of halfway to the next input that each was taken on, since inputs changed between the rows (`straight`)."""
 
     @cached_property
     def chains(self) -> Inputs:
@@ -271,7 +273,8 @@ def from_streams(
 
 def regridded(data: Dataset, model: ComposedModel, in_parts: int = 0) -> Dataset:
     """The same recording on the grid of a model with another step."""
-    return from_streams(model, data.segments, data.source, data.digests, data.paths, data.reconstruction, in_parts)
+    again = from_streams(model, data.segments, data.source, data.digests, data.paths, data.reconstruction, in_parts)
+    return replace(again, straight=data.straight)
 
 
 def thinned(

@@ -63,6 +63,8 @@ class TraceResult:
     """Name and channel of effects that what was held out never asks for: the fit alone speaks for them."""
     may_depend_on: tuple[str, ...] = ()
     """Of `depends_on`, beside a name: what no rollout shows, or what is less sure."""
+    straight: float = 0.0
+    """As the dataset's: inputs went on changing between the rows."""
 
     def same(self, found: Found) -> tuple[Found, ...]:
         """Of `ambiguous_with`: other names of the very same thing on this model."""
@@ -100,6 +102,9 @@ class TraceResult:
         if self.unseen:
             was = "was" if len(self.unseen) == 1 else "were"
             lines.append(f"{', '.join(self.unseen)} {was} not measured, and not needed: the motion follows from the inputs without")
+        if self.straight:
+            way = f"{50.0 * self.straight:.0f} % of the way"
+            lines.append(f"the inputs went on changing between the rows, as the motion says: each was taken {way} to the next one")
         if self.unconfirmed:
             names = ", ".join(f"{name} on {channel}" for name, channel in self.unconfirmed)
             lines.append(f"not confirmed: {names}; what it was judged on never asks for that, the fit alone speaks for it")

@@ -172,11 +172,12 @@ def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int, bar:
 
 
 def _told_by_stamps(given: Problem, fit: Fit, base: Fit) -> bool:
-    """False for a time within a step where rows do not lie on the step: stamps, averages and reality differ by that much. Of a robot
-    that slides sideways that is so only where rows were interpolated: else its position and heading are of one moment, whenever that was.
+    """False for a time within a step where rows do not lie on the step, or inputs moved on between them: stamps, averages and reality
+    differ by that much. Of a robot that slides sideways that is so only where rows were interpolated: else its position and heading are of
+    one moment, whenever that was.
     """
     data = given.data
-    if not data.interpolated and not data.uneven:
+    if not data.interpolated and not data.uneven and not data.straight:
         return True
     there = names(base.model)
     values = values_of(fit.model, fit.free)

@@ -45,6 +45,7 @@ from s2r_runtime.trace.retimed import dated
 from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, names
 from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded, select
 from s2r_runtime.trace.slots import Slot
+from s2r_runtime.trace.straight import moved_on, sampled, straight
 from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import asked, confirmed, final_fit, foretelling, foretold_too, takes_far, verdict_of, worth_its_risk
 from s2r_runtime.trace.whole import Whole
@@ -141,6 +142,9 @@ def _traced(
         judged_on = _held_out(checked, seen, test, model, horizon)
         given = problem(fit_part.data, fit_part.steps)
         chosen = select(given, model, ahead, lambda share: say(60.0 + 20.0 * share, 100.0, "looking for effects"))
+    lines = _straight(as_recorded, asked, parts, checked, seen, given, chosen.fit)
+    if lines is not None:
+        return _traced(lines[0], asked, lines[1], horizon, seed, _from(60.0, say), norm, parts)
     whole = Whole(checked, model, ahead)
     chosen = foretold_too(given, chosen, judged_on, ahead)
     chosen = confirmed(given, replace(chosen, fit=dated(given, whole.given, chosen.fit)), judged_on)
@@ -166,6 +170,29 @@ def _traced(
 def _from(begun: float, say: Progress) -> Progress:
     """Progress of what is still to do when so much of 100 is done."""
     return lambda done, total, detail: say(begun + (1.0 - begun / 100.0) * done, total, detail)
+
+
+def _straight(
+    recorded: tuple[Dataset, Dataset | None], asked: ComposedModel, parts: int, checked: Checked, seen: Mask, given: Problem, fit: Fit
+) -> tuple[Dataset, Dataset | None] | None:
+    """The recordings with inputs that moved on between the rows, if the motion says that they did."""
+    data, test = recorded
+    if data.straight or not sampled(data):
+        return None
+
+    def laid(share: float) -> Problem:
+        if not share:
+            return given
+        model, there, other = alike(asked, straight(data, asked, share), test)
+        model, there, _ = thinned(model, there, other, parts)
+        return replace(given, data=part(with_history(model, there), checked.left_out, seen, FIT_STEPS).data, searches={})
+
+    if [len(run.y) for run in laid(1.0).data.runs] != [len(run.y) for run in given.data.runs]:
+        return None
+    share = moved_on(laid, fit)
+    if not share:
+        return None
+    return straight(data, asked, share), None if test is None else straight(test, asked, share) if sampled(test) else test
 
 
 def _finer(dataset: Dataset, model: ComposedModel, chosen: Selection, ahead: int) -> int | None:
@@ -298,6 +325,7 @@ def _result(
         source=dataset.source,
         interpolated=dataset.interpolated,
         reconstruction=dataset.reconstruction,
+        straight=dataset.straight,
         unconfirmed=tuple((final.model.effects[place].effect.name, final.model.effects[place].channel) for place in idle),
         could_see=visible(given, final, chosen.tried),
     )

@@ -1,0 +1,53 @@
+"""Recordings slower than the loop that set their inputs: these moved on between the rows."""
+
+import numpy as np
+import pytest
+
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.trace.dataset import Stream, from_streams
+from s2r_runtime.trace.tracer import trace
+
+DT_S, TICKS, NOISE = 0.02, 10, 1e-3
+
+
+def _joint(seed, friction, held, rows=1500):
+    """A joint under a force of some sines, set TICKS times a row, or held for each row; as a table's streams."""
+    model, rng = compose(ModelSpec("joint", DT_S)), np.random.default_rng(seed)
+    f, phase = rng.uniform(0.2, 1.5, 5)[:, None], rng.uniform(0.0, 6.3, 5)[:, None]
+    t = np.arange(rows * TICKS) * DT_S / TICKS
+    force = np.sum(np.cos(2.0 * np.pi * f * t + phase), axis=0)
+    force = np.repeat(force[::TICKS], TICKS) if held else force
+    q, v, h, states = 0.0, 0.0, DT_S / TICKS, []
+    for k, u in enumerate(force.tolist()):
+        if k % TICKS == 0:
+            states.append((q, v))
+        a = u - friction * v
+        q, v = q + h * v + 0.5 * h * h * a, v + h * a
+    stamps = t[::TICKS]
+    measured = np.array(states) + rng.normal(size=(rows, 2)) * NOISE
+    return model, from_streams(model, [(Stream(stamps, measured), Stream(stamps, force[::TICKS, None]))], "a table")
+
+
+def test_a_force_that_moves_on_between_the_rows_is_no_structure():
+    model, data = _joint(1, friction=0.0, held=False)
+    result = trace(data, model)
+    assert result.verdict == "none"
+    assert result.straight == pytest.approx(1.0 - 1.0 / TICKS, abs=0.03)
+    assert "went on changing between the rows" in result.text()
+
+
+def test_friction_beside_a_force_that_moves_on_has_its_size():
+    model, data = _joint(2, friction=0.3, held=False)
+    (found,) = trace(data, model).effects
+    assert (found.name, found.channel) == ("viscous_friction", "qd")
+    _, low, high, _ = found.parameters["coefficient"]
+    assert low < 0.3 < high
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_a_force_that_is_held_is_taken_as_held(friction):
+    model, data = _joint(3, friction, held=True)
+    result = trace(data, model)
+    assert not result.straight
+    assert [e.name for e in result.effects] == ["viscous_friction"] * (friction > 0.0)
