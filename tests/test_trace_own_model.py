@@ -244,8 +244,6 @@ def test_where_somebodys_model_steps_nowhere_else_no_two_effects_are_promising(m
     monkeypatch.setattr(screening, "foretold", lambda given, model: None)
     assert two_together(given, Selection(base, base, 100, (), ()), _alike) is None
 
-    assert two_together(given, Selection(base, base, 100, (), ())) is None
-
 
 FLYING = """
 import numpy as np
