@@ -70,3 +70,17 @@ def test_what_a_file_prints_goes_to_stderr(tmp_path: Path, capsys: pytest.Captur
     printed = capsys.readouterr()
     assert printed.out == ""
     assert printed.err == "loading\nstepping\n"
+
+
+def test_the_same_rows_are_asked_once_and_what_a_caller_does_to_the_result_is_his(tmp_path: Path) -> None:
+    own = model(tmp_path, HEAD + "CALLS = []\n" + STEP + "CALLS.append(1)\n    " + GOOD)
+    x, u = np.array([[1.0, 2.0]]), np.array([[4.0]])
+    calls = own.nominal.shared.function.__globals__["CALLS"]  # type: ignore[attr-defined]
+    first = own.nominal.step(x, u, 0.1, own.nominal.parameters)
+    first[:] = 9.0
+    before = len(calls)
+    assert own.nominal.step(x.copy(), u.copy(), 0.1, own.nominal.parameters)[0] == pytest.approx([1.2, 2.2])
+    assert len(calls) == before
+    assert own.nominal.step(x, u, 0.2, own.nominal.parameters)[0] == pytest.approx([1.4, 2.4])
+    assert own.nominal.step(x, u, 0.1, {"mass": 4.0})[0] == pytest.approx([1.2, 2.1])
+    assert len(calls) == before + 2
