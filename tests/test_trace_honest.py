@@ -11,10 +11,12 @@ from s2r_runtime.errors import NotEnoughEvidence
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
+from s2r_runtime.trace import lack_of_fit as lack_of_fit_of
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import held, judge, noise_floor
+from s2r_runtime.trace.fields import Field
 from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
-from s2r_runtime.trace.lack_of_fit import Structure, _weight_of, left_of
+from s2r_runtime.trace.lack_of_fit import Looks, Structure, _weight_of, left_of
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.residual_noise import MEMORIES
@@ -250,6 +252,27 @@ def test_something_is_missing_where_most_of_the_way_is_although_it_looks_like_no
     data = from_arrays(model, [(y, u)])
     given = held(model, data, steps_of(data), (), np.ones(1000, dtype=bool), 1.0)
     assert misses(judge(model, given), given, NOISE) == missing
+
+
+def test_what_only_sliding_shows_gives_way_to_a_field_that_explains_more(monkeypatch):
+    """Sliding names what it tries. Here a yaw push that nobody named is left."""
+    (data,) = recordings([], 1, steps=STEPS, seed=46)
+    given = problem(data, steps_of(data))
+    nominal = evaluate(given, declared())
+    push = np.zeros((len(given.steps), 3, 1))
+    push[:, 2, 0] = 0.02
+    bias = AppliedEffect(registry().get("effects", "input_bias"), "w", {"bias": 0.02 / DT})
+    named = insert(declared(), bias, 0)
+    looks = Looks(left_of(given, evaluate(given, named)))
+    there = Field("time", (), push, np.array([-1.0]), 500.0, 400.0)
+    slid = Judged("memory(w)", push, 0.0, 1.0, np.full((BLOCKS, 1), -0.5))
+    monkeypatch.setattr(Looks, "field", there)
+    monkeypatch.setattr(lack_of_fit_of, "_forward", lambda of: ([slid], {"memory(w)": 0.0}))
+    monkeypatch.setattr(lack_of_fit_of, "_for_a_while", lambda left: None)
+    monkeypatch.setattr(lack_of_fit_of, "_wanders", lambda left, judged, enough: False)
+    for nats, tokens in ((0.0, ("time",)), (600.0, ("memory(w)",))):
+        monkeypatch.setattr(lack_of_fit_of, "nats_of", lambda left, judged, nats=nats: nats)
+        assert lack_of_fit_of.lack_of_fit(looks, nominal, 30).tokens == tokens
 
 
 def test_a_model_that_nothing_can_ask_to_move_is_refused_in_a_line(tmp_path):

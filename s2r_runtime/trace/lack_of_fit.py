@@ -132,7 +132,10 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     windows: Judged | None = None
     if chosen and chosen[-1].gain <= 0.0:  # it was seen by sliding only: that names what it tries
         windows = _for_a_while(left)
-        if windows is not None and windows.gain > nats_of(left, chosen[-1]):
+        others = [] if windows is None else [windows.gain]
+        if left.fit.added and looks.field is not None and looks.field.beyond > 0.0:
+            others.append(looks.field.nats)
+        if others and max(others) > nats_of(left, chosen[-1]):
             chosen = []
     if chosen:
         matters, share = _weight_of(left, nominal, chosen[-1], horizon)
