@@ -112,6 +112,33 @@ def test_a_push_that_wanders_is_no_field(memory):
     assert (result.verdict, result.depends_on) == ("none", ("noise",))
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_a_wandering_push_explains_is_its_marginal_likelihood(seed):
+    """Against the whole covariance at once, under the noise of what is left, whatever the size of the push: judged under one noise and
+    priced under another, it explained ten nats more than that.
+    """
+    rng = np.random.default_rng(seed)
+    u = _held(rng, 200, [-0.5, -1.2], [0.5, 1.2])
+    data, model = _recording(_driven(rng, u, lambda k, x, v, w: (0.9 * v, w)), u)
+    given = problem(data, steps_of(data))
+    left = left_of(given, evaluate(given, model))
+    bumps = np.exp(-0.5 * ((np.arange(200)[:, None] - np.linspace(0, 199, 40)) / 5.0) ** 2)
+    theta = given.steps.y0[:, 2]
+    x = np.column_stack([np.cos(theta), np.sin(theta), 0.0 * theta])[:, :, None] * bumps[:, None, :]
+    x /= math.sqrt(np.mean(x * x))
+    told, beta = fields._marginal(left, x, fields.PASSES)
+    rest = left.r - x @ beta
+    whiten = noises.Whitener(noises.estimate(rest, left.f, given.steps.joined, given.floor), left.f, given.steps.joined)
+    table, z = whiten(x).reshape(-1, 40), whiten(left.r).ravel()
+
+    def exactly(size):
+        covariance = np.eye(len(z)) + size * table @ table.T
+        return -0.5 * z @ np.linalg.solve(covariance, z) - 0.5 * np.linalg.slogdet(covariance)[1] - whiten.logdet
+
+    exact = max(exactly(10.0**k) for k in np.arange(-8.0, 2.0, 0.25))
+    assert exact - 10.0 < told < exact + 2.0  # noise of what is left may be a little off, or of a colour
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_sensors_that_are_steadier_than_a_model_is_believed_to_be_are_no_noise_that_wanders(seed):
     """White noise on a robot that does what it is told: process noise is never below its floor, and sums of what is left are small."""

@@ -34,6 +34,7 @@ def test_a_force_that_moves_on_between_the_rows_is_no_structure():
     result = trace(data, model)
     assert result.verdict == "none"
     assert result.straight == pytest.approx(1.0 - 1.0 / TICKS, abs=0.03)
+    assert result.to_json()["inputs_moved_on"] == pytest.approx(0.5 - 0.5 / TICKS, abs=0.015)
     assert "went on changing between the rows" in result.text()
 
 

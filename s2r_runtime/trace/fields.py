@@ -206,8 +206,9 @@ def wanders(nominal: Left, named: Left) -> bool:
 
 
 def as_noise(left: Left, judged: Judged) -> bool:
-    """Whether a push that wanders explains what a dictionary does, and more."""
-    return wandering_nats(left) > bare_nats(left) + max(nats_of(left, judged), 0.0) + ALIKE
+    """Whether a push that wanders explains what a dictionary does, and more, or noise of some colour what only sliding shows."""
+    nats = nats_of(left, judged)
+    return max(nats, judged.gain) <= 0.0 or wandering_nats(left) > bare_nats(left) + max(nats, 0.0) + ALIKE
 
 
 def nats_of(left: Left, judged: Judged) -> float:
@@ -335,26 +336,31 @@ def _cells(place: Array, along: int) -> Array:
 
 
 def _marginal(left: Left, x: Array, passes: int) -> tuple[float, Array]:
-    """(log marginal likelihood, beta (m,)) of x (n, nx, m), the best of some passes of beta and noise in turn."""
+    """(log marginal likelihood, beta (m,)) of x (n, nx, m), the best of some passes of beta and noise in turn. What is left is judged, and
+    its price is taken, under one noise.
+    """
     whiten, z, joined = left.fit.whiten, left.fit.z, left.given.steps.joined
-    best, told = -math.inf, np.asarray(np.zeros(x.shape[2]))
-    for _ in range(passes):
+    best, told, rest = -math.inf, np.asarray(np.zeros(x.shape[2])), left.r
+    for again in range(passes):
+        if again:
+            whiten = Whitener(noises.estimate(rest, left.f, joined, left.given.floor), left.f, joined)
+            z = whiten(rest)
         before, root = best, np.sqrt(noises.weight(np.clip(z, -CLIPPED, CLIPPED)))
-        weighted = (whiten(x) * root[:, :, None]).reshape(-1, x.shape[2])
+        table = whiten(x) * root[:, :, None]
+        weighted = table.reshape(-1, x.shape[2])
         product = weighted.T @ weighted  # half the work of a product of two
         slope = weighted.T @ (root * np.clip(whiten(left.r), -CLIPPED, CLIPPED)).ravel()
         ridge = evidence(product, slope).ridge
         beta: Array = np.asarray(np.linalg.solve(product + ridge * np.eye(len(slope)), slope))
-        price = 0.5 * float(np.linalg.slogdet(np.eye(len(slope)) + product / ridge)[1]) + 0.5 * ridge * float(beta @ beta)
         rest = left.r - x @ beta
-        for again in range(2 if passes > 1 else 1):
-            if again:
-                whiten = Whitener(noises.estimate(rest, left.f, joined, left.given.floor), left.f, joined)
-            z = whiten(rest)
-            less = 1.0 if again else _less(left, z)
-            nats = _under_any_law(z / less, whiten, left) - price - len(z) * float(np.sum(np.log(less)))
-            if nats > best:
-                best, told = nats, beta
+        z = whiten(rest)
+        less = _less(left, z)
+        size = np.sum(table * table, axis=(0, 2))
+        finer = float(np.sum(size / less**2) / max(float(np.sum(size)), 1e-300))
+        price = 0.5 * float(np.linalg.slogdet(np.eye(len(slope)) + product * (finer / ridge))[1]) + 0.5 * ridge * float(beta @ beta)
+        nats = _under_any_law(z / less, whiten, left) - price - len(z) * float(np.sum(np.log(less)))
+        if nats > best:
+            best, told = nats, beta
         if best < before + SETTLED:
             break
     return best, told

@@ -150,6 +150,7 @@ class TraceResult:
             ],
             "reconstructed": None if self.reconstruction is None else self.reconstruction.to_json(),
             "unmeasured": list(self.unseen),
+            "inputs_moved_on": 0.5 * self.straight,
             "unconfirmed": [{"name": name, "channel": channel} for name, channel in self.unconfirmed],
             "step_s": self.nominal.dt,
             "n_fit": self.n_fit,
