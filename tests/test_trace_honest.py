@@ -22,7 +22,7 @@ from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.residual_noise import MEMORIES
 from s2r_runtime.trace.selection import significant
 from s2r_runtime.trace.tracer import trace
-from s2r_runtime.trace.verdict import curves_of, misses
+from s2r_runtime.trace.verdict import curves_of, foretells, misses
 from s2r_runtime.trace.whole import _bent
 
 STEPS = 700
@@ -273,6 +273,20 @@ def test_what_only_sliding_shows_gives_way_to_a_field_that_explains_more(monkeyp
     for nats, tokens in ((0.0, ("time",)), (600.0, ("memory(w)",))):
         monkeypatch.setattr(lack_of_fit_of, "nats_of", lambda left, judged, nats=nats: nats)
         assert lack_of_fit_of.lack_of_fit(looks, nominal, 30).tokens == tokens
+
+
+@pytest.mark.parametrize(("ahead", "by_noise", "foretold"), [(0.2, True, True), (0.2, False, False), (-0.2, True, False)])
+def test_a_robot_that_noise_pushes_about_is_foretold_as_far_as_noise_lets_it(ahead, by_noise, foretold):
+    """After five seconds noise has taken it three quarters as far as it drove; a model that drives the other way foretells nothing."""
+    rng = np.random.default_rng(6)
+    n, horizon, push = 2000, 50, 0.106
+    y = np.zeros((n + 1, 3))
+    y[1:, :2] = np.cumsum(DT * np.array([0.2, 0.0]) + push * rng.normal(size=(n, 2)), axis=0)
+    model = compose(ModelSpec("unicycle", DT))
+    data = from_arrays(model, [(y, np.tile([ahead, 0.0], (n, 1)))])
+    given = held(model, data, steps_of(data), (), np.ones(n, dtype=bool), horizon * DT)
+    floor = push * math.sqrt(horizon) * np.array([1.0, 1.0, 0.0]) * (1.0 if by_noise else 0.1)
+    assert foretells(judge(model, given), given, floor) == foretold
 
 
 def test_a_model_that_nothing_can_ask_to_move_is_refused_in_a_line(tmp_path):
