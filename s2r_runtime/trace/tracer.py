@@ -144,7 +144,7 @@ def _traced(
         chosen = select(given, model, ahead, lambda share: say(60.0 + 20.0 * share, 100.0, "looking for effects"))
     lines = _straight(as_recorded, asked, parts, checked, seen, given, chosen.fit)
     if lines is not None:
-        return _traced(lines[0], asked, lines[1], horizon, seed, _from(60.0, say), norm, parts)
+        return _traced(lines[0], asked, lines[1], horizon, seed, _from(80.0, say), norm, parts)
     whole = Whole(checked, model, ahead)
     chosen = foretold_too(given, chosen, judged_on, ahead)
     chosen = confirmed(given, replace(chosen, fit=dated(given, whole.given, chosen.fit)), judged_on)
