@@ -91,3 +91,18 @@ def test_a_play_as_wide_as_its_input_goes_is_found_with_its_width():
     (play,) = [e for e in found.effects if (e.name, e.channel) == ("input_backlash", "v")]
     low, high = play.parameters["width"][1:3]
     assert low - 0.02 < width < high + 0.02
+
+
+def test_the_fit_sees_the_beginning_and_the_end():
+    """The hardest pushes come at the beginning and where the usual stretches are not. What changes after a quarter must be seen before."""
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        u = 0.1 * rng.normal(size=STEPS)
+        for at in rng.choice(np.r_[0:280, 500:780], 3, replace=False):
+            u[at : at + 20] = -10.0
+        u[20:40] = -10.0
+        seen = fit_mask(_data([u]), 0)
+        fitted, held = _reach(u, seen)
+        assert fitted == held == -10.0
+        assert seen[:200].any()
+        assert seen[800:].any()

@@ -28,6 +28,9 @@ HELD_OUT = ((0.3, 0.5), (0.8, 1.0))
 TENTHS = 4
 """Tenths of a run's time that are held out, as much as in HELD_OUT."""
 
+ENDS = (0.05, 0.15), (0.85, 0.95)
+"""Middles of the tenths at the beginning, and at the end, of a run's time."""
+
 DRAWS = 20
 """Draws of runs, the seed's own first."""
 
@@ -74,7 +77,9 @@ def fit_mask(data: Dataset, seed: int, *, everything: bool = False) -> Mask:
         ways = [(set(rng.permutation(len(data.runs))[:few].tolist()), ()) for _ in range(DRAWS)]
     else:
         chosen = [HELD_OUT, *(tuple((k / 10.0, (k + 1) / 10.0) for k in tenths) for tenths in combinations(range(10), TENTHS))]
-        ways = [(set(), stretches) for stretches in [HELD_OUT, *sorted(chosen, key=lambda way: (_pieces(way) < 2, _pieces(way)))]]
+        ways = [
+            (set(), stretches) for stretches in [HELD_OUT, *sorted(chosen, key=lambda way: (_pieces(way) < 2, _hides(way), _pieces(way)))]
+        ]
     shorter = np.array([_shorter(u, _without(data, spans, *way)[rows]) for way in ways])
     enough = np.flatnonzero(shorter <= shorter.min() + (SHORTER if shorter[0] <= shorter.min() + SHORTER else 0.5 * SHORTER))
     return _without(data, spans, *ways[int(enough[0])])
@@ -83,6 +88,11 @@ def fit_mask(data: Dataset, seed: int, *, everything: bool = False) -> Mask:
 def _pieces(stretches: Stretches) -> int:
     """How many, those that touch taken as one: the longer they are, the longer a rollout can be judged."""
     return 1 + sum(before[1] < after[0] for before, after in pairwise(stretches))
+
+
+def _hides(way: Stretches) -> bool:
+    """Whether the first fifth of the time is held out, or the last: what changed since then, or only then, the fit would never see."""
+    return any(all(any(a <= at < b for a, b in way) for at in ends) for ends in ENDS)
 
 
 def _spans(data: Dataset) -> list[tuple[int, int]]:
