@@ -176,23 +176,22 @@ def _straight(
     recorded: tuple[Dataset, Dataset | None], asked: ComposedModel, parts: int, checked: Checked, seen: Mask, given: Problem, fit: Fit
 ) -> tuple[Dataset, Dataset | None] | None:
     """The recordings with inputs that moved on between the rows, if the motion says that they did."""
-    data, test = recorded
+    model, data, test = alike(asked, *recorded)
     if data.straight or not sampled(data):
         return None
 
     def laid(share: float) -> Problem:
         if not share:
             return given
-        model, there, other = alike(asked, straight(data, asked, share), test)
-        model, there, _ = thinned(model, there, other, parts)
-        return replace(given, data=part(with_history(model, there), checked.left_out, seen, FIT_STEPS).data, searches={})
+        longer, there, _ = thinned(model, straight(data, model, share), test, parts)
+        return replace(given, data=part(with_history(longer, there), checked.left_out, seen, FIT_STEPS).data, searches={})
 
     if [len(run.y) for run in laid(1.0).data.runs] != [len(run.y) for run in given.data.runs]:
         return None
     share = moved_on(laid, fit)
     if not share:
         return None
-    return straight(data, asked, share), None if test is None else straight(test, asked, share) if sampled(test) else test
+    return straight(data, model, share), None if test is None else straight(test, model, share) if sampled(test) else test
 
 
 def _finer(dataset: Dataset, model: ComposedModel, chosen: Selection, ahead: int) -> int | None:
