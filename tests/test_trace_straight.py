@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from s2r_runtime.models.composed import compose
-from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.dataset import Stream, from_streams
+from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.tracer import trace
 
 DT_S, TICKS, NOISE = 0.02, 10, 1e-3
@@ -52,3 +53,25 @@ def test_a_force_that_is_held_is_taken_as_held(friction):
     result = trace(data, model)
     assert not result.straight
     assert [e.name for e in result.effects] == ["viscous_friction"] * (friction > 0.0)
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_a_car_whose_speed_was_not_measured_is_asked_as_well(tmp_path, held):
+    """The motion does not need that state: it is traced in a model without it."""
+    rng = np.random.default_rng(4)
+    exact = EffectSpec("integration_scheme", "*", {"scheme": "exact"})
+    model = compose(ModelSpec("bicycle", DT_S, {"wheel_base": 0.3}, (exact,)))
+    fine = compose(ModelSpec("bicycle", DT_S / TICKS, {"wheel_base": 0.3}, (exact,)))
+    t = np.arange(1000 * TICKS) * DT_S / TICKS
+    f, phase = rng.uniform(0.2, 1.0, (2, 3, 1)), rng.uniform(0.0, 6.3, (2, 3, 1))
+    u = (np.sum(np.cos(2.0 * np.pi * f * t + phase), axis=1) * [[0.1], [0.3]] + [[0.0], [1.0]]).T
+    u = np.repeat(u[::TICKS], TICKS, axis=0) if held else u
+    x, states = np.zeros((1, 4)), []
+    for k in range(len(u)):
+        if k % TICKS == 0:
+            states.append(x[0, :3])
+        x = fine.advance(x, u[k : k + 1], u[k : k + 1])
+    table = np.column_stack([t[::TICKS], np.array(states) + rng.normal(size=(1000, 3)) * 2e-4, u[::TICKS]])
+    np.savetxt(tmp_path / "run.csv", table, "%.9g", ",", header="t,x,y,theta,steer_cmd,speed_cmd", comments="")
+    result = trace(load_dataset(tmp_path / "run.csv", model), model)
+    assert (result.verdict, bool(result.straight), result.unseen) == ("none", not held, ("speed",))
