@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from trace_sets.families import make
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
@@ -75,3 +76,12 @@ def test_a_car_whose_speed_was_not_measured_is_asked_as_well(tmp_path, held):
     np.savetxt(tmp_path / "run.csv", table, "%.9g", ",", header="t,x,y,theta,steer_cmd,speed_cmd", comments="")
     result = trace(load_dataset(tmp_path / "run.csv", model), model)
     assert (result.verdict, bool(result.straight), result.unseen) == ("none", not held, ("speed",))
+
+
+def test_a_run_that_begins_under_way_is_asked_as_well(tmp_path):
+    """What was commanded before its first row is told by its residual, otherwise for inputs that moved on: it was an error."""
+    given = make("tiny", 73003)
+    path, _ = given.write(tmp_path)
+    model = compose(ModelSpec(given.model["name"], given.model["dt"], given.model["parameters"]))
+    result = trace(load_dataset(path, model), model)
+    assert (result.verdict, result.straight) == ("none", 0.0)

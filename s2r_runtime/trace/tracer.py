@@ -24,7 +24,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.begun import begun
-from s2r_runtime.trace.dataset import MOST_PARTS, Dataset, in_finer_parts, thinned
+from s2r_runtime.trace.dataset import MOST_PARTS, Dataset, Run, in_finer_parts, thinned
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge, noise_floor
 from s2r_runtime.trace.excitation import advice
@@ -180,18 +180,32 @@ def _straight(
     if data.straight or not sampled(data):
         return None
 
+    def moved(share: float) -> Dataset:
+        return thinned(model, straight(data, model, share), test, parts)[1]
+
     def laid(share: float) -> Problem:
         if not share:
             return given
-        longer, there, _ = thinned(model, straight(data, model, share), test, parts)
-        return replace(given, data=part(with_history(longer, there), checked.left_out, seen, FIT_STEPS).data, searches={})
+        runs = [_with_inputs(run, there.u) for run, there in zip(checked.data.runs, moved(share).runs, strict=True)]
+        return replace(given, data=part(replace(checked.data, runs=tuple(runs)), checked.left_out, seen, FIT_STEPS).data, searches={})
 
-    if [len(run.y) for run in laid(1.0).data.runs] != [len(run.y) for run in given.data.runs]:
+    if not _alike_laid(moved(1.0), checked.data):
         return None
     share = moved_on(laid, fit)
     if not share:
         return None
     return straight(data, model, share), None if test is None else straight(test, model, share) if sampled(test) else test
+
+
+def _alike_laid(other: Dataset, data: Dataset) -> bool:
+    """Whether the other's inputs can stand in those of the data, which may begin before its first row."""
+    pairs = zip(other.runs, data.runs, strict=False)
+    return (len(other.runs), other.substeps) == (len(data.runs), data.substeps) and all(len(a.u) <= len(b.u) for a, b in pairs)
+
+
+def _with_inputs(run: Run, u: Array) -> Run:
+    """A run with other inputs (K, nu) at its end; what was there before its first row stays."""
+    return replace(run, u=np.concatenate([run.u[: len(run.u) - len(u)], u]))
 
 
 def _finer(dataset: Dataset, model: ComposedModel, chosen: Selection, ahead: int) -> int | None:
