@@ -1,14 +1,17 @@
 """Recordings slower than the loop that set their inputs: these moved on between the rows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from trace_sets.families import make
 
+from s2r_runtime.gap import Transitions
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.dataset import Stream, from_streams
-from s2r_runtime.trace.dataset_files import load_dataset
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.straight import straight
+from s2r_runtime.trace.tracer import load_dataset, trace
 
 DT_S, TICKS, NOISE = 0.02, 10, 1e-3
 
@@ -57,31 +60,26 @@ def test_a_force_that_is_held_is_taken_as_held(friction):
 
 
 @pytest.mark.parametrize("held", [True, False])
-def test_a_car_whose_speed_was_not_measured_is_asked_as_well(tmp_path, held):
-    """The motion does not need that state: it is traced in a model without it."""
-    rng = np.random.default_rng(4)
-    exact = EffectSpec("integration_scheme", "*", {"scheme": "exact"})
-    model = compose(ModelSpec("bicycle", DT_S, {"wheel_base": 0.3}, (exact,)))
-    fine = compose(ModelSpec("bicycle", DT_S / TICKS, {"wheel_base": 0.3}, (exact,)))
-    t = np.arange(1000 * TICKS) * DT_S / TICKS
-    f, phase = rng.uniform(0.2, 1.0, (2, 3, 1)), rng.uniform(0.0, 6.3, (2, 3, 1))
-    u = (np.sum(np.cos(2.0 * np.pi * f * t + phase), axis=1) * [[0.1], [0.3]] + [[0.0], [1.0]]).T
+def test_a_recording_without_a_state_that_the_motion_does_not_need_is_laid_without_it(tmp_path, held):
+    """A car whose speed nobody measured, steered by a wheel that moves on, or commanded anew every row."""
+    model, fine, rng = compose(ModelSpec("bicycle", 0.05)), compose(ModelSpec("bicycle", 0.05 / TICKS)), np.random.default_rng(5)
+    t = np.arange(600 * TICKS) * 0.05 / TICKS
+    u = np.column_stack([0.2 * np.sin(2.3 * t) + 0.1 * np.cos(4.1 * t), np.full(len(t), 0.8)])
     u = np.repeat(u[::TICKS], TICKS, axis=0) if held else u
-    x, states = np.zeros((1, 4)), []
-    for k in range(len(u)):
+    x, hidden, rows = np.zeros((1, 4)), fine.at_rest(1), []
+    for k in range(len(t)):
         if k % TICKS == 0:
-            states.append(x[0, :3])
-        x = fine.advance(x, u[k : k + 1], u[k : k + 1])
-    table = np.column_stack([t[::TICKS], np.array(states) + rng.normal(size=(1000, 3)) * 2e-4, u[::TICKS]])
-    np.savetxt(tmp_path / "run.csv", table, "%.9g", ",", header="t,x,y,theta,steer_cmd,speed_cmd", comments="")
-    result = trace(load_dataset(tmp_path / "run.csv", model), model)
-    assert (result.verdict, bool(result.straight), result.unseen) == ("none", not held, ("speed",))
+            rows.append([t[k], *(x[0, :3] + NOISE * rng.normal(size=3)), *u[k]])
+        x, hidden = fine.step(x, u[k : k + 1], hidden)
+    path = tmp_path / "car.csv"
+    np.savetxt(path, rows, delimiter=",", header="t,x,y,theta,steer_cmd,speed_cmd", comments="")
+    data = load_dataset(path, model)
+    result = trace(data, model, test=data)
+    assert result.unseen == ("speed",)
+    assert result.straight == pytest.approx(0.0 if held else 1.0 - 1.0 / TICKS, abs=0.1)
 
 
-def test_a_run_that_begins_under_way_is_asked_as_well(tmp_path):
-    """What was commanded before its first row is told by its residual, otherwise for inputs that moved on: it was an error."""
-    given = make("tiny", 73003)
-    path, _ = given.write(tmp_path)
-    model = compose(ModelSpec(given.model["name"], given.model["dt"], given.model["parameters"]))
-    result = trace(load_dataset(path, model), model)
-    assert (result.verdict, result.straight) == ("none", 0.0)
+def test_samples_of_a_campaign_stay_with_inputs_that_moved_on():
+    model, data = _joint(4, friction=0.0, held=False, rows=50)
+    samples = Transitions(np.zeros((2, 2)), np.zeros((2, 1)), np.zeros((2, 2)), None, 1, True, {}, "", np.zeros(2), "here")
+    assert straight(replace(data, campaign=samples), model, 0.5).campaign is samples

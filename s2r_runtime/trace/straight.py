@@ -58,7 +58,8 @@ def _sampled(states: Stream, inputs: Stream) -> bool:
 def straight(data: Dataset, model: ComposedModel, share: float) -> Dataset:
     """The recording with each input a share of halfway on to the next one."""
     segments = [(states, Stream(inputs.t, _moved_on(inputs.values, share))) for states, inputs in data.segments]
-    return regridded(replace(data, segments=tuple(segments), straight=share), model)
+    again = regridded(replace(data, segments=tuple(segments), straight=share), model)
+    return replace(again, campaign=data.campaign)  # the step is the same, so its samples still are of this model
 
 
 def _moved_on(values: Array, share: float) -> Array:

@@ -179,6 +179,7 @@ def _straight(
     model, data, test = alike(asked, *recorded)
     if data.straight or not sampled(data):
         return None
+    less, data, test = alike(asked, data, test)  # a recording without a state is laid for the model without it
 
     def moved(share: float) -> Dataset:
         return thinned(model, straight(data, model, share), test, parts)[1]
@@ -186,26 +187,15 @@ def _straight(
     def laid(share: float) -> Problem:
         if not share:
             return given
-        runs = [_with_inputs(run, there.u) for run, there in zip(checked.data.runs, moved(share).runs, strict=True)]
-        return replace(given, data=part(replace(checked.data, runs=tuple(runs)), checked.left_out, seen, FIT_STEPS).data, searches={})
+        model, there, _ = thinned(less, straight(data, less, share), test, parts)
+        return replace(given, data=part(with_history(model, there), checked.left_out, seen, FIT_STEPS).data, searches={})
 
     if not _alike_laid(moved(1.0), checked.data):
         return None
     share = moved_on(laid, fit)
     if not share:
         return None
-    return straight(data, model, share), None if test is None else straight(test, model, share) if sampled(test) else test
-
-
-def _alike_laid(other: Dataset, data: Dataset) -> bool:
-    """Whether the other's inputs can stand in those of the data, which may begin before its first row."""
-    pairs = zip(other.runs, data.runs, strict=False)
-    return (len(other.runs), other.substeps) == (len(data.runs), data.substeps) and all(len(a.u) <= len(b.u) for a, b in pairs)
-
-
-def _with_inputs(run: Run, u: Array) -> Run:
-    """A run with other inputs (K, nu) at its end; what was there before its first row stays."""
-    return replace(run, u=np.concatenate([run.u[: len(run.u) - len(u)], u]))
+    return straight(data, less, share), None if test is None else straight(test, less, share) if sampled(test) else test
 
 
 def _finer(dataset: Dataset, model: ComposedModel, chosen: Selection, ahead: int) -> int | None:
