@@ -84,6 +84,17 @@ def test_mistakes_tried_at_once_say_what_each_says_by_itself(name):
         assert alone is None or np.allclose(alone, found, rtol=1e-12)
 
 
+def test_too_few_rows_are_no_question_to_somebodys_own_model(tmp_path):
+    path = tmp_path / "own.py"
+    path.write_text(
+        'STATES, INPUTS, PARAMS = ("x",), ("f",), {}\n\ndef step(x, u, dt, params):\n    assert len(x), "no rows"\n    return x + dt * u\n'
+    )
+    model = compose(ModelSpec(str(path), DT))
+    t, rng = DT * np.arange(10), np.random.default_rng(3)
+    rows = Stream(t, rng.normal(size=(10, 1))), Stream(t, rng.normal(size=(10, 1)))
+    check_plausible(model, from_streams(model, [rows], "here.csv"))
+
+
 def test_the_tracer_says_so_instead_of_looking_for_an_effect():
     name, spoil, said = MISTAKES["degrees"]
     with pytest.raises(RecordingError, match=said):
