@@ -59,6 +59,15 @@ def test_a_force_that_is_held_is_taken_as_held(friction):
     assert [e.name for e in result.effects] == ["viscous_friction"] * (friction > 0.0)
 
 
+def test_runs_of_which_some_began_under_way_tell_it_too():
+    """Which of them did is another question with each way that inputs may have gone."""
+    model, data = _joint(1, friction=0.3, held=False)
+    ((states, inputs),) = data.segments
+    rows = [slice(k, k + 170) for k in range(0, 1440, 180)]
+    runs = [tuple(Stream(one.t[some] - one.t[some.start], one.values[some]) for one in (states, inputs)) for some in rows]
+    assert trace(from_streams(model, runs, "runs"), model).straight == pytest.approx(1.0 - 1.0 / TICKS, abs=0.03)
+
+
 @pytest.mark.parametrize("held", [True, False])
 def test_a_recording_without_a_state_that_the_motion_does_not_need_is_laid_without_it(tmp_path, held):
     """A car whose speed nobody measured, steered by a wheel that moves on, or commanded anew every row."""

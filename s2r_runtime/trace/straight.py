@@ -62,6 +62,17 @@ def straight(data: Dataset, model: ComposedModel, share: float) -> Dataset:
     return replace(again, campaign=data.campaign)  # the step is the same, so its samples still are of this model
 
 
+def acted(checked: Dataset, moved: Dataset) -> Dataset:
+    """The recording as it was checked, with the inputs of one that moved on. What is taken to have been before its runs stays: asked of
+    each anew, that may be there with some inputs and not with others.
+    """
+    runs = []
+    for run, other in zip(checked.runs, moved.runs, strict=True):
+        before = (len(run.y) - len(other.y)) * checked.substeps
+        runs.append(replace(run, u=np.concatenate([run.u[:before], other.u])))
+    return replace(checked, runs=tuple(runs))
+
+
 def _moved_on(values: Array, share: float) -> Array:
     """Towards the mean over the row of a cubic through the rows around: a straight line cuts a sine's corners."""
     before, after, late = (np.concatenate([values[:1], values, values[-1:], values[-1:]])[k : k + len(values)] for k in (0, 2, 3))

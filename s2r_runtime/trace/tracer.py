@@ -45,7 +45,7 @@ from s2r_runtime.trace.retimed import dated
 from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, names
 from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded, select
 from s2r_runtime.trace.slots import Slot
-from s2r_runtime.trace.straight import moved_on, sampled, straight
+from s2r_runtime.trace.straight import acted, moved_on, sampled, straight
 from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import asked, confirmed, final_fit, foretelling, foretold_too, takes_far, verdict_of, worth_its_risk
 from s2r_runtime.trace.whole import Whole
@@ -181,16 +181,15 @@ def _straight(
         return None
     less, data, test = alike(asked, data, test)  # a recording without a state is laid for the model without it
 
-    def moved(share: float) -> Dataset:
-        return thinned(model, straight(data, model, share), test, parts)[1]
+    def so_far(share: float) -> Dataset:
+        return thinned(less, straight(data, less, share), test, parts)[1]
 
     def laid(share: float) -> Problem:
         if not share:
             return given
-        model, there, _ = thinned(less, straight(data, less, share), test, parts)
-        return replace(given, data=part(with_history(model, there), checked.left_out, seen, FIT_STEPS).data, searches={})
+        return replace(given, data=part(acted(checked.data, so_far(share)), checked.left_out, seen, FIT_STEPS).data, searches={})
 
-    if not _alike_laid(moved(1.0), checked.data):
+    if so_far(1.0).substeps != checked.data.substeps:
         return None
     share = moved_on(laid, fit)
     if not share:
