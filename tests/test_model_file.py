@@ -84,3 +84,12 @@ def test_the_same_rows_are_asked_once_and_what_a_caller_does_to_the_result_is_hi
     assert own.nominal.step(x, u, 0.2, own.nominal.parameters)[0] == pytest.approx([1.4, 2.4])
     assert own.nominal.step(x, u, 0.1, {"mass": 4.0})[0] == pytest.approx([1.2, 2.1])
     assert len(calls) == before + 2
+
+
+def test_a_step_in_place_changes_nothing_of_its_callers(tmp_path: Path) -> None:
+    """Nor does it step farther when it is asked once more."""
+    own = model(tmp_path, HEAD + STEP + "x[:, 0] += dt * x[:, 1]\n    u *= dt / params.pop('mass')\n    x[:, 1] += u[:, 0]\n    return x\n")
+    x, u = np.array([[1.0, 2.0]]), np.array([[4.0]])
+    for _ in range(2):
+        assert own.nominal.step(x, u, 0.1, own.nominal.parameters)[0] == pytest.approx([1.2, 2.2])
+        assert (x.tolist(), u.tolist(), own.nominal.parameters) == ([[1.0, 2.0]], [[4.0]], {"mass": 2.0})

@@ -66,9 +66,9 @@ class FileModel:
 
     def _called(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
         try:
-            # a division by zero shows in the result, which is checked
+            # a division by zero shows in the result, which is checked; a step in place may change what it is given
             with contextlib.redirect_stdout(sys.stderr), np.errstate(all="ignore"):
-                result = np.array(self.function(x, u, dt, parameters), dtype=np.float64)
+                result = np.array(self.function(x.copy(), u.copy(), dt, dict(parameters)), dtype=np.float64)
         except (Exception, SystemExit) as error:  # noqa: BLE001 - a user's file: whatever it raises is its report
             raise _failed(self.name, "step", error) from None
         if result.shape != x.shape:
