@@ -6,8 +6,9 @@ next one: (m - 1) / (2 m) of the way if the loop set it m times a row, 1/2 if it
 
     z = beta c + J delta,    c = what halfway does to the prediction, whitened;  J = what the model's own numbers do
 
-beta is 0 for a command that is held, (m - 1) / m for samples, less where they are noisy. Nothing else makes it positive: no robot answers
-to what it is told later, and a controller that answers to noise answers against it.
+beta is 0 for a command that is held, (m - 1) / m for samples, less where they are noisy. No robot answers to what it is told later, and a
+controller that answers to noise answers against it, which makes beta negative. One that goes along with it (a speed fed back to make up for
+friction) makes it positive, with what noise pushes the robot: mostly beyond FARTHEST, but not always.
 """
 
 from __future__ import annotations
