@@ -8,9 +8,12 @@ from trace_sets.families import make
 
 from s2r_runtime.gap import Transitions
 from s2r_runtime.models.composed import compose
-from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.trace import straight as inputs_straight
 from s2r_runtime.trace.dataset import Stream, from_streams
-from s2r_runtime.trace.straight import straight
+from s2r_runtime.trace.fitting import evaluate, problem
+from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.straight import NATS, ROUNDS, moved_on, straight
 from s2r_runtime.trace.tracer import load_dataset, trace
 
 DT_S, TICKS, NOISE = 0.02, 10, 1e-3
@@ -92,3 +95,12 @@ def test_samples_of_a_campaign_stay_with_inputs_that_moved_on():
     model, data = _joint(4, friction=0.0, held=False, rows=50)
     samples = Transitions(np.zeros((2, 2)), np.zeros((2, 1)), np.zeros((2, 2)), None, 1, True, {}, "", np.zeros(2), "here")
     assert straight(replace(data, campaign=samples), model, 0.5).campaign is samples
+
+
+@pytest.mark.parametrize(("after", "told"), [(-0.05, 0.8), (-0.9, 0.0)])
+def test_what_is_hardly_on_its_way_when_numbers_are_fitted_again_is_held(monkeypatch, after, told):
+    model, data = _joint(6, friction=0.0, held=False, rows=100)
+    given = problem(data, steps_of(data))
+    says = iter([(0.85, 2.0 * NATS), (after, 0.0), *[(min(after + 0.05, 0.0), 0.0)] * ROUNDS])
+    monkeypatch.setattr(inputs_straight, "_beta", lambda *asked: next(says))
+    assert moved_on(lambda share: given, evaluate(given, model)) == pytest.approx(told)

@@ -96,7 +96,7 @@ def moved_on(laid: Callable[[float], Problem], fit: Fit) -> float:
         share = min(max(share + more, LEAST), 1.0)
         if abs(more) < CLOSE:
             break
-    return share
+    return share if share > LEAST else 0.0
 
 
 def _beta(given: Problem, fit: Fit, held: Acting, halfway: Acting) -> tuple[float, float]:
