@@ -274,3 +274,13 @@ def test_a_push_on_a_flying_robot_of_which_only_speeds_are_known(tmp_path):
     (found,) = trace(from_arrays(model, [(np.array(states), np.array(inputs))]), model).effects
     assert (found.name, found.channel, found.parameters["x"][3]) == ("constant_disturbance", "world", "m/s²")
     assert found.values == pytest.approx({"x": 1.2, "y": -0.6}, abs=0.02)
+
+
+def test_a_flying_robots_wind_does_not_push_its_joints(tmp_path):
+    path = tmp_path / "arms.py"
+    path.write_text(
+        'import numpy as np\nSTATES = ("vx", "vy", "q1", "w1", "q2", "w2")\nINPUTS = ("ax", "ay", "a1", "a2")\nPARAMS = {}\n'
+        'RATES = {"w1": "q1", "w2": "q2"}\n\ndef step(x, u, dt, params):\n'
+        "    return x + dt * np.column_stack([u[:, :2], x[:, 3], u[:, 2], x[:, 5], u[:, 3]])\n"
+    )
+    assert registry().get("effects", "constant_disturbance").channels(compose(ModelSpec(str(path), 0.05)).nominal) == ()

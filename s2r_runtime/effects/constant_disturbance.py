@@ -82,8 +82,10 @@ def directions(model: NominalModel) -> tuple[str, ...]:
 
 
 def level_speeds(model: NominalModel) -> list[int]:
-    """Where, among the states, the speeds along x and y without a position are. Upwards gravity, or a gain of thrust, says the same."""
-    lone = lone_speeds(model)
+    """Where, among the states, the speeds along x and y without a position are. Upwards gravity, or a gain of thrust, says the same. None
+    beside axes, which are what is pushed then.
+    """
+    lone = () if axes(model) else lone_speeds(model)
     named = [[name for name in lone if name.lower().endswith(letter)] for letter in "xy"]
     return [model.states.index(one) for (one,) in named] if all(len(n) == 1 for n in named) else []
 
