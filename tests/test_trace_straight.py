@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from trace_sets.families import make
 
 from s2r_runtime.gap import Transitions
 from s2r_runtime.models.composed import compose

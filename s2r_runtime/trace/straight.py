@@ -63,6 +63,12 @@ def straight(data: Dataset, model: ComposedModel, share: float) -> Dataset:
     return replace(again, campaign=data.campaign)  # the step is the same, so its samples still are of this model
 
 
+def alike_laid(moved: Dataset, checked: Dataset) -> bool:
+    """Whether inputs of the one can stand in the runs of the other, which may begin earlier."""
+    counts = [[len(run.y) for run in data.runs] for data in (moved, checked)]
+    return moved.substeps == checked.substeps and len(counts[0]) == len(counts[1]) and all(a <= b for a, b in zip(*counts, strict=True))
+
+
 def acted(checked: Dataset, moved: Dataset) -> Dataset:
     """The recording as it was checked, with the inputs of one that moved on. What is taken to have been before its runs stays: asked of
     each anew, that may be there with some inputs and not with others.

@@ -24,7 +24,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.begun import begun
-from s2r_runtime.trace.dataset import MOST_PARTS, Dataset, Run, in_finer_parts, thinned
+from s2r_runtime.trace.dataset import MOST_PARTS, Dataset, in_finer_parts, thinned
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge, noise_floor
 from s2r_runtime.trace.excitation import advice
@@ -45,7 +45,7 @@ from s2r_runtime.trace.retimed import dated
 from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, names
 from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded, select
 from s2r_runtime.trace.slots import Slot
-from s2r_runtime.trace.straight import acted, moved_on, sampled, straight
+from s2r_runtime.trace.straight import acted, alike_laid, moved_on, sampled, straight
 from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import asked, confirmed, final_fit, foretelling, foretold_too, takes_far, verdict_of, worth_its_risk
 from s2r_runtime.trace.whole import Whole
@@ -176,10 +176,9 @@ def _straight(
     recorded: tuple[Dataset, Dataset | None], asked: ComposedModel, parts: int, checked: Checked, seen: Mask, given: Problem, fit: Fit
 ) -> tuple[Dataset, Dataset | None] | None:
     """The recordings with inputs that moved on between the rows, if the motion says that they did."""
-    model, data, test = alike(asked, *recorded)
-    if data.straight or not sampled(data):
+    if recorded[0].straight or not sampled(recorded[0]):
         return None
-    less, data, test = alike(asked, data, test)  # a recording without a state is laid for the model without it
+    less, data, test = alike(asked, *recorded)  # a recording without a state is laid for the model without it
 
     def so_far(share: float) -> Dataset:
         return thinned(less, straight(data, less, share), test, parts)[1]
@@ -189,7 +188,7 @@ def _straight(
             return given
         return replace(given, data=part(acted(checked.data, so_far(share)), checked.left_out, seen, FIT_STEPS).data, searches={})
 
-    if so_far(1.0).substeps != checked.data.substeps:
+    if not alike_laid(so_far(1.0), checked.data):
         return None
     share = moved_on(laid, fit)
     if not share:
