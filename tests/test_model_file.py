@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,14 @@ def test_the_same_rows_are_asked_once_and_what_a_caller_does_to_the_result_is_hi
     assert own.nominal.step(x, u, 0.2, own.nominal.parameters)[0] == pytest.approx([1.4, 2.4])
     assert own.nominal.step(x, u, 0.1, {"mass": 4.0})[0] == pytest.approx([1.2, 2.1])
     assert len(calls) == before + 2
+
+
+def test_a_copy_with_another_step_remembers_nothing_of_the_first(tmp_path: Path) -> None:
+    own = model(tmp_path, HEAD + STEP + GOOD).nominal.shared
+    x, u = np.array([[1.0, 2.0]]), np.array([[4.0]])
+    assert own.step(x, u, 0.1, own.parameters)[0] == pytest.approx([1.2, 2.2])
+    other = replace(own, function=lambda x, u, dt, params: x)  # type: ignore[type-var]
+    assert other.step(x, u, 0.1, own.parameters)[0] == pytest.approx([1.0, 2.0])
 
 
 def test_a_step_in_place_changes_nothing_of_its_callers(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import lack_of_fit as lack_of_fit_of
+from s2r_runtime.trace import verdict
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import held, judge, noise_floor
 from s2r_runtime.trace.fields import Field
@@ -287,6 +288,19 @@ def test_a_robot_that_noise_pushes_about_is_foretold_as_far_as_noise_lets_it(ahe
     given = held(model, data, steps_of(data), (), np.ones(n, dtype=bool), horizon * DT)
     floor = push * math.sqrt(horizon) * np.array([1.0, 1.0, 0.0]) * (1.0 if by_noise else 0.1)
     assert foretells(judge(model, given), given, floor) == foretold
+
+
+@pytest.mark.parametrize(
+    ("off", "beyond", "foretold"),
+    [((0.94, 0.94), (False, False), True), ((0.94, 0.94), (False, True), False), ((0.6, 0.94), (False, True), True)],
+)
+def test_a_state_that_noise_takes_far_does_not_speak_for_one_that_it_does_not(monkeypatch, off, beyond, foretold):
+    """off: shares of the way that two states end off by; beyond: whether noise alone falls short of that."""
+    (data,) = recordings([], 1, steps=STEPS, seed=46)
+    given = held(declared(), data, steps_of(data), (), np.ones(STEPS, dtype=bool), 1.0)
+    monkeypatch.setattr(verdict, "_off", lambda judged, given: np.array(off))
+    monkeypatch.setattr(verdict, "_beyond_noise", lambda judged, given, floor: np.array(beyond))
+    assert foretells(judge(declared(), given), given, NOISE) == foretold
 
 
 def test_a_model_that_nothing_can_ask_to_move_is_refused_in_a_line(tmp_path):

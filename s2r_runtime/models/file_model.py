@@ -46,7 +46,7 @@ class FileModel:
     parameters: dict[str, float]
     function: Callable[..., Any]
     follows: dict[str, Follows] = field(default_factory=dict)
-    _known: OrderedDict[Asked, Array] = field(default_factory=OrderedDict, repr=False, compare=False)
+    _known: OrderedDict[Asked, Array] = field(default_factory=OrderedDict, init=False, repr=False, compare=False)
 
     def step(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
         """Calls the file's `step`: x (n, nx), u (n, nu) -> (n, nx).

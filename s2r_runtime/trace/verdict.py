@@ -159,17 +159,17 @@ def _withdrawn(fit: Fit, structure: Structure) -> bool:
 
 def foretells(judged: Judged, given: Held, floor: Array) -> bool:
     """Whether rollouts end nearer to the measurement than the state was from which they began: clearly in some state, or not clearly where
-    no more than noise takes it; and in every one that goes somewhere (much farther in the horizon than in a step, which noise does not) and
-    not where noise takes it (a heading that nobody steers wanders). A position counts as one: a robot that drives straight on goes nowhere
-    sideways. floor: (nx,) what noise alone makes of the ends of rollouts.
+    noise alone takes all of them as far; and in every one that goes somewhere (much farther in the horizon than in a step, which noise does
+    not) and not where noise takes it (a heading that nobody steers wanders). A position counts as one: a robot that drives straight on goes
+    nowhere sideways. floor: (nx,) what noise alone makes of the ends of rollouts.
     """
     if not len(judged.ends):
         return True
     share = _off(judged, given)
     goes = ~np.isnan(share)
     by_noise = np.logical_not(_beyond_noise(judged, given, floor))
-    clearly = np.where(by_noise, NEARER, FORETELLS)
-    return not goes.any() or bool(np.any(share[goes] < clearly[goes]) and np.all((share[goes] < NEARER) | by_noise[goes]))
+    clearly = NEARER if by_noise[goes].all() else FORETELLS
+    return not goes.any() or bool(np.any(share[goes] < clearly) and np.all((share[goes] < NEARER) | by_noise[goes]))
 
 
 def _where_measured(floor: Array, given: Held) -> Array:
