@@ -10,7 +10,7 @@ from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.dataset import Stream, from_streams
-from s2r_runtime.trace.plausible import _if_each_taken_back, _if_taken_back, _mistake, _mistakes, _scaled, check_plausible
+from s2r_runtime.trace.plausible import _foretold, _if_each_taken_back, _if_taken_back, _mistake, _mistakes, _scaled, check_plausible
 from s2r_runtime.trace.tracer import trace
 
 DT, STEPS = 0.05, 700
@@ -280,3 +280,15 @@ def test_a_joint_that_friction_holds_from_then_on_has_no_clock_that_runs_away():
     y, t = np.array(rows) + np.random.default_rng(3).normal(size=(n, 2)) * [2e-4, 3e-3], dt * np.arange(n)
     model = compose(ModelSpec("joint", dt))
     check_plausible(model, from_streams(model, [(Stream(t, y), Stream(t, u))], "here.csv"))
+
+
+def test_a_heading_that_is_wrapped_to_chance_is_not_asked_instead_of_foretold():
+    """A robot that skids, turns at a third of the ideal rate, and whose position is lost in noise: only heading and wheels go anywhere."""
+    model, rng = _model("differential_drive"), np.random.default_rng(3)
+    y, u = _driven("differential_drive")
+    y = y * [1.0, 1.0, 0.3, 1.0, 1.0] + rng.normal(size=y.shape) * [1.0, 1.0, 0.01, 0.01, 0.01]
+    data = _data(model, y, u)
+    check_plausible(model, data)
+    times_57 = _mistake("states", "", partial(_scaled, [2], 180.0 / np.pi))
+    assert _if_each_taken_back(model, data, [times_57])[0] is None
+    assert len(_if_taken_back(model, data, times_57)) < len(_foretold(model, data)), "it does leave fewer that go"
