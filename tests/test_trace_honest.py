@@ -13,8 +13,10 @@ from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import lack_of_fit as lack_of_fit_of
 from s2r_runtime.trace import verdict
+from s2r_runtime.trace.about import about_states
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import held, judge, noise_floor
+from s2r_runtime.trace.faults import Checked
 from s2r_runtime.trace.fields import Field
 from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.lack_of_fit import Looks, Structure, _weight_of, left_of
@@ -23,8 +25,8 @@ from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.residual_noise import MEMORIES
 from s2r_runtime.trace.selection import significant
 from s2r_runtime.trace.tracer import trace
-from s2r_runtime.trace.verdict import curves_of, foretells, misses
-from s2r_runtime.trace.whole import _bent
+from s2r_runtime.trace.verdict import foretells, misses
+from s2r_runtime.trace.whole import Whole
 
 STEPS = 700
 GAIN = [("input_gain", "w", {"gain": 0.75})]
@@ -344,8 +346,9 @@ def test_what_goes_with_the_position_beside_a_spring_says_that_it_is_none(left, 
     named = fitted(given, nominal, insert(model, spring, 0))
     nats = {token: share * gain(named, nominal) for token, share in left.items()}
     assert gain(named, nominal) > 50.0
-    assert _bent(Structure(tuple(nats), True, 0.03, nats), named, nominal) is bent
-    assert not _bent(Structure((), True, 0.03, {}), nominal, named), "what explains nothing is bent by nothing"
+    whole = Whole(Checked(data, (), (), 0), model, 10)
+    assert whole._bent(Structure(tuple(nats), True, 0.03, nats), named) is bent
+    assert not whole._bent(Structure((), True, 0.03, {}), nominal), "what explains nothing is bent by nothing"
 
 
 @pytest.mark.parametrize(
@@ -360,5 +363,5 @@ def test_what_goes_with_the_position_beside_a_spring_says_that_it_is_none(left, 
 )
 def test_what_goes_with_a_speed_or_a_position_does_so_whatever_it_is_called(effect, channel, p, token):
     model = insert(compose(ModelSpec("joint", 0.02)), AppliedEffect(registry().get("effects", effect), channel, p), 0)
-    data = from_arrays(model, [(np.zeros((20, 2)), np.zeros((19, 1)))])
-    assert curves_of(evaluate(problem(data, steps_of(data)), model)) == token
+    data = from_arrays(model, [(np.random.default_rng(1).normal(size=(20, 2)), np.zeros((19, 1)))])
+    assert about_states(model, (0,), data, steps_of(data)) == token

@@ -25,7 +25,7 @@ from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.evidence import margin
 from s2r_runtime.trace.fitting import evaluate, foretold, gain, slopes, without
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
-from s2r_runtime.trace.lack_of_fit_terms import VELOCITIES, quieter
+from s2r_runtime.trace.lack_of_fit_terms import VELOCITIES, quieter, token_of
 from s2r_runtime.trace.residual import acting, first_steps
 
 Array = NDArray[np.float64]
@@ -139,12 +139,12 @@ def _coordinates(left: Left) -> Iterator[_Along]:
     for i, name in enumerate(model.states):
         if name in model.nominal.angles:
             angle = np.remainder(y[:, i], math.tau)
-            yield _Along("heading" if name in {"theta", "heading", "yaw"} else name, angle)
+            yield _Along(token_of(model, name), angle)
         elif name in VELOCITIES:
             yield _Along("speed", y[:, i])
             yield _Along("speed", np.abs(y[:, i]))
         else:
-            yield _Along("position" if name in {"x", "y", "z", "q"} else name, y[:, i])
+            yield _Along(token_of(model, name), y[:, i])
     for i, name in enumerate(model.inputs):
         u = act[given.steps.place, i]
         yield _Along(name, u)

@@ -58,6 +58,14 @@ PLAYS = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Widths of plays, as shares of the largest input."""
 
 VELOCITIES = ("speed", "vx", "vy", "qd", "wheel_left", "wheel_right")
+HEADINGS, PLACES = ("theta", "heading", "yaw"), ("x", "y", "z", "q")
+
+
+def token_of(model: ComposedModel, state: str) -> str:
+    """What is said of something that depends on a state."""
+    if state in model.nominal.angles:
+        return "heading" if state in HEADINGS else state
+    return "speed" if state in VELOCITIES else "position" if state in PLACES else state
 
 
 def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise, r: Array) -> Iterator[tuple[str, Terms]]:
@@ -274,7 +282,7 @@ def _of_states(
     inputs, one = [u[:, j] for j in range(u.shape[1])], np.ones(len(u))
     for name in model.nominal.angles:
         angle = y[:, model.states.index(name)]
-        token = "heading" if name in {"theta", "heading", "yaw"} else name
+        token = token_of(model, name)
         first, second = [np.cos(angle), np.sin(angle)], [np.cos(2.0 * angle), np.sin(2.0 * angle)]
         known.add(name)
         yield token, first, body

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.models.forces import axes
+from s2r_runtime.trace.about import about_states
 from s2r_runtime.trace.errors import Held, Judged, better, displacement
 from s2r_runtime.trace.faults import Fault
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, foretold, gain, plainly, problem, without
@@ -145,16 +145,18 @@ def verdict_of(
         nothing = away or misses(after, given, floors[1])
         return "unexplained" if structure.matters or nothing else "sensor_fault" if faulty else "none"
     noise_alone = 0.0 * floors[0] if structure.matters else floors[0]  # what is left was taken for noise, too
-    if away or not foretells(after, given, noise_alone) or _withdrawn(chosen.fit, structure) or harms(before, after, floor):
+    if away or not foretells(after, given, noise_alone) or _withdrawn(chosen.fit, structure, given) or harms(before, after, floor):
         return "unexplained"
     return "ambiguous" if chosen.rivals else "traced"
 
 
-def _withdrawn(fit: Fit, structure: Structure) -> bool:
+def _withdrawn(fit: Fit, structure: Structure, given: Held) -> bool:
     """Whether what is left takes the names away from the effects that were found."""
-    about = {token for place in fit.added for token in _about(fit.model, place)}
-    limit = SAME_KIND if about & set(structure.tokens) else LARGE
-    return structure.matters and structure.share > limit
+    if not structure.matters or structure.share <= SAME_KIND:
+        return False
+    kinds = {token for place in fit.added for token in _about(fit.model, place)}
+    kinds |= about_states(fit.model, fit.added, given.data, given.steps)
+    return structure.share > LARGE or bool(kinds & set(structure.tokens))
 
 
 def foretells(judged: Judged, given: Held, floor: Array) -> bool:
@@ -257,13 +259,6 @@ def _lengths(e: Array, columns: list[list[int]]) -> Array:
 def final_fit(chosen: Selection, verdict: Verdict) -> Fit:
     """The model that is handed on: with the effects, unless their names were withdrawn."""
     return chosen.nominal if verdict in {"unexplained", "sensor_fault", "none"} else chosen.fit
-
-
-def curves_of(fit: Fit) -> set[str]:
-    """Tokens of the states that what was found goes with: friction and drag with a speed, a spring with a position."""
-    channels = {fit.model.effects[place].channel for place in fit.added if fit.model.effects[place].effect.stage != "sensor"}
-    tokens = {fit.model.states[j]: name for axis in axes(fit.model.nominal) for j, name in zip(axis, ("position", "speed"), strict=True)}
-    return {tokens[channel] for channel in channels if channel in tokens}
 
 
 def _about(model: ComposedModel, place: int) -> list[str]:

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace.about import about_states
 from s2r_runtime.trace.challenge import MORE as SHAPED
 from s2r_runtime.trace.challenge import Better, best_shape, better_shape
 from s2r_runtime.trace.faults import Checked
@@ -27,9 +28,9 @@ from s2r_runtime.trace.lack_of_fit import (
     still_left,
 )
 from s2r_runtime.trace.lack_of_fit_judged import Judged, Left
+from s2r_runtime.trace.patchwork import patchwork
 from s2r_runtime.trace.residual import first_steps
 from s2r_runtime.trace.selection import Selection, crowded
-from s2r_runtime.trace.verdict import curves_of
 
 STRUCTURE_STEPS = 4000
 """Transitions that the lack of fit is tested on at most."""
@@ -39,6 +40,9 @@ CLEAR = 10.0
 
 NEARLY = 0.4
 """Of what effects explain: dictionaries that give less at first look are not judged."""
+
+SOMEWHAT = 0.2
+"""The same where one dictionary is held against several names: at first look it sees little beside all that it is not about."""
 
 
 class Whole:
@@ -89,14 +93,14 @@ class Whole:
         fit = self._everywhere(chosen)
         looks = Looks(left_of(self.given, fit))
         found = lack_of_fit(looks, self.nominal, self._horizon)
-        if crowded(fit):
+        if crowded(fit) or self._patchwork(fit):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
         quiet = looks.most <= NOTHING and not found.matters  # what explained more than a name would explain something beside it
         if quiet and not _twice(fit):
             return found
         if (looks.most > ALIKE or found.matters) and self._explained_without(fit, looks.left, found):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
-        if found.matters and _bent(found, fit, self.nominal):
+        if found.matters and self._bent(found, fit):
             return replace(found, share=1.0)
         better = better_shape(self.given, fit, self._horizon)
         if better is None:
@@ -118,6 +122,12 @@ class Whole:
         named = tuple(dict.fromkeys((*tokens, *found.tokens)))
         return replace(found, tokens=named, matters=True, share=1.0) if tokens else found
 
+    def _patchwork(self, fit: Fit) -> bool:
+        """Whether names are together no more than one dependence that has none."""
+        if len(fit.added) < 2 or self._looks.most < SOMEWHAT * gain(fit, self.nominal):
+            return False
+        return patchwork(self.given, fit, self.nominal, self.unnamed)
+
     def _explained_without(self, fit: Fit, left: Left, found: Structure) -> bool:
         """Whether something without a name explains more than what was named."""
         if self._unnamed_explains_more(fit, found.matters):
@@ -129,6 +139,15 @@ class Whole:
         if found.varies and self._field is not None and self._field.beyond > 0.0 and beats(self._field, self._looks.left, named):
             return True
         return wanders(self._looks.left, named)
+
+    def _bent(self, found: Structure, best: Fit) -> bool:
+        """Whether what is left goes with the very position, speed or heading that a named effect goes with, by as large a part of what was
+        explained as that by which a shape must be better to win (`challenge`): then it is another curve. A spring is not what gravity does
+        to a link.
+        """
+        least = SHAPED * max(gain(best, self.nominal), 0.0)
+        left = {token for token, nats in found.gains.items() if token in found.tokens and nats > least}
+        return bool(left) and bool(left & about_states(best.model, best.added, self.given.data, self.given.steps))
 
     @property
     def likeliest(self) -> tuple[str, ...]:
@@ -158,11 +177,3 @@ def _twice(fit: Fit) -> bool:
     """Whether two effects were named on one input: they may be one thing that has no name, and leave nothing of it."""
     channels = [fit.model.effects[i].channel for i in fit.added if fit.model.effects[i].effect.stage == "input"]
     return len({*channels}) < len(channels)
-
-
-def _bent(found: Structure, best: Fit, nominal: Fit) -> bool:
-    """Whether what is left goes with the very position or speed that a named effect goes with, by as large a part of what was explained as
-    that by which a shape must be better to win (`challenge`): then it is another curve. A spring is not what gravity does to a link.
-    """
-    left = max((nats for token, nats in found.gains.items() if token in found.tokens and token in curves_of(best)), default=0.0)
-    return left > SHAPED * max(gain(best, nominal), 0.0)

@@ -1,0 +1,74 @@
+"""What an effect is about: the inputs and states on which what it does depends, by the names that `depends_on` has for them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.errors import ConfigError
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.fitting import without
+from s2r_runtime.trace.lack_of_fit_terms import token_of
+from s2r_runtime.trace.residual import Acting, Steps, acting, advanced, rms
+
+Array = NDArray[np.float64]
+
+VARIES = 0.05
+"""Share by which what an effect does must change along a state or an input for it to be about that."""
+
+
+def about(model: ComposedModel, place: int, data: Dataset, steps: Steps) -> set[str]:
+    """Tokens of one thing each (an input, its memory, time, or as `about_states`) on which an effect of a model depends. Of what acts on an
+    input its own word is taken; of all else it is tried.
+    """
+    a = model.effects[place]
+    found = {"time"} if getattr(a.effect, "timed", False) else set()
+    if not _filters(model, place):
+        return found | _tried(model, place, data, steps, of_states=True) | _tried(model, place, data, steps, of_states=False)
+    names = model.inputs if a.channel == "*" else (a.channel,)
+    reads = a.effect.reads(model.nominal, a.channel) if hasattr(a.effect, "reads") else ()
+    remembers = a.effect.hidden(1, model.nominal, a.channel, model.dt, a.p).size > len(found)  # what is timed has the time there
+    return found | {*names, *reads} | ({f"memory({name})" for name in names} if remembers else set())
+
+
+def about_states(model: ComposedModel, places: tuple[int, ...], data: Dataset, steps: Steps) -> set[str]:
+    """Tokens (position, speed, heading, or a state's own name) of the states that what these effects do to the robot depends on: friction
+    and drag on a speed, a spring on a position. An effect on an input is about none, nor is a sensor's.
+    """
+    plant = [place for place in places if model.effects[place].effect.stage != "sensor" and not _filters(model, place)]
+    return set().union(*(_tried(model, place, data, steps, of_states=True) for place in plant))
+
+
+def _filters(model: ComposedModel, place: int) -> bool:
+    """Whether an effect changes what is commanded; some that do may also act on a speed."""
+    a = model.effects[place]
+    return a.effect.stage == "input" and (a.channel == "*" or a.channel in model.inputs)
+
+
+def _tried(model: ComposedModel, place: int, data: Dataset, steps: Steps, *, of_states: bool) -> set[str]:
+    """Of states, or of inputs, those that change what an effect does, seen from the robot, if they are elsewhere by as much as usual."""
+    less, act, y = without(model, place), acting(model, data).at(steps.place), steps.y0
+    size = rms(model.difference(steps.y1, y)) + 1e-300
+    usual = _done(model, less, y, act) / size
+    enough = VARIES * float(np.linalg.norm(usual))
+    found, names = set(), model.states if of_states else model.inputs
+    for j, name in enumerate(names):
+        by = np.eye(len(names))[j] * (1.0 if name in model.nominal.angles else float(np.std((y if of_states else act.mean)[:, j])))
+        try:
+            there = _done(model, less, y + by, act) if of_states else _done(model, less, y, act.moved(by))
+        except ConfigError:  # a user's own model may give no numbers there
+            continue
+        if np.linalg.norm(there / size - usual) > enough:
+            found.add(token_of(model, name))
+    return found
+
+
+def _done(model: ComposedModel, less: ComposedModel, y: Array, act: Acting) -> Array:
+    """(n, nx) what a model does in a step that another one does not; of a robot with a heading along it and across it."""
+    done = model.difference(*(advanced(m, y, act, slice(None)) for m in (model, less)))
+    if {"x", "y", "theta"} <= set(model.states):
+        i, j, k = (model.states.index(name) for name in ("x", "y", "theta"))
+        c, s = np.cos(y[:, k]), np.sin(y[:, k])
+        done[:, i], done[:, j] = c * done[:, i] + s * done[:, j], c * done[:, j] - s * done[:, i]
+    return np.asarray(done)

@@ -1,0 +1,49 @@
+"""Do several names stand for one thing that has none?
+
+With enough numbers, names together can follow what none of them means: a gyro that drifts, as a bias, a field of places and a rate limit.
+What tells: it depends on one thing, and a dictionary of that (`lack_of_fit_terms`) explains as much as all of them together.
+
+    patchwork    gain(dictionary) >= AS_MUCH gain(all names)     and     every gain(one name) <= MOSTLY gain(all names)
+                 and some name is not about what the dictionary depends on
+
+The dictionary's gain is that on blocks which its numbers never saw, that of the names on what they were fitted to. Two effects that are
+there give two dependences, of which one dictionary has one; where both are about the same (dry friction and drag, about the speed), one
+dictionary has both, and that says nothing against them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from s2r_runtime.trace.about import about
+from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, without
+from s2r_runtime.trace.lack_of_fit_judged import Judged
+
+AS_MUCH = 0.95
+"""Of what all names explain: of two effects that are there, one dictionary explained up to 0.89, but for pairs of which one is MOSTLY
+all."""
+
+CONSTANT = "constant"
+"""What every effect that only pushes has in it."""
+
+MOSTLY = 0.9
+"""Of the same: a name that explains more by itself is what is there, whatever the others add."""
+
+
+def patchwork(given: Problem, fit: Fit, nominal: Fit, unnamed: Judged) -> bool:
+    """Whether the names of a fit are together no more than one dependence, which none of them alone is."""
+    named = gain(fit, nominal)
+    if len(fit.added) < 2 or unnamed.token == CONSTANT or unnamed.gain < AS_MUCH * named:
+        return False
+    atoms = set(unnamed.token.split("*"))
+    if all(atoms <= about(fit.model, place, given.data, given.steps) for place in fit.added):
+        return False
+    return all(gain(alone, nominal) <= MOSTLY * named for alone in _each_alone(given, fit))
+
+
+def _each_alone(given: Problem, fit: Fit) -> Iterator[Fit]:
+    for place in fit.added:
+        model = fit.model
+        for other in reversed(fit.added):
+            model = model if other == place else without(model, other)
+        yield fitted(given, fit, model, 2)

@@ -1,0 +1,114 @@
+"""Several names that together are no more than one dependence, and what an effect is about."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from s2r_runtime.models.composed import AppliedEffect, compose
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.plugins import registry
+from s2r_runtime.trace.about import about, about_states
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.faults import Checked
+from s2r_runtime.trace.fitting import fitted, gain, insert
+from s2r_runtime.trace.patchwork import AS_MUCH, MOSTLY, patchwork
+from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.whole import Whole
+
+DT = 0.05
+NOISE = np.array([0.001, 0.001, 0.002, 0.002])
+
+
+def _effect(name, channel, p):
+    return AppliedEffect(registry().get("effects", name), channel, p)
+
+
+def _whole(push, steps=600, seed=4):
+    """All of a drive of a mass in the plane, pushed besides by what push says of its (x, y, vx, vy), seen under the plain model."""
+    rng, parts = np.random.default_rng(seed), 10
+    u = np.repeat(rng.uniform(-1.0, 1.0, (steps // 15, 2)), 15, axis=0)
+    state, rows = np.zeros(4), [np.zeros(4)]
+    for a in u:
+        for _ in range(parts):
+            pull = a - 0.4 * state[:2] - 0.4 * state[2:]  # the command leads it back: it stays where fields are known
+            state = state + DT / parts * np.concatenate([state[2:], pull + np.asarray(push(*state))])
+        rows.append(state)
+    model = compose(ModelSpec("double_integrator", DT))
+    y = np.array(rows)
+    asked = u - 0.4 * y[:-1, :2] - 0.4 * y[:-1, 2:]
+    data = from_arrays(model, [(y + rng.normal(size=y.shape) * NOISE, asked)])
+    return Whole(Checked(data, (), (), 0), model, 20)
+
+
+def _named(whole, *effects):
+    model = whole.nominal.model
+    for place, effect in enumerate(effects):
+        model = insert(model, effect, place)
+    return fitted(whole.given, whole.nominal, model)
+
+
+FIELD = ("position_field", "*", {"matrix": [[0.01, 0.0], [0.0, 0.01]]})
+BIAS = ("input_bias", "ay", {"bias": 0.01})
+
+
+def _drag(state):
+    return _effect("viscous_friction", state, {"coefficient": 0.1})
+
+
+def test_names_that_follow_what_depends_on_the_speed_are_a_patchwork_of_that():
+    whole = _whole(lambda x, y, vx, vy: (-0.8 * vx * vy, 0.8 * vx * vx))  # what a spinning wheel on board does
+    fit = _named(whole, _effect(*FIELD), _effect(*BIAS))
+    assert gain(fit, whole.nominal) > 20.0, "they do explain something"
+    assert {whole.unnamed.token} == {"speed"}
+    assert patchwork(whole.given, fit, whole.nominal, whole.unnamed)
+    assert not patchwork(whole.given, _named(whole, _effect(*BIAS)), whole.nominal, whole.unnamed), "one name is no patchwork"
+
+
+def test_two_effects_that_are_there_are_none():
+    whole = _whole(lambda x, y, vx, vy: (-0.3 * vx + 0.2 * x, 0.2 * y))
+    fit = _named(whole, _drag("vx"), _effect(*FIELD))
+    assert not patchwork(whole.given, fit, whole.nominal, whole.unnamed)
+    as_much = replace(whole.unnamed, gain=AS_MUCH * gain(fit, whole.nominal))
+    assert patchwork(whole.given, fit, whole.nominal, as_much), "but for what one dictionary does not explain"
+
+
+def test_two_effects_of_one_kind_are_none_although_one_dictionary_has_both():
+    whole = _whole(lambda x, y, vx, vy: (-0.3 * vx, -0.3 * vy))
+    fit = _named(whole, _drag("vx"), _drag("vy"))
+    named = gain(fit, whole.nominal)
+    as_much = replace(whole.unnamed, gain=AS_MUCH * named)
+    assert all(gain(_named(whole, _drag(state)), whole.nominal) <= MOSTLY * named for state in ("vx", "vy"))
+    assert not patchwork(whole.given, fit, whole.nominal, as_much)
+
+
+def test_a_name_that_explains_nearly_all_is_none_whatever_stands_beside_it():
+    whole = _whole(lambda x, y, vx, vy: (-0.3 * vx, 0.0))
+    fit = _named(whole, _drag("vx"), _effect(*BIAS))
+    as_much = replace(whole.unnamed, gain=AS_MUCH * gain(fit, whole.nominal))
+    assert about(fit.model, 1, whole.given.data, whole.given.steps) == {"ay"}, "the other one is about something else"
+    assert not patchwork(whole.given, fit, whole.nominal, as_much)
+
+
+@pytest.mark.parametrize(
+    ("name", "channel", "p", "tokens"),
+    [
+        ("gravity_slope", "*", {"x": 0.1, "y": 0.05}, {"heading"}),
+        ("constant_disturbance", "world", {"x": 0.1, "y": 0.05}, {"heading"}),
+        ("constant_disturbance", "body", {"x": 0.1, "y": 0.05}, set()),
+        ("position_field", "*", {"matrix": [[0.1, 0.02], [0.0, 0.1]]}, {"position", "heading"}),
+        ("lateral_slip", "*", {"coefficient": 0.1}, {"v", "w"}),
+        ("longitudinal_slip", "*", {"ratio": 0.1}, {"v"}),
+        ("input_gain", "w", {"gain": 0.8}, {"w"}),
+        ("input_lag", "w", {"time_constant": 0.2}, {"w", "memory(w)"}),
+        ("input_gain_drift", "w", {"rate": 0.01}, {"w", "time"}),
+        ("input_coupling", "w", {"from": "v", "coefficient": 0.2}, {"v", "w"}),
+    ],
+)
+def test_what_an_effect_is_about_is_seen_from_the_robot(name, channel, p, tokens):
+    rng = np.random.default_rng(2)
+    model = insert(compose(ModelSpec("unicycle", DT)), _effect(name, channel, p), 0)
+    data = from_arrays(model, [(rng.normal(size=(41, 3)), rng.normal(size=(40, 2)))])
+    steps = steps_of(data)
+    assert about(model, 0, data, steps) == tokens
+    assert about_states(model, (0,), data, steps) == tokens & {"heading", "position"}
