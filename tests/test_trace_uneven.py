@@ -132,6 +132,26 @@ def test_a_speed_is_what_was_commanded_last_however_late_in_its_step(even: bool,
         assert np.max(np.abs(off)) < 1e-9
 
 
+@pytest.mark.parametrize("even", [True, False], ids=["on the grid", "uneven"])
+@pytest.mark.parametrize("runs", [1, 6])
+def test_a_sine_is_added_to_what_was_commanded_last_however_late_in_its_step(even: bool, runs: int) -> None:
+    """As it stands at the step's end. What a wheel does then is no mean of the commands before and after, not in half a millisecond."""
+    rng = np.random.default_rng(8)
+    model = _model("bicycle", EffectSpec("periodic_disturbance", "speed_cmd", {"frequency": 1.3, "amplitude": 0.4, "phase": 0.7}))
+    made = []
+    for begin in 10.0 * np.arange(runs):
+        t = begin + np.cumsum(np.full(120, DT) if even else 0.8 * DT + 0.4 * DT * rng.random(120))
+        u = np.repeat(rng.uniform(0.5, 1.5, (60, 2)), 2, axis=0)[:119] * [0.1, 1.0]
+        y = np.cumsum(rng.normal(size=(120, 4)), axis=0)
+        y[1:, 3] = u[:, 1] + 0.4 * np.sin(2.0 * np.pi * 1.3 * (t[1:] - (t[0] if not made else made[0][0].t[0])) + 0.7)
+        made.append((Stream(t, y), Stream(t[:-1] + 0.93 * np.diff(t), u)))
+    data = with_history(model, from_streams(model, made, "late"))
+    assert any(run.turned is not None for run in data.runs)
+    steps = steps_of(data)
+    off = residual(model, steps, acting(model, data))[steps.joined & np.append(steps.joined[1:], False), 3]
+    assert np.max(np.abs(off)) < 1e-5
+
+
 @pytest.mark.parametrize("name", ON_STEPS)
 def test_one_advance_is_as_many_as_there_are_lengths(name: str) -> None:
     """Every effect of stage step, alone and all of them together, on rows of lengths of their own."""

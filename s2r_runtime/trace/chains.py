@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel, delays_first
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Key = tuple[object, ...]
 Tables = tuple[list[Array], list[Array], list[Array]]
 
@@ -49,11 +50,18 @@ class _Same:
 
 class Inputs:
     """Held inputs of runs, (T_i, nu) each, in rows of dt; starts: of the runs, s. lasts: (T_i,) s, of each row, where they differ. parts:
-    rows in a step of the model; where there are several, an input that changes within one has a mean there that nobody commanded.
+    rows in a step of the model; where there are several, an input that changes within one has a mean there that nobody commanded. turned:
+    (T_i / parts, nu) of each run, None or steps in whose last row an input changes, and is by its end what it is in the next one.
     """
 
     def __init__(
-        self, inputs: Sequence[Array], dt: float, starts: Sequence[float], lasts: Sequence[Array] | None = None, parts: int = 1
+        self,
+        inputs: Sequence[Array],
+        dt: float,
+        starts: Sequence[float],
+        lasts: Sequence[Array] | None = None,
+        parts: int = 1,
+        turned: Sequence[Mask | None] = (),
     ) -> None:
         self._dt = dt
         self._mixed = parts > 1
@@ -66,6 +74,8 @@ class Inputs:
         self._rows: NDArray[np.int64] | None = None
         self._starts: list[float | Array] = [float(s) for s in starts]
         self._tables = [np.asarray(u, dtype=np.float64) for u in inputs]
+        self._turned = tuple(turned)
+        self._parts = parts
         self._lengths = lengths
         if len(inputs) > 3 and len(inputs) * lengths.max() < 2 * lengths.sum():
             table = _side_by_side(self._tables)
@@ -95,7 +105,8 @@ class Inputs:
         nominal = model.nominal
         who: Key = (_Same(nominal.shared), *sorted(nominal.parameters.items()))
         links: list[Key] = [(who, name) for name in nominal.inputs]
-        now = last = self._tables
+        now = self._tables
+        last = self._given_at_ends if ends else now
         for a in delays_first(nominal, chain, lambda link: link):
             touched = self._touched(a, model)
             key: Key = (_Same(a.effect), a.channel, _values(a), *(links[c] for c in touched))
@@ -129,6 +140,20 @@ class Inputs:
         else:
             self._kept.move_to_end(known)
         return [_with(table, touched, columns) for table, columns in zip(last, found, strict=True)]
+
+    @cached_property
+    def _given_at_ends(self) -> list[Array]:
+        """What is commanded at the ends of rows: `_tables` themselves, if that is what is commanded on average."""
+        if all(mask is None for mask in self._turned):
+            return self._tables
+        runs = [u.copy() for u in self._split(self._tables)]
+        for u, mask in zip(runs, self._turned, strict=True):
+            if mask is not None:
+                step, column = np.nonzero(mask)
+                row = (step + 1) * self._parts - 1
+                within = row < len(u) - 1
+                u[row[within], column[within]] = u[row[within] + 1, column[within]]
+        return runs if self._rows is None else [_side_by_side(runs)]
 
     @cached_property
     def _when(self) -> list[Array]:

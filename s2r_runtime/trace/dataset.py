@@ -155,7 +155,8 @@ class Dataset:
     def chains(self) -> Inputs:
         """The inputs of its runs, for chains of effects."""
         lasts = [np.repeat(run.durations(self.dt) / self.substeps, self.substeps) for run in self.runs] if self.uneven else None
-        return Inputs([run.u for run in self.runs], self.dt / self.substeps, [run.start_s for run in self.runs], lasts, self.substeps)
+        starts, turned = [run.start_s for run in self.runs], [run.turned for run in self.runs]
+        return Inputs([run.u for run in self.runs], self.dt / self.substeps, starts, lasts, self.substeps, turned)
 
     @property
     def uneven(self) -> bool:
