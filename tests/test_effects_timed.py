@@ -111,6 +111,23 @@ def test_the_frequency_of_a_sine_is_found_in_the_residual(frequency, gaps):
     assert np.cos(found[0]["phase"] - 2.0) > np.cos(5.0 * np.sqrt(8.0 / n) * s / a)
 
 
+@pytest.mark.parametrize("second", [0.0, 0.01])
+def test_a_strong_sine_that_leaks_through_gaps_is_found_and_a_weak_one_beside_it(second):
+    """Two runs a while apart, of each a fifth held out. The leakage of the first is far above all else, and level for a long way around."""
+    effect, rng = registry().get("effects", "periodic_disturbance"), np.random.default_rng(7)
+    t = DT * np.concatenate([np.arange(280), np.arange(700, 980)])
+    t = t[(np.arange(560) % 280 < 84) | ((np.arange(560) % 280 >= 140) & (np.arange(560) % 280 < 224))]
+    pushes = np.zeros((len(t), 3))
+    pushes[:, 2] = 1.0
+    r = rng.normal(size=(len(t), 3)) * 0.003
+    r[:, 2] += 0.7 * np.sin(2.0 * np.pi * 2.414 * (t + DT / 2)) + second * np.sin(2.0 * np.pi * 6.2 * (t + DT / 2))
+    found = effect.starts_from_residual(r, t, pushes, UNICYCLE, "w", DT)
+    assert found[0]["frequency"] == pytest.approx(2.414, abs=1e-3)
+    assert found[0]["amplitude"] == pytest.approx(0.7 / np.sinc(2.414 * DT), rel=0.02)
+    if second:
+        assert found[1]["frequency"] == pytest.approx(6.2, abs=5e-3)
+
+
 def test_noise_that_grows_with_frequency_does_not_hide_a_slow_sine():
     """Noise of measured states enters a one-step residual twice: its power is all at high frequencies."""
     effect, rng = registry().get("effects", "periodic_disturbance"), np.random.default_rng(6)

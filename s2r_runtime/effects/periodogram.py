@@ -7,7 +7,10 @@ residual r_k that a disturbance s pushes by p_k s. The drop of the sum of square
 
 On a grid of dt (t rounded to it) S is one Fourier transform, and M, from cos² = (1 + cos 2x)/2, another one taken at 2 f. Peaks are ranked
 by their height over the usual level around them, since measured states make a residual's noise grow with frequency; then the best are
-refined with the exact stamps. Sines slower than SLOWEST periods over all of the data cannot be told from a drift and are left out.
+refined with the exact stamps. The level is that without the highest peak, if that is lower: through gaps (stretches that are held out,
+between runs) a strong sine leaks into all frequencies around, and stands out of its own leakage less than chance does elsewhere. Each peak
+is taken out before the next one is looked for (CLEAN: D. Roberts, J. Lehár, J. Dreher, Astronomical Journal 93 (1987) 968). Sines slower
+than SLOWEST periods over all of the data cannot be told from a drift and are left out.
 
 N. R. Lomb, Astrophysics and Space Science 39 (1976) 447; J. D. Scargle, Astrophysical Journal 263 (1982) 835; for weights and the mean
 M. Zechmeister, M. Kürster, Astronomy and Astrophysics 496 (2009) 577.
@@ -50,16 +53,31 @@ def peaks(t: Array, d: Array, w: Array, dt: float, count: int) -> list[Peak]:
     if len(t) < 8 or span <= 0.0 or not np.any(w > 0.0):
         return []
     d = d - w * (d.sum() / w.sum())
-    frequency, power = _spectrum(t - t[0], d, w, max(dt, OVERSAMPLED * span / MOST))
-    usable = (frequency > SLOWEST / span) & (frequency < 0.5 / dt)
-    outstanding = np.where(usable, power / _usual(power, usable), 0.0)
-    apart = 2 * OVERSAMPLED
+    grid = max(dt, OVERSAMPLED * span / MOST)
     found: list[Peak] = []
-    while len(found) < count and outstanding.max(initial=0.0) > 0.0:
-        k = int(np.argmax(outstanding))
-        found.append(_refined(float(frequency[k]), frequency[1] - frequency[0], t, d, w))
-        outstanding[max(0, k - apart) : k + apart + 1] = 0.0
+    while len(found) < count:
+        frequency, power = _spectrum(t - t[0], d, w, grid)
+        usable = (frequency > SLOWEST / span) & (frequency < 0.5 / dt)
+        power = np.where(usable, power, 0.0)
+        if not np.any(power > 0.0):
+            break
+        highest, width = int(np.argmax(power)), float(frequency[1] - frequency[0])
+        peak = _refined(float(frequency[highest]), width, t, d, w)
+        rest = _without(peak, t, d, w)
+        level = np.minimum(_usual(power, usable), _usual(_spectrum(t - t[0], rest, w, grid)[1], usable))
+        k = int(np.argmax(power / level))
+        if k != highest:
+            peak = _refined(float(frequency[k]), width, t, d, w)
+            rest = _without(peak, t, d, w)
+        found.append(peak)
+        d = rest
     return found
+
+
+def _without(peak: Peak, t: Array, d: Array, w: Array) -> Array:
+    """d (n,) less what the sine does to it."""
+    angle = 2.0 * np.pi * peak.frequency * t
+    return np.asarray(d - w * (peak.sine * np.sin(angle) + peak.cosine * np.cos(angle)))
 
 
 def _spectrum(t: Array, d: Array, w: Array, dt: float) -> tuple[Array, Array]:
