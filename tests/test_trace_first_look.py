@@ -237,3 +237,60 @@ def test_a_limit_that_is_hardly_met_is_begun_from_near_it():
     given, model = _drive(JOINT, [("input_saturation", "force", {"high": 1.95})], u, 1e-4)
     best = screen(given, evaluate(given, model), candidates(model, given.data))[0][0]
     assert (best.candidate.name, best.candidate.channel) == ("input_saturation", "force")
+
+
+def _best(given, model, name):
+    """The start of an effect that looks best."""
+    tried = [c for c in candidates(model, given.data) if c.name == name]
+    return screen(given, evaluate(given, model), tried)[0][0]
+
+
+def test_of_delays_that_look_alike_the_one_that_explains_most_as_it_stands_is_begun_from():
+    """A delay of 30 steps, sought from 25 and from 50. By a line from none at all to it the shorter one looks better; from there, the
+    search ends at the next command.
+    """
+    u = np.repeat(np.random.default_rng(3).uniform(-1.0, 1.0, 9), 40)[:, None]
+    spec = ModelSpec("joint", 0.002, {"mass": 1.0}, ())
+    true, model = compose(ModelSpec("joint", 0.002, {"mass": 1.0}, (EffectSpec("input_delay", "force", {"delay": 0.0628}),))), compose(spec)
+    x, hidden, rows = np.zeros((1, 2)), true.at_rest(1), [np.zeros(2)]
+    for row in u:
+        x, hidden = true.step(x, row[None, :], hidden)
+        rows.append(x[0])
+    y = np.array(rows) + np.random.default_rng(4).normal(size=(len(u) + 1, 2)) * 2e-4
+    data = from_arrays(model, [(y, u)])
+    given = problem(data, steps_of(data))
+    assert fitted(given, evaluate(given, model), _best(given, model, "input_delay").start).model.effects[-1].p["delay"] == pytest.approx(
+        0.0628, abs=2e-3
+    )
+
+
+def test_a_curve_of_two_forces_is_begun_as_large_as_it_explains_most():
+    """Starts are a tenth of the largest input; friction that is a two hundredth of it they overdo so much that no step leads back."""
+    u = _held(np.random.default_rng(31), 600, [-1.0], [1.0])
+    friction = {"force": 0.004, "static_force": 0.009, "velocity": 0.2}
+    given, model = _drive(JOINT, [("stribeck_friction", "qd", friction)], u, 1e-4)
+    best = _best(given, model, "stribeck_friction")
+    assert best.value > 0.9 * _best(given, model, "coulomb_friction").value
+    assert fitted(given, evaluate(given, model), best.start).model.effects[-1].p == pytest.approx(friction, rel=0.2)
+
+
+@pytest.mark.parametrize("share", [0.98, 0.85])
+def test_a_limit_of_both_wheels_is_found_by_a_quiet_sensor(share):
+    """A start that is a little too low takes off so much more than there is that it is far worse than nothing."""
+    u = _held(np.random.default_rng(32), 600, [-0.5, -1.0], [0.5, 1.0])
+    track = 0.7
+    load = np.max(np.abs(u[:, :1] + u[:, 1:] * np.array([-0.5, 0.5]) * track))
+    limit = {"speed": share * float(load), "track": track}
+    given, model = _drive(ModelSpec("unicycle", DT, {}, ()), [("wheel_saturation", "*", limit)], u, 1e-5)
+    best = screen(given, evaluate(given, model), candidates(model, given.data))[0][0]
+    assert best.candidate.name == "wheel_saturation"
+    assert fitted(given, evaluate(given, model), best.start).model.effects[-1].p == pytest.approx(limit, rel=0.02)
+
+
+def test_a_lag_of_a_tenth_of_a_step_is_begun_from():
+    """Its mean over a step is a tenth less of what is new; its end is none."""
+    u = _held(np.random.default_rng(33), 300, [-4.0, -4.0], [4.0, 4.0])
+    given, model = _drive(WHEELS, [("input_lag", "cmd_left", {"time_constant": 0.1 * DT})], u, [1e-3, 1e-3, 1e-4, 1e-4, 1e-4])
+    best = _best(given, model, "input_lag")
+    assert best.candidate.channel == "cmd_left"
+    assert best.value > 100.0

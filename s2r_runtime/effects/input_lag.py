@@ -61,9 +61,9 @@ class InputLag(InputEffect):
         return replaced(acting, model, channel, u + (acting[..., columns(model, channel)] - u) * (keep / np.maximum(mean, SMALLEST)))
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
-        """From a third of a step to 40 steps, and the time constants that actuators have."""
+        """From a tenth of a step to 40 steps, and the time constants that actuators have."""
         usual = [s for s in (0.05, 0.1, 0.2, 0.4, 0.8, 1.5) if 6.0 * dt < s <= 400.0 * dt]
-        return [{"time_constant": s} for s in sorted({*(dt * k for k in (0.3, 0.7, 1.5, 3.0, 6.0, 12.0, 40.0)), *usual})]
+        return [{"time_constant": s} for s in sorted({*(dt * k for k in (0.1, 0.3, 0.7, 1.5, 3.0, 6.0, 12.0, 40.0)), *usual})]
 
 
 def _factors(time_constant: float, dt: float | Array) -> tuple[float | Array, float | Array]:

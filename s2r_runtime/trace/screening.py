@@ -5,11 +5,17 @@ sensitivities of what the present model's own parameters do (they may move aside
 
     value = max over delta of  sum log density(z - c - J delta)  -  sum log density(z)           least squares, the density's weights
 
-An effect that enters linearly needs no grid: its columns, one a number, are scaled by the same least squares.
+An effect that enters linearly needs no grid: its columns, one a number, are scaled by the same least squares. So are all sizes of one
+together that it has several of (a force, and a larger one at rest), whatever its shape: a curve of the right shape that is ten times too
+large is worse than nothing.
+
+What bends (a delay, a play) is nearly linear between nothing and a start only: of starts that look good by that, the best one is that which
+explains most as it stands. A delay of twenty steps that is sought from fifteen ends at a smaller maximum beside it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -30,11 +36,18 @@ STEPS_ON = 2
 
 HOPELESS = 50.0
 """Nats, or those of the best start if they are more, by which a start is worse than nothing that two steps will not make worth a fit: one
-of 397 such came to more than a fifth of the best, where that had more than 7 nats.
+of 397 such came to more than a fifth of the best, where that had more than 7 nats. By a quiet sensor even a limit that is a twentieth too
+low is: of those, the one is followed that would be worth most if it did less of the same.
 """
+
+WORTH = 10.0
+"""Nats that a start must promise for doing less: no effect counts that explains fewer."""
 
 PROMISING = 0.2
 """Of what the best start explains: one that explains less is not looked at in its fuller form."""
+
+ALOOK = 3
+"""Starts of an effect that are looked at as they stand."""
 
 CHUNK = 48
 """Columns that are whitened together: few enough to stay in the cache of a small machine."""
@@ -47,12 +60,14 @@ class Screened:
     value: float
     candidate: Candidate
     start: ComposedModel
+    less: float = -math.inf
+    """Nats that it would gain if it did only a part of what it does, as no values of its own may say."""
 
 
 @dataclass(frozen=True)
 class Probe:
-    """A start. models: one a column; free: the slots that the columns scale, none where the start is taken as it is; values: names of the
-    effect's parameters that the start holds.
+    """A start. models: one a column; free: the slots that the columns scale, each one or all by the only one, none where the start is taken
+    as it is; values: names of the effect's parameters that the start holds.
     """
 
     candidate: Candidate
@@ -72,24 +87,66 @@ def screen(given: Problem, base: Fit, found: Sequence[Candidate], hopeless: floa
     white = replace(base, colour=noises.no_colour(base.z.shape[1]))  # what looks like colour may be what an effect explains
     aside = _Aside(base.z.ravel(), sensitivities(given, white, base.model, base.free))
     level = float(np.sum(noises.log_density(aside.z)))
-    best: dict[tuple[str | int, ...], Screened] = {}  # one for each set of parameters: more of them may do no better at the start
+    found_of: dict[tuple[str | int, ...], list[Screened]] = {}  # by set of parameters: more of them may do no better at the start
     for probe, c in columns(given, base, probes, before):
         value, start = aside.look(probe, c)
+        less = -math.inf if probe.free else aside.less(c)
         key: tuple[str | int, ...] = (probe.candidate.name, probe.candidate.channel, probe.candidate.place, *sorted(probe.values))
-        if np.isfinite(value) and (key not in best or value - level > best[key].value):
-            best[key] = Screened(value - level, probe.candidate, start)
-    steppable = [s for s in best.values() if foretold(given, s.start) is not None]  # as it was scaled
-    least = -max(max((s.value for s in steppable), default=0.0), hopeless)
-    moved_on = [_moved_on(given, white, aside, before, s, level) if s.value > least else s for s in steppable]
+        if np.isfinite(value):
+            found_of.setdefault(key, []).append(Screened(value - level, probe.candidate, start, less - level))
+    best = {key: sorted(several, key=lambda s: -s.value)[:ALOOK] for key, several in found_of.items()}
+    enough = max(PROMISING * max((several[0].value for several in best.values()), default=0.0), 0.0)
+    first = {
+        key: _as_it_stands(given, white, aside, before, several, level) if several[0].value > enough else several[0]
+        for key, several in best.items()
+    }
+    first = {key: s for key, s in first.items() if foretold(given, s.start) is not None}  # as it was scaled
+    least = -max(max((s.value for s in first.values()), default=0.0), hopeless)
+    moved = {key: _moved_on(given, white, aside, before, s, level) if s.value > least else s for key, s in first.items()}
+    enough = max(PROMISING * max((s.value for s in moved.values()), default=0.0), WORTH)
+    for key, s in moved.items():
+        too_much = max(found_of[key], key=lambda s: s.less)
+        if too_much.less > max(s.value, enough):
+            other = _moved_on(given, white, aside, before, too_much, level)
+            moved[key] = other if other.value > s.value else s
+    moved_on = [*moved.values()]
     enough = max(PROMISING * max((s.value for s in moved_on), default=0.0), 0.0)
     more = [_moved_on(given, white, aside, before, s, level) for s in _fuller(s for s in moved_on if s.value > enough)]
     return sorted([*moved_on, *more], key=lambda s: -s.value), len(probes) + len(more)
 
 
+def _as_it_stands(given: Problem, white: Fit, aside: _Aside, before: Array, starts: Sequence[Screened], level: float) -> Screened:
+    """Of starts of one effect, the best one first, that which explains most as it stands. What scaling promised of any is kept: a fit goes
+    on from where this one is.
+    """
+    first = starts[0]
+    place = _place(first)
+    slots = slots_of(first.start.effects[place], place)
+    if len(starts) < 2 or len(slots) != 1 or not bounds_of(first.start, slots[0]).kink or bounds_of(first.start, slots[0]).neutral is None:
+        return first
+    best, most = first, -np.inf
+    for s in starts:
+        there = foretold(given, s.start)
+        value = -np.inf if there is None else aside.look(Probe(s.candidate, s.start, (s.start,), (), ()), _column(white, there - before))[0]
+        if value > most:
+            best, most = s, value
+    return replace(best, value=max(first.value, most - level))
+
+
+def _place(s: Screened) -> int:
+    """Of the effect in its model's list."""
+    return s.candidate.place if s.candidate.replaced < 0 else s.candidate.replaced
+
+
+def _column(white: Fit, moved: Array) -> Array:
+    """(n nx, 1) of what a model changes in the prediction, (n, nx)."""
+    return white.whiten(moved).reshape(-1, 1)
+
+
 def _fuller(found: Iterable[Screened]) -> Iterator[Screened]:
     """The same with more numbers, where an effect has a fuller form that does the same to begin with."""
     for s in found:
-        place = s.candidate.place if s.candidate.replaced < 0 else s.candidate.replaced
+        place = _place(s)
         there = s.start.effects
         fuller = getattr(there[place].effect, "fuller", None)
         values = fuller(there[place].p) if fuller else None
@@ -126,7 +183,7 @@ def columns(given: Problem, base: Fit, probes: Sequence[Probe], before: Array) -
 
 def _moved_on(given: Problem, white: Fit, aside: _Aside, before: Array, s: Screened, level: float) -> Screened:
     """An effect of several numbers, or of one that has no neutral value, some steps on from its best start: no scale brings it in place."""
-    place = s.candidate.place if s.candidate.replaced < 0 else s.candidate.replaced
+    place = _place(s)
     slots = tuple(slots_of(s.start.effects[place], place))
     if (
         not slots
@@ -135,7 +192,7 @@ def _moved_on(given: Problem, white: Fit, aside: _Aside, before: Array, s: Scree
     ):
         return s
     start = refine(given, white, s.start, slots, STEPS_ON)
-    column = white.whiten(predicted(start, given.steps, acting(start, given.data)) - before).reshape(-1, 1)
+    column = _column(white, predicted(start, given.steps, acting(start, given.data)) - before)
     value, _ = aside.look(Probe(s.candidate, start, (start,), (), ()), column)
     return Screened(value - level, s.candidate, start) if value - level > s.value else s
 
@@ -166,6 +223,9 @@ def _probes(candidate: Candidate, model: ComposedModel) -> Iterator[Probe]:
             if all(m is not None for m in alone):
                 yield Probe(candidate, start, tuple(m for m in alone if m is not None), slots, held)
                 continue
+        if len(sizes) > 1:  # in the shape that the start has
+            yield Probe(candidate, start, (start,), sizes, held)
+            continue
         yield Probe(candidate, start, (start,), (), held)
 
 
@@ -185,18 +245,23 @@ class _Aside:
 
     def look(self, probe: Probe, c: Array) -> tuple[float, ComposedModel]:
         """Log density of what the probe leaves, and the model that it means."""
-        best = self._left(self.z - c[:, 0], self._j) if not probe.free or len(probe.free) == 1 else (-np.inf, np.zeros(0))
+        best = self._left(self.z - c[:, 0], self._j) if c.shape[1] == 1 else (-np.inf, np.zeros(0))
         value, start = best[0], probe.start
         if probe.free:
             scaled, beta = self._left(self.z, np.hstack([c, self._j]))
             neutral = np.array([bounds_of(start, s).neutral or 0.0 for s in probe.free])
-            size = beta[: len(probe.free)]
+            size = beta[: c.shape[1]]
             values = neutral + size * (values_of(start, probe.free) - neutral)
             other = with_values(start, probe.free, inside(start, probe.free, values))
             bent = any(bounds_of(start, s).kink for s in probe.free)  # then it is nearly linear between nothing and the start only
             if other is not None and scaled > value and (not bent or np.all((size > 0.0) & (size < 1.0))):
                 value, start = scaled, other
         return value, start
+
+    def less(self, c: Array) -> float:
+        """Log density of what is left by a part of c (m, 1); none if that is no part."""
+        value, beta = self._left(self.z, np.hstack([c, self._j]))
+        return value if 0.0 < beta[0] < 1.0 else -math.inf
 
     def _left(self, z: Array, x: Array) -> tuple[float, Array]:
         """Log density of z less its weighted least squares on x (m, k); the coefficients."""
