@@ -1,8 +1,9 @@
 """Which transitions the fit sees, and which it never does.
 
 Of one run two stretches are held out, one of them the end (HELD_OUT); of several runs, whole runs drawn by the seed (TEST_SHARE). Where
-the inputs of one side do not reach as far as those of the other, other stretches, or runs, are held out on which they do (TENTHS,
-DRAWS): an end stop that only one side meets would be found and not confirmed, or not found. What the robot did then is not looked at.
+the inputs of one side do not reach as far as those of the other, each by itself or two together (a wheel turns at the sum of what both ask
+of it), other stretches, or runs, are held out on which they do (TENTHS, DRAWS): an end stop that only one side meets would be found and not
+confirmed, or not found. What the robot did then is not looked at.
 The inputs of a run are kept from its beginning: a wide play never forgets, and a slow process hardly. Long recordings are thinned for the
 fit: blocks of contiguous steps, evenly spread, each with the inputs before it from which hidden states settle.
 """
@@ -117,10 +118,16 @@ def _without(data: Dataset, spans: list[tuple[int, int]], runs: set[int], stretc
 
 
 def _rows(data: Dataset, measured: Mask) -> tuple[Array, NDArray[np.int64]]:
-    """Inputs (n, nu) of some of the steps that were measured, and which ones."""
+    """Inputs of some of the steps that were measured, and sums and differences of each two, as large as one another, (n, nu²); and which
+    steps.
+    """
     rows = np.flatnonzero(measured)
     rows = rows[:: max(1, len(rows) // LOOKED_AT)]
-    return np.concatenate([run.u[:: data.substeps][: len(run.y) - 1] for run in data.runs])[rows], rows
+    u = np.concatenate([run.u[:: data.substeps][: len(run.y) - 1] for run in data.runs])[rows]
+    size = np.max(np.abs(u), axis=0, initial=0.0)
+    alike = u / np.where(size > 0.0, size, 1.0)
+    both = [alike[:, i] + sign * alike[:, j] for i, j in combinations(range(u.shape[1]), 2) for sign in (1.0, -1.0)]
+    return np.column_stack([u, *both]), rows
 
 
 def _shorter(u: Array, seen: Mask) -> float:
