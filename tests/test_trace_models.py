@@ -10,6 +10,7 @@ from trace_robots import GEOMETRY, INPUTS, POSES, commands, drive
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
+from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
 from s2r_runtime.trace.fitting import evaluate, fitted, problem
 from s2r_runtime.trace.residual import steps_of
@@ -114,6 +115,26 @@ def test_runs_that_begin_under_way_show_the_same_lag_as_those_from_rest():
     found = trace(from_arrays(model, runs), model)
     assert {(e.name, e.channel) for e in found.effects} == {("input_lag", "speed_cmd")}
     assert found.effects[0].parameters["time_constant"][0] == pytest.approx(0.3, rel=0.05)
+
+
+def test_a_command_before_the_recording_began_that_nobody_recorded_is_let_be_forgotten():
+    """A unicycle was on its way when it was asked to turn, a moment before the first row: its lag is still catching up."""
+    rng, dt = np.random.default_rng(10), 0.01
+    u = commands(rng, 1, 520, dt, [(0.3, 0.9), (-1.5, 1.5)], rest=0.0, hold=(0.4, 1.2))
+    u[0, :40] = [0.7, 0.0]
+    u[0, 40:90] = [0.7, 1.2]
+    y = drive(rng, "unicycle", u, [("input_lag", "w", {"time_constant": 0.0164})], dt, [1e-4, 1e-4, 2e-4])
+    states, inputs = y[0][40:], u[0][40:]
+    model = compose(ModelSpec("unicycle", dt))
+    data = with_history(model, from_arrays(model, [(states, inputs)]))
+    there = np.flatnonzero(~np.isnan(data.runs[0].y).any(axis=1))
+    begin = len(data.runs[0].y) - len(states)
+    assert 5 <= there[0] - begin <= 0.05 * len(states)
+    found = trace(from_arrays(model, [(states, inputs)]), model)
+    assert {(e.name, e.channel) for e in found.effects} >= {("input_lag", "w")}
+    assert next(e for e in found.effects if e.channel == "w").parameters["time_constant"][0] == pytest.approx(0.0164, rel=0.05)
+    known = with_history(model, from_arrays(model, [(states[50:], inputs[50:])]))  # all that acts had been held
+    assert np.flatnonzero(~np.isnan(known.runs[0].y).any(axis=1))[0] == len(known.runs[0].y) - len(states[50:])
 
 
 def test_one_delay_of_all_inputs_gives_way_to_as_long_a_lag_of_each():

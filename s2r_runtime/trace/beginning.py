@@ -1,10 +1,14 @@
 """Did a run begin at rest, or in the middle of a drive? Hidden states (a lag's, a delay's) depend on what came before its first row.
 
-A run whose first steps are foretold clearly better if its first input had been acting before was under way; that input is then taken to
-have been held before the run, long enough for hidden states to settle. Otherwise the robot stood, and everything before is zero.
+A run whose first steps are foretold clearly better if its first inputs had been acting before was under way; these are then taken to have
+been held before the run, long enough for hidden states to settle, but for one without which they are foretold better still: the robot was
+told to turn just then. Otherwise the robot stood, and everything before is zero.
 
 A state that the model sets to an input at once (a wheel's speed) says itself what had been acting when the run began: what was measured
 first is taken to have been commanded before, whatever the first command is. A wheel that is still coasting down is then no riddle.
+
+The first command need not have been held for long, and not all inputs change at once. If the first steps of a run that was under way are
+far off, and those after them are not, something remembers another command, which nobody recorded: these rows only let it be forgotten.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ from s2r_runtime.trace.dataset import Dataset, Run
 from s2r_runtime.trace.residual import acting, residual, steps_of
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 FIRST = 2
 """Steps from which it is told."""
@@ -27,8 +32,19 @@ FIRST = 2
 CLEARLY = 0.25
 """Ratio of squared errors below which it counts as clear; where noise hides it, the robot stood."""
 
+NOT_YET = 0.5
+"""The same, below which an input was at rest when another one had been held: less than a command leaves that is not carried out at all."""
+
 MOVING = 0.05
 """Of the largest command: what was measured first counts as standing still below it."""
+
+WILD = 5.0
+"""Times the usual size of a residual from which the first ones are far off."""
+
+FORGOTTEN, PART = 2, 0.05
+"""Times as many steps as are far off that are left to forget in (what falls to 5 of usual from 40 is below 1 by then); share of a run that
+is given to it at most.
+"""
 
 HELD_S = 3.0
 """For how long the first input is taken to have been held, s (30 to 300 steps)."""
@@ -42,13 +58,30 @@ def with_history(model: ComposedModel, data: Dataset) -> Dataset:
     size = np.max(np.abs(np.concatenate([run.u for run in data.runs])), axis=0)
     runs = []
     for run in data.runs:
-        under_way = _under_way(model, data, run, steps, usual)
-        before = run.u[0].copy() if under_way else np.zeros(run.u.shape[1])
+        acted = _acted(model, data, run, steps, usual)
+        under_way, before = bool(acted.any()), np.where(acted, run.u[0], 0.0)
         if not np.isnan(run.y[0]).any():
             for x, u in reached:
                 before[u] = run.y[0, x] if abs(run.y[0, x]) > MOVING * size[u] else 0.0
-        runs.append(_preceded(data, run, steps, before) if np.any(before) else run)
+        run = _preceded(data, run, steps, before) if np.any(before) else run
+        runs.append(_forgetting(model, data, run, steps, usual) if under_way else run)
     return replace(data, runs=tuple(runs))
+
+
+def _forgetting(model: ComposedModel, data: Dataset, run: Run, before: int, usual: Array) -> Run:
+    """A run that was under way, after so many steps of what was before, less the rows in which that still shows not to have been so."""
+    rows = len(run.y) - before
+    most = max(FIRST, int(PART * rows))
+    first = replace(data, runs=(run,))
+    steps = steps_of(first)
+    off = np.any(np.abs(residual(model, steps, acting(model, first))) > WILD * usual, axis=1)
+    there = off[: most + 1] & (steps.place[: most + 1] == before + np.arange(min(most + 1, len(off))))
+    wild = int(np.argmin(there)) if not there.all() else 0  # what goes on is no matter of the beginning
+    if not wild:
+        return run
+    y = run.y.copy()
+    y[: before + min(FORGOTTEN * wild, most)] = np.nan
+    return replace(run, y=y)
 
 
 def _usual(model: ComposedModel, data: Dataset) -> Array:
@@ -62,22 +95,35 @@ def _usual(model: ComposedModel, data: Dataset) -> Array:
     return size
 
 
-def _under_way(model: ComposedModel, data: Dataset, run: Run, steps: int, usual: Array) -> bool:
-    """Whether the first steps are foretold clearly better with the first input held before them than from rest."""
-    first = FIRST * data.substeps
+def _acted(model: ComposedModel, data: Dataset, run: Run, steps: int, usual: Array) -> Mask:
+    """(nu,) inputs with which the first steps are foretold clearly better if they had been held before than from rest."""
+    none = np.zeros(run.u.shape[1], dtype=bool)
     if len(run.y) < FIRST + 1 or not np.any(run.u[: data.substeps]) or np.isnan(run.y[: FIRST + 1]).any():
-        return False
-    held = np.concatenate([np.tile(run.u[:1], (steps * data.substeps, 1)), run.u[:first]])
-    part = data.dt / data.substeps
-    acted = [
+        return none
+    held = run.u[0] != 0.0
+    driven, rested = (_at_first(model, data, run, np.where(mask, run.u[0], 0.0), steps) for mask in (held, none))
+    forgets = np.allclose(driven, rested)  # nothing in the model remembers: what was before shows in the first step alone
+
+    def off(mask: Mask) -> float:
+        """Squared errors of the first steps."""
+        u = _at_first(model, data, run, np.where(mask, run.u[0], 0.0), steps)
+        if forgets:
+            u = np.concatenate([np.where(mask, u[:1], 0.0), u[1:]])
+        return float(np.sum((_errors(model, run, u) / usual) ** 2))
+
+    for i in np.flatnonzero(held).tolist():
+        less = held & (np.arange(len(held)) != i)
+        held = less if off(less) < NOT_YET * off(held) else held
+    return held if off(held) < CLEARLY * off(none) else none
+
+
+def _at_first(model: ComposedModel, data: Dataset, run: Run, before: Array, steps: int) -> Array:
+    """(FIRST, parts, nu) what acts in the first steps after so many of an input (nu,)."""
+    first, part = FIRST * data.substeps, data.dt / data.substeps
+    u = np.concatenate([np.tile(before, (steps * data.substeps, 1)), run.u[:first]])
+    return (
         Inputs([u], part, [run.start_s + part * (first - len(u))]).through(model, _chain(model))[-first:].reshape(FIRST, data.substeps, -1)
-        for u in (held, run.u[:first])
-    ]
-    if np.allclose(acted[0], acted[1]):  # nothing in the model remembers: what was before shows in the first step alone
-        acted[1] = np.where(np.arange(FIRST)[:, None, None] == 0, 0.0, acted[1])
-    errors = [_errors(model, run, u) for u in acted]
-    driven, rested = (float(np.sum((e / usual) ** 2)) for e in errors)
-    return driven < CLEARLY * rested
+    )
 
 
 def _chain(model: ComposedModel) -> list[AppliedEffect]:
