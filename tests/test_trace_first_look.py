@@ -20,7 +20,8 @@ from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.scores import names
 from s2r_runtime.trace.screening import probes_of, screen
-from s2r_runtime.trace.selection import Selection
+from s2r_runtime.trace.selection import Selection, _doing_something, _edges, relevant
+from s2r_runtime.trace.slots import Added
 
 JOINT, WHEELS = ModelSpec("joint", DT, {"mass": 1.0}, ()), ModelSpec("differential_drive", DT, {}, ())
 
@@ -294,3 +295,27 @@ def test_a_lag_of_a_tenth_of_a_step_is_begun_from():
     best = _best(given, model, "input_lag")
     assert best.candidate.channel == "cmd_left"
     assert best.value > 100.0
+
+
+def test_what_was_asked_for_once_only_is_foretold_from_a_part_of_it():
+    """A wheel turns for a tenth of the time, in the last of the blocks; from the others, which know nothing of its gain, it is foretold."""
+    u = np.tile([3.0, 5e-5], (600, 1))
+    u[520:580, 1] = np.repeat(np.random.default_rng(34).uniform(1.0, 4.0, 6), 10)
+    given, model = _drive(WHEELS, [("input_gain", "cmd_right", {"gain": 1.2})], u, [1e-3, 1e-3, 2e-3, 1e-2, 1e-2])
+    base = evaluate(given, model)
+    fit = fitted(given, base, insert(model, Added(registry().get("effects", "input_gain"), "cmd_right", {"gain": 1.1}), 0))
+    assert relevant(given, fit, base, 20)
+    change = Added(registry().get("effects", "input_gain_drift"), "cmd_right", {"rate": 0.01})
+    fit = fitted(given, base, insert(model, change, 0))
+    assert _edges(given, fit, base) == pytest.approx(np.linspace(0, 599, 6))  # what depends on time must be seen at other times
+
+
+def test_an_effect_that_came_to_do_nothing_beside_a_later_one_is_left_out():
+    given, model = _drive(
+        JOINT, [("input_lag", "force", {"time_constant": 0.1})], _held(np.random.default_rng(35), 300, [-1.0], [1.0]), 1e-3
+    )
+    late = Added(registry().get("effects", "input_delay"), "force", {"delay": 0.0})
+    lag = Added(registry().get("effects", "input_lag"), "force", {"time_constant": 0.1})
+    both = evaluate(given, insert(insert(model, lag, 0), late, 0))
+    assert names(_doing_something(given, both).model) == (("input_lag", "force"),)
+    assert names(_doing_something(given, evaluate(given, insert(model, lag, 0))).model) == (("input_lag", "force"),)

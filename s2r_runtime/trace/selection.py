@@ -39,7 +39,7 @@ from s2r_runtime.trace.fitting import (
 from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
 from s2r_runtime.trace.rivals import CLOSE, rivals, simplified
 from s2r_runtime.trace.scores import STRICT, Bar, Scored, at_first_look, best_candidates, limited, name_of, names, rescored, unlimited
-from s2r_runtime.trace.slots import Added, bounds_of, slots_of, values_of, with_values
+from s2r_runtime.trace.slots import Added, Slot, bounds_of, slots_of, values_of, with_values
 
 Array = NDArray[np.float64]
 
@@ -61,6 +61,9 @@ EXCHANGED = 3
 BENT = 3.0
 """Standard deviations by which a number must change to have been bent by what the model lacks beside."""
 
+IDLE = 1e-9
+"""Of its neutral value, or of its unit: a number that is no farther from it does nothing."""
+
 CLOSE_BY, SHORT = 3, 0.5
 """Effects that fall short which what was not fitted is asked about, and the share of what is needed that they must have."""
 
@@ -69,6 +72,9 @@ BLOCKS = 5
 
 SOME = 4
 """Rounds of parameters under another law of noise."""
+
+ALONE_TELLS = 0.95
+"""Share of what tells a number from which on a block alone tells it: the others know it four times as poorly, or worse."""
 
 STARTS = 1200
 """Rollouts that relevance is judged on at most."""
@@ -148,9 +154,23 @@ def one_more(given: Problem, chosen: Selection, horizon: int, foretells: Callabl
             continue
         ahead = min(foretells(s.fit, fit), gain(s.fit, fit))
         if ahead > 0.0 and accepted(given, s.fit, fit, chosen.tried, horizon, ahead=ahead):
-            more, found = overtaken(given, plainly(given, fitted(given, s.fit, s.fit.model)), STRICT)
+            more, found = overtaken(given, plainly(given, _doing_something(given, fitted(given, s.fit, s.fit.model))), STRICT)
             return replace(chosen, fit=more, rivals=tuple(found))
     return chosen
+
+
+def _doing_something(given: Problem, fit: Fit) -> Fit:
+    """Less the effects that came to do nothing beside a later one: a delay of 0 s that a lag took over from."""
+    for place in fit.added:
+        ends = [(bounds_of(fit.model, slot).neutral, value) for slot, value in _numbers(fit, place)]
+        if ends and all(neutral is not None and abs(value - neutral) <= IDLE * max(abs(neutral), 1.0) for neutral, value in ends):
+            return _doing_something(given, fitted(given, fit, without(fit.model, place)))
+    return fit
+
+
+def _numbers(fit: Fit, place: int) -> list[tuple[Slot, float]]:
+    """What was fitted of the effect at this place."""
+    return [(slot, value) for slot, value in zip(fit.free, values_of(fit.model, fit.free).tolist(), strict=True) if slot.place == place]
 
 
 def crowded(fit: Fit) -> bool:
@@ -260,25 +280,28 @@ def _beyond_wandering(given: Problem, fit: Fit, base: Fit, needed: float) -> boo
 def relevant(given: Problem, fit: Fit, base: Fit, horizon: int, bar: Bar = STRICT) -> bool:
     """Whether some state's error at one step, a quarter of the horizon or all of it falls by the bar's share, cross-validated."""
     known = (begun(given, fit), uncertain(fit, given.data.dt)) if given.floor.axes else None
+    edges = _edges(given, fit, base)
+    blind = [(f, _less_each_block(given, f, edges)) for f in (base, fit)]
     for steps in sorted({1, max(1, horizon // 4), horizon}):
-        before, after = held_out_errors(given, base, steps, known), held_out_errors(given, fit, steps, known)
+        before, after = (_held_out_errors(given, f, models, edges, steps, known) for f, models in blind)
         if np.any(before > (1.0 + bar.share) * after):
             return True
     return False
 
 
-def held_out_errors(given: Problem, fit: Fit, horizon: int, known: tuple[Array | None, Array] | None = None) -> Array:
-    """(nx,) rms at the end of rollouts, in blocks of time, each under parameters from the other blocks. known: where axes were whose speed
-    was not measured (rows, nx), and its variances; else by what was measured.
+def _held_out_errors(
+    given: Problem, fit: Fit, models: Sequence[ComposedModel], edges: Array, horizon: int, known: tuple[Array | None, Array] | None
+) -> Array:
+    """(nx,) rms at the end of rollouts, in blocks of time between the edges, each under the model that has its parameters from the other
+    blocks. known: where axes were whose speed was not measured (rows, nx), and its variances; else by what was measured.
     """
     starts = rollout_starts(given.data, horizon)
     starts = starts[np.isin(starts, given.steps.place)]
     starts = starts[:: max(1, len(starts) // STARTS)]
     if not len(starts):
         return np.full(given.steps.y0.shape[1], np.nan)
-    edges = np.quantile(given.steps.place, np.linspace(0.0, 1.0, BLOCKS + 1))
     errors = []
-    for block, model in enumerate(_less_each_block(given, fit, edges)):
+    for block, model in enumerate(models):
         inside = starts[(starts >= edges[block]) & ((starts < edges[block + 1]) | (block == BLOCKS - 1))]
         if len(inside):
             begin = begun(given, under_noise(given, model, fit.noise)) if given.floor.axes else None
@@ -289,6 +312,31 @@ def held_out_errors(given: Problem, fit: Fit, horizon: int, known: tuple[Array |
     return off if known is None else np.sqrt(off**2 + known[1])
 
 
+def _edges(given: Problem, fit: Fit, base: Fit) -> Array:
+    """(BLOCKS + 1,) of blocks of time, all of as many steps. Where one of these has nearly all that tells a new number (a wheel that was
+    asked to turn once only), the others know nothing of it, and no block can be foretold: then half of what makes blocks alike is that. Not
+    of what depends on time itself: of that, something that happens once shows nothing.
+    """
+    place, even = given.steps.place, np.linspace(0.0, 1.0, BLOCKS + 1)
+    edges = np.quantile(place, even)
+    there = names(base.model)
+    effects = [fit.model.effects[slot.place] for slot in fit.free]
+    new = tuple(s for s, a in zip(fit.free, effects, strict=True) if name_of(a) not in there and not getattr(a.effect, "timed", False))
+    told = np.square(sensitivities(given, fit, fit.model, new)).reshape(*fit.z.shape, len(new)).sum(axis=1)
+    told = told[:, told.sum(axis=0) > 0.0] / told.sum(axis=0)[told.sum(axis=0) > 0.0]
+    block = _block(place, edges)
+    if max((float(np.max(np.bincount(block, one, BLOCKS))) for one in told.T), default=0.0) <= ALONE_TELLS:
+        return np.asarray(edges)
+    share = np.cumsum(0.5 / len(place) + 0.5 * told.mean(axis=1))
+    cut = np.minimum(np.searchsorted(share, even[1:-1]), len(place) - 1)
+    return np.array([place[0], *place[cut], place[-1]], dtype=np.float64)
+
+
+def _block(place: NDArray[np.int64], edges: Array) -> NDArray[np.int64]:
+    """(n,) which block each step is in."""
+    return np.clip(np.searchsorted(edges, place, side="right") - 1, 0, BLOCKS - 1)
+
+
 def _less_each_block(given: Problem, fit: Fit, edges: Array) -> list[ComposedModel]:
     """The model refitted without each block, to first order."""
     free = fit.free
@@ -297,7 +345,7 @@ def _less_each_block(given: Problem, fit: Fit, edges: Array) -> list[ComposedMod
     z = objective(given, fit, fit.model)
     j = sensitivities(given, fit, fit.model, free)
     w = noises.weight(z).ravel()
-    block = np.repeat(np.clip(np.searchsorted(edges, given.steps.place, side="right") - 1, 0, BLOCKS - 1), z.shape[1])
+    block = np.repeat(_block(given.steps.place, edges), z.shape[1])
     models = []
     for b in range(BLOCKS):
         rest = block != b
