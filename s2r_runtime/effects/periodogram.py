@@ -102,10 +102,14 @@ def _spectrum(t: Array, d: Array, w: Array, dt: float) -> tuple[Array, Array]:
 def _usual(power: Array, usable: NDArray[np.bool_]) -> Array:
     """Median of the power around each frequency."""
     inside = np.flatnonzero(usable)
-    parts = np.array_split(inside, min(BANDS, max(1, len(inside) // (8 * OVERSAMPLED))))
-    middle = np.array([np.median(part) for part in parts if len(part)])
-    level = np.array([np.median(power[part]) for part in parts if len(part)])
-    return np.maximum(np.interp(np.arange(len(power)), middle, level), 1e-300) if len(middle) else np.ones_like(power)
+    if not len(inside):
+        return np.ones_like(power)
+    bands = min(BANDS, max(1, len(inside) // (8 * OVERSAMPLED)))
+    each, more = divmod(len(inside), bands)  # as many in each, and one more in the first ones
+    first = more * (each + 1)
+    parts = [part.reshape(-1, size) for part, size in ((inside[:first], each + 1), (inside[first:], each)) if len(part)]
+    middle, level = (np.concatenate([np.median(of[part], axis=1) for part in parts]) for of in (np.arange(len(power)), power))
+    return np.asarray(np.maximum(np.interp(np.arange(len(power)), middle, level), 1e-300))
 
 
 def _refined(frequency: float, width: float, t: Array, d: Array, w: Array) -> Peak:
