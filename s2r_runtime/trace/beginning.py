@@ -63,13 +63,13 @@ def with_history(model: ComposedModel, data: Dataset) -> Dataset:
         if not np.isnan(run.y[0]).any():
             for x, u in reached:
                 before[u] = run.y[0, x] if abs(run.y[0, x]) > MOVING * size[u] else 0.0
-        run = _preceded(data, run, steps, before) if np.any(before) else run
-        runs.append(_forgetting(model, data, run, steps, usual) if under_way else run)
+        laid = _preceded(data, run, steps, before) if np.any(before) else run
+        runs.append(_forgetting(model, data, laid, len(laid.y) - len(run.y), usual) if under_way else laid)
     return replace(data, runs=tuple(runs))
 
 
 def _forgetting(model: ComposedModel, data: Dataset, run: Run, before: int, usual: Array) -> Run:
-    """A run that was under way, after so many steps of what was before, less the rows in which that still shows not to have been so."""
+    """A run that was under way, after so many steps of what was before, less the rows in which that shows not to have been so."""
     rows = len(run.y) - before
     most = max(FIRST, int(PART * rows))
     first = replace(data, runs=(run,))
