@@ -46,7 +46,7 @@ def test_what_two_inputs_reach_together_is_shared():
         u[at : at + 10] = 0.0
         u[at : at + 10, one] = [0.5, 2.0][one]
     u[400:420] = u[850:870] = [0.5, 2.0]
-    seen = fit_mask(from_arrays(model, [(np.zeros((STEPS + 1, 3)), u)]), 0)
+    seen = fit_mask(from_arrays(model, [(np.zeros((STEPS + 1, 3)), u)]), 0, one_body=True)
     together = (u / [0.5, 2.0]).sum(axis=1)
     assert together[seen].max() == together[~seen].max() == 2.0
 
