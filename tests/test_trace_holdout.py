@@ -37,20 +37,6 @@ def test_pushes_that_only_one_side_would_see_are_shared():
     assert fitted == held == -10.0
 
 
-def test_what_two_inputs_reach_together_is_shared():
-    """Each is as large by itself now and then on both sides; together they are at the end only, and at four tenths of the time."""
-    rng, model = np.random.default_rng(7), compose(ModelSpec("unicycle", 0.01))
-    u = rng.uniform(-1.0, 1.0, (STEPS, 2)) * [0.5, 2.0]
-    u[np.abs(u @ [2.0, 0.5]) > 1.2] *= 0.5
-    for at, one in ((100, 0), (350, 0), (650, 0), (900, 0), (120, 1), (370, 1), (670, 1), (920, 1)):
-        u[at : at + 10] = 0.0
-        u[at : at + 10, one] = [0.5, 2.0][one]
-    u[400:420] = u[850:870] = [0.5, 2.0]
-    seen = fit_mask(from_arrays(model, [(np.zeros((STEPS + 1, 3)), u)]), 0, one_body=True)
-    together = (u / [0.5, 2.0]).sum(axis=1)
-    assert together[seen].max() == together[~seen].max() == 2.0
-
-
 def test_runs_are_drawn_so_that_both_sides_hold_hard_pushes():
     rng = np.random.default_rng(3)
     for seed in range(20):

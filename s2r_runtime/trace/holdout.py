@@ -1,9 +1,8 @@
 """Which transitions the fit sees, and which it never does.
 
 Of one run two stretches are held out, one of them the end (HELD_OUT); of several runs, whole runs drawn by the seed (TEST_SHARE). Where
-the inputs of one side do not reach as far as those of the other, each by itself or, on a body that both move, two together (a wheel turns
-at the sum of what both ask of it), other stretches, or runs, are held out on which they do (TENTHS, DRAWS): an end stop that only one side
-meets would be found and not confirmed, or not found. What the robot did then is not looked at.
+the inputs of one side do not reach as far as those of the other, other stretches, or runs, are held out on which they do (TENTHS,
+DRAWS): an end stop that only one side meets would be found and not confirmed, or not found. What the robot did then is not looked at.
 The inputs of a run are kept from its beginning: a wide play never forgets, and a slow process hardly. Long recordings are thinned for the
 fit: blocks of contiguous steps, evenly spread, each with the inputs before it from which hidden states settle.
 """
@@ -65,15 +64,13 @@ class Part:
     left_out: tuple[tuple[int, int], ...]
 
 
-def fit_mask(data: Dataset, seed: int, *, everything: bool = False, one_body: bool = False) -> Mask:
-    """(M,) steps, of the runs laid end to end, that the fit may see. everything: another recording is the judge. one_body: all inputs move
-    one body; axes that each have their own share nothing.
-    """
+def fit_mask(data: Dataset, seed: int, *, everything: bool = False) -> Mask:
+    """(M,) steps, of the runs laid end to end, that the fit may see. everything: another recording is the judge."""
     spans = _spans(data)
     measured = _without(data, spans, set(), ())
     if everything:
         return measured
-    u, rows = _rows(data, measured, one_body)
+    u, rows = _rows(data, measured)
     ways: list[tuple[set[int], Stretches]]
     if len(data.runs) >= FEWEST_RUNS:
         rng, few = np.random.default_rng(seed), round(TEST_SHARE * len(data.runs))
@@ -119,19 +116,11 @@ def _without(data: Dataset, spans: list[tuple[int, int]], runs: set[int], stretc
     return seen
 
 
-def _rows(data: Dataset, measured: Mask, one_body: bool) -> tuple[Array, NDArray[np.int64]]:
-    """Inputs (n, nu) of some of the steps that were measured, of one body (n, nu²) with sums and differences of each two, as large as one
-    another; and which steps.
-    """
+def _rows(data: Dataset, measured: Mask) -> tuple[Array, NDArray[np.int64]]:
+    """Inputs (n, nu) of some of the steps that were measured, and which ones."""
     rows = np.flatnonzero(measured)
     rows = rows[:: max(1, len(rows) // LOOKED_AT)]
-    u = np.concatenate([run.u[:: data.substeps][: len(run.y) - 1] for run in data.runs])[rows]
-    if not one_body:
-        return u, rows
-    size = np.max(np.abs(u), axis=0, initial=0.0)
-    alike = u / np.where(size > 0.0, size, 1.0)
-    both = [alike[:, i] + sign * alike[:, j] for i, j in combinations(range(u.shape[1]), 2) for sign in (1.0, -1.0)]
-    return np.column_stack([u, *both]), rows
+    return np.concatenate([run.u[:: data.substeps][: len(run.y) - 1] for run in data.runs])[rows], rows
 
 
 def _shorter(u: Array, seen: Mask) -> float:
