@@ -183,6 +183,7 @@ class Effect(Protocol):
     - `once` = True: a model has at most one of it; `linear` = True: it commutes with other linear effects, so the tracer tries one
       place in the list only; `shift` = True: a pure delay, which commutes with all that has no clock of its own; `additive` = True: what
       it does is a sum over its parameters, in proportion to each one's distance from neutral (a force: as long as nothing stops);
+      `homogeneous` = True: it does as much more as all parameters that have a neutral value are farther from it, in one ratio;
     - `same_as(model, channel) -> tuple[tuple[str, str, convert], ...]`: effects that it is identical to on this model: name, channel, and
       a function of its values that gives theirs. The tracer looks for the first of them instead (`effects.classes` has the built-in ones);
     - `simpler(p) -> (name, p)`: the effect with fewer numbers that it is if its own agree, on the same channel;

@@ -30,6 +30,7 @@ class StribeckFriction(ForceEffect):
     )
     uneven = True
     varies = True
+    homogeneous = True
 
     def unit(self, model: NominalModel, channel: str, parameter: str) -> str:
         """Of a force, of a speed."""

@@ -58,13 +58,14 @@ def with_history(model: ComposedModel, data: Dataset) -> Dataset:
     size = np.max(np.abs(np.concatenate([run.u for run in data.runs])), axis=0)
     runs = []
     for run in data.runs:
-        acted = _acted(model, data, run, steps, usual)
-        under_way, before = bool(acted.any()), np.where(acted, run.u[0], 0.0)
+        guessed = _acted(model, data, run, steps, usual)
+        before = np.where(guessed, run.u[0], 0.0)
         if not np.isnan(run.y[0]).any():
             for x, u in reached:
                 before[u] = run.y[0, x] if abs(run.y[0, x]) > MOVING * size[u] else 0.0
+                guessed[u] = False
         laid = _preceded(data, run, steps, before) if np.any(before) else run
-        runs.append(_forgetting(model, data, laid, len(laid.y) - len(run.y), usual) if under_way else laid)
+        runs.append(_forgetting(model, data, laid, len(laid.y) - len(run.y), usual) if guessed.any() else laid)
     return replace(data, runs=tuple(runs))
 
 

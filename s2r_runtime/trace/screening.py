@@ -5,9 +5,9 @@ sensitivities of what the present model's own parameters do (they may move aside
 
     value = max over delta of  sum log density(z - c - J delta)  -  sum log density(z)           least squares, the density's weights
 
-An effect that enters linearly needs no grid: its columns, one a number, are scaled by the same least squares. So are all sizes of one
-together that it has several of (a force, and a larger one at rest), whatever its shape: a curve of the right shape that is ten times too
-large is worse than nothing.
+An effect that enters linearly needs no grid: its columns, one a number, are scaled by the same least squares. So are all sizes
+together of one that does as much more as they are larger (`homogeneous`: a force, and a larger one at rest): a curve of the right shape
+that is ten times too large is worse than nothing.
 
 What bends (a delay, a play) is nearly linear between nothing and a start only: of starts that look good by that, the best one is that which
 explains most as it stands. A delay of twenty steps that is sought from fifteen ends at a smaller maximum beside it.
@@ -223,7 +223,7 @@ def _probes(candidate: Candidate, model: ComposedModel) -> Iterator[Probe]:
             if all(m is not None for m in alone):
                 yield Probe(candidate, start, tuple(m for m in alone if m is not None), slots, held)
                 continue
-        if len(sizes) > 1:  # in the shape that the start has
+        if len(sizes) > 1 and getattr(start.effects[place].effect, "homogeneous", False):  # in the shape that the start has
             yield Probe(candidate, start, (start,), sizes, held)
             continue
         yield Probe(candidate, start, (start,), (), held)
