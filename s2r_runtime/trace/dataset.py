@@ -45,6 +45,7 @@ from s2r_runtime.trace.streams import (
     turned,
     unwrapped,
 )
+from s2r_runtime.trace.ways import Way
 
 __all__ = ["Dataset", "Pause", "Run", "Stream", "from_arrays", "from_streams", "thinned"]
 
@@ -148,8 +149,10 @@ class Dataset:
     in_parts: bool = False
     """The model takes each of the S parts of a step by itself: its own steps are that much shorter."""
     campaign: Transitions | None = field(default=None, repr=False)
-    straight: float = 0.0
-    """Share of halfway to the next input that each was taken on, since inputs changed between the rows (`straight`)."""
+    way: Way = field(default_factory=Way)
+    """How inputs went that the recording has samples of (`straight`)."""
+    noisy: dict[str, float] = field(default_factory=dict)
+    """Standard deviations of the noise that was taken out of inputs for that."""
 
     @cached_property
     def chains(self) -> Inputs:
@@ -275,7 +278,7 @@ def from_streams(
 def regridded(data: Dataset, model: ComposedModel, in_parts: int = 0) -> Dataset:
     """The same recording on the grid of a model with another step."""
     again = from_streams(model, data.segments, data.source, data.digests, data.paths, data.reconstruction, in_parts)
-    return replace(again, straight=data.straight)
+    return replace(again, way=data.way, noisy=data.noisy)
 
 
 def thinned(

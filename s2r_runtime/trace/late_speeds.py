@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 SURELY, BLOCKS = 8.0, 10
 """Standard errors by which a speed must be late, from the scatter of so many blocks of time."""
 
-ROWS = 0.75
+ROWS = 0.6
 """Of the rows' distance: what it must be late at least. A difference of the last two positions is late by half of it."""
 
 MOSTLY = 0.5

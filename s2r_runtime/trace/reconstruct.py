@@ -26,6 +26,7 @@ from s2r_runtime.trace import differentiation
 from s2r_runtime.trace.late_speeds import late
 from s2r_runtime.trace.speeds import Smoothed, smoothed
 from s2r_runtime.trace.streams import Stream, complete, fresh, held_between, held_means, unwrapped
+from s2r_runtime.trace.ways import less_noise_of
 
 Array = NDArray[np.float64]
 
@@ -70,6 +71,8 @@ class Reconstruction:
     """Standard deviations of these speeds."""
     apart: int = 1
     """Of the model's steps, where nothing was filtered that would make neighbours alike."""
+    cleaned: tuple[Stream, ...] = field(default=(), repr=False)
+    """Inputs of each segment without the noise of samples (`ways`), where all was filtered: what is left of it then looks smooth."""
     late: dict[str, float] = field(default_factory=dict)
     """s by which speeds were late that the recording has (`late_speeds`)."""
 
@@ -199,11 +202,14 @@ def _with_speeds(
     rows = [part.values for s, _ in given for part in _stretches(s, interval) if len(part.t) > 2]
     needed = min(shown, differentiation.bandwidth(rows, interval, rows=0)) if rows else shown
     apart = max(1, min(math.ceil(steps / MANY_STEPS), math.floor(INSIDE / (needed * model.dt)), math.floor(SHORT_S / model.dt)))
+    cleaned: list[Stream] = []
     if apart > 1 or interval < FINER * model.dt:
-        made = [both for s, u in made for both in _filtered(s, u, interval, INSIDE / (apart * model.dt))]
+        band = INSIDE / (apart * model.dt)
+        cleaned = [part for s, u in made for _, part in _filtered(s, less_noise_of(u)[0], interval, band)]
+        made = [both for s, u in made for both in _filtered(s, u, interval, band)]
         if not made:
             raise RecordingError(f"{source}: {', '.join(missing)} cannot be told: no stretch without a gap is long enough")
-    return made, Reconstruction(missing, shown, interval, needed, pairs, errors, apart)
+    return made, Reconstruction(missing, shown, interval, needed, pairs, errors, apart, tuple(cleaned))
 
 
 def _speeds(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -20,6 +20,7 @@ from s2r_runtime.trace.power import Visible
 from s2r_runtime.trace.reconstruct import Reconstruction
 from s2r_runtime.trace.verdict import Verdict
 from s2r_runtime.trace.views import views
+from s2r_runtime.trace.ways import Way
 
 Array = NDArray[np.float64]
 __all__ = ["Found", "Limit", "TraceResult"]
@@ -63,8 +64,10 @@ class TraceResult:
     """Name and channel of effects that what was held out never asks for: the fit alone speaks for them."""
     may_depend_on: tuple[str, ...] = ()
     """Of `depends_on`, beside a name: what no rollout shows, or what is less sure."""
-    straight: float = 0.0
-    """As the dataset's: inputs went on changing between the rows."""
+    way: Way = field(default_factory=Way)
+    """As the dataset's: how inputs went that the recording has samples of."""
+    noisy: dict[str, float] = field(default_factory=dict)
+    """Standard deviations of the noise that was taken out of inputs."""
 
     def same(self, found: Found) -> tuple[Found, ...]:
         """Of `ambiguous_with`: other names of the very same thing on this model."""
@@ -102,9 +105,7 @@ class TraceResult:
         if self.unseen:
             was = "was" if len(self.unseen) == 1 else "were"
             lines.append(f"{', '.join(self.unseen)} {was} not measured, and not needed: the motion follows from the inputs without")
-        if self.straight:
-            way = f"{50.0 * self.straight:.0f} % of the way"
-            lines.append(f"the inputs went on changing between the rows, as the motion says: each was taken {way} to the next one")
+        lines += self._inputs_taken()
         if self.unconfirmed:
             names = ", ".join(f"{name} on {channel}" for name, channel in self.unconfirmed)
             lines.append(f"not confirmed: {names}; what it was judged on never asks for that, the fit alone speaks for it")
@@ -114,6 +115,27 @@ class TraceResult:
             longer = f"fitted and judged on steps of {self.nominal.dt:g} s, the shortest that are independent"
             lines.append(f"{longer}; the model's are {self.spec.dt:g} s")
         return tuple(lines)
+
+    def _inputs_taken(self) -> list[str]:
+        """How inputs were taken that the recording has samples of."""
+        lines = []
+        if self.way.late:
+            lines.append("the inputs come a row late, as the motion says (a mean over the row before?): each was taken from the next row")
+        if any(self.way.on):
+            shares = {f"{50.0 * on:.0f} % of the way" for on in self.way.on}
+            if len(shares) == 1:
+                lines.append(
+                    f"the inputs went on changing between the rows, as the motion says: each was taken {shares.pop()} to the next one"
+                )
+            else:
+                each = ", ".join(f"{name} {50.0 * on:.0f} %" for name, on in zip(self.nominal.inputs, self.way.on, strict=True) if on)
+                lines.append(
+                    f"some inputs went on changing between the rows, as the motion says: taken on their way to the next one ({each})"
+                )
+        if self.noisy:
+            each = ", ".join(f"{name} {size:.2g}" for name, size in self.noisy.items())
+            lines.append(f"inputs are noisy samples, as the motion says: noise was taken out of them (standard deviation: {each})")
+        return lines
 
     @property
     def horizon_s(self) -> float:
@@ -150,7 +172,9 @@ class TraceResult:
             ],
             "reconstructed": None if self.reconstruction is None else self.reconstruction.to_json(),
             "unmeasured": list(self.unseen),
-            "inputs_moved_on": 0.5 * self.straight,
+            "inputs_moved_on": 0.5 * self.way.most,
+            "inputs_noise": self.noisy,
+            "inputs_late": self.way.late,
             "unconfirmed": [{"name": name, "channel": channel} for name, channel in self.unconfirmed],
             "step_s": self.nominal.dt,
             "n_fit": self.n_fit,

@@ -197,7 +197,7 @@ def _told_by_stamps(given: Problem, fit: Fit, base: Fit) -> bool:
     one moment, whenever that was.
     """
     data = given.data
-    if not data.interpolated and not data.uneven and not data.straight:
+    if not data.interpolated and not data.uneven and not data.way:
         return True
     there = names(base.model)
     values = values_of(fit.model, fit.free)

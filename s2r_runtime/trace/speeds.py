@@ -34,6 +34,9 @@ WILD, ROUNDS = 4.0, 3
 ENOUGH = 6000
 """Rows from which r is estimated at most; it is then known to a few per cent."""
 
+FEWEST = 8
+"""Rows through which a spline is laid."""
+
 
 @dataclass(frozen=True)
 class Smoothed:
@@ -56,6 +59,15 @@ def smoothed(t: Array, y: Array, pushed: Array) -> Smoothed:
             break
         weight = np.where(off > WILD, (WILD / np.maximum(off, WILD)) ** 2 / 4.0, 1.0)
     return Smoothed(x[1] / unit, spread / unit, math.exp(0.25 * ratio) / (2.0 * math.pi * unit))
+
+
+def less_noise(t: Array, y: Array, ratio: float | None = None) -> tuple[Array, float, float]:
+    """(n,) y without its noise, the standard deviation of that, and log r. t, y: (n,), n >= FEWEST; ratio: log r, if it is known."""
+    h, weight, still = np.diff(t) / float(np.median(np.diff(t))), np.ones(len(t)), np.zeros(len(t) - 1)
+    if ratio is None:
+        ratio, _ = _likeliest(h, y, weight, (still,))
+    (found, _), scale, _ = _Spline(h, y, weight, still).solve(ratio)
+    return found, math.sqrt(scale), ratio
 
 
 def _likeliest(h: Array, y: Array, weight: Array, ways: tuple[Array, ...]) -> tuple[float, Array]:

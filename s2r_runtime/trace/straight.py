@@ -1,12 +1,15 @@
-"""Inputs that went on changing between the rows that hold them.
+"""Inputs that went on changing between the rows that hold them, and that a sensor told.
 
 A recording that is slower than the loop it listens to (a joint's torque at 100 Hz out of 1 kHz, a quadrotor's tilt, a steering wheel's
 angle) has samples of an input that moved on, not commands that were held. On average over a row such an input was up to halfway to the
-next one: (m - 1) / (2 m) of the way if the loop set it m times a row, 1/2 if it went straight on.
+next one: (m - 1) / (2 m) of the way if the loop set it m times a row, 1/2 if it went straight on. A sample is as noisy as its sensor,
+too: what a smooth curve through its neighbours says of it, the robot may have felt. And a speed that an encoder counted is a mean over
+the row that is over (`ways`).
 
-    z = beta c + J delta,    c = what halfway does to the prediction, whitened;  J = what the model's own numbers do
+    z = C beta + J delta,    C = what each of these does to the prediction, whitened;  J = what the model's own numbers do
 
-beta is 0 for a command that is held, (m - 1) / m for samples, less where they are noisy. No robot answers to what it is told later, and a
+beta is 0 for a command that is held, (m - 1) / m for samples, less where they are noisy; it is 1 for what is the sensor's noise, and 0
+for what the robot was asked. No robot answers to what it is told later, and a
 controller that answers to noise answers against it, which makes beta negative. One that goes along with it (a speed fed back to make up for
 friction) makes it positive, with what noise pushes the robot: mostly beyond FARTHEST, but not always.
 """
@@ -14,7 +17,7 @@ friction) makes it positive, with what noise pushes the robot: mostly beyond FAR
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +25,15 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.dataset import Dataset, regridded
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, sensitivities
-from s2r_runtime.trace.residual import Acting, acting, predicted
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, sensitivities
+from s2r_runtime.trace.residual import Acting, acting, predicted, residual
+from s2r_runtime.trace.rivals import CLOSE, NEAR
 from s2r_runtime.trace.streams import Stream
+from s2r_runtime.trace.ways import MOVING, Samples, Way
 
 Array = NDArray[np.float64]
-
-MOVING = 0.5
-"""Share of the rows in which some input is another one than in the row before: of fewer, they are commands that are held."""
+Mask = NDArray[np.bool_]
+Lay = Callable[[Way], Problem]
 
 MOST = 0.9
 """Share of the inputs' rows on which states stand: at the ends of a recording speeds do not follow from positions."""
@@ -37,11 +41,25 @@ MOST = 0.9
 LEAST, FARTHEST = 0.2, 1.25
 """beta between which inputs moved on: less could be the bend of what is held, and more is an input that came a row too late."""
 
-ROUNDS, CLOSE = 4, 0.005
+MOST_NOISE = 2.0
+"""beta up to which it is noise: a spline that follows what the input does follows noise, too, and takes out a part of it only."""
+
+LATE = 0.8, 1.2
+"""beta between which inputs did come a row too late: what a controller makes of noise is mostly not just that."""
+
+USUAL = 0.75
+"""Share from which it is sought by likelihood: of a loop that goes four times a row."""
+
+LOOKS = 3
+"""Times that further ways are looked for, at most: what is left by the first one is less."""
+
+ROUNDS, NARROW = 4, 0.005
 """In which the share is told, and how near it has to come."""
 
 NATS = 15.0
-"""By which halfway must explain more than held: what is held is the rule, as everywhere where rivals are told apart (`rivals`)."""
+"""By which halfway must explain more than held, and each input on a way of its own more than all alike: what is held is the rule, as
+everywhere where rivals are told apart (`rivals`). What is noisy, or moved on, is a sample, and samples are mostly both: CLOSE is enough.
+"""
 
 
 def sampled(data: Dataset) -> bool:
@@ -56,11 +74,23 @@ def _sampled(states: Stream, inputs: Stream) -> bool:
     return bool(np.all(np.isfinite(changed)) and np.mean(np.any(changed != 0.0, axis=1)) > MOVING)
 
 
-def straight(data: Dataset, model: ComposedModel, share: float) -> Dataset:
-    """The recording with each input a share of halfway on to the next one."""
-    segments = [(states, Stream(inputs.t, _moved_on(inputs.values, share))) for states, inputs in data.segments]
-    again = regridded(replace(data, segments=tuple(segments), straight=share), model)
+def samples_of(data: Dataset) -> Samples:
+    """Of a recording that has samples of its inputs."""
+    return Samples([inputs for _, inputs in data.segments], data.reconstruction.cleaned if data.reconstruction else ())
+
+
+def straight(data: Dataset, model: ComposedModel, way: Way, samples: Samples) -> Dataset:
+    """The recording with its inputs as they went."""
+    segments = [(states, inputs) for (states, _), inputs in zip(data.segments, samples.laid(way), strict=True)]
+    again = regridded(replace(data, segments=tuple(segments), way=way), model)
     return replace(again, campaign=data.campaign)  # the step is the same, so its samples still are of this model
+
+
+def noisy(data: Dataset, way: Way, samples: Samples) -> dict[str, float]:
+    """Standard deviation of what was taken out of inputs as noise."""
+    return {
+        name: share * float(size) for name, share, size in zip(data.inputs, way.clean, samples.noise, strict=False) if share and size > 0.0
+    }
 
 
 def alike_laid(moved: Dataset, checked: Dataset) -> bool:
@@ -80,42 +110,185 @@ def acted(checked: Dataset, moved: Dataset) -> Dataset:
     return replace(checked, runs=tuple(runs))
 
 
-def _moved_on(values: Array, share: float) -> Array:
-    """Towards the mean over the row of a cubic through the rows around: a straight line cuts a sine's corners."""
-    before, after, late = (np.concatenate([values[:1], values, values[-1:], values[-1:]])[k : k + len(values)] for k in (0, 2, 3))
-    mean = 0.5 * (values + after) - (late - after - values + before) / 24.0
-    return np.asarray(values + share * (mean - values))
+@dataclass(frozen=True)
+class _Share:
+    """A number that says how inputs went: for which of them, (nu,), and whether it is of what they moved on by, or of their noise."""
+
+    inputs: tuple[bool, ...]
+    noise: bool
+
+    @property
+    def most(self) -> float:
+        """Of this share."""
+        return MOST_NOISE if self.noise else 1.0
+
+    def believed(self, beta: float) -> bool:
+        """Whether it may be this share."""
+        return LEAST < beta < (MOST_NOISE if self.noise else FARTHEST)
+
+    def of(self, way: Way) -> float:
+        """It, as a way has it."""
+        return (way.clean if self.noise else way.on)[self.inputs.index(True)]
+
+    def put(self, way: Way, share: float) -> Way:
+        """The way with this share."""
+        now = way.clean if self.noise else way.on
+        then = tuple(share if mine else other for mine, other in zip(self.inputs, now, strict=True))
+        return replace(way, clean=then) if self.noise else replace(way, on=then)
 
 
-def moved_on(laid: Callable[[float], Problem], fit: Fit) -> float:
-    """Share of halfway that inputs moved on by a fit and its effects, their numbers fitted again; 0 where they were held. laid: the fit's
-    problem with inputs moved on so far.
+def way_of(lay: Lay, fit: Fit, moves: Mask) -> Way:
+    """How inputs went by a fit and its effects, their numbers fitted again. lay: the fit's problem with inputs that went some way; moves:
+    (nu,) those that change in most rows.
     """
-    held, halfway = (acting(fit.model, laid(share).data) for share in (0.0, 1.0))
-    share, gained = _beta(laid(0.0), fit, held, halfway)
-    if gained < NATS or not LEAST < share < FARTHEST:
-        return 0.0
-    for _ in range(ROUNDS):  # the noise is taken for larger than it is, and of another colour, until inputs are where they were
-        here = laid(min(share, 1.0))
-        now = fitted(here, fit, fit.model) if fit.free else evaluate(here, fit.model)
-        more, _ = _beta(here, now, held, halfway)
-        share = min(max(share + more, LEAST), 1.0)
-        if abs(more) < CLOSE:
+    nu = len(moves)
+    held = Way((0.0,) * nu, (0.0,) * nu)
+    instead = _instead(lay, fit, moves) if fit.added else None
+    if instead is not None:
+        return instead
+    return _found(lay, fit, fit, held, moves)
+
+
+def _found(lay: Lay, fit: Fit, under: Fit, held: Way, moves: Mask) -> Way:
+    """The way that explains most by a fit, looked for again under the noise that is left by what was found first. under: whose noise it is
+    at first.
+    """
+    way = held
+    for _ in range(LOOKS):
+        further = _likeliest(_Look(lay, fit, under, way), moves)
+        if further.late or further == way:
+            return further
+        way = _settled(lay, fit, further)
+        if not way:
+            return way
+        here = lay(way)
+        under = fit = fitted(here, fit, fit.model) if fit.free else evaluate(here, fit.model)
+    return way
+
+
+def _likeliest(look: _Look, moves: Mask) -> Way:
+    """Of the ways that inputs may have gone at a look, each further number paid for."""
+    held, nu = look.held, len(moves)
+    each = [tuple(i == j for i in range(nu)) for j in np.flatnonzero(moves).tolist()]
+    together, noisy = [_Share((True,) * nu, noise=False)], [_Share(one, noise=True) for one in each]
+    apart = [_Share(one, noise=False) for one in each] if nu > 1 else []
+    ways = [(together, NATS), (noisy, NATS), (together + noisy, NATS + CLOSE), (apart, 2.0 * NATS), (apart + noisy, 2.0 * NATS + CLOSE)]
+    if held:
+        ways = [(noisy, CLOSE)] if not any(held.clean) else [(together, CLOSE), (apart, NATS)] if not any(held.on) else []
+    best, most = held, 0.0
+    for shares, price in ways:
+        way, gained = look.best(shares)
+        if gained - price > most:
+            best, most = way, gained - price
+    if held:
+        return best
+    beta, gained = look.late()
+    return replace(held, late=True) if LATE[0] < beta < LATE[1] and gained - NATS > most else best
+
+
+def _instead(lay: Lay, fit: Fit, moves: Mask) -> Way | None:
+    """A way that explains more by itself than all that was found on inputs that are held: on a sine, half a row's lateness of a force is
+    friction, and noise of a sensor is a lag. By likelihood, as noise is much less under the right way.
+    """
+    nu = len(moves)
+    held = Way((0.0,) * nu, (0.0,) * nu)
+    bare = replace(fit.model, effects=tuple(a for i, a in enumerate(fit.model.effects) if i not in fit.added))
+    given = lay(held)
+    nominal = evaluate(given, bare)
+    on, clean = (USUAL,) * nu, tuple(float(one) for one in moves)
+    fits = [evaluate(lay(way), bare) for way in (Way(on, held.clean), Way(held.on, clean), Way(on, clean))]
+    best = max(fits, key=lambda other: gain(other, nominal))
+    if gain(best, nominal) < NATS or gain(best, fit) < -NEAR:
+        return None
+    way = _found(lay, nominal, best, held, moves)
+    return way if way and gain(evaluate(lay(way), bare), fit) > CLOSE else None
+
+
+class _Look:
+    """What ways do to what a fit predicts of inputs that are held."""
+
+    def __init__(self, lay: Lay, fit: Fit, under: Fit, held: Way) -> None:
+        self._lay, self.held = lay, held
+        self._given = lay(held)
+        act = acting(fit.model, self._given.data)
+        self._predicted = predicted(fit.model, self._given.steps, act)
+        z = fit.z if under is fit else under.whiten(residual(fit.model, self._given.steps, act))
+        self._fit = replace(under, model=fit.model, free=fit.free, z=z)
+        self._j = sensitivities(self._given, self._fit, fit.model, fit.free)
+        self._known: dict[Way, Array] = {}
+
+    def _does(self, way: Way) -> Array:
+        if way not in self._known:
+            self._known[way] = _does(self._given, self._fit, self._predicted, acting(self._fit.model, self._lay(way).data))
+        return self._known[way]
+
+    def best(self, shares: list[_Share]) -> tuple[Way, float]:
+        """The likeliest shares, less those that are none, and the nats that they gain. How inputs moved on is asked of them without the
+        noise that is asked about beside it: to the next row's it would go, too.
+        """
+        while shares:
+            clean = self.held
+            for noise in [s for s in shares if s.noise]:
+                clean = noise.put(clean, 1.0)
+            columns = [self._does(s.put(self.held, 1.0)) if s.noise else self._does(s.put(clean, 1.0)) - self._does(clean) for s in shares]
+            betas, gained = _betas(self._given, self._fit, columns, self._j)
+            kept = [s for s, beta in zip(shares, betas, strict=True) if s.believed(beta)]
+            if len(kept) == len(shares):
+                way = self.held
+                for share, beta in zip(shares, betas, strict=True):
+                    way = share.put(way, min(beta, share.most))
+                return way, gained
+            shares = kept
+        return self.held, 0.0
+
+    def late(self) -> tuple[float, float]:
+        """How far inputs came a row too late, in rows, and the nats that this gains."""
+        betas, gained = _betas(self._given, self._fit, [self._does(replace(self.held, late=True))], self._j)
+        return betas[0], gained
+
+
+def _settled(lay: Lay, fit: Fit, way: Way) -> Way:
+    """The shares when numbers and noise have been fitted under them: noise is first taken for larger than it is, and of another colour."""
+    together = len({*way.on}) == 1
+    nu = len(way.on)
+    each = [tuple(i == j for i in range(nu)) for j in range(nu)]
+    shares = [_Share((True,) * nu, noise=False)] if together and way.on[0] else []
+    shares += [_Share(one, noise=False) for one, on in zip(each, way.on, strict=True) if on and not together]
+    shares += [_Share(one, noise=True) for one, clean in zip(each, way.clean, strict=True) if clean]
+    now = [s.of(way) for s in shares]
+    ends = [tuple(acting(fit.model, lay(s.put(way, end)).data) for end in (0.0, 1.0)) for s in shares]
+    for _ in range(ROUNDS):
+        here = lay(way)
+        again = fitted(here, fit, fit.model) if fit.free else evaluate(here, fit.model)
+        columns = [_does(here, again, predicted(again.model, here.steps, one), other) for one, other in ends]
+        more, _ = _betas(here, again, columns, sensitivities(here, again, again.model, again.free))
+        then = [min(max(value + change, LEAST), share.most) for share, value, change in zip(shares, now, more, strict=True)]
+        for share, value in zip(shares, then, strict=True):
+            way = share.put(way, value)
+        moved = max(abs(change) for change in more)
+        now = then
+        if moved < NARROW:
             break
-    return share if share > LEAST else 0.0
+    for share, value in zip(shares, now, strict=True):
+        way = share.put(way, value if value > LEAST else 0.0)
+    return way
 
 
-def _beta(given: Problem, fit: Fit, held: Acting, halfway: Acting) -> tuple[float, float]:
-    """How far inputs moved on beyond where they are in a fit, and the nats that this gains."""
-    joined = given.steps.joined
-    change = predicted(fit.model, given.steps, halfway) - predicted(fit.model, given.steps, held)
-    z = fit.colour(fit.z, joined).ravel()
-    c = fit.colour(fit.whiten(change), joined).reshape(-1, 1)
-    x = np.hstack([c, sensitivities(given, fit, fit.model, fit.free)])
+def _does(given: Problem, fit: Fit, held: Array, act: Acting) -> Array:
+    """(n nx, 1) what inputs that act so do to what was predicted, (n, nx), whitened."""
+    change = predicted(fit.model, given.steps, act) - held
+    return np.asarray(fit.colour(fit.whiten(change), given.steps.joined).reshape(-1, 1))
+
+
+def _betas(given: Problem, fit: Fit, columns: list[Array], j: Array) -> tuple[list[float], float]:
+    """How far inputs went each of some ways beyond where they are in a fit, and the nats that this gains."""
+    z = fit.colour(fit.z, given.steps.joined).ravel()
+    c = np.hstack(columns)
+    x = np.hstack([c, j])
     if not np.all(np.isfinite(x)) or not np.any(c):
-        return 0.0, 0.0
+        return [0.0] * len(columns), 0.0
     weighted = x * noises.weight(z)[:, None]
     beta = np.linalg.lstsq(weighted.T @ x, weighted.T @ z, rcond=1e-12)[0]
     left = z - x @ beta
-    gained = np.sum(noises.log_density(left)) - np.sum(noises.log_density(left + beta[0] * c.ravel()))
-    return float(beta[0]), float(gained)
+    gained = np.sum(noises.log_density(left)) - np.sum(noises.log_density(left + c @ beta[: len(columns)]))
+    return beta[: len(columns)].tolist(), float(gained)

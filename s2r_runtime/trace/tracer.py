@@ -45,9 +45,10 @@ from s2r_runtime.trace.retimed import dated
 from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, names
 from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded, select
 from s2r_runtime.trace.slots import Slot
-from s2r_runtime.trace.straight import acted, alike_laid, moved_on, sampled, straight
+from s2r_runtime.trace.straight import acted, alike_laid, noisy, sampled, samples_of, straight, way_of
 from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import asked, confirmed, final_fit, foretelling, foretold_too, takes_far, verdict_of, worth_its_risk
+from s2r_runtime.trace.ways import Way, moving
 from s2r_runtime.trace.whole import Whole
 
 __all__ = ["Dataset", "TraceResult", "load_dataset", "trace", "usual_horizon"]
@@ -176,24 +177,27 @@ def _straight(
     recorded: tuple[Dataset, Dataset | None], asked: ComposedModel, parts: int, checked: Checked, seen: Mask, given: Problem, fit: Fit
 ) -> tuple[Dataset, Dataset | None] | None:
     """The recordings with inputs that moved on between the rows, if the motion says that they did."""
-    if recorded[0].straight or not sampled(recorded[0]):
+    if recorded[0].way or not sampled(recorded[0]):
         return None
     less, data, test = alike(asked, *recorded)  # a recording without a state is laid for the model without it
+    samples = samples_of(data)
 
-    def so_far(share: float) -> Dataset:
-        return thinned(less, straight(data, less, share), test, parts)[1]
+    def so_far(way: Way) -> Dataset:
+        return thinned(less, straight(data, less, way, samples), test, parts)[1]
 
-    def laid(share: float) -> Problem:
-        if not share:
+    def laid(way: Way) -> Problem:
+        if not way:
             return given
-        return replace(given, data=part(acted(checked.data, so_far(share)), checked.left_out, seen, FIT_STEPS).data, searches={})
+        return replace(given, data=part(acted(checked.data, so_far(way)), checked.left_out, seen, FIT_STEPS).data, searches={})
 
-    if not alike_laid(so_far(1.0), checked.data):
+    if not alike_laid(so_far(Way((1.0,) * len(less.inputs), (0.0,) * len(less.inputs))), checked.data):
         return None
-    share = moved_on(laid, fit)
-    if not share:
+    way = way_of(laid, fit, moving([inputs for _, inputs in data.segments]))
+    if not way:
         return None
-    return straight(data, less, share), None if test is None else straight(test, less, share) if sampled(test) else test
+    if test is not None and sampled(test):
+        test = straight(test, less, way, samples_of(test))
+    return replace(straight(data, less, way, samples), noisy=noisy(data, way, samples)), test
 
 
 def _finer(dataset: Dataset, model: ComposedModel, chosen: Selection, ahead: int) -> int | None:
@@ -326,7 +330,8 @@ def _result(
         source=dataset.source,
         interpolated=dataset.interpolated,
         reconstruction=dataset.reconstruction,
-        straight=dataset.straight,
+        way=dataset.way,
+        noisy=dataset.noisy,
         unconfirmed=tuple((final.model.effects[place].effect.name, final.model.effects[place].channel) for place in idle),
         could_see=visible(given, final, chosen.tried),
     )
