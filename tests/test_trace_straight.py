@@ -198,3 +198,55 @@ def test_commands_that_jump_in_every_row_are_not_smoothed():
     t = 0.05 * np.arange(900)
     result = trace(from_streams(model, [(Stream(t, np.array(rows)), Stream(t, u))], "a table"), model)
     assert (result.verdict, bool(result.way)) == ("none", False)
+
+
+def _tank(seed, at_rows, lag=0.0, rows=1200):
+    """A tank's level under a pump that is set anew now and then, between the rows (1 s) or on them; through a lag, s."""
+    parts, rng = 20, np.random.default_rng(seed)
+    u, k = np.zeros(rows * parts), 0
+    while k < len(u):
+        hold = round(rng.uniform(15.0, 60.0)) * parts + (0 if at_rows else int(rng.integers(parts)))
+        u[k : k + hold] = rng.uniform(0.2, 1.8)
+        k += hold
+    level, acts, levels = 1.0, u[0], []
+    for k, asked in enumerate(u.tolist()):
+        if k % parts == 0:
+            levels.append(level)
+        acts += (asked - acts) * (1.0 - np.exp(-1.0 / parts / lag)) if lag else asked - acts
+        level += (0.05 * acts - 0.05 * level) / parts
+    t = np.arange(rows, dtype=float)
+    measured = np.array(levels)[:, None] + 2e-3 * rng.normal(size=(rows, 1))
+    return [(Stream(t, measured), Stream(t, u[::parts, None]))]
+
+
+TANK = """
+STATES = ("level",)
+INPUTS = ("pump",)
+PARAMS = {"rate": 0.05}
+
+
+def step(x, u, dt, params):
+    for _ in range(10):
+        x = x + dt / 10 * params["rate"] * (u - x)
+    return x
+"""
+
+
+@pytest.mark.parametrize("at_rows", [True, False])
+def test_commands_that_change_between_the_rows_are_no_structure(tmp_path, at_rows):
+    (tmp_path / "tank.py").write_text(TANK)
+    model = compose(ModelSpec(str(tmp_path / "tank.py"), 1.0))
+    result = trace(from_streams(model, _tank(1, at_rows), "a table"), model)
+    assert result.verdict == "none"
+    assert result.to_json()["inputs_changed_within"] is not at_rows
+    assert ("changed between the rows" in result.text()) is not at_rows
+
+
+def test_a_lag_of_commands_that_change_between_the_rows_has_its_size(tmp_path):
+    (tmp_path / "tank.py").write_text(TANK)
+    model = compose(ModelSpec(str(tmp_path / "tank.py"), 1.0))
+    result = trace(from_streams(model, _tank(2, at_rows=False, lag=6.0), "a table"), model)
+    (found,) = result.effects
+    assert (found.name, found.channel) == ("input_lag", "pump")
+    assert found.values["time_constant"] == pytest.approx(6.0, rel=0.07)
+    assert result.depends_on == ()

@@ -121,6 +121,8 @@ class TraceResult:
         lines = []
         if self.way.late:
             lines.append("the inputs come a row late, as the motion says (a mean over the row before?): each was taken from the next row")
+        if self.way.within:
+            lines.append("commands changed between the rows that tell them, as the motion says: each change was placed where it tells it")
         if any(self.way.on):
             shares = {f"{50.0 * on:.0f} % of the way" for on in self.way.on}
             if len(shares) == 1:
@@ -175,6 +177,7 @@ class TraceResult:
             "inputs_moved_on": 0.5 * self.way.most,
             "inputs_noise": self.noisy,
             "inputs_late": self.way.late,
+            "inputs_changed_within": self.way.within,
             "unconfirmed": [{"name": name, "channel": channel} for name, channel in self.unconfirmed],
             "step_s": self.nominal.dt,
             "n_fit": self.n_fit,

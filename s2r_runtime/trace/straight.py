@@ -16,8 +16,9 @@ friction) makes it positive, with what noise pushes the robot: mostly beyond FAR
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +26,8 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.dataset import Dataset, regridded
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, sensitivities
-from s2r_runtime.trace.residual import Acting, acting, predicted, residual
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, sensitivities, slopes
+from s2r_runtime.trace.residual import Acting, acting, predicted, residual, state_jacobian
 from s2r_runtime.trace.rivals import CLOSE, NEAR
 from s2r_runtime.trace.streams import Stream
 from s2r_runtime.trace.ways import MOVING, Samples, Way
@@ -44,11 +45,26 @@ LEAST, FARTHEST = 0.2, 1.25
 MOST_NOISE = 2.0
 """beta up to which it is noise: a spline that follows what the input does follows noise, too, and takes out a part of it only."""
 
+SOME = 8
+"""Changes from which a mean of how far on they came is known to a fifth of a row."""
+
+MEAN, SPREAD = 1.0, 0.58
+"""Of how far before its row a change comes, in halves of a row: anywhere between two rows, 2 / sqrt(12)."""
+
+BETWEEN = 0.5, 1.5
+"""Mean of it, between which changes came between the rows: they come on rows (0), or a row late (2), otherwise."""
+
 LATE = 0.8, 1.2
 """beta between which inputs did come a row too late: what a controller makes of noise is mostly not just that."""
 
 USUAL = 0.75
 """Share from which it is sought by likelihood: of a loop that goes four times a row."""
+
+AGAIN = 3
+"""Times that outliers are told from what is left."""
+
+PLACED = 2
+"""Times that changes are placed: the noise is first taken for larger than it is."""
 
 LOOKS = 3
 """Times that further ways are looked for, at most: what is left by the first one is less."""
@@ -72,6 +88,21 @@ def _sampled(states: Stream, inputs: Stream) -> bool:
         return False
     changed = np.diff(inputs.values, axis=0)  # a command that was not received is not a number
     return bool(np.all(np.isfinite(changed)) and np.mean(np.any(changed != 0.0, axis=1)) > MOVING)
+
+
+def commanded(data: Dataset) -> bool:
+    """Whether inputs are commands that change between rows now and then: on the states' rows, in few of them, at times of their own."""
+    if not data.segments or not data.in_order:
+        return False
+    changed = 0
+    for states, inputs in data.segments:
+        if len(inputs.t) < 2 or len(states.t) < MOST * len(inputs.t) or not np.isin(states.t, inputs.t).all():
+            return False
+        if not np.all(np.isfinite(inputs.values)):
+            return False
+        changed += int(np.count_nonzero(np.any(np.diff(inputs.values, axis=0) != 0.0, axis=1)))
+    rows = sum(len(inputs.t) for _, inputs in data.segments)
+    return SOME <= changed <= MOVING * rows
 
 
 def samples_of(data: Dataset) -> Samples:
@@ -204,6 +235,70 @@ def _instead(lay: Lay, fit: Fit, moves: Mask) -> Way | None:
     return way if way and gain(evaluate(lay(way), bare), fit) > CLOSE else None
 
 
+def changed_within(lay: Lay, everywhere: Lay, fit: Fit, samples: Samples, nu: int) -> Way:
+    """Whether commands changed between the rows, by a fit and its effects; then the samples know how far on each did. everywhere: as
+    `lay`, of all transitions: when a command came has to be told where it came.
+
+    r = sum_j beta_j c_j + noise,  beta ~ (MEAN, SPREAD^2)     c: what half a row does, in the rows from a change to the next one
+    """
+    held, way = Way((0.0,) * nu, (0.0,) * nu), Way((0.0,) * nu, (0.0,) * nu, within=True)
+    given, every = lay(held), samples.within
+    at = predicted(fit.model, given.steps, acting(fit.model, given.data))
+    columns, datas = [], []
+    for j in range(nu):
+        samples.within = [one * np.eye(nu)[j] for one in every]
+        columns.append(_does(given, fit, at, acting(fit.model, lay(way).data)))
+        datas.append(everywhere(way).data)
+    mine, own = list(range(nu)), sensitivities(given, fit, fit.model, fit.free)
+    while mine:
+        betas, gained = _betas(given, fit, [columns[i] for i in mine], own, wild=True)
+        kept = [i for i, beta in zip(mine, betas, strict=True) if BETWEEN[0] < beta < BETWEEN[1]]
+        if kept == mine:
+            break
+        mine = kept
+    if not mine or gained < NATS:
+        return held
+    chosen = np.isin(np.arange(nu), mine)
+    halves = [one * chosen for one in every]
+    samples.within = [MEAN * one for one in halves]
+    for _ in range(PLACED):
+        under = lay(way)
+        again = fitted(under, fit, fit.model) if fit.free else evaluate(under, fit.model)
+        samples.within = _placed(everywhere(held), again, datas, samples.changes(), halves)
+    return way
+
+
+def _placed(
+    given: Problem, fit: Fit, datas: Sequence[Dataset], changes: Sequence[tuple[int, int, float]], halves: Sequence[Array]
+) -> list[Array]:
+    """(N, nu) of each segment, how far on changes came, in halves of a row: beside the fit's numbers, which make up for them on average.
+    given: with inputs that are held; datas: with all changes of an input half a row on.
+    """
+    model, steps, nu = fit.model, given.steps, len(datas)
+    act = acting(model, given.data)
+    at = predicted(model, steps, act)
+    whiten = noises.Whitener(fit.noise, state_jacobian(model, steps, act), steps.joined)
+    z = whiten(residual(model, steps, act))
+    c = np.stack([whiten(predicted(model, steps, acting(model, data)) - at) for data in datas], axis=2)
+    j = whiten(slopes(given, model, fit.free)) if fit.free else np.zeros((*z.shape, 0))
+    starts = np.array([stamp for _, _, stamp in changes]) - given.data.origin_s - 0.5 * given.data.dt
+    edges = np.searchsorted(np.searchsorted(starts, steps.t, side="right") - 1, np.arange(len(changes) + 1))
+    c, j, z = (e.reshape(len(steps) * z.shape[1], -1 if e.size else 0) for e in (c, j, z))
+    solved = []
+    normal, slope = j.T @ j, j.T @ z[:, 0]
+    for here in (slice(p, q) for p, q in pairwise((edges * len(model.states)).tolist())):  # of the numbers, what is left beside each change
+        x, own, r = c[here], j[here], z[here]
+        product = x.T @ x + np.eye(nu) / SPREAD**2
+        by, alone = (np.linalg.solve(product, e) for e in (x.T @ own, x.T @ r[:, 0] + MEAN / SPREAD**2))
+        normal, slope = normal - own.T @ x @ by, slope - own.T @ x @ alone
+        solved.append((by, alone))
+    numbers = np.linalg.lstsq(normal, slope, rcond=1e-9)[0]
+    placed = [np.zeros_like(one) for one in halves]
+    for (segment, row, _), (by, alone) in zip(changes, solved, strict=True):
+        placed[segment][row] = halves[segment][row] * np.clip(alone - by @ numbers, 0.0, 2.0)
+    return placed
+
+
 class _Look:
     """What ways do to what a fit predicts of inputs that are held."""
 
@@ -280,15 +375,20 @@ def _does(given: Problem, fit: Fit, held: Array, act: Acting) -> Array:
     return np.asarray(fit.colour(fit.whiten(change), given.steps.joined).reshape(-1, 1))
 
 
-def _betas(given: Problem, fit: Fit, columns: list[Array], j: Array) -> tuple[list[float], float]:
-    """How far inputs went each of some ways beyond where they are in a fit, and the nats that this gains."""
+def _betas(given: Problem, fit: Fit, columns: list[Array], j: Array, *, wild: bool = False) -> tuple[list[float], float]:
+    """How far inputs went each of some ways beyond where they are in a fit, and the nats that this gains. wild: where a command changes
+    between rows that row is far off, and no outlier before it is known how far on the change came.
+    """
     z = fit.colour(fit.z, given.steps.joined).ravel()
     c = np.hstack(columns)
     x = np.hstack([c, j])
     if not np.all(np.isfinite(x)) or not np.any(c):
         return [0.0] * len(columns), 0.0
-    weighted = x * noises.weight(z)[:, None]
-    beta = np.linalg.lstsq(weighted.T @ x, weighted.T @ z, rcond=1e-12)[0]
-    left = z - x @ beta
+    weight = np.ones(len(z)) if wild else noises.weight(z)
+    for _ in range(AGAIN if wild else 1):
+        weighted = x * weight[:, None]
+        beta = np.linalg.lstsq(weighted.T @ x, weighted.T @ z, rcond=1e-12)[0]
+        left = z - x @ beta
+        weight = noises.weight(left)
     gained = np.sum(noises.log_density(left)) - np.sum(noises.log_density(left + c @ beta[: len(columns)]))
     return beta[: len(columns)].tolist(), float(gained)

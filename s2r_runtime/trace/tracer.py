@@ -45,7 +45,7 @@ from s2r_runtime.trace.retimed import dated
 from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, names
 from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded, select
 from s2r_runtime.trace.slots import Slot
-from s2r_runtime.trace.straight import acted, alike_laid, noisy, sampled, samples_of, straight, way_of
+from s2r_runtime.trace.straight import acted, alike_laid, changed_within, commanded, noisy, sampled, samples_of, straight, way_of
 from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import asked, confirmed, final_fit, foretelling, foretold_too, takes_far, verdict_of, worth_its_risk
 from s2r_runtime.trace.ways import Way, moving
@@ -177,25 +177,30 @@ def _straight(
     recorded: tuple[Dataset, Dataset | None], asked: ComposedModel, parts: int, checked: Checked, seen: Mask, given: Problem, fit: Fit
 ) -> tuple[Dataset, Dataset | None] | None:
     """The recordings with inputs that moved on between the rows, if the motion says that they did."""
-    if recorded[0].way or not sampled(recorded[0]):
+    if recorded[0].way or not (sampled(recorded[0]) or commanded(recorded[0])):
         return None
     less, data, test = alike(asked, *recorded)  # a recording without a state is laid for the model without it
     samples = samples_of(data)
 
     def so_far(way: Way) -> Dataset:
-        return thinned(less, straight(data, less, way, samples), test, parts)[1]
+        return acted(checked.data, thinned(less, straight(data, less, way, samples), test, parts)[1])
 
     def laid(way: Way) -> Problem:
-        if not way:
-            return given
-        return replace(given, data=part(acted(checked.data, so_far(way)), checked.left_out, seen, FIT_STEPS).data, searches={})
+        return replace(given, data=part(so_far(way), checked.left_out, seen, FIT_STEPS).data, searches={}) if way else given
 
-    if not alike_laid(so_far(Way((1.0,) * len(less.inputs), (0.0,) * len(less.inputs))), checked.data):
+    def everywhere(way: Way) -> Problem:
+        there = so_far(way) if way else checked.data
+        return problem(there, steps_of(there, checked.left_out))
+
+    if not alike_laid(thinned(less, straight(data, less, Way(late=True), samples), test, parts)[1], checked.data):
         return None
-    way = way_of(laid, fit, moving([inputs for _, inputs in data.segments]))
+    if sampled(data):
+        way = way_of(laid, fit, moving([inputs for _, inputs in data.segments]))
+    else:
+        way = changed_within(laid, everywhere, fit, samples, len(less.inputs))
     if not way:
         return None
-    if test is not None and sampled(test):
+    if test is not None and (sampled(test) or commanded(test)):
         test = straight(test, less, way, samples_of(test))
     return replace(straight(data, less, way, samples), noisy=noisy(data, way, samples)), test
 

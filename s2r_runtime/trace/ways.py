@@ -27,15 +27,16 @@ MOVING = 0.5
 @dataclass(frozen=True)
 class Way:
     """By input, (nu,): on: share of halfway to the next one by which it moved on; clean: share of its noise that is taken out. late: each
-    row tells what acted over the row before it.
+    row tells what acted over the row before it. within: what is held changed between rows, as far on as the samples know.
     """
 
     on: tuple[float, ...] = ()
     clean: tuple[float, ...] = ()
     late: bool = False
+    within: bool = False
 
     def __bool__(self) -> bool:
-        return self.late or any(self.on) or any(self.clean)
+        return self.late or self.within or any(self.on) or any(self.clean)
 
     @property
     def most(self) -> float:
@@ -73,10 +74,24 @@ class Samples:
         self._smooth = [one.values for one in smooth] or [less_noise_of(one, ratios)[0].values for one in inputs]
         off = self._inputs[longest].values - self._smooth[longest]
         self.noise = np.sqrt(np.mean(off**2, axis=0))
+        self.within = [_changing(one.values).astype(np.float64) for one in inputs]
+        """(N, nu) of each segment: how far a change came before its row, in halves of a row; 0 where there is none."""
 
     def laid(self, way: Way) -> list[Stream]:
         """The inputs as they went."""
+        if way.within:
+            return [
+                Stream(one.t, one.values + 0.5 * halves * _ahead(one.values)) for one, halves in zip(self._inputs, self.within, strict=True)
+            ]
         return [Stream(one.t, _went(one.values, smooth, way)) for one, smooth in zip(self._inputs, self._smooth, strict=True)]
+
+    def changes(self) -> list[tuple[int, int, float]]:
+        """(segment, row, stamp) of each row before one that tells a change, in order."""
+        return [
+            (place, k, float(one.t[k]))
+            for place, one in enumerate(self._inputs)
+            for k in np.flatnonzero(_changing(one.values).any(axis=1)).tolist()
+        ]
 
 
 def _went(values: Array, smooth: Array, way: Way) -> Array:
@@ -84,6 +99,16 @@ def _went(values: Array, smooth: Array, way: Way) -> Array:
         return np.concatenate([values[1:], values[-1:]])
     cleaned = values + np.array(way.clean) * (smooth - values)
     return np.asarray(cleaned + np.array(way.on) * (_means(cleaned) - cleaned))
+
+
+def _ahead(values: Array) -> Array:
+    """(N, nu) by how much the next row differs."""
+    return np.diff(values, axis=0, append=values[-1:])
+
+
+def _changing(values: Array) -> Mask:
+    """(N, nu) whether the next row tells something else."""
+    return np.asarray(_ahead(values) != 0.0)
 
 
 def _means(values: Array) -> Array:
