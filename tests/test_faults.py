@@ -287,3 +287,20 @@ def test_a_position_that_jumps_by_less_than_a_car_goes_in_a_step_is_told(seed):
 )
 def test_what_a_car_lacks_is_no_jump_of_its_position(effect):
     assert _driver(5, (effect,)) == ()
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.05])
+def test_a_joint_that_jumps_by_two_of_its_rows_is_told(apart):
+    """At 6 rad/s it goes 24 mrad in a row; its force changes that by a hundredth."""
+    model, rng = compose(ModelSpec("joint", 0.004)), np.random.default_rng(1)
+    t = 0.004 * np.arange(1500)
+    force = 20.0 * np.cos(3.3 * t) + 4.0 * np.cos(7.0 * t + 1.0)
+    x, rows = np.zeros((1, 2)), []
+    for u in force[:, None]:
+        rows.append(x[0])
+        x = model.nominal.step(x, u[None], 0.004, model.parameters)
+    y = np.array(rows) + rng.normal(size=(1500, 2)) * [1e-4, 5e-3]
+    y[700:, 0] += apart
+    found = check(model, from_streams(model, [(Stream(t, y), Stream(t, force[:, None]))], "a table")).faults
+    assert [(f.kind, f.channel) for f in found] == ([("offset_jump", "q")] if apart else [])
+    assert all(f.from_s == pytest.approx(t[700]) for f in found)

@@ -20,6 +20,7 @@ from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.residual import Steps, acting, residual, steps_of
 from s2r_runtime.trace.residual_noise import Noise, quantum
 from s2r_runtime.trace.scores import STRICT, Scored, limited, names
+from s2r_runtime.trace.slots import Added
 from s2r_runtime.trace.streams import held_between, held_means
 from s2r_runtime.trace.tracer import trace
 
@@ -354,3 +355,23 @@ def test_a_model_less_what_stands_in_for_one_of_its_effects_is_the_model_as_give
     instead = next(c for c in candidates(model, data) if c.replaced >= 0)
     for other in instead.models(model):
         assert fitting.without(other, instead.replaced) == model
+
+
+def test_what_never_happens_takes_no_place_of_a_gain(monkeypatch):
+    """A gain that changed before anything was asked is a gain, and is refused as a change: both would be gone."""
+    rng = np.random.default_rng(5)
+    model = compose(ModelSpec("unicycle", 0.05))
+    u = np.repeat(rng.uniform(-0.5, 0.5, (40, 2)), 10, axis=0)
+    y, x = [np.zeros(3)], np.zeros((1, 3))
+    for row in u:
+        x = model.nominal.step(x, 0.8 * row[None], 0.05, model.parameters)
+        y.append(x[0] + 1e-3 * rng.normal(size=3))
+    data = from_arrays(model, [(np.array(y), u)])
+    given = problem(data, steps_of(data))
+    gains = [Added(registry().get("effects", "input_gain"), name, {"gain": 0.8}) for name in ("w", "v")]
+    late = Added(registry().get("effects", "regime_change"), "w", {"time": 0.01, "gain": 0.8})
+    fit = evaluate(given, replace(model, effects=tuple(gains)))
+    other = evaluate(given, replace(model, effects=(gains[1], late)))
+    monkeypatch.setattr(selection, "best_candidates", lambda *asked: ([Scored("regime_change", "w", 1.0, other)], 1))
+    monkeypatch.setattr(selection, "gain", lambda one, base: 1000.0 if one is other else 0.0)
+    assert selection.exchanged(given, fit, STRICT) is fit

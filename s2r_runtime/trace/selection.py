@@ -364,7 +364,7 @@ def exchanged(given: Problem, fit: Fit, bar: Bar) -> Fit:
             continue
         base = fitted(given, fit, without(fit.model, place), 1)
         found, _ = best_candidates(given, base, 4, bar, at_first_look(given, fit, base))
-        best = found[0].fit if found else None
+        best = next((s.fit for s in found if s.fit is not None and _happens(given, s.fit)), None)
         if best is None:
             continue
         margin = CLOSE if best.k >= fit.k else 0.0  # a simpler one that does as well needs no more than that
