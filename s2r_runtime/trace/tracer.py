@@ -137,15 +137,15 @@ def _traced(
     given = problem(fit_part.data, fit_part.steps)
     say(5.0, 100.0, "looking for effects")
     chosen = select(given, model, ahead, lambda share: say(5.0 + 55.0 * share, 100.0, "looking for effects"))
+    lines = _straight(as_recorded, asked, parts, checked, seen, given, chosen.fit)
+    if lines is not None:
+        return _traced(lines[0], asked, lines[1], horizon, seed, _from(60.0, say), norm, parts)
     if given.floor.axes and any(chosen.fit.model.effects[place].effect.stage == "step" for place in chosen.fit.added):
         checked = replace(checked, data=_restated(checked, chosen.fit))  # what depends on a speed is seen where the speed is better known
         fit_part = part(checked.data, checked.left_out, seen, FIT_STEPS)
         judged_on = _held_out(checked, seen, test, model, horizon)
         given = problem(fit_part.data, fit_part.steps)
         chosen = select(given, model, ahead, lambda share: say(60.0 + 20.0 * share, 100.0, "looking for effects"))
-    lines = _straight(as_recorded, asked, parts, checked, seen, given, chosen.fit)
-    if lines is not None:
-        return _traced(lines[0], asked, lines[1], horizon, seed, _from(80.0, say), norm, parts)
     whole = Whole(checked, model, ahead)
     chosen = foretold_too(given, chosen, judged_on, ahead)
     chosen = confirmed(given, replace(chosen, fit=dated(given, whole.given, chosen.fit)), judged_on)
