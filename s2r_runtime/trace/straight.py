@@ -244,11 +244,10 @@ def changed_within(lay: Lay, everywhere: Lay, fit: Fit, samples: Samples, nu: in
     held, way = Way((0.0,) * nu, (0.0,) * nu), Way((0.0,) * nu, (0.0,) * nu, within=True)
     given, every = lay(held), samples.within
     at = predicted(fit.model, given.steps, acting(fit.model, given.data))
-    columns, datas = [], []
+    columns = []
     for j in range(nu):
         samples.within = [one * np.eye(nu)[j] for one in every]
         columns.append(_does(given, fit, at, acting(fit.model, lay(way).data)))
-        datas.append(everywhere(way).data)
     mine, own = list(range(nu)), sensitivities(given, fit, fit.model, fit.free)
     while mine:
         betas, gained = _betas(given, fit, [columns[i] for i in mine], own, wild=True)
@@ -259,7 +258,10 @@ def changed_within(lay: Lay, everywhere: Lay, fit: Fit, samples: Samples, nu: in
     if not mine or gained < NATS:
         return held
     chosen = np.isin(np.arange(nu), mine)
-    halves = [one * chosen for one in every]
+    halves, datas = [one * chosen for one in every], []
+    for j in range(nu):
+        samples.within = [one * np.eye(nu)[j] for one in every]
+        datas.append(everywhere(way).data)
     samples.within = [MEAN * one for one in halves]
     for _ in range(PLACED):
         under = lay(way)
