@@ -16,7 +16,7 @@ from s2r_runtime.trace.patchwork import AS_MUCH, MOSTLY, patchwork
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.whole import Whole
 
-DT = 0.05
+DT, PARTS = 0.05, 10
 NOISE = np.array([0.001, 0.001, 0.002, 0.002])
 
 
@@ -25,14 +25,14 @@ def _effect(name, channel, p):
 
 
 def _whole(push, steps=600, seed=4):
-    """All of a drive of a mass in the plane, pushed besides by what push says of its (x, y, vx, vy), seen under the plain model."""
-    rng, parts = np.random.default_rng(seed), 10
+    """All of a drive of a mass in the plane, pushed besides by what push says of (x, y, vx, vy, command), seen under the plain model."""
+    rng = np.random.default_rng(seed)
     u = np.repeat(rng.uniform(-1.0, 1.0, (steps // 15, 2)), 15, axis=0)
     state, rows = np.zeros(4), [np.zeros(4)]
     for a in u:
-        for _ in range(parts):
+        for _ in range(PARTS):
             pull = a - 0.4 * state[:2] - 0.4 * state[2:]  # the command leads it back: it stays where fields are known
-            state = state + DT / parts * np.concatenate([state[2:], pull + np.asarray(push(*state))])
+            state = state + DT / PARTS * np.concatenate([state[2:], pull + np.asarray(push(*state, pull))])
         rows.append(state)
     model = compose(ModelSpec("double_integrator", DT))
     y = np.array(rows)
@@ -57,7 +57,7 @@ def _drag(state):
 
 
 def test_names_that_follow_what_depends_on_the_speed_are_a_patchwork_of_that():
-    whole = _whole(lambda x, y, vx, vy: (-0.8 * vx * vy, 0.8 * vx * vx))  # what a spinning wheel on board does
+    whole = _whole(lambda x, y, vx, vy, asked: (-0.8 * vx * vy, 0.8 * vx * vx))  # what a spinning wheel on board does
     fit = _named(whole, _effect(*FIELD), _effect(*BIAS))
     assert gain(fit, whole.nominal) > 20.0, "they do explain something"
     assert {whole.unnamed.token} == {"speed"}
@@ -66,7 +66,7 @@ def test_names_that_follow_what_depends_on_the_speed_are_a_patchwork_of_that():
 
 
 def test_two_effects_that_are_there_are_none():
-    whole = _whole(lambda x, y, vx, vy: (-0.3 * vx + 0.2 * x, 0.2 * y))
+    whole = _whole(lambda x, y, vx, vy, asked: (-0.3 * vx + 0.2 * x, 0.2 * y))
     fit = _named(whole, _drag("vx"), _effect(*FIELD))
     assert not patchwork(whole.given, fit, whole.nominal, whole.unnamed)
     as_much = replace(whole.unnamed, gain=AS_MUCH * gain(fit, whole.nominal))
@@ -74,7 +74,7 @@ def test_two_effects_that_are_there_are_none():
 
 
 def test_two_effects_of_one_kind_are_none_although_one_dictionary_has_both():
-    whole = _whole(lambda x, y, vx, vy: (-0.3 * vx, -0.3 * vy))
+    whole = _whole(lambda x, y, vx, vy, asked: (-0.3 * vx, -0.3 * vy))
     fit = _named(whole, _drag("vx"), _drag("vy"))
     named = gain(fit, whole.nominal)
     as_much = replace(whole.unnamed, gain=AS_MUCH * named)
@@ -82,8 +82,24 @@ def test_two_effects_of_one_kind_are_none_although_one_dictionary_has_both():
     assert not patchwork(whole.given, fit, whole.nominal, as_much)
 
 
+def test_what_an_input_does_now_is_no_other_thing_than_what_it_did_lately():
+    late = [0.0]
+
+    def lagged_and_more(x, y, vx, vy, asked):
+        late[0] += (asked[0] - late[0]) * DT / PARTS / 0.03
+        return 1.06 * late[0] - asked[0], 0.0
+
+    whole = _whole(lagged_and_more)
+    gain_of, lag = _effect("input_gain", "ax", {"gain": 1.05}), _effect("input_lag", "ax", {"time_constant": 0.03})
+    fit = _named(whole, gain_of, lag)
+    named = gain(fit, whole.nominal)
+    assert all(20.0 < gain(_named(whole, one), whole.nominal) <= MOSTLY * named for one in (gain_of, lag))
+    for token, found in (("memory(ax)", False), ("memory(ay)", True)):
+        assert patchwork(whole.given, fit, whole.nominal, replace(whole.unnamed, token=token, gain=AS_MUCH * named)) is found
+
+
 def test_a_name_that_explains_nearly_all_is_none_whatever_stands_beside_it():
-    whole = _whole(lambda x, y, vx, vy: (-0.3 * vx, 0.0))
+    whole = _whole(lambda x, y, vx, vy, asked: (-0.3 * vx, 0.0))
     fit = _named(whole, _drag("vx"), _effect(*BIAS))
     as_much = replace(whole.unnamed, gain=AS_MUCH * gain(fit, whole.nominal))
     assert about(fit.model, 1, whole.given.data, whole.given.steps) == {"ay"}, "the other one is about something else"

@@ -4,7 +4,7 @@ With enough numbers, names together can follow what none of them means: a gyro t
 What tells: it depends on one thing, and a dictionary of that (`lack_of_fit_terms`) explains as much as all of them together.
 
     patchwork    gain(dictionary) >= AS_MUCH gain(all names)     and     every gain(one name) <= MOSTLY gain(all names)
-                 and some name is not about what the dictionary depends on
+                 and some name is about something else than the dictionary
 
 The dictionary's gain is that on blocks which its numbers never saw, that of the names on what they were fitted to. Two effects that are
 there give two dependences, of which one dictionary has one; where both are about the same (dry friction and drag, about the speed), one
@@ -36,7 +36,9 @@ def patchwork(given: Problem, fit: Fit, nominal: Fit, unnamed: Judged) -> bool:
     if len(fit.added) < 2 or unnamed.token == CONSTANT or unnamed.gain < AS_MUCH * named:
         return False
     atoms = set(unnamed.token.split("*"))
-    if all(atoms <= about(fit.model, place, given.data, given.steps) for place in fit.added):
+    seen = atoms | {atom.removeprefix("memory(").removesuffix(")") for atom in atoms}  # what an input was has in it what it is
+    each = [about(fit.model, place, given.data, given.steps) for place in fit.added]
+    if all(atoms <= one or one <= seen for one in each):
         return False
     return all(gain(alone, nominal) <= MOSTLY * named for alone in _each_alone(given, fit))
 
