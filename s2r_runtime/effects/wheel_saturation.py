@@ -10,7 +10,7 @@ import numpy as np
 from s2r_runtime.effects.input_effect import Array, InputEffect, Values, replaced
 from s2r_runtime.hookspecs import NominalModel, Parameter
 
-SHARES = (0.97, 0.9, 0.7, 0.5, 0.35)
+SHARES = (0.97, 0.85, 0.6, 0.35)
 """Of the largest load of a wheel."""
 
 
