@@ -16,7 +16,7 @@ from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.slots import Added
 from s2r_runtime.trace.straight import ROUNDS, samples_of, straight
 from s2r_runtime.trace.tracer import load_dataset, trace
-from s2r_runtime.trace.ways import Way
+from s2r_runtime.trace.ways import Samples, Way
 
 DT_S, TICKS, NOISE = 0.02, 10, 1e-3
 
@@ -200,22 +200,24 @@ def test_commands_that_jump_in_every_row_are_not_smoothed():
     assert (result.verdict, bool(result.way)) == ("none", False)
 
 
-def _tank(seed, at_rows, lag=0.0, rows=1200):
-    """A tank's level under a pump that is set anew now and then, between the rows (1 s) or on them; through a lag, s."""
+def _tank(seed, at_rows, lag=0.0, rows=1200, lags=1, noise=2e-3, hold_s=(15.0, 60.0)):
+    """A tank's level under a pump that is set anew now and then, between the rows (1 s) or on them; through so many lags, s."""
     parts, rng = 20, np.random.default_rng(seed)
     u, k = np.zeros(rows * parts), 0
     while k < len(u):
-        hold = round(rng.uniform(15.0, 60.0)) * parts + (0 if at_rows else int(rng.integers(parts)))
+        hold = round(rng.uniform(*hold_s)) * parts + (0 if at_rows else int(rng.integers(parts)))
         u[k : k + hold] = rng.uniform(0.2, 1.8)
         k += hold
-    level, acts, levels = 1.0, u[0], []
+    level, chain, levels = 1.0, [u[0]] * lags, []
     for k, asked in enumerate(u.tolist()):
         if k % parts == 0:
             levels.append(level)
-        acts += (asked - acts) * (1.0 - np.exp(-1.0 / parts / lag)) if lag else asked - acts
-        level += (0.05 * acts - 0.05 * level) / parts
+        for i in range(lags):
+            chain[i] += (asked - chain[i]) * (1.0 - np.exp(-1.0 / parts / lag)) if lag else asked - chain[i]
+            asked = chain[i]
+        level += (0.05 * asked - 0.05 * level) / parts
     t = np.arange(rows, dtype=float)
-    measured = np.array(levels)[:, None] + 2e-3 * rng.normal(size=(rows, 1))
+    measured = np.array(levels)[:, None] + noise * rng.normal(size=(rows, 1))
     return [(Stream(t, measured), Stream(t, u[::parts, None]))]
 
 
@@ -250,3 +252,46 @@ def test_a_lag_of_commands_that_change_between_the_rows_has_its_size(tmp_path):
     assert (found.name, found.channel) == ("input_lag", "pump")
     assert found.values["time_constant"] == pytest.approx(6.0, rel=0.07)
     assert result.depends_on == ()
+
+
+def test_what_remembers_in_another_way_is_no_clock_of_the_commands(tmp_path):
+    """Two lags look like one, and a delay, with all commands half a row too early: they would all have come at the same part of a row."""
+    (tmp_path / "tank.py").write_text(TANK)
+    model = compose(ModelSpec(str(tmp_path / "tank.py"), 1.0))
+    result = trace(from_streams(model, _tank(1, at_rows=True, lag=1.5, lags=2, noise=1e-3, hold_s=(8.0, 30.0)), "a table"), model)
+    assert not result.to_json()["inputs_changed_within"]
+    delays = [found.values["delay"] for found in result.effects if found.name == "input_delay"]
+    assert all(delay == pytest.approx(0.8, abs=0.1) for delay in delays)
+
+
+def test_a_test_recording_whose_force_is_held_is_judged_as_held():
+    model, samples = _joint(1, friction=0.0, held=False)
+    rng = np.random.default_rng(2)
+    force = np.repeat(rng.uniform(-3.0, 3.0, 100), 10)
+    q, v, states = 0.0, 0.0, []
+    for u in force.tolist():
+        states.append((q, v))
+        q, v = q + DT_S * v + 0.5 * DT_S**2 * u, v + DT_S * u
+    stamps = DT_S * np.arange(len(force))
+    measured = np.array(states) + rng.normal(size=(len(force), 2)) * NOISE
+    commands = from_streams(model, [(Stream(stamps, measured), Stream(stamps, force[:, None]))], "another table")
+    result = trace(samples, model, test=commands)
+    error = result.to_json()["error"]
+    assert result.way.most > 0.8
+    assert all(error["before"]["rollout_rms"][s] < 1.3 * error["rollout_noise_floor"][s] for s in ("q", "qd"))
+
+
+def test_only_inputs_that_were_placed_change_within_the_rows_of_another_recording():
+    t = np.arange(12.0)
+    values = np.column_stack([np.repeat([0.0, 1.0, 2.0], 4), np.repeat([5.0, 6.0, 7.0], 4)])
+    placed, others = (Samples([Stream(t, values)]) for _ in range(2))
+    placed.within = [placed.within[0] * [0.7, 0.0]]
+    assert np.array_equal(others.as_of(placed).within[0] > 0.0, (np.diff(values, axis=0, append=values[-1:]) != 0.0) & [True, False])
+
+
+def test_an_input_on_its_way_stays_within_what_was_asked():
+    t = np.arange(40.0)
+    valve = np.maximum(np.sin(0.9 * t), 0.0)
+    (laid,) = Samples([Stream(t, valve[:, None])]).laid(Way((1.0,), (1.0,)))
+    assert laid.values.min() >= 0.0
+    assert laid.values.max() <= valve.max()

@@ -49,7 +49,8 @@ def _filters(model: ComposedModel, place: int) -> bool:
 def _tried(model: ComposedModel, place: int, data: Dataset, steps: Steps, *, of_states: bool) -> set[str]:
     """Of states, or of inputs, those that change what an effect does, seen from the robot, if they are elsewhere by as much as usual."""
     less, act, y = without(model, place), acting(model, data).at(steps.place), steps.y0
-    size = rms(model.difference(steps.y1, y)) + 1e-300
+    moved = rms(model.difference(steps.y1, y))
+    size = np.where(moved > 0.0, moved, np.inf)  # what never changes tells nothing
     usual = _done(model, less, y, act) / size
     enough = VARIES * float(np.linalg.norm(usual))
     found, names = set(), model.states if of_states else model.inputs

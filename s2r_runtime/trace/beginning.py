@@ -72,7 +72,7 @@ def with_history(model: ComposedModel, data: Dataset) -> Dataset:
 def _forgetting(model: ComposedModel, data: Dataset, run: Run, before: int, usual: Array) -> Run:
     """A run that was under way, after so many steps of what was before, less the rows in which that shows not to have been so."""
     rows = len(run.y) - before
-    most = max(FIRST, int(PART * rows))
+    most = int(PART * rows)
     first = replace(data, runs=(run,))
     steps = steps_of(first)
     off = np.any(np.abs(residual(model, steps, acting(model, first))) > WILD * usual, axis=1)

@@ -51,6 +51,9 @@ SOME = 8
 MEAN, SPREAD = 1.0, 0.58
 """Of how far before its row a change comes, in halves of a row: anywhere between two rows, 2 / sqrt(12)."""
 
+SCATTER = 0.5
+"""Of SPREAD, from which changes come at times of their own: all by as much is no clock, but something that remembers in another way."""
+
 BETWEEN = 0.5, 1.5
 """Mean of it, between which changes came between the rows: they come on rows (0), or a row late (2), otherwise."""
 
@@ -267,7 +270,11 @@ def changed_within(lay: Lay, everywhere: Lay, fit: Fit, samples: Samples, nu: in
         under = lay(way)
         again = fitted(under, fit, fit.model) if fit.free else evaluate(under, fit.model)
         samples.within = _placed(everywhere(held), again, datas, samples.changes(), halves)
-    return way
+    come = np.concatenate(halves) > 0.0
+    placed = np.concatenate(samples.within)
+    apart = np.array([one[there].std() > SCATTER * SPREAD if there.any() else False for one, there in zip(placed.T, come.T, strict=True)])
+    samples.within = [one * apart for one in samples.within]
+    return way if apart.any() else held
 
 
 def _placed(

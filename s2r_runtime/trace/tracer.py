@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.errors import NotEnoughEvidence, UsageError
+from s2r_runtime.errors import ConfigError, NotEnoughEvidence, UsageError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.beginning import with_history
@@ -194,14 +194,17 @@ def _straight(
 
     if not alike_laid(thinned(less, straight(data, less, Way(late=True), samples), test, parts)[1], checked.data):
         return None
-    if sampled(data):
-        way = way_of(laid, fit, moving([inputs for _, inputs in data.segments]))
-    else:
-        way = changed_within(laid, everywhere, fit, samples, len(less.inputs))
+    try:
+        if sampled(data):
+            way = way_of(laid, fit, moving([inputs for _, inputs in data.segments]))
+        else:
+            way = changed_within(laid, everywhere, fit, samples, len(less.inputs))
+    except ConfigError:  # a user's own model may give no numbers for inputs that went so
+        return None
     if not way:
         return None
-    if test is not None and (sampled(test) or commanded(test)):
-        test = straight(test, less, way, samples_of(test))
+    if test is not None and (commanded(test) if way.within else sampled(test)):
+        test = straight(test, less, way, samples_of(test).as_of(samples))
     return replace(straight(data, less, way, samples), noisy=noisy(data, way, samples)), test
 
 

@@ -77,6 +77,12 @@ class Samples:
         self.within = [_changing(one.values).astype(np.float64) for one in inputs]
         """(N, nu) of each segment: how far a change came before its row, in halves of a row; 0 where there is none."""
 
+    def as_of(self, others: Samples) -> Samples:
+        """These, of another recording in which no other inputs change within rows than in the one that was placed; each at its mean."""
+        chosen = np.any([one.any(axis=0) for one in others.within], axis=0)
+        self.within = [one * chosen for one in self.within]
+        return self
+
     def laid(self, way: Way) -> list[Stream]:
         """The inputs as they went."""
         if way.within:
@@ -98,7 +104,9 @@ def _went(values: Array, smooth: Array, way: Way) -> Array:
     if way.late:
         return np.concatenate([values[1:], values[-1:]])
     cleaned = values + np.array(way.clean) * (smooth - values)
-    return np.asarray(cleaned + np.array(way.on) * (_means(cleaned) - cleaned))
+    went = cleaned + np.array(way.on) * (_means(cleaned) - cleaned)
+    ends = [end(values, axis=0, initial=-size, where=np.isfinite(values)) for end, size in ((np.min, -np.inf), (np.max, np.inf))]
+    return np.asarray(np.clip(went, *ends))  # a valve that was closed did not open the other way between two rows
 
 
 def _ahead(values: Array) -> Array:
