@@ -14,6 +14,8 @@ from s2r_runtime.trace.residual import Acting, Steps, acting, advanced, rms
 
 Array = NDArray[np.float64]
 
+MOTION = {"position", "speed", "heading"}
+
 VARIES = 0.05
 """Share by which what an effect does must change along a state or an input for it to be about that."""
 
@@ -33,11 +35,11 @@ def about(model: ComposedModel, place: int, data: Dataset, steps: Steps) -> set[
 
 
 def about_states(model: ComposedModel, places: tuple[int, ...], data: Dataset, steps: Steps) -> set[str]:
-    """Tokens (position, speed, heading, or a state's own name) of the states that what these effects do to the robot depends on: friction
-    and drag on a speed, a spring on a position. An effect on an input is about none, nor is a sensor's.
+    """Which of position, speed and heading what these effects do to the robot depends on: friction and drag on a speed, a spring on a
+    position. An effect on an input is about none, nor is a sensor's. Other states may be anything, and are left out.
     """
     plant = [place for place in places if model.effects[place].effect.stage != "sensor" and not _filters(model, place)]
-    return set().union(*(_tried(model, place, data, steps, of_states=True) for place in plant))
+    return MOTION & set().union(*(_tried(model, place, data, steps, of_states=True) for place in plant))
 
 
 def _filters(model: ComposedModel, place: int) -> bool:
