@@ -94,6 +94,26 @@ def test_one_input_that_weakens_another_is_told_although_the_residual_is_loud():
     assert (result.verdict, result.depends_on[:1]) == ("unexplained", ("cmd_left*cmd_right",))
 
 
+@pytest.mark.parametrize("seed", [0, 13, 26])
+def test_winds_on_every_state_are_no_field(seed):
+    """Each state is pushed by a wind of its own, half a second long: at first look, under a noise that has all of them in it, none
+    stands out.
+    """
+    rng = np.random.default_rng(seed)
+    u = _held(rng, 800, [0.0, -1.0], [0.5, 1.0])
+    keep = math.exp(-DT / 0.5)
+    model = compose(ModelSpec("unicycle", DT))
+    x, hidden, wind, rows = np.zeros((1, 3)), model.at_rest(1), np.zeros(3), [np.zeros(3)]
+    for k in range(len(u)):
+        wind = keep * wind + math.sqrt(1.0 - keep * keep) * rng.normal(size=3) * [0.0003, 0.0003, 0.0009]
+        x, hidden = model.step(x, u[k : k + 1], hidden)
+        x = x + wind
+        rows.append(x[0])
+    y = np.array(rows) + rng.normal(size=(len(rows), 3)) * [0.001, 0.001, 0.003]
+    result = trace(from_arrays(model, [(y, u)]), model)
+    assert (result.verdict, result.depends_on) == ("none", ("noise",))
+
+
 @pytest.mark.parametrize("memory", [0.1, 0.5, 2.0, 8.0])
 def test_a_push_that_wanders_is_no_field(memory):
     """Within some steps, or within a good part of the recording; whatever the robot does meanwhile, and wherever it is."""

@@ -162,13 +162,18 @@ def _looked(
     left: Left, offered: Iterable[_Offer], bare: float, most: int, sure: float = math.inf
 ) -> tuple[list[tuple[float, _Offer]], int]:
     """(nats at first look, offer), the best first, of those that stand out most, or beyond doubt; and how many were offered."""
+    ranked, tried = _standing_out(left, offered)
+    looked = [(_marginal(left, offer.x, 1)[0] - bare, offer) for k, (far, offer) in enumerate(ranked) if k < most or far > sure]
+    return sorted(looked, key=lambda pair: -pair[0]), tried
+
+
+def _standing_out(left: Left, offered: Iterable[_Offer]) -> tuple[list[tuple[float, _Offer]], int]:
+    """(standard deviations above chance, offer) of those that stand out, the first one most; and how many were offered."""
     flipped = _flipped(left)
     every = list(offered)
     along = {id(offer.push): np.einsum("ki,kis->ks", offer.push, flipped) for offer in {id(o.push): o for o in every}.values()}
     scored = [(_stands_out(offer, along[id(offer.push)]), offer) for offer in every]  # the same pushes go with many coordinates
-    best = sorted((pair for pair in scored if pair[0] > SEEN), key=lambda pair: -pair[0])
-    looked = [(_marginal(left, offer.x, 1)[0] - bare, offer) for k, (far, offer) in enumerate(best) if k < most or far > sure]
-    return sorted(looked, key=lambda pair: -pair[0]), len(scored)
+    return sorted((pair for pair in scored if pair[0] > SEEN), key=lambda pair: -pair[0]), len(every)
 
 
 def _flipped(left: Left) -> Array:
@@ -233,8 +238,12 @@ def wandering_nats(left: Left, least: float = 0.0) -> float:
     body, world = directions_of(given, model, acting(model, given.data))
     when = np.arange(len(given.steps), dtype=float)[:, None]
     bare = bare_nats(left)
-    looked, _ = _looked(left, _over("time", when, (*body, *world), (*CELLS, QUICKEST)), bare, DIRECTIONS)
-    kept = [offer for nats, offer in looked if nats > max(least, LOOKS)][:FITTED]
+    offered = _over("time", when, (*body, *world), (*CELLS, QUICKEST))
+    if least > LOOKS:
+        looked, _ = _looked(left, offered, bare, DIRECTIONS)
+        kept = [offer for nats, offer in looked if nats > least][:FITTED]
+    else:  # a rival is fitted as closely as what it stands against: at first look, the noise still has all that wanders
+        kept = [offer for _, offer in _standing_out(left, offered)[0]]
     found = max((_marginal(left, offer.x, PASSES)[0] for offer in kept), default=bare)
     if least <= LOOKS:
         left.known["wandering"] = found

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.errors import Held
+from s2r_runtime.trace.lack_of_fit_terms import token_of
 from s2r_runtime.trace.residual import acting
 
 Array = NDArray[np.float64]
@@ -35,8 +36,6 @@ RECENT_S = (0.0, 0.1, 0.4, 1.5)
 
 BETTER = 0.1
 """Share by which a variable must account for more than a simpler thing: than a constant, or than without an input that it multiplies."""
-
-SPEEDS = ("speed", "vx", "vy", "qd", "wheel_left", "wheel_right")
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,14 +127,9 @@ def variables(model: ComposedModel, held: Held) -> list[Variable]:
     u = acting(model, held.data, ()).mean[steps.place]
     found = [Variable(name, name, units.get(name, ""), name, u[:, j]) for j, name in enumerate(model.inputs)]
     for i, name in enumerate(model.states):
-        values, about = steps.y0[:, i], name
+        values, about = steps.y0[:, i], token_of(model, name)
         if name in model.nominal.angles:
             values = np.asarray((values + np.pi) % (2.0 * np.pi) - np.pi)
-            about = "heading" if name in {"theta", "heading", "yaw"} else name
-        elif name in {"x", "y"} or (name == "q" and not has_pose(model)):
-            about = "position"
-        elif name in SPEEDS:
-            about = "speed"
         found.append(Variable(name, about, units.get(name, ""), "the heading" if about == "heading" else name, values))
     return [*found, Variable("time", "time", "s", "the time", steps.t)]
 
