@@ -102,7 +102,12 @@ def screen(given: Problem, base: Fit, found: Sequence[Candidate], hopeless: floa
     }
     first = {key: s for key, s in first.items() if foretold(given, s.start) is not None}  # as it was scaled
     least = -max(max((s.value for s in first.values()), default=0.0), hopeless)
-    moved = {key: _moved_on(given, white, aside, before, s, level) if s.value > least else s for key, s in first.items()}
+    moved = {
+        key: max((_moved_on(given, white, aside, before, one, level) for one in _shapes(s, best[key])), key=lambda s: s.value)
+        if s.value > least
+        else s
+        for key, s in first.items()
+    }
     enough = max(PROMISING * max((s.value for s in moved.values()), default=0.0), WORTH)
     for key, s in moved.items():
         too_much = max(found_of[key], key=lambda s: s.less)
@@ -131,6 +136,13 @@ def _as_it_stands(given: Problem, white: Fit, aside: _Aside, before: Array, star
         if value > most:
             best, most = s, value
     return replace(best, value=max(first.value, most - level))
+
+
+def _shapes(s: Screened, starts: Sequence[Screened]) -> list[Screened]:
+    """Starts to go on from: the best one, or every one of an effect that scales in shape. The scale says little of the shape there: dry
+    friction that is larger at rest is plain dry friction, if the speed at which it falls is next to none, and stays that.
+    """
+    return list(starts) if getattr(s.start.effects[_place(s)].effect, "homogeneous", False) else [s]
 
 
 def _place(s: Screened) -> int:

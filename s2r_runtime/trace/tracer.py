@@ -42,7 +42,7 @@ from s2r_runtime.trace.residual import Mask, acting, first_steps, rms, steps_of
 from s2r_runtime.trace.residual_noise import no_colour
 from s2r_runtime.trace.result import Found, Limit, TraceResult
 from s2r_runtime.trace.retimed import dated
-from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, names
+from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, Scored, names
 from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded, select
 from s2r_runtime.trace.slots import Slot
 from s2r_runtime.trace.straight import acted, alike_laid, changed_within, commanded, noisy, sampled, samples_of, straight, way_of
@@ -235,12 +235,17 @@ def _astray(chosen: Selection, structure: Structure, judged_on: Held, seed: int)
 def _once_more(
     given: Problem, whole: Whole, chosen: Selection, structure: Structure, judged_on: Held, ahead: int
 ) -> tuple[Selection, Structure]:
-    """Where structure is left, something is there: two effects together that leave nothing, coloured noise neither (two take up a part of
-    anything, and the rest looks like that); or what is found with a lower bar, if that leaves nothing. What was not fitted must be
-    foretold no worse.
+    """Where structure is left, something is there: a rival that leaves nothing; or two effects together that do, coloured noise neither
+    (two take up a part of anything, and the rest looks like that); or what is found with a lower bar, if that leaves nothing. What was not
+    fitted must be foretold no worse.
     """
-    pair = two_together(given, chosen, lambda fits: foretelling(judged_on, fits))
     refused = {names(chosen.fit.model)}
+    complete = [(s, rest) for s in chosen.rivals if (rest := _left_by(whole, chosen, s, structure, refused)) is not None]
+    if complete:  # what ties with the first, and leaves nothing, is more than that
+        best, rest = max(complete, key=lambda pair: pair[0].score)
+        if best.fit is not None and foretelling(judged_on, [chosen.fit, best.fit])[1] >= 0.0:
+            return replace(chosen, fit=best.fit, rivals=tuple(s for s, _ in complete if s is not best)), rest
+    pair = two_together(given, chosen, lambda fits: foretelling(judged_on, fits))
     told = None if pair is None else _all_explained(whole, pair, structure, refused)
     for bar, before, may_be_left in (
         (STRICT, pair if told is not None and not told.tokens else None, set()),
@@ -261,6 +266,14 @@ def _once_more(
         if foretelling(judged_on, [chosen.fit, other.fit])[1] >= 0.0:
             return other, rest
     return chosen, structure
+
+
+def _left_by(
+    whole: Whole, chosen: Selection, rival: Scored, structure: Structure, refused: set[tuple[tuple[str, str], ...]]
+) -> Structure | None:
+    """What is left by a rival of what was chosen, as far as it is noise; None if it is more."""
+    rest = None if rival.fit is None else _all_explained(whole, replace(chosen, fit=rival.fit, rivals=()), structure, refused)
+    return rest if rest is not None and {*rest.tokens} <= {"noise"} else None
 
 
 def _all_explained(whole: Whole, other: Selection, structure: Structure, refused: set[tuple[tuple[str, str], ...]]) -> Structure | None:
