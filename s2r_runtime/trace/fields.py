@@ -64,7 +64,10 @@ LOOKS = 4.0
 """Nats at first look from which on a field is fitted with noise of its own."""
 
 FITTED = 3
-"""Fields, and pushes that wander, that are."""
+"""Fields that are; and pushes that wander, where they must show at first look."""
+
+BESIDE = 3
+"""Pushes that wander which a field is asked beside, in a direction each: a body in a plane has as many."""
 
 FLIPS = 24
 """Draws of what is left with signs by chance, step by step: what fields would see in noise alone."""
@@ -78,7 +81,7 @@ SURE = 10.0
 """Those from which on all are: where all have a mean in them that is there, the finest stands out least, and may explain most."""
 
 DIRECTIONS = 4
-"""Pushes that wander, in some direction and as quickly, that are looked at."""
+"""Pushes that wander, in some direction and as quickly, that are looked at where they must show at first look."""
 
 SETTLED = 0.5
 """Nats that a pass must gain for another one."""
@@ -154,8 +157,26 @@ def field(left: Left) -> Field | None:
     if nats - bare < price:
         return None
     beyond = nats - max(bare, wandering_nats(left)) - price
+    if beyond <= 0.0:
+        beyond = _beside_pushes(left, kept[best].x, beta) - price
     also = tuple(kept[k].token for other, _, k in fitted[1:] if other > nats - ALIKE)
     return Field(kept[best].token, also, kept[best].x, beta, nats - bare, beyond)
+
+
+def _beside_pushes(left: Left, x: Array, beta: Array) -> float:
+    """Nats of a field, fitted to beta alone, beside the pushes that wander most: both may be there, and a push that is free to follow time
+    closely follows a field, too, and leaves more than both leave.
+    """
+    pushes = [_scaled(push.x, slopes) for _, push, slopes in _pushes(left)]
+    if not pushes:
+        return -math.inf
+    with_it, without = (_marginal(left, np.concatenate(parts, axis=2), PASSES)[0] for parts in ([*pushes, _scaled(x, beta)], pushes))
+    return with_it - max(without, bare_nats(left), wandering_nats(left))
+
+
+def _scaled(x: Array, beta: Array) -> Array:
+    """x (n, nx, m) such that its slopes beta (m,) are of size 1: what is fitted together has one ridge."""
+    return np.asarray(x * math.sqrt(max(float(np.mean(beta * beta)), 1e-300)))
 
 
 def _looked(
@@ -225,29 +246,41 @@ def bare_nats(left: Left) -> float:
     """Log likelihood of what a model leaves, under noise of whatever colour is likeliest."""
     if "bare" not in left.known:
         left.known["bare"] = _under_any_law(left.fit.z, left.fit.whiten, left)
-    return left.known["bare"]
+    bare: float = left.known["bare"]
+    return bare
 
 
 def wandering_nats(left: Left, least: float = 0.0) -> float:
-    """The same with a push that wanders in time, in whichever direction that is likeliest. least: nats that it must have at first look,
-    else it is not looked at any closer.
+    """The same with a push that wanders in time, in whichever direction that is likeliest. least: nats that it must have at first look if
+    they are more than LOOKS, else it is not looked at any closer.
     """
-    if "wandering" in left.known:
-        return left.known["wandering"]
+    bare = bare_nats(left)
+    if least <= LOOKS or "pushes" in left.known:
+        return max((nats for nats, _, _ in _pushes(left)), default=bare)
+    looked, _ = _looked(left, _wandering(left), bare, DIRECTIONS)
+    kept = [offer for nats, offer in looked if nats > least][:FITTED]
+    return max((_marginal(left, offer.x, PASSES)[0] for offer in kept), default=bare)
+
+
+def _pushes(left: Left) -> list[tuple[float, _Offer, Array]]:
+    """(log likelihood, push, slopes) of BESIDE pushes that wander, in a direction each, as quickly as is likeliest, the best first. All
+    that stand out are fitted: at first look, the noise has all in it that wanders.
+    """
+    if "pushes" not in left.known:
+        ranked, _ = _standing_out(left, _wandering(left))
+        found = sorted(((*_marginal(left, offer.x, PASSES), offer) for _, offer in ranked), key=lambda f: -f[0])
+        best = {id(offer.push): (nats, offer, beta) for nats, beta, offer in reversed(found)}
+        left.known["pushes"] = sorted(best.values(), key=lambda f: -f[0])[:BESIDE]
+    pushes: list[tuple[float, _Offer, Array]] = left.known["pushes"]
+    return pushes
+
+
+def _wandering(left: Left) -> Iterator[_Offer]:
+    """Pushes that may wander, in each direction."""
     given, model = left.given, left.fit.model
     body, world = directions_of(given, model, acting(model, given.data))
     when = np.arange(len(given.steps), dtype=float)[:, None]
-    bare = bare_nats(left)
-    offered = _over("time", when, (*body, *world), (*CELLS, QUICKEST))
-    if least > LOOKS:
-        looked, _ = _looked(left, offered, bare, DIRECTIONS)
-        kept = [offer for nats, offer in looked if nats > least][:FITTED]
-    else:  # a rival is fitted as closely as what it stands against: at first look, the noise still has all that wanders
-        kept = [offer for _, offer in _standing_out(left, offered)[0]]
-    found = max((_marginal(left, offer.x, PASSES)[0] for offer in kept), default=bare)
-    if least <= LOOKS:
-        left.known["wandering"] = found
-    return found
+    return _over("time", when, (*body, *world), (*CELLS, QUICKEST))
 
 
 def _offered(left: Left) -> Iterator[_Offer]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +52,7 @@ class Judged:
 @dataclass(frozen=True)
 class Left:
     """What is to be explained. r: (n, nx); f: (n, nx, nx); block: (n,). clipped: (n, nx), whitened, wild values cut off but with the
-    weight of any other; None if there are none. known: nats of it that were asked for (`fields`).
+    weight of any other; None if there are none. known: what was asked of it before (`fields`).
 
     What shows only when an input jumps is wild, and few: weights would take it for outliers. Whether outliers have to do with the inputs
     is told by sliding.
@@ -63,7 +64,7 @@ class Left:
     f: Array
     block: NDArray[np.int64]
     clipped: Array | None
-    known: dict[str, float] = field(default_factory=dict, init=False, repr=False, compare=False)
+    known: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @cached_property
     def law(self) -> Colour | None:

@@ -263,6 +263,9 @@ def _beyond_wandering(given: Problem, fit: Fit, base: Fit, needed: float) -> boo
     """
     joined = given.steps.joined
     law, bare = (noises.wandering(f.z, joined, f.colour) for f in (fit, base))
+    if law is None and bare is not None:  # an effect explains more than the law of all that is left without it
+        with_it, without = (noises.log_likelihood(f.z, f.whiten, c, joined) for f, c in ((fit, fit.colour), (base, bare)))
+        return with_it - without > needed
     if law is None:
         return True
     if bare is not None:
