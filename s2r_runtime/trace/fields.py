@@ -14,8 +14,9 @@ the inputs do.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,7 +109,7 @@ BODY, ANGLES = {"x", "y", "theta"}, ("theta", "heading", "yaw")
 class Field:
     """token: what it depends on; also: what others that say the same do. x: (n, nx, m) bumps times a push; beta: (m,).
 
-    nats: beyond the model's own noise of any colour. beyond: nats beyond that and what wanders by itself, less the price of having looked.
+    nats: beyond the model's own noise of any colour.
     """
 
     token: str
@@ -116,7 +117,12 @@ class Field:
     x: Array
     beta: Array
     nats: float
-    beyond: float
+    weighed: Callable[[], float]
+
+    @cached_property
+    def beyond(self) -> float:
+        """Nats beyond noise and what wanders by itself, less the price of having looked. Few ask, and it takes longer than all the rest."""
+        return self.weighed()
 
     @property
     def judged(self) -> Judged:
@@ -156,11 +162,14 @@ def field(left: Left) -> Field | None:
     price = math.log(tried / ALPHA)
     if nats - bare < price:
         return None
-    beyond = nats - max(bare, wandering_nats(left)) - price
-    if beyond <= 0.0:
-        beyond = _beside_pushes(left, kept[best].x, beta) - price
     also = tuple(kept[k].token for other, _, k in fitted[1:] if other > nats - ALIKE)
-    return Field(kept[best].token, also, kept[best].x, beta, nats - bare, beyond)
+    return Field(kept[best].token, also, kept[best].x, beta, nats - bare, lambda: _beyond(left, nats - price, kept[best].x, beta, price))
+
+
+def _beyond(left: Left, nats: float, x: Array, beta: Array, price: float) -> float:
+    """What `beyond` says of a field that has so many nats less its price: beyond pushes that wander, or, if that is none, beside them."""
+    beyond = nats - max(bare_nats(left), wandering_nats(left))
+    return beyond if beyond > 0.0 else _beside_pushes(left, x, beta) - price
 
 
 def _beside_pushes(left: Left, x: Array, beta: Array) -> float:
@@ -170,8 +179,9 @@ def _beside_pushes(left: Left, x: Array, beta: Array) -> float:
     pushes = [_scaled(push.x, slopes) for _, push, slopes in _pushes(left)]
     if not pushes:
         return -math.inf
-    with_it, without = (_marginal(left, np.concatenate(parts, axis=2), PASSES)[0] for parts in ([*pushes, _scaled(x, beta)], pushes))
-    return with_it - max(without, bare_nats(left), wandering_nats(left))
+    alone = max(bare_nats(left), wandering_nats(left))
+    beside = _marginal(left, np.concatenate([*pushes, _scaled(x, beta)], axis=2), PASSES)[0]
+    return beside - (alone if beside <= alone else max(alone, _marginal(left, np.concatenate(pushes, axis=2), PASSES)[0]))
 
 
 def _scaled(x: Array, beta: Array) -> Array:
@@ -383,21 +393,22 @@ def _marginal(left: Left, x: Array, passes: int) -> tuple[float, Array]:
     """
     whiten, z, joined = left.fit.whiten, left.fit.z, left.given.steps.joined
     best, told, rest = -math.inf, np.asarray(np.zeros(x.shape[2])), left.r
+    columns = np.asfortranarray(x.reshape(-1, x.shape[2]))  # as whitening takes them: they are copied once, not in every pass
     for again in range(passes):
         if again:
             whiten = Whitener(noises.estimate(rest, left.f, joined, left.given.floor), left.f, joined)
             z = whiten(rest)
         before, root = best, np.sqrt(noises.weight(np.clip(z, -CLIPPED, CLIPPED)))
-        table = whiten(x) * root[:, :, None]
-        weighted = table.reshape(-1, x.shape[2])
+        weighted = whiten.columns(columns)
+        weighted *= root.reshape(-1, 1)
         product = weighted.T @ weighted  # half the work of a product of two
         slope = weighted.T @ (root * np.clip(whiten(left.r), -CLIPPED, CLIPPED)).ravel()
         ridge = evidence(product, slope).ridge
         beta: Array = np.asarray(np.linalg.solve(product + ridge * np.eye(len(slope)), slope))
-        rest = left.r - x @ beta
+        rest = left.r - (columns @ beta).reshape(left.r.shape)
         z = whiten(rest)
         less = _less(left, z)
-        size = np.sum(table * table, axis=(0, 2))
+        size = np.sum(np.einsum("km,km->k", weighted, weighted).reshape(left.r.shape), axis=0)
         finer = float(np.sum(size / less**2) / max(float(np.sum(size)), 1e-300))
         price = 0.5 * float(np.linalg.slogdet(np.eye(len(slope)) + product * (finer / ridge))[1]) + 0.5 * ridge * float(beta @ beta)
         nats = _under_any_law(z / less, whiten, left) - price - len(z) * float(np.sum(np.log(less)))

@@ -103,11 +103,14 @@ class Whitener:
 
     def __call__(self, r: Array) -> Array:
         """Same shape as r."""
+        return self.columns(r.reshape(r.shape[0] * r.shape[1], -1)).reshape(r.shape)
+
+    def columns(self, r: Array) -> Array:
+        """The same of r (n nx, m)."""
         from scipy.linalg import lapack
 
-        flat = r.reshape(r.shape[0] * r.shape[1], -1)
-        z, _ = lapack.dtbtrs(self._lower, flat, uplo="L")
-        return np.asarray(z).reshape(r.shape)
+        z, _ = lapack.dtbtrs(self._lower, r, uplo="L")
+        return np.asarray(z)
 
     def back(self, z: Array) -> Array:
         """L^-T z for z (n, nx) or (n, nx, m), same shape: S^-1 r of z = L^-1 r."""
