@@ -267,7 +267,7 @@ def test_what_only_sliding_shows_gives_way_to_a_field_that_explains_more(monkeyp
     bias = AppliedEffect(registry().get("effects", "input_bias"), "w", {"bias": 0.02 / DT})
     named = insert(declared(), bias, 0)
     looks = Looks(left_of(given, evaluate(given, named)))
-    there = Field("time", (), push, np.array([-1.0]), 500.0, 400.0)
+    there = Field("time", (), push, np.array([-1.0]), 500.0, lambda: 400.0)
     slid = Judged("memory(w)", push, 0.0, 1.0, np.full((BLOCKS, 1), -0.5))
     monkeypatch.setattr(Looks, "field", there)
     monkeypatch.setattr(lack_of_fit_of, "_forward", lambda of: ([slid], {"memory(w)": 0.0}))
@@ -300,9 +300,27 @@ def test_a_state_that_noise_takes_far_does_not_speak_for_one_that_it_does_not(mo
     """off: shares of the way that two states end off by; beyond: whether noise alone falls short of that."""
     (data,) = recordings([], 1, steps=STEPS, seed=46)
     given = held(declared(), data, steps_of(data), (), np.ones(STEPS, dtype=bool), 1.0)
-    monkeypatch.setattr(verdict, "_off", lambda judged, given: np.array(off))
+    monkeypatch.setattr(verdict, "_off", lambda judged, given: (np.array(off), np.array([True, True])))
     monkeypatch.setattr(verdict, "_beyond_noise", lambda judged, given, floor: np.array(beyond))
     assert foretells(judge(declared(), given), given, NOISE) == foretold
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_heading_that_is_pushed_about_takes_no_name_from_wheels_that_go_as_they_are_told(seed):
+    """In a second, pushes that nobody commands turn the robot farther than its wheels do, and it is seen too coarsely to go anywhere."""
+    rng = np.random.default_rng([47, seed])
+    n, dt, most = 700, 0.02, 4.0
+    model = compose(ModelSpec("differential_drive", dt, {"wheel_radius": 0.05, "track": 0.5}))
+    asked = np.repeat(rng.uniform(-8.0, 8.0, size=(n // 20, 2)), 20, axis=0)
+    wheels = np.column_stack([np.clip(asked[:, 0], -most, most), asked[:, 1]])
+    x = np.zeros((n + 1, 5))
+    for k in range(n):
+        x[k + 1] = model.advance(x[k : k + 1], wheels[k : k + 1], wheels[k : k + 1])[0]
+        x[k + 1, 2] += 0.15 * rng.normal()
+    y = x + rng.normal(size=x.shape) * np.array([0.1, 0.1, 0.05, 0.2, 0.2])
+    found = trace(from_arrays(model, [(y, asked)]), model)
+    assert found.verdict == "traced", found.depends_on
+    assert _names(found.effects) == {("input_saturation", "cmd_left")}
 
 
 def test_a_model_that_nothing_can_ask_to_move_is_refused_in_a_line(tmp_path):

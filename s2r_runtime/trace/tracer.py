@@ -98,6 +98,7 @@ def trace(
     Raises NotEnoughEvidence if there are too few transitions or nothing was asked of the robot, UsageError if dataset and
     model do not belong together.
     """
+    import scipy.linalg  # noqa: F401  what brings threads of its own must be there before they are limited
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(limits=1):
@@ -241,10 +242,10 @@ def _once_more(
     """
     refused = {names(chosen.fit.model)}
     complete = [(s, rest) for s in chosen.rivals if (rest := _left_by(whole, chosen, s, structure, refused)) is not None]
-    if complete:  # what ties with the first, and leaves nothing, is more than that
-        best, rest = max(complete, key=lambda pair: pair[0].score)
+    for best, rest in sorted(complete, key=lambda pair: pair[0].score, reverse=True):  # what ties, and leaves nothing, is more than that
         if best.fit is not None and foretelling(judged_on, [chosen.fit, best.fit])[1] >= 0.0:
-            return replace(chosen, fit=best.fit, rivals=tuple(s for s, _ in complete if s is not best)), rest
+            fit = dated(given, whole.given, best.fit)
+            return replace(chosen, fit=fit, rivals=tuple(s for s, _ in complete if s is not best)), rest
     pair = two_together(given, chosen, lambda fits: foretelling(judged_on, fits))
     told = None if pair is None else _all_explained(whole, pair, structure, refused)
     for bar, before, may_be_left in (

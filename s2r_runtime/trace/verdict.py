@@ -52,6 +52,11 @@ ASKED = 0.1
 FORETELLS, NEARER = 0.7, 0.95
 """A model whose rollouts end farther off than these shares of the way that the robot went foretells nothing worth a name."""
 
+SET = 0.5
+"""The same of a state that goes nowhere (a wheel's speed that inputs set anew): a constant is foretold from what set it 0.7 times as
+far off as from one measurement to the next, whatever set it.
+"""
+
 MISSES = 0.5
 """Share of the way that the robot went by which rollouts must be off for something to be missing that looks like noise step by step."""
 
@@ -161,17 +166,24 @@ def _withdrawn(fit: Fit, structure: Structure, given: Held) -> bool:
 
 def foretells(judged: Judged, given: Held, floor: Array) -> bool:
     """Whether rollouts end nearer to the measurement than the state was from which they began: clearly in some state, or not clearly where
-    noise alone takes all of them as far; and in every one that goes somewhere (much farther in the horizon than in a step, which noise does
-    not) and not where noise takes it (a heading that nobody steers wanders). A position counts as one: a robot that drives straight on goes
-    nowhere sideways. floor: (nx,) what noise alone makes of the ends of rollouts.
+    noise alone takes all of them as far, and not even so where inputs set another one that goes nowhere (a wheel's speed) beyond doubt;
+    and in every one that goes somewhere (much farther in the horizon than in a step, which noise does not) and not where noise takes it (a
+    heading that nobody steers wanders). A position counts as one: a robot that drives straight on goes nowhere sideways. floor: (nx,) what
+    noise alone makes of the ends of rollouts.
     """
     if not len(judged.ends):
         return True
-    share = _off(judged, given)
-    goes = ~np.isnan(share)
+    share, goes = _off(judged, given)
     by_noise = np.logical_not(_beyond_noise(judged, given, floor))
     clearly = NEARER if by_noise[goes].all() else FORETELLS
-    return not goes.any() or bool(np.any(share[goes] < clearly) and np.all((share[goes] < NEARER) | by_noise[goes]))
+    some = np.any(share[goes] < clearly) or (by_noise[goes].all() and np.any(_set(share, given, floor)[~goes]))
+    return not goes.any() or bool(some and np.all((share[goes] < NEARER) | by_noise[goes]))
+
+
+def _set(share: Array, given: Held, floor: Array) -> Mask:
+    """(groups,) whether inputs set a state farther apart than noise does, and it is foretold where."""
+    columns = _together(given.data.states)
+    return np.asarray((share < SET) & (_lengths(displacement(given), columns) > NOISIER * _lengths(floor[None], columns)), dtype=bool)
 
 
 def _where_measured(floor: Array, given: Held) -> Array:
@@ -227,22 +239,22 @@ def misses(judged: Judged, given: Held, floor: Array) -> bool:
     """
     if not len(judged.ends):
         return False
-    return bool(np.any((_off(judged, given) > MISSES) & _beyond_noise(judged, given, floor)))
+    off, goes = _off(judged, given)
+    return bool(np.any(goes & (off > MISSES) & _beyond_noise(judged, given, floor)))
 
 
 def _beyond_noise(judged: Judged, given: Held, floor: Array) -> Mask:
     """(groups,) whether rollouts end farther off than noise takes them."""
     columns = _together(given.data.states)
-    by_noise = np.array([float(np.sqrt(np.sum(floor[group] ** 2))) for group in columns])
-    return np.asarray(_lengths(judged.ends, columns) > NOISIER * by_noise, dtype=bool)
+    return np.asarray(_lengths(judged.ends, columns) > NOISIER * _lengths(floor[None], columns), dtype=bool)
 
 
-def _off(judged: Judged, given: Held) -> Array:
-    """How far rollouts end from the measurement, over how far the state went; NaN for states that go nowhere."""
+def _off(judged: Judged, given: Held) -> tuple[Array, Mask]:
+    """(groups,) how far rollouts end from the measurement, over how far the state went; and whether it goes anywhere."""
     columns = _together(given.data.states)
     gone, step, off = (_lengths(e, columns) for e in (displacement(given), given.steps.y1 - given.steps.y0, judged.ends))
     goes = gone > min(5.0, 0.5 * given.horizon) * step
-    return np.where(goes, off / np.maximum(gone, 1e-300), np.nan)
+    return off / np.maximum(gone, 1e-300), np.asarray(goes, dtype=bool)
 
 
 def _together(states: tuple[str, ...]) -> list[list[int]]:
