@@ -10,8 +10,9 @@ from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.dataset import Stream, from_streams
-from s2r_runtime.trace.plausible import _foretold, _if_each_taken_back, _if_taken_back, _mistake, _mistakes, _scaled, check_plausible
+from s2r_runtime.trace.plausible import _if_each_taken_back, _if_taken_back, _mistake, _mistakes, _scaled, check_plausible
 from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.unforetold import unforetold
 
 DT, STEPS = 0.05, 700
 BOUNDS = {
@@ -291,4 +292,4 @@ def test_a_heading_that_is_wrapped_to_chance_is_not_asked_instead_of_foretold():
     check_plausible(model, data)
     times_57 = _mistake("states", "", partial(_scaled, [2], 180.0 / np.pi))
     assert _if_each_taken_back(model, data, [times_57])[0] is None
-    assert len(_if_taken_back(model, data, times_57)) < len(_foretold(model, data)), "it does leave fewer that go"
+    assert len(_if_taken_back(model, data, times_57)) < len(unforetold(model, data)), "it does leave fewer that go"

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.fitting import Problem, slopes
-from s2r_runtime.trace.residual import Acting, Steps, advanced
+from s2r_runtime.trace.residual import Acting, Steps, acting, advanced
 from s2r_runtime.trace.residual_noise import Noise
 from s2r_runtime.trace.slots import free_of
 
@@ -29,6 +29,9 @@ HARMONICS = 6
 
 WAVES = 24
 """Waves of a position over the way that was gone: cogging has many."""
+
+LIKE = 0.5
+"""Share of an input that must be left of it, else what was asked is asked about beside what acts."""
 
 LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)
 """Steps back at which an input may still act."""
@@ -78,6 +81,9 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
     t = (steps.t - np.min(steps.t)) / max(float(np.ptp(steps.t)), 1e-9)
     one = np.ones(len(u))
     yield "constant", _push([one], [*body, *world])
+    for j, asked in _swallowed(given, model, act):
+        yield from ((model.inputs[j], _push(terms, body)) for terms in _static(asked[steps.place]))
+        yield from ((f"memory({model.inputs[j]})", _push(terms, body)) for terms in _memory(asked, steps.place))
     for j, name in enumerate(model.inputs):
         yield from ((name, _push(terms, body)) for terms in _static(u[:, j]))
         yield from ((name, _push(terms, body)) for terms in _levels(r, u[:, j], body))
@@ -104,6 +110,24 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
     yield "time", _push([one, *(np.where(t > s, one, 0.0) for s in np.linspace(0.1, 0.9, 9))], body)
     for directions in (body, world):
         yield from (("wave", _push(waves, directions)) for waves in _hum(r, given, directions))
+
+
+def _swallowed(given: Problem, model: ComposedModel, act: Acting) -> Iterator[tuple[int, Array]]:
+    """(input, (M,) what was asked of it, over its largest size) where what effects leave of it is something else: a robot that does nothing
+    by one input may do something else by it.
+    """
+    if not any(a.effect.stage == "input" for a in model.effects):
+        return
+    for j, (asked, left) in enumerate(zip(acting(model, given.data, ()).mean.T, act.mean.T, strict=True)):
+        size = float(np.max(np.abs(asked), initial=0.0))
+        if size > 0.0 and not _goes_with(asked, left):
+            yield j, asked / size
+
+
+def _goes_with(a: Array, b: Array) -> bool:
+    """Whether two are one and the same for the most part, but for their size and mean."""
+    a, b = a - a.mean(), b - b.mean()
+    return float(a @ b) ** 2 > LIKE * float(a @ a) * float(b @ b)
 
 
 def pushes_by_token(given: Problem, model: ComposedModel, act: Acting) -> list[tuple[str, Array]]:

@@ -30,11 +30,13 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError, RecordingError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
+from s2r_runtime.trace.accelerations import check_accelerations
 from s2r_runtime.trace.dataset import Dataset, Run, regridded
 from s2r_runtime.trace.never_measured import check_measured
-from s2r_runtime.trace.residual import Index, acting, first_steps, predicted, rollout, rollout_starts, steps_of
+from s2r_runtime.trace.residual import Index, acting, predicted, rollout, rollout_starts, steps_of
 from s2r_runtime.trace.scales import SCALES, Scale, axis_pairs, groups
 from s2r_runtime.trace.streams import Stream
+from s2r_runtime.trace.unforetold import FEWEST_STARTS, each_unforetold, steps_ahead, trimmed, unforetold
 
 Array = NDArray[np.float64]
 Change = Callable[[Array], Array]
@@ -65,26 +67,11 @@ ALIKE = 1.5
 FAR = 50.0
 """Times too large, from which on E need not be below SURELY: no robot is that far off by itself."""
 
-HORIZON_S = 0.5
-"""Of the rollouts, s (1 to 50 steps)."""
-
-SLOW_STEPS = 10
-"""Of the rollouts, where a step is as long as that: in one step a tank's level hardly moves beyond its noise."""
-
-STARTS = 300
-"""Rollouts: their mean error is then known to a few per cent."""
-
-FEWEST_STARTS = 20
-"""Fewer say nothing."""
-
 ROWS = 6000
 """Rows of each segment that are looked at."""
 
 AT_ONCE = 100_000
 """Rows of recordings that are rolled out at once: some megabytes."""
-
-GOES = 5.0
-"""Standard deviations of its noise that a state must go in the horizon to count."""
 
 LEAD_S, APART_S = 4.0, 0.05
 LEADS = (-60, -40, -28, -20, -14, -10, -7, -5, -4, -3, -2, -1, 0, 1, 2, 3, 4, 5, 7, 10, 14, 20, 28, 40, 56, 80)
@@ -125,6 +112,7 @@ def check_plausible(model: ComposedModel, data: Dataset) -> None:
     """Raises RecordingError if the columns are clearly not what they say, with what they seem to be."""
     check_measured(model, data)
     _check_columns(model, data)
+    check_accelerations(model, data)
     _check_angles(model, data)
     _check_scales(model, data)
     _check_speeds(model, data)
@@ -133,7 +121,7 @@ def check_plausible(model: ComposedModel, data: Dataset) -> None:
 
 def _check_columns(model: ComposedModel, data: Dataset) -> None:
     """Raises RecordingError if the motion is foretold so much better with one usual mistake taken back that it must have been made."""
-    every = _foretold(model, data)
+    every = unforetold(model, data)
     if every is None or not data.segments or (np.mean(every) <= NOTHING and np.max(every) <= NOTHING_ALONE):
         return
     few = _few(model, data)
@@ -161,7 +149,7 @@ def _check_angles(model: ComposedModel, data: Dataset) -> None:
 
 def _check_scales(model: ComposedModel, data: Dataset) -> None:
     """Raises RecordingError if states that belong together are clearly so many times what they must be."""
-    every = _foretold(model, data)
+    every = unforetold(model, data)
     if every is None or not data.segments or (np.mean(every) <= NOTHING and np.max(every) <= NOTHING_ALONE):
         return
     few, every_input = _few(model, data), list(range(len(model.inputs)))
@@ -216,7 +204,7 @@ def _check_speeds(model: ComposedModel, data: Dataset) -> None:
         told, y = foretold[:, j], steps.y1[:, j]
         slope = float(told @ y) / max(float(told @ told), 1e-300)
         for unit, right, factor, _ in (*_UNITS.get(units.get(name, ""), ()), *_OF_STATES.get(units.get(name, ""), ())):
-            left = _trimmed((y - told / factor)[:, None])[0]
+            left = trimmed((y - told / factor)[:, None])[0]
             if abs(slope * factor - 1.0) < EXACTLY and left < SURELY * float(np.std(y)) and _goes_as_told(model, data):
                 raise RecordingError(
                     f"{data.source}: {name} seems to be in {unit}, must be in {right}: it is {slope:.4g} times what was commanded, and "
@@ -227,7 +215,7 @@ def _check_speeds(model: ComposedModel, data: Dataset) -> None:
 def _goes_as_told(model: ComposedModel, data: Dataset) -> bool:
     """Whether the states that are not set by an input are foretold."""
     others = [i for i, name in enumerate(model.states) if name not in model.nominal.reached]
-    found = _foretold(model, data, others)
+    found = unforetold(model, data, others)
     return found is not None and float(np.mean(found)) < WELL
 
 
@@ -266,7 +254,7 @@ def _as_it_is(values: Array) -> Array:
 def _if_taken_back(model: ComposedModel, data: Dataset, mistake: _Mistake) -> Array | None:
     """What is foretold then; None where somebody's own model cannot go there."""
     try:
-        return _foretold(model, _taken_back(model, data, mistake))
+        return unforetold(model, _taken_back(model, data, mistake))
     except ConfigError:
         return None
 
@@ -275,7 +263,7 @@ def _if_each_taken_back(model: ComposedModel, data: Dataset, mistakes: Sequence[
     """The same of each of some by itself, many rolled out at once: what a step costs hardly depends on how many take it. None, too, where
     fewer states go anywhere than as it is: a heading 57 times as large is wrapped to chance, and what is not asked is not foretold.
     """
-    as_it_is = _foretold(model, data)
+    as_it_is = unforetold(model, data)
     asked = 0 if as_it_is is None else len(as_it_is)
     count = max(1, AT_ONCE // max(1, sum(len(run.y) for run in data.runs)))
     found: list[Array | None] = []
@@ -283,68 +271,10 @@ def _if_each_taken_back(model: ComposedModel, data: Dataset, mistakes: Sequence[
         try:
             changed = [_taken_back(model, data, mistake) for mistake in some]
             alike = len({one.substeps for one in changed}) == 1  # inputs that never change have no parts of a step
-            found += _each_foretold(model, changed) if alike else [_foretold(model, one) for one in changed]
+            found += each_unforetold(model, changed) if alike else [unforetold(model, one) for one in changed]
         except ConfigError:
             found += [_if_taken_back(model, data, mistake) for mistake in some]
     return [None if e is None or len(e) < asked else e for e in found]
-
-
-def _foretold(model: ComposedModel, data: Dataset, among: list[int] | None = None, *, pushed: bool = False) -> Array | None:
-    """The share that E is the mean of, of each state (or of these) that goes somewhere; None where nothing goes anywhere. pushed: less a
-    steady push on each state.
-    """
-    return _each_foretold(model, [data], among, pushed=pushed)[0]
-
-
-def _each_foretold(
-    model: ComposedModel, each: Sequence[Dataset], among: list[int] | None = None, *, pushed: bool = False
-) -> list[Array | None]:
-    """`_foretold` of recordings with one step."""
-    starts = [_some_starts(data) for data in each]
-    if not any(map(len, starts)):  # a user's own model need not take a table without rows
-        return [None] * len(starts)
-    begin = np.cumsum([0] + [int(first_steps(data)[-1]) for data in each])
-    together = replace(each[0], runs=tuple(run for data in each for run in data.runs))
-    places = np.concatenate([b + s for b, s in zip(begin[:-1], starts, strict=True)])
-    with np.errstate(all="ignore"):
-        errors = rollout(model, together, acting(model, together), places, _ahead(together)).error
-    parts = np.split(errors, np.cumsum([len(s) for s in starts])[:-1])
-    return [_shares(model, data, s, e, among, pushed) for data, s, e in zip(each, starts, parts, strict=True)]
-
-
-def _some_starts(data: Dataset) -> Index:
-    """Of rollouts; none if there are too few."""
-    starts = rollout_starts(data, _ahead(data))
-    starts = starts[:: max(1, len(starts) // STARTS)]
-    return starts if len(starts) >= FEWEST_STARTS else starts[:0]
-
-
-def _shares(model: ComposedModel, data: Dataset, starts: Index, error: Array, among: list[int] | None, pushed: bool) -> Array | None:
-    """Errors (n, nx) over how far each state goes."""
-    if not len(starts):
-        return None
-    begin = first_steps(data)
-    rows = starts + np.searchsorted(begin, starts, side="right") - 1
-    y = np.concatenate([run.y for run in data.runs])
-    error = _trimmed(error - np.median(error, axis=0) if pushed else error)
-    gone = _trimmed(model.difference(y[rows + _ahead(data)].copy(), y[rows]))
-    bent = np.concatenate([np.diff(run.y, 2, axis=0) for run in data.runs])
-    noise = np.nanmedian(np.abs(bent), axis=0) / 0.6745 / math.sqrt(6.0)
-    goes = gone > GOES * noise + 1e-12
-    if among is not None:
-        goes &= np.isin(np.arange(len(goes)), among)
-    return np.minimum(error[goes] / gone[goes], 2.0) if goes.any() else None
-
-
-def _ahead(data: Dataset) -> int:
-    """Steps of the rollouts."""
-    return int(np.clip(round(HORIZON_S / data.dt), 1, 50)) if data.dt < HORIZON_S else SLOW_STEPS
-
-
-def _trimmed(e: Array) -> Array:
-    """(nx,) rms of the four fifths that are smallest."""
-    sizes = np.sort(np.abs(np.nan_to_num(e, nan=1e300)), axis=0)[: max(1, int(0.8 * len(e)))]
-    return np.asarray(np.sqrt(np.mean(np.minimum(sizes, 1e100) ** 2, axis=0)))
 
 
 def _mistakes(model: ComposedModel) -> Iterator[_Mistake]:
@@ -406,7 +336,7 @@ def _exchanged(kind: str, names: tuple[str, ...], pairs: tuple[tuple[str, str], 
 def _otherwise(model: ComposedModel, data: Dataset) -> list[Array]:
     """E where it is no mistake: each input by itself does nothing; something pushes steadily (wind, a slope)."""
     dead = _if_each_taken_back(model, data, [_mistake("inputs", "", partial(_scaled, [j], 0.0)) for j in range(len(model.inputs))])
-    return [e for e in (*dead, _foretold(model, data, pushed=True)) if e is not None]
+    return [e for e in (*dead, unforetold(model, data, pushed=True)) if e is not None]
 
 
 def _moves_as_well(model: ComposedModel, data: Dataset, mistake: _Mistake) -> bool:
@@ -419,7 +349,7 @@ def _moves_as_well(model: ComposedModel, data: Dataset, mistake: _Mistake) -> bo
 
 def _unlike(model: ComposedModel, data: Dataset) -> Array:
     """(axes,) how far positions go otherwise than their rates say in the steps of a rollout, over how far they go, at most 2."""
-    ahead = _ahead(data)
+    ahead = steps_ahead(data)
     found = []
     for axis in axes(model.nominal):
         off, way = [np.zeros(0)], [np.zeros(0)]
@@ -429,7 +359,7 @@ def _unlike(model: ComposedModel, data: Dataset) -> Array:
             went = run.y[ahead:, axis.position] - run.y[:-ahead, axis.position]
             off.append(went - (gone[ahead:] - gone[:-ahead]))
             way.append(went)
-        e, w = (_trimmed(np.concatenate(part)[:, None]) for part in (off, way))
+        e, w = (trimmed(np.concatenate(part)[:, None]) for part in (off, way))
         found.append(min(float(e[0] / max(w[0], 1e-300)), 2.0))
     return np.array(found)
 

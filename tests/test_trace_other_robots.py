@@ -1,0 +1,79 @@
+"""A recording of another robot than the model's is refused, or is unexplained: effects that make up for all of it are no names."""
+
+import numpy as np
+import pytest
+
+from s2r_runtime.errors import RecordingError
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.trace.accelerations import check_accelerations
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.tracer import trace
+
+DT, ROWS, FINE = 0.05, 900, 10
+NOISE = np.array([0.003, 0.003, 0.005])
+UNICYCLE = compose(ModelSpec("unicycle", DT))
+
+
+def _held(rng, size, steps=15):
+    return np.repeat(rng.uniform(-1.0, 1.0, size=(ROWS // steps, 2)) * size, steps, axis=0)
+
+
+def _driven(rng, u, speeds):
+    """Where a robot gets to whose speed ahead, to the left and turning are speeds(u, those before, s)."""
+    x, now, dt = np.zeros((len(u) + 1, 3)), np.zeros(3), DT / FINE
+    for k, asked in enumerate(u):
+        x[k + 1] = x[k]
+        for _ in range(FINE):
+            now = speeds(asked, now, dt)
+            c, s = np.cos(x[k + 1, 2]), np.sin(x[k + 1, 2])
+            x[k + 1] += dt * np.array([c * now[0] - s * now[1], s * now[0] + c * now[1], now[2]])
+    return from_arrays(UNICYCLE, [(x + NOISE * rng.normal(size=x.shape), u)])
+
+
+def _lags(*time_constants):
+    def speeds(asked, now, dt):
+        return now + np.array([(asked[0] - now[0]) * dt / time_constants[0], 0.0, (asked[1] - now[2]) * dt / time_constants[1]])
+
+    return speeds
+
+
+@pytest.mark.parametrize(
+    ("pushed", "said"), [((True, True), "v and w seem to be accelerations"), ((True, False), "v seems to be an acceleration")]
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_accelerations_for_speeds_are_told(pushed, said, seed):
+    rng = np.random.default_rng([48, seed])
+
+    def speeds(asked, now, dt):
+        ahead, turning = (n + dt * a if grows else a for n, a, grows in zip(now[[0, 2]], asked, pushed, strict=True))
+        return np.array([ahead, 0.0, turning])
+
+    with pytest.raises(RecordingError, match=f"{said}, must be .*: so read, the model errs by"):
+        trace(_driven(rng, _held(rng, [1.0, 0.5]), speeds), UNICYCLE)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("time_constant", [0.5, 2.0, 8.0])
+def test_slow_actuators_are_no_accelerations(time_constant, seed):
+    rng = np.random.default_rng([49, seed])
+    check_accelerations(UNICYCLE, _driven(rng, _held(rng, [1.0, 0.5]), _lags(time_constant, time_constant)))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_speeds_of_two_wheels_are_not_those_of_a_body(seed):
+    """Gains and couplings make up for it, to the last digit: they are another model."""
+    rng = np.random.default_rng([50, seed])
+    data = _driven(rng, _held(rng, [10.0, 10.0]), lambda u, now, dt: np.array([0.025 * (u[0] + u[1]), 0.0, 0.05 / 0.3 * (u[1] - u[0])]))
+    found = trace(data, UNICYCLE)
+    assert found.verdict == "unexplained"
+    assert len(found.partial) > 2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_an_input_does_instead_is_asked_of_the_input_and_not_of_what_is_left_of_it(seed):
+    """Of a robot that goes sideways where the model turns, a deadband of w swallows all turning, and with it what goes with w."""
+    rng = np.random.default_rng([51, seed])
+    found = trace(_driven(rng, _held(rng, [1.0, 1.0]), lambda u, now, dt: np.array([u[0], u[1], 0.0])), UNICYCLE)
+    assert found.verdict == "unexplained"
+    assert not found.effects
