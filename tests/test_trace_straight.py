@@ -289,6 +289,19 @@ def test_only_inputs_that_were_placed_change_within_the_rows_of_another_recordin
     assert np.array_equal(others.as_of(placed).within[0] > 0.0, (np.diff(values, axis=0, append=values[-1:]) != 0.0) & [True, False])
 
 
+@pytest.mark.parametrize("way", [Way((1.0,), (0.0,)), Way((0.0,), (1.0,)), Way(late=True)])
+def test_steps_stay_in_as_many_parts_however_inputs_went(way):
+    model, steps = compose(ModelSpec("joint", DT_S)), np.arange(400)
+    between = steps[21::42] + 0.5  # rows beside the grid, as where stamps wander: commands that come there need steps in parts
+    t = DT_S * np.sort(np.concatenate([steps, between]))
+    force = np.cumsum(np.isin(np.rint(t / DT_S * 2.0) / 2.0, np.concatenate([between, steps[::3]])))[:, None] % 7.0
+    data = from_streams(model, [(Stream(t, np.zeros((len(t), 2))), Stream(t, force))], "a table")
+    moved = straight(data, model, way, samples_of(data))
+    assert data.substeps > 1
+    assert moved.substeps == data.substeps
+    assert [run.u.shape for run in inputs_straight.acted(data, moved).runs] == [run.u.shape for run in data.runs]
+
+
 def test_an_input_on_its_way_stays_within_what_was_asked():
     t = np.arange(40.0)
     valve = np.clip(1.5 * np.sin(0.9 * t), 0.0, 1.0)

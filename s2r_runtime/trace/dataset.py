@@ -210,9 +210,10 @@ def from_streams(
     paths: tuple[Path, ...] = (),
     reconstruction: Reconstruction | None = None,
     in_parts: int = 0,
+    substeps: int = 0,
 ) -> Dataset:
     """Segments of (states, inputs), both as received. reconstruction: what was done to them before. in_parts: S, if the model
-    is to take each part of a step by itself.
+    is to take each part of a step by itself; substeps: S, if it is known, and the model takes steps whole.
 
     Raises RecordingError if states come too seldom for the model's dt, or never, or inputs at another time.
     """
@@ -234,7 +235,7 @@ def from_streams(
         apart = max(apart, independent_step(reconstruction, dt))
     exact = all(on_grid(states.t, dt) for states, _ in stretches)
     as_they_are = not exact and spacing <= NEAREST * dt
-    parts = in_parts or _parts(model, stretches, exact, as_they_are)
+    parts = in_parts or substeps or _parts(model, stretches, exact, as_they_are)
     origin = min(_first(states) for states, _ in segments)
     runs: list[Run] = []
     pauses: list[Pause] = []
@@ -275,9 +276,9 @@ def from_streams(
     )
 
 
-def regridded(data: Dataset, model: ComposedModel, in_parts: int = 0) -> Dataset:
-    """The same recording on the grid of a model with another step."""
-    again = from_streams(model, data.segments, data.source, data.digests, data.paths, data.reconstruction, in_parts)
+def regridded(data: Dataset, model: ComposedModel, in_parts: int = 0, substeps: int = 0) -> Dataset:
+    """The same recording on the grid of a model with another step. in_parts, substeps: as `from_streams`."""
+    again = from_streams(model, data.segments, data.source, data.digests, data.paths, data.reconstruction, in_parts, substeps)
     return replace(again, way=data.way, noisy=data.noisy)
 
 

@@ -114,9 +114,11 @@ def samples_of(data: Dataset) -> Samples:
 
 
 def straight(data: Dataset, model: ComposedModel, way: Way, samples: Samples) -> Dataset:
-    """The recording with its inputs as they went."""
+    """The recording with its inputs as they went, in as many parts a step: rows are where they were, but values that change elsewhere
+    could seem to need others.
+    """
     segments = [(states, inputs) for (states, _), inputs in zip(data.segments, samples.laid(way), strict=True)]
-    again = regridded(replace(data, segments=tuple(segments), way=way), model)
+    again = regridded(replace(data, segments=tuple(segments), way=way), model, substeps=data.substeps)
     return replace(again, campaign=data.campaign)  # the step is the same, so its samples still are of this model
 
 
