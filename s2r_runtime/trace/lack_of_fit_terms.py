@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.fitting import Problem, slopes
 from s2r_runtime.trace.residual import Acting, Steps, acting, advanced
 from s2r_runtime.trace.residual_noise import Noise
@@ -35,6 +36,9 @@ LIKE = 0.5
 
 LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)
 """Steps back at which an input may still act."""
+
+MOST_LATE = 8
+"""Of these, for a position that comes late against its speed: a third of a second at 100 Hz."""
 
 PATCHES = 5
 """Along each axis of the region: what lies on a part of the floor is then seen if the part is a fifth of it."""
@@ -95,6 +99,8 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
             a, b = u[:, i], u[:, j]
             yield f"{model.inputs[i]}*{name}", _push([a * b, np.abs(a) * b, a * np.abs(b), np.abs(a * b)], body)
             yield f"{model.inputs[i]}*{name}", _push([a * b, a * a * b, a * b * b], body)
+    if not given.floor.axes:
+        yield from (("speed", terms) for terms in _not_its_rate(given, model, quieter(steps, noise)))
     pushes = [u[:, j][:, None] * own for j, own in enumerate(own_pushes(given, model, act))]
     for name, terms, directions in _of_states(model, quieter(steps, noise), u, body, world, pushes):
         yield name, terms if directions is None else _push(terms, directions)
@@ -338,6 +344,24 @@ def _of_states(
         if name not in known:
             v = _scaled(y[:, i])
             yield name, [v, v * v, v**3, np.sign(v), *(v * w for w in inputs)], [*body, *world]
+
+
+def _not_its_rate(given: Problem, model: ComposedModel, y: Array) -> Iterator[Terms]:
+    """A position that moves otherwise than its speed says, although inputs push neither beside the other: by a share of the speed (a
+    sensor's scale), or as the speed was a while ago (a sensor that comes late).
+    """
+    shares: Terms = []
+    late: Terms = []
+    first = np.flatnonzero(~given.steps.joined)
+    begin = np.repeat(first, np.diff(np.append(first, len(y))))
+    at = np.arange(len(y))
+    for axis in axes(model.nominal):
+        v, push = _scaled(y[:, axis.velocity], centred=False), np.eye(len(model.states))[axis.position]
+        shares.append(v[:, None] * push)
+        late += [(v[np.maximum(at - lag, begin)] - v)[:, None] * push for lag in LAGS[:MOST_LATE]]
+    if shares:
+        yield shares
+        yield [*shares, *late]
 
 
 def _dry(v: Array) -> tuple[Array, Array]:

@@ -1,0 +1,67 @@
+"""A position and a speed that do not belong together: no input does that, and no noise of either."""
+
+import numpy as np
+import pytest
+
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.fitting import evaluate, problem
+from s2r_runtime.trace.lack_of_fit_terms import dictionaries
+from s2r_runtime.trace.residual import acting, residual, steps_of
+from s2r_runtime.trace.tracer import trace
+
+DT_S, ROWS = 0.01, 1200
+NOISE = np.array([2e-4, 4e-3])
+
+
+def _followed(seed):
+    """A joint that follows steps on what a sensor without noise says: (q, qd) (ROWS + 1, 2), force (ROWS, 1)."""
+    rng = np.random.default_rng(seed)
+    wanted = np.repeat(rng.uniform(-0.3, 0.3, ROWS // 100), 100)
+    q, v, states, forces = 0.0, 0.0, [(0.0, 0.0)], []
+    for target in wanted.tolist():
+        force = float(np.clip(16.0 * (target - q) - 5.6 * v, -3.0, 3.0))
+        q, v = q + DT_S * v + 0.5 * DT_S * DT_S * force, v + DT_S * force
+        states.append((q, v))
+        forces.append((force,))
+    return np.array(states), np.array(forces)
+
+
+def _recorded(seed, measured):
+    model = compose(ModelSpec("joint", DT_S))
+    states, forces = _followed(seed)
+    noise = np.random.default_rng(seed + 1).normal(size=states.shape) * NOISE
+    return model, from_arrays(model, [(measured(states) + noise, forces)])
+
+
+def _late(states, rows=3):
+    return np.column_stack([np.concatenate([np.full(rows, states[0, 0]), states[:-rows, 0]]), states[:, 1]])
+
+
+@pytest.mark.parametrize(
+    "measured",
+    [lambda s: s * [1.08, 1.0], lambda s: s * [1.0, 1.08], _late],
+    ids=["a scale of the position", "a scale of the speed", "a position that comes late"],
+)
+def test_a_position_that_moves_otherwise_than_its_speed_says_is_told(measured):
+    model, data = _recorded(3, measured)
+    result = trace(data, model)
+    assert result.verdict != "none"
+    assert "speed" in result.depends_on, "beside a name, too: a speed that is measured too large is first of all a gain of the force"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_those_that_belong_together_are_no_structure(seed):
+    model, data = _recorded(10 + seed, lambda s: s)
+    assert trace(data, model).verdict == "none"
+
+
+def test_what_it_is_told_by_pushes_positions_alone():
+    model, data = _recorded(3, lambda s: s)
+    given = problem(data, steps_of(data))
+    fit = evaluate(given, model)
+    act = acting(model, data)
+    found = dictionaries(given, model, act, fit.noise, residual(model, given.steps, act))
+    alone = [terms for about, terms in found if about.startswith("speed") and not any(np.any(term[:, 1]) for term in terms)]
+    assert sorted(len(terms) for terms in alone) == [1, 9]
