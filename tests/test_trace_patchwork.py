@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from s2r_runtime.models.composed import AppliedEffect, compose
-from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.about import about, about_states
+from s2r_runtime.trace.about import about, about_states, carried
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.faults import Checked
 from s2r_runtime.trace.fitting import fitted, gain, insert
@@ -128,3 +128,33 @@ def test_what_an_effect_is_about_is_seen_from_the_robot(name, channel, p, tokens
     steps = steps_of(data)
     assert about(model, 0, data, steps) == tokens
     assert about_states(model, (0,), data, steps) == tokens & {"heading", "position"}
+
+
+def test_what_a_car_makes_of_a_bias_of_its_steering_goes_with_its_speed():
+    rng = np.random.default_rng(3)
+    steer, speed = rng.uniform(-0.3, 0.3, 300), rng.uniform(1.0, 5.0, 300)
+    effects = (_effect("input_bias", "steer_cmd", {"bias": 0.02}), _effect("longitudinal_slip", "*", {"ratio": 0.1}))
+    model = compose(ModelSpec("bicycle", DT))
+    data = from_arrays(model, [(rng.normal(size=(301, 4)), np.column_stack([steer, speed]))])
+    model, steps = insert(insert(model, effects[0], 0), effects[1], 1), steps_of(data)
+    assert about(model, 0, data, steps) == {"steer_cmd"}, "its own word"
+    assert "speed_cmd" in carried(model, 0, data, steps)
+    assert carried(model, 1, data, steps) == set(), "what acts on no input is tried as it is"
+
+
+def test_slip_and_a_bias_of_the_steering_are_no_patchwork_of_the_speed():
+    rng = np.random.default_rng(5)
+    command = np.column_stack([np.repeat(rng.uniform(-0.3, 0.3, 40), 20), np.repeat(rng.uniform(1.0, 5.0, 40), 20)])
+    pose, rows = np.array([0.0, 0.0, 0.0]), [np.zeros(4)]
+    for steer, speed in command:
+        for _ in range(PARTS):
+            v = 0.98 * speed
+            pose = pose + DT / PARTS * np.array([v * np.cos(pose[2]), v * np.sin(pose[2]), v * np.tan(steer + 0.02)])
+        rows.append(np.append(pose, speed))
+    model = compose(ModelSpec("bicycle", DT, {"wheel_base": 1.0}, (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),)))
+    y = np.array(rows) + rng.normal(size=(801, 4)) * [0.01, 0.01, 0.005, 0.02]
+    whole = Whole(Checked(from_arrays(model, [(y, command)]), (), (), 0), model, 20)
+    fit = _named(whole, _effect("input_bias", "steer_cmd", {"bias": 0.02}), _effect("longitudinal_slip", "*", {"ratio": 0.02}))
+    named, of_speed = gain(fit, whole.nominal), "speed_cmd"
+    assert all(gain(_named(whole, a), whole.nominal) < MOSTLY * named for a in [fit.model.effects[p] for p in fit.added])
+    assert not patchwork(whole.given, fit, whole.nominal, replace(whole.unnamed, token=of_speed, gain=named))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,6 +36,15 @@ def about(model: ComposedModel, place: int, data: Dataset, steps: Steps) -> set[
     return found | {*names, *reads} | ({f"memory({name})" for name in names} if remembers else set())
 
 
+def carried(model: ComposedModel, place: int, data: Dataset, steps: Steps) -> set[str]:
+    """Tokens of one thing each on which it depends what the model makes of an effect on an input: a bias of the steering turns a car the
+    more, the faster it goes. None of what does not act on an input.
+    """
+    if not _filters(model, place):
+        return set()
+    return _tried(model, place, data, steps, of_states=True) | _tried(model, place, data, steps, of_states=False)
+
+
 def about_states(model: ComposedModel, places: tuple[int, ...], data: Dataset, steps: Steps) -> set[str]:
     """Which of position, speed and heading what these effects do to the robot depends on: friction and drag on a speed, a spring on a
     position. An effect on an input is about none, nor is a sensor's. Other states may be anything, and are left out.
@@ -50,16 +61,17 @@ def _filters(model: ComposedModel, place: int) -> bool:
 
 def _tried(model: ComposedModel, place: int, data: Dataset, steps: Steps, *, of_states: bool) -> set[str]:
     """Of states, or of inputs, those that change what an effect does, seen from the robot, if they are elsewhere by as much as usual."""
-    less, act, y = without(model, place), acting(model, data).at(steps.place), steps.y0
+    pair, y = (model, without(model, place)), steps.y0
+    acts = [acting(m, data).at(steps.place) for m in pair]
     moved = rms(model.difference(steps.y1, y))
     size = np.where(moved > 0.0, moved, np.inf)  # what never changes tells nothing
-    usual = _done(model, less, y, act) / size
+    usual = _done(pair, y, acts) / size
     enough = VARIES * float(np.linalg.norm(usual))
     found, names = set(), model.states if of_states else model.inputs
     for j, name in enumerate(names):
-        by = np.eye(len(names))[j] * (1.0 if name in model.nominal.angles else float(np.std((y if of_states else act.mean)[:, j])))
+        by = np.eye(len(names))[j] * (1.0 if name in model.nominal.angles else float(np.std((y if of_states else acts[1].mean)[:, j])))
         try:
-            there = _done(model, less, y + by, act) if of_states else _done(model, less, y, act.moved(by))
+            there = _done(pair, y + by, acts) if of_states else _done(pair, y, [act.moved(by) for act in acts])
         except ConfigError:  # a user's own model may give no numbers there
             continue
         if np.linalg.norm(there / size - usual) > enough:
@@ -67,9 +79,12 @@ def _tried(model: ComposedModel, place: int, data: Dataset, steps: Steps, *, of_
     return found
 
 
-def _done(model: ComposedModel, less: ComposedModel, y: Array, act: Acting) -> Array:
-    """(n, nx) what a model does in a step that another one does not; of a robot with a heading along it and across it."""
-    done = model.difference(*(advanced(m, y, act, slice(None)) for m in (model, less)))
+def _done(pair: Sequence[ComposedModel], y: Array, acts: Sequence[Acting]) -> Array:
+    """(n, nx) what a model does in a step that another one does not, each under its own inputs; of a robot with a heading along it and
+    across it.
+    """
+    model = pair[0]
+    done = model.difference(*(advanced(m, y, act, slice(None)) for m, act in zip(pair, acts, strict=True)))
     if {"x", "y", "theta"} <= set(model.states):
         i, j, k = (model.states.index(name) for name in ("x", "y", "theta"))
         c, s = np.cos(y[:, k]), np.sin(y[:, k])

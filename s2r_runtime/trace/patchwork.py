@@ -7,15 +7,16 @@ What tells: it depends on one thing, and a dictionary of that (`lack_of_fit_term
                  and some name is about something else than the dictionary
 
 The dictionary's gain is that on blocks which its numbers never saw, that of the names on what they were fitted to. Two effects that are
-there give two dependences, of which one dictionary has one; where both are about the same (dry friction and drag, about the speed), one
-dictionary has both, and that says nothing against them.
+there give two dependences, of which one dictionary has one; where both are about the same (dry friction and drag, about the speed; wheels
+that slip and a bias of the steering, which turns a car the more, the faster it goes), one dictionary has both, and that says nothing
+against them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from s2r_runtime.trace.about import about
+from s2r_runtime.trace.about import about, carried
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, without
 from s2r_runtime.trace.lack_of_fit_judged import Judged
 
@@ -37,8 +38,8 @@ def patchwork(given: Problem, fit: Fit, nominal: Fit, unnamed: Judged) -> bool:
         return False
     atoms = set(unnamed.token.split("*"))
     seen = atoms | {atom.removeprefix("memory(").removesuffix(")") for atom in atoms}  # what an input was has in it what it is
-    each = [about(fit.model, place, given.data, given.steps) for place in fit.added]
-    if all(atoms <= one or one <= seen for one in each):
+    each = [(about(fit.model, place, given.data, given.steps), place) for place in fit.added]
+    if all(atoms <= one or one <= seen or atoms <= one | carried(fit.model, place, given.data, given.steps) for one, place in each):
         return False
     return all(gain(alone, nominal) <= MOSTLY * named for alone in _each_alone(given, fit))
 
