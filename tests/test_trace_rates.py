@@ -7,6 +7,8 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, problem
+from s2r_runtime.trace.lack_of_fit import dictionaries_of, left_of
+from s2r_runtime.trace.lack_of_fit_judged import first_look
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
 from s2r_runtime.trace.residual import acting, residual, steps_of
 from s2r_runtime.trace.tracer import trace
@@ -26,6 +28,19 @@ def _followed(seed):
         states.append((q, v))
         forces.append((force,))
     return np.array(states), np.array(forces)
+
+
+def _seen_by_its_controller(seed, step=0.03):
+    """A joint whose controller sees what was measured: noise of its position is in the speeds that come after."""
+    rng, model = np.random.default_rng(seed), compose(ModelSpec("joint", step))
+    x, states, forces = np.zeros(2), [], []
+    for target in np.repeat(rng.uniform(-0.02, 0.02, ROWS // 50), 50).tolist():
+        seen = x + rng.normal(size=2) * [5e-3, 4e-3]
+        force = float(np.clip(36.0 * (target - seen[0]) - 8.4 * seen[1], -9.0, 9.0))
+        states.append(seen)
+        forces.append((force,))
+        x = np.array([x[0] + step * x[1] + 0.5 * step * step * force, x[1] + step * force + 1.4e-3 * rng.normal()])
+    return model, from_arrays(model, [(np.array([*states, x]), np.array(forces))])
 
 
 def _recorded(seed, measured):
@@ -54,6 +69,16 @@ def test_a_position_that_moves_otherwise_than_its_speed_says_is_told(measured):
 @pytest.mark.parametrize("seed", range(4))
 def test_those_that_belong_together_are_no_structure(seed):
     model, data = _recorded(10 + seed, lambda s: s)
+    assert trace(data, model).verdict == "none"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_of_a_position_that_its_controller_sees_is_no_structure(seed):
+    model, data = _seen_by_its_controller(seed)
+    given = problem(data, steps_of(data))
+    left = left_of(given, evaluate(given, model))
+    nats = [first_look(left, x) for about, x in dictionaries_of(left) if about.startswith("speed")]
+    assert max(nats) < 3.0
     assert trace(data, model).verdict == "none"
 
 

@@ -100,7 +100,7 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
             yield f"{model.inputs[i]}*{name}", _push([a * b, np.abs(a) * b, a * np.abs(b), np.abs(a * b)], body)
             yield f"{model.inputs[i]}*{name}", _push([a * b, a * a * b, a * b * b], body)
     if not given.floor.axes:
-        yield from (("speed", terms) for terms in _not_its_rate(given, model, quieter(steps, noise)))
+        yield from (("speed", terms) for terms in _not_its_rate(given, model))
     pushes = [u[:, j][:, None] * own for j, own in enumerate(own_pushes(given, model, act))]
     for name, terms, directions in _of_states(model, quieter(steps, noise), u, body, world, pushes):
         yield name, terms if directions is None else _push(terms, directions)
@@ -346,10 +346,12 @@ def _of_states(
             yield name, [v, v * v, v**3, np.sign(v), *(v * w for w in inputs)], [*body, *world]
 
 
-def _not_its_rate(given: Problem, model: ComposedModel, y: Array) -> Iterator[Terms]:
+def _not_its_rate(given: Problem, model: ComposedModel) -> Iterator[Terms]:
     """A position that moves otherwise than its speed says, although inputs push neither beside the other: by a share of the speed (a
-    sensor's scale), or as the speed was a while ago (a sensor that comes late).
+    sensor's scale), or as the speed was a while ago (a sensor that comes late). Speeds as they were measured until then, no later one: a
+    controller that sees a position's noise makes speed of it. Of what was, what is left when whitened knows nothing.
     """
+    y = given.steps.y0
     shares: Terms = []
     late: Terms = []
     first = np.flatnonzero(~given.steps.joined)
