@@ -22,6 +22,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.begun import begun, measured
@@ -86,6 +87,14 @@ MOST_GROUPS = 3
 
 ROUNDED, SLACK = 0.99, 0.05
 """Share of a state's rows that must lie within half the step of its rounding, and how much more that may be: it is known from digits."""
+
+NOISES, FARTHEST = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0), 4
+"""Standard deviations of a sensor's noise before it rounds, over the step: noise that is larger leaves nothing of the rounding to see;
+and how many steps away a reading may then be.
+"""
+
+WRONG = 100.0
+"""Of so many readings one may be an outlier."""
 
 VANISHING = 1e-24
 """Mean square of a term that is none."""
@@ -358,7 +367,7 @@ def _weight_of(left: Left, nominal: Fit, judged: Judged, horizon: int, least: fl
     lacks it is.
     """
     matters, worst, share = False, 1.0 + MATTERS, 0.0
-    told = ~_to_their_rounding(left)
+    told = ~_to_their_rounding(left, judged)
     for before, now, after in _rollouts(left, nominal, judged, horizon):
         for b, n, a in zip(before[told], now[told], after[told], strict=True):
             matters = matters or bool(n > least * a)
@@ -367,16 +376,39 @@ def _weight_of(left: Left, nominal: Fit, judged: Judged, horizon: int, least: fl
     return matters, share
 
 
-def _to_their_rounding(left: Left) -> Mask:
-    """(nx,) whether a state that an input sets is foretold to half the step in which it is rounded: what is left goes with the input, as
-    the digits that rounding cuts off do. Of others the next value depends on the last one's rounding, too.
+def _to_their_rounding(left: Left, judged: Judged) -> Mask:
+    """(nx,) whether a state that an input sets is foretold to half the step in which it is rounded, or as well by its rounding as by a
+    structure: what is left goes with the input, as the digits that rounding cuts off do. Of others the next value depends on the last
+    one's rounding, too.
     """
     model, steps = left.fit.model, left.given.steps
     found = np.zeros(left.r.shape[1], dtype=bool)
     for j in [model.states.index(state) for state in getattr(model.nominal, "reached", {}) if state in model.states]:
         step = noises.quantum(steps.y0[:, j], steps.y1[:, j])
-        found[j] = step > 0.0 and float(np.quantile(np.abs(left.r[:, j]), ROUNDED)) <= 0.5 * step * (1.0 + SLACK)
+        if step > 0.0:
+            r = left.r[:, j]
+            rest = r - np.einsum("km,km->k", judged.x[:, j], judged.betas[left.block])
+            within = float(np.quantile(np.abs(r), ROUNDED)) <= 0.5 * step * (1.0 + SLACK)
+            found[j] = within or float(rms(beyond_rounding(r, step))) <= (1.0 + MATTERS) * float(rms(rest))
     return found
+
+
+def beyond_rounding(r: Array, step: float) -> Array:
+    """r (n,), by which readings are off a state x that is known, less what a sensor is expected to be off by that rounds after some noise:
+
+    P(reading k) = Phi((k + step/2 - x) / s) - Phi((k - step/2 - x) / s),    s: of NOISES, the likeliest; one in WRONG is anything
+    """
+    if not np.any(r):
+        return r
+    anything = step / WRONG / (2.0 * float(np.max(np.abs(r))) + step)
+
+    def cell(off: Array, s: float) -> Array:
+        return np.asarray(ndtr((off + 0.5 * step) / s) - ndtr((off - 0.5 * step) / s))
+
+    s = step * max(NOISES, key=lambda share: float(np.sum(np.log((1.0 - 1.0 / WRONG) * cell(r, step * share) + anything))))
+    near = r - step * np.rint(r / step)  # of the reading nearest to the state
+    around = near[:, None] + step * np.arange(-FARTHEST, FARTHEST + 1)
+    return np.asarray(r - np.sum(around * cell(around, s), axis=1))
 
 
 def _rollouts(left: Left, other: Fit, judged: Judged, horizon: int) -> Iterator[tuple[Array, Array, Array]]:
