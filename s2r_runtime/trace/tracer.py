@@ -152,7 +152,7 @@ def _traced(
     chosen = confirmed(given, replace(chosen, fit=dated(given, whole.given, chosen.fit)), judged_on)
     say(80.0, 100.0, "testing what is left")
     structure = whole.structure(chosen)
-    if (structure.matters and not structure.nameless) or _astray(chosen, structure, judged_on, seed):
+    if structure.matters or _astray(chosen, structure, judged_on, seed):
         chosen, structure = _once_more(given, whole, chosen, structure, judged_on, ahead)
     if structure.matters and parts == MOST_PARTS:
         finer = _finer(dataset, model, chosen, ahead)
@@ -236,9 +236,9 @@ def _astray(chosen: Selection, structure: Structure, judged_on: Held, seed: int)
 def _once_more(
     given: Problem, whole: Whole, chosen: Selection, structure: Structure, judged_on: Held, ahead: int
 ) -> tuple[Selection, Structure]:
-    """Where structure is left, something is there: a rival that leaves nothing; or two effects together that do, coloured noise neither
-    (two take up a part of anything, and the rest looks like that); or what is found with a lower bar, if that leaves nothing. What was not
-    fitted must be foretold no worse.
+    """Where structure is left, or a shape without a name is likelier than what was named, something is there: a rival that leaves nothing;
+    or two effects together that do, coloured noise neither (two take up a part of anything, and the rest looks like that); or what is
+    found with a lower bar, if that leaves nothing. What was not fitted must be foretold no worse. Each is challenged by shapes, too.
     """
     refused = {names(chosen.fit.model)}
     complete = [(s, rest) for s in chosen.rivals if (rest := _left_by(whole, chosen, s, structure, refused)) is not None]
@@ -247,6 +247,8 @@ def _once_more(
             fit = dated(given, whole.given, best.fit)
             return replace(chosen, fit=fit, rivals=tuple(s for s, _ in complete if s is not best)), rest
     pair = two_together(given, chosen, lambda fits: foretelling(judged_on, fits))
+    if pair is not None:  # a change between the parts that are fitted is anywhere there: its time is told by all of the recording
+        pair = replace(pair, fit=dated(given, whole.given, pair.fit))
     told = None if pair is None else _all_explained(whole, pair, structure, refused)
     for bar, before, may_be_left in (
         (STRICT, pair if told is not None and not told.tokens else None, set()),
