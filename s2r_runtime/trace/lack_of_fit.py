@@ -22,7 +22,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.begun import begun, measured
@@ -398,6 +397,8 @@ def beyond_rounding(r: Array, step: float) -> Array:
 
     P(reading k) = Phi((k + step/2 - x) / s) - Phi((k - step/2 - x) / s),    s: of NOISES, the likeliest; one in WRONG is anything
     """
+    from scipy.special import ndtr
+
     if not np.any(r):
         return r
     anything = step / WRONG / (2.0 * float(np.max(np.abs(r))) + step)
