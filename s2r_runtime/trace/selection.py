@@ -36,6 +36,7 @@ from s2r_runtime.trace.fitting import (
     under_noise,
     without,
 )
+from s2r_runtime.trace.friction import with_friction
 from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
 from s2r_runtime.trace.rivals import CLOSE, rivals, simplified
 from s2r_runtime.trace.scores import STRICT, Bar, Scored, at_first_look, best_candidates, limited, name_of, names, rescored, unlimited
@@ -122,6 +123,7 @@ def called_for(
         ranking = ranking or found
         progress(0.1 + 0.6 * (step + 1) / (MOST + 1))
         chosen = next((s.fit for s in found if s.fit is not None and accepted(given, s.fit, fit, tried, horizon, bar)), None)
+        chosen = chosen if fit.added else _of_all_axes(given, nominal, chosen, tried, horizon, bar)
         if chosen is None:
             break
         chosen = parted(given, fitted(given, chosen, chosen.model), ranking, bar)
@@ -131,6 +133,16 @@ def called_for(
     fit = unbent(given, simplified(given, pruned(given, fit, tried, horizon, bar)), tried, bar)
     progress(0.8)
     return Selection(nominal, plainly(given, fit), tried, tuple(ranking), ())
+
+
+def _of_all_axes(given: Problem, nominal: Fit, chosen: Fit | None, tried: int, horizon: int, bar: Bar) -> Fit | None:
+    """What was chosen first, or friction of all axes where that explains more."""
+    both = with_friction(given, nominal)
+    if both is None:
+        return chosen
+    base = nominal if chosen is None else chosen
+    more = gain(both, base) - bar.price(both.k - base.k, len(given.steps))
+    return both if more > CLOSE and accepted(given, both, nominal, tried, horizon, bar) else chosen
 
 
 def against_rivals(given: Problem, chosen: Selection, bar: Bar) -> Selection:
