@@ -284,3 +284,40 @@ def test_a_flying_robots_wind_does_not_push_its_joints(tmp_path):
         "    return x + dt * np.column_stack([u[:, :2], x[:, 3], u[:, 2], x[:, 5], u[:, 3]])\n"
     )
     assert registry().get("effects", "constant_disturbance").channels(compose(ModelSpec(str(path), 0.05)).nominal) == ()
+
+
+REACTOR = """
+import numpy as np
+
+STATES = ("c", "T")
+INPUTS = ("q", "Tc")
+PARAMS = {"k0": 7.2e10, "E_R": 8750.0, "heat": 209.2, "UA": 2.092}
+
+
+def step(x, u, dt, params):
+    def rates(x):
+        r = params["k0"] * np.exp(-params["E_R"] / x[:, 1]) * x[:, 0]
+        flow, off = u[:, 0] / 100.0, params["UA"] * (u[:, 1] - x[:, 1])
+        return np.column_stack([flow * (1.0 - x[:, 0]) - r, flow * (350.0 - x[:, 1]) + params["heat"] * r + off])
+
+    for _ in range(4):
+        x = x + dt / 4 * rates(x + dt / 8 * rates(x))
+    return x
+"""
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_reaction_that_runs_away_under_other_values_ends_no_trace(tmp_path, seed):
+    """Rates go with e to the power of what temperature is: in a candidate's steps, and in rollouts, numbers leave what a computer holds."""
+    path = tmp_path / "reactor.py"
+    path.write_text(REACTOR)
+    model, rng, rows = compose(ModelSpec(str(path), 0.05)), np.random.default_rng(seed), 1000
+    u = np.column_stack([np.repeat(rng.uniform(95.0, 105.0, rows // 50), 50), np.repeat(rng.uniform(296.0, 303.0, rows // 40), 40)])
+    robot = compose(ModelSpec(str(path), 0.005, {"UA": 0.9 * 2.092}))
+    x, states = np.array([[0.55, 345.0]]), []
+    for k in range(rows + 1):
+        states.append(x[0])
+        for _ in range(10 if k < rows else 0):
+            x = robot.nominal.step(x, u[k : k + 1], 0.005, robot.parameters)
+    found = trace(from_arrays(model, [(np.array(states) + rng.normal(size=(rows + 1, 2)) * [0.002, 0.15], u)]), model)
+    assert {(e.name, e.channel) for e in found.effects} <= {("parameter_change", "UA")}

@@ -123,7 +123,7 @@ def _refined(frequency: float, width: float, t: Array, d: Array, w: Array) -> Pe
         c, s = np.cos(angle), np.sin(angle)
         cc, ss, cs = w @ (c * c), w @ (s * s), w @ (c * s)
         dc, ds = d @ c, d @ s
-        det = np.maximum(cc * ss - cs * cs, 1e-300)
+        det = np.maximum(cc * ss - cs * cs, 1e-14 * cc * ss + 1e-300)  # below that it is rounding
         beta, alpha = (ss * dc - cs * ds) / det, (cc * ds - cs * dc) / det
         k = int(np.argmax(beta * dc + alpha * ds))
         best, a, b = float(tried[k]), float(alpha[k]), float(beta[k])

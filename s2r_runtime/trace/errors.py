@@ -22,7 +22,7 @@ from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.fitting import Fit, evaluate, gain, problem
 from s2r_runtime.trace.holdout import FEWEST_RUNS
 from s2r_runtime.trace.inverse import Inverse, input_relative, inverse
-from s2r_runtime.trace.residual import Acting, Steps, acting, advanced, residual, rms, rollout, rollout_starts, state_jacobian
+from s2r_runtime.trace.residual import Acting, Steps, acting, farthest, residual, rms, rollout, rollout_starts, state_jacobian, wherever
 from s2r_runtime.trace.residual_noise import Noise, Past
 
 Array = NDArray[np.float64]
@@ -165,9 +165,10 @@ def noise_floor(fit: Fit, given: Held, seed: int) -> tuple[Array, Array]:
             return one, rms(ends)
     known = uncertain(fit, given.data.dt) if fit.noise.axes else noise.r
     noisy = clean + rng.normal(size=clean.shape) * np.sqrt(known)
+    far = farthest(clean)
     for h in range(given.horizon):
-        clean = advanced(model, clean, act, starts + h)
-        noisy = advanced(model, noisy, act, starts + h) + rng.normal(size=clean.shape) * np.sqrt(noise.q)
+        clean = np.clip(wherever(model, clean, act, starts + h), -far, far)
+        noisy = np.clip(wherever(model, noisy, act, starts + h), -far, far) + rng.normal(size=clean.shape) * np.sqrt(noise.q)
     return one, rms(model.difference(clean, noisy) + rng.normal(size=clean.shape) * np.sqrt(noise.r))
 
 
@@ -183,6 +184,7 @@ def _coloured_ends(fit: Fit, given: Held, act: Acting, starts: Index, y: Array, 
     measured = [np.flatnonzero(~np.isnan(run.y).any(axis=1)) for run in given.data.runs]  # rows before the first one are inputs alone
     longest = max((int(rows[-1] - rows[0]) for rows in measured if len(rows)), default=0)
     before = longest - given.horizon  # what lasts longer than a run was not seen, nor its law
+    far = farthest(y)
     settle = min(SETTLE if fit.colour.slow.size else SETTLE // 10, max(before, 0))
     for k in range(settle + given.horizon):
         late = s * rng.normal(size=y.shape)
@@ -191,9 +193,9 @@ def _coloured_ends(fit: Fit, given: Held, act: Acting, starts: Index, y: Array, 
             law.follow(push - e)
         else:
             place = starts + k - settle
-            there = advanced(model, y, act, place)
-            y = there + law.follow(push - (there - advanced(model, y - e, act, place)))
-            x = advanced(model, x, act, place)
+            there = wherever(model, y, act, place)
+            y = np.clip(there + law.follow(push - (there - wherever(model, y - e, act, place))), -far, far)
+            x = np.clip(wherever(model, x, act, place), -far, far)
         e = late
     ends = model.difference(y, x)
     return ends if law.settled else None

@@ -22,7 +22,7 @@ from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.coarse import coarse
 from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.residual import Steps, acting, predicted, residual, state_jacobian
+from s2r_runtime.trace.residual import Steps, acting, advanced, farthest, predicted, residual, state_jacobian
 from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
 from s2r_runtime.trace.slots import Added, Free, Slot, bounds_of, free_of, inside, values_of, with_values
 from s2r_runtime.trace.speed_noise import BEYOND
@@ -152,11 +152,12 @@ def _whitened(given: Problem, fit: Fit, r: Array) -> Array:
 
 
 def foretold(given: Problem, model: ComposedModel) -> Array | None:
-    """What a model predicts, (n, nx); None where a user's own gives no numbers at such values."""
+    """What a model predicts, (n, nx); None where a user's own gives no numbers at such values, or absurd ones."""
     try:
-        return predicted(model, given.steps, acting(model, given.data))
+        there = advanced(model, given.steps.y0, acting(model, given.data), given.steps.place)
     except ConfigError:
         return None
+    return None if np.any(np.abs(there) > farthest(given.steps.y1)) else there
 
 
 def sensitivities(given: Problem, fit: Fit, model: ComposedModel, free: Free, here: Array | None = None) -> Array:

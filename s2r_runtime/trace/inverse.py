@@ -20,7 +20,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import differentiation
 from s2r_runtime.trace.dataset import Dataset, regridded
 from s2r_runtime.trace.reconstruct import at_step
-from s2r_runtime.trace.residual import Acting, Steps, acting, advanced, steps_of
+from s2r_runtime.trace.residual import Acting, Steps, acting, steps_of, wherever
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -96,7 +96,7 @@ def _needed(model: ComposedModel, steps: Steps, act: Acting) -> Array:
     back = np.linalg.pinv(answer)  # (nu, nx)
     shift = np.zeros_like(act.mean)
     for _ in range(ROUNDS):
-        e = model.difference(steps.y1, advanced(model, steps.y0, act.moved(shift), slice(None)))
+        e = model.difference(steps.y1, wherever(model, steps.y0, act.moved(shift), slice(None)))
         step = e @ back.T
         shift = np.clip(shift + step, -FARTHEST * size, FARTHEST * size)
         if np.all(np.abs(step) < CLOSE * size):
@@ -108,7 +108,7 @@ def _slope(model: ComposedModel, steps: Steps, act: Acting, j: int, h: float) ->
     """(nx,) what a unit more of input j does to the state, where it does much: where friction holds, it does nothing."""
     up = np.zeros(act.mean.shape[1])
     up[j] = h
-    change = np.subtract(*(advanced(model, steps.y0, act.moved(way), slice(None)) for way in (up, -up)))
+    change = np.subtract(*(wherever(model, steps.y0, act.moved(way), slice(None)) for way in (up, -up)))
     return np.asarray(np.quantile(np.abs(change), 0.9, axis=0) * np.sign(np.sum(change, axis=0)) / (2.0 * h))
 
 

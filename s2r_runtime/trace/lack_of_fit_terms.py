@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.fitting import Problem, slopes
-from s2r_runtime.trace.residual import Acting, Steps, acting, advanced
+from s2r_runtime.trace.residual import Acting, Steps, acting, wherever
 from s2r_runtime.trace.residual_noise import Noise
 from s2r_runtime.trace.slots import free_of
 
@@ -408,10 +408,10 @@ def directions_of(given: Problem, model: ComposedModel, act: Acting) -> tuple[li
 def own_pushes(given: Problem, model: ComposedModel, act: Acting) -> Terms:
     """(n, nx) by input: where it pushes."""
     here = act.at(given.steps.place)
-    usual, pushed = advanced(model, given.steps.y0, here, slice(None)), []
+    usual, pushed = wherever(model, given.steps.y0, here, slice(None)), []
     for j in range(here.mean.shape[1]):
         h = 1e-4 * max(1.0, float(np.max(np.abs(here.mean[:, j]), initial=0.0)))
         up = np.zeros(here.mean.shape[1])
         up[j] = h
-        pushed.append((advanced(model, given.steps.y0, here.moved(up), slice(None)) - usual) / h)
+        pushed.append((wherever(model, given.steps.y0, here.moved(up), slice(None)) - usual) / h)
     return pushed

@@ -14,7 +14,7 @@ from s2r_runtime.hookspecs import Effect
 from s2r_runtime.models.composed import AppliedEffect
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.fitting import Fit, Problem, insert
-from s2r_runtime.trace.residual import Acting, acting, advanced, predicted
+from s2r_runtime.trace.residual import Acting, acting, predicted, wherever
 
 Array = NDArray[np.float64]
 
@@ -81,7 +81,7 @@ class Leftover:
         more[:, columns] = here.mean[:, columns] if proportional else 1.0
         h = NUDGE * max(float(np.max(np.abs(here.mean), initial=0.0)), NUDGE) / max(float(np.max(np.abs(more), initial=0.0)), NUDGE)
         nudged = here.moved(h * more)
-        return (advanced(model, steps.y0, nudged, steps.place) - advanced(model, steps.y0, here, steps.place)) / h
+        return (wherever(model, steps.y0, nudged, steps.place) - wherever(model, steps.y0, here, steps.place)) / h
 
     @cached_property
     def _act(self) -> Acting:

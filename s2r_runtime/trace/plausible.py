@@ -33,7 +33,7 @@ from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.accelerations import check_accelerations
 from s2r_runtime.trace.dataset import Dataset, Run, regridded
 from s2r_runtime.trace.never_measured import check_measured
-from s2r_runtime.trace.residual import Index, acting, predicted, rollout, rollout_starts, steps_of
+from s2r_runtime.trace.residual import Index, acting, advanced, predicted, rollout, rollout_starts, steps_of
 from s2r_runtime.trace.scales import SCALES, Scale, axis_pairs, groups
 from s2r_runtime.trace.streams import Stream
 from s2r_runtime.trace.unforetold import FEWEST_STARTS, each_unforetold, steps_ahead, trimmed, unforetold
@@ -109,7 +109,9 @@ class _Mistake:
 
 
 def check_plausible(model: ComposedModel, data: Dataset) -> None:
-    """Raises RecordingError if the columns are clearly not what they say, with what they seem to be."""
+    """Raises RecordingError if the columns are clearly not what they say, with what they seem to be; ConfigError if somebody's own model
+    gives no numbers where the robot was.
+    """
     check_measured(model, data)
     _check_columns(model, data)
     check_accelerations(model, data)
@@ -117,6 +119,8 @@ def check_plausible(model: ComposedModel, data: Dataset) -> None:
     _check_scales(model, data)
     _check_speeds(model, data)
     _check_clocks(model, data)
+    steps = steps_of(data)  # last: what is not what it says may lie where no model goes
+    advanced(model, steps.y0, acting(model, data), steps.place)
 
 
 def _check_columns(model: ComposedModel, data: Dataset) -> None:

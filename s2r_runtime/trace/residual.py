@@ -16,6 +16,7 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
+from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace.dataset import Dataset
 
@@ -148,9 +149,36 @@ def _once(model: ComposedModel, x: Array, mean: Array, end: Array, lasts: Array 
     return np.asarray(usual + h / (2.0 * s) * (long - short) + (h / s) ** 2 / 2.0 * (long - 2.0 * usual + short))
 
 
+FARTHEST = 1e6
+"""Times the largest value of a state: what is foretold beyond it explains nothing, its squares leave no digits for the rest, and an
+integration that is not stable there leaves all numbers within a few steps.
+"""
+
+
+def farthest(y: Array) -> Array:
+    """(nx,) sizes that nothing foretold exceeds, from measured states (n, nx)."""
+    largest = np.nanmax(np.abs(y), axis=0, initial=0.0)
+    return np.asarray(np.where(largest > 0.0, FARTHEST * largest, np.inf))
+
+
+def wherever(model: ComposedModel, x: Array, act: Acting, place: Index | slice) -> Array:
+    """As `advanced`; a row stays from which somebody's own model gives no numbers: a rollout has left all that its equations are for, or a
+    candidate's values have, just beside what was recorded.
+    """
+    try:
+        return advanced(model, x, act, place)
+    except ConfigError:
+        if len(x) == 1:
+            return x
+        place, half = np.arange(len(act.end))[place], len(x) // 2
+        return np.concatenate([wherever(model, x[part], act, place[part]) for part in (slice(half), slice(half, None))])
+
+
 def predicted(model: ComposedModel, steps: Steps, act: Acting) -> Array:
-    """f(y0, a), (n, nx), angles not wrapped."""
-    return advanced(model, steps.y0, act, steps.place)
+    """f(y0, a), (n, nx), angles not wrapped; y0 where somebody's own model gives no numbers (`wherever`), and none that are absurd."""
+    x = wherever(model, steps.y0, act, steps.place)
+    ends_at = farthest(steps.y1)
+    return x if np.all(np.abs(x) <= ends_at) else np.clip(x, -ends_at, ends_at)
 
 
 def residual(model: ComposedModel, steps: Steps, act: Acting) -> Array:
@@ -167,7 +195,7 @@ def state_jacobian(model: ComposedModel, steps: Steps, act: Acting) -> Array:
         up, down = steps.y0.copy(), steps.y0.copy()
         up[:, j] += h
         down[:, j] -= h
-        f[:, :, j] = (advanced(model, up, act, steps.place) - advanced(model, down, act, steps.place)) / (2.0 * h)
+        f[:, :, j] = (wherever(model, up, act, steps.place) - wherever(model, down, act, steps.place)) / (2.0 * h)
     return f
 
 
@@ -227,11 +255,13 @@ def rollout(
     y = np.concatenate([r.y for r in data.runs])
     rows = starts + run  # a run has one row more than it has steps
     x = y[rows] if begun is None else begun[rows]
+    ends_at = farthest(y)
     for h in range(horizon):
         place = starts + h
-        x = advanced(model, x, act, place)
+        x = wherever(model, x, act, place)
         if extra is not None:
             x = x + extra[place]
+        x = np.clip(x, -ends_at, ends_at)
     return Rollouts(horizon, starts, model.difference((y if ends is None else ends)[rows + horizon], x))
 
 

@@ -59,6 +59,14 @@ ROUNDED, DIGITS = 10, 1e-3
 one step of rounding are, of themselves, by the digits that are written: what a robot does lies farther apart.
 """
 
+WIDENED = (0.0, 1e-12, 1e-8, 1e-4, 1.0)
+"""Shares by which variances are made larger until rounding leaves their matrix positive definite: a candidate of somebody's own model may
+magnify what is measured by so much that the rest is lost beside it. It explains nothing, and shall say so, not end the search.
+"""
+
+FARTHEST = 1e200
+"""Of a variance, for the same reason."""
+
 
 @dataclass(frozen=True)
 class Noise:
@@ -96,8 +104,13 @@ class Whitener:
             h = ft[p, v]
             band[0, :, p] += noise.q[v] * h * h / 3.0
             band[abs(v - p), :, min(p, v)] += noise.q[v] * h / 2.0
-        self._lower, info = lapack.dpbtrf(band.reshape(2 * nx, n * nx), lower=1)
-        if info != 0:
+        band[0] = np.minimum(band[0], FARTHEST)
+        for more in WIDENED:
+            band[0] *= 1.0 + more
+            self._lower, info = lapack.dpbtrf(band.reshape(2 * nx, n * nx), lower=1)
+            if info == 0:
+                break
+        else:
             raise ValueError("the noise has no positive definite covariance")
         self.logdet = float(np.sum(np.log(self._lower[0])))
 
