@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset, Pause
+from s2r_runtime.trace.fault import Fault
 from s2r_runtime.trace.frozen import frozen
 from s2r_runtime.trace.heading import departures
 from s2r_runtime.trace.holes import bridged
 from s2r_runtime.trace.jumps import WILD_SIGMAS, jumps_of, tails_of
-from s2r_runtime.trace.reach import Fault, Reach, predicted, reach_of
+from s2r_runtime.trace.reach import Reach, predicted, reach_of
 from s2r_runtime.trace.residual import Acting, acting
 
 __all__ = ["Checked", "Fault", "check"]
@@ -67,7 +68,10 @@ def check(model: ComposedModel, data: Dataset) -> Checked:
     act = acting(model, data)
     reach = reach_of(model, data, act)
     faults = [_of_pause(model, data, act, pause, reach) for pause in data.pauses]
-    found = [f for f in faults if f is not None]
+    known = data.reconstruction.faults if data.reconstruction else ()
+    near = LONG * data.dt  # what was left out there is no dropout
+    silent = [f for f in faults if f is not None and all(f.to_s < k.from_s - near or f.from_s > k.to_s + near for k in known)]
+    found = [*known, *silent]
     pose = _pose(model)
     bad = [np.zeros(run.y.shape, dtype=bool) for run in data.runs]
     left_out: list[tuple[int, int]] = []

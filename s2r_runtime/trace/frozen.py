@@ -9,17 +9,12 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.reach import SIGMAS, Fault, Reach, predicted
+from s2r_runtime.trace.fault import FROZEN_ROWS, QUANTA, SIGMAS, Fault
+from s2r_runtime.trace.reach import Reach, predicted
 from s2r_runtime.trace.residual import Acting
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-FROZEN_ROWS = 5
-"""Rows that repeat a state exactly before it counts as frozen."""
-
-QUANTA = 6.0
-"""Least changes by which a state must have moved on while it repeated: below that it may be resolution."""
 
 LONG_FROZEN = 50
 """Rows of exact repeats that need no catching up to count as frozen."""

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.reach import ONE_IN, SIGMAS, Fault, Reach, predicted
+from s2r_runtime.trace.fault import SIGMAS, Fault
+from s2r_runtime.trace.reach import ONE_IN, Reach, predicted
 from s2r_runtime.trace.residual import Acting
 
 Array = NDArray[np.float64]

@@ -16,9 +16,6 @@ from s2r_runtime.trace.residual_noise import quantum
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-SIGMAS = 8.0
-"""Robust standard deviations from which a single residual is suspected."""
-
 ROUNDING = math.sqrt(1.0 / 6.0)
 """Of the step in which a state is rounded, standard deviation of what that does to a residual, which has it twice. Where more than half of
 the residuals are alike, their median says nothing of noise.
@@ -26,16 +23,6 @@ the residuals are alike, their median says nothing of noise.
 
 ONE_IN = 100.0
 """Recordings in which noise may once reach a spike's size."""
-
-
-@dataclass(frozen=True)
-class Fault:
-    """An interval of the recording, s since its first stamp. channel: a state, or `*`. kind: as docs/json.md."""
-
-    from_s: float
-    to_s: float
-    channel: str
-    kind: str
 
 
 @dataclass(frozen=True)

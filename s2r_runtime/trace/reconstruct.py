@@ -23,7 +23,9 @@ from s2r_runtime.hookspecs import Follows
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
 from s2r_runtime.trace import differentiation
+from s2r_runtime.trace.fault import Fault
 from s2r_runtime.trace.late_speeds import late
+from s2r_runtime.trace.position_faults import mended
 from s2r_runtime.trace.speeds import Smoothed, smoothed
 from s2r_runtime.trace.streams import Stream, complete, fresh, held_between, held_means, unwrapped
 from s2r_runtime.trace.ways import less_noise_of
@@ -75,6 +77,8 @@ class Reconstruction:
     """Inputs of each segment without the noise of samples (`ways`), where all was filtered: what is left of it then looks smooth."""
     late: dict[str, float] = field(default_factory=dict)
     """s by which speeds were late that the recording has (`late_speeds`)."""
+    faults: tuple[Fault, ...] = ()
+    """Of positions, found before anything was done to them (`position_faults`)."""
 
     def to_json(self) -> dict[str, object]:
         """docs/json.md's `reconstructed`."""
@@ -190,6 +194,7 @@ def _with_speeds(
             f"{source}: {', '.join(missing)} cannot be told: fewer than {FEWEST} rows on which {', '.join(measured)} were measured"
         )
     interval = snapped(float(np.median(np.concatenate([np.diff(s.t) for s, _ in given]))), model.dt)
+    given, faults = _mended(model, given, measured, pairs)
     made, known = [], []
     for states, inputs in given:
         whole, found = _speeds(model, states, inputs, measured, pairs)
@@ -209,19 +214,42 @@ def _with_speeds(
         made = [both for s, u in made for both in _filtered(s, u, interval, band)]
         if not made:
             raise RecordingError(f"{source}: {', '.join(missing)} cannot be told: no stretch without a gap is long enough")
-    return made, Reconstruction(missing, shown, interval, needed, pairs, errors, apart, tuple(cleaned))
+    return made, Reconstruction(missing, shown, interval, needed, pairs, errors, apart, tuple(cleaned), faults=faults)
+
+
+def _mended(
+    model: ComposedModel, given: list[tuple[Stream, Stream]], measured: list[str], pairs: tuple[tuple[str, str], ...]
+) -> tuple[list[tuple[Stream, Stream]], tuple[Fault, ...]]:
+    """Segments without what is wrong with their positions, cut where these jumped, and what that was."""
+    begin = min(float(states.t[0]) for states, _ in given)
+    columns = [(measured.index(position), position) for position, _ in pairs]
+    made: list[tuple[Stream, Stream]] = []
+    faults: list[Fault] = []
+    for states, inputs in given:
+        rates = _pushed(model, states, inputs, measured)[1]
+        done = mended(states, columns, rates[:, [model.states.index(speed) for _, speed in pairs]], begin)
+        faults += done.faults
+        for part in done.parts if done.faults else (states,):
+            if len(part.t) >= FEWEST:
+                until = np.searchsorted(inputs.t, part.t[-1], side="right")
+                made.append((part, inputs if part is states else Stream(inputs.t[:until], inputs.values[:until])))
+    return made, tuple(faults)
+
+
+def _pushed(model: ComposedModel, states: Stream, inputs: Stream, measured: list[str]) -> tuple[Array, Array]:
+    """All states on the rows of what was measured, 0 where they were not, and the rates there (n - 1, nx)."""
+    nominal, h = model.nominal, 1e-3 * model.dt
+    x = np.zeros((len(states.t), len(model.states)))
+    for j, name in enumerate(measured):
+        x[:, model.states.index(name)] = states.values[:, j]
+    return x, (nominal.step(x[:-1], held_between(inputs, states.t, 1), h, nominal.parameters) - x[:-1]) / h
 
 
 def _speeds(
     model: ComposedModel, states: Stream, inputs: Stream, measured: list[str], pairs: tuple[tuple[str, str], ...]
 ) -> tuple[Stream, list[Smoothed]]:
     """All states on the rows of what was measured."""
-    nominal, h = model.nominal, 1e-3 * model.dt
-    x = np.zeros((len(states.t), len(model.states)))
-    for j, name in enumerate(measured):
-        x[:, model.states.index(name)] = states.values[:, j]
-    u = held_between(inputs, states.t, 1)
-    rates = (nominal.step(x[:-1], u, h, nominal.parameters) - x[:-1]) / h
+    x, rates = _pushed(model, states, inputs, measured)
     found = []
     for position, speed in pairs:
         j = model.states.index(speed)

@@ -14,7 +14,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.account import account
 from s2r_runtime.trace.errors import Held, Judged
-from s2r_runtime.trace.faults import Fault
+from s2r_runtime.trace.fault import Fault
 from s2r_runtime.trace.found import Found, Limit
 from s2r_runtime.trace.power import Visible
 from s2r_runtime.trace.reconstruct import Reconstruction

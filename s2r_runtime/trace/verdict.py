@@ -24,7 +24,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.about import about_states
 from s2r_runtime.trace.errors import Held, Judged, better, displacement
-from s2r_runtime.trace.faults import Fault
+from s2r_runtime.trace.fault import Fault
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, foretold, gain, plainly, problem, without
 from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import Mask, acting, predicted, rms

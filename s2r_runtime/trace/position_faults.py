@@ -1,0 +1,145 @@
+"""Faults of a position whose speed was not measured, told from its own rows: behind a low-pass, and a spline, nothing of them is left.
+
+A body's position goes on at its pace. With d_k = p_{k+1} - p_k over h_k, and m_k the median pace of the rows around,
+
+    off_k = d_k - m_k h_k                       of noise, rounding, and what accelerates the body
+    jump:    |off_k| beyond noise, and beyond what the inputs do, with nothing like it beside: a blow changes the pace, and stays
+    spike:   one that is taken back within a few rows
+    frozen:  p repeats exactly, and then makes up for the way that the pace before and after says
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.trace.fault import FROZEN_ROWS, QUANTA, SIGMAS, Fault
+from s2r_runtime.trace.streams import Stream
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+AROUND = 5
+"""Rows on either side that tell the pace."""
+
+ALIKE = 0.3
+"""Of a jump, that no row beside it may be off by."""
+
+BEYOND = 3.0
+"""Times what the largest force does in a row to the way that is made in it."""
+
+MADE_UP = 0.5
+"""Of the way that a frozen position missed, by which the first row after it may miss that."""
+
+BRIEF = 3
+"""Rows that a spike lasts at most."""
+
+FEWEST = 60
+"""Rows from which noise is told."""
+
+RARE = 0.01
+"""Share of rows from which on what is wild is a property of the sensor."""
+
+
+@dataclass(frozen=True)
+class Mended:
+    """parts: the rows that are right, cut where a position jumped; faults: s since `begin`."""
+
+    parts: tuple[Stream, ...]
+    faults: tuple[Fault, ...]
+
+
+def mended(states: Stream, columns: Sequence[tuple[int, str]], pushed: Array, begin: float) -> Mended:
+    """states: rows without gaps in any column; columns: (place, name) of positions of axes; pushed: (n - 1, k) acceleration that the inputs
+    cause, of each of them; begin: s, of the recording.
+    """
+    lost, cuts, faults = np.zeros(len(states.t), dtype=bool), set[int](), []
+    for (j, name), push in zip(columns, pushed.T, strict=True):
+        wrong, jumps, told = _of_one(states.t, states.values[:, j], push)
+        lost |= wrong
+        cuts |= set(jumps)
+        faults += [Fault(float(states.t[a]) - begin, float(states.t[b]) - begin, name, kind) for a, b, kind in told]
+    edges = [0, *(k + 1 for k in sorted(cuts)), len(states.t)]
+    kept = [np.arange(a, b)[~lost[a:b]] for a, b in pairwise(edges)]
+    parts = tuple(Stream(states.t[rows], states.values[rows]) for rows in kept if len(rows))
+    return Mended(parts, tuple(faults))
+
+
+def _of_one(t: Array, p: Array, pushed: Array) -> tuple[Mask, list[int], list[tuple[int, int, str]]]:
+    """Rows that are wrong (n,), steps that jump, and (from, to, kind) in rows."""
+    lost = np.zeros(len(p), dtype=bool)
+    if len(p) < FEWEST:
+        return lost, [], []
+    h, d = np.diff(t), np.diff(p)
+    pace = _pace(d / h)
+    off = d - pace * h
+    changed = np.abs(d[d != 0.0])
+    quantum = float(changed.min()) if len(changed) else 0.0
+    noise = max(1.4826 * float(np.median(np.abs(off - np.median(off)))), quantum / 2.0)
+    least = SIGMAS * noise + BEYOND * float(np.max(np.abs(pushed), initial=0.0)) * float(np.median(h)) ** 2
+    told: list[tuple[int, int, str]] = []
+    for a, b in _repeats(d):
+        around = np.concatenate(
+            [d[max(a - AROUND, 0) : a] / h[max(a - AROUND, 0) : a], d[b + 1 : b + 1 + AROUND] / h[b + 1 : b + 1 + AROUND]]
+        )
+        if b >= len(d) or len(around) < AROUND:
+            continue
+        missed = float(np.median(around)) * float(t[b + 1] - t[a])
+        if abs(missed) > least + QUANTA * quantum and abs(float(d[b]) - missed) < MADE_UP * abs(missed):
+            lost[a + 1 : b + 1] = True
+            off[max(a - AROUND, 0) : b + 1 + AROUND] = 0.0  # the pace there is told from rows that stand still
+            told.append((a, b, "frozen"))
+    jumps, wild = [], [k for k in np.flatnonzero(np.abs(off) > least).tolist() if off[k] != 0.0]
+    if len(wild) > max(RARE * len(p), 3.0):
+        return lost, [], told
+    while wild:
+        k = wild.pop(0)
+        back = next((m for m in wild if m <= k + BRIEF and abs(off[m] + off[k]) < ALIKE * abs(off[k])), None)
+        if back is not None:
+            wild.remove(back)
+            lost[k + 1 : back + 1] = True
+            told.append((k + 1, back, "spike"))
+        elif _alone(off, k):
+            jumps.append(k)
+    told += [(k + 1, _until(off, k, jumps, len(p)), "offset_jump") for k in _first_of_pairs(off, jumps)]
+    return lost, jumps, told
+
+
+def _pace(v: Array) -> Array:
+    """(n,) median of the rows around each, itself left out."""
+    padded = np.concatenate([np.full(AROUND, np.nan), v, np.full(AROUND, np.nan)])
+    near = np.lib.stride_tricks.sliding_window_view(padded, 2 * AROUND + 1)
+    return np.asarray(np.nanmedian(np.delete(near, AROUND, axis=1), axis=1))
+
+
+def _repeats(d: Array) -> list[tuple[int, int]]:
+    """[a, b) of steps that go nowhere, FROZEN_ROWS and more."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], (d == 0.0).astype(np.int8), [0]])))
+    return [(a, b) for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True) if b - a >= FROZEN_ROWS]
+
+
+def _alone(off: Array, k: int) -> bool:
+    around = np.abs(np.concatenate([off[max(k - 2, 0) : k], off[k + 1 : k + 3]]))
+    return bool(np.all(around < ALIKE * abs(off[k])))
+
+
+def _first_of_pairs(off: Array, jumps: list[int]) -> list[int]:
+    """Jumps but for those that take an earlier one back."""
+    left = list(jumps)
+    firsts = []
+    while left:
+        k = left.pop(0)
+        firsts.append(k)
+        back = next((m for m in left if abs(off[m] + off[k]) < ALIKE * abs(off[k])), None)
+        if back is not None:
+            left.remove(back)
+    return firsts
+
+
+def _until(off: Array, k: int, jumps: list[int], rows: int) -> int:
+    """The row until which a jump lasts."""
+    return next((m for m in jumps if m > k and abs(off[m] + off[k]) < ALIKE * abs(off[k])), rows - 1)

@@ -1,0 +1,71 @@
+"""Faults of a position whose speed was not measured: told from its rows, before anything smooths them."""
+
+import numpy as np
+import pytest
+from test_trace_friction import _joint, _recorded
+
+from s2r_runtime.trace.position_faults import mended
+from s2r_runtime.trace.streams import Stream
+from s2r_runtime.trace.tracer import load_dataset, trace
+
+
+def _frozen(q):
+    q[4000:4300] = q[4000]
+
+
+def _jumped(q):
+    q[5000:] += 0.02
+
+
+def _spiked(q):
+    q[6000] += 0.05
+
+
+@pytest.mark.parametrize(
+    ("wrong", "kind", "begins", "ends"),
+    [(_frozen, "frozen", 4.0, 4.3), (_jumped, "offset_jump", 5.0, 10.0), (_spiked, "spike", 6.0, 6.0)],
+)
+def test_a_fault_of_a_position_alone_is_found_where_it_is_and_takes_no_name_away(tmp_path, wrong, kind, begins, ends):
+    rows = _recorded(np.random.default_rng(0), 10.0)
+    wrong(rows[:, 1])
+    path = tmp_path / "joint.csv"
+    np.savetxt(path, rows, delimiter=",", header="t,q,force", comments="", fmt="%.8g")
+    model = _joint()
+    found = trace(load_dataset(path, model), model)
+    (fault,) = found.faults
+    assert (fault.kind, fault.channel) == (kind, "q")
+    assert (fault.from_s, fault.to_s) == pytest.approx((begins, ends), abs=0.01)
+    assert {e.name for e in found.effects} == {"coulomb_friction", "viscous_friction"}
+
+
+def _checked(p, h=0.001, pushed=0.0):
+    t = h * np.arange(len(p))
+    return mended(Stream(t, p[:, None]), [(0, "q")], np.full((len(p) - 1, 1), pushed), 0.0)
+
+
+def test_a_blow_that_changes_the_pace_at_once_is_no_jump():
+    t = 0.001 * np.arange(4000)
+    p = np.where(t < 2.0, t, 2.0 - 0.5 * (t - 2.0)) + 1e-5 * np.random.default_rng(1).normal(size=4000)
+    assert _checked(p).faults == ()
+
+
+def test_a_coarse_encoder_that_creeps_and_stands_is_not_frozen():
+    t = 0.001 * np.arange(20_000)
+    p = np.round(0.05 * np.sin(0.4 * t) / 1e-3) * 1e-3  # up to fifty rows on one count, much more where it turns
+    p[8000:10_000] = p[8000]
+    assert _checked(p[:10_000]).faults == ()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_with_wild_rows_has_no_faults(seed):
+    rng = np.random.default_rng(seed)
+    p = np.sin(2.0 * np.arange(3000) * 0.01) + 1e-3 * rng.standard_t(3.0, size=3000)
+    assert all(f.kind == "spike" for f in _checked(p, 0.01).faults)
+
+
+def test_a_push_that_may_move_as_far_within_a_row_is_no_jump():
+    rng = np.random.default_rng(4)
+    p = 1e-6 * rng.normal(size=1000)
+    p[500:] += 1e-3
+    assert len(_checked(p, 0.01, 1.0).faults) == 1
+    assert _checked(p, 0.01, 10.0).faults == ()
