@@ -69,3 +69,9 @@ def test_a_push_that_may_move_as_far_within_a_row_is_no_jump():
     p[500:] += 1e-3
     assert len(_checked(p, 0.01, 1.0).faults) == 1
     assert _checked(p, 0.01, 10.0).faults == ()
+
+
+def test_what_was_done_while_nothing_was_recorded_is_no_jump():
+    t = np.concatenate([0.01 * np.arange(500), 7.0 + 0.01 * np.arange(500)])
+    p = np.sin(t) + 1e-5 * np.random.default_rng(5).normal(size=1000)
+    assert mended(Stream(t, p[:, None]), [(0, "q")], np.zeros((999, 1)), 0.0).faults == ()

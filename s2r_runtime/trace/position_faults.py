@@ -26,6 +26,9 @@ Mask = NDArray[np.bool_]
 AROUND = 5
 """Rows on either side that tell the pace."""
 
+APART = 2.5
+"""Usual intervals from which on rows are too far apart."""
+
 ALIKE = 0.3
 """Of a jump, that no row beside it may be off by."""
 
@@ -76,7 +79,8 @@ def _of_one(t: Array, p: Array, pushed: Array) -> tuple[Mask, list[int], list[tu
         return lost, [], []
     h, d = np.diff(t), np.diff(p)
     pace = _pace(d / h)
-    off = d - pace * h
+    pauses = np.convolve(h > APART * np.median(h), np.ones(2 * AROUND + 1), mode="same") > 0.5
+    off = np.where(pauses, 0.0, d - pace * h)  # across one, a pace says nothing
     changed = np.abs(d[d != 0.0])
     quantum = float(changed.min()) if len(changed) else 0.0
     noise = max(1.4826 * float(np.median(np.abs(off - np.median(off)))), quantum / 2.0)
