@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.models.forces import axes
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.begun import begun, uncertain
@@ -36,7 +37,7 @@ from s2r_runtime.trace.fitting import (
     under_noise,
     without,
 )
-from s2r_runtime.trace.friction import with_friction
+from s2r_runtime.trace.friction import KINDS, with_friction
 from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
 from s2r_runtime.trace.rivals import CLOSE, rivals, simplified
 from s2r_runtime.trace.scores import STRICT, Bar, Scored, at_first_look, best_candidates, limited, name_of, names, rescored, unlimited
@@ -136,8 +137,10 @@ def called_for(
 
 
 def _of_all_axes(given: Problem, nominal: Fit, chosen: Fit | None, tried: int, horizon: int, bar: Bar) -> Fit | None:
-    """What was chosen first, or friction of all axes where that explains more."""
-    both = with_friction(given, nominal)
+    """What was chosen first, or friction of all axes where that explains more. Of one axis, friction that was chosen leads to the rest."""
+    found = [name for name, _ in names(chosen.model)] if chosen is not None else []
+    one = len(axes(nominal.model.nominal)) < 2
+    both = None if one and {*found} & {*KINDS} else with_friction(given, nominal)
     if both is None:
         return chosen
     base = nominal if chosen is None else chosen
