@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError, RecordingError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.residual import Acting, Index, acting, first_steps, rollout
+from s2r_runtime.trace.residual import Acting, Index, acting, first_steps, rms, rollout
 from s2r_runtime.trace.unforetold import shares, some_starts, steps_ahead, unforetold
 
 Array = NDArray[np.float64]
@@ -36,10 +36,13 @@ LAGS_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 
 QUARTER = 0.25
 
-RUNS = 20
+RUNS = 8
 """At most: each has a speed of its own at its start."""
 
 SPEEDS = {"m/s", "rad/s"}
+
+LITTLE = 1e-3
+"""Of an input's size: the change by which slopes are told."""
 
 TURNS = 3
 """Of Gauss-Newton: headings first, then the way along them."""
@@ -69,26 +72,24 @@ def _off(model: ComposedModel, data: Dataset, columns: list[int], lag: float) ->
     """Mean E with these inputs through a lag, s, with the gain and starts of runs that foretell best; infinite where nothing goes."""
     act, starts = acting(model, data), some_starts(data)
     terms = _terms(data, act.mean[:, columns], lag)
-    size = np.maximum(np.std(act.mean[:, columns], axis=0), 1e-300)
     told = np.zeros((len(columns), terms.shape[2]))
     error = _errors(model, data, starts, _with(act, columns, terms, told))
     if error is None:
         return math.inf
-    scale = np.maximum(np.sqrt(np.mean(error**2, axis=0)), 1e-300)  # with no input: how far each state goes
+    scale = np.maximum(rms(error), 1e-300)  # with no input: how far each state goes
+    by = LITTLE * np.std(act.mean[:, columns], axis=0)[:, None] / np.maximum(np.sqrt(np.mean(terms**2, axis=0)), 1e-300)
     for _ in range(TURNS):
         slopes = []
-        for place in np.ndindex(told.shape):
-            by = np.zeros_like(told)
-            by[place] = (
-                1e-3
-                * size[place[0]]
-                / max(float(np.std(terms[:, place[0], place[1]])), float(np.mean(terms[:, place[0], place[1]])), 1e-300)
-            )
-            moved = _errors(model, data, starts, _with(act, columns, terms, told + by))
+        for place in np.argwhere(by > 0.0):
+            more = np.zeros_like(told)
+            more[tuple(place)] = by[tuple(place)]
+            moved = _errors(model, data, starts, _with(act, columns, terms, told + more))
             if moved is None:
                 return math.inf
-            slopes.append(((moved - error) / scale).ravel() / by[place])
-        told = told - np.linalg.lstsq(np.stack(slopes, axis=1), (error / scale).ravel(), rcond=1e-8)[0].reshape(told.shape)
+            slopes.append(((moved - error) / scale).ravel())
+        if not slopes:
+            return math.inf
+        told[by > 0.0] -= by[by > 0.0] * np.linalg.lstsq(np.stack(slopes, axis=1), (error / scale).ravel(), rcond=1e-8)[0]
         error = _errors(model, data, starts, _with(act, columns, terms, told))
         if error is None:
             return math.inf
@@ -98,18 +99,23 @@ def _off(model: ComposedModel, data: Dataset, columns: list[int], lag: float) ->
 
 def _terms(data: Dataset, u: Array, lag: float) -> Array:
     """(M, inputs, 1 + runs): z of each run from rest, and what is left of its start, over each step."""
+    from scipy.linalg import lapack
+
     begin = first_steps(data)
     terms = np.zeros((*u.shape, 1 + len(data.runs)))
     for i, run in enumerate(data.runs):
         here, lasts = slice(begin[i], begin[i + 1]), run.durations(data.dt)
-        keep = np.exp(-lasts / lag) if lag > 0.0 else np.zeros(len(lasts))
-        gains = lasts if math.isinf(lag) else lag * (1.0 - keep)
-        z, left = np.zeros(u.shape[1]), 1.0
-        for k, (asked, a, g) in enumerate(zip(u[here], keep, gains, strict=True)):
-            after = a * z + g * asked
-            terms[begin[i] + k, :, 0] = 0.5 * (z + after) if lag > 0.0 else asked
-            terms[begin[i] + k, :, 1 + i] = 0.5 * (1.0 + a) * left if lag > 0.0 else 1.0
-            z, left = after, a * left
+        if lag == 0.0:
+            terms[here, :, 0], terms[here, :, 1 + i] = u[here], 1.0
+        elif len(lasts):
+            keep = np.exp(-lasts / lag)
+            band = np.ones((2, len(lasts)))
+            band[1, :-1] = -keep[1:]
+            gains = lasts if math.isinf(lag) else lag * (1.0 - keep)
+            after, _ = lapack.dtbtrs(band, gains[:, None] * u[here], uplo="L", diag="U")
+            left = np.append(1.0, np.cumprod(keep))
+            terms[here, :, 0] = 0.5 * (after + np.concatenate([np.zeros((1, u.shape[1])), after[:-1]]))
+            terms[here, :, 1 + i] = 0.5 * (left[1:] + left[:-1])[:, None]
     return terms
 
 
