@@ -3,7 +3,7 @@
 sensor_fault   nothing is missing, but measurements are wrong in places
 none           nothing beyond noise
 unexplained    structure is left that no effect accounts for: nothing was found; or what was found leaves a large part, or has the
-               wrong shape for what it acts on; or is many names for a model that foretells nothing without them; or the model (with it)
+               wrong shape for what it acts on; or exchanges inputs of a model that foretells nothing without that; or the model (with it)
                foretells the held-out data no better than `stays where it is`;
                or with what was found rollouts are worse than without;
                or what is left looks like noise, step by step, and takes rollouts much farther than noise does, or half of the way
@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.about import about_states
 from s2r_runtime.trace.errors import Held, Judged, better, displacement
 from s2r_runtime.trace.fault import Fault
@@ -68,8 +67,8 @@ WORSE = 1.1
 MATTERS = 1.5
 """Times that rollouts are farther off without an effect, in some state, from which on it matters to somebody who drives as was recorded."""
 
-FEW = 2
-"""Names that a model which foretells nothing by itself may have: with more, they are another model, which nobody declared."""
+MIXED = 0.5
+"""Of what an input does in its own place: as much of another input in it is not what crosses over from there, but another model's input."""
 
 MANY = 0.9
 """Share of the rollouts that must go far for that to be no matter of outliers."""
@@ -157,7 +156,7 @@ def verdict_of(
     noise_alone = 0.0 * floors[0] if structure.matters else floors[0]  # what is left was taken for noise, too
     if away or not foretells(after, given, noise_alone) or _withdrawn(chosen.fit, structure, given) or harms(before, after, floor):
         return "unexplained"
-    if _another_model(chosen, before, given):
+    if _another_model(chosen.fit, before, given):
         return "unexplained"
     return "ambiguous" if chosen.rivals else "traced"
 
@@ -171,14 +170,21 @@ def _withdrawn(fit: Fit, structure: Structure, given: Held) -> bool:
     return structure.share > LARGE or bool(kinds & set(structure.tokens))
 
 
-def _another_model(chosen: Selection, before: Judged, given: Held) -> bool:
-    """Whether names stand for the model, and not for what it lacks: wheels' speeds taken for a robot's, a boat for a car. Friction, springs
-    and weights are many things in one machine, and under a force alone hardly anything is foretold: they do not count.
+def _another_model(fit: Fit, before: Judged, given: Held) -> bool:
+    """Whether names stand for the model, and not for what it lacks: the model as given foretells nothing, and by what was named, what acts
+    in the place of an input is another input as much (the speeds of two wheels, taken for those of a body).
     """
-    model = chosen.fit.model
-    acts = [i for i in chosen.fit.added if model.effects[i].effect.stage == "input" or not axes(model.nominal)]
-    share, goes = _off(before, given) if len(acts) > FEW and len(before.ends) else (np.zeros(1), np.zeros(1, dtype=bool))
-    return bool(goes.any() and np.all(share[goes] > FORETELLS))
+    model = fit.model
+    mixed = [model.effects[i].channel for i in fit.added if model.effects[i].effect.name == "input_coupling"]
+    share, goes = _off(before, given) if mixed and len(before.ends) else (np.zeros(1), np.zeros(1, dtype=bool))
+    if not goes.any() or np.any(share[goes] <= FORETELLS):
+        return False
+    asked, acts = (acting(model, given.data, chain).mean for chain in ((), None))
+    asked = asked - asked.mean(axis=0)
+    parts = np.abs(np.linalg.lstsq(asked, acts - acts.mean(axis=0), rcond=None)[0]) * np.std(asked, axis=0)[:, None]  # (asked, acts)
+    own = np.diag(parts)
+    others = np.max(parts - np.diag(own), axis=0)
+    return any(others[j] > MIXED * own[j] for j in map(model.inputs.index, dict.fromkeys(mixed)))
 
 
 def foretells(judged: Judged, given: Held, floor: Array) -> bool:
