@@ -49,6 +49,22 @@ def test_a_blow_that_changes_the_pace_at_once_is_no_jump():
     assert _checked(p).faults == ()
 
 
+@pytest.mark.parametrize("into", [0.0, 0.5, 0.9], ids=["at a row", "between two", "just before one"])
+@pytest.mark.parametrize("after", [-1.0, -0.6, 0.0, 2.0])
+@pytest.mark.parametrize("noise", [1e-9, 1e-6])
+def test_an_end_stop_or_a_blow_on_a_fine_encoder_is_no_spike(noise, after, into):
+    t = 0.01 * (np.arange(1000) - 500 + into)
+    p = np.where(t < 0.0, t, after * t) + noise * np.random.default_rng(2).normal(size=1000)
+    assert _checked(p, 0.01).faults == ()
+
+
+def test_a_spike_beside_a_blow_is_found():
+    t = 0.01 * (np.arange(1000) - 500)
+    p = np.where(t < 0.0, t, 0.0) + 1e-6 * np.random.default_rng(3).normal(size=1000)
+    p[502] += 0.1
+    assert [f.kind for f in _checked(p, 0.01).faults] == ["spike"]
+
+
 def test_a_coarse_encoder_that_creeps_and_stands_is_not_frozen():
     t = 0.001 * np.arange(20_000)
     p = np.round(0.05 * np.sin(0.4 * t) / 1e-3) * 1e-3  # up to fifty rows on one count, much more where it turns

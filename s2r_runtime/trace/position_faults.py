@@ -3,9 +3,12 @@
 A body's position goes on at its pace. With d_k = p_{k+1} - p_k over h_k, and m_k the median pace of the rows around,
 
     off_k = d_k - m_k h_k                       of noise, rounding, and what accelerates the body
-    jump:    |off_k| beyond noise, and beyond what the inputs do, with nothing like it beside: a blow changes the pace, and stays
+    jump:    |off_k| beyond noise, and beyond what the inputs do, with nothing like it beside
     spike:   one that is taken back within a few rows
     frozen:  p repeats exactly, and then makes up for the way that the pace before and after says
+
+A blow, or an end stop, changes the pace from v to w, and m is between them at that row: off is half of (v - w) h before it, and the other
+way after it, as if one row were wrong. So a jump and a spike must be beyond |w - v| h, too.
 """
 
 from __future__ import annotations
@@ -78,7 +81,7 @@ def _of_one(t: Array, p: Array, pushed: Array) -> tuple[Mask, list[int], list[tu
     if len(p) < FEWEST:
         return lost, [], []
     h, d = np.diff(t), np.diff(p)
-    pace = _pace(d / h)
+    pace, blow = _pace(d / h)
     pauses = np.convolve(h > APART * np.median(h), np.ones(2 * AROUND + 1), mode="same") > 0.5
     off = np.where(pauses, 0.0, d - pace * h)  # across one, a pace says nothing
     changed = np.abs(d[d != 0.0])
@@ -97,7 +100,7 @@ def _of_one(t: Array, p: Array, pushed: Array) -> tuple[Mask, list[int], list[tu
             lost[a + 1 : b + 1] = True
             off[max(a - AROUND, 0) : b + 1 + AROUND] = 0.0  # the pace there is told from rows that stand still
             told.append((a, b, "frozen"))
-    jumps, wild = [], [k for k in np.flatnonzero(np.abs(off) > least).tolist() if off[k] != 0.0]
+    jumps, wild = [], np.flatnonzero(np.abs(off) > least + blow * h).tolist()
     if len(wild) > max(RARE * len(p), 3.0):
         return lost, [], told
     while wild:
@@ -113,11 +116,15 @@ def _of_one(t: Array, p: Array, pushed: Array) -> tuple[Mask, list[int], list[tu
     return lost, jumps, told
 
 
-def _pace(v: Array) -> Array:
-    """(n,) median of the rows around each, itself left out."""
+def _pace(v: Array) -> tuple[Array, Array]:
+    """(n,) median of the rows around each, itself left out, and by how much that of the rows after differs from that of those before; 0
+    where there are none on one side.
+    """
     padded = np.concatenate([np.full(AROUND, np.nan), v, np.full(AROUND, np.nan)])
-    near = np.lib.stride_tricks.sliding_window_view(padded, 2 * AROUND + 1)
-    return np.asarray(np.nanmedian(np.delete(near, AROUND, axis=1), axis=1))
+    near = np.delete(np.lib.stride_tricks.sliding_window_view(padded, 2 * AROUND + 1), AROUND, axis=1)
+    blow = np.zeros(len(v))
+    blow[1:-1] = np.abs(np.nanmedian(near[1:-1, AROUND:], axis=1) - np.nanmedian(near[1:-1, :AROUND], axis=1))
+    return np.asarray(np.nanmedian(near, axis=1)), blow
 
 
 def _repeats(d: Array) -> list[tuple[int, int]]:
