@@ -17,7 +17,7 @@ from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import held
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
 from s2r_runtime.trace.hidden_pairs import two_together
-from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.residual import Acting, steps_of, wherever
 from s2r_runtime.trace.scores import names
 from s2r_runtime.trace.selection import Selection
 from s2r_runtime.trace.tracer import trace, usual_horizon
@@ -321,3 +321,13 @@ def test_a_reaction_that_runs_away_under_other_values_ends_no_trace(tmp_path, se
             x = robot.nominal.step(x, u[k : k + 1], 0.005, robot.parameters)
     found = trace(from_arrays(model, [(np.array(states) + rng.normal(size=(rows + 1, 2)) * [0.002, 0.15], u)]), model)
     assert {(e.name, e.channel) for e in found.effects} <= {("parameter_change", "UA")}
+
+
+def test_a_rollout_from_nowhere_goes_nowhere_whatever_a_model_says_to_no_rows(tmp_path):
+    path = tmp_path / "picky.py"
+    path.write_text(
+        'STATES, INPUTS, PARAMS = ("h",), ("q",), {}\n\ndef step(x, u, dt, params):\n    assert len(x)\n    return x + dt * u\n'
+    )
+    model = compose(ModelSpec(str(path), 0.1))
+    act = Acting(np.zeros((5, 1)), np.zeros((5, 1)))
+    assert wherever(model, np.zeros((0, 1)), act, np.arange(0)).shape == (0, 1)

@@ -168,7 +168,7 @@ def wherever(model: ComposedModel, x: Array, act: Acting, place: Index | slice) 
     try:
         return advanced(model, x, act, place)
     except ConfigError:
-        if len(x) == 1:
+        if len(x) <= 1:
             return x
         place, half = np.arange(len(act.end))[place], len(x) // 2
         return np.concatenate([wherever(model, x[part], act, place[part]) for part in (slice(half), slice(half, None))])
