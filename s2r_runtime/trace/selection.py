@@ -244,13 +244,24 @@ def _beyond_rounding(given: Problem, fit: Fit, base: Fit) -> bool:
 
 
 def _happens(given: Problem, fit: Fit) -> bool:
-    """False for what changes at one time, if hardly any steps lie before it, or after it: that is no change."""
+    """False for what changes at one time, if hardly any steps lie before it, or after it, or if it may as well have been so from the
+    beginning: that is no change. A robot that stands at first has a gain, and not another one from when it begins to move.
+    """
     for slot, value in zip(fit.free, values_of(fit.model, fit.free).tolist(), strict=True):
         if sought(fit.model, slot) and bounds_of(fit.model, slot).unit == "s":
             before = float(np.mean(given.steps.t < value))
-            if not EDGE < before < 1.0 - EDGE:
+            if not EDGE < before < 1.0 - EDGE or _always(given, fit, slot):
                 return False
     return True
+
+
+def _always(given: Problem, fit: Fit, slot: Slot) -> bool:
+    """Whether something explains as much that begins before the recording does. slot: of its time."""
+    begin = max(bounds_of(fit.model, slot).low, float(given.steps.t[0]) - given.data.dt)
+    model = with_values(fit.model, (slot,), np.array([begin]))
+    if model is None or foretold(given, model) is None:
+        return False
+    return under_noise(given, model, fit.noise).white > float(np.sum(noises.log_density(fit.z))) - fit.whiten.logdet - CLOSE
 
 
 def significant(given: Problem, fit: Fit, base: Fit, tried: int, bar: Bar = STRICT, ahead: float = 0.0) -> bool:
