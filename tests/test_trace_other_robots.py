@@ -19,16 +19,16 @@ def _held(rng, size, steps=15):
     return np.repeat(rng.uniform(-1.0, 1.0, size=(ROWS // steps, 2)) * size, steps, axis=0)
 
 
-def _driven(rng, u, speeds):
-    """Where a robot gets to whose speed ahead, to the left and turning are speeds(u, those before, s)."""
+def _driven(rng, u, speeds, asked=None):
+    """Where a robot gets to whose speed ahead, to the left and turning are speeds(u, those before, s). asked: as recorded, if not u."""
     x, now, dt = np.zeros((len(u) + 1, 3)), np.zeros(3), DT / FINE
-    for k, asked in enumerate(u):
+    for k, now_asked in enumerate(u):
         x[k + 1] = x[k]
         for _ in range(FINE):
-            now = speeds(asked, now, dt)
+            now = speeds(now_asked, now, dt)
             c, s = np.cos(x[k + 1, 2]), np.sin(x[k + 1, 2])
             x[k + 1] += dt * np.array([c * now[0] - s * now[1], s * now[0] + c * now[1], now[2]])
-    return from_arrays(UNICYCLE, [(x + NOISE * rng.normal(size=x.shape), u)])
+    return from_arrays(UNICYCLE, [(x + NOISE * rng.normal(size=x.shape), u if asked is None else asked)])
 
 
 def _lags(*time_constants):
@@ -77,3 +77,19 @@ def test_what_an_input_does_instead_is_asked_of_the_input_and_not_of_what_is_lef
     found = trace(_driven(rng, _held(rng, [1.0, 1.0]), lambda u, now, dt: np.array([u[0], u[1], 0.0])), UNICYCLE)
     assert found.verdict == "unexplained"
     assert not found.effects
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("late", [8, 16])
+def test_a_robot_that_answers_late_and_weakly_by_both_inputs_gets_all_its_names(late, seed):
+    """As given, the model foretells nothing: the robot is elsewhere by more than it goes."""
+    rng = np.random.default_rng([52, seed])
+    u = _held(rng, [1.0, 1.0], 45)
+    acts = np.concatenate([np.zeros((late, 2)), u[:-late]]) * [0.3, 0.4]
+    found = trace(_driven(rng, acts, lambda u, now, dt: np.array([u[0], 0.0, u[1]]), asked=u), UNICYCLE)
+    told = {(e.name, e.channel): e.parameters for e in found.effects}
+    assert found.verdict in {"traced", "ambiguous"}
+    delays = [p["delay"][0] for (name, _), p in told.items() if name == "input_delay"]  # one of both, or one of each
+    assert delays
+    assert delays == pytest.approx([late * DT] * len(delays), abs=0.01)
+    assert [told["input_gain", name]["gain"][0] for name in ("v", "w")] == pytest.approx([0.3, 0.4], abs=0.005)

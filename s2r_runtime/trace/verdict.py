@@ -3,8 +3,8 @@
 sensor_fault   nothing is missing, but measurements are wrong in places
 none           nothing beyond noise
 unexplained    structure is left that no effect accounts for: nothing was found; or what was found leaves a large part, or has the
-               wrong shape for what it acts on; or exchanges inputs of a model that foretells nothing without that; or the model (with it)
-               foretells the held-out data no better than `stays where it is`;
+               wrong shape for what it acts on; or exchanges inputs of a model that foretells nothing without that, or silences one; or
+               the model (with it) foretells the held-out data no better than `stays where it is`;
                or with what was found rollouts are worse than without;
                or what is left looks like noise, step by step, and takes rollouts much farther than noise does, or half of the way
 ambiguous      rivals explain as much
@@ -69,6 +69,9 @@ MATTERS = 1.5
 
 MIXED = 0.5
 """Of what an input does in its own place: as much of another input in it is not what crosses over from there, but another model's input."""
+
+SILENT = 0.05
+"""Of what is asked of an input: if less is left of it, effects have silenced it."""
 
 MANY = 0.9
 """Share of the rollouts that must go far for that to be no matter of outliers."""
@@ -156,7 +159,7 @@ def verdict_of(
     noise_alone = 0.0 * floors[0] if structure.matters else floors[0]  # what is left was taken for noise, too
     if away or not foretells(after, given, noise_alone) or _withdrawn(chosen.fit, structure, given) or harms(before, after, floor):
         return "unexplained"
-    if _another_model(chosen.fit, before, given):
+    if _another_model(chosen.fit, before, given) or _silenced(chosen.fit, after, given):
         return "unexplained"
     return "ambiguous" if chosen.rivals else "traced"
 
@@ -179,12 +182,26 @@ def _another_model(fit: Fit, before: Judged, given: Held) -> bool:
     share, goes = _off(before, given) if mixed and len(before.ends) else (np.zeros(1), np.zeros(1, dtype=bool))
     if not goes.any() or np.any(share[goes] <= FORETELLS):
         return False
-    asked, acts = (acting(model, given.data, chain).mean for chain in ((), None))
-    asked = asked - asked.mean(axis=0)
-    parts = np.abs(np.linalg.lstsq(asked, acts - acts.mean(axis=0), rcond=None)[0]) * np.std(asked, axis=0)[:, None]  # (asked, acts)
+    asked, acts = _asked_and_acting(fit, given)
+    parts = np.abs(np.linalg.lstsq(asked, acts, rcond=None)[0]) * np.std(asked, axis=0)[:, None]  # (asked, acts)
     own = np.diag(parts)
     others = np.max(parts - np.diag(own), axis=0)
     return any(others[j] > MIXED * own[j] for j in map(model.inputs.index, dict.fromkeys(mixed)))
+
+
+def _silenced(fit: Fit, after: Judged, given: Held) -> bool:
+    """Whether names leave nothing of an input while the robot goes where no model foretells: it does something else by that input."""
+    if not any(fit.model.effects[i].effect.stage == "input" for i in fit.added) or not len(after.ends):
+        return False
+    asked, acts = (np.std(u, axis=0) for u in _asked_and_acting(fit, given))
+    share, goes = _off(after, given)
+    return bool(np.any((asked > 0.0) & (acts < SILENT * asked)) and np.any(share[goes] >= NEARER))
+
+
+def _asked_and_acting(fit: Fit, given: Held) -> tuple[Array, Array]:
+    """(M, nu) inputs before and after what acts on them, less their means."""
+    asked, acts = (acting(fit.model, given.data, chain).mean for chain in ((), None))
+    return asked - asked.mean(axis=0), acts - acts.mean(axis=0)
 
 
 def foretells(judged: Judged, given: Held, floor: Array) -> bool:
