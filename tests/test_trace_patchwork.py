@@ -8,7 +8,7 @@ import pytest
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.about import about, about_states, carried
+from s2r_runtime.trace.about import about, about_states, carried, only_pushes
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.faults import Checked
 from s2r_runtime.trace.fitting import fitted, gain, insert
@@ -158,3 +158,17 @@ def test_slip_and_a_bias_of_the_steering_are_no_patchwork_of_the_speed():
     named, of_speed = gain(fit, whole.nominal), "speed_cmd"
     assert all(gain(_named(whole, a), whole.nominal) < MOSTLY * named for a in [fit.model.effects[p] for p in fit.added])
     assert not patchwork(whole.given, fit, whole.nominal, replace(whole.unnamed, token=of_speed, gain=named))
+
+
+def test_a_steady_push_is_part_of_no_patchwork_although_the_square_of_a_two_valued_command_is_one():
+    rng = np.random.default_rng(6)
+    asked = np.repeat(rng.choice([-1.0, 1.0], (40, 2)), 15, axis=0)
+    speeds = np.cumsum(np.concatenate([np.zeros((1, 2)), DT * (asked * [1.0, 0.8] + [0.1, 0.0])]), axis=0)
+    places = np.cumsum(np.concatenate([np.zeros((1, 2)), 0.5 * DT * (speeds[1:] + speeds[:-1])]), axis=0)
+    y = np.column_stack([places, speeds]) + rng.normal(size=(601, 4)) * [0.001, 0.001, 0.004, 0.004]
+    model = compose(ModelSpec("double_integrator", DT))
+    whole = Whole(Checked(from_arrays(model, [(y, asked)]), (), (), 0), model, 20)
+    fit = _named(whole, _effect("input_gain", "ay", {"gain": 0.8}), _effect("input_bias", "ax", {"bias": 0.1}))
+    as_much = replace(whole.unnamed, token="ay", gain=AS_MUCH * gain(fit, whole.nominal))
+    assert only_pushes(fit.model, 1, whole.given.data, whole.given.steps)
+    assert not patchwork(whole.given, fit, whole.nominal, as_much)

@@ -53,6 +53,13 @@ def about_states(model: ComposedModel, places: tuple[int, ...], data: Dataset, s
     return MOTION & set().union(*(_tried(model, place, data, steps, of_states=True) for place in plant))
 
 
+def only_pushes(model: ComposedModel, place: int, data: Dataset, steps: Steps) -> bool:
+    """Whether what an effect does, seen from the robot, is the same in every step of a recording, whatever it is about."""
+    pair = (model, without(model, place))
+    done = _done(pair, steps.y0, [acting(m, data).at(steps.place) for m in pair])
+    return bool(np.all(np.std(done, axis=0) <= VARIES * rms(done)))
+
+
 def _filters(model: ComposedModel, place: int) -> bool:
     """Whether an effect changes what is commanded; some that do may also act on a speed."""
     a = model.effects[place]

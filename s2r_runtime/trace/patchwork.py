@@ -9,14 +9,14 @@ What tells: it depends on one thing, and a dictionary of that (`lack_of_fit_term
 The dictionary's gain is that on blocks which its numbers never saw, that of the names on what they were fitted to. Two effects that are
 there give two dependences, of which one dictionary has one; where both are about the same (dry friction and drag, about the speed; wheels
 that slip and a bias of the steering, which turns a car the more, the faster it goes), one dictionary has both, and that says nothing
-against them.
+against them. Nor does it say anything against a steady push, if what is commanded has two values: the square of that is one, too.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from s2r_runtime.trace.about import about, carried
+from s2r_runtime.trace.about import about, carried, only_pushes
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, without
 from s2r_runtime.trace.lack_of_fit_judged import Judged
 
@@ -38,7 +38,8 @@ def patchwork(given: Problem, fit: Fit, nominal: Fit, unnamed: Judged) -> bool:
         return False
     atoms = set(unnamed.token.split("*"))
     seen = atoms | {atom.removeprefix("memory(").removesuffix(")") for atom in atoms}  # what an input was has in it what it is
-    each = [(about(fit.model, place, given.data, given.steps), place) for place in fit.added]
+    varied = [place for place in fit.added if not only_pushes(fit.model, place, given.data, given.steps)]
+    each = [(about(fit.model, place, given.data, given.steps), place) for place in varied]
     if all(atoms <= one or one <= seen or atoms <= one | carried(fit.model, place, given.data, given.steps) for one, place in each):
         return False
     return all(gain(alone, nominal) <= MOSTLY * named for alone in _each_alone(given, fit))
