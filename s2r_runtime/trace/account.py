@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.trace.found import Found
 from s2r_runtime.trace.residual import rms
-from s2r_runtime.trace.shape import Shape, components, derived, strongest, variables
+from s2r_runtime.trace.shape import Component, Shape, components, derived, strongest, variables
 
 if TYPE_CHECKING:
     from s2r_runtime.trace.result import TraceResult
@@ -125,19 +125,28 @@ def _left_over(r: TraceResult) -> list[str]:
         parts = components(r.nominal, r.held, r.before.one_step, r.after.one_step, 0.0 * r.floor[0])
         told = [v for v in over if v.token in r.depends_on]
         shapes = [s for s in strongest(parts, told, inputs) if s.share > SEEN and s.variable is not None] if told else []
-        return [*(f"{s.component.said}: {_percent(s.share)} of it, noise included, {s.said}" for s in shapes[:2]), *away] or ["structure"]
-    parts = components(r.nominal, r.held, r.before.one_step, r.after.one_step, r.floor[0])
-    loud = [p for p in parts if float(rms(p.before)) > TOLD * p.floor]
+        said = [f"{s.component.said}: {_percent(s.share)} of it, noise included, {s.said}" for s in shapes[:2]]
+        hidden = ["structure, which the transitions that were held out do not show"]
+        return [*said, *away] or [_louder(part) for part in _loud(r)] or hidden
+    loud = _loud(r)
     shapes = strongest(loud, over, inputs)
     return [*(_told(s) for s in shapes[:3]), *away] if loud else [f"nothing beyond noise in one step{'; ' if away else ''}{''.join(away)}"]
 
 
+def _loud(r: TraceResult) -> list[Component]:
+    """Parts of the residual of one step that are beyond the noise on what was held out."""
+    parts = components(r.nominal, r.held, r.before.one_step, r.after.one_step, r.floor[0])
+    return [p for p in parts if float(rms(p.before)) > TOLD * p.floor]
+
+
 def _told(shape: Shape) -> str:
     """One line about a part of the residual and what it follows."""
-    part = shape.component
-    ratio = float(rms(part.before)) / max(part.floor, 1e-300)
     follows = f"{_percent(shape.share)} of that {shape.said}" if shape.share > FOLLOWED else "it follows no single variable"
-    return f"{part.said}: {ratio:.3g} x the noise in one step; {follows}"
+    return f"{_louder(shape.component)}; {follows}"
+
+
+def _louder(part: Component) -> str:
+    return f"{part.said}: {float(rms(part.before)) / max(part.floor, 1e-300):.3g} x the noise in one step"
 
 
 def _percent(share: float) -> str:

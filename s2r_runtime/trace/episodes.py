@@ -6,17 +6,18 @@ from other times (`lack_of_fit_judged`) cannot. So windows [a, b) are looked for
 
     r = sum_w beta_w 1[a_w <= k < b_w] d_w + noise          d: a push in some direction, or what an input pushes
 
-or all those together in which values stay wild, with one beta (commands that are lost now and then: `_lost`). They count if the log
-likelihood, noise and colour re-estimated, is beyond that of coloured noise alone by the price of having looked everywhere,
-log(windows x directions) + 1/2 log n for each (the price of a change at an unknown time: N. Zhang, D. Siegmund, Biometrics 63, 2007), and
-by BEYOND, and beyond the evidence for a push in the same directions that wanders: waves of all lengths, their amplitudes falling as their
-frequency grows, as an Ornstein-Uhlenbeck process has them.
+or all those together in which values stay wild, with one beta (commands that are lost now and then: `_lost`), or each of these with its own
+(an actuator that sticks, now here, now there: `_each`). They count if the log likelihood, noise and colour re-estimated, is beyond that of
+coloured noise alone by the price of having looked everywhere, log(windows x directions) + 1/2 log n for each (the price of a change at an
+unknown time: N. Zhang, D. Siegmund, Biometrics 63, 2007), and by BEYOND, and beyond the evidence for a push in the same directions that
+wanders: waves of all lengths, their amplitudes falling as their frequency grows, as an Ornstein-Uhlenbeck process has them.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,8 +39,8 @@ EDGES = 48
 SHORTEST = 4
 """Steps of a window at least: less is an outlier."""
 
-MOST = 6
-"""Windows."""
+MOST, MOST_WILD = 6, 12
+"""Windows; and of those in which values stay wild."""
 
 PASSES = 3
 """Of waves and noise in turn."""
@@ -65,9 +66,11 @@ def episodes(left: Left) -> Judged | None:
     price = math.log(0.5 * n**2 * max(len(pushes), 1)) + 0.5 * math.log(n)
     bare = max(fit.coloured, fit.white)
     best: Judged | None = None
-    lost = _lost(left, pushes)
+    wild = _staying_wild(left)
+    lost, each = _lost(wild, pushes), _each(left, wild, pushes)
     if lost:
-        best, _, _ = _better(left, fit.whiten, lost, bare + price * max(lost[0][2], len(lost)), None)
+        best, _, _ = _better(left, fit.whiten, lost, bare + price * max(len(wild), len(lost)), None)
+        best, _, _ = _better(left, fit.whiten, each, bare + price * len(each), best)
     found: list[Window] = []
     whiten, rest = fit.whiten, left.r
     while pushes and len(found) < MOST:
@@ -94,9 +97,9 @@ def _better(left: Left, whiten: Whitener, found: list[Window], least: float, bes
     return best, rest, whiten
 
 
-def _lost(left: Left, pushes: list[tuple[str, Array]]) -> list[Window]:
-    """(token, (n, nx) push, how many) where some state is wild for SHORTEST steps on end, the same share of a push wherever that is:
-    commands that are lost now and then. A measurement that is off is wild for two steps. (Whitened, all that follows a jump is wild.)
+def _staying_wild(left: Left) -> list[slice]:
+    """Steps where some state is wild for SHORTEST steps on end; a measurement that is off is wild for two. (Whitened, all that follows a
+    jump is wild.)
     """
     usual = np.maximum(np.median(np.abs(left.r), axis=0) / 0.6745, left.given.floor.one_step(left.f))
     wild = np.abs(left.r) > noises.OUTLIER * usual
@@ -106,9 +109,42 @@ def _lost(left: Left, pushes: list[tuple[str, Array]]) -> list[Window]:
     inside: Mask = np.zeros(n, dtype=bool)
     for k in range(SHORTEST):
         inside[k : n - SHORTEST + 1 + k] |= begun
-    count = float(np.count_nonzero(inside & ~(joined & np.append(False, inside[:-1]))))
-    windows = [(token, np.where(inside[:, None], push, 0.0), count) for token, push in pushes]
-    return [w for w in windows if np.any(w[1])] if count else []
+    begins = np.flatnonzero(inside & ~(joined & np.append(False, inside[:-1])))
+    ends = [int(np.argmin(np.append(inside[a:b], False))) + a for a, b in pairwise([*begins.tolist(), n])]
+    return [slice(a, b) for a, b in zip(begins.tolist(), ends, strict=True)]
+
+
+def _lost(wild: list[slice], pushes: list[tuple[str, Array]]) -> list[Window]:
+    """(token, (n, nx) push, how many) where values stay wild, the same share of a push wherever that is: commands lost now and then."""
+    windows = [(token, _within(wild, push), float(len(wild))) for token, push in pushes]
+    return [w for w in windows if np.any(w[1])]
+
+
+def _each(left: Left, wild: list[slice], pushes: list[tuple[str, Array]]) -> list[Window]:
+    """(token, (n, nx) push, nats) of the push that explains most of it where values stay wild, each time another share: an actuator that
+    sticks, now here, now there.
+    """
+    z = left.fit.whiten(left.r)
+    found = []
+    for where in wild:
+        there = [(token, _within([where], push)) for token, push in pushes]
+        told = [
+            (float(np.sum(x * z)) ** 2 / max(2.0 * float(np.sum(x * x)), 1e-300), i)
+            for i, (_, p) in enumerate(there)
+            if np.any(x := left.fit.whiten(p))
+        ]
+        if told:
+            nats, i = max(told)
+            found.append((*there[i], nats))
+    return sorted(found, key=lambda window: -window[2])[:MOST_WILD]
+
+
+def _within(where: list[slice], push: Array) -> Array:
+    """(n, nx) a push in some steps only."""
+    inside = np.zeros((len(push), 1), dtype=bool)
+    for steps in where:
+        inside[steps] = True
+    return np.where(inside, push, 0.0)
 
 
 def _most_of(found: list[Window], explained: Array) -> str:
