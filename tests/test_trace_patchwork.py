@@ -169,6 +169,7 @@ def test_a_steady_push_is_part_of_no_patchwork_although_the_square_of_a_two_valu
     model = compose(ModelSpec("double_integrator", DT))
     whole = Whole(Checked(from_arrays(model, [(y, asked)]), (), (), 0), model, 20)
     fit = _named(whole, _effect("input_gain", "ay", {"gain": 0.8}), _effect("input_bias", "ax", {"bias": 0.1}))
-    as_much = replace(whole.unnamed, token="ay", gain=AS_MUCH * gain(fit, whole.nominal))
+    of_input = "ay"
+    as_much = replace(whole.unnamed, token=of_input, gain=AS_MUCH * gain(fit, whole.nominal))
     assert only_pushes(fit.model, 1, whole.given.data, whole.given.steps)
     assert not patchwork(whole.given, fit, whole.nominal, as_much)
