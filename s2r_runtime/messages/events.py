@@ -1,0 +1,244 @@
+"""Events: into the core, in the order in which they are logged."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from s2r_runtime.messages.link import Command, Observation, Source, Struct
+from s2r_runtime.messages.memory import Memory, Settings
+from s2r_runtime.messages.results import CertificateFacts, Gap, Verification
+
+
+class Started(Struct, frozen=True, tag="started"):
+    """First event of every run; a restored memory is that of the same robot and schema, or there is none."""
+
+    t_ns: int
+    unix_s: int
+    settings: Settings
+    memory: Memory
+
+
+class Observed(Struct, frozen=True, tag="observed"):
+    """The robot was heard. `t_ns`: when the frame arrived (the host's clock); in lockstep the robot's own stamp."""
+
+    t_ns: int
+    observation: Observation
+
+
+class Proposed(Struct, frozen=True, tag="proposed"):
+    """A source answers an `Ask` (or an outsider commands unasked: source `external`, which is never allowed)."""
+
+    t_ns: int
+    command: Command
+
+
+class Ticked(Struct, frozen=True, tag="ticked"):
+    """Time passed. At least every 20 ms in real time, also when nothing else happens."""
+
+    t_ns: int
+
+
+class WallClockRead(Struct, frozen=True, tag="wall_clock_read"):
+    """The time of day, for expiry alone: read about once a second. unix_s: s since 1970, UTC."""
+
+    t_ns: int
+    unix_s: int
+
+
+class LinkChanged(Struct, frozen=True, tag="link_changed"):
+    """A transport found its robot (`up`), or lost it, with the reason in `detail`. A robot that started anew: down, then up."""
+
+    t_ns: int
+    up: bool
+    detail: str = ""
+
+
+class RecorderChanged(Struct, frozen=True, tag="recorder_changed"):
+    """The recorder failed (disk full, thread dead) or works again."""
+
+    t_ns: int
+    ok: bool
+    detail: str = ""
+
+
+class AnalyticsChanged(Struct, frozen=True, tag="analytics_changed"):
+    """The process that measures while a controller drives died (or hung), or is there again. Unwatched, nobody drives: the gate
+    closes with the reason `analytics_down`. Up after start unless this says otherwise.
+    """
+
+    t_ns: int
+    up: bool
+    detail: str = ""
+
+
+class Stopping(Struct, frozen=True, tag="stopping"):
+    """Last event of an orderly run: sources are stopped, the recovery command goes out, the memory is persisted."""
+
+    t_ns: int
+    detail: str = ""
+
+
+class OverrideChanged(Struct, frozen=True, tag="override_changed"):
+    """A transport's emergency stop or manual override signal (latches until cleared)."""
+
+    t_ns: int
+    kind: Literal["emergency_stop", "manual_override"]
+    detail: str = ""
+
+
+class Measured(Struct, frozen=True, tag="measured"):
+    """One discrepancy of the stream, from analytics: of the transition that ended with observation `obs_seq`.
+
+    `fault`: the measurement-fault rule that rejected it (then it does not count), or empty. `e_value`: the watch's, after it; `change`: of
+    its detector of changes; `exchange`: its evidence that the discrepancies are not exchangeable.
+    """
+
+    t_ns: int
+    obs_seq: int
+    discrepancy: float
+    fault: str
+    e_value: float
+    n: int
+    exceedances: int
+    epoch: int = 0
+    """Of the gap it was measured against; one of another epoch than that in force is ignored (0: not said)."""
+    change: float = 0.0
+    exchange: float = 1.0
+
+
+class SourceStarted(Struct, frozen=True, tag="source_started"):
+    """A source runs and can be asked. `digest`: of what really runs (controller), or of the campaign's settings."""
+
+    t_ns: int
+    source: Source
+    digest: str
+
+
+class SourceStopped(Struct, frozen=True, tag="source_stopped"):
+    """A source is gone. `reason`: finished, raised, died, deadline, malformed, stopped, start_failed."""
+
+    t_ns: int
+    source: Source
+    reason: Literal["finished", "raised", "died", "deadline", "malformed", "stopped", "start_failed"]
+    detail: str = ""
+
+
+class SampleTaken(Struct, frozen=True, tag="sample_taken"):
+    """One independent transition of a campaign (guarantee G1). x0, x1: (nx,), one period apart; u: (nu,), held from x0 on.
+
+    `held`: (nx,), the state after `periods` held periods, or empty if the campaign holds for one period only. `obs_seq0`,
+    `t0_ns`: of the observation that x0 was; the robot's numbers, so that an auditor finds the raw frame. `again`: logged once more
+    when an interrupted campaign goes on in a new log, so that the log holds all of them; its frames are in the earlier one.
+    """
+
+    t_ns: int
+    epoch: int
+    index: int
+    obs_seq0: int
+    t0_ns: int
+    u: tuple[float, ...]
+    x0: tuple[float, ...]
+    x1: tuple[float, ...]
+    held: tuple[float, ...]
+    periods: int
+    before: tuple[float, ...] = ()
+    """(nx,), observed one period before x0, while the robot stood still: the two differ by measurement noise alone."""
+    again: bool = False
+
+
+class CampaignFinished(Struct, frozen=True, tag="campaign_finished"):
+    """`complete` iff all samples that were fixed beforehand are there. Stopping early costs the epoch but founds no gap."""
+
+    t_ns: int
+    epoch: int
+    n: int
+    complete: bool
+    rejected: dict[str, int]
+    detail: str = ""
+
+
+class InputsFinished(Struct, frozen=True, tag="inputs_finished"):
+    """Given inputs were driven, `n` rows of them; `complete` iff that is all. They were chosen, so they found no gap."""
+
+    t_ns: int
+    digest: str
+    n: int
+    complete: bool
+    detail: str = ""
+
+
+class JobFinished(Struct, frozen=True, tag="job_finished"):
+    """A worker's result: exactly one of gap, verification, trace is there unless `error` is not empty. trace: docs/log-format.md."""
+
+    t_ns: int
+    job_id: int
+    kind: Literal["gap", "verify", "trace"]
+    gap: Gap | None = None
+    verification: Verification | None = None
+    trace: dict[str, object] | None = None
+    error: str = ""
+    safety: dict[str, list[float]] = {}
+    """verify: the safety value of every scenario, by law (for the report; the audit recomputes them)."""
+
+
+class EpisodeEnded(Struct, frozen=True, tag="episode_ended"):
+    """The driving controller finished a scenario of its task (the core counts it). safety, progress: as the task measures them."""
+
+    t_ns: int
+    index: int
+    steps: int
+    safety: float
+    progress: float
+    detail: str = ""
+
+
+class CertificateStored(Struct, frozen=True, tag="certificate_stored"):
+    """A certificate was signed or loaded, its signature verified against a trusted key, and it is durable in the log.
+
+    `gap`: the gap it rests on, present when it was loaded from a file rather than issued by this daemon.
+    """
+
+    t_ns: int
+    facts: CertificateFacts
+    gap: Gap | None = None
+    request_id: int = 0
+
+
+class CertificateFailed(Struct, frozen=True, tag="certificate_failed"):
+    """An `IssueCertificate` came to nothing (no key, or it could not be made durable), or a loaded certificate was refused."""
+
+    t_ns: int
+    error: str
+    request_id: int = 0
+
+
+class CertificatesDistrusted(Struct, frozen=True, tag="certificates_distrusted"):
+    """Certificates (by id) that are not believed any more: their key was revoked or is not trusted now, or their file was changed."""
+
+    t_ns: int
+    reasons: dict[str, str]
+
+
+class Requested(Struct, frozen=True, tag="requested"):
+    """An operator's decision, from the control socket. `by`: user id of the peer. Unused fields are at their defaults.
+
+    deploy: `digest` of the controller that was loaded for it. adopt: `digest` of the model. revoke: `text` a certificate
+    id, or empty for all. clear: `text` the reason. permit: `duration_s`. sample: `count` (0: the profile's). excite: `digest` of the
+    inputs, `count` their rows. trace: `text` a stretch (empty: campaign).
+    """
+
+    t_ns: int
+    request_id: int
+    verb: Literal["deploy", "undeploy", "revoke", "adopt", "clear", "stop", "permit", "sample", "cancel", "trace", "verify", "excite"]
+    by: int
+    digest: str = ""
+    text: str = ""
+    duration_s: float = 0.0
+    count: int = 0
+
+
+Event = (
+    Started | Observed | Proposed | Ticked | WallClockRead | LinkChanged | RecorderChanged | AnalyticsChanged | OverrideChanged | Measured
+    | EpisodeEnded | SourceStarted | SourceStopped | SampleTaken | CampaignFinished | InputsFinished | JobFinished | CertificateStored
+    | CertificateFailed | CertificatesDistrusted | Requested | Stopping
+)  # fmt: skip

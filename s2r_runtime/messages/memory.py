@@ -1,0 +1,130 @@
+"""What the core is told at its start: the profile's settings, and the memory that outlives a restart."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from s2r_runtime.messages.link import Struct
+from s2r_runtime.messages.results import CertificateFacts, Gap
+
+Stretch = Literal["campaign", "drive", "inputs"]
+"""What a trace is made on: the newest campaign; what controllers drove since its gap came into force; the newest drive of given inputs."""
+
+
+class Settings(Struct, frozen=True):
+    """What the profile fixes for the core. Bounds: (lower, upper) a state or input; angles are wrapped and unbounded."""
+
+    robot: str
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    angles: tuple[str, ...]
+    dt_ns: int
+    lockstep: bool
+    region: tuple[tuple[float, float], ...]
+    geofence: tuple[tuple[float, float], ...]
+    input_bounds: tuple[tuple[float, float], ...]
+    observation_timeout_ns: int
+    command_ttl_ns: int
+    hysteresis_ns: int
+    settle_periods: int
+    latching: tuple[str, ...]
+    recovery: Literal["stop", "hold", "return"]
+    recovery_input: tuple[float, ...]
+    home: tuple[float, ...]
+    model_name: str
+    model_digest: str
+    task_digest: str
+    profile_digest: str
+    epsilon: float
+    beta: float
+    discard: int
+    campaign_n: int
+    headroom: float
+    alpha: float
+    max_measurement_faults: int
+    certificate_lifetime_s: int
+    seed: int
+    campaign_timeout_s: float = 0.0
+    trace_after_campaign: bool = False
+    trace_after_inputs: bool = False
+    trace_on_growth: bool = False
+    trace_delay_ns: int = 10_000_000_000
+    """How long is driven on, after the gap grew, before that is traced."""
+    trace_rows: int = 40_000
+    """Observations that a trace is made on at most, the newest."""
+    adopt: Literal["ask", "always"] = "ask"
+    """Whose decision it is to use a proposed model: a person's, or the profile's."""
+    required_laws: tuple[str, ...] = ()
+    """Disturbance laws that must pass (guarantee G8); empty: not said, the verification's own word counts."""
+    campaign_digest: str = ""
+    """Of what a gap rests on besides the model: region, inputs, norm, sampling, guarantee. Another one voids the gap."""
+    run_length: float = 1e5
+    """Discrepancies between two false notices of change, at least, on average (guarantee G5)."""
+    norm_set: Literal["", "ball", "box"] = ""
+    norm_weights: tuple[float, ...] = ()
+    """The norm that every gap here is measured in: its set, and a weight for each state; empty: not said."""
+
+
+MEMORY_SCHEMA = 1
+"""Of `Memory`: a memory of another schema is refused."""
+
+
+class WatchStood(Struct, frozen=True):
+    """Where the watch of an epoch stands: what goes on after a restart. counts: of discrepancies by bin (`core.stream`)."""
+
+    n: int = 0
+    exceedances: int = 0
+    e_value: float = 1.0
+    change: float = 0.0
+    exchange: float = 1.0
+    counts: tuple[int, ...] = ()
+
+
+class Proposal(Struct, frozen=True):
+    """A repaired model that tracing proposes. `digest`: its; `base`: of the model in whose residual the effects were found.
+
+    `stretch`, `epoch`: what it was traced on; `effects`: in words.
+    """
+
+    digest: str
+    base: str
+    stretch: Stretch
+    epoch: int
+    effects: tuple[str, ...] = ()
+
+
+class Memory(Struct, frozen=True):
+    """What outlives a restart: counters, the gap in force, the grown radius, certificates and revocations."""
+
+    robot: str
+    schema: int
+    epochs: int = 0
+    attempts: int = 0
+    model_digest: str = ""
+    gap: Gap | None = None
+    radius: float = 0.0
+    certificates: tuple[CertificateFacts, ...] = ()
+    revoked: dict[str, str] = {}
+    latched: tuple[str, ...] = ()
+    campaign_epoch: int = 0
+    """Epoch of a campaign that was begun and not finished (0: none); resuming it costs no new epoch."""
+    campaign_n: int = 0
+    """How many samples that campaign fixed beforehand."""
+    campaign_digest: str = ""
+    """`Settings.campaign_digest` when the gap in force was measured."""
+    alarm_epoch: int = 0
+    """Epoch whose gap the watch refuted (0: none): it founds no certificate any more, only a fresh campaign does."""
+    watch_n: int = 0
+    watch_exceedances: int = 0
+    watch_e_value: float = 1.0
+    """Where the watch of this epoch stood when the memory was last written, so that a restart forgives nothing."""
+    watch_change: float = 0.0
+    watch_exchange: float = 1.0
+    watch_counts: tuple[int, ...] = ()
+    """Its other tests, and how many discrepancies fell into each bin (`core.stream`)."""
+    traced: bool = False
+    """An effect was traced in the residual and no model that has it was adopted since (guarantee G8)."""
+    proposal: Proposal | None = None
+    """The newest repaired model that waits to be adopted."""
+    refuted: tuple[str, ...] = ()
+    """Digests of the transitions whose gaps ended refuted or outgrown: they found no later epoch."""
