@@ -6,7 +6,6 @@ Everything a statement depends on is fixed here, before any data are seen. The p
 from __future__ import annotations
 
 import difflib
-import math
 import re
 import tomllib
 from collections.abc import Mapping
@@ -15,10 +14,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 
-from s2r_runtime.canonical import digest_of
+from s2r_runtime.canonical import canonical, digest_of
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.gate import REASONS
 from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.profile_checks import problems
 
 if TYPE_CHECKING:
     from s2r_runtime.models.composed import ComposedModel
@@ -257,8 +256,12 @@ def parse_profile(text: str, where: str, base: Path, files: Mapping[str, str] | 
         profile = msgspec.convert(table, Profile)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{where}: {_explain(str(error), table)}") from None
-    for field, value, must in _checks(profile):
+    for field, value, must in problems(profile):
         raise ConfigError(f"{where}: {field} is {value}, must be {must}")
+    try:
+        canonical(table)
+    except ValueError as error:  # nan and inf, wherever they stand: such a profile would have no digest
+        raise ConfigError(f"{where}: {str(error).removeprefix('$.')}") from None
     transport = _with_files(profile.transport, where, base, files)
     return msgspec.structs.replace(profile, model=_resolved(profile.model, where, base), transport=transport)
 
@@ -372,94 +375,3 @@ def _fields_at(field: str) -> list[str]:
         if not (isinstance(struct, type) and issubclass(struct, msgspec.Struct)):
             return []
     return [f.name for f in msgspec.structs.fields(struct)]
-
-
-def _checks(p: Profile) -> list[tuple[str, object, str]]:
-    """(field, value, what it must be) for every setting out of its range."""
-    found: list[tuple[str, object, str]] = []
-
-    def need(ok: bool, field: str, value: object, must: str) -> None:
-        if not ok:
-            found.append((field, value, must))
-
-    need(p.recording.keep_bytes >= 0, "recording.keep_bytes", p.recording.keep_bytes, ">= 0 (0: all logs are kept)")
-    need(p.recording.keep_days >= 0.0, "recording.keep_days", p.recording.keep_days, ">= 0 (0: all logs are kept)")
-    need(
-        re.fullmatch(r"[a-z0-9][a-z0-9_-]*", p.robot.name) is not None,
-        "robot.name",
-        repr(p.robot.name),
-        "lower-case letters, digits, - and _",
-    )
-    for table, bounds in (("region", p.region), ("inputs", p.inputs), ("geofence", p.geofence)):
-        for name, (low, high) in bounds.items():
-            need(
-                math.isfinite(low) and math.isfinite(high) and low < high,
-                f"{table}.{name}",
-                [low, high],
-                "[low, high] with low < high, finite",
-            )
-    for name, (low, high) in p.inputs.items():
-        need(low <= 0.0 <= high, f"inputs.{name}", [low, high], "an interval around 0 (zero input stops the robot)")
-    for name, weight in p.norm.weights.items():
-        need(0.0 < weight < math.inf, f"norm.weights.{name}", weight, "> 0 and finite")
-    g, s, v, gate = p.guarantee, p.sampling, p.verification, p.gate
-    for field, value in (
-        ("guarantee.epsilon", g.epsilon),
-        ("guarantee.beta", g.beta),
-        ("guarantee.alpha", g.alpha),
-        ("verification.epsilon", v.epsilon),
-    ):
-        need(0.0 < value < 1.0, field, value, "between 0 and 1")
-    need(g.discard >= 0, "guarantee.discard", g.discard, ">= 0")
-    need(s.n >= 0, "sampling.n", s.n, ">= 0 (0: as many as beta asks for)")
-    need(s.hold_periods >= 1, "sampling.hold_periods", s.hold_periods, ">= 1")
-    need(s.stop_periods >= 1, "sampling.stop_periods", s.stop_periods, ">= 1, and at least the robot's delay + 1")
-    for field, value in (
-        ("waypoint_radius", s.waypoint_radius),
-        ("waypoint_timeout", s.waypoint_timeout),
-        ("position_gain", s.position_gain),
-        ("heading_gain", s.heading_gain),
-        ("stuck_after", s.stuck_after),
-    ):
-        need(0.0 < value < math.inf, f"sampling.{field}", value, "> 0")
-    need(v.n >= 0, "verification.n", v.n, ">= 0 (0: as many as beta asks for)")
-    need(1.0 <= v.headroom < math.inf, "verification.headroom", v.headroom, ">= 1")
-    need(math.isfinite(v.threshold), "verification.threshold", v.threshold, "finite")
-    need(
-        bool(v.required) and set(v.required) <= set(v.laws), "verification.required", list(v.required), "at least one of verification.laws"
-    )
-    for field, value in (
-        ("observation_timeout", gate.observation_timeout),
-        ("command_ttl", gate.command_ttl),
-        ("controller_deadline", gate.controller_deadline),
-    ):
-        need(0.0 < value < math.inf, f"gate.{field}", value, "> 0 s")
-    need(0.0 <= gate.hysteresis < math.inf, "gate.hysteresis", gate.hysteresis, ">= 0 s")
-    for reason in gate.latching:  # a misspelt one would never latch
-        near = difflib.get_close_matches(reason, REASONS, 1, 0.6)
-        need(
-            reason in REASONS, "gate.latching", repr(reason), "one of the gate's reasons" + (f"; did you mean {near[0]!r}?" if near else "")
-        )
-    need(p.certificate.lifetime >= 1.0, "certificate.lifetime", p.certificate.lifetime, ">= 1 s")
-    d = p.driving
-    need(
-        d.block == 0.0 or 2.0 * p.model.dt <= d.block < math.inf,
-        "driving.block",
-        d.block,
-        "0 (driving founds no gap) or two steps and more, s",
-    )
-    need(0.0 <= d.mixing < 1.0, "driving.mixing", d.mixing, "a bound on the beta-mixing coefficient, 0 to 1")
-    need(
-        (d.block > 0.0) == bool(d.because.strip()),
-        "driving.because",
-        repr(d.because),
-        "the reason why blocks mix, if and only if there are blocks",
-    )
-    need(0.0 <= p.repair.delay < math.inf, "repair.delay", p.repair.delay, ">= 0 s")
-    need(p.repair.rows >= 100, "repair.rows", p.repair.rows, ">= 100 (a trace needs some dozens of transitions)")
-    need(0.0 < p.repair.timeout < math.inf, "repair.timeout", p.repair.timeout, "> 0 s")
-    need(p.task.episodes >= 0, "task.episodes", p.task.episodes, ">= 0 (0: no end)")
-    need(1.0 <= p.watch.run_length <= 1e12, "watch.run_length", p.watch.run_length, "1 to 1e12 discrepancies")
-    need(p.watch.fault_jump >= 0.0, "watch.fault_jump", p.watch.fault_jump, ">= 0 (0: no such rule)")
-    need(not p.transport or isinstance(p.transport.get("name"), str), "transport.name", p.transport.get("name"), "the name of a transport")
-    return found
