@@ -10,6 +10,8 @@ from typing import Any
 import pytest
 from daemon_rig import Rig
 
+from s2r_runtime.daemon.heads import HEAD_NS, LINE_NS, Heads
+from s2r_runtime.messages import LogHead
 from s2r_runtime.recording.reading import read
 
 
@@ -66,3 +68,17 @@ def test_the_last_head_in_the_journal_is_that_of_the_closed_log(rig: Rig) -> Non
     noted = json.loads((rig.state / "log_evidence.json").read_text())
     assert noted[path.stem].pop("seen_s") > 0.0
     assert noted == {path.stem: {"tags": [], "certificates": [], "head": said}}, "so it may be deleted some day (docs/log-format.md)"
+
+
+def test_a_head_is_told_once_and_at_most_every_second_and_the_journal_hears_of_it_now_and_then() -> None:
+    def head(records: int) -> LogHead:
+        return LogHead("run", 1, records, "00", "11")
+
+    told: list[LogHead] = []
+    lines: list[str] = []
+    heads = Heads(lines.append)
+    heads.tick(0, None, told.append)  # nothing is on the disk yet
+    for now_ns, records in ((0, 5), (HEAD_NS, 5), (HEAD_NS + 1, 6), (HEAD_NS + 2, 7), (2 * HEAD_NS + 1, 7), (LINE_NS, 8)):
+        heads.tick(now_ns, head(records), told.append)
+    assert [one.records for one in told] == [5, 6, 7, 8]
+    assert lines == ["log of run run, 5 records: head 00", "log of run run, 8 records: head 00"]

@@ -15,6 +15,7 @@ import msgspec
 
 from s2r_runtime.daemon import issuing
 from s2r_runtime.daemon.control import Connection, ControlServer
+from s2r_runtime.daemon.every import Every
 from s2r_runtime.daemon.model_store import parse_model
 from s2r_runtime.daemon.settings import ModelFacts
 from s2r_runtime.daemon.status import status
@@ -64,7 +65,7 @@ class Desk:
         self.answers: dict[int, Answer] = {}  # to requests of this process itself
         self._said = (0, "")
         self._postponed: list[tuple[Requested, int]] = []
-        self._next_progress_ns = 0
+        self._told = Every(PROGRESS_NS)
 
     def open(self, path: Path) -> None:
         """Listens. Raises ConfigError if another daemon does."""
@@ -81,8 +82,7 @@ class Desk:
         if self._server is not None:
             self._server.tick(now_ns)
         self._put()
-        if now_ns >= self._next_progress_ns:
-            self._next_progress_ns = now_ns + PROGRESS_NS
+        if self._told.due(now_ns):
             sampling = self._d.sampler.progress()
             if sampling is not None:
                 phase, taken, n, rejected, left_s = sampling

@@ -30,8 +30,10 @@ from s2r_runtime.daemon import control, issuing, past
 from s2r_runtime.daemon.actions import Actions
 from s2r_runtime.daemon.desk import Desk
 from s2r_runtime.daemon.driver import Driver
+from s2r_runtime.daemon.every import Every
 from s2r_runtime.daemon.excitation import Excitation
 from s2r_runtime.daemon.hang_guard import HangGuard
+from s2r_runtime.daemon.heads import Heads
 from s2r_runtime.daemon.logbook import Logbook
 from s2r_runtime.daemon.model_store import ModelStore
 from s2r_runtime.daemon.persistence import StateFolder
@@ -52,7 +54,6 @@ from s2r_runtime.messages import (
     Event,
     Frame,
     LinkChanged,
-    LogHead,
     Memory,
     Observation,
     Observed,
@@ -73,9 +74,6 @@ from s2r_runtime.profile import Profile
 TICK_NS = 20_000_000
 ROUND_NS = 100_000_000
 WALL_CLOCK_NS = 1_000_000_000
-HEAD_NS = 1_000_000_000
-HEAD_LINE_NS = 600_000_000_000
-"""Between two heads of the log's chain on the robot's side, and in the journal."""
 PRUNE_NS = 60_000_000_000
 """Between two looks whether old logs are to be deleted."""
 NEW_LOG_NS = 1_000_000_000
@@ -123,9 +121,9 @@ class Daemon:
         self._last_ns = 0
         self._numbers = 0
         self._recorder_ok = True
-        self._next_tick_ns = self._next_round_ns = self._next_wall_ns = self._next_log_ns = 0
-        self._anchored: LogHead | None = None
-        self._next_head_ns = self._next_head_line_ns = self._next_prune_ns = 0
+        self._next_tick_ns = 0
+        self._round, self._wall_clock, self._new_log, self._prune = map(Every, (ROUND_NS, WALL_CLOCK_NS, NEW_LOG_NS, PRUNE_NS))
+        self._heads = Heads(self.say)
         self._log_closed = False
         self._ended = ""
 
@@ -158,62 +156,79 @@ class Daemon:
 
     def _open(self, stack: ExitStack) -> None:
         """What takes long comes first and goes on beside the rest: analytics loads the model while the transport is loaded here."""
-        profile = self.profile
         stack.callback(self.selector.close)
         stack.callback(self.notifier.close)
         self._signals = stack.enter_context(StopSignals(self.selector))
         self.guard = stack.enter_context(HangGuard(self.say))
-        self.folder = stack.enter_context(StateFolder(self.state_dir, profile.robot.name))
-        self.memory = self.folder.memory(self._log_dir.glob(f"{profile.robot.name}-*.mcap") if self._log_file is None else ())
-        self.key = issuing.signing_key(self._key_path, self.folder.path, self.say)
-        self.trust = Trust(self.folder.path, keys.public_bytes(self.key))
-        self.trust.check_own()
-        self.memory, before = self._held_against_the_logs(self.memory)
-        self.models = ModelStore(self.folder.path, profile.model.digest())
-        self.profile = profile = self.models.in_force(profile, self.memory)
-        self.watcher = Watcher(self.selector, profile, str(self._profile_path), self.feed, self._analytics)
-        stack.callback(self.watcher.close)
-        for plugin in registry().loaded:
-            if plugin.error:
-                self.say(
-                    f"plug-in {plugin.name!r} of {plugin.distribution} {'in part ' if plugin.offers else ''}not in use: {plugin.error}"
-                )
-        registry().get("transports", str(profile.transport.get("name")))  # loaded here, while analytics loads the model
-        self.workshop = Workshop(self.selector)
-        stack.callback(self.workshop.close)
-        kept = profile.recording
-        self.retention = None
-        if self._log_file is None:
-            self.retention = Retention(self._log_dir, self.folder.path, profile.robot.name, kept.keep_bytes, kept.keep_days, self.say)
-        self.logbook = Logbook(
-            self._log_dir, profile.robot.name, kept, self.key, lockstep=self.clock.lockstep, file=self._log_file, retention=self.retention
-        )
-        self.facts: ModelFacts = self.watcher.facts()
-        self.settings = settings_of(profile, profile.model, self.facts, self.seed)
-        self.link = link_of(self.profile, self.facts, self._record_frame, self.guard)
-        self.logbook.begin(self._profile_path, self.profile.model, self.profile.files)
-        self._recall_proposal()
-        stack.callback(self._close_log)
-        stack.callback(self._close_link)
-        self.keeper = Keeper(self.folder, self.say)
-        stack.callback(self.keeper.close)
-        self.sampler = Sampler(
-            self.folder, self.keeper, profile.sampling, lambda: tuple(map(str, self.logbook.paths)), self.next_seq, before
-        )
-        self.excitation = Excitation()
-        self.driver = Driver(self.selector, profile, lambda: self.settings, self.feed, self.clock.now, self.next_seq)
-        stack.callback(self.driver.stop)
+        taken = self._open_state(stack)
+        self._start_helpers(stack)
+        self._open_log(stack)
+        self._set_up_sources(stack, taken)
         self.actions = Actions(self)
-        self.desk = Desk(self)
-        if self._listen:
-            self.desk.open(control.socket_dir() / f"{profile.robot.name}.sock")
-            stack.callback(self.desk.close)
+        self._open_desk(stack)
         self._open_link()
         if self.memory.gap is not None:
             self.sampler.recall(self.memory.gap.epoch)
         self._begin_run()
         self.notifier.ready("waiting for the robot")
-        self.say(f"robot {profile.robot.name!r}: log {self.logbook.paths[-1]}, state {self.folder.path}")
+        self.say(f"robot {self.profile.robot.name!r}: log {self.logbook.paths[-1]}, state {self.folder.path}")
+
+    def _open_state(self, stack: ExitStack) -> list[SampleTaken]:
+        """Memory, key, trust, and the model in force. Returns the samples of an unfinished campaign that were logged."""
+        robot = self.profile.robot.name
+        self.folder = stack.enter_context(StateFolder(self.state_dir, robot))
+        self.memory = self.folder.memory(self._log_dir.glob(f"{robot}-*.mcap") if self._log_file is None else ())
+        self.key = issuing.signing_key(self._key_path, self.folder.path, self.say)
+        self.trust = Trust(self.folder.path, keys.public_bytes(self.key))
+        self.trust.check_own()
+        self.memory, taken = self._held_against_the_logs(self.memory)
+        self.models = ModelStore(self.folder.path, self.profile.model.digest())
+        self.profile = self.models.in_force(self.profile, self.memory)
+        return taken
+
+    def _start_helpers(self, stack: ExitStack) -> None:
+        """Analytics now, a worker when there is work."""
+        self.watcher = Watcher(self.selector, self.profile, str(self._profile_path), self.feed, self._analytics)
+        stack.callback(self.watcher.close)
+        for plugin in registry().loaded:
+            if plugin.error:
+                part = "in part " if plugin.offers else ""
+                self.say(f"plug-in {plugin.name!r} of {plugin.distribution} {part}not in use: {plugin.error}")
+        registry().get("transports", str(self.profile.transport.get("name")))  # loaded here, while analytics loads the model
+        self.workshop = Workshop(self.selector)
+        stack.callback(self.workshop.close)
+
+    def _open_log(self, stack: ExitStack) -> None:
+        """The log, and the link whose frames it records. What the model is made of is known from here on."""
+        robot, kept, lockstep = self.profile.robot.name, self.profile.recording, self.clock.lockstep
+        self.retention = None
+        if self._log_file is None:
+            self.retention = Retention(self._log_dir, self.folder.path, robot, kept.keep_bytes, kept.keep_days, self.say)
+        self.logbook = Logbook(self._log_dir, robot, kept, self.key, lockstep=lockstep, file=self._log_file, retention=self.retention)
+        self.facts: ModelFacts = self.watcher.facts()
+        self.settings = settings_of(self.profile, self.profile.model, self.facts, self.seed)
+        self.link = link_of(self.profile, self.facts, self._record_frame, self.guard)
+        self.logbook.begin(self._profile_path, self.profile.model, self.profile.files)
+        self._recall_proposal()
+        stack.callback(self._close_log)
+        stack.callback(self._close_link)
+
+    def _set_up_sources(self, stack: ExitStack, taken: list[SampleTaken]) -> None:
+        """Who may be asked what to do: the sampler, given inputs, a controller. taken: samples of an unfinished campaign."""
+        self.keeper = Keeper(self.folder, self.say)
+        stack.callback(self.keeper.close)
+        sampling, logs = self.profile.sampling, lambda: tuple(map(str, self.logbook.paths))
+        self.sampler = Sampler(self.folder, self.keeper, sampling, logs, self.next_seq, taken)
+        self.excitation = Excitation()
+        self.driver = Driver(self.selector, self.profile, lambda: self.settings, self.feed, self.clock.now, self.next_seq)
+        stack.callback(self.driver.stop)
+
+    def _open_desk(self, stack: ExitStack) -> None:
+        """Where people ask; a socket, unless only this process does."""
+        self.desk = Desk(self)
+        if self._listen:
+            self.desk.open(control.socket_dir() / f"{self.profile.robot.name}.sock")
+            stack.callback(self.desk.close)
 
     def _held_against_the_logs(self, memory: Memory) -> tuple[Memory, list[SampleTaken]]:
         """The memory to start with, and the samples of its unfinished campaign that were logged."""
@@ -288,8 +303,7 @@ class Daemon:
             self._leave_link()
         self.driver.poll(now_ns)
         self.watcher.tick(now_ns)
-        if now_ns >= self._next_round_ns:
-            self._next_round_ns = now_ns + ROUND_NS
+        if self._round.due(now_ns):
             self._go_round(now_ns)
         self.feed(Ticked(0))
         if self._on_tick is not None:
@@ -300,12 +314,11 @@ class Daemon:
         self.workshop.tick(now_ns)
         self._look_at_log(now_ns)
         self.actions.tick(now_ns)
-        if now_ns >= self._next_wall_ns:
-            self._next_wall_ns = now_ns + WALL_CLOCK_NS
+        if self._wall_clock.due(now_ns):
             self.feed(WallClockRead(0, int(time.time())), *self.trust.look(self.state.memory))
         self.desk.tick(now_ns)
         self.notifier.alive(now_ns)
-        self._publish_head(now_ns)
+        self._heads.tick(now_ns, self.logbook.anchor(), self.link.anchor)
         self._retain(now_ns)
         self.notifier.status(f"gate {'open' if self.state.gate_open else 'closed'} ({self.state.gate_reason})")
 
@@ -389,10 +402,8 @@ class Daemon:
         ok = health.ok and not self.actions.unsaved and not self.trust.trouble
         if ok != self._recorder_ok:
             self.log_changed(ok, health.detail or self.actions.unsaved or self.trust.trouble)
-        if self.logbook.faulty and now_ns >= self._next_log_ns:
-            self._next_log_ns = now_ns + NEW_LOG_NS
-            if self.logbook.prepare():
-                self._run_anew()
+        if self.logbook.faulty and self._new_log.due(now_ns) and self.logbook.prepare():
+            self._run_anew()
 
     def _run_anew(self) -> None:
         """A new run in a new log. What a transport says depends on all that it heard before, so it begins anew as well: the log alone
@@ -412,25 +423,13 @@ class Daemon:
         if self.retention is None:
             return
         self._log_deleted()
-        if now_ns >= self._next_prune_ns:
-            self._next_prune_ns = now_ns + PRUNE_NS
+        if self._prune.due(now_ns):
             self.retention.prune_beside(lambda: self.state.memory)
 
     def _log_deleted(self) -> None:
         """What was deleted stands in the log."""
         for gone in () if self.retention is None else self.retention.deleted():
             self.logbook.put(msgspec.structs.replace(gone, t_ns=self._last_ns), self._last_ns)
-
-    def _publish_head(self, now_ns: int) -> None:
-        """Tells the robot's side, and now and then the journal, how far the log is on the disk."""
-        anchor = self.logbook.anchor()
-        if anchor is None or anchor == self._anchored or now_ns < self._next_head_ns:
-            return
-        self._anchored, self._next_head_ns = anchor, now_ns + HEAD_NS
-        self.link.anchor(anchor)
-        if now_ns >= self._next_head_line_ns:
-            self._next_head_line_ns = now_ns + HEAD_LINE_NS
-            self.say(f"log of run {anchor.run}, {anchor.records} records: head {anchor.head}")
 
     def log_changed(self, ok: bool, detail: str) -> None:
         """The recorder failed, or works again."""

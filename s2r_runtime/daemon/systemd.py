@@ -8,6 +8,8 @@ from __future__ import annotations
 import os
 import socket
 
+from s2r_runtime.daemon.every import Every
+
 
 class Notifier:
     """Sends state to the service manager, if one asked for it; without one every call does nothing.
@@ -20,8 +22,8 @@ class Notifier:
         self._address = env.get("NOTIFY_SOCKET", "")
         self._socket: socket.socket | None = None
         self._status = ""
-        self._next_ping_ns = 0
         self.watchdog_ns = _watchdog_ns(env)
+        self._ping = Every(self.watchdog_ns // 2)
         if self._address.startswith("@"):
             self._address = "\0" + self._address[1:]  # abstract namespace
         if self._address:
@@ -40,8 +42,7 @@ class Notifier:
 
     def alive(self, now_ns: int) -> None:
         """Called on every turn of the loop; pings twice per watchdog period. now_ns: host's monotonic clock."""
-        if self.watchdog_ns and now_ns >= self._next_ping_ns:
-            self._next_ping_ns = now_ns + self.watchdog_ns // 2
+        if self.watchdog_ns and self._ping.due(now_ns):
             self._send("WATCHDOG=1")
 
     def stopping(self) -> None:
