@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from s2r_runtime.offline_ledger import open_ledger
+
 ROOT = Path(__file__).parent.parent
 PROFILE = ROOT / "profiles" / "robotarium.toml"
 
@@ -201,6 +203,14 @@ def test_trace_checks_where_its_output_goes_before_it_works(table: Path, tmp_pat
 def test_verbs_about_logs_check_where_their_output_goes_before_they_work(table: Path, tmp_path: Path, verb: tuple[str, ...]) -> None:
     refused(s2r(*verb, table, "-o", tmp_path / "none" / "a.out"), 2, "a.out", "no folder")
     refused(s2r(*verb, table, "-o", tmp_path), 2, "is a folder")
+
+
+def test_certify_checks_where_its_certificate_goes_before_it_pays(table: Path, tmp_path: Path) -> None:
+    key = tmp_path / "key.pem"
+    assert s2r("keys", "new", key).returncode == 0
+    given = ("certify", ROOT / "controllers" / "grid.py", "--profile", PROFILE, "--recording", table, "--key", key)
+    refused(s2r(*given, "-o", tmp_path / "none" / "a.cert"), 2, "a.cert", "no folder")
+    assert open_ledger(key, "robotarium").entries() == ()
 
 
 def test_a_socket_where_nobody_listens_is_told_in_words(tmp_path: Path) -> None:

@@ -5,12 +5,21 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import controller_at, load_checked
+from s2r_runtime.cli.choices import controller_at, load_checked, writable
 from s2r_runtime.errors import UsageError
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+    from s2r_runtime.controllers.file import ControllerFile
+    from s2r_runtime.messages import Gap, Trials, Verification
+    from s2r_runtime.models.composed import ComposedModel
+    from s2r_runtime.profile import Profile
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -38,48 +47,89 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Exit 0 with a certificate written, 1 if the controller did not pass (the attempt is spent all the same)."""
-    from s2r_runtime import certificate, keys, offline_ledger
-    from s2r_runtime import verify as verification
+    from s2r_runtime import keys, offline_ledger
     from s2r_runtime.bounds import attempt_beta, epoch_beta
-    from s2r_runtime.canonical import digest
-    from s2r_runtime.cli.evidence import gap_of, print_verification, profile_model, run_verification
+    from s2r_runtime.cli.evidence import gap_of, profile_model, run_verification
     from s2r_runtime.cli.trials_verb import trials_of
-    from s2r_runtime.daemon import persistence
-    from s2r_runtime.plugins import registry
 
+    writable(args.output)  # now, because what is spent below stays spent, whatever becomes of the certificate
     profile = load_checked(args.profile)
     model = profile_model(args, profile)
     key_path = args.key or keys.default_path()
     key = keys.load(key_path)
     controller = controller_at(args.controller, args.param)
-    try:
-        recording = digest(args.recording.read_bytes())
-    except OSError as error:
-        raise UsageError(f"{args.recording}: cannot be read: {error.strerror}") from None
+    recording = _digest(args.recording)
     trials = trials_of(args.trials, controller, model, profile) if args.trials else None
-    ledger = offline_ledger.open_ledger(key_path, profile.robot.name)
+    ledger, beta = offline_ledger.open_ledger(key_path, profile.robot.name), profile.guarantee.beta
     epoch = ledger.epoch_for(recording, model.spec.digest(), profile.digest())
-    gap, assumption = gap_of(args.recording, model, profile, beta=epoch_beta(profile.guarantee.beta, epoch), epoch=epoch)
+    gap, assumption = gap_of(args.recording, model, profile, beta=epoch_beta(beta, epoch), epoch=epoch)
     attempt = ledger.spend_attempt(controller.digest)
-    beta = attempt_beta(profile.guarantee.beta, attempt)
-    headroom, laws = profile.verification.headroom, profile.verification.laws
-    result = run_verification(controller, model, profile, gap=gap, headroom=headroom, laws=laws, n=0, attempt=attempt, beta=beta)
-    spent = ledger.spent(profile.guarantee.beta)
+    result = run_verification(
+        controller,
+        model,
+        profile,
+        gap=gap,
+        headroom=profile.verification.headroom,
+        laws=profile.verification.laws,
+        n=0,
+        attempt=attempt,
+        beta=attempt_beta(beta, attempt),
+    )
     if result.passed:
-        task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
-        issued = certificate.issue(
-            profile=msgspec.structs.replace(profile, model=model.spec),
-            controller=controller,
-            gap=gap,
-            verification=result,
-            issued_unix_s=int(time.time()),
-            horizon=task.horizon,
-            trials=trials,
-            assumption=assumption,
-        )
-        persistence.replace(args.output, certificate.sign(issued, key))
+        _write(args.output, profile, model, controller, gap, result, trials, assumption, key)
+    _tell(args, gap, trials, result, epoch, ledger.spent(beta), beta)
+    return 0 if result.passed else 1
+
+
+def _digest(path: Path) -> str:
+    from s2r_runtime.canonical import digest
+
+    try:
+        return digest(path.read_bytes())
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _write(
+    path: Path,
+    profile: Profile,
+    model: ComposedModel,
+    controller: ControllerFile,
+    gap: Gap,
+    result: Verification,
+    trials: Trials | None,
+    assumption: str,
+    key: Ed25519PrivateKey,
+) -> None:
+    """The certificate, signed."""
+    from s2r_runtime import certificate
+    from s2r_runtime.daemon import persistence
+    from s2r_runtime.plugins import registry
+
+    task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
+    issued = certificate.issue(
+        profile=msgspec.structs.replace(profile, model=model.spec),
+        controller=controller,
+        gap=gap,
+        verification=result,
+        issued_unix_s=int(time.time()),
+        horizon=task.horizon,
+        trials=trials,
+        assumption=assumption,
+    )
+    try:
+        persistence.replace(path, certificate.sign(issued, key))
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def _tell(args: argparse.Namespace, gap: Gap, trials: Trials | None, result: Verification, epoch: int, spent: float, beta: float) -> None:
+    """beta: of the whole budget."""
+    from s2r_runtime.cli.evidence import print_verification
+    from s2r_runtime.verify import verification_json
+
+    answer = verification_json(result)
     if args.json:
-        answer = verification.verification_json(result)
         output.result_json(
             {
                 **answer,
@@ -88,14 +138,13 @@ def run(args: argparse.Namespace) -> int:
                 "trials": trials,
                 "verified_radius": result.radius if result.passed else None,
                 "epoch": epoch,
-                "attempt": attempt,
+                "attempt": result.attempt,
                 "beta_spent": spent,
-                "beta_left": profile.guarantee.beta - spent,
+                "beta_left": beta - spent,
             }
         )
-    else:
-        print_verification(verification.verification_json(result))
-        output.out(f"gap epoch {epoch}, verification attempt {attempt}: {spent:.4f} of beta {profile.guarantee.beta} spent")
-        told = f"gap {gap.radius:.4g}, certified to {result.radius:.4g}: certificate written to {args.output}"
-        output.out(told if result.passed else "no certificate")
-    return 0 if result.passed else 1
+        return
+    print_verification(answer)
+    output.out(f"gap epoch {epoch}, verification attempt {result.attempt}: {spent:.4f} of beta {beta} spent")
+    told = f"gap {gap.radius:.4g}, certified to {result.radius:.4g}: certificate written to {args.output}"
+    output.out(told if result.passed else "no certificate")
