@@ -139,6 +139,7 @@ def test_client_that_hangs_up_is_noticed(desk: Desk) -> None:
         time.sleep(0.005)
     desk.waiting[0].progress(text="into the void")
     desk.waiting[0].answer(0, "nobody hears it")
+    assert call(desk.server.path, {"verb": "echo"})["exit_code"] == 0  # and the next one is served
 
 
 def test_more_clients_than_allowed_are_sent_away(desk: Desk) -> None:

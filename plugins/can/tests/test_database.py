@@ -159,7 +159,10 @@ def test_the_profiles_advice_for_a_bus_without_a_pose_works(tmp_path: Path) -> N
     (tmp_path / "amr-can.dbc").write_bytes((ROOT / "profiles" / "amr-can.dbc").read_bytes())
     profile = parse_profile(text, "advised", tmp_path)
     states = ("x", "y", "theta", "wheel_left", "wheel_right")
-    CanTransport({k: v for k, v in profile.transport.items() if k != "name"}, states, ("cmd_left", "cmd_right"))
+    transport = {k: v for k, v in profile.transport.items() if k != "name"}
+    CanTransport(transport, states, ("cmd_left", "cmd_right"))
+    assert transport.keys() >= {"dead_reckoning"}
+    assert transport["states"].keys() == {"wheel_left", "wheel_right"}
 
 
 def test_stand_in_and_profile_have_the_same_dbc() -> None:
