@@ -11,7 +11,9 @@ import threading
 from pathlib import Path
 
 import pytest
+from command_reference import verbs
 
+from s2r_runtime.cli.main import parser
 from s2r_runtime.offline_ledger import open_ledger
 
 ROOT = Path(__file__).parent.parent
@@ -153,6 +155,13 @@ def test_every_verb_has_help() -> None:
     for verb in verbs.split():
         assert f"  {verb} " in done.stdout
         assert s2r(verb, "--help").returncode == 0
+
+
+def test_every_verb_and_every_option_is_explained_where_it_is_asked_for() -> None:
+    pages = [(name, verb) for name, verb, _ in verbs(parser(), "s2r")]
+    assert len(pages) > 25
+    assert [name for name, verb in pages if not verb.description] == []
+    assert [(name, one.dest) for name, verb in pages for one in verb._actions if not one.help] == []
 
 
 def test_keys_are_private_and_never_overwritten(tmp_path: Path) -> None:

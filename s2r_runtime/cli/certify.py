@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verb."""
     verb = verbs.add_parser("certify", help="gap + verify + sign: a certificate for this controller from a recorded campaign")
-    verb.add_argument("controller", type=Path, metavar="CONTROLLER")
-    verb.add_argument("--profile", type=Path, required=True, metavar="P")
+    verb.add_argument("controller", type=Path, metavar="CONTROLLER", help="a Python file with control(x, theta, parameters)")
+    verb.add_argument("--profile", type=Path, required=True, metavar="P", help="the robot's profile (TOML)")
     verb.add_argument(
         "--recording",
         type=Path,
@@ -34,7 +34,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         metavar="REC",
         help="a campaign's MCAP; or a drive, if the profile vouches for blocks of it ([driving])",
     )
-    verb.add_argument("-o", "--output", type=Path, required=True, metavar="CERT")
+    verb.add_argument("-o", "--output", type=Path, required=True, metavar="CERT", help="where the certificate goes")
     verb.add_argument(
         "--trials", type=Path, action="append", default=[], metavar="LOG", help="closed-loop runs of it, from this log; may be repeated"
     )

@@ -14,7 +14,7 @@ from s2r_runtime.errors import UsageError
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verbs of this module."""
     run = verbs.add_parser("run", help="the daemon: talks to the robot, guards it, records everything")
-    run.add_argument("profile", type=Path, metavar="PROFILE")
+    run.add_argument("profile", type=Path, metavar="PROFILE", help="the robot's profile (TOML)")
     run.add_argument(
         "--state", type=Path, metavar="DIR", help="where counters, certificates and logs live (default: the user's state folder, by robot)"
     )
@@ -26,7 +26,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     run.set_defaults(run=run_daemon)
 
     sample = verbs.add_parser("sample", help="one sampling campaign, through the running daemon if there is one")
-    sample.add_argument("profile", type=Path, metavar="PROFILE")
+    sample.add_argument("profile", type=Path, metavar="PROFILE", help="the robot's profile (TOML)")
     sample.add_argument("-o", "--output", type=Path, metavar="FILE.mcap", help="the recording (without a running daemon)")
     sample.add_argument(
         "-n", type=count, default=0, metavar="N", help="samples, fixed beforehand (default: what the profile or its beta asks for)"
@@ -48,7 +48,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     sample.set_defaults(run=run_sample)
 
     deploy = _talker(verbs, "deploy", "let this controller drive, if a certificate covers it; verify it first if none does")
-    deploy.add_argument("controller", type=Path, metavar="CONTROLLER")
+    deploy.add_argument("controller", type=Path, metavar="CONTROLLER", help="a Python file with control(x, theta, parameters)")
     deploy.add_argument("--certificate", type=Path, metavar="CERT", help="a certificate made by s2r certify")
     deploy.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the controller; may be repeated")
     deploy.set_defaults(run=run_deploy)
@@ -65,14 +65,14 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     adopt.set_defaults(run=run_adopt)
 
     clear = _talker(verbs, "clear", "clear a latched reason, after looking into it")
-    clear.add_argument("reason", metavar="REASON")
+    clear.add_argument("reason", metavar="REASON", help="as s2r status names it, such as emergency_stop")
     clear.set_defaults(run=lambda a: _say(a, {"verb": "clear", "text": a.reason}))
 
     stop = _talker(verbs, "stop", "emergency stop; latches until cleared")
     stop.set_defaults(run=lambda a: _say(a, {"verb": "stop"}))
 
     permit = _talker(verbs, "permit", "let the sampler drive inside the geofence for a limited time")
-    permit.add_argument("seconds", type=positive, metavar="SECONDS")
+    permit.add_argument("seconds", type=positive, metavar="SECONDS", help="from now on")
     permit.set_defaults(run=lambda a: _say(a, {"verb": "permit", "duration_s": a.seconds}))
 
     status = _talker(verbs, "status", "what the daemon is doing, and why")
@@ -80,7 +80,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def _talker(verbs: argparse._SubParsersAction[argparse.ArgumentParser], name: str, summary: str) -> argparse.ArgumentParser:
-    verb = verbs.add_parser(name, help=summary, description=summary)
+    verb = verbs.add_parser(name, help=summary)
     _common(verb)
     return verb
 

@@ -39,20 +39,20 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     audit.set_defaults(run=run_audit)
 
     report = verbs.add_parser("report", help="plots and statements of a log on one self-contained page")
-    report.add_argument("log", type=Path, nargs="+", metavar="LOG")
-    report.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.html")
+    report.add_argument("log", type=Path, nargs="+", metavar="LOG", help="a run's files, in order if it was rotated")
+    report.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.html", help="where the page goes")
     report.set_defaults(run=run_report)
 
     log = verbs.add_parser("log", help="look at a log, or recover what a crash left").add_subparsers(
         dest="what", metavar="WHAT", required=True
     )
     recover = log.add_parser("recover", help="write a clean file with all that is readable, and say what is missing")
-    recover.add_argument("log", type=Path, metavar="LOG")
-    recover.add_argument("-o", "--output", type=Path, required=True, metavar="FILE")
+    recover.add_argument("log", type=Path, metavar="LOG", help="a log that is damaged or was cut off; it is kept as it is")
+    recover.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="another file, for what is readable")
     recover.add_argument("--json", action="store_true", help="print one JSON object")
     recover.set_defaults(run=run_recover)
     info = log.add_parser("info", help="what a log holds, and whether it ends cleanly")
-    info.add_argument("log", type=Path, metavar="LOG")
+    info.add_argument("log", type=Path, metavar="LOG", help="one file of a log (MCAP)")
     info.add_argument("--json", action="store_true", help="print one JSON object")
     info.set_defaults(run=run_info)
 

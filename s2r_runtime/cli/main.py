@@ -13,6 +13,7 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from importlib import metadata
+from typing import Any
 
 from s2r_runtime.cli import output
 from s2r_runtime.errors import NotEnoughEvidence, S2RError
@@ -36,8 +37,22 @@ GROUPS = (
 """Modules of this package, each with `add(verbs)` and its functions `run(args) -> int`. Nothing heavy is imported at the top."""
 
 
+class _Verbs(argparse._SubParsersAction):  # type: ignore[type-arg]  # generic for type checkers alone
+    """A verb's own help page begins with what the list of verbs says of it."""
+
+    def add_parser(self, name: str, **options: Any) -> argparse.ArgumentParser:
+        """As argparse's, with a description."""
+        summary: str = options["help"]
+        verb: argparse.ArgumentParser = super().add_parser(name, **{"description": f"{summary[0].upper()}{summary[1:]}.", **options})
+        return verb
+
+
 class _Parser(argparse.ArgumentParser):
     """argparse, but an error is one line."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.register("action", "parsers", _Verbs)
 
     def error(self, message: str) -> None:  # type: ignore[override]
         """Prints the error and where the help is; exits with 2."""

@@ -26,7 +26,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "synthesize", help="search a controller's parameters, then verify the winner on scenarios that did not choose it"
     )
     verb.add_argument("controller", type=Path, metavar="CONTROLLER", help="a controller with BOUNDS for its PARAMETERS")
-    verb.add_argument("--profile", type=Path, required=True, metavar="P")
+    verb.add_argument("--profile", type=Path, required=True, metavar="P", help="the robot's profile (TOML)")
     verb.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.py", help="where the winner goes, with its parameters")
     size = verb.add_mutually_exclusive_group(required=True)
     size.add_argument("--radius", type=positive, metavar="R", help="radius of the gap set")
