@@ -206,6 +206,7 @@ def test_a_controller_that_fails_never_passes(tmp_path: Path, code: str, reason:
 def test_trace_checks_where_its_output_goes_before_it_works(table: Path, tmp_path: Path, option: str) -> None:
     refused(s2r("trace", table, *MODEL, option, tmp_path / "none" / "a.toml"), 2, "a.toml", "no folder")
     refused(s2r("trace", table, *MODEL, option, tmp_path), 2, "is a folder")
+    refused(s2r("trace", "--live", "campaign", option, tmp_path), 2, "is a folder")
 
 
 @pytest.mark.parametrize("verb", [("report",), ("log", "recover")])

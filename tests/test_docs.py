@@ -6,7 +6,6 @@ for anything. Blocks marked ```console no-run show what needs hardware, root or 
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
 import shutil
@@ -15,8 +14,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from command_reference import text, verbs
 
 from s2r_runtime import hookspecs
+from s2r_runtime.cli.main import parser
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md")])
@@ -77,12 +78,15 @@ def test_python_block_runs(where: str, block: str, tmp_path: Path, monkeypatch: 
 
 
 def test_command_reference_is_the_command_line() -> None:
-    spec = importlib.util.spec_from_file_location("command_reference", ROOT / "tools" / "command_reference.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    assert (ROOT / "docs" / "commands.md").read_text(encoding="utf-8") == module.text()
+    assert (ROOT / "docs" / "commands.md").read_text(encoding="utf-8") == text()
+
+
+def test_every_verb_that_prints_json_says_what() -> None:
+    page = (ROOT / "docs" / "json.md").read_text(encoding="utf-8")
+    told = {name for row in re.findall(r"^\| (`[^|]*`) \|", page, re.MULTILINE) for name in re.findall(r"`([^`]+)`", row)}
+    asked = [name.removeprefix("s2r ") for name, verb, _ in verbs(parser(), "s2r") if any(one.dest == "json" for one in verb._actions)]
+    assert asked
+    assert [name for name in asked if name not in told] == []
 
 
 def test_every_hook_is_documented() -> None:

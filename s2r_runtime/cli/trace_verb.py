@@ -68,10 +68,10 @@ def run(args: argparse.Namespace) -> int:
 
     if (args.recording is None) == (args.live is None):
         raise UsageError("trace: give a RECORDING, or --live with what the running daemon recorded")
-    if args.live:
-        return run_live_trace(args)
     for path in (args.output, args.report, args.suggest):
         writable(path)
+    if args.live:
+        return run_live_trace(args)
     if args.suggest_duration and not args.suggest:
         raise UsageError("--suggest-duration: belongs to --suggest FILE.csv")
     model, profile = chosen_model(args)
