@@ -81,6 +81,7 @@ class Streamed(audit_bench.Bench):  # type: ignore[misc,name-defined]
 
     @property
     def items(self) -> Sink:
+        """Where the run puts its messages: not a list of them, but the file."""
         return self.sink
 
     @items.setter

@@ -150,6 +150,7 @@ class Bench:
 
     @contextlib.contextmanager
     def daemon(self) -> Iterator[subprocess.Popen[bytes]]:
+        """The daemon as a process, its journal in `daemon.txt`; ended with SIGTERM on leaving."""
         argv = [sys.executable, "-m", "s2r_runtime.cli.main", "run", str(self.profile), "--state", str(self.folder / "state")]
         with (self.folder / "daemon.txt").open("ab") as sink:
             process = subprocess.Popen(argv, stdout=sink, stderr=sink, env=self.environment)
@@ -160,6 +161,7 @@ class Bench:
                 process.wait(30.0)
 
     def ask(self, verb: str, **fields: Any) -> dict[str, Any]:
+        """The daemon's answer to one request, once it listens (30 s at most)."""
         from s2r_runtime.daemon import control
 
         path, limit = self.folder / "s2r" / "amr-can.sock", time.monotonic() + 30.0
@@ -168,6 +170,7 @@ class Bench:
         return control.call(path, {"verb": verb, **fields})
 
     def status(self) -> dict[str, Any]:
+        """What `s2r status --json` shows."""
         return dict(self.ask("status")["data"])
 
     def until(self, ready: Callable[[dict[str, Any]], bool], seconds: float = 30.0) -> dict[str, Any]:
@@ -214,6 +217,7 @@ class Bench:
         return max((self.folder / "state" / "logs").glob("*.mcap"), key=lambda path: path.stat().st_mtime_ns)
 
     def close(self) -> None:
+        """Ends the hub between the interfaces, where there is one."""
         if self.hub is not None:
             self.hub.close()
 

@@ -68,6 +68,7 @@ def message(k: int, rng: random.Random) -> Struct:
 
 
 def critical(one: Struct) -> bool:
+    """Whether the daemon waits for the disk before this takes effect: losing one is a failure."""
     return isinstance(one, CertificateInstalled) or (isinstance(one, GateChanged) and one.open)
 
 
@@ -86,6 +87,7 @@ class Found:
     wrong: list[str] = field(default_factory=list)
 
     def add(self, what: str) -> None:
+        """Notes what should not have been."""
         self.wrong.append(what)
 
 

@@ -65,21 +65,25 @@ class Bench:
         self.environment = {**os.environ, "XDG_RUNTIME_DIR": str(folder), "XDG_STATE_HOME": str(folder / "home")}
 
     def endpoint(self, index: int) -> str:
+        """Zenoh's name of a free port: 0 toward the robot, 1 toward controllers."""
         return f"tcp/127.0.0.1:{self.ports[index]}"
 
     @contextmanager
     def robot(self) -> Iterator[subprocess.Popen[bytes]]:
+        """The built-in robot as a process."""
         options = ["--realtime"] if self.clock == "realtime" else []
         argv = [sys.executable, "-m", "s2r_standins.robotarium", "--connect", self.endpoint(0), "--period", str(self.dt), *options]
         yield from ended(subprocess.Popen(argv, stdout=subprocess.DEVNULL, stdin=subprocess.DEVNULL))
 
     @contextmanager
     def daemon(self) -> Iterator[subprocess.Popen[bytes]]:
+        """The daemon as a process, its journal in `daemon.txt`."""
         argv = [sys.executable, "-m", "s2r_runtime.cli.main", "run", str(self.profile), "--state", str(self.folder / "state")]
         with (self.folder / "daemon.txt").open("ab") as sink:
             yield from ended(subprocess.Popen(argv, stdout=sink, stderr=sink, env=self.environment))
 
     def ask(self, verb: str, **fields: Any) -> dict[str, Any]:
+        """The daemon's answer to one request, once it listens (30 s at most)."""
         from s2r_runtime.daemon import control
 
         limit = time.monotonic() + 30.0
@@ -89,9 +93,11 @@ class Bench:
         return control.call(path, {"verb": verb, **fields})
 
     def status(self) -> dict[str, Any]:
+        """What `s2r status --json` shows."""
         return dict(self.ask("status")["data"])
 
     def until(self, name: str, value: Any) -> dict[str, Any]:
+        """Waits until the status has this value, and gives it whole. Ends the bench after 30 s."""
         limit = time.monotonic() + 30.0
         while time.monotonic() < limit:
             if (found := self.status())[name] == value:
@@ -100,6 +106,7 @@ class Bench:
         raise SystemExit(f"{name} did not become {value}: {(self.folder / 'daemon.txt').read_text()}")
 
     def logs(self) -> list[Path]:
+        """The daemon's logs, the oldest first."""
         return sorted((self.folder / "state" / "logs").glob("*.mcap"))
 
 

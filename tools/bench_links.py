@@ -58,6 +58,7 @@ class Hop:
         self._thread.start()
 
     def cut(self) -> None:
+        """Ends every connection and refuses new ones, as a switch that lost its power."""
         with self._lock:
             for key in list(self._selector.get_map().values()):
                 self._selector.unregister(key.fileobj)
@@ -65,9 +66,11 @@ class Hop:
             self._listener = None
 
     def silence(self) -> None:
+        """Passes nothing on, but keeps every connection: as a cable that was pulled."""
         self._silent.set()
 
     def restore(self) -> None:
+        """As before the cut or the silence."""
         self._silent.clear()
         with self._lock:
             if self._listener is None:
@@ -75,6 +78,7 @@ class Hop:
                 self._selector.register(self._listener, selectors.EVENT_READ, None)
 
     def close(self) -> None:
+        """Ends its thread and every connection."""
         self._over.set()
         self._thread.join()
         self.cut()
@@ -110,6 +114,7 @@ class Hop:
 
 
 def free_port() -> int:
+    """A TCP port of the loopback that nobody uses at this moment."""
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         return int(s.getsockname()[1])
@@ -172,9 +177,11 @@ class Bench:
         self.hop.close()
 
     def status(self) -> dict[str, Any]:
+        """What `s2r status --json` shows."""
         return self.rig.status()
 
     def until(self, ready: Callable[[dict[str, Any]], Any]) -> None:
+        """Waits until the status is so; raises AssertionError if that takes too long."""
         self.rig.until(lambda: ready(self.rig.status()))
 
     def drive(self) -> None:
@@ -290,6 +297,7 @@ def inside(call: str) -> dict[str, Any]:
 
 
 def can_cuts(number: int) -> dict[str, Any]:
+    """As `cuts`, over CAN: the figures of bench_can, in a network namespace of its own."""
     found = inside(f"cuts({number})")
     shut, back = found["gate_closed_after_s"], found["healed_after_s"]
     return {
@@ -303,6 +311,7 @@ def can_cuts(number: int) -> dict[str, Any]:
 
 
 def mavlink_cuts(number: int) -> dict[str, Any]:
+    """As `cuts`, over MAVLink: the figures of bench_mavlink."""
     import bench_mavlink
 
     found = bench_mavlink.cuts(number)
@@ -317,6 +326,7 @@ def mavlink_cuts(number: int) -> dict[str, Any]:
 
 
 def can_rate(seconds: float) -> dict[str, Any]:
+    """As `rate`, over CAN: the figures of bench_can, in a network namespace of its own."""
     found = inside(f"at_100_hz({seconds})")
     return {
         "seconds": seconds,
@@ -332,6 +342,7 @@ def can_rate(seconds: float) -> dict[str, Any]:
 
 
 def mavlink_rate(seconds: float) -> dict[str, Any]:
+    """As `rate`, over MAVLink: the figures of bench_mavlink."""
     import bench_mavlink
 
     found = bench_mavlink.hours(seconds)

@@ -101,6 +101,7 @@ class Relay:
         self._open = True
 
     def close(self) -> None:
+        """Ends its thread, and listens no more."""
         self._over = True
         self._thread.join()
         self._server.close()
@@ -189,6 +190,7 @@ class Bench:
 
     @contextlib.contextmanager
     def daemon(self) -> Iterator[subprocess.Popen[bytes]]:
+        """The daemon as a process, its journal in `daemon.txt`; ended with SIGTERM on leaving."""
         argv = [sys.executable, "-m", "s2r_runtime.cli.main", "run", str(self.profile), "--state", str(self.folder / "state")]
         with (self.folder / "daemon.txt").open("ab") as sink:
             process = subprocess.Popen(argv, stdout=sink, stderr=sink, env=self.environment)
@@ -199,6 +201,7 @@ class Bench:
                 process.wait(30.0)
 
     def ask(self, verb: str, **fields: Any) -> dict[str, Any]:
+        """The daemon's answer to one request, once it listens (30 s at most)."""
         from s2r_runtime.daemon import control
 
         path, limit = self.folder / "s2r" / "turtlebot-ros2-zenoh.sock", time.monotonic() + 30.0
@@ -207,6 +210,7 @@ class Bench:
         return control.call(path, {"verb": verb, **fields})
 
     def status(self) -> dict[str, Any]:
+        """What `s2r status --json` shows."""
         return dict(self.ask("status")["data"])
 
     def until(self, ready: Callable[[dict[str, Any]], bool], seconds: float = 30.0) -> dict[str, Any]:
@@ -237,6 +241,7 @@ class Bench:
         return max((self.folder / "state" / "logs").glob("*.mcap"), key=lambda path: path.stat().st_mtime_ns)
 
     def close(self) -> None:
+        """Ends the relay."""
         self.relay.close()
 
 

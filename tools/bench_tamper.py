@@ -123,6 +123,7 @@ Mutator = Callable[[Target, random.Random], bytes]
 
 
 def flip(t: Target, rng: random.Random) -> bytes:
+    """One bit, or a few."""
     data = bytearray(t.data)
     for _ in range(rng.choice((1, 1, 1, 2, 8))):
         place = rng.randrange(8 * len(data))
@@ -131,6 +132,7 @@ def flip(t: Target, rng: random.Random) -> bytes:
 
 
 def overwrite(t: Target, rng: random.Random) -> bytes:
+    """A run of bytes by zeros or noise."""
     data, n = bytearray(t.data), rng.choice((1, 4, 8, 64, 4096))
     at = rng.randrange(len(data))
     run = bytes(n) if rng.random() < 0.3 else rng.randbytes(n)
@@ -144,17 +146,20 @@ def _span(t: Target, rng: random.Random) -> tuple[int, int]:
 
 
 def remove(t: Target, rng: random.Random) -> bytes:
+    """A stretch taken out."""
     a, b = _span(t, rng)
     return t.data[:a] + t.data[b:]
 
 
 def insert(t: Target, rng: random.Random) -> bytes:
+    """A stretch put in: zeros, noise, or what stands there once more."""
     a, b = _span(t, rng)
     put = rng.choice((bytes(b - a), rng.randbytes(b - a), t.data[a:b]))
     return t.data[:a] + put + t.data[a:]
 
 
 def swap(t: Target, rng: random.Random) -> bytes:
+    """Two stretches exchanged."""
     (a, b), (c, d) = sorted((_span(t, rng), _span(t, rng)))
     c = max(b, c)
     d = max(c, d)
@@ -162,19 +167,23 @@ def swap(t: Target, rng: random.Random) -> bytes:
 
 
 def cut(t: Target, rng: random.Random) -> bytes:
+    """The end cut off."""
     return t.data[: rng.randrange(len(t.data))]
 
 
 def cut_with_zeros(t: Target, rng: random.Random) -> bytes:
+    """The end replaced by zeros, as after a power cut."""
     at = rng.randrange(len(t.data))
     return t.data[:at] + bytes(rng.choice((1, 16, 4096, len(t.data) - at)))
 
 
 def pad(t: Target, rng: random.Random) -> bytes:
+    """Something put behind the end."""
     return t.data + rng.choice((b"\0", bytes(16), bytes(4096), MAGIC, rng.randbytes(9), t.data, pack(DataEnd(0)), t.data[-200:]))
 
 
 def header(t: Target, rng: random.Random) -> bytes:
+    """The file says that it is another format, or library."""
     old, new = rng.choice(((b"log 2", b"log 1"), (b"s2r-runtime", b"S2R-runtime"), (MAGIC, MAGIC[:5] + b"1\r\n")))
     return t.data.replace(old, new, 1)
 
@@ -213,6 +222,7 @@ def _message(p: Parts, rng: random.Random) -> tuple[Piece, int]:
 
 
 def change_data(p: Parts, rng: random.Random, _: Target) -> None:
+    """One digit of one message."""
     piece, i = _message(p, rng)
     m = piece.messages[i]
     at = rng.choice([k for k, c in enumerate(m.data) if 48 <= c <= 57] or [0])
@@ -228,6 +238,7 @@ def second_key(p: Parts, rng: random.Random, _: Target) -> None:
 
 
 def change_field(p: Parts, rng: random.Random, _: Target) -> None:
+    """One field of a message's record: channel, number or time."""
     piece, i = _message(p, rng)
     m = piece.messages[i]
     channel, sequence, log_time, publish_time = m.channel, m.sequence, m.log_time, m.publish_time
@@ -247,18 +258,21 @@ def change_field(p: Parts, rng: random.Random, _: Target) -> None:
 
 
 def drop(p: Parts, rng: random.Random, _: Target) -> None:
+    """One message taken out."""
     piece, i = _message(p, rng)
     del piece.messages[i]
     _renumber(p, rng)
 
 
 def duplicate(p: Parts, rng: random.Random, _: Target) -> None:
+    """One message twice."""
     piece, i = _message(p, rng)
     piece.messages.insert(i, piece.messages[i])
     _renumber(p, rng)
 
 
 def put_in(p: Parts, rng: random.Random, t: Target) -> None:
+    """A message of another run put in."""
     piece, i = _message(p, rng)
     assert t.other is not None
     foreign = rng.choice(rng.choice(t.other.parts.pieces).messages)
@@ -267,6 +281,7 @@ def put_in(p: Parts, rng: random.Random, t: Target) -> None:
 
 
 def replace(p: Parts, rng: random.Random, t: Target) -> None:
+    """A message with another one's content."""
     piece, i = _message(p, rng)
     m = piece.messages[i]
     other = rng.choice([o for q in p.pieces for o in q.messages if o.data != m.data])
@@ -274,6 +289,7 @@ def replace(p: Parts, rng: random.Random, t: Target) -> None:
 
 
 def reorder(p: Parts, rng: random.Random, _: Target) -> None:
+    """Two neighbours exchanged, with or without their numbers and times."""
     piece = rng.choice([q for q in p.pieces if len(q.messages) > 2])
     i = rng.randrange(len(piece.messages) - 2)
     piece.messages[i], piece.messages[i + 1] = piece.messages[i + 1], piece.messages[i]
@@ -315,6 +331,7 @@ def declare(p: Parts, rng: random.Random, _: Target) -> None:
 
 
 def attachments(p: Parts, rng: random.Random, t: Target) -> None:
+    """What is attached: exchanged, removed, or changed in its name, time, type or content."""
     places = [(q, i) for q in p.pieces for i in range(len(q.prefix))]
     (a, i), (b, j) = rng.sample(places, 2)
     one, other = attachment_fields(a.prefix[i]), attachment_fields(b.prefix[j])
@@ -337,6 +354,7 @@ def attachments(p: Parts, rng: random.Random, t: Target) -> None:
 
 
 def blocks(p: Parts, rng: random.Random, t: Target) -> None:
+    """Whole blocks taken out, exchanged or repeated."""
     i = rng.randrange(len(p.pieces) - 1)
     match rng.randrange(5):
         case 0:
@@ -352,12 +370,14 @@ def blocks(p: Parts, rng: random.Random, t: Target) -> None:
 
 
 def splice(p: Parts, rng: random.Random, t: Target) -> None:
+    """From some block on, another run."""
     assert t.other is not None
     i = rng.randrange(1, len(p.pieces))
     p.pieces[i:] = copied(t.other.parts).pieces[min(i, len(t.other.parts.pieces) - 1) :]
 
 
 def foreign_block(p: Parts, rng: random.Random, t: Target) -> None:
+    """One block of another run."""
     assert t.other is not None
     i = rng.randrange(len(p.pieces) - 1)
     p.pieces[i] = rng.choice(copied(t.other.parts).pieces[:-1])

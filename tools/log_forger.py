@@ -57,6 +57,7 @@ class Msg:
     data: bytes
 
     def record(self) -> bytes:
+        """The message's record as MCAP has it."""
         return MESSAGE.pack(5, MESSAGE_FIELDS + len(self.data), self.channel, self.sequence, self.log_time, self.publish_time) + self.data
 
 
@@ -130,6 +131,7 @@ def forge(parts: Parts, effort: Effort, key: Ed25519PrivateKey | None = None, si
 
 
 def start(parts: Parts, effort: Effort, key: Ed25519PrivateKey | None) -> bytes:
+    """The file's first records; where somebody poses as the signer, with the forger's key in them."""
     if effort != "pose" or key is None:
         return parts.start
     _, fields = metadata_fields(parts.start[len(FIRST) :])
@@ -139,6 +141,7 @@ def start(parts: Parts, effort: Effort, key: Ed25519PrivateKey | None) -> bytes:
 
 
 def resealed(message: Msg, head: bytes, file: bytes, effort: Effort, key: Ed25519PrivateKey | None) -> Msg:
+    """A seal made anew over what was changed, as far as the effort goes; a message that is no seal stays as it is."""
     try:
         seal = msgspec.structs.replace(msgspec.json.decode(message.data, type=Seal), head=head, file=file)
     except msgspec.DecodeError:
@@ -159,6 +162,7 @@ def framed(piece: Piece, content: bytes, index: dict[int, array[int]]) -> bytes:
 
 
 def compressed(content: bytes, level: int = 1) -> bytes:
+    """A zstd frame of one chunk."""
     return zstandard.ZstdCompressor(level=level).compress(content)
 
 

@@ -71,6 +71,7 @@ class Mutant:
 
     @property
     def name(self) -> str:
+        """What `--only` looks into, and what is printed."""
         return f"{self.module}:{self.where or '<module>'}: {self.change}"
 
     def mutated(self) -> ast.stmt:

@@ -106,6 +106,7 @@ def account(plan: Plan, missed: set[tuple[str, int]], *, whole: bool) -> int:
 
 
 def main() -> int:
+    """0 if every line was run and every mutant killed or told to be equivalent, 1 otherwise."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("modules", nargs="*", help="gate.py certificate.py core/drive.py ... (default: all)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)

@@ -57,11 +57,13 @@ def anchored(readings: Sequence[Reading], heads: Sequence[bytes], findings: Find
 
 
 def unrecorded(message: msgspec.Struct, findings: Findings) -> None:
+    """Takes what the log says it lacks: messages that could not be written (`log/unrecorded`)."""
     assert isinstance(message, Unrecorded)  # noqa: S101 - the channel's type
     findings.lack(f"{message.count} messages at the end were not recorded: {message.reason}")
 
 
 def deleted(message: msgspec.Struct, findings: Findings) -> None:
+    """Takes the name of a run whose log was deleted to make room (`log/deleted`): it was there, and is not any more."""
     assert isinstance(message, LogDeleted)  # noqa: S101 - the channel's type
     head = f" (head {message.head})" if message.head else ""
     findings.lack(f"the log of run {message.run}{head}, which the daemon deleted: {message.reason}")
