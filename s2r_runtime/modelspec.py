@@ -14,25 +14,31 @@ from s2r_runtime.errors import ConfigError
 
 
 class EffectSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One effect: its registered name, the input or state it acts on (`*` for all alike), its parameters in SI units."""
+    """One effect that the model has."""
 
     name: str
+    """One of those on the page of effects, or a plug-in's."""
     channel: str = "*"
+    """The input or state that it acts on; `*`: all alike."""
     parameters: dict[str, float | str | list[list[float]]] = {}
+    """In SI units."""
 
 
 class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`name`: a registered model, or the path of a Python file. `dt` in s. `source_digest`: of that file, filled on loading.
-
-    `fitted_on`: digests of the recordings that effects were fitted on; a gap is refused on those (guarantee G6).
-    """
+    """The simple model, and what is known to be added to it."""
 
     name: str
+    """A model that is built in or comes from a plug-in, or the path of a Python file."""
     dt: float
+    """s; its step."""
     parameters: dict[str, float] = {}
+    """Of the model, in SI units, by name."""
     effects: tuple[EffectSpec, ...] = ()
+    """`[[model.effects]]`, in order: what the data sheet says, and what tracing found."""
     fitted_on: tuple[str, ...] = ()
+    """Digests of the recordings that effects were fitted on; a gap is refused on those (guarantee G6). Tracing writes it."""
     source_digest: str = ""
+    """Of the Python file; filled when it is loaded."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.dt < float("inf"):

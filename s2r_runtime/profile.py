@@ -24,75 +24,95 @@ if TYPE_CHECKING:
 
 
 class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Base of the profile's tables."""
+    """Base of the profile's tables. What stands below a setting is its row in docs/profile.md (`tools/profile_reference.py`)."""
 
 
 class Robot(_Table, frozen=True):
-    """Who it is. `name` keys state, sockets and topics."""
+    """Who it is."""
 
     name: str
+    """Keys its state, sockets and topics: lower-case letters, digits, - and _."""
     description: str = ""
+    """For people."""
 
 
 class Norm(_Table, frozen=True):
-    """The norm of the discrepancy. Weights by state, each in norm-units per state-unit; a state left out weighs 1."""
+    """The norm of the discrepancy, fixed before the data are seen."""
 
     set: Literal["ball", "box"] = "ball"
+    """Shape of the gap set: `ball` for `sqrt(sum (w e)^2)`, `box` for `max w |e|`."""
     weights: dict[str, float] = {}
+    """By state, each in norm-units per state-unit; a state left out weighs 1."""
 
 
 class Sampling(_Table, frozen=True):
-    """The campaign (paper, section V). `stop_periods`: zero input before x0 is recorded, at least the robot's delay + 1.
-
-    `n` 0: as many samples as the epoch's share of beta asks for. Times in s, lengths in m, gains of the go-to law in 1/s.
-    """
+    """The campaign: goes to a random place, stops, and applies a random input."""
 
     n: int = 0
+    """Samples, fixed beforehand; 0: as many as the epoch's share of beta asks for."""
     hold_periods: int = 50
+    """For how many periods each input is held. The first gives the sample, the last the hold gap."""
     stop_periods: int = 4
+    """Periods of zero input before a sample begins, at least the robot's delay + 1."""
     waypoint_radius: float = 0.1
+    """m; a waypoint is reached when the robot is nearer than this."""
     waypoint_margin: float = 0.15
+    """m; waypoints are drawn this far inside region and geofence."""
     waypoint_timeout: float = 60.0
+    """s; a waypoint that is not reached by then is given up for another one."""
     position_gain: float = 1.0
+    """1/s; of the go-to law, on the distance."""
     heading_gain: float = 3.0
+    """1/s; of the go-to law, on the bearing."""
     stuck_after: float = 5.0
+    """s; a robot that was commanded for so long and did not move is stuck."""
     max_rejections: int = 200
+    """Samples that may be rejected in all before the campaign gives up."""
     seed: int = 1
+    """Of all draws, together with robot, model, profile and epoch; `s2r run --seed` replaces it."""
 
 
 class Driving(_Table, frozen=True):
-    """Whether ordinary driving may found a gap, and on which assumption: `block` s apart, transitions are `mixing`-close to independent (a
-    bound on the beta-mixing coefficient, 0: independent), `because` of what. block 0: driving founds nothing.
-    """
+    """Whether ordinary driving may found a gap, and on which assumption (guarantee G4). Left out, it may not."""
 
     block: float = 0.0
+    """s; transitions so far apart are taken to be `mixing`-close to independent. 0: driving founds nothing."""
     mixing: float = 0.0
+    """A bound on the beta-mixing coefficient of the blocks, 0: independent."""
     because: str = ""
+    """Why that may be assumed. There must be a reason where there are blocks; it stands in the statement."""
 
 
 class Guarantee(_Table, frozen=True):
-    """epsilon, beta of guarantee G1 to G4, alpha of the watch's alarm, k discarded samples."""
+    """What the gap's statement says (guarantee G1, G4, G5)."""
 
     epsilon: float = 0.01
+    """A new discrepancy exceeds the gap with at most this probability."""
     beta: float = 0.05
+    """One minus the confidence, of all campaigns and verifications of the robot's life together."""
     alpha: float = 0.01
+    """Probability of a false alarm of the watch, at most."""
     discard: int = 0
+    """Largest discrepancies to leave out, fixed beforehand; each asks for more samples."""
 
 
 class VerificationSettings(_Table, frozen=True):
-    """`headroom`: verification finds the largest radius at which the controller passes, up to headroom times the gap's, so that growth
-    below it costs nothing.
-
-    `n` 0: as many as the attempt's share of beta asks for. `required`: the laws that must pass; the others are reported.
-    """
+    """Rollouts of the uncertain model (guarantee G2, G8)."""
 
     epsilon: float = 0.01
+    """A new rollout scores below the worst of these with at most this probability."""
     n: int = 0
+    """Scenarios for each law; 0: as many as the attempt's share of beta asks for."""
     threshold: float = 0.0
+    """Safety value that every rollout must reach."""
     headroom: float = 3.0
+    """The largest radius at which the controller passes is looked for up to so many times the gap; growth below it costs nothing."""
     laws: tuple[Literal["uniform", "persistent", "adversarial"], ...] = ("uniform", "persistent", "adversarial")
+    """Disturbance laws that are run and reported."""
     required: tuple[Literal["uniform", "persistent", "adversarial"], ...] = ("uniform", "persistent")
+    """Those of them that must pass."""
     timeout: float = 60.0
+    """s; a controller that is not done by then has not passed."""
 
 
 TaskLaw = float | str | list[float] | dict[str, list[float]]
@@ -101,21 +121,29 @@ TaskValue = float | str | list[float] | dict[str, TaskLaw]
 
 
 class TaskChoice(_Table, frozen=True):
-    """Which task, its parameters, and how many scenarios are driven one after the other once deployed (0: no end)."""
+    """What the controller is asked to do."""
 
     name: str
+    """A task that is built in or comes from a plug-in (`s2r plugin list`)."""
     parameters: dict[str, TaskValue] = {}
+    """Its own: below, or on the page of tasks."""
     episodes: int = 0
+    """Scenarios that are driven one after the other once deployed; 0: no end."""
 
 
 class Gate(_Table, frozen=True):
-    """Time-outs in s. `latching`: reasons that stay until a person clears them."""
+    """What closes the gate in time, and what keeps it closed."""
 
     observation_timeout: float = 0.2
+    """s; an observation that is older closes the gate."""
     command_ttl: float = 0.1
+    """s; for how long a command is good, and how long an answer may take."""
     controller_deadline: float = 0.05
+    """s; a controller that has not answered by then is at fault. In lockstep it has 1 s at least."""
     hysteresis: float = 0.1
+    """s; the gate opens when nothing has stood against it for so long."""
     settle_periods: int = 30
+    """In lockstep, with nobody to ask: so many instants get the recovery command, then the robot waits."""
     latching: tuple[str, ...] = (
         "emergency_stop",
         "manual_override",
@@ -124,77 +152,88 @@ class Gate(_Table, frozen=True):
         "command_invalid",
         "measurement_faults",
     )
+    """Reasons that stay until a person clears them (`s2r clear`)."""
 
 
 class Recovery(_Table, frozen=True):
-    """What drives when the gate is closed: `stop` (zero input), `hold` (a fixed `input`), `return` (to `home`, then stop)."""
+    """What drives when the gate is closed."""
 
     kind: Literal["stop", "hold", "return"] = "stop"
+    """`stop`: zero input; `hold`: a fixed `input`; `return`: to `home`, then stop."""
     input: dict[str, float] = {}
+    """For `hold`, by input, within its bounds; an input left out is 0."""
     home: dict[str, float] = {}
+    """For `return`, by state; a state left out is 0."""
 
 
 class Watch(_Table, frozen=True):
-    """`fault_jump`: a discrepancy above it (in the norm's unit) is a fault of measurement, not motion; 0: there is no such rule.
-    More than `max_faults` of them in a deployment close the gate.
-
-    `run_length`: discrepancies between two false notices of a change, at least, on average.
-    """
+    """What is made of discrepancies while a controller drives (guarantee G5)."""
 
     fault_jump: float = 0.0
+    """In the norm's unit; a discrepancy above it is a fault of measurement, not motion. 0: there is no such rule."""
     max_faults: int = 20
+    """More of these in a deployment close the gate."""
     run_length: float = 1e5
+    """Discrepancies between two false notices of a change, at least, on average."""
 
 
 class CertificateSettings(_Table, frozen=True):
-    """How long a certificate is valid, in s."""
+    """What a certificate is given."""
 
     lifetime: float = 86400.0
+    """s; for how long it is valid."""
 
 
 class Recording(_Table, frozen=True):
-    """Where logs go (relative to the state folder), when they rotate (bytes, s; 0: never).
-
-    keep_bytes, keep_days: of all logs; the oldest runs beyond are deleted, but never what a valid certificate rests on (0: all are kept).
-    """
+    """Where logs go, and how many are kept: never is one deleted on which a valid certificate rests."""
 
     directory: str = "logs"
+    """Relative to the state folder."""
     rotate_bytes: int = 1_000_000_000
+    """A new file begins when one is so large; 0: not for its size."""
     rotate_after: float = 0.0
+    """s; a new file begins when one is so old; 0: not for its age."""
     keep_bytes: int = 0
+    """Of all logs; the oldest runs beyond are deleted. 0: all are kept."""
     keep_days: float = 0.0
+    """Older runs are deleted. 0: all are kept."""
 
 
 class Repair(_Table, frozen=True):
-    """When the residual is traced without being asked for: after a campaign, after given inputs, or `delay` s after the gap grew while a
-    controller drives. `rows`: observations at most, the newest. `timeout` in s.
-
-    `adopt`: a repaired model is used when a person says so (`ask`), or as soon as nothing drives (`always`).
-    """
+    """When the residual is traced without being asked for, and whose decision it is to use a repaired model."""
 
     after_campaign: bool = False
+    """After every campaign."""
     after_inputs: bool = False
+    """After given inputs (`s2r sample --inputs`)."""
     on_growth: bool = False
+    """When the gap grew while a controller drives, and again when it has grown by a tenth more."""
     delay: float = 10.0
+    """s; of driving after the gap grew, before that is traced: so that there is something to see."""
     rows: int = 40_000
+    """Observations that are traced at most, the newest."""
     timeout: float = 600.0
+    """s; then a trace is ended, and the log says so."""
     adopt: Literal["ask", "always"] = "ask"
+    """`ask`: a person adopts it (`s2r adopt`); `always`: it is in force as soon as nothing drives."""
 
 
 class Profile(_Table, frozen=True):
-    """A robot. region: where the certificate holds, bounds by state (an angle may be left out: all of it).
-
-    transport: empty where nobody is to drive: what is computed from recordings and models alone needs none.
-    """
+    """A robot."""
 
     robot: Robot
     model: ModelSpec
     region: dict[str, tuple[float, float]]
+    """Where samples count and certificates hold: `[low, high]` by state; an angle may be left out (all of it)."""
     inputs: dict[str, tuple[float, float]]
+    """`[low, high]` by input, around 0: the robot stops on zero input."""
     task: TaskChoice
     transport: dict[str, Any] = {}
+    """How the robot is reached: `name`, and that transport's options. What is computed from recordings and models alone needs none."""
     geofence: dict[str, tuple[float, float]] = {}
+    """Where the sampler may drive, by state; a state left out is fenced by the region."""
     columns: dict[str, str] = {}
+    """Name of the model's -> column of a recording, where they differ."""
     norm: Norm = Norm()
     sampling: Sampling = Sampling()
     driving: Driving = Driving()
@@ -207,6 +246,7 @@ class Profile(_Table, frozen=True):
     recording: Recording = Recording()
     repair: Repair = Repair()
     clock: Literal["realtime", "lockstep"] = "realtime"
+    """`lockstep`: the robot's clock is the clock, and stands still while nobody answers (a simulation)."""
 
     @property
     def files(self) -> dict[str, str]:

@@ -13,6 +13,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import profile_reference
 import pytest
 from command_reference import text, verbs
 
@@ -79,6 +80,10 @@ def test_python_block_runs(where: str, block: str, tmp_path: Path, monkeypatch: 
 
 def test_command_reference_is_the_command_line() -> None:
     assert (ROOT / "docs" / "commands.md").read_text(encoding="utf-8") == text()
+
+
+def test_profile_reference_is_what_a_profile_may_say() -> None:
+    assert (ROOT / "docs" / "profile.md").read_text(encoding="utf-8") == profile_reference.text()
 
 
 def test_every_verb_that_prints_json_says_what() -> None:
