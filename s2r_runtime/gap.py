@@ -124,11 +124,7 @@ def estimate_gap(
     radius = _largest(discrepancy(e, w, kind), discard)
     e_hold = hold_residuals(model, tr)
     paid = e_hold is not None and (not tr.independent or scenario_confidence(n, discard, epsilon) <= split(beta, (1, 1))[0])
-    white = whiteness(model, tr.x0, tr.u, e, first_lag=1 if tr.independent else 2)
-    if tr.independent:
-        both = [one for one in (e, e_hold) if one is not None]
-        series = [*(discrepancy(one, w, kind) for one in both), *(c for one in both for c in body_axes(model, tr.x0, one).T)]
-        white = _in_order(series, 1e-12 * max(1.0, float(np.max(np.abs(tr.x0))))) or white
+    white = _structure(model, tr, e, e_hold, w, kind)
     return Gap(
         radius=radius,
         radius_literal=_largest(discrepancy(e, np.ones_like(w), kind), discard),
@@ -148,6 +144,16 @@ def estimate_gap(
         white=white.white,
         white_reason=white.reason,
     )
+
+
+def _structure(model: ComposedModel, tr: Transitions, e: Array, e_hold: Array | None, w: Array, kind: Kind) -> Whiteness:
+    """What the residual e (n, nx) has besides noise; of samples, their order before all else. e_hold: after the whole hold, (n, nx)."""
+    if tr.independent:
+        both = [one for one in (e, e_hold) if one is not None]
+        series = [*(discrepancy(one, w, kind) for one in both), *(c for one in both for c in body_axes(model, tr.x0, one).T)]
+        if (found := _in_order(series, 1e-12 * max(1.0, float(np.max(np.abs(tr.x0)))))) is not None:
+            return found
+    return whiteness(model, tr.x0, tr.u, e, first_lag=1 if tr.independent else 2)
 
 
 def _in_order(series: list[Array], rounding: float) -> Whiteness | None:

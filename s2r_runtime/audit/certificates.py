@@ -17,6 +17,8 @@ from s2r_runtime.recording.reading import Entry
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from s2r_runtime.certificate import Certificate
+    from s2r_runtime.controllers.file import ControllerFile
     from s2r_runtime.revocations import Revocation
 
 
@@ -90,19 +92,10 @@ class Certificates:
         unix_s: int,
     ) -> str:
         """Why it stands. Raises ConfigError with why it doesn't."""
-        data = attachments.get(f"certificate/{event.facts.id}")
-        if data is None:
-            raise ConfigError("is not attached to the log")
-        elsewhere = event.gap is not None
-        signer = certificates.signer(data.data)
-        if (revocation := self._revoked.get(keys.fingerprint(signer))) is not None:
-            raise ConfigError(f"is signed with the key {keys.fingerprint(signer)}, which was {revocation}")
-        certificate = certificates.load(data.data, {*trusted, signer} if elsewhere else trusted[:1], None, "certificate")
-        if certificates.facts(certificate) != event.facts or event.gap not in (None, certificate.gap):
-            raise ConfigError("what the gate was told is not what it says")
+        certificate, signer = self._signed(event, attachments, trusted)
         if problem := certificates.assumption_problem(certificate, profile):
             raise ConfigError(problem)
-        if elsewhere:
+        if event.gap is not None:
             known = "a trusted key" if signer in trusted else f"key {keys.fingerprint(signer)}, not compared with a trusted one"
             self._findings.lack(f"the evidence of certificate {event.facts.id}, which was made elsewhere")
             return f"signed elsewhere by {known}; its evidence is not in this log"
@@ -112,6 +105,41 @@ class Certificates:
         if problem := self._evidence.problem(order):
             raise ConfigError(problem)
         controller = attached_controller(attachments, certificate.controller_digest)
+        self._compared(certificate, order, controller, profile, settings, horizon, unix_s, traced)
+        self._findings.count("certificates")
+        return self._evidence.support(order)
+
+    def _signed(
+        self, event: CertificateStored, attachments: Mapping[str, Attached], trusted: tuple[bytes, ...]
+    ) -> tuple[Certificate, bytes]:
+        """The attached certificate, which says what the gate was told, and the public key that signed it. Raises ConfigError.
+
+        One that was made elsewhere may have any signer, who is named; one of this daemon's has its key.
+        """
+        data = attachments.get(f"certificate/{event.facts.id}")
+        if data is None:
+            raise ConfigError("is not attached to the log")
+        signer = certificates.signer(data.data)
+        if (revocation := self._revoked.get(keys.fingerprint(signer))) is not None:
+            raise ConfigError(f"is signed with the key {keys.fingerprint(signer)}, which was {revocation}")
+        believed = {*trusted, signer} if event.gap is not None else trusted[:1]
+        certificate = certificates.load(data.data, believed, None, "certificate")
+        if certificates.facts(certificate) != event.facts or event.gap not in (None, certificate.gap):
+            raise ConfigError("what the gate was told is not what it says")
+        return certificate, signer
+
+    @staticmethod
+    def _compared(
+        certificate: Certificate,
+        order: IssueCertificate,
+        controller: ControllerFile | None,
+        profile: Profile,
+        settings: Settings,
+        horizon: Callable[[], int],
+        unix_s: int,
+        traced: bool,
+    ) -> None:
+        """Issues it once more from what was ordered. Raises ConfigError if that is another one."""
         if controller is None:
             raise ConfigError("the controller that it is of is not attached")
         if certificate.profile_digest != settings.profile_digest:
@@ -130,5 +158,3 @@ class Certificates:
         )
         if again.id != certificate.id:
             raise ConfigError("what it says is not what the evidence says")
-        self._findings.count("certificates")
-        return self._evidence.support(order)
