@@ -47,6 +47,9 @@ LEAST = -50.0
 SMALL = 1e-3
 """Of rate times time: below it a series of four terms is exact to rounding."""
 
+LIKE_NONE = 1e-300
+"""Of rate times time: it may be divided by, and what comes out is that of none."""
+
 PROBE_S, PROBE = 1e-3, 1e-3
 """Step within which a bit of an input says whether inputs are forces, s: short against any motion, long against rounding; and that bit,
 over the inputs.
@@ -250,13 +253,14 @@ def _swept(speeds: list[Array], given: list[Array], pushes: list[Push], w: Array
     """
     forces = np.zeros((len(speeds), len(speeds[0])))
     moved = [(v, v) for v in speeds]
+    flows = [_flows(push.rate, h) for push in pushes]  # rates stay from sweep to sweep
     rows: slice | NDArray[np.int64] = slice(None)
     now, last = forces.copy(), forces
     for sweep in range(SWEEPS):
         before = now.copy()
-        for i, (v, g, push) in enumerate(zip(speeds, given, pushes, strict=True)):
+        for i, (v, g, push, flow) in enumerate(zip(speeds, given, pushes, flows, strict=True)):
             drive = g + sum(w[:, i, j] * now[j] for j in range(len(speeds)) if j != i)
-            end, way = _glide(v, drive, push, h)
+            end, way = _glide(v, drive, push, h, flow)
             now[i] = ((end - v) / h - drive) / w[:, i, i]
             if isinstance(rows, slice):
                 moved[i] = end, way
@@ -270,6 +274,7 @@ def _swept(speeds: list[Array], given: list[Array], pushes: list[Push], w: Array
         if len(changing) < FEWER * w.shape[0]:
             rows = changing if isinstance(rows, slice) else rows[changing]
             w, pushes = w[changing], [_rows(push, changing) for push in pushes]
+            flows = [(_flow_at(ahead, changing), _flow_at(back, changing)) for ahead, back in flows]
             speeds, given = [v[changing] for v in speeds], [g[changing] for g in given]
             now, changed, last = now[:, changing], changed[:, changing], last[:, changing]
         if sweep % 2 and sweep < SWEEPS // 2:  # where links go on changing between stick and slip, steps so long never end
@@ -286,6 +291,11 @@ def _rows(push: Push, rows: NDArray[np.int64]) -> Push:
     return Push(drive, _at(push.rate, rows), _at(push.dry, rows), None if push.hold is None else _at(push.hold, rows))
 
 
+def _flow_at(flow: Flow, rows: NDArray[np.int64]) -> Flow:
+    """Of some of its rows."""
+    return Flow(*(e[rows] if isinstance(e, np.ndarray) else e for e in flow))
+
+
 def _times(push: Push, w: Array) -> Push:
     """As accelerations, of what is over the mass (n,) or the model's."""
     dry = _both(push.dry, w)
@@ -293,6 +303,8 @@ def _times(push: Push, w: Array) -> Push:
 
 
 def _both(pair: Pair, w: Array) -> Pair:
+    if _alike(pair) and not isinstance(pair[0], np.ndarray) and pair[0] == 0.0:
+        return pair
     first = pair[0] * w
     return first, first if _alike(pair) else pair[1] * w
 
@@ -317,19 +329,19 @@ def _sum(a: Pair, b: Pair) -> Pair:
     return first, first if a[0] is a[1] and b[0] is b[1] else a[1] + b[1]
 
 
-def _glide(v: Array, given: Array, push: Push, h: float | Array) -> tuple[Array, Array]:
-    """v (n,) h seconds later, and the way made, with constant coefficients; given: (n,) acceleration without the push."""
+def _glide(v: Array, given: Array, push: Push, h: float | Array, flows: tuple[Flow, Flow] | None = None) -> tuple[Array, Array]:
+    """v (n,) h seconds later, and the way made, with constant coefficients; given: (n,) acceleration without the push; flows: `_flows` of
+    it, where they are known.
+    """
     drive = given + push.drive
+    ahead, back = flows or _flows(push.rate, h)
     held = push.hold or push.dry
-    if _alike(push.rate) and not any(np.any(force) for force in (*push.dry, *held)):
-        return _moved(v, drive, _flow(push.rate[0], h))
+    if _alike(push.rate) and not any(_some(force) for force in (*push.dry, *held)):
+        return _moved(v, drive, ahead)
     forward = v > 0.0
     sign = np.sign(v)
     pull = drive - sign * _by_sign(push.dry, forward)
-    flow = _flow(push.rate[0], h)
-    if not _alike(push.rate):
-        back = _flow(push.rate[1], h)
-        flow = Flow(*(_by_sign(pair, forward) for pair in zip(flow, back, strict=True)))
+    flow = ahead if back is ahead else Flow(*(_by_sign(pair, forward) for pair in zip(ahead, back, strict=True)))
     end, way = _moved(v, pull, flow)
     stops = np.flatnonzero(end * sign <= 0.0)
     if len(stops):
@@ -353,15 +365,20 @@ class Flow(NamedTuple):
     second: Value
 
 
+def _flows(rate: Pair, t: Value) -> tuple[Flow, Flow]:
+    """While moving forward, and backward."""
+    ahead = _flow(rate[0], t)
+    return ahead, ahead if _alike(rate) else _flow(rate[1], t)
+
+
 def _flow(rate: Value, t: Value) -> Flow:
     """keep = exp(-z), first = t (1 - exp(-z))/z, second = t² (z - 1 + exp(-z))/z², z = rate t."""
     z = rate * t
     if isinstance(z, np.ndarray):
         z = np.maximum(z, LEAST)
-        safe = np.where(z == 0.0, 1.0, z)
-        one = np.where(z == 0.0, 1.0, -np.expm1(-safe) / safe)
-        small = np.abs(z) < SMALL
-        two = np.where(small, _series(z), (1.0 - one) / np.where(small, 1.0, z))
+        safe = z if z.all() else np.where(z == 0.0, LIKE_NONE, z)
+        one = -np.expm1(-safe) / safe
+        two = np.where(np.abs(z) < SMALL, _series(z), (1.0 - one) / safe)
         return Flow(1.0 - z * one, t * one, t * t * two)
     z = max(float(z), LEAST)
     single = -math.expm1(-z) / z if z else 1.0
@@ -387,6 +404,11 @@ def _time_to_rest(v: Array, pull: Array, rate: Value) -> Array:
 
 def _alike(pair: Pair) -> bool:
     return pair[0] is pair[1] or (not isinstance(pair[0], np.ndarray) and not isinstance(pair[1], np.ndarray) and pair[0] == pair[1])
+
+
+def _some(value: Value) -> bool:
+    """Whether it is anything but zero. Mostly it is one number, and asked of that, numpy takes as long as for a thousand."""
+    return bool(np.any(value)) if isinstance(value, np.ndarray) else value != 0.0
 
 
 def _by_sign(pair: Pair, forward: Mask) -> Value:
