@@ -30,10 +30,10 @@ class DoubleIntegrator:
 
     def step(self, x: Array, u: Array, dt: float | Array, parameters: dict[str, float]) -> Array:
         """One step of dt seconds, (n, 4)."""
-        dt = dt[:, None] if isinstance(dt, np.ndarray) else dt
         after = np.empty_like(x)
-        after[:, :2] = x[:, :2] + dt * x[:, 2:] + 0.5 * dt * dt * u
-        after[:, 2:] = x[:, 2:] + dt * u
+        for axis in (0, 1):  # a column at a time: numpy runs along many rows faster than along two columns
+            after[:, axis] = x[:, axis] + dt * x[:, 2 + axis] + 0.5 * dt * dt * u[:, axis]
+            after[:, 2 + axis] = x[:, 2 + axis] + dt * u[:, axis]
         return after
 
 
