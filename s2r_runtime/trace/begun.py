@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.fitting import Fit, Problem
-from s2r_runtime.trace.residual import acting, state_jacobian
 
 Array = NDArray[np.float64]
 
@@ -26,7 +25,7 @@ def begun(given: Problem, fit: Fit) -> Array | None:
     if not given.floor.axes:
         return None
     steps, model = given.steps, fit.model
-    f = state_jacobian(model, steps, acting(model, given.data))
+    f = given.jacobian(model)
     s = fit.whiten.back(fit.z * noises.weight(fit.z))
     before = np.where(steps.joined[:, None], np.concatenate([np.zeros((1, s.shape[1])), s[:-1]]), 0.0)
     error = fit.noise.r * (before - np.einsum("kji,kj->ki", f, s))

@@ -35,19 +35,6 @@ TINY = 1e-9
 """s that rows after the end of a run last, which nobody reads: no division by zero."""
 
 
-class _Same:
-    """Equal only to itself: models and effects of others need not be hashable. It is kept, so that no other object takes its place."""
-
-    def __init__(self, thing: object) -> None:
-        self._thing = thing
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self._thing is other._thing
-
-    def __hash__(self) -> int:
-        return id(self._thing)
-
-
 class Inputs:
     """Held inputs of runs, (T_i, nu) each, in rows of dt; starts: of the runs, s. lasts: (T_i,) s, of each row, where they differ. parts:
     rows in a step of the model; where there are several, an input that changes within one has a mean there that nobody commanded. turned:
@@ -70,6 +57,7 @@ class Inputs:
         self._begins = _end_to_end([b[:, None] for b in begins], 0.0)[:, 0] if begins else np.zeros(0)
         self._kept: OrderedDict[Key, list[Array]] = OrderedDict()
         self._bytes = 0
+        self._met: dict[int, object] = {}
         lengths = np.array([len(u) for u in inputs])
         self._rows: NDArray[np.int64] | None = None
         self._starts: list[float | Array] = [float(s) for s in starts]
@@ -103,13 +91,13 @@ class Inputs:
     def _follow(self, model: ComposedModel, chain: Sequence[AppliedEffect], *, ends: bool) -> tuple[list[Array], list[Array], list[Key]]:
         """Tables on average and at the ends of rows (the same ones, unless these are asked for), and the last link on each input."""
         nominal = model.nominal
-        who: Key = (_Same(nominal.shared), *sorted(nominal.parameters.items()))
+        who: Key = (self._number(nominal.shared), *sorted(nominal.parameters.items()))
         links: list[Key] = [(who, name) for name in nominal.inputs]
         now = self._tables
         last = self._given_at_ends if ends else now
         for a in delays_first(nominal, chain, lambda link: link):
             touched = self._touched(a, model)
-            key: Key = (_Same(a.effect), a.channel, _values(a), *(links[c] for c in touched))
+            key: Key = (self._number(a.effect), a.channel, values_key(a), *(links[c] for c in touched))
             found = self._kept.get(key)
             if found is None:
                 found = [table[..., touched] for table in self._apply(a, now, model)]
@@ -229,6 +217,11 @@ class Inputs:
         """What an effect is told that knows what to make of rows within which an input changes."""
         return {"mixed": True} if self._mixed and getattr(a.effect, "takes_mixed", False) else {}
 
+    def _number(self, thing: object) -> int:
+        """Of a model or an effect of others, which need not be hashable. It is kept, so that no other object gets its number."""
+        self._met[id(thing)] = thing
+        return id(thing)
+
     def _keep(self, key: Key, found: list[Array]) -> None:
         self._kept[key] = found
         self._bytes += sum(columns.nbytes for columns in found)
@@ -263,6 +256,6 @@ def _with(table: Array, columns: list[int], values: Array) -> Array:
     return changed
 
 
-def _values(a: AppliedEffect) -> Key:
+def values_key(a: AppliedEffect) -> Key:
     """Parameter values as something that can be looked up."""
     return tuple((name, str(value) if isinstance(value, list) else value) for name, value in sorted(a.p.items()))

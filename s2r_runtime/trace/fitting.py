@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.answers import Known, kept
 from s2r_runtime.trace.coarse import coarse
 from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.residual import Steps, acting, advanced, farthest, predicted, residual, state_jacobian
+from s2r_runtime.trace.residual import Steps, acting, advanced, predicted, state_jacobian
 from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
 from s2r_runtime.trace.slots import Added, Free, Slot, bounds_of, free_of, inside, values_of, with_values
 from s2r_runtime.trace.speed_noise import BEYOND
@@ -62,11 +63,31 @@ class Problem:
     steps: Steps
     floor: Noise
     searches: dict[tuple[object, ...], object] = field(default_factory=dict, repr=False, compare=False)
+    known: Known = field(default_factory=Known, init=False, repr=False, compare=False)
 
     @cached_property
     def coarse(self) -> Problem:
         """The same with steps in fewer parts, for a first look: most of what it takes is to work out what acts in each."""
-        return replace(self, data=coarse(self.data))
+        data = coarse(self.data)
+        return self if data is self.data else replace(self, data=data)
+
+    def predicted(self, model: ComposedModel) -> Array:
+        """Where a model leads, (n, nx)."""
+        known = self.known.of(model)
+        if known.predicted is None:
+            known.predicted = kept(predicted(model, self.steps, acting(model, self.data)))
+        return known.predicted
+
+    def residual(self, model: ComposedModel) -> Array:
+        """What a model leaves, (n, nx)."""
+        return model.difference(self.steps.y1, self.predicted(model))
+
+    def jacobian(self, model: ComposedModel) -> Array:
+        """F of a model, (n, nx, nx)."""
+        known = self.known.of(model)
+        if known.jacobian is None:
+            known.jacobian = kept(state_jacobian(model, self.steps, acting(model, self.data)))
+        return known.jacobian
 
 
 @dataclass(frozen=True)
@@ -120,9 +141,7 @@ def problem(data: Dataset, steps: Steps) -> Problem:
 
 def evaluate(given: Problem, model: ComposedModel, near: Noise | None = None) -> Fit:
     """The model as it stands, with its own noise. near: noise from which its estimate begins."""
-    act = acting(model, given.data)
-    r = residual(model, given.steps, act)
-    f = state_jacobian(model, given.steps, act)
+    r, f = given.residual(model), given.jacobian(model)
     level = noises.estimate(r, f, given.steps.joined, given.floor, near)
     whiten = Whitener(level, f, given.steps.joined)
     z = whiten(r)
@@ -134,16 +153,15 @@ def evaluate(given: Problem, model: ComposedModel, near: Noise | None = None) ->
 
 def under_noise(given: Problem, model: ComposedModel, level: Noise) -> Fit:
     """The model under a noise that is not its own."""
-    act = acting(model, given.data)
-    whiten = Whitener(level, state_jacobian(model, given.steps, act), given.steps.joined)
-    z = whiten(residual(model, given.steps, act))
+    whiten = Whitener(level, given.jacobian(model), given.steps.joined)
+    z = whiten(given.residual(model))
     told = float(np.sum(noises.log_density(z))) - whiten.logdet
     return Fit(model, free_of(model), level, noises.no_colour(z.shape[1]), whiten, z, told, told)
 
 
 def objective(given: Problem, fit: Fit, model: ComposedModel) -> Array:
     """z (n, nx) of a model under the noise of a fit."""
-    return _whitened(given, fit, residual(model, given.steps, acting(model, given.data)))
+    return _whitened(given, fit, given.residual(model))
 
 
 def _whitened(given: Problem, fit: Fit, r: Array) -> Array:
@@ -157,22 +175,29 @@ def foretold(given: Problem, model: ComposedModel) -> Array | None:
         there = advanced(model, given.steps.y0, acting(model, given.data), given.steps.place)
     except ConfigError:
         return None
-    return None if np.any(np.abs(there) > farthest(given.steps.y1)) else there
+    return None if np.any(np.abs(there) > given.steps.farthest) else there
 
 
-def sensitivities(given: Problem, fit: Fit, model: ComposedModel, free: Free, here: Array | None = None) -> Array:
-    """dz/dp, (n nx, k), under the noise of a fit. here: (n, nx), what the model predicts, where that is known."""
+def sensitivities(given: Problem, fit: Fit, model: ComposedModel, free: Free) -> Array:
+    """dz/dp, (n nx, k), under the noise of a fit."""
     n, nx = given.steps.y0.shape
     if not free:
         return np.zeros((n * nx, 0))
-    moved = slopes(given, model, free, here)
+    moved = slopes(given, model, free)
     return fit.colour(fit.whiten(moved), given.steps.joined).reshape(n * nx, len(free))
 
 
-def slopes(given: Problem, model: ComposedModel, free: Free, here: Array | None = None) -> Array:
-    """d(residual)/dp, (n, nx, k), one-sided differences inside the bounds. here: (n, nx), what the model predicts, where that is known."""
+def slopes(given: Problem, model: ComposedModel, free: Free) -> Array:
+    """d(residual)/dp, (n, nx, k), one-sided differences inside the bounds."""
+    known = given.known.of(model).slopes
+    if free not in known:
+        known[free] = kept(_slopes(given, model, free))
+    return known[free]
+
+
+def _slopes(given: Problem, model: ComposedModel, free: Free) -> Array:
     n, nx = given.steps.y0.shape
-    here = predicted(model, given.steps, acting(model, given.data)) if here is None else here
+    here = given.predicted(model)
     now = values_of(model, free)
     moved = np.zeros((n, nx, len(free)))
     for j, h in enumerate(_differences(given, model, free)):
@@ -228,12 +253,11 @@ def refine(given: Problem, fit: Fit, model: ComposedModel, free: Free | None = N
     free = free_of(model) if free is None else free
     if not free:
         return model
-    here = predicted(model, given.steps, acting(model, given.data))
-    z = _whitened(given, fit, model.difference(given.steps.y1, here))
+    z = objective(given, fit, model)
     best = float(np.sum(noises.log_density(z)))
     damping = 1e-4
     for _ in range(iterations):
-        j = sensitivities(given, fit, model, free, here)
+        j = sensitivities(given, fit, model, free)
         w = noises.weight(z).ravel()
         normal, slope = j.T @ (j * w[:, None]), j.T @ (w * z.ravel())
         before = best
@@ -248,7 +272,8 @@ def refine(given: Problem, fit: Fit, model: ComposedModel, free: Free | None = N
                 z_other = z if there is None else _whitened(given, fit, other.difference(given.steps.y1, there))
                 reached = float(np.sum(noises.log_density(z_other)))
                 if there is not None and reached > best:
-                    model, here, z, best, damping = other, there, z_other, reached, damping / 10.0
+                    model, z, best, damping = other, z_other, reached, damping / 10.0
+                    given.known.of(model).predicted = kept(there)
                     break
             damping *= 10.0
         damping = max(damping, 1e-8)
@@ -297,9 +322,10 @@ def about(given: Problem, fit: Fit) -> Problem:
     filtering theory, 1970).
     """
     steps, act = given.steps, acting(fit.model, given.data)
+    f = given.jacobian(fit.model)
     s = fit.whiten.back(fit.z * noises.weight(fit.z))
     before = np.where(steps.joined[:, None], np.concatenate([np.zeros((1, s.shape[1])), s[:-1]]), 0.0)
-    error = fit.noise.r * (before - np.einsum("kji,kj->ki", state_jacobian(fit.model, steps, act), s))
+    error = fit.noise.r * (before - np.einsum("kji,kj->ki", f, s))
     begin = replace(steps, y0=steps.y0 - error)
     moved = np.einsum("kij,kj->ki", state_jacobian(fit.model, begin, act), error)
     return replace(given, steps=replace(begin, y1=steps.y1 - moved))

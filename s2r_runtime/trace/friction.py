@@ -19,7 +19,6 @@ from s2r_runtime.models.forces import axes
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, foretold, insert
-from s2r_runtime.trace.residual import acting, predicted
 from s2r_runtime.trace.scores import name_of
 
 Array = NDArray[np.float64]
@@ -41,7 +40,7 @@ def with_friction(given: Problem, base: Fit) -> Fit | None:
     if len(ones) < 2:
         return None
     alone = [foretold(given, insert(model, one, len(model.effects))) for one in ones]
-    before = predicted(model, given.steps, acting(model, given.data))
+    before = given.predicted(model)
     sizes = _sizes(base, np.array([before if one is None else one for one in alone]) - before)
     kept = [_scaled(one, size) for one, size in zip(ones, sizes.tolist(), strict=True) if size > 0.0]
     if len(kept) < 2:

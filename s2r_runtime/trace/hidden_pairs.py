@@ -24,7 +24,6 @@ from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.candidates import candidates, places
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, foretold, gain, insert, sought
 from s2r_runtime.trace.leftover import Leftover
-from s2r_runtime.trace.residual import acting, predicted
 from s2r_runtime.trace.rivals import NEAR
 from s2r_runtime.trace.scores import STRICT, name_of, names
 from s2r_runtime.trace.screening import Probe, columns, probes_of
@@ -71,7 +70,7 @@ def two_together(given: Problem, chosen: Selection, foretells: Callable[[list[Fi
 def _promising(given: Problem, chosen: Selection) -> list[tuple[Probe, Probe]]:
     """Pairs of different effects that explain most, as far as that is linear."""
     base, given = chosen.nominal, given.coarse
-    before = predicted(base.model, given.steps, acting(base.model, given.data))
+    before = given.predicted(base.model)
     probes = probes_of(base.model, candidates(base.model, given.data, Leftover(given, base)))
     root = np.sqrt(noises.weight(base.z.ravel()))
     found = [(probe, c * root[:, None]) for probe, c in columns(given, base, probes, before)]

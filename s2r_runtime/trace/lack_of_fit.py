@@ -33,7 +33,7 @@ from s2r_runtime.trace.fitting import Fit, Problem
 from s2r_runtime.trace.fitting import gain as explained
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, SLOWLY, Judged, Left, first_look, judge, leading
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
-from s2r_runtime.trace.residual import Mask, acting, covered, residual, rms, rollout, rollout_starts, state_jacobian
+from s2r_runtime.trace.residual import Mask, acting, covered, rms, rollout, rollout_starts
 from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
 
 Array = NDArray[np.float64]
@@ -245,7 +245,7 @@ def explains_more(looks: Looks, unnamed: Judged, fit: Fit, horizon: int, *, left
     left: whether they leave some that matters. What effects change is judged as a dictionary of one term is.
     """
     given, nominal = looks.left.given, looks.left.fit
-    changed = looks.left.r - residual(fit.model, given.steps, acting(fit.model, given.data))
+    changed = looks.left.r - given.residual(fit.model)
     x = _columns([changed], np.ones(changed.shape[1]))
     mine = max(explained(fit, nominal), judge(looks.left, "", x).gain if x.shape[2] else 0.0)
     if unnamed.gain <= MORE * mine + ALIKE * (1.0 if left else 3.0):
@@ -258,12 +258,10 @@ def explains_more(looks: Looks, unnamed: Judged, fit: Fit, horizon: int, *, left
 
 def left_of(given: Problem, fit: Fit) -> Left:
     """What a model leaves."""
-    act = acting(fit.model, given.data)
-    r = residual(fit.model, given.steps, act)
     n = len(given.steps)
     block = np.minimum(np.arange(n) * BLOCKS // n, BLOCKS - 1)
     wild = np.any(np.abs(fit.z) > noises.OUTLIER)
-    return Left(given, fit, r, state_jacobian(fit.model, given.steps, act), block, _clipped(fit.z) if wild else None)
+    return Left(given, fit, given.residual(fit.model), given.jacobian(fit.model), block, _clipped(fit.z) if wild else None)
 
 
 def dictionaries_of(left: Left) -> list[tuple[str, Array]]:

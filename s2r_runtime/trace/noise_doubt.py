@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.fitting import WIDEST, Fit, Problem, slopes
-from s2r_runtime.trace.residual import acting, residual, state_jacobian
 from s2r_runtime.trace.state_noise import State
 
 Array = NDArray[np.float64]
@@ -39,8 +38,7 @@ WILD = 100.0
 
 def doubted(given: Problem, fit: Fit) -> Array:
     """(k,) by which standard deviations are larger than the likelihood at its best noise says, within [1, WIDEST]."""
-    act = acting(fit.model, given.data)
-    r, f = residual(fit.model, given.steps, act), state_jacobian(fit.model, given.steps, act)
+    r, f = given.residual(fit.model), given.jacobian(fit.model)
     more = _more(r, f, given, fit)
     if not np.any(more):
         return np.ones(len(fit.free))

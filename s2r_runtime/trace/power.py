@@ -21,7 +21,6 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.candidates import Candidate, candidates
 from s2r_runtime.trace.fitting import Fit, Problem, foretold, sensitivities
-from s2r_runtime.trace.residual import acting, predicted
 from s2r_runtime.trace.scores import STRICT
 from s2r_runtime.trace.slots import Slot, bounds_of, slots_of, values_of
 
@@ -45,7 +44,7 @@ class Visible:
 
 def visible(given: Problem, fit: Fit, tried: int) -> tuple[Visible, ...]:
     """Of every effect with a neutral value that the model does not have yet. tried: starts that were looked at."""
-    before = predicted(fit.model, given.steps, acting(fit.model, given.data))
+    before = given.predicted(fit.model)
     white = replace(fit, colour=noises.no_colour(fit.z.shape[1]))
     j = sensitivities(given, white, fit.model, fit.free)
     found: dict[tuple[str, str], Visible] = {}

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, refine, sensitivities, sought, under_noise, without
-from s2r_runtime.trace.residual import acting, predicted
 from s2r_runtime.trace.slots import Slot, bounds_of, values_of, with_values
 
 Array = NDArray[np.float64]
@@ -99,9 +98,9 @@ def _curve(given: Problem, fit: Fit, slot: Slot) -> tuple[Array, Array]:
 
 
 def _nats(given: Problem, fit: Fit, base: Fit, slot: Slot, times: Array) -> Array:
-    before = predicted(base.model, given.steps, acting(base.model, given.data))
+    before = given.predicted(base.model)
     models = [_at(fit.model, slot, float(when)) for when in times]
-    moved = np.stack([0.0 * before if m is None else predicted(m, given.steps, acting(m, given.data)) - before for m in models], axis=2)
+    moved = np.stack([0.0 * before if m is None else given.predicted(m) - before for m in models], axis=2)
     weights = np.sqrt(noises.weight(base.z)).ravel()
     z, c = weights * base.z.ravel(), weights[:, None] * base.whiten(moved).reshape(len(weights), -1)
     if base.free:

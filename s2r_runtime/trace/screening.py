@@ -26,7 +26,6 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.candidates import Candidate
 from s2r_runtime.trace.fitting import Fit, Problem, foretold, refine, sensitivities
-from s2r_runtime.trace.residual import acting, predicted
 from s2r_runtime.trace.slots import Free, bounds_of, inside, slots_of, values_of, with_values
 
 Array = NDArray[np.float64]
@@ -83,7 +82,7 @@ def screen(given: Problem, base: Fit, found: Sequence[Candidate], hopeless: floa
     """
     given = given.coarse
     probes = probes_of(base.model, found)
-    before = predicted(base.model, given.steps, acting(base.model, given.data))
+    before = given.predicted(base.model)
     white = replace(base, colour=noises.no_colour(base.z.shape[1]))  # what looks like colour may be what an effect explains
     aside = _Aside(base.z.ravel(), sensitivities(given, white, base.model, base.free))
     level = float(np.sum(noises.log_density(aside.z)))
@@ -204,7 +203,7 @@ def _moved_on(given: Problem, white: Fit, aside: _Aside, before: Array, s: Scree
     ):
         return s
     start = refine(given, white, s.start, slots, STEPS_ON)
-    column = _column(white, predicted(start, given.steps, acting(start, given.data)) - before)
+    column = _column(white, given.predicted(start) - before)
     value, _ = aside.look(Probe(s.candidate, start, (start,), (), ()), column)
     return Screened(value - level, s.candidate, start) if value - level > s.value else s
 

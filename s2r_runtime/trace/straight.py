@@ -248,7 +248,7 @@ def changed_within(lay: Lay, everywhere: Lay, fit: Fit, samples: Samples, nu: in
     """
     held, way = Way((0.0,) * nu, (0.0,) * nu), Way((0.0,) * nu, (0.0,) * nu, within=True)
     given, every = lay(held), samples.within
-    at = predicted(fit.model, given.steps, acting(fit.model, given.data))
+    at = given.predicted(fit.model)
     columns = []
     for j in range(nu):
         samples.within = [one * np.eye(nu)[j] for one in every]

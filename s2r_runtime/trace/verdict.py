@@ -133,7 +133,7 @@ def asked(given: Problem, judged_on: Held, model: ComposedModel, less: ComposedM
 
 def _once(given: Problem, model: ComposedModel, less: ComposedModel) -> bool:
     """Whether an effect does what it does at one time only: somebody may have held the robot there."""
-    apart = model.difference(*(predicted(m, given.steps, acting(m, given.data)) for m in (model, less)))
+    apart = model.difference(*(given.predicted(m) for m in (model, less)))
     done = np.array([np.sum((part / np.maximum(rms(apart), 1e-300)) ** 2) for part in np.array_split(apart, TIMES)])
     return bool(np.max(done) > MOSTLY * np.sum(done))
 

@@ -1,0 +1,104 @@
+"""What takes a tracer's time is asked of a model once: rounds of a fit, and what follows it, go back to what they know."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from s2r_runtime.models import forces
+from s2r_runtime.models.composed import compose
+from s2r_runtime.models.double_integrator import DoubleIntegrator
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.trace import fitting, residual
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.fitting import Problem, evaluate, fitted, insert, problem, scatter
+from s2r_runtime.trace.residual import acting, state_jacobian, steps_of
+
+DT_S, ROWS = 0.02, 300
+
+
+def _given(drag: float = 0.3) -> tuple[Problem, fitting.Fit]:
+    """A body with drag, and a fit of it that begins elsewhere."""
+    rng = np.random.default_rng(0)
+    robot = compose(ModelSpec("double_integrator", DT_S, {}, (EffectSpec("viscous_friction", "vx", {"coefficient": drag}),)))
+    model = compose(ModelSpec("double_integrator", DT_S))
+    u = np.repeat(rng.uniform(-1.0, 1.0, (ROWS // 20, 2)), 20, axis=0)
+    x, hidden, rows = np.zeros((1, 4)), robot.at_rest(1), [np.zeros(4)]
+    for k in range(ROWS):
+        x, hidden = robot.step(x, u[k : k + 1], hidden)
+        rows.append(x[0])
+    data = from_arrays(model, [(np.array(rows) + 0.002 * rng.normal(size=(ROWS + 1, 4)), u)])
+    given = problem(data, steps_of(data))
+    start = insert(model, robot.effects[0], 0)
+    return given, fitted(given, evaluate(given, model), start)
+
+
+def test_rounds_of_a_fit_and_what_follows_ask_for_slopes_once_a_model(monkeypatch):
+    asked: list[tuple[float, ...]] = []
+    slopes = fitting._slopes
+
+    def counted(given, model, free):
+        asked.append(tuple(fitting.values_of(model, free)))
+        return slopes(given, model, free)
+
+    monkeypatch.setattr(fitting, "_slopes", counted)
+    given, fit = _given()
+    scatter(given, fit)
+    assert 1 < len(asked) == len({*asked})
+
+
+def test_what_is_known_of_a_model_is_what_it_says():
+    given, fit = _given()
+    act = acting(fit.model, given.data)
+    assert np.array_equal(given.residual(fit.model), residual.residual(fit.model, given.steps, act))
+    assert np.array_equal(given.jacobian(fit.model), state_jacobian(fit.model, given.steps, act))
+    assert np.array_equal(fitting.slopes(given, fit.model, fit.free), fitting._slopes(given, fit.model, fit.free))
+    with pytest.raises(ValueError, match="read-only"):
+        given.predicted(fit.model)[0] = 0.0
+
+
+def test_another_value_is_another_model():
+    given, fit = _given()
+    other = fitting.with_values(fit.model, fit.free, 2.0 * fitting.values_of(fit.model, fit.free))
+    assert other is not None
+    assert not np.array_equal(given.predicted(other), given.predicted(fit.model))
+
+
+def test_a_jacobian_is_one_call_of_a_model_where_rows_are_few(monkeypatch):
+    given, fit = _given()
+    model, rows = fit.model.nominal.shared, []
+    step = DoubleIntegrator.step
+    monkeypatch.setattr(DoubleIntegrator, "step", lambda self, x, *rest: (rows.append(len(x)), step(self, x, *rest))[1])
+    found = state_jacobian(fit.model, given.steps, acting(fit.model, given.data))
+    assert rows == [8 * len(given.steps)]
+    monkeypatch.setattr(residual, "TOGETHER", 1)
+    assert np.allclose(found, state_jacobian(fit.model, given.steps, acting(fit.model, given.data)), rtol=0.0, atol=1e-9)
+    assert rows[1:] == [len(given.steps)] * 8
+    assert model.name == "double_integrator"
+
+
+def test_rates_that_stay_are_worked_out_once_for_all_sweeps(monkeypatch):
+    flow, rows, count, n = forces._flow, [], 3, 50
+    monkeypatch.setattr(forces, "_flow", lambda rate, t: (rows.append(np.shape(t)), flow(rate, t))[1])
+    rng = np.random.default_rng(1)
+    w = np.eye(count) + 0.3 * (1.0 - np.eye(count))
+    speeds, given = list(rng.uniform(1.0, 2.0, (count, n))), list(rng.normal(size=(count, n)))
+    pushes = [forces.Push(rate=(np.full(n, 0.5),) * 2) for _ in range(count)]
+    forces._swept(speeds, given, pushes, np.tile(w, (n, 1, 1)), 0.01)
+    assert len(rows) == count
+
+
+@pytest.mark.parametrize("z", [0.0, 1e-12, 5e-4, 0.2, -3.0])
+def test_a_flow_of_many_rates_is_that_of_each(z):
+    many = forces._flow(np.array([z, 1.0, 0.0]), 0.1)
+    one = forces._flow(z, 0.1)
+    assert [e[0] for e in many] == pytest.approx(list(one), rel=1e-12)
+    assert [e[2] for e in many] == pytest.approx(list(forces._flow(0.0, 0.1)), rel=1e-15)
+
+
+def test_columns_of_a_double_integrator_take_steps_of_their_own():
+    rng = np.random.default_rng(2)
+    x, u, dt = rng.normal(size=(5, 4)), rng.normal(size=(5, 2)), rng.uniform(0.01, 0.1, 5)
+    step = partial(DoubleIntegrator().step, parameters={})
+    together = step(x, u, dt)
+    assert np.array_equal(together, np.concatenate([step(x[i : i + 1], u[i : i + 1], dt[i]) for i in range(5)]))
