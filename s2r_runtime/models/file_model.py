@@ -73,6 +73,11 @@ class FileModel:
             raise _failed(self.name, "step", error) from None
         if result.shape != x.shape:
             raise ConfigError(f"{self.name}: step returned shape {result.shape}, must be {x.shape}")
+        if not np.isfinite(result).all():  # as it mostly is: asking which rows were given so takes as long as a simple step
+            self._check_finite(x, u, result)
+        return result
+
+    def _check_finite(self, x: Array, u: Array, result: Array) -> None:
         given = np.isfinite(np.hstack([x, u])).all(axis=1, keepdims=True)
         wrong = np.argwhere(~np.isfinite(result) & given)
         if len(wrong):
@@ -81,7 +86,6 @@ class FileModel:
                 f"{self.name}: step returned {result[row, column]} for state {self.states[column]!r} in row {row}"
                 f" (x = {x[row].tolist()}, u = {u[row].tolist()}), must be finite"
             )
-        return result
 
 
 def load_file_model(spec: ModelSpec, where: str) -> NominalModel:
