@@ -44,11 +44,14 @@ class PeriodicDisturbance(TimedInputEffect):
         """u and the sine's mean."""
         rate, phase, amplitude = TURN * float(p["frequency"]), float(p["phase"]), float(p["amplitude"])
         damped = amplitude * np.sinc(float(p["frequency"]) * dt)
-        if t.min(initial=0.0) >= 0.0:
-            return np.asarray(u + damped * np.sin(rate * (t + 0.5 * dt) + phase))
-        begin, end = np.maximum(t, 0.0), np.maximum(t + dt, 0.0)
-        moving = amplitude * (end - begin) * np.sinc(float(p["frequency"]) * (end - begin)) * np.sin(0.5 * rate * (begin + end) + phase)
-        return np.asarray(u + (moving + (dt - (end - begin)) * amplitude * np.sin(phase)) / dt)
+        after = np.asarray(u + damped * np.sin(rate * (t + 0.5 * dt) + phase))
+        if t.min(initial=0.0) < 0.0:  # a few rows, if any, begin before the start
+            early = np.flatnonzero(t.reshape(len(t), -1).min(axis=1) < 0.0)
+            u, t, dt = u[early], t[early], dt[early] if isinstance(dt, np.ndarray) and len(dt) > 1 else dt
+            begin, end = np.maximum(t, 0.0), np.maximum(t + dt, 0.0)
+            moving = amplitude * (end - begin) * np.sinc(float(p["frequency"]) * (end - begin)) * np.sin(0.5 * rate * (begin + end) + phase)
+            after[early] = u + (moving + (dt - (end - begin)) * amplitude * np.sin(phase)) / dt
+        return after
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float, t: Array) -> list[Values]:
         """None: the input does not show it."""
