@@ -1,17 +1,22 @@
 """What takes a tracer's time is asked of a model once: rounds of a fit, and what follows it, go back to what they know."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 
+from s2r_runtime.effects.periodic_disturbance import PeriodicDisturbance
+from s2r_runtime.errors import ConfigError
 from s2r_runtime.models import forces
-from s2r_runtime.models.composed import compose
+from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.models.double_integrator import DoubleIntegrator
+from s2r_runtime.models.file_model import FileModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.plugins import registry
 from s2r_runtime.trace import fitting, residual
 from s2r_runtime.trace.dataset import from_arrays
-from s2r_runtime.trace.fitting import Problem, evaluate, fitted, insert, problem, scatter
+from s2r_runtime.trace.fitting import Problem, evaluate, fitted, foretold, foretold_by, insert, problem, scatter
 from s2r_runtime.trace.residual import acting, state_jacobian, steps_of
 
 DT_S, ROWS = 0.02, 300
@@ -102,3 +107,59 @@ def test_columns_of_a_double_integrator_take_steps_of_their_own():
     step = partial(DoubleIntegrator().step, parameters={})
     together = step(x, u, dt)
     assert np.array_equal(together, np.concatenate([step(x[i : i + 1], u[i : i + 1], dt[i]) for i in range(5)]))
+
+
+def test_models_that_differ_in_what_acts_take_their_steps_together(monkeypatch):
+    given, fit = _given()
+    lag, drag = registry().get("effects", "input_lag"), fit.model.effects[0]
+    lags = [insert(fit.model, AppliedEffect(lag, "ax", {"time_constant": 0.05 * k}), 0) for k in range(1, 4)]
+    slower = replace(fit.model, effects=(replace(drag, p={"coefficient": 0.7}),))
+    pulled = insert(fit.model, AppliedEffect(registry().get("effects", "quadratic_drag"), "vx", {"coefficient": 0.5}), 0)
+    models = [lags[0], slower, pulled, *lags[1:]]
+    alone = [foretold(given, model) for model in models]
+    rows, step = [], DoubleIntegrator.step
+    monkeypatch.setattr(DoubleIntegrator, "step", lambda self, x, *rest: (rows.append(len(x)), step(self, x, *rest))[1])
+    for one, other in zip(foretold_by(given, models), alone, strict=True):
+        assert one is not None
+        assert other is not None
+        assert np.array_equal(one, other)
+    assert rows == [3 * len(given.steps), len(given.steps), len(given.steps)]
+
+
+def test_a_model_that_steps_nowhere_is_none_and_takes_no_other_with_it(monkeypatch):
+    given, fit = _given()
+    gain = registry().get("effects", "input_gain")
+    models = [insert(fit.model, AppliedEffect(gain, "ax", {"gain": size}), 0) for size in (0.5, 9.0, 2.0)]
+    alone, step = [foretold(given, model) for model in models], DoubleIntegrator.step
+
+    def refusing(self, x, u, *rest):
+        if np.max(np.abs(u)) > 4.0:
+            raise ConfigError("no such motor")
+        return step(self, x, u, *rest)
+
+    monkeypatch.setattr(DoubleIntegrator, "step", refusing)
+    found = foretold_by(given, models)
+    assert [one is None for one in found] == [False, True, False]
+    assert all(one is None or np.array_equal(one, other) for one, other in zip(found, alone, strict=True))
+
+
+def test_a_file_model_asks_which_rows_were_given_only_where_something_is_not_finite(tmp_path, monkeypatch):
+    path = tmp_path / "robot.py"
+    path.write_text('STATES = ("q",)\nINPUTS = ("u",)\nPARAMS = {}\n\ndef step(x, u, dt, params):\n    return x / u\n')
+    model, asked, check = compose(ModelSpec(str(path), DT_S)).nominal, [], FileModel._check_finite
+    monkeypatch.setattr(FileModel, "_check_finite", lambda self, *given: (asked.append(1), check(self, *given))[1])
+    model.step(np.ones((3, 1)), np.ones((3, 1)), DT_S, {})
+    assert not asked
+    assert np.isnan(model.step(np.array([[np.nan], [1.0]]), np.ones((2, 1)), DT_S, {})[0, 0])
+    with pytest.raises(ConfigError, match="row 1"):
+        model.step(np.ones((2, 1)), np.array([[1.0], [0.0]]), DT_S, {})
+    assert len(asked) == 2
+
+
+@pytest.mark.parametrize("dt", [0.1, np.full((40, 1), 0.1)])
+def test_a_sine_before_the_start_is_worked_out_for_the_rows_before_it_only(dt):
+    p = {"frequency": 1.3, "amplitude": 0.7, "phase": 0.4}
+    t, u = 0.1 * np.arange(-5.5, 34.5)[:, None], np.zeros((40, 1))
+    found = PeriodicDisturbance().act_at(u, t, dt, p)
+    fine = np.maximum(t + 0.1 * (np.arange(1000) + 0.5) / 1000, 0.0)
+    assert found[:, 0] == pytest.approx(np.mean(0.7 * np.sin(2.0 * np.pi * 1.3 * fine + 0.4), axis=1), abs=1e-4)

@@ -10,6 +10,7 @@ model with an effect. Parameters are refined by Gauss-Newton with the weights of
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -23,7 +24,7 @@ from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.answers import Known, kept
 from s2r_runtime.trace.coarse import coarse
 from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.residual import Steps, acting, advanced, predicted, state_jacobian
+from s2r_runtime.trace.residual import TOGETHER, Steps, acting, advanced, predicted, side_by_side, state_jacobian
 from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
 from s2r_runtime.trace.slots import Added, Free, Slot, bounds_of, free_of, inside, values_of, with_values
 from s2r_runtime.trace.speed_noise import BEYOND
@@ -178,6 +179,35 @@ def foretold(given: Problem, model: ComposedModel) -> Array | None:
     return None if np.any(np.abs(there) > given.steps.farthest) else there
 
 
+def foretold_by(given: Problem, models: Sequence[ComposedModel]) -> list[Array | None]:
+    """The same of each. Those that differ in what acts only take their steps together, as many as are few enough to gain by it."""
+    found: list[Array | None] = [None] * len(models)
+    alike: dict[tuple[int, ...], list[int]] = {}
+    for i, model in enumerate(models):
+        on_step = (id(a) for a in model.effects if a.effect.stage != "input" or hasattr(a.effect, "pushes"))  # drag is either
+        alike.setdefault((id(model.nominal), *on_step), []).append(i)
+    many = max(1, TOGETHER // max(given.steps.y0.size, 1))
+    for those in alike.values():
+        for some in (those[k : k + many] for k in range(0, len(those), many)):
+            for i, there in zip(some, _foretold_together(given, [models[i] for i in some]), strict=True):
+                found[i] = there
+    return found
+
+
+def _foretold_together(given: Problem, models: Sequence[ComposedModel]) -> Iterable[Array | None]:
+    """Of models with the same effects on the step."""
+    n, place = len(given.steps), given.steps.place
+    try:
+        if len(models) > 1:
+            act = side_by_side([acting(model, given.data).over(place) for model in models])
+            there = advanced(models[0], np.tile(given.steps.y0, (len(models), 1)), act, slice(None)).reshape(len(models), n, -1)
+            beyond = np.any(np.abs(there) > given.steps.farthest, axis=(1, 2))
+            return [None if far else one for far, one in zip(beyond.tolist(), there, strict=True)]
+    except ConfigError:  # somebody's own model takes no step there for one of them
+        pass
+    return (foretold(given, model) for model in models)
+
+
 def sensitivities(given: Problem, fit: Fit, model: ComposedModel, free: Free) -> Array:
     """dz/dp, (n nx, k), under the noise of a fit."""
     n, nx = given.steps.y0.shape
@@ -198,17 +228,16 @@ def slopes(given: Problem, model: ComposedModel, free: Free) -> Array:
 def _slopes(given: Problem, model: ComposedModel, free: Free) -> Array:
     n, nx = given.steps.y0.shape
     here = given.predicted(model)
-    now = values_of(model, free)
+    now, away = values_of(model, free), np.array(_differences(given, model, free))
     moved = np.zeros((n, nx, len(free)))
-    for j, h in enumerate(_differences(given, model, free)):
-        for signed in (h, -h):
-            there = now.copy()
-            there[j] += signed
-            other = with_values(model, free, there)
-            beyond = None if other is None else foretold(given, other)
+    open_yet = list(range(len(free)))
+    for signed in (away, -away):  # to the other side, where a bound or somebody's own model does not let it go to one
+        others = [(j, with_values(model, free, now + np.where(np.arange(len(free)) == j, signed, 0.0))) for j in open_yet]
+        allowed = [(j, other) for j, other in others if other is not None]
+        for (j, _), beyond in zip(allowed, foretold_by(given, [other for _, other in allowed]), strict=True):
             if beyond is not None:
-                moved[:, :, j] = (beyond - here) / -signed
-                break
+                moved[:, :, j] = (beyond - here) / -signed[j]
+                open_yet.remove(j)
     return moved
 
 

@@ -81,10 +81,26 @@ class Acting:
         """Over some of the steps, each as one."""
         return Acting(self.mean[place], self.end[place], None if self.lasts is None else self.lasts[place])
 
+    def over(self, place: Index) -> Acting:
+        """Over some of the steps, as it is."""
+        mean = self.mean[place]
+        end = mean if self.end is self.mean else self.end[place]
+        parts = None if self.parts is None else self.parts[place]
+        return Acting(mean, end, None if self.lasts is None else self.lasts[place], parts)
+
     def moved(self, shift: Array) -> Acting:
         """The same with (M, nu), or (nu,), more."""
         parts = None if self.parts is None else self.parts + shift[..., None, :]
         return Acting(self.mean + shift, self.end + shift, self.lasts, parts)
+
+
+def side_by_side(acts: Sequence[Acting]) -> Acting:
+    """What acts over the same steps in several ways, one after the other."""
+    mean = np.concatenate([act.mean for act in acts])
+    end = mean if all(act.end is act.mean for act in acts) else np.concatenate([act.end for act in acts])
+    lasts = [act.lasts for act in acts if act.lasts is not None]
+    parts = [act.parts for act in acts if act.parts is not None]
+    return Acting(mean, end, np.concatenate(lasts) if lasts else None, np.concatenate(parts) if parts else None)
 
 
 def first_steps(data: Dataset) -> Index:

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.candidates import Candidate
-from s2r_runtime.trace.fitting import Fit, Problem, foretold, refine, sensitivities
+from s2r_runtime.trace.fitting import Fit, Problem, foretold, foretold_by, refine, sensitivities
 from s2r_runtime.trace.slots import Free, bounds_of, inside, slots_of, values_of, with_values
 
 Array = NDArray[np.float64]
@@ -178,8 +179,9 @@ def columns(given: Problem, base: Fit, probes: Sequence[Probe], before: Array) -
     for chunk in _chunks(probes):
         whole: list[Probe] = []
         moved: list[Array] = []
+        foretold_there = iter(foretold_by(given, [m for probe in chunk for m in probe.models]))
         for probe in chunk:
-            there = [one - before for m in probe.models if (one := foretold(given, m)) is not None]
+            there = [one - before for one in islice(foretold_there, len(probe.models)) if one is not None]
             if len(there) == len(probe.models):
                 whole.append(probe)
                 moved += there
