@@ -6,16 +6,18 @@ import pytest
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
+from s2r_runtime.trace.changes import from_the_beginning
 from s2r_runtime.trace.dataset import from_arrays
-from s2r_runtime.trace.fitting import evaluate, insert, problem
+from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
 from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.scores import STRICT, name_of
 from s2r_runtime.trace.selection import accepted
 
 DT_S, STANDS, CHANGED_S = 0.1, 40, 30.0
 
 
-def _accepted(robots, time_s):
-    """Whether a change of what all inputs do to 0.9 of it is believed, of a robot that stands at first."""
+def _problem(robots):
+    """Of a robot that stands at first, and its model."""
     rng, model = np.random.default_rng(0), compose(ModelSpec("unicycle", DT_S))
     u = np.repeat(rng.uniform([0.05, -1.0], [0.3, 1.0], (60, 2)), 10, axis=0)
     u[:STANDS] = 0.0
@@ -26,16 +28,43 @@ def _accepted(robots, time_s):
         x, hidden = robot.step(x, command[None, :], hidden)
     y = np.array([*states, x[0]]) + 0.002 * rng.normal(size=(len(u) + 1, 3))
     data = from_arrays(model, [(y, u)])
-    given = problem(data, steps_of(data))
+    return problem(data, steps_of(data)), model
+
+
+def _accepted(robots, time_s):
+    """Whether a change of what all inputs do to 0.9 of it is believed."""
+    given, model = _problem(robots)
     change = AppliedEffect(registry().get("effects", "regime_change"), "*", {"time": time_s, "gain": 0.9})
     return accepted(given, evaluate(given, insert(model, change, 0)), evaluate(given, model), 100, 10)
 
 
+GAINS = tuple(EffectSpec("input_gain", channel, {"gain": 0.9}) for channel in ("v", "w"))
+CHANGE = (EffectSpec("regime_change", "*", {"time": CHANGED_S, "gain": 0.9}),)
+
+
 @pytest.mark.parametrize("time_s", [2.0, 3.9])
 def test_a_robot_that_stands_at_first_has_a_gain_from_when_it_moves_and_no_change(time_s):
-    gains = tuple(EffectSpec("input_gain", channel, {"gain": 0.9}) for channel in ("v", "w"))
-    assert not _accepted(gains, time_s)
+    assert not _accepted(GAINS, time_s)
 
 
 def test_a_change_on_the_way_is_one():
-    assert _accepted((EffectSpec("regime_change", "*", {"time": CHANGED_S, "gain": 0.9}),), CHANGED_S)
+    assert _accepted(CHANGE, CHANGED_S)
+
+
+def _instead(robots, name, p):
+    """What stands in the end in the place of an effect on all inputs."""
+    given, model = _problem(robots)
+    found = insert(model, AppliedEffect(registry().get("effects", name), "*", p), 0)
+    fit = fitted(given, evaluate(given, found), found)
+    return [name_of(a) for a in from_the_beginning(given, fit, STRICT).model.effects]
+
+
+@pytest.mark.parametrize(("name", "p"), [("regime_change", {"time": 3.9, "gain": 0.95}), ("input_gain_drift", {"rate": -0.002})])
+def test_two_gains_are_neither_a_change_of_all_at_first_nor_a_drift_of_all(name, p):
+    assert _instead(GAINS, name, p) == [("input_gain", "v"), ("input_gain", "w")]
+
+
+def test_a_change_on_the_way_and_a_drift_stay():
+    assert _instead(CHANGE, "regime_change", {"time": CHANGED_S, "gain": 0.95}) == [("regime_change", "*")]
+    drift = (EffectSpec("input_gain_drift", "*", {"rate": -0.003}),)
+    assert _instead(drift, "input_gain_drift", {"rate": -0.002}) == [("input_gain_drift", "*")]

@@ -20,6 +20,7 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.begun import begun, uncertain
 from s2r_runtime.trace.candidates import candidates
+from s2r_runtime.trace.changes import from_the_beginning, happens
 from s2r_runtime.trace.fitting import (
     WIDEST,
     Fit,
@@ -33,7 +34,6 @@ from s2r_runtime.trace.fitting import (
     refine,
     scatter,
     sensitivities,
-    sought,
     under_noise,
     without,
 )
@@ -50,9 +50,6 @@ WITHIN = 0.4
 
 SAME = 1e-3
 """Of the step in which a sensor reads: what moves all values by the same to so much is an offset."""
-
-EDGE = 0.02
-"""Share of the steps on either side of a change that makes it one."""
 
 MOST, MOST_ON_ONE = 5, 3
 """Effects that are looked for at most, and on one input: more are a curve in parts, not so many things that happen."""
@@ -123,7 +120,8 @@ def called_for(
         tried = max(tried, columns)
         ranking = ranking or found
         progress(0.1 + 0.6 * (step + 1) / (MOST + 1))
-        chosen = next((s.fit for s in found if s.fit is not None and accepted(given, s.fit, fit, tried, horizon, bar)), None)
+        offered = (from_the_beginning(given, s.fit, bar) for s in found if s.fit is not None)
+        chosen = next((other for other in offered if accepted(given, other, fit, tried, horizon, bar)), None)
         chosen = chosen if fit.added else _of_all_axes(given, nominal, chosen, tried, horizon, bar)
         if chosen is None:
             break
@@ -201,7 +199,7 @@ def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int, bar:
         and significant(given, fit, base, tried, bar, ahead)
         and _told_by_stamps(given, fit, base)
         and _beyond_rounding(given, fit, base)
-        and _happens(given, fit)
+        and happens(given, fit)
         and relevant(given, fit, base, horizon, bar)
     )
 
@@ -241,27 +239,6 @@ def _beyond_rounding(given: Problem, fit: Fit, base: Fit) -> bool:
             if np.ptp(off) < SAME * q and abs(off[0]) < q * min(0.5, float(np.sqrt(np.sum(share**2)))):
                 return False
     return True
-
-
-def _happens(given: Problem, fit: Fit) -> bool:
-    """False for what changes at one time, if hardly any steps lie before it, or after it, or if it may as well have been so from the
-    beginning: that is no change. A robot that stands at first has a gain, and not another one from when it begins to move.
-    """
-    for slot, value in zip(fit.free, values_of(fit.model, fit.free).tolist(), strict=True):
-        if sought(fit.model, slot) and bounds_of(fit.model, slot).unit == "s":
-            before = float(np.mean(given.steps.t < value))
-            if not EDGE < before < 1.0 - EDGE or _always(given, fit, slot):
-                return False
-    return True
-
-
-def _always(given: Problem, fit: Fit, slot: Slot) -> bool:
-    """Whether something explains as much that begins before the recording does. slot: of its time."""
-    begin = max(bounds_of(fit.model, slot).low, float(given.steps.t[0]) - given.data.dt)
-    model = with_values(fit.model, (slot,), np.array([begin]))
-    if model is None or foretold(given, model) is None:
-        return False
-    return under_noise(given, model, fit.noise).white > float(np.sum(noises.log_density(fit.z))) - fit.whiten.logdet - CLOSE
 
 
 def significant(given: Problem, fit: Fit, base: Fit, tried: int, bar: Bar = STRICT, ahead: float = 0.0) -> bool:
@@ -393,7 +370,8 @@ def exchanged(given: Problem, fit: Fit, bar: Bar) -> Fit:
             continue
         base = fitted(given, fit, without(fit.model, place), 1)
         found, _ = best_candidates(given, base, 4, bar, at_first_look(given, fit, base))
-        best = next((s.fit for s in found if s.fit is not None and _happens(given, s.fit)), None)
+        offered = (from_the_beginning(given, s.fit, bar) for s in found if s.fit is not None)
+        best = next((other for other in offered if happens(given, other)), None)
         if best is None:
             continue
         margin = CLOSE if best.k >= fit.k else 0.0  # a simpler one that does as well needs no more than that
@@ -455,7 +433,7 @@ def overtaken(given: Problem, fit: Fit, bar: Bar) -> tuple[Fit, list[Scored]]:
         more, best = max(better, key=lambda pair: pair[0], default=(0.0, fit))
         if more <= CLOSE:
             break
-        fit = plainly(given, fitted(given, best, best.model))
+        fit = plainly(given, from_the_beginning(given, fitted(given, best, best.model), bar))
         found = rivals(given, fit)
     return fit, found
 

@@ -1,0 +1,74 @@
+"""What changes at one time: whether it does, and what it is if it does not.
+
+A change that explains no more than one that began before the recording is none. Of one input that is a gain, which is looked for by itself.
+Of all inputs alike (both wheels smaller than said, a thrust that is weaker) it is a gain of each, two effects, of which the search takes
+one at a time: a change of all at the first moment explains more than either, and a drift of all comes near to it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.plugins import registry
+from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.fitting import Fit, Problem, fitted, foretold, gain, sought, under_noise
+from s2r_runtime.trace.rivals import CLOSE
+from s2r_runtime.trace.scores import Bar, name_of
+from s2r_runtime.trace.slots import Added, Slot, bounds_of, values_of, with_values
+
+EDGE = 0.02
+"""Share of the steps on either side of a change that makes it one."""
+
+OF_ALL = {("regime_change", "*"): "gain", ("input_gain_drift", "*"): ""}
+"""What may stand for a gain of each input, and the number in which it says how large that is."""
+
+
+def happens(given: Problem, fit: Fit) -> bool:
+    """False for what changes at one time, if hardly any steps lie before it, or after it, or if it may as well have been so from the
+    beginning: that is no change. A robot that stands at first has a gain, and not another one from when it begins to move.
+    """
+    for slot, value in zip(fit.free, values_of(fit.model, fit.free).tolist(), strict=True):
+        if sought(fit.model, slot) and bounds_of(fit.model, slot).unit == "s":
+            before = float(np.mean(given.steps.t < value))
+            if not EDGE < before < 1.0 - EDGE or _always(given, fit, slot):
+                return False
+    return True
+
+
+def _always(given: Problem, fit: Fit, slot: Slot) -> bool:
+    """Whether something explains as much that begins before the recording does. slot: of its time."""
+    begin = max(bounds_of(fit.model, slot).low, float(given.steps.t[0]) - given.data.dt)
+    model = with_values(fit.model, (slot,), np.array([begin]))
+    if model is None or foretold(given, model) is None:
+        return False
+    return under_noise(given, model, fit.noise).white > float(np.sum(noises.log_density(fit.z))) - fit.whiten.logdet - CLOSE
+
+
+def from_the_beginning(given: Problem, fit: Fit, bar: Bar) -> Fit:
+    """With a gain of each input in the place of a change of all that does not happen, and of a drift of all that explains less."""
+    for place in fit.added:
+        drifts = fit.model.effects[place].effect.name == "input_gain_drift"
+        model = _of_each(fit.model, place)
+        if model is None or foretold(given, model) is None or not (drifts or not happens(given, fit)):
+            continue
+        other = fitted(given, fit, model)
+        more = gain(other, fit) - bar.price(other.k - fit.k, len(given.steps))
+        if more > (CLOSE if drifts else -CLOSE):
+            return other
+    return fit
+
+
+def _of_each(model: ComposedModel, place: int) -> ComposedModel | None:
+    """The model with a gain of each input that has none, in the place of what acts on all of them; None where nothing does there."""
+    a = model.effects[place]
+    number = OF_ALL.get(name_of(a))
+    effect = registry().get("effects", "input_gain")
+    there = model.effects
+    inputs = [name for name in model.inputs if all(name_of(b) != (effect.name, name) for b in there)]
+    if number is None or not {*inputs} <= {*effect.channels(model.nominal)} or not inputs:
+        return None
+    gains = [Added(effect, name, {"gain": a.p.get(number, 1.0)}) for name in inputs]
+    return replace(model, effects=(*there[:place], *gains, *there[place + 1 :]))
