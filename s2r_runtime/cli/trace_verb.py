@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     columns, transport = (dict(profile.columns), profile.transport) if profile else ({}, None)
     data = load_dataset(args.recording, model, columns, bandwidth=args.bandwidth, transport=transport)
     used = data.reconstruction.bandwidth if data.reconstruction and not data.reconstruction.axes else args.bandwidth
-    test = load_dataset(args.test, model, columns, bandwidth=used, transport=transport) if args.test else None
+    test = load_dataset(args.test, model, columns, bandwidth=used, transport=transport, behind=data.behind) if args.test else None
     if test and set(test.digests) & set(data.digests):
         raise UsageError(f"--test {args.test}: is the recording that the fit is made on; take one that the fit never sees")
     bar = output.Progress("tracing")

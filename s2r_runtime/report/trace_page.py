@@ -150,16 +150,15 @@ def _over_time(page: Page, r: TraceResult, changed: bool) -> None:
     page.heading("Over time")
     everything = over_time(r)
     same = r.held.data.source == r.source
+    wrong = [f for f in r.faults if f.kind != "late"]
     note = (
         "Grey: held out, the fit never saw it." if everything.held_out else "All of it is held out: the fit was made on another recording."
     )
-    page.text(note + (" Red: faults of measurement; what they spoil is left out." if r.faults and same else ""), "soft")
+    page.text(note + (" Red: faults of measurement; what they spoil is left out." if wrong and same else ""), "soft")
     page.key(BEFORE_AFTER if changed else [("residual", "blue")])
     for part in everything.parts:
         faults = (
-            [(f.from_s, f.to_s, f.kind) for f in r.faults if f.channel in {part.name, "*"} or part.name in {"along", "across"}]
-            if same
-            else []
+            [(f.from_s, f.to_s, f.kind) for f in wrong if f.channel in {part.name, "*"} or part.name in {"along", "across"}] if same else []
         )
         page.broad(plots.over_time(part, everything, faults, changed=changed), "")
 

@@ -242,7 +242,7 @@ def _faults(r: TraceResult) -> Iterator[str]:
     silent = [f for f in r.faults if f.kind == "dropout"]
     if silent:
         yield f"{len(silent)} dropout{'s' if len(silent) > 1 else ''}, the longest {max(f.to_s - f.from_s for f in silent):.3g} s"
-    if r.faults:
+    if any(f.kind != "late" for f in r.faults):
         yield "what they spoil is left out"
 
 

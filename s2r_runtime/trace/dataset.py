@@ -153,6 +153,8 @@ class Dataset:
     """How inputs went that the recording has samples of (`straight`)."""
     noisy: dict[str, float] = field(default_factory=dict)
     """Standard deviations of the noise that was taken out of inputs for that."""
+    behind: dict[str, float] = field(default_factory=dict)
+    """s by which states came late against others, and were taken earlier (`late_poses`)."""
 
     @cached_property
     def chains(self) -> Inputs:
@@ -279,7 +281,7 @@ def from_streams(
 def regridded(data: Dataset, model: ComposedModel, in_parts: int = 0, substeps: int = 0) -> Dataset:
     """The same recording on the grid of a model with another step. in_parts, substeps: as `from_streams`."""
     again = from_streams(model, data.segments, data.source, data.digests, data.paths, data.reconstruction, in_parts, substeps)
-    return replace(again, way=data.way, noisy=data.noisy)
+    return replace(again, way=data.way, noisy=data.noisy, behind=data.behind)
 
 
 def thinned(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from s2r_runtime.messages import CampaignFinished, Observed, Send, StartCampaign
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.robot_logs import content_digest, is_robot_log, read_robot_log
 from s2r_runtime.trace.dataset import Array, Dataset, Stream, columns_of, from_streams
+from s2r_runtime.trace.late_poses import earlier, late_pose
 from s2r_runtime.trace.reconstruct import late_speeds, reconstruct
 from s2r_runtime.trace.unseen import unneeded, without
 
@@ -34,11 +36,13 @@ def load_dataset(
     epoch: int | None = None,
     bandwidth: float | None = None,
     transport: Mapping[str, Any] | None = None,
+    behind: Mapping[str, float] | None = None,
 ) -> Dataset:
     """Reads a recording on the model's grid. columns: name in the model -> column of the table. Several paths: parts of one log.
     epoch: of a log, only what was recorded while that campaign was under way. bandwidth: Hz within which states that the table does not
     have are reconstructed from those that it has (None: what the data bear, and only those that the motion
-    needs: unseen.py). transport: the profile's, for a log in a robot's own format.
+    needs: unseen.py). transport: the profile's, for a log in a robot's own format. behind: s by which states of the pose come late, if that
+    is known from another recording (None: as this one says, `late_poses`).
 
     Raises RecordingError (unreadable, lacks a column that does not follow from others, too slow for the model's dt).
     """
@@ -52,18 +56,21 @@ def load_dataset(
         segments, missing, content = _robot_segments(paths[0], model, transport)
     else:
         segments, missing, content = _table_segments(paths[0], model, columns or {})
-    behind = {} if bandwidth else late_speeds(model, segments, missing)
-    if behind:
-        names = [s for s in model.states if s not in missing]
-        kept = [j for j, s in enumerate(names) if s not in behind]
+    if behind is None:
+        behind = {} if bandwidth else late_pose(model, segments, missing)
+    names = [s for s in model.states if s not in missing]
+    segments = earlier(segments, names, behind) if behind else segments
+    slow = {} if bandwidth else late_speeds(model, segments, missing)
+    if slow:
+        kept = [j for j, s in enumerate(names) if s not in slow]
         segments = [(Stream(states.t, states.values[:, kept]), inputs) for states, inputs in segments]
-        missing = tuple(s for s in model.states if s in {*missing, *behind})
+        missing = tuple(s for s in model.states if s in {*missing, *slow})
     spare = () if bandwidth else unneeded(model, missing)  # who gives a bandwidth wants to see them
     model, missing = without(model, spare), tuple(s for s in missing if s not in spare)
-    if not missing:
-        return from_streams(model, segments, source, (*digests, content), paths)
-    segments, done = reconstruct(model, segments, missing, source, bandwidth, behind)
-    return from_streams(model, segments, source, (*digests, content), paths, done)
+    done = None
+    if missing:
+        segments, done = reconstruct(model, segments, missing, source, bandwidth, slow)
+    return replace(from_streams(model, segments, source, (*digests, content), paths, done), behind=dict(behind))
 
 
 def _digest(path: Path) -> str:

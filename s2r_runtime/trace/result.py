@@ -68,6 +68,8 @@ class TraceResult:
     """As the dataset's: how inputs went that the recording has samples of."""
     noisy: dict[str, float] = field(default_factory=dict)
     """Standard deviations of the noise that was taken out of inputs."""
+    behind: dict[str, float] = field(default_factory=dict)
+    """s by which states came late against others of the pose, and were taken earlier."""
 
     def same(self, found: Found) -> tuple[Found, ...]:
         """Of `ambiguous_with`: other names of the very same thing on this model."""
@@ -105,6 +107,11 @@ class TraceResult:
         if self.unseen:
             was = "was" if len(self.unseen) == 1 else "were"
             lines.append(f"{', '.join(self.unseen)} {was} not measured, and not needed: the motion follows from the inputs without")
+        if self.behind:
+            who, others = ", ".join(self.behind), ", ".join(s for s in ("x", "y", "theta") if s not in self.behind)
+            comes, was = ("comes", "was") if len(self.behind) == 1 else ("come", "were")
+            by = next(iter(self.behind.values()))
+            lines.append(f"{who} {comes} {by:.3g} s late against {others}, as the motion says, and {was} taken that much earlier")
         lines += self._inputs_taken()
         if self.unconfirmed:
             names = ", ".join(f"{name} on {channel}" for name, channel in self.unconfirmed)
@@ -167,6 +174,7 @@ class TraceResult:
                 "rollout_noise_floor": dict(zip(states, self.floor[1].tolist(), strict=True)),
             },
             "gap": {"before": self.gap[0], "after": self.gap[1], "independent": self.gap[2]},
+            "states_late": self.behind,
             "faults": [{"from_s": f.from_s, "to_s": f.to_s, "channel": f.channel, "kind": f.kind} for f in self.faults],
             "outliers": self.outliers,
             "could_see": [

@@ -34,6 +34,7 @@ from s2r_runtime.trace.grid_errors import widened
 from s2r_runtime.trace.hidden_pairs import two_together
 from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.lack_of_fit import Structure
+from s2r_runtime.trace.late_poses import late_faults
 from s2r_runtime.trace.one_place import from_one_place
 from s2r_runtime.trace.orders import in_either_order
 from s2r_runtime.trace.plausible import check_plausible
@@ -313,7 +314,9 @@ def _result(
     floor = noise_floor(chosen.fit, judged_on, seed)
     forgets = replace(chosen.fit, colour=no_colour(len(model.states)))  # a law with a memory may have taken up all that the model lacks
     alone = floor if chosen.fit.added else noise_floor(forgets, judged_on, seed)
-    verdict = verdict_of(chosen, structure, checked.faults, (before, after), judged_on, (floor[1], alone[1]))
+    last = max(run.start_s + float(np.sum(run.durations(dataset.dt))) for run in dataset.runs)
+    faults = (*late_faults(dataset.behind, last), *checked.faults)
+    verdict = verdict_of(chosen, structure, faults, (before, after), judged_on, (floor[1], alone[1]))
     if verdict == "unexplained" and not {*structure.tokens} - {"noise"}:  # what was named foretells nothing: what else it looks like
         structure = replace(structure, tokens=structure.likeliest or structure.tokens)
     final = final_fit(chosen, verdict)
@@ -339,7 +342,7 @@ def _result(
         may_depend_on=() if verdict == "unexplained" else structure.beside,
         share_left=float(structure.share),
         suggested_excitation=advice(model, [(f.name, f.channel) for f in (*effects, *ties)]) if ties else None,
-        faults=checked.faults,
+        faults=faults,
         outliers=checked.outliers + int(np.count_nonzero(np.abs(final.z).max(axis=1) > WILD)),
         spec=_spec(model, final if worth_its_risk(chosen, before, after) else chosen.nominal, dataset),
         model=final.model,
@@ -356,6 +359,7 @@ def _result(
         reconstruction=dataset.reconstruction,
         way=dataset.way,
         noisy=dataset.noisy,
+        behind=dataset.behind,
         unconfirmed=tuple((final.model.effects[place].effect.name, final.model.effects[place].channel) for place in idle),
         could_see=visible(given, final, chosen.tried),
     )

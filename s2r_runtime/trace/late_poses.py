@@ -1,0 +1,249 @@
+"""A heading that comes late against the positions, or these against it: two sensors, each with a delay of its own.
+
+With l and f the way of a row to the left of the measured heading and along it, w the yaw rate, and a heading that is s late (positions: -s)
+
+    l_k = f_k sin(theta(t + s) - theta(t)) = f_k (s w + s^2/2 w' + ...)
+
+To first order that is a robot that slides sideways, and turns as late as its heading does. The second order tells. So the shift must
+explain the way aside clearly better than all that slides (slip, tyres, a measured point ahead of the axle, in proportion to w), and no
+worse than these with a lead or a lag of their own (w'), their numbers paid for. Nothing that slides looks ahead of how it turns, but tyres
+and whatever hovers follow it late: positions are late only if they clearly are no slide that follows by a lag, either, at no price for its
+numbers; or if they are as late along the way, against a measured speed. Inputs are not asked: what acts late there is another matter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.fault import Fault
+from s2r_runtime.trace.speeds import less_noise
+from s2r_runtime.trace.streams import Stream, complete, fresh, unwrapped
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+POSE, SPEEDS = ("x", "y", "theta"), (("speed",), ("wheel_left", "wheel_right"))
+"""A pose, and what may say how fast it goes ahead, whatever the scale."""
+
+FEWEST, LOOKED_AT = 200, 6000
+"""Rows from which it is asked, and which are looked at."""
+
+LEAST_ROWS, MOST_S = 0.75, 0.5
+"""What it must be late by: an odometry that adds up steps along the heading before, or after them, is half a row off; and longest, s."""
+
+SEEN = 6.0
+"""Standard errors of what slides in proportion to w, below which there is nothing to ask."""
+
+CLEARLY = 15.0
+"""Nats by which a shift must explain more than what slides: as rivals on which all the rest is asked (`rivals.NEAR`)."""
+
+WHOLE = 2.0
+"""Nats that a whole number of rows may explain less than the best shift: rows then lie on one another."""
+
+SHIFTS = (0.4, 0.6, 0.75, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6)
+"""Times the first guess, that are tried."""
+
+ALONG, SAME = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0), 0.25
+"""Times how late positions are by their course, that are tried along the way; and by how much that may be another one."""
+
+LAGS = (0.25, 0.5, 0.75, 1.0, 1.5)
+"""Time constants with which a slide may follow, times how late positions seem to be."""
+
+APART, ROUNDS = 2.5, 3
+"""Usual intervals from which on there is a gap; rounds of weights for what is wild."""
+
+SHARES = (0.0, 0.2, 0.35, 0.45, 0.49)
+"""Of the measurement's noise in the correlation of neighbours: -r / (q + 2 r)."""
+
+
+def late_pose(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], missing: Sequence[str]) -> dict[str, float]:
+    """s by which the heading is late, or x and y are, in the longest segment; empty where nothing is, or nobody can tell."""
+    names = [name for name in model.states if name not in missing]
+    if not {*POSE} <= {*names} or "theta" not in model.nominal.angles or not segments:
+        return {}
+    speeds = next((own for own in SPEEDS if {*own} <= {*names}), ())
+    columns = [names.index(name) for name in (*POSE, *speeds)]
+    states = max((states for states, _ in segments), key=lambda states: len(states.t))
+    states = complete(fresh(Stream(states.t, states.values[:, columns])))
+    if len(states.t) < FEWEST:
+        return {}
+    states = Stream(states.t[:LOOKED_AT], unwrapped(states.values[:LOOKED_AT], [2]))
+    by = _Ways(states).late()
+    return {"theta": by} if by > 0.0 else {"x": -by, "y": -by} if by < 0.0 else {}
+
+
+def earlier(segments: Sequence[tuple[Stream, Stream]], names: Sequence[str], behind: Mapping[str, float]) -> list[tuple[Stream, Stream]]:
+    """The same with the stamps of some states so much earlier, s: on rows of their own, where these do not fall on others'."""
+    columns = {j: behind[name] for j, name in enumerate(names) if name in behind}
+    return [(_earlier(states, columns), inputs) if len(states.t) > 1 else (states, inputs) for states, inputs in segments]
+
+
+def late_faults(behind: Mapping[str, float], until: float) -> tuple[Fault, ...]:
+    """As faults of measurement, which they are from the first stamp to the last one. until: s."""
+    return tuple(Fault(0.0, until, name, "late") for name in behind)
+
+
+def _earlier(states: Stream, columns: dict[int, float]) -> Stream:
+    unit = float(np.median(np.diff(states.t)))
+    width = states.values.shape[1]
+    groups = {by: [j for j in range(width) if columns.get(j, 0.0) == by] for by in {0.0, *columns.values()}}
+    t = np.concatenate([states.t - by for by in groups])
+    values = np.full((len(t), width), np.nan)
+    for k, own in enumerate(groups.values()):
+        rows = slice(k * len(states.t), (k + 1) * len(states.t))
+        values[rows, own] = states.values[:, own]
+    order = np.argsort(t, kind="stable")
+    t, values = t[order], values[order]
+    row = np.concatenate([[0], np.cumsum(np.diff(t) > 1e-3 * unit)])  # stamps are printed with a few digits
+    at = np.flatnonzero(np.diff(np.append(-1, row)))
+    merged = np.full((len(at), width), np.nan)
+    for j in range(width):
+        there = ~np.isnan(values[:, j])
+        merged[row[there], j] = values[there, j]
+    kept = ~np.isnan(merged).all(axis=1) & (t[at] > states.t[0] - 1e-3 * unit)  # times count from the first stamp, as they did
+    kept &= t[at] < states.t[-1] - max(columns.values()) + 1e-3 * unit
+    return Stream(t[at][kept], merged[kept])
+
+
+class _Ways:
+    """From row to row: ways, yaw rate, and what they may be made of."""
+
+    def __init__(self, states: Stream) -> None:
+        self._t, (x, y, theta, *speeds) = states.t, states.values.T
+        self._speed = np.mean(speeds, axis=0) if speeds else None
+        self._h = np.diff(self._t)
+        self._unit = float(np.median(self._h))
+        self._dx, self._dy, self._theta = np.diff(x), np.diff(y), theta
+        self._there = self._h < APART * self._unit
+        self._share = 0.0
+
+    def late(self) -> float:
+        """s by which the heading is late, positions if it is negative; 0: nobody can tell."""
+        guess = self._guess()
+        if not LEAST_ROWS * self._unit < abs(guess) / SHIFTS[0] or abs(guess) * SHIFTS[0] > MOST_S:
+            return 0.0
+        self._theta = less_noise(self._t, self._theta)[0]
+        ways, still = self._of(0.0), self._still(0.0)
+        slides, turning = self._slides()
+        self._share = max(SHARES, key=lambda share: self._nats(ways, [*still, *slides], share))
+        alike = guess > 0.0 or self._along(-guess)
+        price = 0.5 * math.log(len(self._h)) if alike else 0.0
+        nats = self._nats(ways, [*still, *slides]) - (len(slides) - 1) * price
+        leading = self._nats(ways, [*still, *slides, *turning]) - (len(slides) + len(turning) - 1) * price
+        if not alike:
+            lags = (self._lagging(slides, share * -guess) for share in LAGS)
+            nats = max([nats, leading, *(self._nats(ways, [*still, *slow]) for slow in lags)])
+        tried = [guess * share for share in SHIFTS]
+        found = [self._shifted(by) for by in tried]
+        best = _peak(tried, found)
+        most = max(self._shifted(best), *found)
+        if not (LEAST_ROWS * self._unit < abs(best) < MOST_S and most > max(nats + CLEARLY, leading)):
+            return 0.0
+        whole = self._unit * round(best / self._unit)
+        return float(whole if whole and self._shifted(whole) > most - WHOLE else best)
+
+    def _shifted(self, by: float) -> float:
+        return self._nats(self._of(by), self._still(by))
+
+    def _turned(self, by: float) -> Array:
+        """Heading in the middle of each row's way, by seconds later."""
+        theta = np.interp(self._t + by, self._t, self._theta)
+        return np.asarray(0.5 * (theta[1:] + theta[:-1]))
+
+    def _of(self, by: float) -> Array:
+        theta = self._turned(by)
+        return np.asarray(np.cos(theta) * self._dy - np.sin(theta) * self._dx)
+
+    def _ahead(self) -> Array:
+        theta = self._turned(0.0)
+        return np.asarray(np.cos(theta) * self._dx + np.sin(theta) * self._dy)
+
+    def _still(self, by: float) -> list[Array]:
+        """What may be besides: a heading that is off, a push of the body or of the world."""
+        theta = self._turned(by)
+        return [self._ahead(), self._h, -np.sin(theta) * self._h, np.cos(theta) * self._h]
+
+    def _slides(self) -> tuple[list[Array], list[Array]]:
+        """Slip, tyres, a point ahead of the axle, with the yaw rate; and with how that changes."""
+        w = np.diff(self._theta) / self._h
+        turns = np.gradient(w) / self._unit
+        f = self._ahead()
+        kinds = [f, f * f / self._h, self._h]
+        return [kind * w for kind in kinds], [kind * turns for kind in kinds]
+
+    def _lagging(self, slides: list[Array], lag: float) -> list[Array]:
+        """What slides, each following by a lag, s."""
+        from scipy.linalg import solve_banded
+
+        keeps = np.exp(-self._h / lag)
+        upper = np.array([np.ones(len(keeps)), np.append(-keeps[1:], 0.0)])
+        return [np.asarray(solve_banded((1, 0), upper, (1.0 - keeps) * slide)) for slide in slides]
+
+    def _along(self, late: float) -> bool:
+        """Whether the way ahead is about as late against a measured speed, whatever its scale."""
+        if self._speed is None:
+            return False
+        speeds = [np.interp(self._t - late * share, self._t, self._speed) for share in ALONG]
+        gone = [self._nats(self._ahead(), [0.5 * (v[1:] + v[:-1]) * self._h, self._h], SHARES[-1]) for v in speeds]
+        best = int(np.argmax(gone))
+        return gone[best] > gone[0] + CLEARLY and abs(ALONG[best] - 1.0) <= SAME
+
+    def _guess(self) -> float:
+        """s that the way aside is of f w, where that is seen; else 0. The yaw rate is a mean over some rows, as is the way."""
+        wide = max(1, round(0.1 / self._unit))
+        ways, columns = (np.array([np.convolve(c * self._there, np.ones(wide), "valid")[::wide] for c in cs]) for cs in self._first())
+        beta, *_ = np.linalg.lstsq(columns.T, ways[0], rcond=None)
+        rest = ways[0] - columns.T @ beta
+        scale = max(1.4826 * float(np.median(np.abs(rest))), 1e-12)
+        error = scale * math.sqrt(max(float(np.linalg.pinv(columns @ columns.T)[0, 0]), 0.0))
+        return float(beta[0]) if abs(beta[0]) > SEEN * error else 0.0
+
+    def _first(self) -> tuple[list[Array], list[Array]]:
+        f = self._ahead()
+        wide = max(1, round(0.1 / self._unit))
+        w = np.convolve(np.diff(self._theta) / self._h, np.ones(wide) / wide, "same")
+        return [self._of(0.0)], [f * w, *self._still(0.0)]
+
+    def _nats(self, ways: Array, columns: list[Array], share: float | None = None) -> float:
+        """Log likelihood of ways aside, less what the columns make of them. Neighbours share the error of the row between them."""
+        share = self._share if share is None else share
+        white = _white(np.column_stack([ways, *columns])[self._there], share)
+        y, x = white[:, 0], white[:, 1:]
+        x = x / np.maximum(np.linalg.norm(x, axis=0), 1e-300)
+        weight, scale = np.ones(len(y)), 1.0
+        for _ in range(ROUNDS):
+            root = np.sqrt(weight)
+            rest = y - x @ np.linalg.lstsq(root[:, None] * x, root * y, rcond=1e-9)[0]
+            scale = max(math.sqrt(float(np.sum(weight * rest**2) / np.sum(weight))), 1e-300)
+            weight = noises.weight(rest / scale)
+        return float(np.sum(noises.log_density(rest / scale))) - len(y) * math.log(scale) - _logdet(len(y), share)
+
+
+def _peak(at: list[float], nats: list[float]) -> float:
+    """Where the parabola through the best and its neighbours is highest."""
+    k = int(np.clip(int(np.argmax(nats)), 1, len(at) - 2))
+    a, b, _ = np.polyfit(np.array(at[k - 1 : k + 2]) - at[k], nats[k - 1 : k + 2], 2)
+    if a >= 0.0:
+        return at[int(np.argmax(nats))]
+    return float(np.clip(at[k] - b / (2.0 * a), min(at[k - 1], at[k + 1]), max(at[k - 1], at[k + 1])))
+
+
+def _white(columns: Array, share: float) -> Array:
+    """L^-1 of columns, with L L^T = 1 on and -share beside the diagonal."""
+    from scipy.linalg import cholesky_banded, solve_banded
+
+    n = len(columns)
+    lower = cholesky_banded(np.array([np.ones(n), np.full(n, -share)]), lower=True)
+    return np.asarray(solve_banded((1, 0), lower, columns))
+
+
+def _logdet(n: int, share: float) -> float:
+    from scipy.linalg import cholesky_banded
+
+    return float(np.sum(np.log(cholesky_banded(np.array([np.ones(n), np.full(n, -share)]), lower=True)[0])))

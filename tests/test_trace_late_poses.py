@@ -1,0 +1,82 @@
+"""A heading that comes late against the positions is told, and taken earlier; what slides sideways is no late heading."""
+
+import json
+
+import numpy as np
+import pytest
+
+from s2r_runtime.cli.main import main
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.trace.late_poses import earlier, late_pose
+from s2r_runtime.trace.streams import Stream
+
+PARTS, ROW_S, ROWS = 20, 0.025, 1600
+NOISE = np.array([0.001, 0.001, 0.003])
+
+
+def _driven(late_rows=(0, 0), slip_s=0.0, follows_s=0.0, ahead_m=0.0, seed=0):
+    """(t, pose, inputs) of a robot that moves on arcs. late_rows: of the positions, of the heading; slip_s: it slides by that much of its
+    speed and yaw rate, following by a lag; ahead_m: where it is measured."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform([0.2, -1.2], [0.8, 1.2], (ROWS // 40, 2)), 40, axis=0)
+    dt, fine = ROW_S / PARTS, np.repeat(u, PARTS, axis=0)
+    theta = np.append(0.0, np.cumsum(dt * fine[:, 1]))
+    aside, slides = np.zeros(len(fine)), 0.0
+    for k, (v, w) in enumerate(fine):
+        slides += (slip_s * v * w - slides) * (dt / follows_s if follows_s else 1.0)
+        aside[k] = slides
+    middle = 0.5 * (theta[1:] + theta[:-1])
+    x = np.append(0.0, np.cumsum(dt * (fine[:, 0] * np.cos(middle) - aside * np.sin(middle)))) + ahead_m * np.cos(theta)
+    y = np.append(0.0, np.cumsum(dt * (fine[:, 0] * np.sin(middle) + aside * np.cos(middle)))) + ahead_m * np.sin(theta)
+    rows = PARTS * np.arange(ROWS)
+    where, heading = (np.maximum(rows - round(PARTS * late), 0) for late in late_rows)
+    pose = np.column_stack([x[where], y[where], theta[heading]]) + NOISE * rng.normal(size=(ROWS, 3))
+    return ROW_S * np.arange(ROWS), pose, u
+
+
+def _late(**what):
+    t, pose, u = _driven(**what)
+    return late_pose(compose(ModelSpec("unicycle", 0.05)), [(Stream(t, pose), Stream(t, u))], ())
+
+
+@pytest.mark.parametrize("rows", [3, 4.4])
+def test_a_heading_that_comes_late_is_told(rows):
+    found = _late(late_rows=(0, rows))
+    assert found == {"theta": pytest.approx(rows * ROW_S, rel=0.05)}
+
+
+def test_positions_that_come_late_are_told():
+    found = _late(late_rows=(4, 0))
+    assert found == dict.fromkeys(("x", "y"), pytest.approx(4 * ROW_S, rel=0.05))
+
+
+@pytest.mark.parametrize(
+    "what",
+    [{}, {"slip_s": 0.1}, {"slip_s": -0.1}, {"slip_s": -0.1, "follows_s": 0.1}, {"ahead_m": 0.1}, {"ahead_m": -0.1}, {"late_rows": (4, 4)}],
+    ids=str,
+)
+def test_what_slides_or_is_measured_elsewhere_is_not_late(what):
+    assert _late(**what) == {}
+
+
+def test_a_state_that_is_taken_earlier_falls_on_the_rows_of_the_others_where_it_can():
+    t = np.arange(6.0)
+    states = Stream(t, np.column_stack([t, 10.0 * t]))
+    (moved, _), *_ = earlier([(states, states)], ("x", "theta"), {"theta": 2.0})
+    np.testing.assert_allclose(moved.t, t[:4])
+    np.testing.assert_allclose(moved.values, np.column_stack([t[:4], 10.0 * (t[:4] + 2.0)]))
+    (between, _), *_ = earlier([(states, states)], ("x", "theta"), {"theta": 0.5})
+    np.testing.assert_allclose(between.t[:3], [0.0, 0.5, 1.0])
+    np.testing.assert_allclose(between.values[1], [np.nan, 10.0])
+
+
+def test_a_late_heading_is_a_fault_of_measurement_and_no_delay(tmp_path, capsys):
+    t, pose, u = _driven(late_rows=(0, 4))
+    path = tmp_path / "drive.csv"
+    np.savetxt(path, np.column_stack([t, pose, u]), delimiter=",", header="t,x,y,theta,v,w", comments="", fmt="%.7g")
+    assert main(["trace", str(path), "--model", "unicycle", "--dt", "0.05", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [(e["name"], e["channel"]) for e in told["effects"]] in ([], [("integration_scheme", "*")])
+    assert [(f["kind"], f["channel"], f["from_s"]) for f in told["faults"]] == [("late", "theta", 0.0)]
+    assert told["states_late"] == {"theta": pytest.approx(4 * ROW_S, rel=0.05)}
