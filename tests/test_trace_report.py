@@ -20,7 +20,7 @@ from s2r_runtime.report.trace_page import trace_page
 from s2r_runtime.report.trace_section import add_trace
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.excitation import suggest
-from s2r_runtime.trace.found import Found, interval_text
+from s2r_runtime.trace.found import Found, each_once, interval_text
 from s2r_runtime.trace.tracer import trace
 from s2r_runtime.trace.views import envelope, spread, stretches
 
@@ -69,6 +69,18 @@ def test_what_no_rollout_shows_is_told_beside_a_name_and_takes_nothing_from_it(r
 def pages(results):
     """verdict -> page."""
     return {verdict: trace_page(result) for verdict, result in results.items()}
+
+
+def test_a_rival_that_two_explanations_share_is_listed_once():
+    delay, again, slip = (
+        Found(name, channel, {key: (value, None, None, "s")})
+        for name, channel, key, value in (
+            ("input_delay", "steer_cmd", "delay", 0.1587),
+            ("input_delay", "steer_cmd", "delay", 0.1586),
+            ("lateral_slip", "*", "coefficient", -0.05),
+        )
+    )
+    assert each_once([delay, again, slip]) == (delay, slip)
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
@@ -178,6 +190,9 @@ def _fields(result):
     [
         (0.1, 0.0951, 0.1049, "s", "0.100 s (95 %: 0.095 to 0.105)"),
         (0.05, 0.04, 0.06, "rad", "0.05 rad (2.9 deg) (95 %: 0.04 to 0.06)"),
+        (0.47, 0.0, 5.0, "s", "0.5 s (95 %: 0 to 5)"),
+        (-0.04, -0.6, 0.6, "m", "-0.04 m (95 %: -0.6 to 0.6)"),
+        (1e-12, 0.0, 1.0, "s", "0.000 s (95 %: 0.0 to 1.0)"),
         (0.8, None, None, "-", "0.8"),
         (1.5, 1.2, 1e6, "m/s", "1.5 m/s (at least 1.2)"),
         (12345.6, 12000.0, 12700.0, "N", "1.235e+04 N (95 %: 1.2e+04 to 1.27e+04)"),

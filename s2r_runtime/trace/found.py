@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,6 +58,14 @@ class Found:
         return in_words(self.name, self.channel, self.values)
 
 
+def each_once(found: Iterable[Found]) -> tuple[Found, ...]:
+    """The first of each name and channel: beside another rival it has other numbers, and is no other explanation."""
+    kept: dict[tuple[str, str], Found] = {}
+    for e in found:
+        kept.setdefault((e.name, e.channel), e)
+    return tuple(kept.values())
+
+
 def interval_text(value: float, low: Limit, high: Limit, unit: str) -> str:
     """`0.1000 rad/s (5.730 deg/s) (95 %: 0.0980 to 0.1020)`; an end at a parameter's bound says that the data do not limit it there."""
     plain = "" if unit == "-" else unit
@@ -65,8 +73,9 @@ def interval_text(value: float, low: Limit, high: Limit, unit: str) -> str:
     within = ends is not None and abs(ends[0]) < UNLIMITED and abs(ends[1]) < UNLIMITED
     width = 0.5 * (ends[1] - ends[0]) if ends is not None and within else 0.0
     turned = degrees(plain)
-    text = _rounded(value, width) + (f" {plain}" if plain else "")
-    text += f" ({_rounded(math.degrees(value), math.degrees(width))} {turned})" if turned else ""
+    seen = max(min(width, 2.0 * abs(value)), 0.01 * width)  # of a number that is hardly known its first digit, not a zero
+    text = _rounded(value, seen) + (f" {plain}" if plain else "")
+    text += f" ({_rounded(math.degrees(value), math.degrees(seen))} {turned})" if turned else ""
     if ends is None:
         return text
     if within:

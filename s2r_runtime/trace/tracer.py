@@ -30,6 +30,7 @@ from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge
 from s2r_runtime.trace.excitation import advice
 from s2r_runtime.trace.faults import Checked, check
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, problem, told, without
+from s2r_runtime.trace.found import each_once
 from s2r_runtime.trace.grid_errors import widened
 from s2r_runtime.trace.hidden_pairs import two_together
 from s2r_runtime.trace.holdout import Part, fit_mask, part
@@ -331,7 +332,7 @@ def _result(
     effects = tuple(_found(model, final, place, ranges) for place in final.added)
     idle = [place for place in final.added if not asked(given, judged_on, final.model, without(final.model, place))]
     rivals = [s.fit for s in chosen.rivals if s.fit is not None] if verdict == "ambiguous" else []
-    ties = tuple(_found(model, fit, place, {}) for fit in rivals for place in _new(fit, final))
+    ties = each_once(_found(model, fit, place, {}) for fit in rivals for place in _new(fit, final))
     return TraceResult(
         verdict=verdict,
         effects=effects,
