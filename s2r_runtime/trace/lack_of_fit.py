@@ -33,6 +33,7 @@ from s2r_runtime.trace.fitting import Fit, Problem
 from s2r_runtime.trace.fitting import gain as explained
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, SLOWLY, Judged, Left, first_look, judge, leading
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
+from s2r_runtime.trace.lack_of_fit_together import pairs
 from s2r_runtime.trace.residual import Mask, acting, covered, rms, rollout, rollout_starts
 from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
 
@@ -132,7 +133,7 @@ class Structure:
 def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     """Structure left by a model; how much of what `nominal` leaves that is."""
     left, found = looks.left, looks.found
-    chosen, gains = _forward(looks) if found else ([], {})
+    chosen, gains = looks.chosen
     varying = uneven(left)
     number = varying.judged if varying is not None and varying.sure else None
     wanders = left.law is not None and np.any(left.law.slow.sum(axis=1) > 0.0)  # else what is left is steadier than white noise
@@ -149,8 +150,7 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
         matters, share = _weight_of(left, nominal, chosen[-1], horizon)
         if matters and not _wanders(left, chosen[-1], SLOW * math.log(len(looks.found) / ALPHA)):
             first = [] if number is None or number.gain <= chosen[-1].gain else [number]
-            tokens = tuple(dict.fromkeys(TOKENS.get(judged.token, judged.token) for judged in [*first, *chosen]))
-            return Structure(tokens, True, share, gains, noise=_beside(left, chosen[-1]))
+            return Structure(as_told([*first, *chosen]), True, share, gains, noise=_beside(left, chosen[-1]))
     varied = looks.field
     told = [] if varied is None or varied.beyond <= 0.0 else [(varied.nats, varied.judged, varied.tokens, True)]
     if number is not None:
@@ -172,7 +172,7 @@ def still_left(left: Left, tokens: tuple[str, ...], nominal: Fit, horizon: int) 
     False says nothing.
     """
     looks = Looks(left, tokens)
-    chosen = _forward(looks)[0] if looks.looked else []
+    chosen = looks.chosen[0] if looks.looked else []
     sure = chosen and chosen[-1].gain > SLOW * math.log(len(looks.found) / ALPHA)
     return bool(sure) and _weight_of(left, nominal, chosen[-1], horizon)[0]
 
@@ -221,6 +221,11 @@ class Looks:
         return self.looked[0][0] if self.looked else 0.0
 
     @cached_property
+    def chosen(self) -> tuple[list[Judged], dict[str, float]]:
+        """Groups that explain it, the last one with the columns of all, and nats by group."""
+        return _forward(self) if self.found else ([], {})
+
+    @cached_property
     def field(self) -> Field | None:
         """The smooth random field that explains most of what is left; none is looked for where a speed was not measured."""
         return None if self.left.given.floor.axes else field(self.left)
@@ -231,6 +236,11 @@ class Looks:
         looked = _best_of_each(self.looked, self.found)[:FEW]
         kept = [i for nats, i in looked if nats > NOTHING] or [i for _, i in looked[:1]]
         return [judge(self.left, self.found[i][0], leading(self.left, self.found[i][1])) for i in kept]
+
+
+def as_told(chosen: Sequence[Judged]) -> tuple[str, ...]:
+    """Their tokens, as they are told."""
+    return tuple(dict.fromkeys(TOKENS.get(judged.token, judged.token) for judged in chosen))
 
 
 def best_unnamed(looks: Looks) -> Judged:
@@ -292,7 +302,7 @@ def _columns(terms: Sequence[Array], spread: Array) -> Array:
 
 
 def _forward(looks: Looks) -> tuple[list[Judged], dict[str, float]]:
-    """The best group, then those that add to it; the last one holds the columns of all."""
+    """The best group, or the best two together, then those that add to it; the last one holds the columns of all."""
     left, judged = looks.left, looks.judged
     threshold = math.log(len(looks.found) / ALPHA)
     gains = {token: 0.0 for token, _ in looks.found}
@@ -300,19 +310,33 @@ def _forward(looks: Looks) -> tuple[list[Judged], dict[str, float]]:
         gains[j.token] = max(gains[j.token], j.gain)
     strengths = [_strength(left, j, threshold) for j in judged]
     strongest = max(strength for strength, _ in strengths)
-    if strongest <= 0.0:
-        return [], gains
-    chosen = [min((j for s, j in strengths if s >= strongest - ALIKE), key=lambda j: (j.x.shape[2], -j.gain))]
-    rest = [(j.token, j.x) for j in judged if gains[j.token] > threshold and j.token != chosen[0].token]
+    chosen: list[Judged] = []
+    if strongest > 0.0:
+        first = min((j for s, j in strengths if s >= strongest - ALIKE), key=lambda j: (j.x.shape[2], -j.gain))
+        chosen = _onward(left, [first], _others(judged, gains, threshold, {first.token}), threshold)
+    for both in pairs(left, looks.looked, looks.found, 2.0 * threshold):
+        needed = 2.0 * threshold * both[1].scatter * (SLOW if {j.token for j in both} & {*SLOWLY} else 1.0)
+        if both[1].gain > max(needed, strongest, chosen[-1].gain + ALIKE if chosen else 0.0):
+            chosen = _onward(left, both, _others(judged, gains, threshold, {j.token for j in both}), threshold)
+    return chosen, gains
+
+
+def _others(judged: Sequence[Judged], gains: dict[str, float], threshold: float, named: set[str]) -> list[Judged]:
+    """Dictionaries of groups that say something by themselves, and are not named yet."""
+    return [j for j in judged if gains[j.token] > threshold and j.token not in named]
+
+
+def _onward(left: Left, chosen: list[Judged], rest: list[Judged], threshold: float) -> list[Judged]:
+    """With the groups that add to those chosen, the best first."""
     while rest and len(chosen) < MOST_GROUPS:
         before = chosen[-1]
-        judged = [judge(left, token, np.concatenate([before.x, x], axis=2)) for token, x in rest]
+        judged = [judge(left, j.token, np.concatenate([before.x, j.x], axis=2)) for j in rest]
         best = max(judged, key=lambda j: j.gain)
         if best.gain - before.gain < max(threshold * best.scatter, ADDS * before.gain):
             break
-        chosen.append(best)
-        rest = [(token, x) for token, x in rest if token != best.token]
-    return chosen, gains
+        chosen = [*chosen, best]
+        rest = [j for j in rest if j.token != best.token]
+    return chosen
 
 
 def _strength(left: Left, j: Judged, threshold: float) -> tuple[float, Judged]:

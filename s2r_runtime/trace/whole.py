@@ -21,6 +21,7 @@ from s2r_runtime.trace.lack_of_fit import (
     NOTHING,
     Looks,
     Structure,
+    as_told,
     best_unnamed,
     explains_more,
     lack_of_fit,
@@ -40,6 +41,9 @@ CLEAR = 10.0
 
 NEARLY = 0.4
 """Of what effects explain: dictionaries that give less at first look are not judged."""
+
+TWICE = 2.0
+"""Times what the best dictionary explains that several together must explain to be told in its place: it does not do most of it."""
 
 SOMEWHAT = 0.2
 """The same where one dictionary is held against several names: at first look it sees little beside all that it is not about."""
@@ -113,7 +117,7 @@ class Whole:
         """What the model as given leaves."""
         found = lack_of_fit(self._looks, self.nominal, self._horizon)
         seen = found.matters and not found.for_a_while and not found.varies
-        if seen and self.unnamed.gain > CLEAR:
+        if seen and (self.unnamed.gain > CLEAR or self._together):
             tokens = self._looks_like
         elif seen and self._field is not None and self._field.beyond > CLEAR:
             tokens = self._field.tokens  # it was seen by sliding only, which names what it tries
@@ -152,15 +156,26 @@ class Whole:
     @property
     def likeliest(self) -> tuple[str, ...]:
         """What all that the nominal model lacks depends on most, if that is clear."""
-        return self._looks_like if self.unnamed.gain > CLEAR else ()
+        return self._looks_like if self.unnamed.gain > CLEAR or self._together else ()
 
     @cached_property
     def _looks_like(self) -> tuple[str, ...]:
-        """What all that the nominal model lacks depends on most: by the best dictionary, or by a shape or a field that does better."""
-        token, nats = self.unnamed.token, self.unnamed.gain
+        """What all that the nominal model lacks depends on most: by the best dictionary, or by two that say little alone, or by a shape or
+        a field that does better.
+        """
+        tokens: tuple[str, ...] = (self.unnamed.token,)
+        nats = self.unnamed.gain
+        if self._together:
+            tokens, nats = as_told(self._together), self._together[-1].gain
         if self._shape is not None and self._shape.nats >= MORE * nats + ALIKE:
-            token, nats = self._shape.token, self._shape.nats
-        return self._field.tokens if self._field is not None and self._field.nats > nats + CLEAR else (token,)
+            tokens, nats = (self._shape.token,), self._shape.nats
+        return self._field.tokens if self._field is not None and self._field.nats > nats + CLEAR else tokens
+
+    @property
+    def _together(self) -> list[Judged]:
+        """Dictionaries that explain far more together than the best one does; none, if it does most of it."""
+        chosen = self._looks.chosen[0]
+        return chosen if len(chosen) > 1 and chosen[-1].gain >= TWICE * self.unnamed.gain + CLEAR else []
 
     @property
     def _field(self) -> Field | None:
