@@ -5,16 +5,25 @@ import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.trace.errors import Judged
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.errors import Held, Judged
+from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.verdict import goes_astray
 
 CAR = compose(ModelSpec("bicycle", 0.1, {"wheel_base": 2.7}))
 FLOOR = np.array([0.07, 0.07, 0.004, 0.03])
+STEPS, AHEAD = 409, 10
+STARTS = STEPS - AHEAD + 1
+
+
+def _given():
+    data = from_arrays(CAR, [(np.zeros((STEPS + 1, 4)), np.zeros((STEPS, 2)))])
+    return Held(data, steps_of(data), (), np.ones(STEPS, dtype=bool), AHEAD)
 
 
 def _ends(*times_the_noise):
-    ends = np.random.default_rng(1).normal(size=(400, 4)) * FLOOR * times_the_noise
-    return Judged(ends, ends)
+    rng = np.random.default_rng(1)
+    return Judged(rng.normal(size=(STEPS, 4)) * FLOOR, rng.normal(size=(STARTS, 4)) * FLOOR * times_the_noise)
 
 
 @pytest.mark.parametrize(
@@ -28,9 +37,28 @@ def _ends(*times_the_noise):
     ],
 )
 def test_what_takes_rollouts_far_and_is_left_is_no_noise(before, after, astray):
-    assert goes_astray(CAR, _ends(*before), _ends(*after), FLOOR) is astray
+    assert goes_astray(CAR, (_ends(*before), _ends(*after)), _given(), FLOOR) is astray
+
+
+def test_a_few_steps_that_take_many_rollouts_far_are_no_outliers():
+    """Commands that are lost twice, for five steps: too few rollouts pass there for most of them to say so."""
+    judged = _ends(1, 1, 1, 1)
+    for first in (100, 250):
+        judged.one_step[first : first + 5, 2] += 10.0 * FLOOR[2]
+        judged.ends[first - AHEAD + 5 : first, 2] += 50.0 * FLOOR[2]
+    assert goes_astray(CAR, (judged, judged), _given(), FLOOR)
+
+
+def test_rows_that_are_off_by_themselves_take_nothing_astray():
+    judged = _ends(1, 1, 1, 1)
+    for row in range(40, 380, 20):
+        judged.one_step[row - 1 : row + 1, 2] += 50.0 * FLOOR[2]
+        judged.ends[[row, row - AHEAD], 2] += 50.0 * FLOOR[2]
+    assert not goes_astray(CAR, (judged, judged), _given(), FLOOR)
 
 
 def test_nothing_to_judge_on_is_nothing_astray():
-    none = Judged(np.zeros((3, 4)), np.zeros((0, 4)))
-    assert not goes_astray(CAR, none, none, FLOOR)
+    given = _given()
+    nothing = Held(given.data, given.steps, (), np.zeros(STEPS, dtype=bool), AHEAD)
+    none = Judged(np.zeros((STEPS, 4)), np.zeros((0, 4)))
+    assert not goes_astray(CAR, (none, none), nothing, FLOOR)

@@ -95,7 +95,7 @@ def held(model: ComposedModel, data: Dataset, steps: Steps, left_out: tuple[tupl
 def judge(model: ComposedModel, given: Held) -> Judged:
     """The model's errors on what is held out."""
     act = acting(model, given.data)
-    starts = _starts(given)
+    starts = rollout_starts_of(given)
     inverted = None if given.inverse is None else input_relative(model, given.inverse)
     ends = rollout(model, given.data, act, starts, given.horizon, begun=_begun(given, model)).error
     return Judged(residual(model, given.steps, act), ends, inverted)
@@ -129,14 +129,15 @@ def _begun(given: Held, model: ComposedModel) -> Array | None:
 
 def displacement(given: Held) -> Array:
     """(m, nx) how far measured states went in the horizon, from every start of a rollout."""
-    starts = _starts(given)
+    starts = rollout_starts_of(given)
     begin = np.cumsum([0] + [len(run.y) - 1 for run in given.data.runs])
     rows = starts + np.searchsorted(begin, starts, side="right") - 1
     y = np.concatenate([run.y for run in given.data.runs])
     return np.asarray(y[rows + given.horizon] - y[rows])
 
 
-def _starts(given: Held) -> NDArray[np.int64]:
+def rollout_starts_of(given: Held) -> NDArray[np.int64]:
+    """Steps from which rollouts are judged, (m,)."""
     starts = rollout_starts(given.data, given.horizon, given.left_out, given.within)
     return starts[:: max(1, len(starts) * given.horizon // MANY)]
 
@@ -151,7 +152,7 @@ def noise_floor(fit: Fit, given: Held, seed: int) -> tuple[Array, Array]:
     model, noise = fit.model, _as_seen(fit.noise, given.data)
     act = acting(model, given.data)
     one = noise.one_step(state_jacobian(model, given.steps, act))
-    starts = _starts(given)
+    starts = rollout_starts_of(given)
     starts = starts[:: max(1, len(starts) // FLOOR_STARTS)]
     if not len(starts):
         return one, one
