@@ -4,7 +4,7 @@
 # make check  format, lint, types, import walls, docs
 # make bench  the figures that the docs state, as ratios in one run
 # make mutation  does a test notice every small change of the gate, the certificate and the core, and is every line of them run
-# make robotarium-experiment quadruped-experiment  the paper's experiment, reading by reading, with its figures on one page (robotarium-experiment.html)
+# make robotarium-experiment  the paper's experiment, reading by reading, with its figures on one page (robotarium-experiment.html)
 # make quadruped-experiment   the paper's other experiment, on a walking robot in rigid-body physics (quadruped-experiment.html)
 # make bench-trace  the tracer on seeded recordings that it has never seen, in some 15 minutes; SETS="--seeds 0:5 --failures" for others
 # make bench-quadruped  two and a half simulated hours of walking: falls, tracking, and how fast the simulation is
@@ -14,7 +14,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: bench-endurance run test test-long check mutation bench bench-trace bench-quadruped robotarium-experiment format clean wheels setup
+.PHONY: bench-endurance run test test-long check quadruped-experiment mutation bench bench-trace bench-quadruped robotarium-experiment format clean wheels setup
 
 run: $(STAMP)
 	$(BIN)/s2r demo
