@@ -112,37 +112,49 @@ class RobotLink:
             given = self._ask("receive", self.transport.receive)
             frames = values.frames(given, time.monotonic_ns())
         except BaseException as error:  # noqa: BLE001 - a plug-in's defect must not stop the gate
-            if given is not None:
-                self._dropped = one_line(f"{values.DROPPED}{error}; what was dropped may have been a stop")
-                for stop in self._dropped_input():
-                    yield stop.t_ns, stop
-            for change in self._failed("receive", error):
-                yield change.t_ns, change
+            yield from self._spoilt(given, error)
             return
         if time.monotonic_ns() >= self._calm_ns:
             self._faults.pop("receive", None)
         for frame in frames:
             self._record(frame)
-            messages: list[Inbound] = []
-            try:
-                messages, fault = self._ask("decode", values.decoded, self.transport, frame, self._nx)
-            except BaseException as error:  # noqa: BLE001 - as above
-                messages += self._failed("decode", error)
-            else:
-                if fault is None:
-                    self._faults.pop("decode", None)
-                else:
-                    messages += self._failed("decode", fault)
-            for message in messages:
-                if self._down and not self._faults and isinstance(message, Observation):
-                    self._down = False
-                    self._journal.append(f"{self._named} works again")
-                    yield frame.arrival_ns, LinkChanged(frame.arrival_ns, up=True, detail="the transport works again")
-                yield frame.arrival_ns, message
-                if self._faults and isinstance(message, LinkChanged) and message.up:  # it may hear its robot, and be of no use yet
-                    yield frame.arrival_ns, LinkChanged(frame.arrival_ns, up=False, detail=f"transport: {self.trouble}")
+            yield from self._passed_on(frame, self._decoded(frame))
             if self.out_of_use:
                 return
+
+    def _spoilt(self, given: object, error: BaseException) -> Iterator[tuple[int, Inbound]]:
+        """What becomes of input that could not be taken. given: what the transport gave, None if nothing."""
+        if given is not None:
+            self._dropped = one_line(f"{values.DROPPED}{error}; what was dropped may have been a stop")
+            for stop in self._dropped_input():
+                yield stop.t_ns, stop
+        for change in self._failed("receive", error):
+            yield change.t_ns, change
+
+    def _decoded(self, frame: Frame) -> list[Inbound]:
+        """What a frame says, and that the transport could not tell, where it couldn't."""
+        messages: list[Inbound] = []
+        try:
+            messages, fault = self._ask("decode", values.decoded, self.transport, frame, self._nx)
+        except BaseException as error:  # noqa: BLE001 - as above
+            messages += self._failed("decode", error)
+        else:
+            if fault is None:
+                self._faults.pop("decode", None)
+            else:
+                messages += self._failed("decode", fault)
+        return messages
+
+    def _passed_on(self, frame: Frame, messages: list[Inbound]) -> Iterator[tuple[int, Inbound]]:
+        """Them, and what they mean for a transport that was at fault: down until something usable came."""
+        for message in messages:
+            if self._down and not self._faults and isinstance(message, Observation):
+                self._down = False
+                self._journal.append(f"{self._named} works again")
+                yield frame.arrival_ns, LinkChanged(frame.arrival_ns, up=True, detail="the transport works again")
+            yield frame.arrival_ns, message
+            if self._faults and isinstance(message, LinkChanged) and message.up:  # it may hear its robot, and be of no use yet
+                yield frame.arrival_ns, LinkChanged(frame.arrival_ns, up=False, detail=f"transport: {self.trouble}")
 
     def poll(self, now_ns: int) -> Iterator[LinkChanged | OverrideChanged]:
         """Link lost or back, by the transport's own time-outs; and a stop for input that was dropped. now_ns: the host's clock."""
