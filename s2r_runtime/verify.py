@@ -82,24 +82,21 @@ def verify_in_detail(
     _check(laws, required)
     radii = grid(least_radius, gap_set.radius)
     share = beta / len(radii)
-    needed = sample_size(epsilon, share)
-    n = n or needed
-    if n < needed:
-        raise NotEnoughEvidence(
-            f"{n} scenarios, {needed} are needed for epsilon {epsilon:g} and beta {share:.4g}: {needed - n} more", needed - n
-        )
-    runs = _Runs(control, task, model, n, threshold, share, seed, required, keep, progress, 1 + math.ceil(math.log2(len(radii))), laws)
-    tried: list[RadiusTried] = []
-    at: dict[int, _Run] = {}
-
-    def passes(index: int) -> bool:
-        scaled = replace(gap_set, radius=radii[index], hold_radius=gap_set.hold_radius * _share(radii[index], gap_set.radius))
-        at[index] = run = runs.run(scaled, only_required=index > 0)
-        least = min((r.s_star for r in run.results if r.required), default=-np.finfo(np.float64).max)
-        tried.append(RadiusTried(index, scaled.radius, not run.reason, float(least)))
-        return not run.reason
-
-    best = at[search(len(radii), passes) or 0]
+    runs = _Runs(
+        control,
+        task,
+        model,
+        n=_enough(n, epsilon, share),
+        threshold=threshold,
+        share=share,
+        seed=seed,
+        required=required,
+        keep=keep,
+        progress=progress,
+        most=1 + math.ceil(math.log2(len(radii))),
+        laws=laws,
+    )
+    best, tried = _farthest(runs, gap_set, radii)
     runs.complete(best)
     return (
         Verification(
@@ -123,8 +120,15 @@ def verify_in_detail(
     )
 
 
-def _share(radius: float, most: float) -> float:
-    return radius / most if most > 0.0 else 1.0
+def _enough(n: int, epsilon: float, beta: float) -> int:
+    """n scenarios, or as many as are needed where n is 0. Raises NotEnoughEvidence if they are too few."""
+    needed = sample_size(epsilon, beta)
+    n = n or needed
+    if n < needed:
+        raise NotEnoughEvidence(
+            f"{n} scenarios, {needed} are needed for epsilon {epsilon:g} and beta {beta:.4g}: {needed - n} more", needed - n
+        )
+    return n
 
 
 @dataclass
@@ -201,6 +205,24 @@ class _Runs:
         before, whole = (self.done * len(self.laws) + list(self.laws).index(law)) * self.n, self.most * len(self.laws) * self.n
         detail = law if self.most == 1 else f"{law}, radius {radius:.3g}"
         return lambda done, _total: progress(before + done, whole, detail)
+
+
+def _farthest(runs: _Runs, gap_set: GapSet, radii: Sequence[float]) -> tuple[_Run, list[RadiusTried]]:
+    """The run at the largest of the radii (ascending, the last is gap_set's) at which the controller passes, else at the least; and those
+    that were looked at, in that order.
+    """
+    tried: list[RadiusTried] = []
+    at: dict[int, _Run] = {}
+
+    def passes(index: int) -> bool:
+        share = radii[index] / gap_set.radius if gap_set.radius > 0.0 else 1.0
+        scaled = replace(gap_set, radius=radii[index], hold_radius=gap_set.hold_radius * share)
+        at[index] = run = runs.run(scaled, only_required=index > 0)
+        least = min((r.s_star for r in run.results if r.required), default=-np.finfo(np.float64).max)
+        tried.append(RadiusTried(index, scaled.radius, not run.reason, float(least)))
+        return not run.reason
+
+    return at[search(len(radii), passes) or 0], tried
 
 
 def _check(laws: Sequence[str], required: Sequence[str]) -> None:
