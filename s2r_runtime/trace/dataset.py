@@ -219,19 +219,9 @@ def from_streams(
 
     Raises RecordingError if states come too seldom for the model's dt, or never, or inputs at another time.
     """
-    for states, inputs in segments:
-        _check_same_clock(states, inputs, source)
     dt = model.dt
-    _check_seconds(segments, dt, source)
-    stretches = [part for states, inputs in segments for part in _split(states, inputs, model)]
-    stretches = [part for part in stretches if len(part[0].t) >= 2 and part[0].t[-1] - part[0].t[0] > 0.5 * dt]
-    if not stretches:
-        raise RecordingError(f"{source}: has no two rows on which a state was measured")
-    spacing = float(np.median([float(np.median(np.diff(states.t))) for states, _ in stretches]))
-    if spacing > THINNED * dt:
-        raise RecordingError(
-            f"{source}: states are {spacing:.4g} s apart, the model's step is {dt:g} s; give a step of at least {spacing:.4g} s"
-        )
+    stretches = _stretches(model, segments, source)
+    spacing = _spacing(stretches, dt, source)
     apart = math.ceil(spacing / dt - ALIGNED) if spacing > SLOWEST * dt else 1
     if reconstruction is not None:
         apart = max(apart, independent_step(reconstruction, dt))
@@ -239,43 +229,81 @@ def from_streams(
     as_they_are = not exact and spacing <= NEAREST * dt
     parts = in_parts or substeps or _parts(model, stretches, exact, as_they_are)
     origin = min(_first(states) for states, _ in segments)
-    runs: list[Run] = []
-    pauses: list[Pause] = []
-    for states, inputs in stretches:
-        t0 = float(states.t[0])
-        pauses += _pauses(states, inputs.t, len(runs), spacing, origin, dt)
-        early = math.ceil((t0 - inputs.t[0]) / dt - ALIGNED) if len(inputs.t) else 0
-        early = min(max(early, 0), BEFORE)
-        lasts, late = None, None
-        if as_they_are:
-            y, at = nearest(states, dt, model.angle_columns)
-            at = np.concatenate([t0 - dt * np.arange(early, 0, -1), at])
-            u, lasts, late = held_between(inputs, at, parts), np.diff(at), turned(inputs, at, parts)
-        else:
-            y = at_grid(states, dt, model.angle_columns) if exact else interpolated(states, dt, model.angle_columns, spacing)
-            u = held_means(inputs, t0 - early * dt, len(y) - 1 + early, dt, parts)
-            late = turned(inputs, t0 + dt * np.arange(-early, len(y)), parts, ALIGNED * dt) if exact and parts > 1 else None
-        runs.append(Run(t0 - early * dt - origin, np.concatenate([np.full((early, y.shape[1]), np.nan), y]), u, lasts, late))
-    rows = sum(len(states.t) for states, _ in stretches)
+    if as_they_are:
+        runs = [_as_recorded(model, states, inputs, parts, origin) for states, inputs in stretches]
+    else:
+        runs = [_on_the_grid(model, states, inputs, parts, origin, None if exact else spacing) for states, inputs in stretches]
     return Dataset(
-        model.states,
-        model.inputs,
-        dt,
-        parts,
-        tuple(runs),
-        not exact and not as_they_are,
-        rows,
-        source,
-        digests,
-        tuple(pauses),
-        paths,
-        origin,
-        reconstruction,
-        apart,
-        reconstruction.interval if reconstruction else snapped(spacing, dt),
-        tuple(segments),
-        in_parts > 0,
+        states=model.states,
+        inputs=model.inputs,
+        dt=dt,
+        substeps=parts,
+        runs=tuple(runs),
+        interpolated=not exact and not as_they_are,
+        rows=sum(len(states.t) for states, _ in stretches),
+        source=source,
+        digests=digests,
+        pauses=tuple(p for i, (states, inputs) in enumerate(stretches) for p in _pauses(states, inputs.t, i, spacing, origin, dt)),
+        paths=paths,
+        origin_s=origin,
+        reconstruction=reconstruction,
+        apart=apart,
+        interval=reconstruction.interval if reconstruction else snapped(spacing, dt),
+        segments=tuple(segments),
+        in_parts=in_parts > 0,
     )
+
+
+def _stretches(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], source: str) -> list[tuple[Stream, Stream]]:
+    """What is in one piece, and long enough for a step. Raises RecordingError if nothing is, or clocks or units of time differ."""
+    for states, inputs in segments:
+        _check_same_clock(states, inputs, source)
+    _check_seconds(segments, model.dt, source)
+    pieces = [part for states, inputs in segments for part in _split(states, inputs, model)]
+    pieces = [part for part in pieces if len(part[0].t) >= 2 and part[0].t[-1] - part[0].t[0] > 0.5 * model.dt]
+    if not pieces:
+        raise RecordingError(f"{source}: has no two rows on which a state was measured")
+    return pieces
+
+
+def _spacing(stretches: Sequence[tuple[Stream, Stream]], dt: float, source: str) -> float:
+    """Usual interval of the states, s. Raises RecordingError if they come too seldom for the model's step."""
+    spacing = float(np.median([float(np.median(np.diff(states.t))) for states, _ in stretches]))
+    if spacing > THINNED * dt:
+        raise RecordingError(
+            f"{source}: states are {spacing:.4g} s apart, the model's step is {dt:g} s; give a step of at least {spacing:.4g} s"
+        )
+    return spacing
+
+
+def _early(states: Stream, inputs: Stream, dt: float) -> int:
+    """Steps before the first state of which the inputs are known."""
+    early = math.ceil((float(states.t[0]) - inputs.t[0]) / dt - ALIGNED) if len(inputs.t) else 0
+    return min(max(early, 0), BEFORE)
+
+
+def _as_recorded(model: ComposedModel, states: Stream, inputs: Stream, parts: int, origin: float) -> Run:
+    """A run on rows that are near the model's step, each step as long as its rows are apart."""
+    t0, early = float(states.t[0]), _early(states, inputs, model.dt)
+    y, at = nearest(states, model.dt, model.angle_columns)
+    at = np.concatenate([t0 - model.dt * np.arange(early, 0, -1), at])
+    u, lasts, late = held_between(inputs, at, parts), np.diff(at), turned(inputs, at, parts)
+    return Run(t0 - early * model.dt - origin, _after(early, y), u, lasts, late)
+
+
+def _on_the_grid(model: ComposedModel, states: Stream, inputs: Stream, parts: int, origin: float, spacing: float | None) -> Run:
+    """A run on the model's step. spacing: of the rows, s, if they have to be interpolated."""
+    dt, t0, early = model.dt, float(states.t[0]), _early(states, inputs, model.dt)
+    y = at_grid(states, dt, model.angle_columns) if spacing is None else interpolated(states, dt, model.angle_columns, spacing)
+    u = held_means(inputs, t0 - early * dt, len(y) - 1 + early, dt, parts)
+    at = np.asarray(t0 + dt * np.arange(-early, len(y)), dtype=np.float64)
+    late = turned(inputs, at, parts, ALIGNED * dt) if spacing is None and parts > 1 else None
+    return Run(t0 - early * dt - origin, _after(early, y), u, None, late)
+
+
+def _after(early: int, y: Array) -> Array:
+    """States behind steps in which nobody measured any."""
+    return np.concatenate([np.full((early, y.shape[1]), np.nan), y])
 
 
 def regridded(data: Dataset, model: ComposedModel, in_parts: int = 0, substeps: int = 0) -> Dataset:
