@@ -8,7 +8,9 @@ import pytest
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.faults import check
+from s2r_runtime.trace.tracer import trace
 from s2r_runtime.trace.whole import Whole
 
 DT_S, PARTS, INERTIA = 0.004, 8, 0.8
@@ -56,3 +58,39 @@ def test_gravity_and_friction_that_hide_each_other_are_told_by_what_both_depend_
     left = Whole(check(model, data), model, horizon=125)._of_nominal()
     assert left.matters
     assert set(left.tokens) == {"position", "speed"}
+
+
+def _table(path, rows, torques):
+    lines = [f"{k * DT_S:.3f},{q:.9g},{v:.9g},{u:.9g}" for k, ((q, v), (u,)) in enumerate(zip(rows, torques, strict=False))]
+    path.write_text("\n".join(["t,q,qd,force", *lines]) + "\n")
+    return path
+
+
+def _late(rows, by):
+    """Speeds as they were a share of a row before."""
+    return np.column_stack([rows[:, 0], np.append(rows[0, 1], (1.0 - by) * rows[1:, 1] + by * rows[:-1, 1])])
+
+
+def _differences(rows, bits=13):
+    step = 2 * math.pi / 2**bits
+    q = np.round(rows[:, 0] / step) * step
+    return np.column_stack([q, np.append(rows[0, 1], np.diff(q) / DT_S)])
+
+
+@pytest.mark.parametrize("measured", [lambda rows: _late(rows, 0.4), _differences], ids=["by less than a row", "of a coarse encoder"])
+def test_a_speed_that_comes_late_by_a_part_of_a_row_is_no_actuator_that_answers_late(tmp_path, measured):
+    rows, torques = _led(1, seconds=6.0, noise=0.0)
+    model = _joint()
+    data = load_dataset(_table(tmp_path / "joint.csv", measured(rows), torques), model)
+    assert data.reconstruction.late["qd"] == pytest.approx(0.45 * DT_S, rel=0.3)
+    assert trace(data, model).verdict == "none"
+
+
+@pytest.mark.parametrize("digits", [4, 6, 9])
+def test_a_simulator_whose_positions_come_early_has_speeds_that_do_not_come_late(tmp_path, digits):
+    """It steps by v+ = v + h a, q+ = q + h v+, so that its speeds are the last differences of its positions."""
+    _, torques = _led(1, seconds=6.0, noise=0.0)
+    v = np.cumsum(np.append(0.0, DT_S * torques[:, 0] / INERTIA))
+    rows = np.round(np.column_stack([np.cumsum(DT_S * v), v]), digits)
+    data = load_dataset(_table(tmp_path / "joint.csv", rows, torques), _joint())
+    assert data.reconstruction is None

@@ -1,4 +1,5 @@
-"""A speed that a controller made of positions comes late: a filter that looks back only is behind by its time constant.
+"""A speed that a controller made of positions comes late: a filter that looks back only is behind by its time constant, and the difference
+of the last two positions by half a row.
 
 Against the speed v that positions alone say (`speeds`: a spline looks both ways, and is not late), a recorded one is
 
@@ -6,6 +7,13 @@ Against the speed v that positions alone say (`speeds`: a spline looks both ways
 
 to first order, for a filter as for a delay. Least squares gives `late` with its error, from blocks of time. A speed that is late
 has the friction at the wrong time, and looks like an actuator that answers late; the positions tell it better.
+
+By less than a row, a position may as well come early: a simulator that steps by q+ = q + h v+ says so. Then the speed answers an input b
+that is held from row to row at once; one that is late by a share c of a row answers with c of the one before,
+
+    s_{k+1} - s_k - h b_k = c h (b_{k-1} - b_k) + noise
+
+Of positions that were rounded, a speed that is their last difference is late without a doubt, though rounding hides by how much.
 """
 
 from __future__ import annotations
@@ -13,6 +21,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.trace.residual_noise import quantum
 from s2r_runtime.trace.speeds import Smoothed
 
 Array = NDArray[np.float64]
@@ -20,28 +29,68 @@ Array = NDArray[np.float64]
 SURELY, BLOCKS = 8.0, 10
 """Standard errors by which a speed must be late, from the scatter of so many blocks of time."""
 
-ROWS = 0.6
-"""Of the rows' distance: what it must be late at least. A difference of the last two positions is late by half of it."""
+ROWS, LEAST = 0.6, 0.1
+"""Of the rows' distance: what it must be late by for inputs not to be asked, and at least. The spline's speed is late or early by up to a
+fiftieth of a row where an actuator answers late.
+"""
+
+ANSWERS = 0.5
+"""Of what a speed is late by, that with which it must answer inputs late, within twice the error of that."""
 
 MOSTLY = 0.5
 """Of what a recorded speed differs by from that of the positions, mean square, which must be its coming late."""
 
+SAME = 0.05
+"""Of how differences change from row to row: so near to the last one is a speed that was made of it and printed with a few digits."""
 
-def late(t: Array, recorded: Array, found: Smoothed) -> float:
-    """s by which a recorded speed (n,) at t (n,) is late, if that is beyond doubt and most of what is wrong with it; else 0."""
+
+def late(t: Array, recorded: Array, pushed: Array, found: Smoothed) -> float:
+    """s by which a recorded speed (n,) at t (n,) is late, if that is beyond doubt and most of what is wrong with it; else 0.
+    pushed: (n - 1,) acceleration by the inputs from row to row.
+    """
     if len(t) < 8 * BLOCKS:
         return 0.0
+    row = float(np.median(np.diff(t)))
     v = found.speed
     a = (v[2:] - v[:-2]) / (t[2:] - t[:-2])
-    off = (v - recorded)[1:-1]
+    off = _without_outliers((v - recorded)[1:-1])
+    seconds, error = _slope(a, off)
+    explained = 1.0 - float(np.sum((off - seconds * a) ** 2) / max(float(np.sum(off * off)), 1e-300))
+    sure = seconds > max(SURELY * error, LEAST * row) and explained > MOSTLY
+    return seconds if sure and (seconds > ROWS * row or _answers_late(t, recorded, pushed, seconds)) else 0.0
+
+
+def of_differences(t: Array, recorded: Array, position: Array, pushed: Array) -> float:
+    """Half a row (s), if a speed is the difference of the last two of positions that were rounded; else 0."""
+    if len(t) < 8 * BLOCKS or quantum(position[:-1], position[1:]) == 0.0:
+        return 0.0
+    made = np.diff(position) / np.diff(t)
+    change = float(np.sqrt(np.mean(np.diff(made) ** 2)))
+    same = float(np.sqrt(np.mean((recorded[1:] - made) ** 2))) < SAME * change
+    half = 0.5 * float(np.median(np.diff(t)))
+    return half if same and _answers_late(t, recorded, pushed, half) else 0.0
+
+
+def _answers_late(t: Array, recorded: Array, pushed: Array, seconds: float) -> bool:
+    """Whether a speed that is late by less than a row answers what was asked in the row before, or nothing tells."""
+    h = np.diff(t)
+    asked = h * pushed
+    before = h[1:] * pushed[:-1] - asked[1:]
+    share, error = _slope(before, _without_outliers((np.diff(recorded) - asked)[1:]))
+    return share + 2.0 * error > ANSWERS * seconds / float(np.median(h))
+
+
+def _without_outliers(off: Array) -> Array:
+    """Less its median, cut off at six times its usual size."""
     off = off - float(np.median(off))
     limit = 6.0 * float(np.median(np.abs(off))) + 1e-300
-    off = np.clip(off, -limit, limit)
-    power, product = (np.array([float(np.sum(part)) for part in np.array_split(e, BLOCKS)]) for e in (a * a, a * off))
+    return np.asarray(np.clip(off, -limit, limit))
+
+
+def _slope(x: Array, y: Array) -> tuple[float, float]:
+    """Least squares of y on x, with the standard error by BLOCKS of time; (0, inf) where x is none."""
+    power, product = (np.array([float(np.sum(part)) for part in np.array_split(e, BLOCKS)]) for e in (x * x, x * y))
     if not power.sum() > 0.0:
-        return 0.0
-    seconds = float(product.sum() / power.sum())
-    error = float(np.sqrt(np.sum((product - seconds * power) ** 2))) / float(power.sum())
-    explained = 1.0 - float(np.sum((off - seconds * a) ** 2) / max(float(np.sum(off * off)), 1e-300))
-    sure = seconds > max(SURELY * error, ROWS * float(np.median(np.diff(t)))) and explained > MOSTLY
-    return seconds if sure else 0.0
+        return 0.0, float("inf")
+    slope = float(product.sum() / power.sum())
+    return slope, float(np.sqrt(np.sum((product - slope * power) ** 2))) / float(power.sum())

@@ -24,7 +24,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
 from s2r_runtime.trace import differentiation
 from s2r_runtime.trace.fault import Fault
-from s2r_runtime.trace.late_speeds import late
+from s2r_runtime.trace.late_speeds import late, of_differences
 from s2r_runtime.trace.position_faults import mended
 from s2r_runtime.trace.speeds import Smoothed, smoothed
 from s2r_runtime.trace.streams import Stream, complete, fresh, held_between, held_means, unwrapped
@@ -153,15 +153,26 @@ def late_speeds(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]],
     pairs = tuple((p, v) for p, v in found if p in names and v in names and v in getattr(model.nominal, "follows", {}))
     if not pairs or not segments:
         return {}
-    states, inputs = max(segments, key=lambda pair: len(pair[0].t))
-    states = complete(fresh(states))
+    received, inputs = max(segments, key=lambda pair: len(pair[0].t))
+    states = _looked_at(model, complete(fresh(received)), names)
     if len(states.t) < FEWEST or not len(inputs.t):
         return {}
-    angles = [names.index(name) for name in model.nominal.angles if name in names]
-    states = Stream(states.t[:LOOKED_AT], unwrapped(states.values[:LOOKED_AT], angles))
-    _, smooth = _speeds(model, states, inputs, names, pairs)
-    by = {v: late(states.t, states.values[:, names.index(v)], one) for (_, v), one in zip(pairs, smooth, strict=True)}
+    all_rows = _looked_at(model, complete(received), names)  # a position that repeats may be all that a coarse encoder says
+    rates, all_rates = (_pushed(model, rows, inputs, names)[1] for rows in (states, all_rows))
+    by = {}
+    for position, speed in pairs:
+        i, j, k = names.index(position), names.index(speed), model.states.index(speed)
+        by[speed] = of_differences(all_rows.t, all_rows.values[:, j], all_rows.values[:, i], all_rates[:, k])
+        if by[speed] == 0.0:
+            smooth = smoothed(states.t, states.values[:, i], rates[:, k])
+            by[speed] = late(states.t, states.values[:, j], rates[:, k], smooth)
     return {v: seconds for v, seconds in by.items() if seconds > 0.0}
+
+
+def _looked_at(model: ComposedModel, states: Stream, names: Sequence[str]) -> Stream:
+    """The first rows, angles unwrapped."""
+    angles = [names.index(name) for name in model.nominal.angles if name in names]
+    return Stream(states.t[:LOOKED_AT], unwrapped(states.values[:LOOKED_AT], angles))
 
 
 def independent_step(done: Reconstruction, dt: float) -> int:
