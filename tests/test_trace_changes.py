@@ -6,11 +6,12 @@ import pytest
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.changes import from_the_beginning
+from s2r_runtime.trace import changes
+from s2r_runtime.trace.changes import from_the_beginning, rivals_that_happen
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
 from s2r_runtime.trace.residual import steps_of
-from s2r_runtime.trace.scores import STRICT, name_of
+from s2r_runtime.trace.scores import STRICT, Scored, name_of
 from s2r_runtime.trace.selection import accepted
 
 DT_S, STANDS, CHANGED_S = 0.1, 40, 30.0
@@ -68,3 +69,19 @@ def test_a_change_on_the_way_and_a_drift_stay():
     assert _instead(CHANGE, "regime_change", {"time": CHANGED_S, "gain": 0.95}) == [("regime_change", "*")]
     drift = (EffectSpec("input_gain_drift", "*", {"rate": -0.003}),)
     assert _instead(drift, "input_gain_drift", {"rate": -0.002}) == [("input_gain_drift", "*")]
+
+
+def test_a_change_before_the_robot_moves_is_no_rival(monkeypatch):
+    given, model = _problem(GAINS[1:])
+
+    def found(name, p):
+        with_it = insert(model, AppliedEffect(registry().get("effects", name), "w", p), 0)
+        return Scored(name, "w", 1.0, fitted(given, evaluate(given, with_it), with_it))
+
+    gain = found("input_gain", {"gain": 0.95})
+    others = [
+        found("regime_change", {"time": 3.0, "gain": 0.95}),
+        found("input_gain_asymmetry", {"gain_positive": 0.9, "gain_negative": 0.9}),
+    ]
+    monkeypatch.setattr(changes, "rivals", lambda given, fit: others)
+    assert rivals_that_happen(given, gain.fit) == others[1:]

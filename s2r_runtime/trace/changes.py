@@ -15,8 +15,8 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, foretold, gain, sought, under_noise
-from s2r_runtime.trace.rivals import CLOSE
-from s2r_runtime.trace.scores import Bar, name_of
+from s2r_runtime.trace.rivals import CLOSE, rivals
+from s2r_runtime.trace.scores import Bar, Scored, name_of
 from s2r_runtime.trace.slots import Added, Slot, bounds_of, values_of, with_values
 
 EDGE = 0.02
@@ -45,6 +45,12 @@ def _always(given: Problem, fit: Fit, slot: Slot) -> bool:
     if model is None or foretold(given, model) is None:
         return False
     return under_noise(given, model, fit.noise).white > float(np.sum(noises.log_density(fit.z))) - fit.whiten.logdet - CLOSE
+
+
+def rivals_that_happen(given: Problem, fit: Fit) -> list[Scored]:
+    """`rivals`, less those that say of a change that it happens where it does not: what was found says so better."""
+    found = rivals(given, fit)
+    return [s for s in found if s.fit is None or happens(given, s.fit)] if happens(given, fit) else found
 
 
 def from_the_beginning(given: Problem, fit: Fit, bar: Bar) -> Fit:

@@ -20,7 +20,7 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.begun import begun, uncertain
 from s2r_runtime.trace.candidates import candidates
-from s2r_runtime.trace.changes import from_the_beginning, happens
+from s2r_runtime.trace.changes import from_the_beginning, happens, rivals_that_happen
 from s2r_runtime.trace.fitting import (
     WIDEST,
     Fit,
@@ -39,7 +39,7 @@ from s2r_runtime.trace.fitting import (
 )
 from s2r_runtime.trace.friction import KINDS, with_friction
 from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
-from s2r_runtime.trace.rivals import CLOSE, rivals, simplified
+from s2r_runtime.trace.rivals import CLOSE, simplified
 from s2r_runtime.trace.scores import STRICT, Bar, Scored, at_first_look, best_candidates, limited, name_of, names, rescored, unlimited
 from s2r_runtime.trace.slots import Added, Slot, bounds_of, slots_of, values_of, with_values
 
@@ -427,14 +427,14 @@ def _lagging(given: Problem, fit: Fit, bar: Bar) -> Fit:
 
 def overtaken(given: Problem, fit: Fit, bar: Bar) -> tuple[Fit, list[Scored]]:
     """The fit with its rivals. One that does better beside all that was found takes its place, which earlier rounds could not know."""
-    found = rivals(given, fit)
+    found = rivals_that_happen(given, fit)
     for _ in fit.added:
         better = [(gain(s.fit, fit) - bar.price(s.fit.k - fit.k, len(given.steps)), s.fit) for s in found if s.fit is not None]
         more, best = max(better, key=lambda pair: pair[0], default=(0.0, fit))
         if more <= CLOSE:
             break
         fit = plainly(given, from_the_beginning(given, fitted(given, best, best.model), bar))
-        found = rivals(given, fit)
+        found = rivals_that_happen(given, fit)
     return fit, found
 
 

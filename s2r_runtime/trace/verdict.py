@@ -22,13 +22,14 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.about import about_states
+from s2r_runtime.trace.changes import rivals_that_happen
 from s2r_runtime.trace.errors import Held, Judged, better, displacement, rollout_starts_of
 from s2r_runtime.trace.fault import Fault
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, foretold, gain, plainly, problem, without
 from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import Mask, acting, first_steps, predicted, rms
 from s2r_runtime.trace.residual_noise import OUTLIER
-from s2r_runtime.trace.rivals import representative, rivals, tied
+from s2r_runtime.trace.rivals import representative, tied
 from s2r_runtime.trace.selection import Selection, one_more
 from s2r_runtime.trace.slots import slots_of
 
@@ -92,7 +93,8 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
             if refutable and not _holds(judged_on, fit, less, place):
                 fit, again = less, True
                 break
-    found = list(chosen.rivals) if fit is chosen.fit else rivals(given, fit)  # those of a model with more effects are none of this one
+    gone = fit is not chosen.fit  # rivals of a model with more effects are none of this one
+    found = rivals_that_happen(given, fit) if gone else list(chosen.rivals)
     risky = False
     if found:
         fits = [fit, *(s.fit for s in found if s.fit is not None)]
