@@ -72,11 +72,14 @@ def test_a_state_that_is_taken_earlier_falls_on_the_rows_of_the_others_where_it_
 
 
 def test_a_late_heading_is_a_fault_of_measurement_and_no_delay(tmp_path, capsys):
+    report = tmp_path / "page.html"
     t, pose, u = _driven(late_rows=(0, 4))
     path = tmp_path / "drive.csv"
     np.savetxt(path, np.column_stack([t, pose, u]), delimiter=",", header="t,x,y,theta,v,w", comments="", fmt="%.7g")
-    assert main(["trace", str(path), "--model", "unicycle", "--dt", "0.05", "--json"]) == 0
+    assert main(["trace", str(path), "--model", "unicycle", "--dt", "0.05", "--json", "--report", str(report)]) == 0
     told = json.loads(capsys.readouterr().out)
     assert [(e["name"], e["channel"]) for e in told["effects"]] in ([], [("integration_scheme", "*")])
     assert [(f["kind"], f["channel"], f["from_s"]) for f in told["faults"]] == [("late", "theta", 0.0)]
     assert told["states_late"] == {"theta": pytest.approx(4 * ROW_S, rel=0.05)}
+    assert "taken that much earlier" in report.read_text()
+    assert "what they spoil" not in report.read_text()

@@ -61,7 +61,8 @@ def _rows(effects: Sequence[dict[str, Any]], role: str) -> Iterator[tuple[str, s
 def _faults(page: Page, faults: Sequence[dict[str, Any]]) -> None:
     if not faults:
         return
-    page.heading("Faults of measurement; what they spoil is left out", 3)
+    spoilt = any(f["kind"] != "late" for f in faults)  # what is late is taken earlier
+    page.heading("Faults of measurement" + ("; what they spoil is left out" if spoilt else ""), 3)
     rows = [(f["kind"], f["channel"], f"{f['from_s']:.3f}", f"{f['to_s']:.3f}") for f in faults[:FAULTS]]
     page.table(("kind", "of", "from (s)", "to (s)"), rows)
     if len(faults) > FAULTS:
