@@ -16,6 +16,7 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import fitting, residual
 from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.errors import Held, noise_floor
 from s2r_runtime.trace.fitting import Problem, evaluate, fitted, foretold, foretold_by, insert, problem, scatter
 from s2r_runtime.trace.residual import acting, state_jacobian, steps_of
 
@@ -163,3 +164,23 @@ def test_a_sine_before_the_start_is_worked_out_for_the_rows_before_it_only(dt):
     found = PeriodicDisturbance().act_at(u, t, dt, p)
     fine = np.maximum(t + 0.1 * (np.arange(1000) + 0.5) / 1000, 0.0)
     assert found[:, 0] == pytest.approx(np.mean(0.7 * np.sin(2.0 * np.pi * 1.3 * fine + 0.4), axis=1), abs=1e-4)
+
+
+@pytest.mark.parametrize("loud", [0.0, 0.4])
+def test_a_noise_floor_is_one_call_of_a_model_a_step(monkeypatch, loud):
+    given, fit = _given()
+    data = given.data
+    judged_on = Held(data, given.steps, (), np.ones(ROWS, dtype=bool), 5)
+    fit = replace(fit, colour=replace(fit.colour, coefficients=loud * np.eye(4)))  # each state on one of its last values
+    calls, step = [], DoubleIntegrator.step
+    monkeypatch.setattr(DoubleIntegrator, "step", lambda self, x, *rest: (calls.append(len(x)), step(self, x, *rest))[1])
+    one, ends = noise_floor(fit, judged_on, 0)
+    assert np.all(ends > 0.5 * one)
+    assert len(calls) == 1 + judged_on.horizon  # one is the Jacobian's
+
+
+def test_what_is_absurd_in_one_column_only_is_cut_off_there():
+    x, far = np.array([[1.0, 5.0], [-3.0, np.nan]]), np.array([2.0, 100.0])
+    assert not residual.near(x, far)
+    assert np.array_equal(residual.no_farther(x, far), [[1.0, 5.0], [-2.0, np.nan]], equal_nan=True)
+    assert residual.no_farther(x[:1, :1], far[:1]).base is x

@@ -6,6 +6,7 @@ rollout_rms is the error at the end of rollouts of the stated horizon, started a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -22,7 +23,19 @@ from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.fitting import Fit, evaluate, gain, problem
 from s2r_runtime.trace.holdout import FEWEST_RUNS
 from s2r_runtime.trace.inverse import Inverse, input_relative, inverse
-from s2r_runtime.trace.residual import Acting, Steps, acting, farthest, residual, rms, rollout, rollout_starts, state_jacobian, wherever
+from s2r_runtime.trace.residual import (
+    Acting,
+    Steps,
+    acting,
+    farthest,
+    no_farther,
+    residual,
+    rms,
+    rollout,
+    rollout_starts,
+    state_jacobian,
+    wherever,
+)
 from s2r_runtime.trace.residual_noise import Noise, Past
 
 Array = NDArray[np.float64]
@@ -168,8 +181,8 @@ def noise_floor(fit: Fit, given: Held, seed: int) -> tuple[Array, Array]:
     noisy = clean + rng.normal(size=clean.shape) * np.sqrt(known)
     far = farthest(clean)
     for h in range(given.horizon):
-        clean = np.clip(wherever(model, clean, act, starts + h), -far, far)
-        noisy = np.clip(wherever(model, noisy, act, starts + h), -far, far) + rng.normal(size=clean.shape) * np.sqrt(noise.q)
+        clean, noisy = (no_farther(x, far) for x in _each_on(model, (clean, noisy), act, starts + h))
+        noisy = noisy + rng.normal(size=clean.shape) * np.sqrt(noise.q)
     return one, rms(model.difference(clean, noisy) + rng.normal(size=clean.shape) * np.sqrt(noise.r))
 
 
@@ -194,12 +207,17 @@ def _coloured_ends(fit: Fit, given: Held, act: Acting, starts: Index, y: Array, 
             law.follow(push - e)
         else:
             place = starts + k - settle
-            there = wherever(model, y, act, place)
-            y = np.clip(there + law.follow(push - (there - wherever(model, y - e, act, place))), -far, far)
-            x = np.clip(wherever(model, x, act, place), -far, far)
+            there, as_seen, x = _each_on(model, (y, y - e, x), act, place)
+            y = no_farther(there + law.follow(push - (there - as_seen)), far)
+            x = no_farther(x, far)
         e = late
     ends = model.difference(y, x)
     return ends if law.settled else None
+
+
+def _each_on(model: ComposedModel, states: Sequence[Array], act: Acting, place: Index) -> Array:
+    """(several, m, nx), each of several (m, nx) one step on, all in one call: what that takes hardly depends on how many rows there are."""
+    return wherever(model, np.concatenate(states), act, np.tile(place, len(states))).reshape(len(states), *states[0].shape)
 
 
 def _as_seen(noise: Noise, data: Dataset) -> Noise:

@@ -24,7 +24,7 @@ from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.answers import Known, kept
 from s2r_runtime.trace.coarse import coarse
 from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.residual import TOGETHER, Steps, acting, advanced, predicted, side_by_side, state_jacobian
+from s2r_runtime.trace.residual import TOGETHER, Steps, acting, advanced, near, predicted, side_by_side, state_jacobian
 from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
 from s2r_runtime.trace.slots import Added, Free, Slot, bounds_of, free_of, inside, values_of, with_values
 from s2r_runtime.trace.speed_noise import BEYOND
@@ -176,7 +176,7 @@ def foretold(given: Problem, model: ComposedModel) -> Array | None:
         there = advanced(model, given.steps.y0, acting(model, given.data), given.steps.place)
     except ConfigError:
         return None
-    return None if np.any(np.abs(there) > given.steps.farthest) else there
+    return there if near(there, given.steps.farthest) or not np.any(np.abs(there) > given.steps.farthest) else None
 
 
 def foretold_by(given: Problem, models: Sequence[ComposedModel]) -> list[Array | None]:
@@ -201,6 +201,8 @@ def _foretold_together(given: Problem, models: Sequence[ComposedModel]) -> Itera
         if len(models) > 1:
             act = side_by_side([acting(model, given.data).over(place) for model in models])
             there = advanced(models[0], np.tile(given.steps.y0, (len(models), 1)), act, slice(None)).reshape(len(models), n, -1)
+            if near(there, given.steps.farthest):
+                return list(there)
             beyond = np.any(np.abs(there) > given.steps.farthest, axis=(1, 2))
             return [None if far else one for far, one in zip(beyond.tolist(), there, strict=True)]
     except ConfigError:  # somebody's own model takes no step there for one of them

@@ -188,6 +188,18 @@ def farthest(y: Array) -> Array:
     return np.asarray(np.where(largest > 0.0, FARTHEST * largest, np.inf))
 
 
+def near(x: Array, ends_at: Array) -> bool:
+    """Whether all of x (..., nx) is nearer than the nearest of these (nx,), as it mostly is by far: that is seen at once, and column by
+    column it takes as long as a step.
+    """
+    return bool(np.max(np.abs(x), initial=0.0) <= np.min(ends_at))
+
+
+def no_farther(x: Array, ends_at: Array) -> Array:
+    """x (..., nx), cut off there."""
+    return x if near(x, ends_at) else np.clip(x, -ends_at, ends_at)
+
+
 def wherever(model: ComposedModel, x: Array, act: Acting, place: Index | slice) -> Array:
     """As `advanced`; a row stays from which somebody's own model gives no numbers: a rollout has left all that its equations are for, or a
     candidate's values have, just beside what was recorded.
@@ -203,9 +215,7 @@ def wherever(model: ComposedModel, x: Array, act: Acting, place: Index | slice) 
 
 def predicted(model: ComposedModel, steps: Steps, act: Acting) -> Array:
     """f(y0, a), (n, nx), angles not wrapped; y0 where somebody's own model gives no numbers (`wherever`), and none that are absurd."""
-    x = wherever(model, steps.y0, act, steps.place)
-    ends_at = steps.farthest
-    return x if np.all(np.abs(x) <= ends_at) else np.clip(x, -ends_at, ends_at)
+    return no_farther(wherever(model, steps.y0, act, steps.place), steps.farthest)
 
 
 def residual(model: ComposedModel, steps: Steps, act: Acting) -> Array:
@@ -289,7 +299,7 @@ def rollout(
         x = wherever(model, x, act, place)
         if extra is not None:
             x = x + extra[place]
-        x = np.clip(x, -ends_at, ends_at)
+        x = no_farther(x, ends_at)
     return Rollouts(horizon, starts, model.difference((y if ends is None else ends)[rows + horizon], x))
 
 
