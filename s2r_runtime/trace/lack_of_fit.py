@@ -314,7 +314,7 @@ def _forward(looks: Looks) -> tuple[list[Judged], dict[str, float]]:
     if strongest > 0.0:
         first = min((j for s, j in strengths if s >= strongest - ALIKE), key=lambda j: (j.x.shape[2], -j.gain))
         chosen = _onward(left, [first], _others(judged, gains, threshold, {first.token}), threshold)
-    for both in pairs(left, looks.looked, looks.found, 2.0 * threshold):
+    for both in pairs(left, looks.looked, looks.found, 2.0 * threshold, ADDS):
         needed = 2.0 * threshold * both[1].scatter * (SLOW if {j.token for j in both} & {*SLOWLY} else 1.0)
         if both[1].gain > max(needed, strongest, chosen[-1].gain + ALIKE if chosen else 0.0):
             chosen = _onward(left, both, _others(judged, gains, threshold, {j.token for j in both}), threshold)

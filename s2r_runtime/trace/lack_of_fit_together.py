@@ -8,6 +8,7 @@ s (`evidence`), of the best dictionary of each token: one product for all of the
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -23,21 +24,24 @@ JUDGED = 2
 """Pairs that are judged, after a first look under the model's own noise."""
 
 
-def pairs(left: Left, looked: Sequence[tuple[float, int]], found: Sequence[tuple[str, Array]], least: float) -> list[list[Judged]]:
-    """[the first one alone, both] of pairs that explain `least` nats more together than the better one alone, at first look. looked: (nats,
-    place in `found`), the best first.
+def pairs(
+    left: Left, looked: Sequence[tuple[float, int]], found: Sequence[tuple[str, Array]], least: float, adds: float
+) -> list[list[Judged]]:
+    """[both under the token of the first one, both under that of the second one] of pairs that explain `least` nats and a share of `adds`
+    more together than the better one of them alone, at first look. looked: (nats, place in `found`), the best first.
     """
     best = _best_of_each(looked, found)
-    if len(best) < 2 or max(nats for nats, _ in best) <= least:
+    if len(best) < 2 or best[0][0] <= least:
         return []
+    alone = [nats for nats, _ in best]
     x = [leading(left, found[i][1]) for _, i in best]
     told = _together(left, x)
-    more = {(a, b): nats - max(best[a][0], best[b][0]) for (a, b), nats in told.items()}
-    ranked = sorted((pair for pair in told if more[pair] > least), key=lambda pair: -told[pair])
+    enough = {(a, b): alone[a] + max(least, adds * alone[a]) for a, b in told}  # the first one of two is the better one
+    ranked = sorted((pair for pair in told if told[pair] > enough[pair]), key=lambda pair: -told[pair])
     made = []
     for a, b in ranked[:JUDGED]:
-        tokens = found[best[a][1]][0], found[best[b][1]][0]
-        made.append([judge(left, tokens[0], x[a]), judge(left, tokens[1], np.concatenate([x[a], x[b]], axis=2))])
+        both = judge(left, found[best[b][1]][0], np.concatenate([x[a], x[b]], axis=2))
+        made.append([replace(both, token=found[best[a][1]][0]), both])
     return made
 
 
