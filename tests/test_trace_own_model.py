@@ -203,6 +203,38 @@ def test_a_play_is_challenged_by_what_sticks_from_reaches_near_its_own(tmp_path)
     assert "memory(pump)" in better.token
 
 
+FLOW = """
+import numpy as np
+
+STATES = ("flow",)
+INPUTS = ("valve",)
+PARAMS = {"time_constant": 0.8, "most": 4.0}
+
+
+def step(x, u, dt, params):
+    rest = params["most"] * u
+    return rest + (x - rest) * np.exp(-dt / params["time_constant"])
+"""
+
+
+@pytest.mark.parametrize(("reach", "short", "name"), [(0.08, 0.03, None), (0.04, 0.04, "input_backlash")], ids=["sticks", "play"])
+def test_a_valve_that_jumps_and_stays_short_of_what_is_asked_is_no_play(tmp_path, reach, short, name):
+    """It stays until it is asked for something beyond its reach: if it then stays as short as that, it is a play of twice the reach."""
+    path = tmp_path / "flow.py"
+    path.write_text(FLOW)
+    model = compose(ModelSpec(str(path), 0.1))
+    rng = np.random.default_rng(1)
+    asked = np.repeat(rng.uniform(0.1, 0.9, 90), rng.integers(10, 30, 90))
+    at, flow, rows = asked[0], 4.0 * asked[0], []
+    for wanted in [*asked, asked[-1]]:
+        rows.append((flow + 0.01 * rng.normal(),))
+        at = wanted - math.copysign(short, wanted - at) if abs(wanted - at) > reach else at
+        flow = 4.0 * at + (flow - 4.0 * at) * math.exp(-0.1 / 0.8)
+    found = trace(from_arrays(model, [(np.array(rows), asked[:, None])]), model)
+    assert [effect.name for effect in found.effects if found.verdict == "traced"] == ([name] if name else [])
+    assert name or "memory(valve)" in found.depends_on
+
+
 NARROW = """
 import numpy as np
 

@@ -4,8 +4,8 @@ A name says what happens, and a recording can only say that what happens looks l
 asked of shapes that stand near the named ones, each with numbers that are fitted like an effect's:
 
     memory      two lags (out and back, up and down), a lag or a delay that goes with the input's size, an actuator that rings, one that
-                boosts what changes or first goes the other way, one that sticks and jumps, a loop, a gain that fades with what was
-                asked lately, or ever
+                boosts what changes or first goes the other way, one that sticks and jumps (all the way, or short of it), a loop, a
+                gain that fades with what was asked lately, or ever
     the input   a bend (cubic), steps
 
 A shape is never handed on: it has no name, belongs to no model that is saved, and runs over whole recordings only. Its scale is `most`, the
@@ -40,6 +40,11 @@ REACHES = np.geomspace(0.8, 1.8, 40)
 its reach, so that there is no slope to follow to it; by a fiftieth more, it jumps mostly where it did.
 """
 
+SHORT, NEARER = (0.2, 0.35, 0.5, 0.65, 0.8), 0.8
+"""Shares s of its reach by which a valve that sticks and jumps stays short of what is asked. A play that was named for it is as wide as the
+reach where what is asked goes a little way, and 2 s times that where it goes far: from around the mean of the two, less by a fifth.
+"""
+
 
 class Shape(InputEffect):
     """An input (T,) -> what acts, (T,): `over`. memory: it depends on what was asked before."""
@@ -55,8 +60,11 @@ class Shape(InputEffect):
         starts: Callable[[float, Sequence[float]], list[Values]],
         *,
         uneven: bool = True,
+        of_play: Callable[[float], list[Values]] = lambda width: [],
     ) -> None:
+        """of_play: values from which a fit begins where a play of this width (over `most`) was named."""
         self.uneven = uneven
+        self._of_play = of_play
         self.name = name
         self.memory = memory
         self.parameters = parameters
@@ -79,7 +87,7 @@ class Shape(InputEffect):
         if most == 0.0:
             return []
         times = [s for s in near if s > SMALL] or [k * dt for k in TIMES]
-        more = [{"reach": float(k * play / most)} for play in plays for k in REACHES] if self.name == "sticking" else []
+        more = [p for play in plays for p in self._of_play(float(play / most))]
         return [{**p, "most": most} for p in (*self._starts(dt, times), *more)]
 
     def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
@@ -197,6 +205,18 @@ def _sticks(u: Array, dt: float, p: Values) -> Numbers:
     return acts
 
 
+def _sticks_short(u: Array, dt: float, p: Values) -> Numbers:
+    """As `_sticks`, but it comes to rest short of what is asked, by a share of the reach: with a share of 1, a play of twice the reach."""
+    reach = p["reach"] * p["most"]
+    short = p["short"] * reach
+    z, acts = 0.0, []
+    for v in u.tolist():
+        if abs(v - z) > reach:
+            z = v - math.copysign(short, v - z)
+        acts.append(z)
+    return acts
+
+
 def _loop(u: Array, dt: float, p: Values) -> Numbers:
     """u less a part that follows its changes and saturates: h' = u'/w - |u'/w| h, exact for a change at a constant rate."""
     share, width = p["share"] * p["most"], p["width"] * p["most"]
@@ -273,6 +293,16 @@ SHAPES = (
         _sticks,
         lambda dt, times: [{"reach": r} for r in (0.1, 0.2, 0.4, 0.7)],
         uneven=False,
+        of_play=lambda width: [{"reach": float(k * width)} for k in REACHES],
+    ),
+    Shape(
+        "sticking, and short of it",
+        True,
+        (_number("reach", 0.0, 2.0, 0.0, kink=True), _number("short", 0.0, 1.0, 0.0)),
+        _sticks_short,
+        lambda dt, times: [],
+        uneven=False,
+        of_play=lambda width: [{"reach": float(NEARER * k * width / math.sqrt(2.0 * s)), "short": s} for s in SHORT for k in REACHES],
     ),
     Shape(
         "a loop",
