@@ -30,8 +30,10 @@ def _path(seed, seconds, reach=1.0):
     return lambda t: tuple(reach / most * float(e) for e in at(t))
 
 
-def _led(seed, gravity=0.0, dry=0.0, viscous=0.0, seconds=8.0, noise=0.004):
-    """(q, qd) as an encoder of 17 bits and a tachometer tell them, and the torque of a controller that sees these."""
+def _led(seed, gravity=0.0, dry=0.0, viscous=0.0, end=math.inf, seconds=8.0, noise=0.004):
+    """(q, qd) as an encoder of 17 bits and a tachometer tell them, and the torque of a controller that sees these. end: of its way, where
+    it meets a stop.
+    """
     rng, path, step = np.random.default_rng(seed), _path(seed, seconds), 2 * math.pi / 2**17
     (q, v, _), rows, torques, h = path(0.0), [], [], DT_S / PARTS
     for row in range(round(seconds / DT_S) + 1):
@@ -41,7 +43,8 @@ def _led(seed, gravity=0.0, dry=0.0, viscous=0.0, seconds=8.0, noise=0.004):
         u = INERTIA * (acceleration + 225.0 * (ahead - seen) + 24.0 * (rate - speed))
         torques.append(u)
         for _ in range(PARTS):
-            free, stop = v + h * (u - gravity * math.sin(q) - viscous * v) / INERTIA, h * dry / INERTIA
+            back = 2000.0 * (q - math.copysign(end, q)) + 10.0 * v if abs(q) > end else 0.0
+            free, stop = v + h * (u - gravity * math.sin(q) - viscous * v - back) / INERTIA, h * dry / INERTIA
             after = 0.0 if abs(free) <= stop else free - math.copysign(stop, free)
             q, v = q + 0.5 * h * (v + after), after
     return np.array(rows), np.array(torques[:-1])[:, None]
@@ -58,6 +61,14 @@ def test_gravity_and_friction_that_hide_each_other_are_told_by_what_both_depend_
     left = Whole(check(model, data), model, horizon=125)._of_nominal()
     assert left.matters
     assert set(left.tokens) == {"position", "speed"}
+
+
+@pytest.mark.parametrize("seed", [1, 3, 5])
+def test_an_end_stop_is_told_by_the_position_and_not_by_the_force_against_it(seed):
+    model = _joint()
+    data = from_arrays(model, [_led(seed, end=0.75)])
+    whole = Whole(check(model, data), model, horizon=250)
+    assert whole._of_nominal().tokens == ("position",)
 
 
 def _table(path, rows, torques):

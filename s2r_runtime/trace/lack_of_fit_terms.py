@@ -40,6 +40,9 @@ LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)
 MOST_LATE = 8
 """Of these, for a position that comes late against its speed: a third of a second at 100 Hz."""
 
+NEAR_ENDS = (0.002, 0.01, 0.03, 0.1)
+"""Of the way between the two ends: within so much of one, a stop may push back."""
+
 PATCHES = 5
 """Along each axis of the region: what lies on a part of the floor is then seen if the part is a fifth of it."""
 
@@ -329,6 +332,8 @@ def _of_states(
         yield "position", [one, *position], world or body
         yield "position", [a * v for a in position for v in inputs], body
         yield "position", [c[:, None] * p for c in _patches(position) for p in pushes], None
+        for a in [] if world else position:
+            yield "position", [*_push(_at_ends(a), body), *(c[:, None] * p for c in _there(a) for p in pushes)], None
         yield "position", [one, *position, *squares, *(a**3 for a in position)], [*body, *world]
         for a in position:
             yield "position", [f(np.pi * k * a) for k in range(1, WAVES + 1) for f in (np.sin, np.cos)], world or body
@@ -377,6 +382,25 @@ def _patches(position: Sequence[Array]) -> Terms:
     centres = np.linspace(-0.8, 0.8, PATCHES)
     bumps = [[np.exp(-0.5 * ((p - c) * PATCHES / 1.6) ** 2) for c in centres] for p in position[:2]]
     return bumps[0] if len(bumps) == 1 else [a * b for a in bumps[0] for b in bumps[1]]
+
+
+def _at_ends(position: Array) -> Terms:
+    """How far it is into either end of where it ever was, and whether it is there: end stops, which push back ever more, or at once."""
+    return [side * f for side, d in _depths(position) for f in (np.maximum(d, 0.0), (d > 0.0).astype(float))]
+
+
+def _there(position: Array) -> Terms:
+    """Whether it is at either end: a stop holds against whatever pushes there."""
+    return [(d > 0.0).astype(float) for _, d in _depths(position)]
+
+
+def _depths(position: Array) -> Iterator[tuple[float, Array]]:
+    """(side, depth beyond a place near that end, over the distance of that place from the end)."""
+    low, high = float(np.min(position)), float(np.max(position))
+    for near in NEAR_ENDS:
+        reach = max(near * (high - low), 1e-12)
+        yield 1.0, (position - high) / reach + 1.0
+        yield -1.0, (low - position) / reach + 1.0
 
 
 def _scaled(v: Array, *, centred: bool = True) -> Array:
