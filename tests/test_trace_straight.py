@@ -56,6 +56,35 @@ def test_friction_beside_a_force_that_moves_on_has_its_size():
     assert low < 0.3 < high
 
 
+def _late(seed, delay, rows=1200):
+    """A joint under a force that goes straight from one value to another in a tenth of a second, held for each row, and comes late."""
+    model, rng = compose(ModelSpec("joint", DT_S)), np.random.default_rng(seed)
+    t = DT_S * np.arange(rows)
+    corners = np.arange(0.0, t[-1] + 0.2, 0.1)
+    force = np.interp(t, corners, np.convolve(rng.uniform(-1.0, 1.0, len(corners)), np.ones(6) / 6.0, "same"))
+    whole, part = divmod(delay / DT_S, 1)
+    before, after = (np.concatenate([np.zeros(k), force[: rows - k]]) for k in (int(whole) + 1, int(whole)))
+    q, v, states = 0.0, 0.0, []
+    for pair in zip(before.tolist(), after.tolist(), strict=True):
+        states.append((q, v))
+        for a, h in zip(pair, (part * DT_S, (1.0 - part) * DT_S), strict=True):
+            q, v = q + h * v + 0.5 * h * h * a, v + h * a
+    measured = np.array(states) + rng.normal(size=(rows, 2)) * NOISE
+    return model, from_streams(model, [(Stream(t, measured), Stream(t, force[:, None]))], "a table")
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_a_delay_of_a_smooth_force_that_is_held_is_not_half_a_row_longer(seed):
+    """Halfway to the next row, and half a row later, is nearly the same: what the delay makes up for is no gain of such a way."""
+    model, data = _late(seed, delay=0.812)
+    result = trace(data, model)
+    assert result.way == Way()
+    (found,) = result.effects
+    assert (found.name, found.channel) == ("input_delay", "force")
+    _, low, high, _ = found.parameters["delay"]
+    assert low < 0.812 < high
+
+
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 def test_a_force_that_is_held_is_taken_as_held(friction):
     model, data = _joint(3, friction, held=True)

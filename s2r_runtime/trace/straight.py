@@ -387,7 +387,8 @@ def _does(given: Problem, fit: Fit, held: Array, act: Acting) -> Array:
 
 
 def _betas(given: Problem, fit: Fit, columns: list[Array], j: Array, *, wild: bool = False) -> tuple[list[float], float]:
-    """How far inputs went each of some ways beyond where they are in a fit, and the nats that this gains. wild: where a command changes
+    """How far inputs went each of some ways beyond where they are in a fit, and the nats that this gains beyond the fit's own numbers, j,
+    which may make up for it: half a row's lateness of an input is a delay that is longer by as much. wild: where a command changes
     between rows that row is far off, and no outlier before it is known how far on the change came.
     """
     z = fit.colour(fit.z, given.steps.joined).ravel()
@@ -395,11 +396,20 @@ def _betas(given: Problem, fit: Fit, columns: list[Array], j: Array, *, wild: bo
     x = np.hstack([c, j])
     if not np.all(np.isfinite(x)) or not np.any(c):
         return [0.0] * len(columns), 0.0
+    beta, left = _solved(x, z, wild)
+    _, without = _solved(j, z, wild)
+    gained = np.sum(noises.log_density(left)) - np.sum(noises.log_density(without))
+    return beta[: len(columns)].tolist(), float(gained)
+
+
+def _solved(x: Array, z: Array, wild: bool) -> tuple[Array, Array]:
+    """Weighted least squares of z (n,) on x (n, m), and what it leaves."""
     weight = np.ones(len(z)) if wild else noises.weight(z)
-    for _ in range(AGAIN if wild else 1):
+    beta: Array = np.zeros(x.shape[1])
+    left = z
+    for _ in range((AGAIN if wild else 1) if x.shape[1] else 0):
         weighted = x * weight[:, None]
-        beta = np.linalg.lstsq(weighted.T @ x, weighted.T @ z, rcond=1e-12)[0]
+        beta = np.asarray(np.linalg.lstsq(weighted.T @ x, weighted.T @ z, rcond=1e-12)[0], dtype=np.float64)
         left = z - x @ beta
         weight = noises.weight(left)
-    gained = np.sum(noises.log_density(left)) - np.sum(noises.log_density(left + c @ beta[: len(columns)]))
-    return beta[: len(columns)].tolist(), float(gained)
+    return beta, left
