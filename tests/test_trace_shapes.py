@@ -58,6 +58,7 @@ def test_a_shape_that_has_a_named_effect_in_it_is_that_effect_there(name, alike,
         ("two lags, out and back", {"out": 0.0, "back": 0.0}),
         ("a boost of what changes", {"share": 0.0, "time_constant": 0.3}),
         ("sticking", {"reach": 0.0}),
+        ("sticking, and short of it", {"reach": 0.0, "short": 0.5}),
         ("a loop", {"share": 0.0, "width": 0.3}),
         ("fading with what was asked lately", {"loss": 0.0, "time_constant": 1.0}),
         ("tiring with all that was asked", {"loss": 0.0, "time_constant": 1.0}),
@@ -130,10 +131,17 @@ def test_a_loop_closes_on_itself_whatever_the_pace():
     assert first[middle[0]] - first[middle[1]] > 0.38
 
 
+def test_what_sticks_and_stays_short_is_a_play_if_by_all_its_reach_and_jumps_all_the_way_if_by_none():
+    u = _asked()
+    by = {short: _acts("sticking, and short of it", u, reach=0.2, short=short) for short in (0.0, 1.0)}
+    assert np.array_equal(by[0.0], _acts("sticking", u, reach=0.2))
+    assert np.max(np.abs(by[1.0] - _library("input_backlash", u, width=2.0 * 0.2 * 0.8))) < 1e-12
+
+
 @pytest.mark.parametrize("name", sorted(BY_NAME))
 def test_runs_side_by_side_are_the_runs_one_by_one(name):
     u = _asked(200, runs=3)
-    p = BY_NAME[name].starts(u[:, 0], UNICYCLE.nominal, "w", DT, (0.1,))[-1]
+    p = BY_NAME[name].starts(u[:, 0], UNICYCLE.nominal, "w", DT, (0.1,), (0.2,))[-1]  # a play: some begin from one only
     together = BY_NAME[name].input_sequence(u, UNICYCLE.nominal, "w", DT, p)
     for i in range(3):
         assert np.array_equal(together[:, i], BY_NAME[name].input_sequence(u[:, i], UNICYCLE.nominal, "w", DT, p))
