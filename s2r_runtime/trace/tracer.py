@@ -26,6 +26,7 @@ from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.begun import begun
 from s2r_runtime.trace.dataset import MOST_PARTS, Dataset, in_finer_parts, thinned
 from s2r_runtime.trace.dataset_files import load_dataset
+from s2r_runtime.trace.endless import endless
 from s2r_runtime.trace.errors import Held, Kind, displacement, gaps, held, judge, noise_floor
 from s2r_runtime.trace.excitation import advice
 from s2r_runtime.trace.faults import Checked, check
@@ -311,6 +312,9 @@ def _result(
     if dataset.reconstruction is None:  # what a filter leaves has the filter's law, not the noise's
         fit, there, near = told(given, chosen.fit)
         chosen = replace(chosen, fit=fit)
+    integrals = endless(chosen.fit, lambda: widened(there, near, in_either_order(there, near)), checked.data)
+    if integrals:
+        structure = replace(structure, tokens=tuple(dict.fromkeys((*integrals, *structure.tokens))), matters=True, share=1.0)
     before, after = judge(model, judged_on), judge(chosen.fit.model, judged_on)
     floor = noise_floor(chosen.fit, judged_on, seed)
     forgets = replace(chosen.fit, colour=no_colour(len(model.states)))  # a law with a memory may have taken up all that the model lacks

@@ -69,7 +69,7 @@ WORSE = 1.1
 MATTERS = 1.5
 """Times that rollouts are farther off without an effect, in some state, from which on it matters to somebody who drives as was recorded."""
 
-MIXED = 0.5
+MIXED = 0.75
 """Of what an input does in its own place: as much of another input in it is not what crosses over from there, but another model's input."""
 
 SILENT = 0.05
