@@ -390,6 +390,17 @@ def test_evidence_that_is_not_attached_is_missed(run: Any, tmp_path: Path) -> No
         audit([bench.write(tmp_path / "profile.mcap")])
 
 
+def test_a_profile_that_an_earlier_version_took_and_this_one_does_not_is_told_as_that(run: Any, tmp_path: Path) -> None:
+    bench = Bench.__new__(Bench)
+    loose = b"[recovery]\ninput = { v = 500.0 }\n"
+    bench.items = [
+        (item[0], *item[1:-1], item[-1] + loose) if isinstance(item, tuple) and item[0] == "profile.toml" else item for item in run.items
+    ]
+    with pytest.raises(ConfigError, match=r"recovery\.input\.v is 500\.0, .*; this version takes no such profile,") as told:
+        audit([bench.write(tmp_path / "profile.mcap")])
+    assert "\n" not in str(told.value)
+
+
 def test_a_later_run_cannot_forget_what_an_earlier_one_spent(run: Any, tmp_path: Path) -> None:
     first = run.write(tmp_path / "a.mcap", run="first")
     memory = run.state.memory

@@ -60,6 +60,8 @@ from s2r_runtime.recording.layout import Attached
 from s2r_runtime.recording.reading import Entry, Reading
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from s2r_runtime.models.composed import ComposedModel
 
 
@@ -208,8 +210,7 @@ class RunAudit:
         for name in ("profile.toml", "model.toml"):
             if name not in attached:
                 raise ConfigError(f"{self._where()}: {name} is not attached, so nothing can be recomputed")
-        files = {name.removeprefix("profile/"): self._text(one) for name, one in attached.items() if name.startswith("profile/")}
-        profile = parse_profile(self._text(attached["profile.toml"]), f"{self._where()}: profile.toml", Path(), files)
+        profile = self._profile_of(attached)
         self._profile = self._with_model(profile, event.settings.model_digest)
         settings = event.settings
         facts = ModelFacts(settings.states, settings.inputs, settings.angles)
@@ -230,6 +231,15 @@ class RunAudit:
         registry().get("transports", name)(options, facts.states, facts.inputs)  # a transport that is not here is said here
         self._beside.run(name, options, facts.states, facts.inputs)
         self._begun = True
+
+    def _profile_of(self, attached: Mapping[str, Attached]) -> Profile:
+        """The attached profile. Raises ConfigError; not by the log's fault: a version that checked less may have written it."""
+        text = self._text(attached["profile.toml"])
+        files = {name.removeprefix("profile/"): self._text(one) for name, one in attached.items() if name.startswith("profile/")}
+        try:
+            return parse_profile(text, f"{self._where()}: profile.toml", Path(), files)
+        except ConfigError as error:
+            raise ConfigError(f"{error}; this version takes no such profile, so nothing can be recomputed") from None
 
     def _text(self, attached: Attached) -> str:
         try:
