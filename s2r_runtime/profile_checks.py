@@ -93,6 +93,7 @@ def _sampling(s: Sampling) -> Iterator[Check]:
         yield 0.0 < value < math.inf, f"sampling.{field}", value, "> 0"
     yield s.waypoint_margin >= 0.0, "sampling.waypoint_margin", s.waypoint_margin, ">= 0 m"
     yield s.max_rejections >= 0, "sampling.max_rejections", s.max_rejections, ">= 0"
+    yield s.seed >= 0, "sampling.seed", s.seed, ">= 0"  # scenarios of a drive are drawn with it as it is
 
 
 def _driving(d: Driving, dt: float) -> Iterator[Check]:

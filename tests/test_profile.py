@@ -63,6 +63,7 @@ def test_nor_among_what_is_named_by_the_robot_and_its_parts(table: str, key: str
         ("model", "dt", "1e300", "a nanosecond to 1e9 s"),
         ("sampling", "waypoint_margin", "-0.1", ">= 0 m"),
         ("sampling", "max_rejections", "-1", ">= 0"),
+        ("sampling", "seed", "-1", ">= 0"),
         ("verification", "timeout", "0.0", "> 0 s"),
         ("gate", "observation_timeout", "1e300", "at most 1e9 s"),
         ("gate", "command_ttl", "1e300", "at most 1e9 s"),
