@@ -13,7 +13,9 @@ from pathlib import Path
 import pytest
 from command_reference import verbs
 
+from s2r_runtime.cli.choices import writable
 from s2r_runtime.cli.main import parser
+from s2r_runtime.errors import UsageError
 from s2r_runtime.offline_ledger import open_ledger
 
 ROOT = Path(__file__).parent.parent
@@ -221,6 +223,17 @@ def test_certify_checks_where_its_certificate_goes_before_it_pays(table: Path, t
     given = ("certify", ROOT / "controllers" / "grid.py", "--profile", PROFILE, "--recording", table, "--key", key)
     refused(s2r(*given, "-o", tmp_path / "none" / "a.cert"), 2, "a.cert", "no folder")
     assert open_ledger(key, "robotarium").entries() == ()
+
+
+def test_what_is_put_in_a_files_place_needs_the_folder_and_not_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    there = tmp_path / "a.cert"
+    there.touch()
+    monkeypatch.setattr("os.access", lambda path, _mode: path == there)  # for root, everything is writable
+    writable(there)
+    with pytest.raises(UsageError, match=r"a\.cert: cannot be written: permission denied"):
+        writable(there, replaced=True)
+    monkeypatch.setattr("os.access", lambda path, _mode: path == tmp_path)
+    writable(there, replaced=True)
 
 
 def test_a_socket_where_nobody_listens_is_told_in_words(tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     from s2r_runtime.cli.evidence import gap_of, profile_model, run_verification
     from s2r_runtime.cli.trials_verb import trials_of
 
-    writable(args.output)  # now, because what is spent below stays spent, whatever becomes of the certificate
+    writable(args.output, replaced=True)  # now, because what is spent below stays spent, whatever becomes of the certificate
     profile = load_checked(args.profile)
     model = profile_model(args, profile)
     key_path = args.key or keys.default_path()

@@ -62,8 +62,11 @@ def controller_at(path: Path, parameters: list[str]) -> ControllerFile:
     return controllers.load(path, dict(pair(item, "--param") for item in parameters))
 
 
-def writable(path: Path | None) -> None:
-    """Refuses a place where no file can be written, before the work whose result it is for. Raises UsageError."""
+def writable(path: Path | None, *, replaced: bool = False) -> None:
+    """Refuses a place where no file can be written, before the work whose result it is for. Raises UsageError.
+
+    replaced: a new file takes its place (`persistence.replace`), which the folder must allow, whatever the old one does.
+    """
     if path is None:
         return
     folder = path.parent
@@ -71,7 +74,7 @@ def writable(path: Path | None) -> None:
         raise UsageError(f"{path}: is a folder, must be a file")
     if not folder.is_dir():
         raise UsageError(f"{path}: cannot be written: there is no folder {folder}")
-    if not os.access(path if path.exists() else folder, os.W_OK):
+    if not os.access(path if path.exists() and not replaced else folder, os.W_OK):
         raise UsageError(f"{path}: cannot be written: permission denied")
 
 

@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.evaluations < 2 or args.scenarios < 1:
         raise UsageError("--evaluations must be at least 2, --scenarios at least 1")
-    writable(args.output)
+    writable(args.output, replaced=True)
     profile = load_checked(args.profile)
     model = profile_model(args, profile)
     controller = controller_at(args.controller, [])
