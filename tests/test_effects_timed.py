@@ -209,3 +209,13 @@ def test_the_fit_of_a_sine_reaches_the_truth_on_a_long_recording():
     s = np.sqrt(2.0 / n) * (0.003 / DT) / 0.2
     assert found["frequency"] == pytest.approx(3.2, abs=5.0 * np.sqrt(2.0) * s / (2.0 * np.pi * 2400.0))
     assert found["amplitude"] == pytest.approx(0.2, abs=5.0 * s * 0.2)
+
+
+@pytest.mark.parametrize(("times", "steps"), [((1, 8, 1), (1, 8, 1)), ((8, 1), (8, 1)), ((3, 8, 1), (8, 1)), ((8, 1), ())])
+def test_a_sine_before_the_start_stands_still_however_runs_share_their_times(times, steps):
+    """(runs, rows, 1) inputs whose times and steps are given once for all runs: as if given for each."""
+    sine, p = registry().get("effects", "periodic_disturbance"), TIMED["periodic_disturbance"]
+    u, t = np.random.default_rng(3).normal(size=(3, 8, 1)), (DT * np.arange(-4.5, 3.5))[:, None]
+    each = np.array([[sine.act_at(a[None], b[None], DT, p)[0] for a, b in zip(run, t, strict=True)] for run in u])
+    assert np.max(np.abs(sine.act_at(u, np.broadcast_to(t, times), np.broadcast_to(DT, steps), p) - each)) < 1e-12
+    assert each[:, :4] == pytest.approx(u[:, :4] + p["amplitude"] * np.sin(p["phase"]), abs=1e-12)

@@ -46,8 +46,8 @@ class PeriodicDisturbance(TimedInputEffect):
         damped = amplitude * np.sinc(float(p["frequency"]) * dt)
         after = np.asarray(u + damped * np.sin(rate * (t + 0.5 * dt) + phase))
         if t.min(initial=0.0) < 0.0:  # a few rows, if any, begin before the start
-            early = np.flatnonzero(t.reshape(len(t), -1).min(axis=1) < 0.0)
-            u, t, dt = u[early], t[early], dt[early] if isinstance(dt, np.ndarray) and len(dt) > 1 else dt
+            early = np.broadcast_to(t < 0.0, after.shape)
+            u, t, dt = (np.broadcast_to(one, after.shape)[early] for one in (u, t, dt))
             begin, end = np.maximum(t, 0.0), np.maximum(t + dt, 0.0)
             moving = amplitude * (end - begin) * np.sinc(float(p["frequency"]) * (end - begin)) * np.sin(0.5 * rate * (begin + end) + phase)
             after[early] = u + (moving + (dt - (end - begin)) * amplitude * np.sin(phase)) / dt
