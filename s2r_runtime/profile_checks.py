@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from s2r_runtime.gate import REASONS
 
 if TYPE_CHECKING:
-    from s2r_runtime.profile import Driving, Gate, Profile, Recording, Repair, Robot, Sampling, VerificationSettings, Watch
+    from s2r_runtime.profile import Driving, Gate, Profile, Recording, Recovery, Repair, Robot, Sampling, VerificationSettings, Watch
 
 SHORTEST_S, LONGEST_S = 1e-9, 1e9
 """Times are kept in whole nanoseconds of 64 bits: no less than one, and 1e9 s (some 30 years) is well below what fits."""
@@ -35,7 +35,7 @@ def problems(p: Profile) -> Iterator[tuple[str, object, str]]:
         _driving(p.driving, p.model.dt),
         _verification(p.verification),
         _gate(p.gate),
-        _recovery(p.recovery.input, p.inputs),
+        _recovery(p.recovery, p.inputs),
         _watch(p.watch),
         _recording(p.recording),
         _repair(p.repair),
@@ -128,9 +128,9 @@ def _gate(g: Gate) -> Iterator[Check]:
         yield reason in REASONS, "gate.latching", repr(reason), must
 
 
-def _recovery(held: dict[str, float], inputs: dict[str, tuple[float, float]]) -> Iterator[Check]:
-    """What recovers stays in the input bounds: a command beyond them would go out as another one than is written here."""
-    for name, value in held.items():
+def _recovery(recovery: Recovery, inputs: dict[str, tuple[float, float]]) -> Iterator[Check]:
+    """What is held to recover stays in the input bounds: a command beyond them would go out as another one than is written here."""
+    for name, value in recovery.input.items() if recovery.kind == "hold" else ():
         low, high = inputs.get(name, (-math.inf, math.inf))
         yield low <= value <= high, f"recovery.input.{name}", value, f"in inputs.{name}: {low:g} to {high:g}"
 

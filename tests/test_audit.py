@@ -392,7 +392,7 @@ def test_evidence_that_is_not_attached_is_missed(run: Any, tmp_path: Path) -> No
 
 def test_a_profile_that_an_earlier_version_took_and_this_one_does_not_is_told_as_that(run: Any, tmp_path: Path) -> None:
     bench = Bench.__new__(Bench)
-    loose = b"[recovery]\ninput = { v = 500.0 }\n"
+    loose = b'[recovery]\nkind = "hold"\ninput = { v = 500.0 }\n'
     bench.items = [
         (item[0], *item[1:-1], item[-1] + loose) if isinstance(item, tuple) and item[0] == "profile.toml" else item for item in run.items
     ]

@@ -83,6 +83,7 @@ def test_a_setting_that_means_nothing_is_refused(table: str, key: str, value: st
 
 def test_a_recovery_command_beyond_the_input_bounds_is_refused() -> None:
     """It would go out clamped: another command than the profile says."""
-    assert with_setting("recovery.input", "v", "-0.2").recovery.input == {"v": -0.2}
+    assert with_setting("recovery", "input", '{ v = -0.2 }\nkind = "hold"').recovery.input == {"v": -0.2}
     with pytest.raises(ConfigError, match=r"recovery\.input\.v is 5\.0, must be in inputs\.v: -0\.2 to 0\.2"):
-        with_setting("recovery.input", "v", "5.0")
+        with_setting("recovery", "input", '{ v = 5.0 }\nkind = "hold"')
+    assert with_setting("recovery", "input", "{ v = 5.0 }").recovery.kind == "stop", "which never sends it"

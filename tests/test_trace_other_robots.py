@@ -4,10 +4,15 @@ import numpy as np
 import pytest
 
 from s2r_runtime.errors import RecordingError
-from s2r_runtime.models.composed import compose
-from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.models.composed import AppliedEffect, compose
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.plugins import registry
 from s2r_runtime.trace.accelerations import check_accelerations
 from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.endless import endless
+from s2r_runtime.trace.fitting import evaluate, insert, problem
+from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.slots import with_values
 from s2r_runtime.trace.tracer import trace
 
 DT, ROWS, FINE = 0.05, 900, 10
@@ -68,6 +73,38 @@ def test_the_speeds_of_two_wheels_are_not_those_of_a_body(seed):
     found = trace(data, UNICYCLE)
     assert found.verdict == "unexplained"
     assert len(found.partial) > 2
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_what_crosses_over_from_an_input_is_no_other_model_although_the_one_given_foretells_nothing(seed):
+    """Wheels that are slow clip nearly all that is asked, and half of what is left of v comes from w."""
+    rng = np.random.default_rng(seed)
+    lacks = (
+        EffectSpec("input_coupling", "v", {"from": "w", "coefficient": 0.3}),
+        EffectSpec("wheel_saturation", "*", {"speed": 0.15, "track": 0.5}),
+    )
+    robot = compose(ModelSpec("unicycle", DT, {}, lacks))
+    u = np.repeat(np.column_stack([rng.uniform(-1.0, 1.0, 60), rng.uniform(-2.0, 2.0, 60)]), 12, axis=0)
+    x, hidden, rows = np.zeros((1, 3)), robot.at_rest(1), [np.zeros(3)]
+    for asked in u:
+        x, hidden = robot.step(x, asked[None], hidden)
+        rows.append(x[0])
+    found = trace(from_arrays(UNICYCLE, [(np.array(rows) + rng.normal(size=(len(rows), 3)) * [0.001, 0.001, 0.002], u)]), UNICYCLE)
+    assert [(e.name, e.channel) for e in found.effects] == [("input_coupling", "v"), ("wheel_saturation", "*")]
+
+
+def test_a_lag_that_may_be_longer_than_any_run_is_an_integral():
+    rng = np.random.default_rng(53)
+    data = _driven(rng, _held(rng, [1.0, 0.5]), _lags(0.5, 0.5))
+    given = problem(data, steps_of(data))
+    model = insert(UNICYCLE, AppliedEffect(registry().get("effects", "input_lag"), "w", {"time_constant": 20.0}), 0)
+    fit = evaluate(given, model)
+    (slot,) = fit.free
+    lasts = len(data.runs[0].u) * DT
+    assert endless(fit, lambda: {slot: (10.0, lasts + 1.0)}, data) == ("memory(w)",)
+    assert endless(fit, lambda: {slot: (19.0, 21.0)}, data) == ()
+    short = evaluate(given, with_values(model, fit.free, np.array([0.2 * lasts])))
+    assert endless(short, lambda: pytest.fail("of a short lag no interval is asked"), data) == ()
 
 
 @pytest.mark.parametrize("seed", range(3))
