@@ -105,3 +105,12 @@ def test_a_simulator_whose_positions_come_early_has_speeds_that_do_not_come_late
     rows = np.round(np.column_stack([np.cumsum(DT_S * v), v]), digits)
     data = load_dataset(_table(tmp_path / "joint.csv", rows, torques), _joint())
     assert data.reconstruction is None
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+def test_an_actuator_that_is_whole_rows_late_makes_no_late_speeds_of_a_simulator_whose_positions_come_early(tmp_path, rows):
+    _, torques = _led(1, seconds=6.0, noise=0.0)
+    acting = np.append(np.zeros(rows), torques[:-rows, 0])
+    v = np.cumsum(np.append(0.0, DT_S * acting / INERTIA))
+    table = _table(tmp_path / "joint.csv", np.column_stack([np.cumsum(DT_S * v), v]), torques)
+    assert load_dataset(table, _joint()).reconstruction is None

@@ -11,7 +11,9 @@ has the friction at the wrong time, and looks like an actuator that answers late
 By less than a row, a position may as well come early: a simulator that steps by q+ = q + h v+ says so. Then the speed answers an input b
 that is held from row to row at once; one that is late by a share c of a row answers with c of the one before,
 
-    s_{k+1} - s_k - h b_k = c h (b_{k-1} - b_k) + noise
+    s_{k+1} - s_k - h b_{k-d} = c h (b_{k-d-1} - b_{k-d}) + noise
+
+where the actuator is d whole rows late besides.
 
 Of positions that were rounded, a speed that is their last difference is late without a doubt, though rounding hides by how much.
 """
@@ -37,8 +39,13 @@ fiftieth of a row where an actuator answers late.
 ANSWERS = 0.5
 """Of what a speed is late by, that with which it must answer inputs late, within twice the error of that."""
 
+DELAYED = 10
+"""Rows by which an actuator may answer late besides."""
+
 MOSTLY = 0.5
-"""Of what a recorded speed differs by from that of the positions, mean square, which must be its coming late."""
+"""Of what a recorded speed differs by from that of the positions, mean square, which must be its coming late; and of what it answers by
+without such rows, what they must explain.
+"""
 
 SAME = 0.05
 """Of how differences change from row to row: so near to the last one is a speed that was made of it and printed with a few digits."""
@@ -72,12 +79,23 @@ def of_differences(t: Array, recorded: Array, position: Array, pushed: Array) ->
 
 
 def _answers_late(t: Array, recorded: Array, pushed: Array, seconds: float) -> bool:
-    """Whether a speed that is late by less than a row answers what was asked in the row before, or nothing tells."""
+    """Whether a speed that is late by less than a row answers what was asked a part of a row before, or nothing tells. Whole rows are an
+    actuator's: a simulator's speeds are in time, whatever it delays.
+    """
     h = np.diff(t)
-    asked = h * pushed
-    before = h[1:] * pushed[:-1] - asked[1:]
-    share, error = _slope(before, _without_outliers((np.diff(recorded) - asked)[1:]))
-    return share + 2.0 * error > ANSWERS * seconds / float(np.median(h))
+    first = min(DELAYED, len(h) // 2)
+    at = np.arange(first + 1, len(h))
+    found = []
+    for rows in range(first + 1):
+        asked = h[at] * pushed[at - rows]
+        before = h[at] * pushed[at - rows - 1] - asked
+        off = _without_outliers(np.diff(recorded)[at] - asked)
+        share, error = _slope(before, off)
+        share = float(np.clip(share, 0.0, 1.0))
+        found.append((float(np.sum((off - share * before) ** 2)), share, error))
+    best = min(found, key=lambda one: one[0])
+    _, share, error = best if best[0] < (1.0 - MOSTLY) * found[0][0] else found[0]
+    return min(share, 1.0 - share) + 2.0 * error > ANSWERS * seconds / float(np.median(h))
 
 
 def _without_outliers(off: Array) -> Array:
