@@ -57,6 +57,20 @@ def test_rows_that_are_off_by_themselves_take_nothing_astray():
     assert not goes_astray(CAR, (judged, judged), _given(), FLOOR)
 
 
+def test_rows_that_are_off_where_runs_begin_and_end_take_nothing_astray():
+    """Runs as long as a rollout: all begin where a run does, and end where it does."""
+    runs, judged = 40, _ends(1, 1, 1, 1)
+    data = from_arrays(CAR, [(np.zeros((AHEAD + 1, 4)), np.zeros((AHEAD, 2)))] * runs)
+    given = Held(data, steps_of(data), (), np.ones(AHEAD * runs, dtype=bool), AHEAD)
+    judged = Judged(judged.one_step[: AHEAD * runs], judged.ends[:runs])
+    for run, step in ((3, 0), (11, AHEAD - 1), (26, 0)):
+        judged.one_step[AHEAD * run + step, 2] += 50.0 * FLOOR[2]
+        judged.ends[run, 2] += 50.0 * FLOOR[2]
+    assert not goes_astray(CAR, (judged, judged), given, FLOOR)
+    judged.ends[:, 2] *= 20.0
+    assert goes_astray(CAR, (judged, judged), given, FLOOR)
+
+
 def test_nothing_to_judge_on_is_nothing_astray():
     given = _given()
     nothing = Held(given.data, given.steps, (), np.zeros(STEPS, dtype=bool), AHEAD)

@@ -262,11 +262,15 @@ def goes_astray(model: ComposedModel, judged: tuple[Judged, Judged], given: Held
 def _between_plain_rows(judged: Judged, given: Held) -> Mask:
     """(m,) which rollouts neither begin nor end at a row that may be an outlier: between two steps that are wild, or were not judged."""
     usual = np.median(np.abs(judged.one_step), axis=0) / 0.6745
-    wild = np.ones(first_steps(given.data)[-1] + 2, dtype=bool)
+    first = first_steps(given.data)  # of each run; the row at either end of a run has a step on one side only
+    wild = np.ones(first[-1] + 2, dtype=bool)
     wild[given.steps.place + 1] = np.any(np.abs(judged.one_step) > OUTLIER * np.maximum(usual, 1e-300), axis=1)
-    off: Mask = wild[:-1] & wild[1:]
+    before, after = wild[:-1].copy(), wild[1:].copy()
+    before[first], after[first] = True, True
     starts = rollout_starts_of(given)
-    return np.asarray(~off[starts] & ~off[starts + given.horizon], dtype=bool)
+    ends = starts + given.horizon
+    off: Mask = (before & wild[1:])[starts] | (wild[:-1] & after)[ends]
+    return ~off
 
 
 def harms(before: Judged, after: Judged, floor: Array) -> bool:
