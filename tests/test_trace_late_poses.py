@@ -46,6 +46,14 @@ def test_a_heading_that_comes_late_is_told(rows):
     assert found == {"theta": pytest.approx(rows * ROW_S, rel=0.05)}
 
 
+def test_a_position_that_is_off_hides_no_late_heading():
+    t, pose, u = _driven(late_rows=(0, 4))
+    pose[900, 0] += 0.5
+    pose[1200:, 1] += 1.0
+    found = late_pose(compose(ModelSpec("unicycle", 0.05)), [(Stream(t, pose), Stream(t, u))], ())
+    assert found == {"theta": pytest.approx(4 * ROW_S, rel=0.05)}
+
+
 def test_positions_that_come_late_are_told():
     found = _late(late_rows=(4, 0))
     assert found == dict.fromkeys(("x", "y"), pytest.approx(4 * ROW_S, rel=0.05))

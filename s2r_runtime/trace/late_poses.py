@@ -58,6 +58,9 @@ LAGS = (0.25, 0.5, 0.75, 1.0, 1.5)
 APART, ROUNDS = 2.5, 3
 """Usual intervals from which on there is a gap; rounds of weights for what is wild."""
 
+WILD = 5.0
+"""Times the pace that is exceeded on a tenth of the rows: no motion, but a position that is off, and would say more than all others."""
+
 SHARES = (0.0, 0.2, 0.35, 0.45, 0.49)
 """Of the measurement's noise in the correlation of neighbours: -r / (q + 2 r)."""
 
@@ -120,7 +123,8 @@ class _Ways:
         self._h = np.diff(self._t)
         self._unit = float(np.median(self._h))
         self._dx, self._dy, self._theta = np.diff(x), np.diff(y), theta
-        self._there = self._h < APART * self._unit
+        pace = np.hypot(self._dx, self._dy) / self._h
+        self._there = (self._h < APART * self._unit) & (pace <= WILD * np.quantile(pace, 0.9))
         self._share = 0.0
 
     def late(self) -> float:
