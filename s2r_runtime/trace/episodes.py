@@ -39,8 +39,8 @@ EDGES = 48
 SHORTEST = 4
 """Steps of a window at least: less is an outlier."""
 
-MOST, MOST_WILD = 6, 12
-"""Windows; and of those in which values stay wild."""
+MOST, MOST_WILD, LOOKED_AT = 6, 12, 48
+"""Windows; and of those in which values stay wild, and which are looked at for that, the longest first."""
 
 PASSES = 3
 """Of waves and noise in turn."""
@@ -126,7 +126,7 @@ def _each(left: Left, wild: list[slice], pushes: list[tuple[str, Array]]) -> lis
     """
     z = left.fit.whiten(left.r)
     found = []
-    for where in wild:
+    for where in sorted(wild, key=lambda steps: steps.start - steps.stop)[:LOOKED_AT]:
         there = [(token, _within([where], push)) for token, push in pushes]
         told = [
             (float(np.sum(x * z)) ** 2 / max(2.0 * float(np.sum(x * x)), 1e-300), i)

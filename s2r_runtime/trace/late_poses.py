@@ -110,7 +110,7 @@ def _earlier(states: Stream, columns: dict[int, float]) -> Stream:
         there = ~np.isnan(values[:, j])
         merged[row[there], j] = values[there, j]
     kept = ~np.isnan(merged).all(axis=1) & (t[at] > states.t[0] - 1e-3 * unit)  # times count from the first stamp, as they did
-    kept &= t[at] < states.t[-1] - max(columns.values()) + 1e-3 * unit
+    kept &= t[at] < states.t[-1] - max(columns.values(), default=0.0) + 1e-3 * unit
     return Stream(t[at][kept], merged[kept])
 
 
