@@ -240,7 +240,8 @@ def test_what_was_searched_beside_a_model_is_known_when_it_is_searched_again(mon
     assert len(looked_at) == len(set(looked_at)) == 2  # beside nothing, and beside the gain; what else there could be instead is known
 
 
-def test_a_refinement_that_is_at_its_optimum_steps_the_model_for_its_slopes_only(monkeypatch):
+def test_a_refinement_that_is_at_its_optimum_steps_the_model_no_more(monkeypatch):
+    """Slopes were asked for where it was fitted."""
     data = recordings([("input_gain", "w", {"gain": 0.8})], 1, steps=300, seed=5)[0]
     given = problem(data, steps_of(data))
     model = insert(declared(), AppliedEffect(registry().get("effects", "input_gain"), "w", {"gain": 0.9}), len(declared().effects))
@@ -249,7 +250,12 @@ def test_a_refinement_that_is_at_its_optimum_steps_the_model_for_its_slopes_only
     foretell = fitting.foretold
     monkeypatch.setattr(fitting, "foretold", lambda given, model: stepped.append(model) or foretell(given, model))
     assert refine(given, fit, fit.model) is fit.model
-    assert len(stepped) == 1
+    assert not stepped
+    assert (
+        refine(given, fit, insert(declared(), AppliedEffect(registry().get("effects", "input_gain"), "w", {"gain": 0.9}), 1))
+        is not fit.model
+    )
+    assert stepped, "elsewhere it is stepped, and that is seen here"
 
 
 def test_an_exchange_never_takes_out_what_the_user_declared(monkeypatch):
