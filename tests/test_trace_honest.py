@@ -11,6 +11,7 @@ from s2r_runtime.errors import NotEnoughEvidence
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
+from s2r_runtime.report.trace_page import trace_page
 from s2r_runtime.trace import lack_of_fit as lack_of_fit_of
 from s2r_runtime.trace import verdict
 from s2r_runtime.trace.about import about_states
@@ -91,6 +92,11 @@ def test_effects_that_the_data_cannot_tell_apart_are_listed_together_with_what_w
     assert found.verdict == "ambiguous"
     assert {("input_gain", "w"), ("input_saturation", "w")} <= _names(found.effects) | _names(found.ambiguous_with)
     assert "w" in found.suggested_excitation
+    assert found.any_shape_of == ("w",)
+    assert found.depends_on[0] == "w"
+    assert "or          by anything else that depends on w" in found.text()
+    assert "still there nothing beyond noise" in found.text()
+    assert "What is left" not in trace_page(found)
 
 
 def test_a_sensor_that_jumps_is_a_fault_and_not_an_effect():

@@ -9,6 +9,7 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import tracer
+from s2r_runtime.trace.any_shape import any_shape_of
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import Judged, held
 from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
@@ -46,6 +47,20 @@ def test_what_was_not_fitted_decides_between_explanations_that_tie():
     best, rest = tied(given, one, found, [0.0, 2.0])
     assert best is other
     assert [(s.name, s.channel, s.fit) for s in rest] == [("input_gain", "v", one)]
+
+
+def test_what_many_explanations_share_is_all_that_is_known():
+    """Of an input at one speed a gain, an offset and a limit say one thing; two may be just the two that are there."""
+    u = np.column_stack([np.full(400, 0.3), _held(np.random.default_rng(11), 400, [-1.0], [1.0])[:, 0]])
+    given, model = _problem(u)
+    one = _with(given, model, "input_gain", "v", gain=0.8)
+    other, limit = _with(given, model, "input_bias", "v", bias=-0.06), _with(given, model, "input_saturation", "v", high=0.24)
+    lag, late = _with(given, model, "input_lag", "w", time_constant=0.1), _with(given, model, "input_delay", "w", delay=0.1)
+    ramp = _with(given, model, "input_rate_limit", "w", rate=3.0)
+    assert any_shape_of(one, [other, limit], given.data, given.steps) == ("v",)
+    assert any_shape_of(one, [other], given.data, given.steps) == ()
+    assert any_shape_of(late, [lag, ramp], given.data, given.steps) == ("memory(w)",)
+    assert any_shape_of(one, [other, late], given.data, given.steps) == ()
 
 
 def test_what_ties_is_seen_however_large_the_error_was():

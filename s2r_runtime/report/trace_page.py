@@ -70,7 +70,7 @@ def _intervals(page: Page, r: TraceResult) -> None:
 
 def _what_is_left(page: Page, r: TraceResult) -> None:
     """Its shape against what it depends on. It gets no name."""
-    tokens = [t for t in r.depends_on if t != "noise"]
+    tokens = [t for t in r.depends_on if t != "noise" and t not in r.any_shape_of]
     if not tokens:
         return
     sure = not {*tokens} <= {*r.may_depend_on}

@@ -33,8 +33,11 @@ def add_trace(page: Page, trace: dict[str, Any]) -> None:
         page.table(("", "effect", "acts on", "parameter", "value and 95 % interval", "that is"), rows)
     if trace["suggested_excitation"]:
         page.text(f"What would tell them apart: {trace['suggested_excitation']}")
-    if trace["depends_on"]:
-        page.text("What is left depends on: " + ", ".join(trace["depends_on"]), "warn")
+    shared = trace.get("any_shape_of", [])
+    if shared:
+        page.text(f"Or anything else that depends on {' and '.join(shared)}: where so many do alike, one without a name may, too.")
+    if left := [token for token in trace["depends_on"] if token not in shared]:
+        page.text("What is left depends on: " + ", ".join(left), "warn")
     _faults(page, trace["faults"])
     # what no dictionary took up of a structure without a name is still in it
     _errors(page, trace["error"], "noise alone" if trace["verdict"] != "unexplained" else "noise as estimated")

@@ -88,10 +88,17 @@ def _explained(r: TraceResult) -> list[str]:
     if r.rivals:
         where = "cannot be told from" + (", each in place of one of them" if len(r.effects) > 1 else "")
         lines += [f"{where}:", *(line for e in r.rivals for line in _known(r, e))]
+        lines += labelled("or", _nameless(r))
         lines += labelled("try next", [r.suggested_excitation or "", "(--suggest FILE.csv writes such a drive)"])
     if r.partial:
         lines += ["explains a part only, so no name is lent to it:", *(line for e in r.partial for line in _effect(e))]
     return lines
+
+
+def _nameless(r: TraceResult) -> list[str]:
+    """What else it may be where many explanations tie."""
+    shared = " and ".join(r.any_shape_of)
+    return [f"by anything else that depends on {shared}: where so many do alike, one without a name may, too"] if shared else []
 
 
 def _known(r: TraceResult, e: Found) -> list[str]:
@@ -207,7 +214,7 @@ def _gap(r: TraceResult) -> list[str]:
 
 def _shown(r: TraceResult) -> tuple[str, ...]:
     """Of what is left, what it depends on beyond doubt."""
-    return tuple(token for token in r.depends_on if token not in r.may_depend_on)
+    return tuple(token for token in r.depends_on if token not in {*r.may_depend_on, *r.any_shape_of})
 
 
 def _still_there(r: TraceResult) -> list[str]:

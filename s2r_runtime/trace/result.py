@@ -64,6 +64,8 @@ class TraceResult:
     """Name and channel of effects that what was held out never asks for: the fit alone speaks for them."""
     may_depend_on: tuple[str, ...] = ()
     """Of `depends_on`, beside a name: what no rollout shows, or what is less sure."""
+    any_shape_of: tuple[str, ...] = ()
+    """Of `depends_on`: what several explanations that tie have in common, one without a name may, too (`any_shape`)."""
     way: Way = field(default_factory=Way)
     """As the dataset's: how inputs went that the recording has samples of."""
     noisy: dict[str, float] = field(default_factory=dict)
@@ -165,6 +167,7 @@ class TraceResult:
             "partial": [e.to_json() for e in self.partial],
             "depends_on": list(self.depends_on),
             "may_depend_on": list(self.may_depend_on),
+            "any_shape_of": list(self.any_shape_of),
             "suggested_excitation": self.suggested_excitation,
             "error": {
                 "unit": {s: units.get(s, "") for s in states},

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, UsageError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.trace.any_shape import any_shape_of
 from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.begun import begun
 from s2r_runtime.trace.dataset import MOST_PARTS, Dataset, in_finer_parts, thinned
@@ -336,6 +337,8 @@ def _result(
     effects = tuple(_found(model, final, place, ranges) for place in final.added)
     idle = [place for place in final.added if not asked(given, judged_on, final.model, without(final.model, place))]
     rivals = [s.fit for s in chosen.rivals if s.fit is not None] if verdict == "ambiguous" else []
+    left = (*structure.beside, *structure.tokens)
+    shared = tuple(token for token in any_shape_of(final, rivals, given.data, given.steps) if token not in left)
     ties = each_once(_found(model, fit, place, {}) for fit in rivals for place in _new(fit, final))
     return TraceResult(
         verdict=verdict,
@@ -343,7 +346,8 @@ def _result(
         partial=() if final is chosen.fit else tuple(_found(model, chosen.fit, place, {}) for place in chosen.fit.added),
         ambiguous_with=ties,
         candidates=tuple((s.name, s.channel, s.score) for s in chosen.ranking),
-        depends_on=tuple(dict.fromkeys((*structure.beside, *structure.tokens))),
+        depends_on=tuple(dict.fromkeys((*shared, *left))),
+        any_shape_of=shared,
         may_depend_on=() if verdict == "unexplained" else structure.beside,
         share_left=float(structure.share),
         suggested_excitation=advice(model, [(f.name, f.channel) for f in (*effects, *ties)]) if ties else None,

@@ -1,0 +1,38 @@
+"""What several tied explanations have in common.
+
+Where a bias, a gain, a deadband and a limit of one input explain the same, the data have a single number to say about that input: whatever
+depends on it and comes out as that number would do, with a name in the library or without one. Of these only what they share is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from s2r_runtime.trace.about import about
+from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.fitting import Fit
+from s2r_runtime.trace.residual import Steps
+from s2r_runtime.trace.scores import name_of
+
+SEVERAL = 3
+"""Explanations that tie, from which on none is believed to be the one: two may be just the two that are there."""
+
+
+def any_shape_of(fit: Fit, rivals: Sequence[Fit], data: Dataset, steps: Steps) -> tuple[str, ...]:
+    """Tokens of what several explanations of one thing all depend on; of an input and its memory, that memory. rivals: fits with one effect
+    of `fit` replaced by another.
+    """
+    shared: set[str] = set()
+    for place in fit.added:
+        mine = name_of(fit.model.effects[place])
+        instead = [other for other in rivals if all(name_of(other.model.effects[i]) != mine for i in other.added)]
+        if len(instead) >= SEVERAL - 1:
+            found = [about(other.model, _other(other, fit), data, steps) for other in instead]
+            shared |= about(fit.model, place, data, steps).intersection(*found)
+    return tuple(sorted(token for token in shared if f"memory({token})" not in shared))
+
+
+def _other(rival: Fit, fit: Fit) -> int:
+    """The place of the effect that a fit does not have."""
+    there = {name_of(fit.model.effects[place]) for place in fit.added}
+    return next(place for place in rival.added if name_of(rival.model.effects[place]) not in there)
