@@ -163,7 +163,7 @@ class Recovery(_Table, frozen=True):
     input: dict[str, float] = {}
     """For `hold`, by input, within its bounds; an input left out is 0."""
     home: dict[str, float] = {}
-    """For `return`, by state; a state left out is 0."""
+    """For `return`, by state, inside the geofence; a state left out is 0."""
 
 
 class Watch(_Table, frozen=True):

@@ -36,6 +36,7 @@ def problems(p: Profile) -> Iterator[tuple[str, object, str]]:
         _verification(p.verification),
         _gate(p.gate),
         _recovery(p.recovery, p.inputs),
+        _home(p),
         _watch(p.watch),
         _recording(p.recording),
         _repair(p.repair),
@@ -133,6 +134,14 @@ def _recovery(recovery: Recovery, inputs: dict[str, tuple[float, float]]) -> Ite
     for name, value in recovery.input.items() if recovery.kind == "hold" else ():
         low, high = inputs.get(name, (-math.inf, math.inf))
         yield low <= value <= high, f"recovery.input.{name}", value, f"in inputs.{name}: {low:g} to {high:g}"
+
+
+def _home(p: Profile) -> Iterator[Check]:
+    """Where recovery drives to is inside the fence: on its way there the gate is closed already, and nothing else would stop the robot."""
+    for name, (low, high) in {**p.region, **p.geofence}.items() if p.recovery.kind == "return" else ():
+        at = p.recovery.home.get(name, 0.0)
+        fence = "geofence" if name in p.geofence else "region"
+        yield low <= at <= high, f"recovery.home.{name}", at, f"in {fence}.{name}: {low:g} to {high:g} (a state left out is 0)"
 
 
 def _watch(w: Watch) -> Iterator[Check]:

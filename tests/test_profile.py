@@ -81,6 +81,14 @@ def test_a_setting_that_means_nothing_is_refused(table: str, key: str, value: st
         with_setting(table, key, value)
 
 
+def test_a_home_beyond_the_fence_is_refused() -> None:
+    """The gate is closed on the way there: nothing else would stop the robot."""
+    assert with_setting("recovery", "home", '{ x = 0.5 }\nkind = "return"').recovery.home == {"x": 0.5}
+    with pytest.raises(ConfigError, match=r"recovery\.home\.x is 9\.0, must be in (region|geofence)\.x: "):
+        with_setting("recovery", "home", '{ x = 9.0 }\nkind = "return"')
+    assert with_setting("recovery", "home", "{ x = 9.0 }").recovery.kind == "stop", "which never goes there"
+
+
 def test_a_recovery_command_beyond_the_input_bounds_is_refused() -> None:
     """It would go out clamped: another command than the profile says."""
     assert with_setting("recovery", "input", '{ v = -0.2 }\nkind = "hold"').recovery.input == {"v": -0.2}
