@@ -32,6 +32,9 @@ Array = NDArray[np.float64]
 
 TIME, SEGMENT = "t", "segment"
 
+LARGEST = 1e30
+"""In size, whatever the unit: what is beyond (the largest float of 32 or 64 bits) says that there is no value, and its square overflows."""
+
 
 @dataclass(frozen=True)
 class Table:
@@ -142,11 +145,10 @@ def _numbers(path: Path, name: str, cells: tuple[str, ...], lines: list[int]) ->
         values = np.array([float(cell) if cell else math.nan for cell in cells])
     except ValueError:
         values = np.array([_number(path, name, cell, line) for cell, line in zip(cells, lines, strict=True)])
-    for row in np.flatnonzero(~np.isfinite(values)).tolist():
+    for row in np.flatnonzero(~(np.abs(values) <= LARGEST)).tolist():
         if cells[row].strip():
-            raise RecordingError(
-                f"{path}: line {lines[row]}: column {name!r} is {cells[row]!r}, must be a finite number (or blank: not received)"
-            )
+            must = f"a number within {LARGEST:g}" if math.isfinite(values[row]) else "a finite number"
+            raise RecordingError(f"{path}: line {lines[row]}: column {name!r} is {cells[row]!r}, must be {must} (or blank: not received)")
     return values
 
 

@@ -24,7 +24,7 @@ PROFILE = ROOT / "profiles" / "robotarium.toml"
 
 def s2r(*argv: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "s2r_runtime.cli.main", *map(str, argv)], capture_output=True, text=True, timeout=100, check=False, cwd=cwd
+        [sys.executable, "-m", "s2r_runtime", *map(str, argv)], capture_output=True, text=True, timeout=100, check=False, cwd=cwd
     )
 
 

@@ -80,6 +80,7 @@ def test_segments_are_numbered_as_they_appear_and_time_may_start_again(write) ->
         ("t,x\n0,1\n0.5,abc\n", "line 3: column 'x' is 'abc', must be a number (or blank: not received)"),
         ("t,x\n0,1\n0.5,nan\n", "line 3: column 'x' is 'nan', must be a finite number"),
         ("t,x\n0,-inf\n", "line 2: column 'x' is '-inf', must be a finite number"),
+        ("t,x\n0,1\n1,-1e31\n", "line 3: column 'x' is '-1e31', must be a number within 1e+30 (or blank: not received)"),
         ("t,x\n0,1e999\n", "line 2: column 'x' is '1e999', must be a finite number"),
         ("t,x\n0,1\n1,1\n0.5,1\n", "line 4: time runs backwards, from 1.0 s to 0.5 s"),
         ("t,x\n0,1\n,1\n", "line 3: column 't' is blank, every row needs its stamp"),

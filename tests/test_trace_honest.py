@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recordings, wandering
 
-from s2r_runtime.errors import NotEnoughEvidence
+from s2r_runtime.errors import NotEnoughEvidence, RecordingError
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
@@ -389,3 +389,23 @@ def test_what_goes_with_a_speed_or_a_position_does_so_whatever_it_is_called(effe
     model = insert(compose(ModelSpec("joint", 0.02)), AppliedEffect(registry().get("effects", effect), channel, p), 0)
     data = from_arrays(model, [(np.random.default_rng(1).normal(size=(20, 2)), np.zeros((19, 1)))])
     assert about_states(model, (0,), data, steps_of(data)) == token
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error", "said"),
+    [
+        (lambda y, u: (np.full_like(y, np.nan), u), NotEnoughEvidence, "0 usable transitions"),
+        (lambda y, u: (y[:1], u[:0]), NotEnoughEvidence, "0 usable transitions"),
+        (lambda y, u: (y, np.where(np.arange(len(u))[:, None] == 5, np.nan, u)), RecordingError, "row 5: v is nan, must be finite"),
+        (lambda y, u: (y, u * 1e200), RecordingError, "must be finite, within 1e+30"),
+        (lambda y, u: (y * 1e150, u), RecordingError, r"must be finite or NaN \(not measured\)"),
+        (lambda y, u: (y[:, :2], u), RecordingError, r"states \(701, 2\) and inputs \(700, 2\), must be \(K \+ 1, 3\) and \(K, 2\)"),
+        (lambda y, u: (y[:-1], u), RecordingError, r"must be \(K \+ 1, 3\) and \(K, 2\)"),
+    ],
+)
+def test_arrays_that_are_no_recording_are_refused_in_a_line(spoil, error, said):
+    rng = np.random.default_rng(4)
+    u = rng.uniform(-0.2, 0.2, (700, 2))
+    y = drive(rng, "unicycle", u[None], ROBOTARIUM, DT, NOISE)[0]
+    with pytest.raises(error, match=said.replace("1e+", r"1e\+")):
+        trace(from_arrays(declared(), [spoil(y, u)]), declared())

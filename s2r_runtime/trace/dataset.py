@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.gap import Transitions
 from s2r_runtime.models.composed import SUBSTEPS, ComposedModel
+from s2r_runtime.tables import LARGEST
 from s2r_runtime.trace.chains import Inputs
 from s2r_runtime.trace.reconstruct import Reconstruction, at_step, independent_step, snapped
 from s2r_runtime.trace.streams import (
@@ -195,13 +196,28 @@ class Dataset:
 
 
 def from_arrays(model: ComposedModel, runs: Sequence[tuple[Array, Array]], source: str = "arrays") -> Dataset:
-    """Runs of (y (K+1, nx), u (K, nu)), exactly dt apart. Angles may be wrapped or not."""
+    """Runs of (y (K+1, nx), u (K, nu)), exactly dt apart. Angles may be wrapped or not; NaN is a state that was not measured.
+
+    Raises RecordingError for other shapes, and for what is no number.
+    """
     parts = least_parts(model)
     start, made = 0.0, []
-    for y, u in runs:
+    for place, (y, u) in enumerate(runs):
+        _fits(model, np.asarray(y), np.asarray(u), f"{source}: run {place}")
         made.append(Run(start, unwrapped(np.array(y, dtype=np.float64), model.angle_columns), np.repeat(u, parts, axis=0)))
         start += (len(y) + 1) * model.dt
     return Dataset(model.states, model.inputs, model.dt, parts, tuple(made), False, sum(len(r.y) for r in made), source)
+
+
+def _fits(model: ComposedModel, y: Array, u: Array, where: str) -> None:
+    """Raises RecordingError if a run is none of this model."""
+    nx, nu = len(model.states), len(model.inputs)
+    if y.ndim != 2 or u.shape != (len(y) - 1, nu) or y.shape[1] != nx:
+        raise RecordingError(f"{where}: states {y.shape} and inputs {u.shape}, must be (K + 1, {nx}) and (K, {nu})")
+    for values, names, what in ((y, model.states, "finite or NaN (not measured)"), (u, model.inputs, "finite")):
+        wrong = ~(np.abs(values) <= LARGEST) if names is model.inputs else np.abs(values) > LARGEST
+        for row, column in np.argwhere(wrong)[:1].tolist():
+            raise RecordingError(f"{where}: row {row}: {names[column]} is {values[row, column]:g}, must be {what}, within {LARGEST:g}")
 
 
 def from_streams(

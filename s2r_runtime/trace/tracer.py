@@ -130,6 +130,7 @@ def _traced(
     if test is not None:
         _belongs(test, model)
     model, dataset, test = thinned(model, dataset, test, parts)
+    _measured(dataset)
     check_plausible(model, dataset)
     dataset, test = from_one_place(model, dataset), None if test is None else from_one_place(model, test)
     say(0.0, 100.0, "looking for faults of measurement")
@@ -382,6 +383,21 @@ def _belongs(data: Dataset, model: ComposedModel) -> None:
         )
 
 
+def _measured(data: Dataset) -> None:
+    """Raises NotEnoughEvidence if hardly any two rows on end have all states."""
+    there = [~np.isnan(run.y).any(axis=1) for run in data.runs]
+    usable = sum(int(np.count_nonzero(row[1:] & row[:-1])) for row in there)
+    if usable < FEWEST:
+        raise _too_few(data, usable)
+
+
+def _too_few(data: Dataset, usable: int) -> NotEnoughEvidence:
+    more = max(FEWEST - usable, 1)
+    return NotEnoughEvidence(
+        f"{data.source}: {usable} usable transitions of {data.dt:g} s, at least {FEWEST} are needed: {more} more", more
+    )
+
+
 def _held_out(checked: Checked, seen: Mask, test: Dataset | None, model: ComposedModel, horizon: float) -> Held:
     """The transitions that the fit does not see."""
     if test is not None:
@@ -412,10 +428,7 @@ def _enough(data: Dataset, model: ComposedModel, fit_part: Part, judged_on: Held
     """Raises NotEnoughEvidence if there is too little to fit and to judge, or if nothing happened."""
     usable = len(fit_part.steps) + len(judged_on.steps)
     if usable < FEWEST or not len(judged_on.steps):
-        raise NotEnoughEvidence(
-            f"{data.source}: {usable} usable transitions of {data.dt:g} s, at least {FEWEST} are needed: {max(FEWEST - usable, 1)} more",
-            max(FEWEST - usable, 1),
-        )
+        raise _too_few(data, usable)
     if not any(np.any(run.u) for run in fit_part.data.runs):
         raise NotEnoughEvidence(
             f"{data.source}: every input is zero in the part that is fitted; nothing can be traced until the robot is asked to move"

@@ -1,0 +1,7 @@
+"""`python -m s2r_runtime` is `s2r`."""
+
+import sys
+
+from s2r_runtime.cli.main import main
+
+sys.exit(main())
