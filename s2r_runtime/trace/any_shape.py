@@ -27,9 +27,14 @@ def any_shape_of(fit: Fit, rivals: Sequence[Fit], data: Dataset, steps: Steps) -
         mine = name_of(fit.model.effects[place])
         instead = [other for other in rivals if all(name_of(other.model.effects[i]) != mine for i in other.added)]
         if len(instead) >= SEVERAL - 1:
-            found = [about(other.model, _other(other, fit), data, steps) for other in instead]
-            shared |= about(fit.model, place, data, steps).intersection(*found)
+            found = [_about(other, _other(other, fit), data, steps) for other in instead]
+            shared |= _about(fit, place, data, steps).intersection(*found)
     return tuple(sorted(token for token in shared if f"memory({token})" not in shared))
+
+
+def _about(fit: Fit, place: int, data: Dataset, steps: Steps) -> set[str]:
+    """What an effect is about. Drag on an input is about that, which trying does not show where it is the same all the time."""
+    return about(fit.model, place, data, steps) | ({fit.model.effects[place].channel} & {*fit.model.inputs})
 
 
 def _other(rival: Fit, fit: Fit) -> int:
