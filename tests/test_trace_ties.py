@@ -59,6 +59,11 @@ def test_what_many_explanations_share_is_all_that_is_known():
     ramp = _with(given, model, "input_rate_limit", "w", rate=3.0)
     assert any_shape_of(one, [other, limit], given.data, given.steps) == ("v",)
     assert any_shape_of(one, [other], given.data, given.steps) == ()
+    push, drag = (
+        _with(given, model, "constant_disturbance", "body", x=-0.06, y=0.0),
+        _with(given, model, "quadratic_drag", "v", coefficient=0.6),
+    )
+    assert any_shape_of(one, [push, other, drag], given.data, given.steps) == ("v",), "the push is the offset by another name"
     assert any_shape_of(late, [lag, ramp], given.data, given.steps) == ("memory(w)",)
     assert any_shape_of(one, [other, late], given.data, given.steps) == ()
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from s2r_runtime.effects.classes import same
 from s2r_runtime.trace.about import about
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.fitting import Fit
@@ -25,11 +26,22 @@ def any_shape_of(fit: Fit, rivals: Sequence[Fit], data: Dataset, steps: Steps) -
     shared: set[str] = set()
     for place in fit.added:
         mine = name_of(fit.model.effects[place])
-        instead = [other for other in rivals if all(name_of(other.model.effects[i]) != mine for i in other.added)]
-        if len(instead) >= SEVERAL - 1:
-            found = [_about(other, _other(other, fit), data, steps) for other in instead]
-            shared |= _about(fit, place, data, steps).intersection(*found)
+        gone = [other for other in rivals if all(name_of(other.model.effects[i]) != mine for i in other.added)]
+        explained = _each_once([(fit, place), *((other, _other(other, fit)) for other in gone)])
+        if len(explained) >= SEVERAL:
+            shared |= set.intersection(*(_about(*one, data, steps) for one in explained))
     return tuple(sorted(token for token in shared if f"memory({token})" not in shared))
+
+
+def _each_once(explained: list[tuple[Fit, int]]) -> list[tuple[Fit, int]]:
+    """Without other names of the same thing (`effects.classes`); that of an input stays."""
+    kept, known = [], set()
+    for fit, place in sorted(explained, key=lambda one: one[0].model.effects[one[1]].channel not in one[0].model.inputs):
+        a = fit.model.effects[place]
+        if name_of(a) not in known:
+            kept.append((fit, place))
+            known |= {(name, channel) for name, channel, _ in same(fit.model.nominal, a.effect.name, a.channel, a.p)}
+    return kept
 
 
 def _about(fit: Fit, place: int, data: Dataset, steps: Steps) -> set[str]:
