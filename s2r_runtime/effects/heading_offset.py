@@ -6,6 +6,11 @@ from s2r_runtime.effects.sensor_offset import SensorOffset
 from s2r_runtime.effects.step_effect import Array, Values, has_pose
 from s2r_runtime.hookspecs import NominalModel, Parameter
 
+FIRST_RAD = (0.05, 0.8, -0.8, 1.6, -1.6, 2.4, -2.4, 3.1)
+"""Where the tracer begins. What a small angle changes points across the way, what a large one does points along it, too: from a small one
+no scale leads to a sensor that is mounted a quarter of a turn askew, or the wrong way round.
+"""
+
 
 class HeadingOffset(SensorOffset):
     """angle rad; 0 is none."""
@@ -23,8 +28,8 @@ class HeadingOffset(SensorOffset):
         return "rad"
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
-        """One is enough: the response is nearly linear."""
-        return [{"angle": 0.05}]
+        """All round, near enough to one another for a fit to find its way."""
+        return [{"angle": angle} for angle in FIRST_RAD]
 
 
 EFFECT = HeadingOffset()
