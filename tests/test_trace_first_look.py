@@ -1,5 +1,6 @@
 """The first look at candidates and at pairs of them, by columns: which starts lead to a fit."""
 
+import math
 from itertools import product
 
 import numpy as np
@@ -18,7 +19,7 @@ from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.hidden_pairs import TAKEN, _nats, _nats_beside, _nats_of_spans, _span, _together, two_together
 from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.residual import steps_of
-from s2r_runtime.trace.scores import names
+from s2r_runtime.trace.scores import best_candidates, names
 from s2r_runtime.trace.screening import probes_of, screen
 from s2r_runtime.trace.selection import Selection, _doing_something, _edges, relevant
 from s2r_runtime.trace.slots import Added
@@ -65,6 +66,15 @@ def test_what_changes_at_some_time_is_looked_at_with_the_size_that_explains_most
     for s in screen(given, evaluate(given, model), tried)[0]:
         assert s.value > 0.0
         assert s.start.effects[-1].p["gain"] == pytest.approx(1.4, abs=0.1)
+
+
+@pytest.mark.parametrize("angle", [1.2, -0.4, math.pi / 2, 2.9])
+def test_a_heading_that_is_off_by_any_angle_is_found(angle):
+    """What a small angle changes points across the way: from there no scale leads to a large one, and a lever arm does more."""
+    u = _held(np.random.default_rng(32), 200, [0.2, -0.3], [0.4, 0.6])
+    given, model = _drive(ModelSpec("unicycle", DT, {}, ()), [("heading_offset", "theta", {"angle": angle})], u, 1e-3)
+    best = best_candidates(given, evaluate(given, model))[0][0]
+    assert (best.name, best.fit.model.effects[-1].p["angle"]) == ("heading_offset", pytest.approx(angle, abs=0.02))
 
 
 def test_nats_of_two_columns_are_those_of_a_least_squares_fit():
