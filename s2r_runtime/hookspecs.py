@@ -204,7 +204,7 @@ class Effect(Protocol):
     - `at_end(tables, before, model, channel, dt, p) -> Array`: what acts at the end of each step, for states that are what acts
       (`reached`), from what came in, held over it, what acted on average, and what came in at the end (all (..., nu)). before: hidden
       state at the start of a step; where rows come one after the other in time None, or (`timed`) when each begins, (..., 1). dt: s, or
-      of each row, (..., 1). Without it a part's mean is taken;
+      of each row, (..., 1). Without it a part's mean is taken. With `takes_mixed_ends` = True it is asked with mixed=True as above;
     - `reads(model, channel) -> tuple[str, ...]`: inputs besides the channel on which what acts there depends;
     - `starts(u, model, channel, dt) -> list[dict]`: parameter values from which the tracer begins, given the input that it would
       get, u (T, nu). Without it the tracer begins from a grid over the parameters' bounds;

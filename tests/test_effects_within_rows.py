@@ -1,4 +1,4 @@
-"""Inputs that change within a row: a follower (a rate limit, a play) takes the row's mean as what it is the mean of."""
+"""Inputs that change within a row: a follower (a rate limit, a play) and a delay take the row's mean as what it is the mean of."""
 
 import numpy as np
 import pytest
@@ -51,6 +51,21 @@ def test_a_change_within_a_row_is_followed_from_when_it_comes(name, p, runs):
         assert last[known, 0] == pytest.approx(ends[FINE - 1 :: FINE][known, 0], abs=1e-6)
     plain, _ = _through(name, p, rows, DT, 1)
     assert np.max(np.abs(plain - mean)) > 0.01  # as a row of its own it is another command
+
+
+@pytest.mark.parametrize("delay", [0.0005, 0.0041, 0.01, 0.0268])
+@pytest.mark.parametrize("runs", [1, 6])
+def test_what_was_held_a_delay_before_the_end_of_a_row_is_what_was_commanded_before_or_after_a_change(delay, runs):
+    """A mean of both would look like a lag to whoever measures a wheel's speed."""
+    fine = [_held(np.random.default_rng(seed), 2) for seed in range(runs)]
+    end = min(map(len, fine))
+    fine = [u[:end] for u in fine]
+    rows = [u.reshape(-1, FINE, 2).mean(axis=1) for u in fine]
+    exact = _through("input_delay", {"delay": delay}, fine, DT / FINE, 1)[1][FINE - 1 :: FINE, 0]
+    parts, alone = (_through("input_delay", {"delay": delay}, rows, DT, parts)[1][:, 0] for parts in (10, 1))
+    known = np.arange(len(parts)) % (end // FINE) < end // FINE - 2
+    assert parts[known] == pytest.approx(exact[known], abs=1e-9)
+    assert np.max(np.abs(alone - parts)) > 0.01  # as a row of its own it is another command
 
 
 def test_what_is_commanded_for_a_row_of_a_ramp_or_a_peak_is_a_command():

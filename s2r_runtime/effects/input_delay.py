@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from s2r_runtime.effects.follower import mixtures
 from s2r_runtime.effects.input_effect import Array, InputEffect, Values, columns, replaced
 from s2r_runtime.hookspecs import NominalModel, Parameter
 
@@ -26,6 +27,7 @@ class InputDelay(InputEffect):
     linear = True
     shift = True
     uneven = True
+    takes_mixed_ends = True
 
     def within_step(self, dt: float, p: Values) -> bool:
         """A delay of whole steps keeps what is constant over a step so."""
@@ -54,9 +56,17 @@ class InputDelay(InputEffect):
         return replaced(u, model, channel, (1.0 - part) * line[1 : 1 + len(u)] + part * line[: len(u)])
 
     def at_end(
-        self, tables: tuple[Array, Array, Array], before: Array | None, model: NominalModel, channel: str, dt: float | Array, p: Values
+        self,
+        tables: tuple[Array, Array, Array],
+        before: Array | None,
+        model: NominalModel,
+        channel: str,
+        dt: float | Array,
+        p: Values,
+        *,
+        mixed: bool = False,
     ) -> Array:
-        """What was held a delay before the end: u_{k-m}, whole, where the mean is a mixture."""
+        """What was held a delay before the end: u_{k-m}, whole, where the mean is a mixture. mixed: as `Follower.input_sequence` has it."""
         given, acting, _ = tables
         u = given[..., columns(model, channel)]
         if before is not None:
@@ -65,13 +75,13 @@ class InputDelay(InputEffect):
             return replaced(acting, model, channel, line[:, whole])
         lasts = np.broadcast_to(dt, (len(u), *u.shape[1:-1], 1))[..., 0].reshape(len(u), -1)
         runs = u.reshape(len(u), lasts.shape[1], -1)
-        late = np.stack([_before(runs[:, i], lasts[:, i], float(p["delay"])) for i in range(lasts.shape[1])], axis=1)
+        late = np.stack([_before(runs[:, i], lasts[:, i], float(p["delay"]), mixed=mixed) for i in range(lasts.shape[1])], axis=1)
         return replaced(acting, model, channel, late.reshape(u.shape))
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
-        """Half steps at first, then wider, up to half a second or a dozen steps."""
+        """Parts of a step at first, then wider, up to half a second or a dozen steps."""
         wide = [s for s in (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5) if 4.0 * dt < s <= 200.0 * dt]
-        return [{"delay": s} for s in sorted({*(dt * k for k in (0.3, 0.6, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0, 12.0)), *wide})]
+        return [{"delay": s} for s in sorted({*(dt * k for k in (0.1, 0.3, 0.6, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0, 12.0)), *wide})]
 
 
 def _shifted(u: Array, lasts: Array, delay: float) -> Array:
@@ -87,11 +97,23 @@ def _shifted(u: Array, lasts: Array, delay: float) -> Array:
     return np.where((number[1:] == number[:-1])[:, None], given[:-1], np.diff(area, axis=0) / lasts[:, None])
 
 
-def _before(u: Array, lasts: Array, delay: float) -> Array:
-    """u (T, c), held over rows that last so long, (T,) s, as it was a delay before the end of each row; zero before the first."""
+def _before(u: Array, lasts: Array, delay: float, *, mixed: bool) -> Array:
+    """u (T, c), held over rows that last so long, (T,) s, as it was a delay before the end of each row; zero before the first. mixed: a
+    row within which an input changes, whose mean says when, has what came before that or after it.
+    """
     edges = np.concatenate([[0.0], np.cumsum(lasts)])
-    row = np.searchsorted(edges, edges[1:] - delay - ROUNDING * np.max(lasts), side="right") - 1
-    return np.where((row >= 0)[:, None], u[np.clip(row, 0, None)], 0.0)
+    at = edges[1:] - delay
+    row = np.searchsorted(edges, at - ROUNDING * np.max(lasts), side="right") - 1
+    k = np.clip(row, 0, None)
+    known = u[k]
+    for j in range(u.shape[1] if mixed else 0):
+        changes = mixtures(u[:, j], len(u))
+        before, mean, after = (u[changes + shift, j] for shift in (-1, 0, 1))
+        until = np.full(len(u), np.nan)
+        until[changes] = (after - mean) / (after - before)
+        since = (at - edges[k]) / lasts[k]
+        known[:, j] = np.where(np.isnan(until[k]), known[:, j], u[np.where(since <= until[k], k - 1, np.minimum(k + 1, len(u) - 1)), j])
+    return np.where((row >= 0)[:, None], known, 0.0)
 
 
 def _steps(delay: float, dt: float) -> tuple[int, float]:

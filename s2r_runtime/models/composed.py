@@ -77,15 +77,24 @@ class AppliedEffect:
         return hasattr(self.effect, "at_end")
 
     def ends(
-        self, tables: tuple[Array, Array, Array], before: Array | None, again: Callable[[], Array], nominal: BoundModel, dt: Any
+        self,
+        tables: tuple[Array, Array, Array],
+        before: Array | None,
+        again: Callable[[], Array],
+        nominal: BoundModel,
+        dt: Any,
+        *,
+        mixed: bool = False,
     ) -> Array:
         """What acts at the ends of steps of dt, (..., nu). tables: what came in, held over each; what acted on average; what came in at the
         ends (the first one itself, if that is all there is). before: hidden state at the start of one step; over time None, or when each
         row begins, (..., 1), of what is `timed`. again: the effect, applied to what came in at the ends. dt: s, or of each row, (..., 1).
+        mixed: rows are parts of a step.
         """
         given, acting, end = tables
         if hasattr(self.effect, "at_end"):
-            found = self.effect.at_end(tables, before, nominal, self.channel, dt, self.p)
+            also = {"mixed": True} if mixed and getattr(self.effect, "takes_mixed_ends", False) else {}
+            found = self.effect.at_end(tables, before, nominal, self.channel, dt, self.p, **also)
         elif end is given or self.effect.hidden(1, nominal, self.channel, float(np.min(dt)), self.p).size:
             found = acting  # what came in at the ends of the steps before is not kept
         else:

@@ -123,7 +123,7 @@ class Inputs:
             found = []
             when = self._when if getattr(a.effect, "timed", False) else [None for _ in given]
             for i, (u, acting, end, dt, t) in enumerate(zip(given, acted, last, self._each, when, strict=True)):
-                found.append(a.ends((u, acting, end), t, partial(_one, again, i), model.nominal, dt)[..., touched])
+                found.append(a.ends((u, acting, end), t, partial(_one, again, i), model.nominal, dt, mixed=self._mixed)[..., touched])
             self._keep(known, found)
         else:
             self._kept.move_to_end(known)
