@@ -154,8 +154,19 @@ def test_two_effects_that_foretell_no_better_what_was_not_fitted_are_not_taken(t
     assert found.verdict == "unexplained"
 
 
+def test_a_limit_that_is_met_oftener_where_nothing_is_fitted_is_found(tmp_path):
+    """In closed loop, for some steps: rollouts show it on what was held out alone."""
+    found = _traced(tmp_path, "one", 150023)
+    assert found.verdict == "traced"
+    assert {(e.name, e.channel) for e in found.effects} == {("input_saturation", "ay")}
+
+
 def _traced_pair(folder, seed):
-    made = make("pair", seed)
+    return _traced(folder, "pair", seed)
+
+
+def _traced(folder, family, seed):
+    made = make(family, seed)
     path, _ = made.write(folder)
     m = made.model
     model = compose(ModelSpec(m["name"], m["dt"], m["parameters"], tuple(EffectSpec(**e) for e in m["effects"])))
