@@ -1,5 +1,6 @@
 """A state that was not measured follows from those that were, within a stated bandwidth, and is not taken for more than that."""
 
+import json
 import math
 
 import numpy as np
@@ -9,7 +10,7 @@ from trace_robots import commands, drive
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace.dataset import thinned
+from s2r_runtime.trace.dataset import from_arrays, thinned
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.differentiation import bandwidth, low_pass, reach
 from s2r_runtime.trace.inverse import input_relative, inverse
@@ -155,6 +156,19 @@ def test_the_inverse_model_says_how_much_of_the_force_is_missing(tmp_path, lacki
     whole = _model("joint", effects=[("input_gain", "force", {"gain": 0.75})])
     assert input_relative(short, given) == pytest.approx(0.25, abs=0.01)
     assert input_relative(whole, given) < 0.03
+
+
+def test_of_a_robot_that_was_held_still_while_it_was_judged_no_share_of_the_force_is_told():
+    """The share of nothing is no number, and no JSON could hold it; the rest of the account stands."""
+    model = _model("joint")
+    rng, u = np.random.default_rng(1), np.zeros((1500, 1))
+    u[825:] = np.repeat(rng.choice([-2.0, 2.0], 75), 9)[:, None]
+    still = from_arrays(model, [(drive(rng, "joint", u[None], [], DT, [1e-3, 5e-3])[0], u)])
+    steps = steps_of(still)
+    assert input_relative(model, inverse(model, still, steps.take(np.arange(300, 750)))) is None
+    said = trace(still, model).to_json()
+    assert said["verdict"] == "none"
+    json.dumps(said, allow_nan=False)
 
 
 def test_inputs_that_are_no_forces_have_no_inverse_model(tmp_path):

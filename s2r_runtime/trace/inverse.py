@@ -74,8 +74,8 @@ def inverse(model: ComposedModel, data: Dataset, held_out: Steps) -> Inverse | N
     return Inverse(fine, steps, stretches, band) if stretches else None
 
 
-def input_relative(model: ComposedModel, given: Inverse) -> float:
-    """See above."""
+def input_relative(model: ComposedModel, given: Inverse) -> float | None:
+    """See above. None where nothing was commanded: the share of nothing is no number."""
     model = model if model.dt == given.data.dt else at_step(model, given.data.dt)
     act = acting(model, given.data)
     here = act.at(given.steps.place)
@@ -86,7 +86,7 @@ def input_relative(model: ComposedModel, given: Inverse) -> float:
         lost += np.sum(differentiation.low_pass(error[a:b], given.data.dt, given.bandwidth) ** 2, axis=0)
         whole += np.sum(differentiation.low_pass(commanded[a:b], given.data.dt, given.bandwidth) ** 2, axis=0)
     used = whole > 0.0
-    return float(np.sqrt(np.mean(lost[used] / whole[used]))) if used.any() else float("nan")
+    return float(np.sqrt(np.mean(lost[used] / whole[used]))) if used.any() else None
 
 
 def _needed(model: ComposedModel, steps: Steps, act: Acting) -> Array:
