@@ -1,11 +1,13 @@
 """What takes a tracer's time is asked of a model once: rounds of a fit, and what follows it, go back to what they know."""
 
+from collections import deque
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 
+from s2r_runtime.effects import follower
 from s2r_runtime.effects.periodic_disturbance import PeriodicDisturbance
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.models import forces
@@ -14,10 +16,13 @@ from s2r_runtime.models.double_integrator import DoubleIntegrator
 from s2r_runtime.models.file_model import FileModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import fitting, residual
+from s2r_runtime.trace import fitting, lack_of_fit, residual, scores, selection
+from s2r_runtime.trace.chains import Inputs
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import Held, noise_floor
-from s2r_runtime.trace.fitting import Problem, evaluate, fitted, foretold, foretold_by, insert, problem, scatter
+from s2r_runtime.trace.fields import Field
+from s2r_runtime.trace.fitting import Problem, evaluate, fitted, foretold, foretold_by, insert, problem, scatter, without
+from s2r_runtime.trace.lack_of_fit import left_of
 from s2r_runtime.trace.residual import acting, state_jacobian, steps_of
 
 DT_S, ROWS = 0.02, 300
@@ -184,3 +189,20 @@ def test_what_is_absurd_in_one_column_only_is_cut_off_there():
     assert not residual.near(x, far)
     assert np.array_equal(residual.no_farther(x, far), [[1.0, 5.0], [-2.0, np.nan]], equal_nan=True)
     assert residual.no_farther(x[:1, :1], far[:1]).base is x
+
+
+@pytest.mark.parametrize(("name", "values"), [("input_rate_limit", {"rate": 3.0}), ("input_backlash", {"width": 0.2})])
+def test_where_an_input_holds_is_worked_out_once_for_all_numbers(monkeypatch, name, values):
+    stretched, asked = follower._stretched, []
+    monkeypatch.setattr(follower, "_KNOWN", deque())
+    monkeypatch.setattr(follower, "_stretched", lambda *given: (asked.append(len(given[0])), stretched(*given))[1])
+    model, effect = compose(ModelSpec("unicycle", DT_S)).nominal, registry().get("effects", name)
+    u = np.repeat(np.random.default_rng(3).normal(size=(30, 2)), 7, axis=0)
+    for share in (1.0, 0.5, 2.0):
+        effect.input_sequence(u, model, "v", DT_S, {key: share * value for key, value in values.items()}, mixed=True)
+    assert len(asked) == 1
+    u[20:27, 0] += 0.4  # another input, in the same place
+    again = effect.input_sequence(u, model, "v", DT_S, values, mixed=True)
+    assert len(asked) == 2
+    monkeypatch.setattr(follower, "_KNOWN", deque())
+    assert np.array_equal(again, effect.input_sequence(u, model, "v", DT_S, values, mixed=True))

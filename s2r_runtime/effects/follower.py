@@ -10,7 +10,9 @@ Hidden state: y, zero at rest. An input that never holds costs one turn of the l
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from inspect import signature
 from itertools import pairwise
 
@@ -26,8 +28,80 @@ SHORT = 2
 """Rows a column below which a row at a time is faster than a column at a time."""
 
 
+KEPT, LARGE = 8, 100_000
+"""Inputs of which it is known where they hold, and the values in the largest one that is kept."""
+
+
 LEAST = 1e-6
 """Of a row: what comes that much after its beginning, or before its end, is on it but for rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """What follows from an input (T, columns) alone, whatever the effect's numbers are. Columns are end to end, m rows in all; rows with a
+    change within (`mixtures`) are in two parts.
+
+    u: (m,); lasts: (m,) steps of `usual` s; first: (T columns,) part of each row, None where all are in one. stretches: of each column,
+    the values that are held, and for how many steps each; number: of rows in a stretch; since: (m,) steps since its stretch began.
+    """
+
+    source: tuple[Array, float | Array, bool]
+    u: Array
+    lasts: Array
+    usual: float
+    first: Index | None
+    stretches: list[tuple[list[float], list[float]]]
+    number: Index
+    since: Array
+
+    def of(self, given: Array, dt: float | Array, mixed: bool) -> bool:
+        """Whether it is this input's."""
+        there, lasts, both = self.source
+        return both == mixed and np.array_equal(there, given) and np.array_equal(lasts, dt)
+
+
+_KNOWN: deque[Held] = deque(maxlen=KEPT)
+"""Of the inputs that were asked for last: a fit asks for one input under many numbers."""
+
+
+def _held(given: Array, dt: float | Array, mixed: bool) -> Held:
+    """Known by what is held, not by the array: that may be written to."""
+    found = next((held for held in _KNOWN.copy() if held.of(given, dt, mixed)), None)
+    if found is None:
+        found = _stretched(given, dt, mixed)
+        if given.size <= LARGE:
+            _KNOWN.append(found)
+    return found
+
+
+def _stretched(given: Array, dt: float | Array, mixed: bool) -> Held:
+    """given: (T, columns); dt: s, or of each row (T,)."""
+    rows, many = given.shape
+    usual = float(np.median(dt)) if isinstance(dt, np.ndarray) else float(dt)
+    u, lasts = given.T.ravel(), np.tile(np.broadcast_to(dt / usual, (rows,)), many)
+    begins, first = rows * np.arange(many), None
+    at = mixtures(u, rows) if mixed else np.zeros(0, dtype=np.int64)
+    if len(at):
+        share = (u[at] - u[at - 1]) / (u[at + 1] - u[at - 1])
+        before, after = u[at - 1], u[at + 1]
+        parts = np.ones(len(u), dtype=np.int64)
+        parts[at] = 2
+        first = np.cumsum(parts) - parts
+        u, lasts, begins = np.repeat(u, parts), np.repeat(lasts, parts), first[begins]
+        u[first[at]], u[first[at] + 1] = before, after
+        lasts[first[at]] *= 1.0 - share
+        lasts[first[at] + 1] *= share
+    new = np.append(True, u[1:] != u[:-1])
+    new[begins] = True
+    start = np.flatnonzero(new)
+    number = np.diff(np.append(start, len(u)))
+    until = np.cumsum(lasts)
+    values, steps = u[start].tolist(), np.diff(until[start + number - 1], prepend=0.0).tolist()
+    since = np.append(0.0, until[:-1])
+    since -= np.repeat(since[start], number)
+    edges = np.searchsorted(start, np.append(begins, len(u))).tolist()
+    stretches = [(values[a:b], steps[a:b]) for a, b in pairwise(edges)]
+    return Held((given, dt.copy() if isinstance(dt, np.ndarray) else dt, mixed), u, lasts, usual, first, stretches, number, since)
 
 
 class Follower(InputEffect):
@@ -68,50 +142,27 @@ class Follower(InputEffect):
         within it, and is taken as both.
         """
         given = u[..., columns(model, channel)].reshape(len(u), -1)
-        usual = float(np.median(dt))
-        lasts = np.broadcast_to(dt / usual, (len(u),))
         rows, many = given.shape
-        flat = given.T.ravel()
-        at = mixtures(flat, rows) if mixed else np.zeros(0, dtype=np.int64)
-        if len(at):
-            return replaced(
-                u, model, channel, self._mean_of_both(flat, lasts, usual, p, at).reshape(many, rows).T.reshape(*u.shape[:-1], -1)
-            )
+        held = _held(given, dt, mixed)
+        if held.first is not None:
+            return replaced(u, model, channel, self._mean_of_both(held, held.first, p).reshape(many, rows).T.reshape(*u.shape[:-1], -1))
         if SHORT * many >= rows:
-            y = self._by_rows(given, lasts, usual, p)
+            y = self._by_rows(given, held.lasts[:rows], held.usual, p)
         else:
-            y = self._by_stretches(flat, np.tile(lasts, many), rows * np.arange(many), usual, p).reshape(many, rows).T
+            y = self._by_stretches(held, p).reshape(many, rows).T
         each = dt[:, None] if isinstance(dt, np.ndarray) else dt
         return replaced(u, model, channel, self.mean(y, given, each, p).reshape(*u.shape[:-1], -1))
 
-    def _mean_of_both(self, flat: Array, lasts: Array, dt: float, p: Values, at: Index) -> Array:
-        """u of columns end to end, rows of so many steps (T,) -> means of what acts; rows `at` in two parts, each of what is held."""
-        share = (flat[at] - flat[at - 1]) / (flat[at + 1] - flat[at - 1])
-        parts = np.ones(len(flat), dtype=np.int64)
-        parts[at] = 2
-        first = np.cumsum(parts) - parts
-        u, long = np.repeat(flat, parts), np.repeat(np.tile(lasts, len(flat) // len(lasts)), parts)
-        u[first[at]], u[first[at] + 1] = flat[at - 1], flat[at + 1]
-        long[first[at]] *= 1.0 - share
-        long[first[at] + 1] *= share
-        y = self._by_stretches(u, long, first[:: len(lasts)], dt, p)
-        acting = self.mean(y[:, None], u[:, None], long[:, None] * dt, p)[:, 0]
-        return np.asarray(np.add.reduceat(acting * long, first) / np.add.reduceat(long, first))
+    def _mean_of_both(self, held: Held, first: Index, p: Values) -> Array:
+        """Means of what acts, of columns end to end, rows of which some are in two parts; first: (rows,) part of each."""
+        y = self._by_stretches(held, p)
+        acting = self.mean(y[:, None], held.u[:, None], held.lasts[:, None] * held.usual, p)[:, 0]
+        return np.asarray(np.add.reduceat(acting * held.lasts, first) / np.add.reduceat(held.lasts, first))
 
-    def _by_stretches(self, flat: Array, lasts: Array, begins: Index, dt: float, p: Values) -> Array:
-        """u of columns end to end, (rows,), each row so many steps (rows,), columns from `begins` on -> y at the start of each row."""
-        new = np.append(True, flat[1:] != flat[:-1])
-        new[begins] = True
-        first = np.flatnonzero(new)
-        number = np.diff(np.append(first, len(flat)))
-        until = np.cumsum(lasts)
-        ends = until[first + number - 1]
-        held, counts, begun = flat[first].tolist(), np.diff(ends, prepend=0.0).tolist(), []
-        for a, b in pairwise(np.searchsorted(first, np.append(begins, len(flat))).tolist()):
-            begun += self.begins(held[a:b], counts[a:b], dt, p)
-        since = np.append(0.0, until[:-1])
-        since -= np.repeat(since[first], number)
-        return self.after(np.repeat(np.array(begun), number), flat, since, dt, p)
+    def _by_stretches(self, held: Held, p: Values) -> Array:
+        """y at the start of each row of columns end to end."""
+        begun = [y for values, steps in held.stretches for y in self.begins(values, steps, held.usual, p)]
+        return self.after(np.repeat(np.array(begun), held.number), held.u, held.since, held.usual, p)
 
     def _by_rows(self, u: Array, lasts: Array, dt: float, p: Values) -> Array:
         """The same, a row at a time."""
