@@ -206,3 +206,19 @@ def test_where_an_input_holds_is_worked_out_once_for_all_numbers(monkeypatch, na
     assert len(asked) == 2
     monkeypatch.setattr(follower, "_KNOWN", deque())
     assert np.array_equal(again, effect.input_sequence(u, model, "v", DT_S, values, mixed=True))
+
+
+def test_what_acts_at_the_ends_of_rows_is_asked_of_inputs_that_set_a_state(monkeypatch):
+    u = np.repeat(np.random.default_rng(4).normal(size=(10, 2)), 7, axis=0)
+    model, lag, asked = compose(ModelSpec("bicycle", DT_S)), registry().get("effects", "input_lag"), []
+    steer, speed = (AppliedEffect(lag, name, {"time_constant": 0.1}) for name in ("steer_cmd", "speed_cmd"))
+    mean, end = Inputs([u], DT_S, [0.0]).with_ends(model, [steer])
+    assert end is mean
+    at_end = type(lag).at_end
+    monkeypatch.setattr(type(lag), "at_end", lambda self, *given: (asked.append(given[3]), at_end(self, *given))[1])
+    _, both = Inputs([u], DT_S, [0.0]).with_ends(model, [steer, speed])
+    assert asked == ["speed_cmd"]
+    assert np.array_equal(both[:, 1], Inputs([u], DT_S, [0.0]).with_ends(model, [speed])[1][:, 1])
+    coupling = AppliedEffect(registry().get("effects", "input_coupling"), "speed_cmd", {"from": "steer_cmd", "coefficient": 0.3})
+    Inputs([u], DT_S, [0.0]).with_ends(model, [steer, speed, coupling])
+    assert {*asked[1:]} == {"steer_cmd", "speed_cmd"}  # there, the steering comes into the speed

@@ -78,18 +78,38 @@ class Inputs:
 
     def through(self, model: ComposedModel, chain: Sequence[AppliedEffect]) -> Array:
         """What acts after the chain, on average over each row, from rest: the runs laid end to end, (sum T_i, nu)."""
-        now, _, links = self._follow(model, chain, ends=False)
+        now, _, links = self._follow(model, chain, set())
         return self._laid(("laid", *links), now)
 
     def with_ends(self, model: ComposedModel, chain: Sequence[AppliedEffect]) -> tuple[Array, Array]:
         """The same, and what acts at the end of each row. One and the same array, if no effect says anything of the ends."""
-        ends = bool(getattr(model.nominal, "reached", None)) and any(a.says_ends for a in chain)
-        now, last, links = self._follow(model, chain, ends=ends)
+        asked = self._asked_at_ends(model, chain)
+        ends = any(a.says_ends and asked.intersection(self._touched(a, model)) for a in chain)
+        now, last, links = self._follow(model, chain, asked if ends else set())
         mean = self._laid(("laid", *links), now)
         return mean, (self._laid(("laid at the ends", *links), last) if ends else mean)
 
-    def _follow(self, model: ComposedModel, chain: Sequence[AppliedEffect], *, ends: bool) -> tuple[list[Array], list[Array], list[Key]]:
-        """Tables on average and at the ends of rows (the same ones, unless these are asked for), and the last link on each input."""
+    def _asked_at_ends(self, model: ComposedModel, chain: Sequence[AppliedEffect]) -> set[int]:
+        """Columns of which somebody asks what acts at the ends of rows: those that states are set to, and what these come from. A steering
+        wheel sets none.
+        """
+        reached = getattr(model.nominal, "reached", {})
+        if reached and self._given_at_ends is not self._tables:  # what is commanded there is another thing already
+            return set(range(len(model.nominal.inputs)))
+        found = {model.nominal.inputs.index(name) for name in reached.values()}
+        before: set[int] = set()
+        while len(before) < len(found) < len(model.nominal.inputs):
+            before = set(found)
+            for a in chain:
+                touched = self._touched(a, model)
+                if found.intersection(touched):
+                    found.update(touched)
+        return found
+
+    def _follow(self, model: ComposedModel, chain: Sequence[AppliedEffect], ends: set[int]) -> tuple[list[Array], list[Array], list[Key]]:
+        """Tables on average and at the ends of rows (of those columns only, the same ones if there are none), and the last link on each
+        input.
+        """
         nominal = model.nominal
         who: Key = (self._number(nominal.shared), *sorted(nominal.parameters.items()))
         links: list[Key] = [(who, name) for name in nominal.inputs]
@@ -105,7 +125,10 @@ class Inputs:
             else:
                 self._kept.move_to_end(key)
             acted = [_with(table, touched, columns) for table, columns in zip(now, found, strict=True)]
-            last = self._ends(key, a, (now, acted, last), touched, model) if ends else acted
+            if ends.intersection(touched):
+                last = self._ends(key, a, (now, acted, last), touched, model)
+            elif last is now:
+                last = acted
             now = acted
             for c in touched:
                 links[c] = key
