@@ -222,3 +222,16 @@ def test_what_acts_at_the_ends_of_rows_is_asked_of_inputs_that_set_a_state(monke
     coupling = AppliedEffect(registry().get("effects", "input_coupling"), "speed_cmd", {"from": "steer_cmd", "coefficient": 0.3})
     Inputs([u], DT_S, [0.0]).with_ends(model, [steer, speed, coupling])
     assert {*asked[1:]} == {"steer_cmd", "speed_cmd"}  # there, the steering comes into the speed
+
+
+def test_what_a_field_is_beyond_other_noise_is_not_asked_where_no_rollout_shows_it(monkeypatch):
+    given, fit = _given()
+    looks = lack_of_fit.Looks(left_of(given, fit))
+
+    def asked() -> float:
+        raise AssertionError
+
+    x = np.zeros((*looks.left.r.shape, 1))
+    looks.__dict__.update(field=Field("position", (), x, np.zeros(1), 50.0, asked), chosen=([], {}))
+    monkeypatch.setattr(lack_of_fit, "_weight_of", lambda *given: (False, 0.0))
+    assert not lack_of_fit.lack_of_fit(looks, fit, 20).matters

@@ -152,13 +152,13 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
             first = [] if number is None or number.gain <= chosen[-1].gain else [number]
             return Structure(as_told([*first, *chosen]), True, share, gains, noise=_beside(left, chosen[-1]))
     varied = looks.field
-    told = [] if varied is None or varied.beyond <= 0.0 else [(varied.nats, varied.judged, varied.tokens, True)]
+    told = [] if varied is None else [(varied.nats, varied.judged, varied.tokens, True)]
     if number is not None:
         gains[number.token] = max(gains.get(number.token, 0.0), number.gain)
         told.append((number.gain, number, (number.token,), False))
     for _, judged, tokens, varies in sorted(told, key=lambda t: -t[0]):
         matters, share = _weight_of(left, nominal, judged, horizon)
-        if matters:
+        if matters and (not varies or varied is None or varied.beyond > 0.0):  # rollouts take less time than what it is beyond
             return Structure(tokens, True, share, gains, varies=varies, noise=_beside(left, judged))
     windows = None if chosen else windows or _for_a_while(left)
     matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
