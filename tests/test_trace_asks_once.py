@@ -235,3 +235,15 @@ def test_what_a_field_is_beyond_other_noise_is_not_asked_where_no_rollout_shows_
     looks.__dict__.update(field=Field("position", (), x, np.zeros(1), 50.0, asked), chosen=([], {}))
     monkeypatch.setattr(lack_of_fit, "_weight_of", lambda *given: (False, 0.0))
     assert not lack_of_fit.lack_of_fit(looks, fit, 20).matters
+
+
+def test_candidates_are_held_against_what_one_model_foretells(monkeypatch):
+    given, fit = _given()
+    base, asked, errors = evaluate(given, without(fit.model, 0)), [], selection._held_out_errors
+    monkeypatch.setattr(selection, "_held_out_errors", lambda given, of, *rest: (asked.append(of), errors(given, of, *rest))[1])
+    other = fitted(
+        given, base, insert(base.model, AppliedEffect(registry().get("effects", "viscous_friction"), "vy", {"coefficient": 0.1}), 0)
+    )
+    told = [selection.relevant(given, one, base, 20) for one in (other, fit, other)]
+    assert told == [False, True, False]
+    assert len([of for of in asked if of is base]) == len([of for of in asked if of is other]) == 3  # one a length of rollouts

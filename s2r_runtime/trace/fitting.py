@@ -58,12 +58,15 @@ ABOUT, STAYS = 4, 1e-3
 
 @dataclass(frozen=True)
 class Problem:
-    """Transitions that a model is to explain. floor: least variances of noise. searches: what was tried beside which model (`scores`)."""
+    """Transitions that a model is to explain. floor: least variances of noise. searches: what was tried beside which model (`scores`).
+    blind: how fits foretell what they did not see (`selection`).
+    """
 
     data: Dataset
     steps: Steps
     floor: Noise
     searches: dict[tuple[object, ...], object] = field(default_factory=dict, repr=False, compare=False)
+    blind: dict[tuple[object, ...], object] = field(default_factory=dict, init=False, repr=False, compare=False)
     known: Known = field(default_factory=Known, init=False, repr=False, compare=False)
 
     @cached_property

@@ -9,7 +9,7 @@ relevant      some rollout's rms error falls by the bar's share, on blocks that 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +74,10 @@ SOME = 4
 
 ALONE_TELLS = 0.95
 """Share of what tells a number from which on a block alone tells it: the others know it four times as poorly, or worse."""
+
+BLIND = 4
+"""Fits of which it is known how they foretell what they did not see.
+"""
 
 STARTS = 1200
 """Rollouts that relevance is judged on at most."""
@@ -300,12 +304,42 @@ def relevant(given: Problem, fit: Fit, base: Fit, horizon: int, bar: Bar = STRIC
     """Whether some state's error at one step, a quarter of the horizon or all of it falls by the bar's share, cross-validated."""
     known = (begun(given, fit), uncertain(fit, given.data.dt)) if given.floor.axes else None
     edges = _edges(given, fit, base)
-    blind = [(f, _less_each_block(given, f, edges)) for f in (base, fit)]
+    blind = [_blind(given, f, edges, known) for f in (base, fit)]
     for steps in sorted({1, max(1, horizon // 4), horizon}):
-        before, after = (_held_out_errors(given, f, models, edges, steps, known) for f, models in blind)
+        before, after = (one.errors(steps) for one in blind)
         if np.any(before > (1.0 + bar.share) * after):
             return True
     return False
+
+
+@dataclass(frozen=True)
+class _Blind:
+    """A fit, each block of time under the model that has its parameters from the other ones."""
+
+    fit: Fit
+    models: Sequence[ComposedModel]
+    of: Callable[[Fit, Sequence[ComposedModel], int], Array]
+    found: dict[int, Array] = field(default_factory=dict)
+
+    def errors(self, steps: int) -> Array:
+        """(nx,) rms at the end of rollouts of so many steps."""
+        if steps not in self.found:
+            self.found[steps] = self.of(self.fit, self.models, steps)
+        return self.found[steps]
+
+
+def _blind(given: Problem, fit: Fit, edges: Array, known: tuple[Array | None, Array] | None) -> _Blind:
+    """The last ones are known: many candidates are held against one model, and one model against many that it could do without."""
+    key = id(fit), edges.tobytes()
+    found = given.blind.pop(key, None) if known is None else None
+    if not isinstance(found, _Blind):
+        models = _less_each_block(given, fit, edges)
+        found = _Blind(fit, models, lambda fit, models, steps: _held_out_errors(given, fit, models, edges, steps, known))
+    if known is None:
+        given.blind[key] = found
+        while len(given.blind) > BLIND:
+            given.blind.pop(next(iter(given.blind)))
+    return found
 
 
 def _held_out_errors(
