@@ -224,6 +224,20 @@ def test_what_acts_at_the_ends_of_rows_is_asked_of_inputs_that_set_a_state(monke
     assert {*asked[1:]} == {"steer_cmd", "speed_cmd"}  # there, the steering comes into the speed
 
 
+def test_a_candidate_that_a_round_leaves_far_behind_gets_no_other_one(monkeypatch):
+    given, fit = _given()
+    base = evaluate(given, without(fit.model, 0))
+    rounds, found = [], []
+    monkeypatch.setattr(fitting, "evaluate", lambda *asked: (rounds.append(1), evaluate(*asked))[1])
+    for share in (0.0, scores.ONWARD):
+        rounds.clear()
+        monkeypatch.setattr(scores, "ONWARD", share)
+        best, _ = scores.best_candidates(replace(given, searches={}), base, 6)
+        found.append((len(rounds), best[0].name, best[0].channel, best[0].score))
+    assert found[1][0] < found[0][0]
+    assert found[1][1:] == found[0][1:]
+
+
 def test_what_a_field_is_beyond_other_noise_is_not_asked_where_no_rollout_shows_it(monkeypatch):
     given, fit = _given()
     looks = lack_of_fit.Looks(left_of(given, fit))

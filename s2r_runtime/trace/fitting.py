@@ -10,7 +10,7 @@ model with an effect. Parameters are refined by Gauss-Newton with the weights of
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -316,13 +316,15 @@ def refine(given: Problem, fit: Fit, model: ComposedModel, free: Free | None = N
     return model
 
 
-def fitted(given: Problem, start: Fit, model: ComposedModel, rounds: int = ROUNDS) -> Fit:
-    """Parameters and noise in turn, until neither gains. start: whose noise to begin with."""
+def fitted(
+    given: Problem, start: Fit, model: ComposedModel, rounds: int = ROUNDS, hopeless: Callable[[Fit], bool] = lambda fit: False
+) -> Fit:
+    """Parameters and noise in turn, until neither gains. start: whose noise to begin with. hopeless: what is not gone on with."""
     fit = replace(start, colour=noises.no_colour(start.z.shape[1]))  # what looks like colour may be what the effect explains
     for turn in range(rounds):
         model = refine(given, fit, model)
         before, fit = fit, evaluate(given, model, fit.noise)
-        if turn and fit.white - before.white < SETTLED:
+        if (turn and fit.white - before.white < SETTLED) or hopeless(fit):
             break
     return fit
 
