@@ -16,7 +16,7 @@ from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.rivals import SURELY, rivals, simplified, tied
 from s2r_runtime.trace.scores import Scored, _search, names, unlimited
-from s2r_runtime.trace.selection import Selection
+from s2r_runtime.trace.selection import Selection, _scattered
 from s2r_runtime.trace.tracer import load_dataset, trace
 from s2r_runtime.trace.verdict import confirmed, harms
 
@@ -159,6 +159,12 @@ def test_a_limit_that_is_met_oftener_where_nothing_is_fitted_is_found(tmp_path):
     found = _traced(tmp_path, "one", 150023)
     assert found.verdict == "traced"
     assert {(e.name, e.channel) for e in found.effects} == {("input_saturation", "ay")}
+
+
+@pytest.mark.parametrize(("ratios", "taken"), [([1.3], 1.0), ([1.0, 1.4], 1.0), ([1.4], 1.96), ([1.0, 2.0], 4.0), ([], 1.0)])
+def test_scores_of_ten_blocks_scatter_by_as_much_as_chance_makes_them(ratios, taken):
+    """Of one number, 1.35 times in one of 20 recordings; of two, 1.43 times."""
+    assert _scattered(np.array(ratios)) == pytest.approx(taken)
 
 
 def _traced_pair(folder, seed):

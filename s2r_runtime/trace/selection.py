@@ -22,6 +22,7 @@ from s2r_runtime.trace.begun import begun, uncertain
 from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.changes import from_the_beginning, happens, rivals_that_happen
 from s2r_runtime.trace.fitting import (
+    SCORE_BLOCKS,
     WIDEST,
     Fit,
     Problem,
@@ -71,6 +72,9 @@ BLOCKS = 5
 
 SOME = 4
 """Rounds of parameters under another law of noise."""
+
+BY_CHANCE = 0.05
+"""Chance of white noise to scatter as much between blocks of time, from which on it is taken to be white."""
 
 ALONE_TELLS = 0.95
 """Share of what tells a number from which on a block alone tells it: the others know it four times as poorly, or worse."""
@@ -273,7 +277,18 @@ def significant(given: Problem, fit: Fit, base: Fit, tried: int, bar: Bar = STRI
         return reached > needed
     there = names(base.model)
     new = [i for i, slot in enumerate(fit.free) if name_of(fit.model.effects[slot.place]) not in there]
-    return reached > needed * float(np.max(scatter(given, fit)[new], initial=1.0)) ** 2
+    return reached > needed * _scattered(scatter(given, fit)[new])
+
+
+def _scattered(ratios: Array) -> float:
+    """Times that scores of blocks scatter more than white noise, a ratio of variances: that of the number that does most so, 1 if chance
+    alone makes one of so many as large (chi-squared, a degree of freedom a block). ratios: (k,) of standard deviations.
+    """
+    from scipy.special import gammaincinv
+
+    most = float(np.max(ratios, initial=1.0)) ** 2
+    by_chance = 2.0 * float(gammaincinv(0.5 * SCORE_BLOCKS, 1.0 - BY_CHANCE / max(len(ratios), 1))) / SCORE_BLOCKS
+    return most if most > by_chance else 1.0
 
 
 def _beyond_wandering(given: Problem, fit: Fit, base: Fit, needed: float) -> bool:
