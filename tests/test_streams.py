@@ -8,7 +8,7 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.dataset import from_streams, thinned
 from s2r_runtime.trace.faults import check
-from s2r_runtime.trace.streams import Stream, complete, fresh
+from s2r_runtime.trace.streams import Stream, complete, fresh, turned
 
 
 def _pose(t):
@@ -107,3 +107,12 @@ def test_inputs_and_states_that_share_no_time_are_of_two_clocks(shift):
     t = 0.05 * np.arange(100)
     with pytest.raises(RecordingError, match="their stamps must be of one clock"):
         from_streams(_model(), [(Stream(t, _pose(t)), Stream(t + shift, np.ones((100, 2))))], "here.csv")
+
+
+@pytest.mark.parametrize(("before_s", "over"), [(0.0049, True), (0.0042, True), (0.0011, True), (0.0005, False), (0.0051, False)])
+def test_a_change_anywhere_in_the_last_part_of_a_step_but_on_its_end_is_over_by_then(before_s, over):
+    """Steps of 0.05 s in ten parts; what comes within 1 ms of a stamp may as well be on it."""
+    at = 0.05 * np.arange(6)
+    inputs = Stream(np.array([0.0, at[3] - before_s]), np.array([[1.0], [2.0]]))
+    found = turned(inputs, at, 10, on_edge=0.001)
+    assert (found is not None and found[:, 0].tolist() == [False, False, True, False, False]) == over

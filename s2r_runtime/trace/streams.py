@@ -241,10 +241,11 @@ def turned(inputs: Stream, at: Array, parts: int, on_edge: float = 0.0) -> Mask 
     values = held(inputs.values)
     found: Mask = np.zeros((len(at) - 1, values.shape[1]), dtype=np.bool_)
     last, after = np.diff(at)[:-1] / parts, np.diff(at)[1:] / parts
-    near = np.maximum(ROUNDING * np.minimum(last, after) + 4.0 * np.spacing(np.abs(at[1:-1])), on_edge)
+    least = ROUNDING * np.minimum(last, after) + 4.0 * np.spacing(np.abs(at[1:-1]))
+    near = np.maximum(least, on_edge)
     for j, column in enumerate(values.T):
         t = inputs.t[np.append(True, column[1:] != column[:-1])] if len(column) else inputs.t
-        a, b, c = (np.searchsorted(t, e) for e in (at[1:-1] - last + near, at[1:-1] - near, at[1:-1] + after - near))
+        a, b, c = (np.searchsorted(t, e) for e in (at[1:-1] - last + least, at[1:-1] - near, at[1:-1] + after - least))
         found[:-1, j] = (b > a) & (c == b)
     return found if found.any() else None
 
