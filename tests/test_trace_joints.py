@@ -97,6 +97,38 @@ def test_a_speed_that_comes_late_by_a_part_of_a_row_is_no_actuator_that_answers_
     assert trace(data, model).verdict == "none"
 
 
+def _from_point_to_point(seed, rows=3000, still=0.0):
+    """(rows, 2) of a joint that is moved and rests in turn, its speed told from its encoder by a filter; (rows, 1) torques. still: share of
+    the recording after which the encoder says the same for 40 rows.
+    """
+    rng = np.random.default_rng(seed)
+    torques = np.zeros(rows)
+    for first in range(20, rows - 80, 100):
+        side = rng.choice([-1.0, 1.0])
+        torques[first : first + 20], torques[first + 20 : first + 40] = side * rng.uniform(0.5, 2.0) * np.array([[1.0], [-1.0]])
+    a = torques / INERTIA
+    v = np.append(0.0, DT_S * np.cumsum(a))[:-1]
+    q = np.append(0.0, np.cumsum(DT_S * v + 0.5 * DT_S * DT_S * a))[:-1]
+    q = np.round((q + 1e-5 * rng.normal(size=rows)) / 2e-5) * 2e-5
+    if still:
+        q[round(still * rows) : round(still * rows) + 40] = q[round(still * rows)]
+    speed, told = 0.0, []
+    for made in np.append(0.0, np.diff(q) / DT_S):
+        speed += (made - speed) * DT_S / (DT_S + 2.0 * DT_S)
+        told.append(speed)
+    return np.column_stack([q, told]), torques[:, None]
+
+
+@pytest.mark.parametrize("still", [0.0, 0.54], ids=["as it moved", "with an encoder that stood still"])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_filtered_speed_of_a_joint_that_rests_in_turn_is_no_actuator_that_answers_late(tmp_path, seed, still):
+    """It is off, whenever the joint moves, by many times what it usually is; and where an encoder goes on, by many times that."""
+    model = _joint()
+    data = load_dataset(_table(tmp_path / "joint.csv", *_from_point_to_point(seed, still=still)), model)
+    assert data.reconstruction.late["qd"] == pytest.approx(2.5 * DT_S, rel=0.3)
+    assert still or trace(data, model).verdict == "none"
+
+
 @pytest.mark.parametrize("digits", [4, 6, 9])
 def test_a_simulator_whose_positions_come_early_has_speeds_that_do_not_come_late(tmp_path, digits):
     """It steps by v+ = v + h a, q+ = q + h v+, so that its speeds are the last differences of its positions."""

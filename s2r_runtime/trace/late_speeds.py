@@ -5,8 +5,11 @@ Against the speed v that positions alone say (`speeds`: a spline looks both ways
 
     s_k = v_k - late a_k + noise,      a_k = (v_{k+1} - v_{k-1}) / (t_{k+1} - t_{k-1})
 
-to first order, for a filter as for a delay. Least squares gives `late` with its error, from blocks of time. A speed that is late
-has the friction at the wrong time, and looks like an actuator that answers late; the positions tell it better.
+to first order, for a filter as for a delay. Least squares gives `late` with its error, from blocks of time. Rows that are off by
+themselves are told by what a line through most of the acceleration leaves (least absolute errors): an arm that rests half of the
+time is off, whenever it moves, by many times what it usually is. Rows are not asked at which an encoder that stood still goes on:
+their acceleration is far beyond that by which half of all changes of speed came about. A speed that is late has the friction at
+the wrong time, and looks like an actuator that answers late; the positions tell it better.
 
 By less than a row, a position may as well come early: a simulator that steps by q+ = q + h v+ says so. Then the speed answers an input b
 that is held from row to row at once; one that is late by a share c of a row answers with c of the one before,
@@ -47,6 +50,9 @@ MOSTLY = 0.5
 without such rows, what they must explain.
 """
 
+FAR = 6.0
+"""Times its usual size from which a value is off by itself, and is cut off there."""
+
 SAME = 0.05
 """Of how differences change from row to row: so near to the last one is a speed that was made of it and printed with a few digits."""
 
@@ -60,7 +66,10 @@ def late(t: Array, recorded: Array, pushed: Array, found: Smoothed) -> float:
     row = float(np.median(np.diff(t)))
     v = found.speed
     a = (v[2:] - v[:-2]) / (t[2:] - t[:-2])
-    off = _without_outliers((v - recorded)[1:-1])
+    off = (v - recorded)[1:-1]
+    usual = np.abs(a) <= FAR * _weighted_median(np.abs(a), np.abs(a))
+    a = a[usual]
+    off = _near_a_line(a, off[usual])
     seconds, error = _slope(a, off)
     explained = 1.0 - float(np.sum((off - seconds * a) ** 2) / max(float(np.sum(off * off)), 1e-300))
     sure = seconds > max(SURELY * error, LEAST * row) and explained > MOSTLY
@@ -99,10 +108,29 @@ def _answers_late(t: Array, recorded: Array, pushed: Array, seconds: float) -> b
 
 
 def _without_outliers(off: Array) -> Array:
-    """Less its median, cut off at six times its usual size."""
+    """Less its median, cut off at FAR times its usual size."""
     off = off - float(np.median(off))
-    limit = 6.0 * float(np.median(np.abs(off))) + 1e-300
+    limit = FAR * float(np.median(np.abs(off))) + 1e-300
     return np.asarray(np.clip(off, -limit, limit))
+
+
+def _near_a_line(x: Array, y: Array) -> Array:
+    """y (n,) less its median, cut off at FAR times its usual distance from the line through 0 of least absolute errors on x (n,):
+    usual where x is large, as only that says anything of the line.
+    """
+    y = y - float(np.median(y))
+    some = x != 0.0
+    if not np.any(some):
+        return y
+    line = _weighted_median(y[some] / x[some], np.abs(x[some])) * x
+    limit = FAR * _weighted_median(np.abs(y - line)[some], x[some] ** 2) + 1e-300
+    return np.asarray(line + np.clip(y - line, -limit, limit))
+
+
+def _weighted_median(values: Array, weights: Array) -> float:
+    order = np.argsort(values)
+    below = np.cumsum(weights[order])
+    return float(values[order[np.searchsorted(below, 0.5 * below[-1])]])
 
 
 def _slope(x: Array, y: Array) -> tuple[float, float]:
