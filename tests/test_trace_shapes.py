@@ -1,15 +1,19 @@
 """Names are challenged by shapes that have none: each shape is what it says, takes false names away, and costs true ones nothing."""
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from trace_robots import declared, recordings
 
-from s2r_runtime.models.composed import compose
+from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace import whole
+from s2r_runtime.trace import challenge, whole
 from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.fitting import evaluate, problem
+from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.shapes import SHAPES
 from s2r_runtime.trace.tracer import trace
 
@@ -42,8 +46,10 @@ def _library(name, u, **p):
         ("a boost of what changes", {"share": -1.0, "time_constant": 0.3}, "input_lag", {"time_constant": 0.3}),
         ("a delay that goes with the size", {"small": 0.13, "large": 0.13}, "input_delay", {"delay": 0.13}),
         ("a bend", {"gain": 0.7, "cubic": 0.0}, "input_gain", {"gain": 0.7}),
+        ("a power", {"gain": 0.7, "power": 1.0}, "input_gain", {"gain": 0.7}),
+        ("a dead zone by side", {"positive": 0.25, "negative": 0.25}, "input_deadband", {"width": 0.2}),
     ],
-    ids=["out and back", "up and down", "by size", "boost", "delay", "bend"],
+    ids=["out and back", "up and down", "by size", "boost", "delay", "bend", "power", "by side"],
 )
 def test_a_shape_that_has_a_named_effect_in_it_is_that_effect_there(name, alike, effect, p):
     """The mean of a lag over a step by the trapezium: off by (dt/T)²/12 of a change, at most 1.6 here."""
@@ -63,6 +69,10 @@ def test_a_shape_that_has_a_named_effect_in_it_is_that_effect_there(name, alike,
         ("fading with what was asked lately", {"loss": 0.0, "time_constant": 1.0}),
         ("tiring with all that was asked", {"loss": 0.0, "time_constant": 1.0}),
         ("a bend", {"gain": 1.0, "cubic": 0.0}),
+        ("a power", {"gain": 1.0, "power": 1.0}),
+        ("a dead zone by side", {"positive": 0.0, "negative": 0.0}),
+        ("switching on and off", {"on": 0.0, "off": 0.5}),
+        ("settling with time", {"loss": 0.0, "time_constant": 1.0}),
     ],
 )
 def test_a_shape_of_no_size_changes_nothing_but_within_a_step(name, p):
@@ -98,6 +108,11 @@ def _tire(v, s, h):
     return v * (1.0 - 0.4 * math.tanh(s["z"] / 3.0))
 
 
+def _settle(v, s, h):
+    s["t"] = s.get("t", 0.0) + h
+    return v * (1.0 - 0.4 * (1.0 - math.exp(-s["t"] / 2.0)))
+
+
 def _back(v, s, h):
     z = s.get("z", 0.0)
     s["z"] = z + h * (v - z) / (0.1 if abs(v) > abs(z) else 0.4)
@@ -110,6 +125,7 @@ def _back(v, s, h):
         ("an actuator that rings", {"rate": 10.0, "damping": 0.3}, _ring, 0.02),  # (w dt)²/12 of 1.6 a step, rung up by 1/(2 d)
         ("fading with what was asked lately", {"loss": 0.9, "time_constant": 0.8}, _fade, 0.005),
         ("tiring with all that was asked", {"loss": 0.4, "time_constant": 3.0}, _tire, 0.001),
+        ("settling with time", {"loss": 0.4, "time_constant": 2.0}, _settle, 0.001),
         ("two lags, out and back", {"out": 0.1, "back": 0.4}, _back, 0.12),  # |v| and |z| may cross within a step: dt (1/.1 - 1/.4) |v - z|
     ],
 )
@@ -129,6 +145,40 @@ def test_a_loop_closes_on_itself_whatever_the_pace():
     assert np.max(np.abs(first - again)) < 0.3 * 0.8 * math.exp(-0.8 / 0.32)
     middle = np.argmin(np.abs(there[50:150])), 100 + np.argmin(np.abs(there[150:250]))
     assert first[middle[0]] - first[middle[1]] > 0.38
+
+
+def test_a_soft_limit_is_nearly_a_gain_far_below_it_and_never_beyond_it():
+    u = _asked()
+    far, near = (_acts("a soft limit", u, gain=0.7, limit=limit)[:, 1] for limit in (20.0, 0.5))
+    assert np.max(np.abs(far - 0.7 * u[:, 1])) < 0.7 * 0.8 / (3.0 * 20.0**2)
+    assert np.max(np.abs(near)) < 0.7 * 0.5 * 0.8
+
+
+def test_what_switches_works_from_one_size_on_and_until_another():
+    w = 0.8 * np.array([0.1, 0.45, 0.55, 0.4, -0.3, 0.2, 0.45, 0.6])
+    acts = _acts("switching on and off", np.column_stack([0.0 * w, w]), on=0.5, off=0.5)[:, 1]
+    assert np.array_equal(acts != 0.0, [False, False, True, True, True, False, False, True])
+    assert np.array_equal(acts[acts != 0.0], w[acts != 0.0])
+
+
+def test_bends_leave_a_place_for_shapes_with_memory(monkeypatch):
+    """All bends of one input are alike: were only the best few fitted, memory would not be asked about."""
+    (data,) = recordings([("cubic", "w", {"share": -0.5})], 1, steps=600, seed=61)
+    given = problem(data, steps_of(data))
+    base, asked = evaluate(given, declared()), []
+    monkeypatch.setattr(challenge, "fitted", lambda of, fit, model, rounds: asked.append(model.effects[-1].effect) or fit)
+    monkeypatch.setattr(challenge, "_outlasts", lambda fit, dt: False)
+    monkeypatch.setattr(challenge, "NEARLY", 0.0)
+    challenge._fits(given, base, "w", least=0.1)
+    remember = [shape.memory for shape in asked]
+    assert remember.count(False) == challenge.BENDS
+    assert 0 < remember.count(True) <= challenge.FITTED
+
+
+def test_what_settles_with_time_is_told_as_that():
+    at = {"loss": 0.4, "time_constant": 2.0, "most": 0.8}
+    settling = replace(UNICYCLE, effects=(AppliedEffect(BY_NAME["settling with time"], "w", at),))
+    assert challenge._token(SimpleNamespace(model=settling)) == "time*w"
 
 
 def test_what_sticks_and_stays_short_is_a_play_if_by_all_its_reach_and_jumps_all_the_way_if_by_none():

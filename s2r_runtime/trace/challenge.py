@@ -22,7 +22,7 @@ from typing import cast
 import numpy as np
 
 from s2r_runtime.hookspecs import Effect
-from s2r_runtime.models.composed import AppliedEffect
+from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace.begun import begun, measured
 from s2r_runtime.trace.candidates import Candidate
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, without
@@ -30,7 +30,7 @@ from s2r_runtime.trace.residual import acting, covered, first_steps, rms, rollou
 from s2r_runtime.trace.scores import at_first_look
 from s2r_runtime.trace.screening import screen
 from s2r_runtime.trace.selection import accepted
-from s2r_runtime.trace.shapes import SHAPES
+from s2r_runtime.trace.shapes import SHAPES, Shape
 from s2r_runtime.trace.slots import bounds_of, values_of
 
 ALPHA = 1e-3
@@ -48,8 +48,10 @@ LOWER = 0.05
 REACHES = 0.3
 """Of what is explained by name: a shape that screening gives less does not come up to it."""
 
-FITTED, NEARLY = 3, 0.5
-"""Shapes of an input that are fitted, after screening, which must give them that share of what it gives the best."""
+FITTED, BENDS, NEARLY = 3, 2, 0.5
+"""Shapes of an input that are fitted, after screening, with memory and without, which must give them that share of what it gives the best:
+bends of all kinds are alike, and would leave no place for others.
+"""
 
 LEAST = 4.0
 """Nats that screening must give a shape where nothing was named."""
@@ -150,8 +152,15 @@ def _fits(
     ]
     screened, _ = screen(given, base, offered, math.inf) if offered else ([], 0)  # from few starts
     enough = max(least, NEARLY * screened[0].value) if screened else least
-    fits = [fitted(given, base, s.start, 2) for s in screened[:FITTED] if s.value > max(enough, 0.0)]
+    kept = [s for s in screened if s.value > max(enough, 0.0)]
+    bends = [s for s in kept if not _remembers(s.start)][:BENDS]
+    fits = [fitted(given, base, s.start, 2) for s in [*[s for s in kept if _remembers(s.start)][:FITTED], *bends]]
     return sorted((fit for fit in fits if _outlasts(fit, given.data.dt)), key=lambda fit: -gain(fit, base))
+
+
+def _remembers(model: ComposedModel) -> bool:
+    """Whether the last effect of a model, a shape, has memory."""
+    return cast(Shape, model.effects[-1].effect).memory
 
 
 def _outlasts(fit: Fit, dt: float) -> bool:
@@ -164,6 +173,8 @@ def _outlasts(fit: Fit, dt: float) -> bool:
 def _token(fit: Fit) -> str:
     """What the last effect of a model, a shape, depends on."""
     last = fit.model.effects[-1]
+    if getattr(last.effect, "with_time", False):
+        return f"time*{last.channel}"
     memory = last.effect.hidden(1, fit.model.nominal, last.channel, fit.model.dt, last.p).size > 0
     return f"memory({last.channel})" if memory else last.channel
 

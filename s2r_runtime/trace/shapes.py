@@ -6,7 +6,8 @@ asked of shapes that stand near the named ones, each with numbers that are fitte
     memory      two lags (out and back, up and down), a lag or a delay that goes with the input's size, an actuator that rings, one that
                 boosts what changes or first goes the other way, one that sticks and jumps (all the way, or short of it), a loop, a
                 gain that fades with what was asked lately, or ever
-    the input   a bend (cubic), steps
+    time        a gain that settles
+    the input   a bend (cubic), a power (a root, a square), a soft limit, a dead zone wider on one side, steps
 
 A shape is never handed on: it has no name, belongs to no model that is saved, and runs over whole recordings only. Its scale is `most`, the
 largest size of its input, among its values. Where rows do not last alike, those whose memory is of time get the length of each.
@@ -60,9 +61,13 @@ class Shape(InputEffect):
         starts: Callable[[float, Sequence[float]], list[Values]],
         *,
         uneven: bool = True,
+        with_time: bool = False,
         of_play: Callable[[float], list[Values]] = lambda width: [],
     ) -> None:
-        """of_play: values from which a fit begins where a play of this width (over `most`) was named."""
+        """with_time: it depends on the time since the run began, only; of_play: values from which a fit begins where a play of this width
+        (over `most`) was named.
+        """
+        self.with_time = with_time
         self.uneven = uneven
         self._of_play = of_play
         self.name = name
@@ -240,8 +245,38 @@ def _tires(u: Array, dt: float, p: Values) -> Array:
     return np.asarray(u * (1.0 - p["loss"] * np.tanh(spent / p["time_constant"])))
 
 
+def _settles(u: Array, dt: Lasts, p: Values) -> Array:
+    """A gain that goes from 1 to 1 - loss with time alone, by the middle of each row."""
+    lasts = np.broadcast_to(dt, u.shape)
+    return np.asarray(u * (1.0 - p["loss"] * -np.expm1(-(np.cumsum(lasts) - 0.5 * lasts) / p["time_constant"])))
+
+
 def _bends(u: Array, dt: float, p: Values) -> Array:
     return np.asarray(u * (p["gain"] + p["cubic"] * (u / p["most"]) ** 2))
+
+
+def _power(u: Array, dt: float, p: Values) -> Array:
+    """gain most |u/most|^power, with the sign of u: a root or a logarithm below 1, a valve or a propeller above."""
+    return np.asarray(p["gain"] * p["most"] * np.sign(u) * (np.abs(u) / p["most"]) ** p["power"])
+
+
+def _soft(u: Array, dt: float, p: Values) -> Array:
+    limit = p["limit"] * p["most"]
+    return np.asarray(p["gain"] * limit * np.tanh(u / limit))
+
+
+def _dead_by_side(u: Array, dt: float, p: Values) -> Array:
+    return np.asarray(np.maximum(u - p["positive"] * p["most"], 0.0) + np.minimum(u + p["negative"] * p["most"], 0.0))
+
+
+def _switches(u: Array, dt: float, p: Values) -> Numbers:
+    """u while it is on: from where it is larger than `on`, to where it is smaller than the share `off` of that."""
+    on, off = p["on"] * p["most"], p["on"] * p["off"] * p["most"]
+    works, acts = 0.0, []
+    for v, size in zip(u.tolist(), np.abs(u).tolist(), strict=True):
+        works = 1.0 if size > on else 0.0 if size < off else works
+        acts.append(v * works)
+    return acts
 
 
 def _steps(u: Array, dt: float, p: Values) -> Array:
@@ -328,11 +363,51 @@ SHAPES = (
         uneven=False,
     ),
     Shape(
+        "settling with time",
+        True,
+        (_number("loss", -5.0, 1.0, 0.0), _second("time_constant")),
+        _settles,
+        lambda dt, times: [{"loss": 0.3, "time_constant": k * dt} for k in (30.0, 100.0, 300.0, 1000.0)],
+        with_time=True,
+    ),
+    Shape(
         "a bend",
         False,
         (_number("gain", -2.0, 5.0, 1.0), _number("cubic", -5.0, 5.0, 0.0)),
         _bends,
         lambda dt, times: [{"gain": 1.0, "cubic": -0.2}],
+        uneven=False,
+    ),
+    Shape(
+        "a power",
+        False,
+        (_number("gain", -2.0, 5.0, 1.0), _number("power", 0.2, 5.0, 1.0)),
+        _power,
+        lambda dt, times: [{"gain": 1.0, "power": k} for k in (0.6, 1.7)],
+        uneven=False,
+    ),
+    Shape(
+        "a soft limit",
+        False,
+        (_number("gain", -2.0, 5.0, 1.0), _number("limit", 0.05, 20.0)),
+        _soft,
+        lambda dt, times: [{"gain": 1.0, "limit": k} for k in (0.4, 1.0)],
+        uneven=False,
+    ),
+    Shape(
+        "a dead zone by side",
+        False,
+        (_number("positive", 0.0, 2.0, 0.0, kink=True), _number("negative", 0.0, 2.0, 0.0, kink=True)),
+        _dead_by_side,
+        lambda dt, times: [{"positive": a, "negative": b} for a, b in ((0.3, 0.01), (0.01, 0.3), (0.6, 0.01), (0.01, 0.6))],
+        uneven=False,
+    ),
+    Shape(
+        "switching on and off",
+        True,
+        (_number("on", 0.0, 2.0, 0.0, kink=True), _number("off", 0.0, 1.0, kink=True)),
+        _switches,
+        lambda dt, times: [{"on": on, "off": off} for on in (0.2, 0.4, 0.7) for off in (0.3, 0.7)],
         uneven=False,
     ),
     Shape(
