@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.fitting import Problem, slopes
+from s2r_runtime.trace.lack_of_fit_crossed import bent_product, over_time, overtones
 from s2r_runtime.trace.residual import Acting, Steps, acting, wherever
 from s2r_runtime.trace.residual_noise import Noise
 from s2r_runtime.trace.slots import free_of
@@ -102,6 +103,7 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
             a, b = u[:, i], u[:, j]
             yield f"{model.inputs[i]}*{name}", _push([a * b, np.abs(a) * b, a * np.abs(b), np.abs(a * b)], body)
             yield f"{model.inputs[i]}*{name}", _push([a * b, a * a * b, a * b * b], body)
+            yield f"{model.inputs[i]}*{name}", _push(bent_product(a, b), body)
     if not given.floor.axes:
         yield from (("speed", terms) for terms in _not_its_rate(given, model))
     pushes = [u[:, j][:, None] * own for j, own in enumerate(own_pushes(given, model, act))]
@@ -112,8 +114,11 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
         return
     for name, push in zip(model.inputs, pushes, strict=True):
         yield from ((f"time*{name}", [push, *(wave[:, None] * push for wave in waves)]) for waves in _hum(r, given, [push]))
+    yield from (("time", terms) for terms in overtones(steps, model, given.data.dt, pushes))
     if {"x", "y", "theta"} <= set(model.states):
         yield from (("time", drift) for drift in _drifting_heading(steps, model, t))
+    elif moving := _moving(model, quieter(steps, noise)):
+        yield "speed", _push(over_time(t, moving), body)
     yield "time", _push([one, t], [*body, *world])
     yield "time", _push([one, *(f(2.0 * np.pi * k * t) for k in (0.5, 1.0, 1.5, 2.0) for f in (np.sin, np.cos))], [*body, *world])
     yield "time", _push([one, *(np.where(t > s, one, 0.0) for s in np.linspace(0.1, 0.9, 9))], body)
@@ -337,7 +342,7 @@ def _of_states(
         yield "position", [one, *position, *squares, *(a**3 for a in position)], [*body, *world]
         for a in position:
             yield "position", [f(np.pi * k * a) for k in range(1, WAVES + 1) for f in (np.sin, np.cos)], world or body
-        moving = [f for i, name in enumerate(model.states) if name in VELOCITIES for f in _dry(y[:, i])]
+        moving = _moving(model, y)
         if moving:
             yield "position", [c * f for c in _patches(position) for f in moving], body
     speed = [_scaled(y[:, i], centred=False) for i, name in enumerate(model.states) if name in VELOCITIES]
@@ -369,6 +374,11 @@ def _not_its_rate(given: Problem, model: ComposedModel) -> Iterator[Terms]:
     if shares:
         yield shares
         yield [*shares, *late]
+
+
+def _moving(model: ComposedModel, y: Array) -> Terms:
+    """What friction goes with, of each speed of the states y (n, nx)."""
+    return [f for i, name in enumerate(model.states) if name in VELOCITIES for f in _dry(y[:, i])]
 
 
 def _dry(v: Array) -> tuple[Array, Array]:
