@@ -110,7 +110,8 @@ class Structure:
     share: part of all that the nominal model lacks which is still left (0 where there is nothing). gains: nats by group. nameless: what
     was named looks more like something that has no name (`challenge`). for_a_while: it comes and goes (`episodes`). varies: it is a
     field (`fields`). beside: what it may depend on besides, which no rollout shows. noise: what would be left beside the structure, and
-    its colour; None where there is none that matters.
+    its colour; None where there is none that matters. nats: of what comes
+    and goes, or of a field.
     """
 
     tokens: tuple[str, ...]
@@ -122,6 +123,7 @@ class Structure:
     varies: bool = False
     beside: tuple[str, ...] = ()
     noise: tuple[Noise, Colour] | None = None
+    nats: float = 0.0
 
     @property
     def likeliest(self) -> tuple[str, ...]:
@@ -156,15 +158,16 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     if number is not None:
         gains[number.token] = max(gains.get(number.token, 0.0), number.gain)
         told.append((number.gain, number, (number.token,), False))
-    for _, judged, tokens, varies in sorted(told, key=lambda t: -t[0]):
+    for nats, judged, tokens, varies in sorted(told, key=lambda t: -t[0]):
         matters, share = _weight_of(left, nominal, judged, horizon)
         if matters and (not varies or varied is None or varied.beyond > 0.0):  # rollouts take less time than what it is beyond
-            return Structure(tokens, True, share, gains, varies=varies, noise=_beside(left, judged))
+            return Structure(tokens, True, share, gains, varies=varies, noise=_beside(left, judged), nats=nats)
     windows = None if chosen else windows or _for_a_while(left)
     matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
     if windows is None or not matters:  # a number that may vary is told with the name, if no rollout shows it
         return Structure(coloured, False, 0.0, gains, beside=() if varying is None else (varying.judged.token,))
-    return Structure(may_depend_on(left, windows, found), True, share, gains, for_a_while=True, noise=_beside(left, windows))
+    tokens = may_depend_on(left, windows, found)
+    return Structure(tokens, True, share, gains, for_a_while=True, noise=_beside(left, windows), nats=windows.gain)
 
 
 def still_left(left: Left, tokens: tuple[str, ...], nominal: Fit, horizon: int) -> bool:

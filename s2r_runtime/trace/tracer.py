@@ -174,6 +174,12 @@ def _traced(
     return result
 
 
+def _in_order(structure: Structure, verdict: str) -> tuple[str, ...]:
+    """What is left first, where no name is given and it is more than noise; else what a name may depend on."""
+    left = verdict == "unexplained" and {*structure.tokens} - {"noise"}
+    return (*structure.tokens, *structure.beside) if left else (*structure.beside, *structure.tokens)
+
+
 def _from(begun: float, say: Progress) -> Progress:
     """Progress of what is still to do when so much of 100 is done."""
     return lambda done, total, detail: say(begun + (1.0 - begun / 100.0) * done, total, detail)
@@ -338,7 +344,7 @@ def _result(
     effects = tuple(_found(model, final, place, ranges) for place in final.added)
     idle = [place for place in final.added if not asked(given, judged_on, final.model, without(final.model, place))]
     rivals = [s.fit for s in chosen.rivals if s.fit is not None] if verdict == "ambiguous" else []
-    left = (*structure.beside, *structure.tokens)
+    left = _in_order(structure, verdict)
     shared = tuple(token for token in any_shape_of(final, rivals, given.data, given.steps) if token not in left)
     ties = each_once(_found(model, fit, place, {}) for fit in rivals for place in _new(fit, final))
     return TraceResult(

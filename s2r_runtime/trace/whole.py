@@ -123,7 +123,8 @@ class Whole:
             tokens = self._field.tokens  # it was seen by sliding only, which names what it tries
         else:
             tokens = () if self._shape is None else (self._shape.token,)
-        named = tuple(dict.fromkeys((*tokens, *found.tokens)))
+        more = (found.for_a_while or found.varies) and self._shape is not None and found.nats > self._shape.nats
+        named = tuple(dict.fromkeys((*found.tokens, *tokens) if more else (*tokens, *found.tokens)))
         return replace(found, tokens=named, matters=True, share=1.0) if tokens else found
 
     def _patchwork(self, fit: Fit) -> bool:
