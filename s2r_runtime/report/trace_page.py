@@ -75,7 +75,11 @@ def _what_is_left(page: Page, r: TraceResult) -> None:
         return
     sure = not {*tokens} <= {*r.may_depend_on}
     page.heading(f"What is left, and what it {'depends' if sure else 'may depend'} on")
-    why = "has no name, because no effect in the library has this shape." if sure else "is so small that no rollout shows it."
+    why = (
+        "has no name, because no effect in the library has this shape."
+        if sure
+        else "is so small that no rollout shows it, or was there for a short while only."
+    )
     page.text(
         "Means of the one-step residual on held-out data in bins of what it depends on, with their 95 % intervals. The shape is shown; it "
         + why

@@ -219,7 +219,7 @@ def _shown(r: TraceResult) -> tuple[str, ...]:
 
 def _still_there(r: TraceResult) -> list[str]:
     """What is left for sure, and what may be."""
-    beside = [f"no rollout shows it, but something may depend on {', '.join(r.may_depend_on)}: look at the name again"]
+    beside = [f"less sure, but something may depend on {', '.join(r.may_depend_on)}: look at the name again"]
     return [*_beyond_doubt(r), *(beside if r.may_depend_on else [])]
 
 

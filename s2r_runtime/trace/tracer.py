@@ -168,6 +168,8 @@ def _traced(
     result = _result(dataset, checked, given, chosen, structure, judged_on, seed, w, kind)
     if result.verdict == "unexplained" and chosen.fit.added and not {*result.depends_on} - {"noise"}:
         result = replace(result, depends_on=whole.likeliest or result.depends_on)
+    if result.verdict in {"traced", "ambiguous"} and whole.in_one_stretch(chosen):
+        result = _with_time(result)
     unseen = tuple(s for s in asked.states if s not in model.states)
     result = replace(result, spec=msgspec.structs.replace(result.spec, dt=asked.dt), unseen=unseen)
     say(100.0, 100.0, result.verdict)
@@ -178,6 +180,12 @@ def _in_order(structure: Structure, verdict: str) -> tuple[str, ...]:
     """What is left first, where no name is given and it is more than noise; else what a name may depend on."""
     left = verdict == "unexplained" and {*structure.tokens} - {"noise"}
     return (*structure.tokens, *structure.beside) if left else (*structure.beside, *structure.tokens)
+
+
+def _with_time(result: TraceResult) -> TraceResult:
+    """With the time last among what names may depend on."""
+    left, beside = (tuple(dict.fromkeys((*tokens, "time"))) for tokens in (result.depends_on, result.may_depend_on))
+    return replace(result, depends_on=left, may_depend_on=beside)
 
 
 def _from(begun: float, say: Progress) -> Progress:

@@ -29,6 +29,7 @@ from s2r_runtime.trace.lack_of_fit import (
     still_left,
 )
 from s2r_runtime.trace.lack_of_fit_judged import Judged, Left
+from s2r_runtime.trace.one_stretch import in_one_stretch
 from s2r_runtime.trace.patchwork import patchwork
 from s2r_runtime.trace.residual import first_steps
 from s2r_runtime.trace.selection import Selection, crowded
@@ -58,6 +59,7 @@ class Whole:
         self.nominal = evaluate(self.given, nominal)
         self._horizon = horizon
         self._known: dict[int, tuple[Fit, Structure]] = {}
+        self._fitted: dict[int, tuple[Fit, Fit]] = {}
 
     @cached_property
     def _looks(self) -> Looks:
@@ -86,10 +88,16 @@ class Whole:
         fit = self._everywhere(other.fit)
         return still_left(left_of(self.given, fit), structure.tokens, self.nominal, self._horizon)
 
+    def in_one_stretch(self, chosen: Selection) -> bool:
+        """Whether a name comes from one stretch of the recording."""
+        return in_one_stretch(self.given, self._everywhere(chosen.fit))
+
     def _everywhere(self, fit: Fit) -> Fit:
         """Fitted to all of the recording: numbers of a part are a little off elsewhere, and that is no structure."""
-        fit = evaluate(self.given, fit.model)
-        return fitted(self.given, fit, fit.model, 2)
+        if id(fit) not in self._fitted:
+            here = evaluate(self.given, fit.model)
+            self._fitted[id(fit)] = fit, fitted(self.given, here, here.model, 2)
+        return self._fitted[id(fit)][1]
 
     def _structure(self, chosen: Fit) -> Structure:
         if not chosen.added:
