@@ -107,7 +107,7 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
     if not given.floor.axes:
         yield from (("speed", terms) for terms in _not_its_rate(given, model))
     pushes = [u[:, j][:, None] * own for j, own in enumerate(own_pushes(given, model, act))]
-    for name, terms, directions in _of_states(model, quieter(steps, noise), u, body, world, pushes):
+    for name, terms, directions in _of_states(model, quieter(steps, noise, r), u, body, world, pushes):
         yield name, terms if directions is None else _push(terms, directions)
     yield from _varying(given, model, t, u)
     if not given.data.in_order:
@@ -117,7 +117,7 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
     yield from (("time", terms) for terms in overtones(steps, model, given.data.dt, pushes))
     if {"x", "y", "theta"} <= set(model.states):
         yield from (("time", drift) for drift in _drifting_heading(steps, model, t))
-    elif moving := _moving(model, quieter(steps, noise)):
+    elif moving := _moving(model, quieter(steps, noise, r)):
         yield "speed", _push(over_time(t, moving), body)
     yield "time", _push([one, t], [*body, *world])
     yield "time", _push([one, *(f(2.0 * np.pi * k * t) for k in (0.5, 1.0, 1.5, 2.0) for f in (np.sin, np.cos))], [*body, *world])
@@ -155,21 +155,24 @@ def pushes_by_token(given: Problem, model: ComposedModel, act: Acting) -> list[t
     return [(token, push) for token, push in [*own, *(("time", d) for d in (*body, *world))] if np.any(push)]
 
 
-def quieter(steps: Steps, noise: Noise) -> Array:
-    """(n, nx) states at the start of steps, each the mean of its neighbours over the time in which noise of the process grows to that of
-    the measurement. A residual has the error of its own first state in it, with the other sign: terms in that very state would find it.
+def quieter(steps: Steps, noise: Noise, r: Array) -> Array:
+    """(n, nx) states at the start of steps, each the mean of what its neighbours say of it, over the time in which noise of the process
+    grows to that of the measurement. A residual has the error of its own first state in it, with the other sign: terms in that very state
+    would find it. r: (n, nx) what the model leaves; by what it does not, it moves on from a neighbour to the state that is asked for: of a
+    robot that turns, the plain mean of headings is another heading.
     """
     first = np.flatnonzero(~steps.joined)
     edges = np.append(first, len(steps))
     number = np.repeat(first, np.diff(edges)), np.repeat(edges[1:], np.diff(edges))
     y = steps.y0.copy()
+    at = np.arange(len(y))
     for i, wide in enumerate(np.sqrt(noise.r / noise.q)):
         half = int(min(wide, WIDEST))
         if half:
-            total = np.concatenate([[0.0], np.cumsum(steps.y0[:, i])])
-            reach = np.minimum(np.minimum(np.arange(len(y)) - number[0], number[1] - 1 - np.arange(len(y))), half)
-            at = np.arange(len(y))
-            y[:, i] = (total[at + reach + 1] - total[at - reach]) / (2 * reach + 1)
+            gone = np.concatenate([[0.0], np.cumsum((steps.y1 - steps.y0 - r)[:-1, i])])
+            total = np.concatenate([[0.0], np.cumsum(steps.y0[:, i] - gone)])
+            reach = np.minimum(np.minimum(at - number[0], number[1] - 1 - at), half)
+            y[:, i] = (total[at + reach + 1] - total[at - reach]) / (2 * reach + 1) + gone
     return y
 
 
@@ -325,7 +328,7 @@ def _of_states(
         known.add(name)
         yield token, first, body
         yield token, [c * v for c in first for v in inputs], body
-        yield token, [c * v for c in [*first, *second] for v in [one, *inputs]], body
+        yield token, [c * v for c in [one, *first, *second] for v in [one, *inputs]], body
         ripples = [wave(k * angle) for k in range(1, HARMONICS + 1) for wave in (np.cos, np.sin)]
         yield token, ripples, body
         yield token, [c[:, None] * p for c in ripples for p in pushes], None

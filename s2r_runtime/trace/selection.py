@@ -168,16 +168,18 @@ def one_more(
     """With an effect besides that falls short of what is needed on what was fitted, but not on all of the recording. foretells: nats by
     which one model foretells what was not fitted better than another one does: the probability of both parts is that of one times that
     of the other, given the first, so they add. helps: whether rollouts of what was not fitted are better by one than by another: what a
-    robot was asked for once or twice may show in those alone.
+    robot was asked for once or twice, too seldom to be sure of, may show in those alone.
     """
     fit = chosen.fit
     if len(fit.added) >= MOST or crowded(fit):
         return chosen
     for s in best_candidates(given, fit)[0][:CLOSE_BY]:
-        if s.fit is None or crowded(s.fit) or gain(s.fit, fit) < SHORT * STRICT.needed(chosen.tried, s.fit.k - fit.k, len(given.steps)):
+        needed = 0.0 if s.fit is None else STRICT.needed(chosen.tried, s.fit.k - fit.k, len(given.steps))
+        if s.fit is None or crowded(s.fit) or gain(s.fit, fit) < SHORT * needed:
             continue
         ahead = foretells(s.fit, fit)
-        if ahead > 0.0 and accepted(given, s.fit, fit, chosen.tried, horizon, ahead=ahead, elsewhere=helps):
+        seldom = helps if gain(s.fit, fit) <= needed else None  # where it is clear what it does, that shows there or not at all
+        if ahead > 0.0 and accepted(given, s.fit, fit, chosen.tried, horizon, ahead=ahead, elsewhere=seldom):
             more, found = overtaken(given, plainly(given, _doing_something(given, fitted(given, s.fit, s.fit.model))), STRICT)
             return replace(chosen, fit=more, rivals=tuple(found))
     return chosen
