@@ -104,14 +104,16 @@ def test_states_are_averaged_over_the_time_in_which_noise_of_the_process_grows_t
     measured = true + rng.normal(size=(400, 2)) * [0.01, 0.0]
     joined = np.ones(400, dtype=bool)
     joined[[0, 200]] = False
-    steps = Steps(np.arange(400), np.zeros(400, dtype=np.int64), 0.1 * np.arange(400.0), measured, measured, joined)
+    model = compose(ModelSpec("joint", 0.1, {"mass": 1.0}))
+    given = problem(data := from_arrays(model, [(np.vstack([measured, measured[-1:]]), np.zeros((400, 1)))]), steps_of(data))
+    given = replace(given, steps=replace(given.steps, y0=measured, y1=measured, joined=joined))
     law, nothing = Noise(np.array([1e-6, 1e-4]), np.array([1e-4, 1e-6])), np.zeros((400, 2))
-    calm = quieter(steps, law, nothing)
+    calm = quieter(given, law, nothing)
     assert np.std(calm[20:-20, 0] - true[20:-20, 0]) < 0.01 / np.sqrt(15.0)
     assert np.array_equal(calm[:, 1], measured[:, 1]), "where measurements are better than the process there is nothing to average"
     assert np.allclose(calm[[0, 199, 200, 399]], measured[[0, 199, 200, 399]], atol=1e-12), "never across a gap"
     wave = 0.5 * np.sin(0.3 * np.arange(401))[:, None]
-    turning = replace(steps, y0=measured + wave[:-1], y1=measured + wave[1:])
+    turning = replace(given, steps=replace(given.steps, y0=measured + wave[:-1], y1=measured + wave[1:]))
     assert np.allclose(quieter(turning, law, nothing)[:, 0], (calm + wave[:-1])[:, 0], atol=1e-12), "by how the model moves on"
 
 

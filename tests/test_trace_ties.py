@@ -66,6 +66,7 @@ def test_what_many_explanations_share_is_all_that_is_known():
     assert any_shape_of(one, [push, other, drag], given.data, given.steps) == ("v",), "the push is the offset by another name"
     assert any_shape_of(late, [lag, ramp], given.data, given.steps) == ("memory(w)",)
     assert any_shape_of(one, [other, late], given.data, given.steps) == ()
+    assert any_shape_of(one, [other, limit, late], given.data, given.steps) == ("v",), "one that is about something else does not matter"
 
 
 def test_what_ties_is_seen_however_large_the_error_was():

@@ -6,6 +6,7 @@ depends on it and comes out as that number would do, with a name in the library 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 from s2r_runtime.effects.classes import same
@@ -20,8 +21,8 @@ SEVERAL = 3
 
 
 def any_shape_of(fit: Fit, rivals: Sequence[Fit], data: Dataset, steps: Steps) -> tuple[str, ...]:
-    """Tokens of what several explanations of one thing all depend on; of an input and its memory, that memory. rivals: fits with one effect
-    of `fit` replaced by another.
+    """Tokens of what most explanations of one thing depend on, if these are several; of an input and its memory, that memory. rivals: fits
+    with one effect of `fit` replaced by another.
     """
     shared: set[str] = set()
     for place in fit.added:
@@ -29,7 +30,9 @@ def any_shape_of(fit: Fit, rivals: Sequence[Fit], data: Dataset, steps: Steps) -
         gone = [other for other in rivals if all(name_of(other.model.effects[i]) != mine for i in other.added)]
         explained = _each_once([(fit, place), *((other, _other(other, fit)) for other in gone)])
         if len(explained) >= SEVERAL:
-            shared |= set.intersection(*(_about(*one, data, steps) for one in explained))
+            count = Counter(token for one in explained for token in _about(*one, data, steps))
+            most = max(count.values(), default=0)
+            shared |= {token for token in count if count[token] == most >= SEVERAL}
     return tuple(sorted(token for token in shared if f"memory({token})" not in shared))
 
 

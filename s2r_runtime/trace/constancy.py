@@ -130,7 +130,7 @@ def _scores(left: Left, moved: Array) -> _Scores:
 def _coordinates(left: Left) -> Iterator[_Along]:
     """Of what a number may be more here and less there."""
     given, model = left.given, left.fit.model
-    y = quieter(given.steps, left.fit.noise, left.r)
+    y = quieter(given, left.fit.noise, left.r)
     act = acting(model, given.data).mean
     first = first_steps(given.data)
     begin = np.repeat(first[:-1], np.diff(first))

@@ -297,7 +297,7 @@ def _offered(left: Left) -> Iterator[_Offer]:
     """Fields, each from coarse to fine."""
     given, model = left.given, left.fit.model
     act = acting(model, given.data)
-    y = quieter(given.steps, left.fit.noise, left.r)
+    y = quieter(given, left.fit.noise, left.r)
     u = act.mean[given.steps.place]
     body, world = directions_of(given, model, act)
     own = [u[:, [j]] * push for j, push in enumerate(own_pushes(given, model, act))]

@@ -107,7 +107,7 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
     if not given.floor.axes:
         yield from (("speed", terms) for terms in _not_its_rate(given, model))
     pushes = [u[:, j][:, None] * own for j, own in enumerate(own_pushes(given, model, act))]
-    for name, terms, directions in _of_states(model, quieter(steps, noise, r), u, body, world, pushes):
+    for name, terms, directions in _of_states(model, quieter(given, noise, r), u, body, world, pushes):
         yield name, terms if directions is None else _push(terms, directions)
     yield from _varying(given, model, t, u)
     if not given.data.in_order:
@@ -117,7 +117,7 @@ def dictionaries(given: Problem, model: ComposedModel, act: Acting, noise: Noise
     yield from (("time", terms) for terms in overtones(steps, model, given.data.dt, pushes))
     if {"x", "y", "theta"} <= set(model.states):
         yield from (("time", drift) for drift in _drifting_heading(steps, model, t))
-    elif moving := _moving(model, quieter(steps, noise, r)):
+    elif moving := _moving(model, quieter(given, noise, r)):
         yield "speed", _push(over_time(t, moving), body)
     yield "time", _push([one, t], [*body, *world])
     yield "time", _push([one, *(f(2.0 * np.pi * k * t) for k in (0.5, 1.0, 1.5, 2.0) for f in (np.sin, np.cos))], [*body, *world])
@@ -155,12 +155,14 @@ def pushes_by_token(given: Problem, model: ComposedModel, act: Acting) -> list[t
     return [(token, push) for token, push in [*own, *(("time", d) for d in (*body, *world))] if np.any(push)]
 
 
-def quieter(steps: Steps, noise: Noise, r: Array) -> Array:
+def quieter(given: Problem, noise: Noise, r: Array) -> Array:
     """(n, nx) states at the start of steps, each the mean of what its neighbours say of it, over the time in which noise of the process
     grows to that of the measurement. A residual has the error of its own first state in it, with the other sign: terms in that very state
     would find it. r: (n, nx) what the model leaves; by what it does not, it moves on from a neighbour to the state that is asked for: of a
-    robot that turns, the plain mean of headings is another heading.
+    robot that turns, the plain mean of headings is another heading. Where speeds were not measured, r is not of these states.
     """
+    steps = given.steps
+    moves = np.zeros_like(r) if given.floor.axes else steps.y1 - steps.y0 - r
     first = np.flatnonzero(~steps.joined)
     edges = np.append(first, len(steps))
     number = np.repeat(first, np.diff(edges)), np.repeat(edges[1:], np.diff(edges))
@@ -169,7 +171,7 @@ def quieter(steps: Steps, noise: Noise, r: Array) -> Array:
     for i, wide in enumerate(np.sqrt(noise.r / noise.q)):
         half = int(min(wide, WIDEST))
         if half:
-            gone = np.concatenate([[0.0], np.cumsum((steps.y1 - steps.y0 - r)[:-1, i])])
+            gone = np.concatenate([[0.0], np.cumsum(moves[:-1, i])])
             total = np.concatenate([[0.0], np.cumsum(steps.y0[:, i] - gone)])
             reach = np.minimum(np.minimum(at - number[0], number[1] - 1 - at), half)
             y[:, i] = (total[at + reach + 1] - total[at - reach]) / (2 * reach + 1) + gone
