@@ -68,6 +68,16 @@ def test_what_was_held_a_delay_before_the_end_of_a_row_is_what_was_commanded_bef
     assert np.max(np.abs(alone - parts)) > 0.01  # as a row of its own it is another command
 
 
+@pytest.mark.parametrize(("name", "p"), [("input_delay", {"delay": 0.0005}), ("input_backlash", {"width": 0.01})])
+def test_what_a_run_ends_with_does_not_depend_on_longer_runs_beside_it(name, p):
+    """Nothing is known of what came after its last row, least of all that it was zero."""
+    short, longer = np.ones((40, 2)), [np.ones((length, 2)) for length in range(41, 46)]
+    short[-1] = 0.5
+    beside, alone = (_through(name, p, runs, DT / 10, 10) for runs in ([short, *longer], [short]))
+    for acts, acts_alone in zip(beside, alone, strict=True):
+        assert np.array_equal(acts[:40], acts_alone)
+
+
 def test_what_is_commanded_for_a_row_of_a_ramp_or_a_peak_is_a_command():
     u = np.zeros((12, 2))
     u[3:, 0] = [0.1, 0.2, 0.3, 0.4, 0.5, 0.5, 0.9, 0.5, 0.5]

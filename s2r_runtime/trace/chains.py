@@ -32,7 +32,7 @@ REST_S = 1e4
 """Between runs that are laid end to end: no actuator remembers for so long."""
 
 TINY = 1e-9
-"""s that rows after the end of a run last, which nobody reads: no division by zero."""
+"""s that rows of a run that has none last, which nobody reads: no division by zero."""
 
 
 class Inputs:
@@ -254,10 +254,14 @@ class Inputs:
 
 
 def _side_by_side(runs: Sequence[Array]) -> Array:
-    """(T_i, nu) each -> (T, runs, nu), zero after the end of a run."""
+    """(T_i, nu) each -> (T, runs, nu). After its end a run goes on as it was: beside zeros its last row might look like a mean of what was
+    held before and of them.
+    """
     table = np.zeros((max(len(u) for u in runs), len(runs), runs[0].shape[1]))
     for i, u in enumerate(runs):
         table[: len(u), i] = u
+        if len(u):
+            table[len(u) :, i] = u[-1]
     return table
 
 
