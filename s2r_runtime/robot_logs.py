@@ -17,7 +17,7 @@ from s2r_runtime.errors import ConfigError, RecordingError, UsageError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.recording.origin import other_writer
-from s2r_runtime.tables import Table
+from s2r_runtime.tables import LARGEST, Table
 
 Array = NDArray[np.float64]
 
@@ -77,8 +77,8 @@ def read_robot_log(path: Path, model: ComposedModel, transport: Mapping[str, Any
 def _rows(given: tuple[Any, Any], width: int, path: Path, reader: str) -> Rows:
     """Checked: what a plug-in gives is taken at its word nowhere else."""
     t, values = np.asarray(given[0], dtype=np.float64), np.asarray(given[1], dtype=np.float64).reshape(-1, width)
-    if t.shape != values.shape[:1] or not np.all(np.isfinite(t)) or np.any(np.diff(t) < 0.0) or np.any(np.isinf(values)):
-        raise RecordingError(f"{path}: the reader {reader!r} gave rows that are not in order, or not finite")
+    if t.shape != values.shape[:1] or not np.all(np.isfinite(t)) or np.any(np.diff(t) < 0.0) or np.any(np.abs(values) > LARGEST):
+        raise RecordingError(f"{path}: the reader {reader!r} gave rows that are not in order, or not finite (or beyond {LARGEST:g})")
     kept = ~np.isnan(values).all(axis=1)
     return Rows(t[kept], values[kept])
 

@@ -91,13 +91,15 @@ def test_reader_that_needs_a_profile_says_so(registered: Path) -> None:
         read_robot_log(registered, MODEL, {"name": "one", "bad": True})
 
 
-@pytest.mark.parametrize("what", ["backwards", "infinite", "lengths", "stamps", "nothing"])
+@pytest.mark.parametrize("what", ["backwards", "infinite", "the largest float", "lengths", "stamps", "nothing"])
 def test_rows_that_are_none_are_refused(registered: Path, what: str) -> None:
     (t, x), (tu, u) = drive()
     if what == "backwards":
         t[5] = 0.0
     elif what == "infinite":
         x[5, 0] = np.inf
+    elif what == "the largest float":
+        u[5, 0] = np.finfo(np.float32).max
     elif what == "lengths":
         t = t[:-1]
     elif what == "stamps":
