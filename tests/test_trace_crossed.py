@@ -65,3 +65,13 @@ def test_a_square_wave_is_a_sine_and_its_overtones():
     share = (1.0 / 9.0 + 1.0 / 25.0) / sum(1.0 / k**2 for k in range(3, 4001, 2))  # of all overtones, by Fourier
     assert 1.0 - np.sum(rest**2) / np.sum((square - own) ** 2) == pytest.approx(share, abs=0.02)
     assert not list(overtones(steps, JOINT, DT, [push]))
+
+
+@pytest.mark.parametrize(("frequency", "seen"), [(4.0, (2, 3, 4, 5)), (6.0, (2, 3, 4)), (10.0, (2,)), (20.0, ())])
+def test_an_overtone_that_is_too_fast_to_be_seen_is_not_asked_about(frequency, seen):
+    """At 50 Hz, five times 10 Hz would be a constant."""
+    sine = EffectSpec("periodic_disturbance", "force", {"frequency": frequency, "amplitude": 1.0, "phase": 0.0})
+    model = compose(ModelSpec("joint", DT, {"mass": 2.0}, (sine,)))
+    found = list(overtones(SimpleNamespace(t=DT * np.arange(200)), model, DT, [np.ones((200, 2))]))
+    assert [len(terms) for terms in found] == ([2 * len(seen)] if seen else [])
+    assert all(np.ptp(term) > 1.0 for terms in found for term in terms)

@@ -13,7 +13,7 @@ from s2r_runtime.trace.fitting import evaluate, problem
 from s2r_runtime.trace.one_stretch import _once, in_one_stretch
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.slots import Added
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.tracer import _with_time, trace
 
 DT, HOLD = 0.05, 20
 UNICYCLE = compose(ModelSpec("unicycle", DT))
@@ -81,3 +81,11 @@ def test_the_answer_says_that_a_name_may_be_about_that_time(monkeypatch):
         found = trace(data, UNICYCLE)
         assert [(e.name, e.channel) for e in found.effects] == [("input_saturation", "w")]
         assert ("time" in found.may_depend_on) == ("time" in found.depends_on) == once
+
+
+def test_what_is_left_beyond_doubt_is_no_less_sure_for_a_name_from_one_stretch():
+    found = trace(_limited((3, 11, 22, 34)), UNICYCLE)
+    left = replace(found, depends_on=("time",))
+    assert "structure" in _with_time(left).text()
+    assert _with_time(left).may_depend_on == ()
+    assert _with_time(found).may_depend_on == ("time",)

@@ -181,6 +181,15 @@ def test_the_same_thing_under_another_name_is_no_rival(results):
         assert page.html().count("the same thing on this model") == 1
 
 
+@pytest.mark.parametrize("left", [(), ("noise",)])
+def test_a_page_says_of_what_a_name_may_depend_on_no_more_than_that(results, left):
+    told = {**results["traced"].to_json(), "depends_on": [*left, "time"], "may_depend_on": ["time"]}
+    page = Page("", "")
+    add_trace(page, told)
+    assert "something may depend on time: look at the name again" in page.html()
+    assert [line for line in ("depends on: noise", "depends on: time") if line in page.html()] == ["depends on: noise"][: len(left)]
+
+
 def _fields(result):
     return {name: getattr(result, name) for name in type(result).__dataclass_fields__}
 

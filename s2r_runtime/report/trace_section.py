@@ -36,8 +36,11 @@ def add_trace(page: Page, trace: dict[str, Any]) -> None:
     shared = trace.get("any_shape_of", [])
     if shared:
         page.text(f"Or anything else that depends on {' and '.join(shared)}: where so many do alike, one without a name may, too.")
-    if left := [token for token in trace["depends_on"] if token not in shared]:
+    beside = trace.get("may_depend_on", [])
+    if left := [token for token in trace["depends_on"] if token not in {*shared, *beside}]:
         page.text("What is left depends on: " + ", ".join(left), "warn")
+    if beside:
+        page.text(f"Less sure, but something may depend on {', '.join(beside)}: look at the name again.", "warn")
     _faults(page, trace["faults"])
     # what no dictionary took up of a structure without a name is still in it
     _errors(page, trace["error"], "noise alone" if trace["verdict"] != "unexplained" else "noise as estimated")

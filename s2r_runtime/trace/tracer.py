@@ -183,7 +183,9 @@ def _in_order(structure: Structure, verdict: str) -> tuple[str, ...]:
 
 
 def _with_time(result: TraceResult) -> TraceResult:
-    """With the time last among what names may depend on."""
+    """With the time last among what names may depend on, unless it is told already: what is left beyond doubt is not less sure by that."""
+    if "time" in result.depends_on:
+        return result
     left, beside = (tuple(dict.fromkeys((*tokens, "time"))) for tokens in (result.depends_on, result.may_depend_on))
     return replace(result, depends_on=left, may_depend_on=beside)
 
