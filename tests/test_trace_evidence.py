@@ -17,7 +17,7 @@ from s2r_runtime.trace.faults import check
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem, refine
 from s2r_runtime.trace.lack_of_fit_terms import LINE, dictionaries, line, quieter
 from s2r_runtime.trace.leftover import Leftover
-from s2r_runtime.trace.residual import Steps, acting, residual, steps_of
+from s2r_runtime.trace.residual import acting, residual, steps_of
 from s2r_runtime.trace.residual_noise import Noise, quantum
 from s2r_runtime.trace.scores import STRICT, Scored, limited, names
 from s2r_runtime.trace.slots import Added

@@ -401,7 +401,7 @@ def _belongs(data: Dataset, model: ComposedModel) -> None:
 
 def _measured(data: Dataset) -> None:
     """Raises NotEnoughEvidence if hardly any two rows on end have all states."""
-    there = [~np.isnan(run.y).any(axis=1) for run in data.runs]
+    there = [np.asarray(np.isfinite(run.y).all(axis=1)) for run in data.runs]
     usable = sum(int(np.count_nonzero(row[1:] & row[:-1])) for row in there)
     if usable < FEWEST:
         raise _too_few(data, usable)
