@@ -87,7 +87,7 @@ def test_friction_is_linearised_as_it_is():
     """df/dx of v' = a - c v - f sign(v) away from rest, and where it is held."""
     model = composed("joint", ("viscous_friction", "qd", {"coefficient": 3.0}), ("coulomb_friction", "qd", {"force": 0.5}), mass=1.0)
     y = np.array([[0.0, 1.0], [0.1, -0.7], [0.3, 0.001], [0.0, 0.4]])
-    data = from_arrays(model, [(y, np.zeros((4, 1)))])
+    data = from_arrays(model, [(y, np.zeros((3, 1)))])
     steps = steps_of(data)
     f = state_jacobian(model, steps, acting(model, data))
     keep = np.exp(-3.0 * DT)

@@ -155,13 +155,6 @@ def test_two_effects_that_foretell_no_better_what_was_not_fitted_are_not_taken(t
     assert found.verdict == "unexplained"
 
 
-def test_a_limit_that_is_met_oftener_where_nothing_is_fitted_is_found(tmp_path):
-    """In closed loop, for some steps: rollouts show it on what was held out alone."""
-    found = _traced(tmp_path, "one", 150023)
-    assert found.verdict == "traced"
-    assert {(e.name, e.channel) for e in found.effects} == {("input_saturation", "ay")}
-
-
 @pytest.mark.parametrize(("ratios", "taken"), [([1.3], 1.0), ([1.0, 1.4], 1.0), ([1.4], 1.96), ([1.0, 2.0], 4.0), ([], 1.0)])
 def test_scores_of_ten_blocks_scatter_by_as_much_as_chance_makes_them(ratios, taken):
     """Of one number, 1.35 times in one of 20 recordings; of two, 1.43 times."""

@@ -162,24 +162,19 @@ def against_rivals(given: Problem, chosen: Selection, bar: Bar) -> Selection:
     return replace(chosen, fit=fit, rivals=tuple(found))
 
 
-def one_more(
-    given: Problem, chosen: Selection, horizon: int, foretells: Callable[[Fit, Fit], float], helps: Callable[[Fit, Fit], bool]
-) -> Selection:
+def one_more(given: Problem, chosen: Selection, horizon: int, foretells: Callable[[Fit, Fit], float]) -> Selection:
     """With an effect besides that falls short of what is needed on what was fitted, but not on all of the recording. foretells: nats by
     which one model foretells what was not fitted better than another one does: the probability of both parts is that of one times that
-    of the other, given the first, so they add. helps: whether rollouts of what was not fitted are better by one than by another: what a
-    robot was asked for once or twice, too seldom to be sure of, may show in those alone.
+    of the other, given the first, so they add. It counts for no more than the fit does.
     """
     fit = chosen.fit
     if len(fit.added) >= MOST or crowded(fit):
         return chosen
     for s in best_candidates(given, fit)[0][:CLOSE_BY]:
-        needed = 0.0 if s.fit is None else STRICT.needed(chosen.tried, s.fit.k - fit.k, len(given.steps))
-        if s.fit is None or crowded(s.fit) or gain(s.fit, fit) < SHORT * needed:
+        if s.fit is None or crowded(s.fit) or gain(s.fit, fit) < SHORT * STRICT.needed(chosen.tried, s.fit.k - fit.k, len(given.steps)):
             continue
-        ahead = foretells(s.fit, fit)
-        seldom = helps if gain(s.fit, fit) <= needed else None  # where it is clear what it does, that shows there or not at all
-        if ahead > 0.0 and accepted(given, s.fit, fit, chosen.tried, horizon, ahead=ahead, elsewhere=seldom):
+        ahead = min(foretells(s.fit, fit), gain(s.fit, fit))
+        if ahead > 0.0 and accepted(given, s.fit, fit, chosen.tried, horizon, ahead=ahead):
             more, found = overtaken(given, plainly(given, _doing_something(given, fitted(given, s.fit, s.fit.model))), STRICT)
             return replace(chosen, fit=more, rivals=tuple(found))
     return chosen
@@ -205,24 +200,15 @@ def crowded(fit: Fit) -> bool:
     return any(channels.count(c) + channels.count("*") * (c != "*") > MOST_ON_ONE for c in channels)
 
 
-def accepted(
-    given: Problem,
-    fit: Fit,
-    base: Fit,
-    tried: int,
-    horizon: int,
-    bar: Bar = STRICT,
-    ahead: float = 0.0,
-    elsewhere: Callable[[Fit, Fit], bool] | None = None,
-) -> bool:
-    """Significant and relevant. ahead: nats by which it foretells better what was not fitted; elsewhere: whether it is relevant there."""
+def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int, bar: Bar = STRICT, ahead: float = 0.0) -> bool:
+    """Significant and relevant. ahead: nats by which it foretells better what was not fitted."""
     return (
         limited(fit)
         and significant(given, fit, base, tried, bar, ahead)
         and _told_by_stamps(given, fit, base)
         and _beyond_rounding(given, fit, base)
         and happens(given, fit)
-        and (relevant(given, fit, base, horizon, bar) or (elsewhere is not None and elsewhere(fit, base)))
+        and relevant(given, fit, base, horizon, bar)
     )
 
 
@@ -265,15 +251,14 @@ def _beyond_rounding(given: Problem, fit: Fit, base: Fit) -> bool:
 
 def significant(given: Problem, fit: Fit, base: Fit, tried: int, bar: Bar = STRICT, ahead: float = 0.0) -> bool:
     """Beyond chance, everything tried paid for, and not by one step alone: that may be the error of a stamp. The gain shrunk by how
-    much more than white noise the scores of blocks scatter. ahead: as in `accepted`; against noise that wanders, and goes on to do so,
-    it counts for no more than the fit does.
+    much more than white noise the scores of blocks scatter.
     """
     needed = bar.needed(tried, fit.k - base.k, len(given.steps))
     reached = gain(fit, base) + ahead
     each = noises.log_density(fit.z).sum(axis=1) - noises.log_density(base.z).sum(axis=1)
     if reached - max(float(np.max(each, initial=0.0)), 0.0) <= needed:
         return False
-    if reached > needed and not _beyond_wandering(given, fit, base, needed - min(ahead, reached - ahead)):
+    if reached > needed and not _beyond_wandering(given, fit, base, needed - ahead):
         return False
     if reached <= needed or reached > WIDEST**2 * needed or not fit.free:
         return reached > needed

@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.about import about_states
 from s2r_runtime.trace.changes import rivals_that_happen
 from s2r_runtime.trace.errors import Held, Judged, better, displacement, rollout_starts_of
@@ -31,7 +30,6 @@ from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import Mask, acting, first_steps, predicted, rms
 from s2r_runtime.trace.residual_noise import OUTLIER
 from s2r_runtime.trace.rivals import representative, tied
-from s2r_runtime.trace.scores import STRICT
 from s2r_runtime.trace.selection import Selection, one_more
 from s2r_runtime.trace.slots import slots_of
 
@@ -107,13 +105,7 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
 
 def foretold_too(given: Problem, chosen: Selection, judged_on: Held, horizon: int) -> Selection:
     """With an effect besides that only all of the recording shows."""
-    return one_more(
-        given,
-        chosen,
-        horizon,
-        lambda fit, base: _not_by_one_step(judged_on, base, fit),
-        lambda fit, base: better(judged_on, fit.model, base.model, STRICT.share),
-    )
+    return one_more(given, chosen, horizon, lambda fit, base: foretelling(judged_on, [base, fit])[1])
 
 
 def foretelling(judged_on: Held, fits: list[Fit]) -> list[float]:
@@ -124,16 +116,6 @@ def foretelling(judged_on: Held, fits: list[Fit]) -> list[float]:
     there = [None if foretold(here, one.model) is None else evaluate(here, one.model) for one in fits]
     first = there[0]
     return [0.0 if first is None else -math.inf if one is None else gain(one, first) for one in there]
-
-
-def _not_by_one_step(judged_on: Held, base: Fit, fit: Fit) -> float:
-    """Nats by which a fit foretells what is held out better than another one, less those of the one step that says most: it may be off."""
-    nats = foretelling(judged_on, [base, fit])[1]
-    if nats <= 0.0:
-        return nats
-    here = problem(judged_on.data, judged_on.steps)
-    with_it, without = (noises.log_density(evaluate(here, one.model).z).sum(axis=1) for one in (fit, base))
-    return nats - max(float(np.max(with_it - without)), 0.0)
 
 
 def _holds(judged_on: Held, fit: Fit, less: Fit, place: int) -> bool:
