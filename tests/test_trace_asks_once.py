@@ -16,7 +16,7 @@ from s2r_runtime.models.double_integrator import DoubleIntegrator
 from s2r_runtime.models.file_model import FileModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import fitting, lack_of_fit, residual, scores, selection
+from s2r_runtime.trace import fitting, lack_of_fit, relevance, residual, scores
 from s2r_runtime.trace.chains import Inputs
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import Held, noise_floor
@@ -253,11 +253,11 @@ def test_what_a_field_is_beyond_other_noise_is_not_asked_where_no_rollout_shows_
 
 def test_candidates_are_held_against_what_one_model_foretells(monkeypatch):
     given, fit = _given()
-    base, asked, errors = evaluate(given, without(fit.model, 0)), [], selection._held_out_errors
-    monkeypatch.setattr(selection, "_held_out_errors", lambda given, of, *rest: (asked.append(of), errors(given, of, *rest))[1])
+    base, asked, errors = evaluate(given, without(fit.model, 0)), [], relevance._held_out_errors
+    monkeypatch.setattr(relevance, "_held_out_errors", lambda given, of, *rest: (asked.append(of), errors(given, of, *rest))[1])
     other = fitted(
         given, base, insert(base.model, AppliedEffect(registry().get("effects", "viscous_friction"), "vy", {"coefficient": 0.1}), 0)
     )
-    told = [selection.relevant(given, one, base, 20) for one in (other, fit, other)]
+    told = [relevance.relevant(given, one, base, 20) for one in (other, fit, other)]
     assert told == [False, True, False]
     assert len([of for of in asked if of is base]) == len([of for of in asked if of is other]) == 3  # one a length of rollouts

@@ -9,7 +9,7 @@ from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recor
 from s2r_runtime.models.composed import AppliedEffect, compose, wrap
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import fitting, scores, selection
+from s2r_runtime.trace import exchange, fitting, scores
 from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
 from s2r_runtime.trace.evidence import RIDGES, evidence, margin
@@ -283,8 +283,8 @@ def test_an_exchange_never_takes_out_what_the_user_declared(monkeypatch):
         other = evaluate(given, insert(base.model, effect("input_bias", "ay", {"bias": 0.0}), len(base.model.effects)))
         return [Scored("input_bias", "ay", 1e9, replace(other, white=1e9, coloured=1e9))][: len(asked) == 1], 1
 
-    monkeypatch.setattr(selection, "best_candidates", best)
-    after = selection.exchanged(given, evaluate(given, there), STRICT)
+    monkeypatch.setattr(exchange, "best_candidates", best)
+    after = exchange.exchanged(given, evaluate(given, there), STRICT)
     assert [a.effect.name for a in after.model.effects] == ["input_gain", "input_lag", "input_bias", "input_bias"]
     assert asked == [
         [("input_gain", "ay"), ("input_lag", "ax"), ("input_bias", "ax")],
@@ -384,6 +384,6 @@ def test_what_never_happens_takes_no_place_of_a_gain(monkeypatch):
     late = Added(registry().get("effects", "regime_change"), "w", {"time": 0.01, "gain": 0.8})
     fit = evaluate(given, replace(model, effects=tuple(gains)))
     other = evaluate(given, replace(model, effects=(gains[1], late)))
-    monkeypatch.setattr(selection, "best_candidates", lambda *asked: ([Scored("regime_change", "w", 1.0, other)], 1))
-    monkeypatch.setattr(selection, "gain", lambda one, base: 1000.0 if one is other else 0.0)
-    assert selection.exchanged(given, fit, STRICT) is fit
+    monkeypatch.setattr(exchange, "best_candidates", lambda *asked: ([Scored("regime_change", "w", 1.0, other)], 1))
+    monkeypatch.setattr(exchange, "gain", lambda one, base: 1000.0 if one is other else 0.0)
+    assert exchange.exchanged(given, fit, STRICT) is fit

@@ -18,10 +18,11 @@ from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.hidden_pairs import TAKEN, _nats, _nats_beside, _nats_of_spans, _span, _together, two_together
 from s2r_runtime.trace.leftover import Leftover
+from s2r_runtime.trace.relevance import _edges, relevant
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.scores import best_candidates, names
 from s2r_runtime.trace.screening import probes_of, screen
-from s2r_runtime.trace.selection import Selection, _doing_something, _edges, relevant
+from s2r_runtime.trace.selection import Selection, _doing_something
 from s2r_runtime.trace.slots import Added
 
 JOINT, WHEELS = ModelSpec("joint", DT, {"mass": 1.0}, ()), ModelSpec("differential_drive", DT, {}, ())

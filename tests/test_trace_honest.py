@@ -15,6 +15,7 @@ from s2r_runtime.report.trace_page import trace_page
 from s2r_runtime.trace import lack_of_fit as lack_of_fit_of
 from s2r_runtime.trace import verdict
 from s2r_runtime.trace.about import about_states
+from s2r_runtime.trace.acceptance import significant
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import held, judge, noise_floor
 from s2r_runtime.trace.faults import Checked
@@ -24,7 +25,6 @@ from s2r_runtime.trace.lack_of_fit import Looks, Structure, _weight_of, left_of
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.residual_noise import MEMORIES
-from s2r_runtime.trace.selection import significant
 from s2r_runtime.trace.tracer import trace
 from s2r_runtime.trace.verdict import foretells, misses
 from s2r_runtime.trace.whole import Whole

@@ -12,10 +12,10 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
+from s2r_runtime.trace.exchange import parted
 from s2r_runtime.trace.fitting import evaluate, fitted, problem
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.scores import STRICT
-from s2r_runtime.trace.selection import parted
 from s2r_runtime.trace.slots import Added
 from s2r_runtime.trace.tracer import trace
 

@@ -11,6 +11,7 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import coarse, grid_errors
+from s2r_runtime.trace.acceptance import WITHIN, _beyond_rounding
 from s2r_runtime.trace.dataset import Run, from_arrays, from_streams
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem, sensitivities, told
 from s2r_runtime.trace.grid_errors import widened
@@ -20,7 +21,6 @@ from s2r_runtime.trace.orders import in_either_order
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.residual_noise import Colour, no_colour, no_steadier
 from s2r_runtime.trace.retimed import retimed
-from s2r_runtime.trace.selection import WITHIN, _beyond_rounding
 from s2r_runtime.trace.slots import Slot, bounds_of, values_of
 from s2r_runtime.trace.streams import Stream
 

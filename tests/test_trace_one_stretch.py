@@ -8,12 +8,13 @@ import pytest
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace import whole
+from s2r_runtime.trace.answer import with_time
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, problem
 from s2r_runtime.trace.one_stretch import _once, in_one_stretch
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.slots import Added
-from s2r_runtime.trace.tracer import _with_time, trace
+from s2r_runtime.trace.tracer import trace
 
 DT, HOLD = 0.05, 20
 UNICYCLE = compose(ModelSpec("unicycle", DT))
@@ -86,6 +87,6 @@ def test_the_answer_says_that_a_name_may_be_about_that_time(monkeypatch):
 def test_what_is_left_beyond_doubt_is_no_less_sure_for_a_name_from_one_stretch():
     found = trace(_limited((3, 11, 22, 34)), UNICYCLE)
     left = replace(found, depends_on=("time",))
-    assert "structure" in _with_time(left).text()
-    assert _with_time(left).may_depend_on == ()
-    assert _with_time(found).may_depend_on == ("time",)
+    assert "structure" in with_time(left).text()
+    assert with_time(left).may_depend_on == ()
+    assert with_time(found).may_depend_on == ("time",)

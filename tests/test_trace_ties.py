@@ -8,7 +8,8 @@ from trace_sets.families import make
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import tracer
+from s2r_runtime.trace import second_look
+from s2r_runtime.trace.acceptance import _scattered
 from s2r_runtime.trace.any_shape import any_shape_of
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import Judged, held
@@ -16,7 +17,7 @@ from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.rivals import SURELY, rivals, simplified, tied
 from s2r_runtime.trace.scores import Scored, _search, names, unlimited
-from s2r_runtime.trace.selection import Selection, _scattered
+from s2r_runtime.trace.selection import Selection
 from s2r_runtime.trace.tracer import load_dataset, trace
 from s2r_runtime.trace.verdict import confirmed, harms
 
@@ -149,7 +150,7 @@ def test_the_second_of_two_effects_is_found(tmp_path, seed, names):
 
 def test_two_effects_that_foretell_no_better_what_was_not_fitted_are_not_taken(tmp_path, monkeypatch):
     """However little structure they leave."""
-    monkeypatch.setattr(tracer, "foretelling", lambda judged_on, fits: [0.0] + [-1.0] * (len(fits) - 1))
+    monkeypatch.setattr(second_look, "foretelling", lambda judged_on, fits: [0.0] + [-1.0] * (len(fits) - 1))
     found = _traced_pair(tmp_path, 20014)
     assert not found.effects
     assert found.verdict == "unexplained"

@@ -3,9 +3,9 @@
 import pytest
 
 from s2r_runtime.trace import whole
+from s2r_runtime.trace.answer import _in_order
 from s2r_runtime.trace.challenge import Better
 from s2r_runtime.trace.lack_of_fit import Structure
-from s2r_runtime.trace.tracer import _in_order
 
 
 def test_what_is_left_comes_first_where_no_name_is_given():

@@ -23,13 +23,13 @@ import numpy as np
 
 from s2r_runtime.hookspecs import Effect
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
+from s2r_runtime.trace.acceptance import accepted
 from s2r_runtime.trace.begun import begun, measured
 from s2r_runtime.trace.candidates import Candidate
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, without
 from s2r_runtime.trace.residual import acting, covered, first_steps, rms, rollout, rollout_starts
 from s2r_runtime.trace.scores import at_first_look
 from s2r_runtime.trace.screening import screen
-from s2r_runtime.trace.selection import accepted
 from s2r_runtime.trace.shapes import SHAPES, Shape
 from s2r_runtime.trace.slots import bounds_of, values_of
 

@@ -109,9 +109,9 @@ class Structure:
 
     share: part of all that the nominal model lacks which is still left (0 where there is nothing). gains: nats by group. nameless: what
     was named looks more like something that has no name (`challenge`). for_a_while: it comes and goes (`episodes`). varies: it is a
-    field (`fields`). beside: what it may depend on besides, which no rollout shows. noise: what would be left beside the structure, and
-    its colour; None where there is none that matters. nats: of what comes
-    and goes, or of a field.
+    field (`fields`), or a number of what was named that varies (`constancy`). beside: what it may depend on besides, which no rollout
+    shows. noise: what would be left beside the structure, and its colour; None where there is none that matters. nats: of what comes and
+    goes, or varies.
     """
 
     tokens: tuple[str, ...]

@@ -1,0 +1,102 @@
+"""Where something is left by what was found, the library is asked once more, with what is left in view."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.trace.beginning import with_history
+from s2r_runtime.trace.dataset import Dataset, in_finer_parts
+from s2r_runtime.trace.errors import Held, judge, noise_floor
+from s2r_runtime.trace.faults import check
+from s2r_runtime.trace.fitting import Problem, fitted
+from s2r_runtime.trace.hidden_pairs import two_together
+from s2r_runtime.trace.lack_of_fit import Structure
+from s2r_runtime.trace.retimed import dated
+from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, Scored, names
+from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded
+from s2r_runtime.trace.verdict import confirmed, foretelling, takes_far
+from s2r_runtime.trace.whole import Whole
+
+
+def finer(dataset: Dataset, model: ComposedModel, chosen: Selection, ahead: int) -> int | None:
+    """Parts of a step in which nothing is left by what was found, or by the model as given, if there are such: then it is what inputs do
+    within the parts there are. Of what they do a part has the mean, and a position more.
+    """
+    data = in_finer_parts(dataset, model)
+    if data is None:
+        return None
+    checked = check(model, with_history(model, data))
+    whole = Whole(checked, model, ahead)
+    nominal = whole.nominal
+    fit = nominal if not chosen.fit.added else fitted(whole.given, nominal, chosen.fit.model)
+    return None if whole.structure(replace(chosen, nominal=nominal, fit=fit)).matters else data.substeps
+
+
+def astray(chosen: Selection, structure: Structure, judged_on: Held, seed: int) -> bool:
+    """Whether what is left beside names is no noise, although it looks like noise step by step. Where nothing was named, a second look
+    with a lower bar would name what wanders by itself.
+    """
+    if not chosen.fit.added or structure.tokens != ("noise",):  # as it mostly is: no need for rollouts
+        return False
+    judged = judge(chosen.nominal.model, judged_on), judge(chosen.fit.model, judged_on)
+    return takes_far(chosen, structure, judged, judged_on, noise_floor(chosen.fit, judged_on, seed)[1])
+
+
+def once_more(
+    given: Problem, whole: Whole, chosen: Selection, structure: Structure, judged_on: Held, ahead: int
+) -> tuple[Selection, Structure]:
+    """Where structure is left, or a shape without a name is likelier than what was named, something is there: a rival that leaves nothing;
+    or two effects together that do, coloured noise neither (two take up a part of anything, and the rest looks like that); or what is
+    found with a lower bar, if that leaves nothing. What was not fitted must be foretold no worse. Each is challenged by shapes, too.
+    """
+    refused = {names(chosen.fit.model)}
+    complete = [(s, rest) for s in chosen.rivals if (rest := _left_by(whole, chosen, s, structure, refused)) is not None]
+    for best, rest in sorted(complete, key=lambda pair: pair[0].score, reverse=True):  # what ties, and leaves nothing, is more than that
+        if best.fit is not None and foretelling(judged_on, [chosen.fit, best.fit])[1] >= 0.0:
+            fit = dated(given, whole.given, best.fit)
+            return replace(chosen, fit=fit, rivals=tuple(s for s, _ in complete if s is not best)), rest
+    pair = two_together(given, chosen, lambda fits: foretelling(judged_on, fits))
+    if pair is not None:  # a change between the parts that are fitted is anywhere there: its time is told by all of the recording
+        pair = replace(pair, fit=dated(given, whole.given, pair.fit))
+    told = None if pair is None else _all_explained(whole, pair, structure, refused)
+    for bar, before, may_be_left in (
+        (STRICT, pair if told is not None and not told.tokens else None, set()),
+        (LENIENT if chosen.fit.added else ALONE, chosen, {"noise"}),
+    ):
+        if before is None:
+            continue
+        alone = called_for(given, chosen.nominal.model, ahead, lambda share: None, bar, before)
+        rest = _all_explained(whole, alone, structure, refused)
+        if rest is None or not {*rest.tokens} <= may_be_left:  # as it mostly is: no need to ask for rivals
+            continue
+        other = against_rivals(given, alone, bar)
+        other = confirmed(given, replace(other, fit=dated(given, whole.given, other.fit)), judged_on)
+        if other.fit is not alone.fit:
+            rest = _all_explained(whole, other, structure, refused)
+        if rest is None or not {*rest.tokens} <= may_be_left:
+            continue
+        if foretelling(judged_on, [chosen.fit, other.fit])[1] >= 0.0:
+            return other, rest
+    return chosen, structure
+
+
+def _left_by(
+    whole: Whole, chosen: Selection, rival: Scored, structure: Structure, refused: set[tuple[tuple[str, str], ...]]
+) -> Structure | None:
+    """What is left by a rival of what was chosen, as far as it is noise; None if it is more."""
+    rest = None if rival.fit is None else _all_explained(whole, replace(chosen, fit=rival.fit, rivals=()), structure, refused)
+    return rest if rest is not None and {*rest.tokens} <= {"noise"} else None
+
+
+def _all_explained(whole: Whole, other: Selection, structure: Structure, refused: set[tuple[tuple[str, str], ...]]) -> Structure | None:
+    """What another selection leaves, if it shows in no rollout; None if it does. refused: effects that were asked about and leave more.
+    structure: what was left before: that is asked for first, as it mostly still is there.
+    """
+    if names(other.fit.model) in refused or crowded(other.fit):
+        return None
+    rest = None if whole.still(other, structure) else whole.structure(other)
+    if rest is not None and not rest.matters:
+        return rest
+    refused.add(names(other.fit.model))
+    return None
