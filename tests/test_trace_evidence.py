@@ -334,7 +334,7 @@ def test_a_rival_that_explains_clearly_more_takes_the_place_of_what_was_found():
     lag = AppliedEffect(registry().get("effects", "input_lag"), "w", {"time_constant": 0.1})
     nominal = evaluate(given, model)
     first = fitted(given, nominal, insert(model, lag, 0))
-    found, rivals = selection.overtaken(given, first, STRICT)
+    found, rivals = exchange.overtaken(given, first, STRICT)
     assert [(found.model.effects[i].effect.name, found.model.effects[i].channel) for i in found.added] == [("input_delay", "w")]
     assert found.white > first.white + 10.0
     assert ("input_lag", "w") not in {(s.name, s.channel) for s in rivals}
