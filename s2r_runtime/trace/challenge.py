@@ -6,10 +6,11 @@ of the recording, noise re-estimated for each, the smaller of white and coloured
     shape wins     L(shape) - L(named) > log(tried / ALPHA) + the price of numbers that it has more than they,
                    and by LITTLE of all that the named effects explain
     it shows       by MORE of that, and some rollout's error is lower by LOWER
+    it is told     L(shape) - L(named) > log(tried / TOLD) + the same price, and by LITTLE
 
 A name that loses to a shape that shows is not given: the recording does not look like what it means. Beside one that loses to a shape that
-does not, what the shape depends on is told: the repair is as good, and the name may be wrong. A shape that has the named effect in it (two
-lags that are alike) costs a name nothing, as it explains no more.
+does not, or is behind one that is only told, what the shape depends on is told: the repair is as good, and the name may be wrong. A shape
+that has the named effect in it (two lags that are alike) costs a name nothing, as it explains no more.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ from s2r_runtime.trace.screening import screen
 from s2r_runtime.trace.shapes import SHAPES, Shape
 from s2r_runtime.trace.slots import bounds_of, values_of
 
-ALPHA = 1e-3
-"""Chance that a shape wins against the truth, as far as the likelihood is right."""
+ALPHA, TOLD = 1e-3, 0.05
+"""Chances that a shape wins against the truth, as far as the likelihood is right, and that it is told beside it."""
 
 MORE = 0.05
 """Of what is explained: less than this is how any model differs from any robot."""
@@ -66,8 +67,8 @@ SECONDS = ("out", "back", "up", "down", "small", "large", "time_constant")
 
 @dataclass(frozen=True)
 class Better:
-    """A shape that does. nats: beyond the model without anything on that input, its numbers paid for. shows: in some rollout, beside the
-    effects that were named.
+    """A shape that does. nats: beyond the model without anything on that input, its numbers paid for. shows: it wins, and in some rollout,
+    too, beside the effects that were named.
     """
 
     token: str
@@ -76,7 +77,7 @@ class Better:
 
 
 def better_shape(given: Problem, fit: Fit, horizon: int) -> Better | None:
-    """The shape that explains most beyond the effects named on its input, of those that show, if any do; None if none wins."""
+    """The shape that explains most beyond the effects named on its input, of those that show, if any do; None if none is told."""
     won = [found for channel in _inputs(fit) for found in [_challenge(given, fit, channel, horizon)] if found is not None]
     return max(won, key=lambda better: (better.shows, better.nats), default=None)
 
@@ -108,9 +109,9 @@ def _challenge(given: Problem, fit: Fit, channel: str, horizon: int) -> Better |
     won: list[Better] = []
     for shape in _fits(given, base, channel, REACHES * at_first_look(given, fit, base), _times(fit, channel), _plays(fit, channel)):
         ahead = gain(shape, base) - here
-        needed = max(_price(given, shape, fit), 0.0) + math.log(len(SHAPES) / ALPHA)
-        if ahead > max(needed, LITTLE * here):
-            shows = ahead > MORE * here and _lower(given, fit, shape, horizon)
+        beyond = ahead - max(_price(given, shape, fit), 0.0)
+        if beyond > math.log(len(SHAPES) / TOLD) and ahead > LITTLE * here:
+            shows = beyond > math.log(len(SHAPES) / ALPHA) and ahead > MORE * here and _lower(given, fit, shape, horizon)
             won.append(Better(_token(shape), gain(shape, base) - _price(given, shape, base), shows))
     return max(won, key=lambda better: (better.shows, better.nats), default=None)
 

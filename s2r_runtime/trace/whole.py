@@ -18,7 +18,6 @@ from s2r_runtime.trace.holdout import part
 from s2r_runtime.trace.lack_of_fit import (
     ALIKE,
     MORE,
-    NOTHING,
     Looks,
     Structure,
     as_told,
@@ -107,9 +106,6 @@ class Whole:
         found = lack_of_fit(looks, self.nominal, self._horizon)
         if crowded(fit) or self._patchwork(fit):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
-        quiet = looks.most <= NOTHING and not found.matters  # what explained more than a name would explain something beside it
-        if quiet and not _twice(fit):
-            return found
         if (looks.most > ALIKE or found.matters) and self._explained_without(fit, looks.left, found):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
         if found.matters and self._bent(found, fit):
@@ -195,9 +191,3 @@ class Whole:
     def _shape(self) -> Better | None:
         """The shape that explains most of it."""
         return best_shape(self.given, self.nominal, self._horizon)
-
-
-def _twice(fit: Fit) -> bool:
-    """Whether two effects were named on one input: they may be one thing that has no name, and leave nothing of it."""
-    channels = [fit.model.effects[i].channel for i in fit.added if fit.model.effects[i].effect.stage == "input"]
-    return len({*channels}) < len(channels)
