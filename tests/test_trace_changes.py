@@ -1,5 +1,7 @@
 """A change that may as well have been there from the beginning is none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,8 @@ from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.scores import STRICT, Scored, name_of
+from s2r_runtime.trace.selection import Selection, all_dated
+from s2r_runtime.trace.slots import Added
 
 DT_S, STANDS, CHANGED_S = 0.1, 40, 30.0
 
@@ -85,3 +89,27 @@ def test_a_change_before_the_robot_moves_is_no_rival(monkeypatch):
     ]
     monkeypatch.setattr(changes, "rivals", lambda given, fit: others)
     assert rivals_that_happen(given, gain.fit) == others[1:]
+
+
+def test_a_rival_is_dated_as_what_was_chosen_is():
+    """Between what is fitted nobody can tell one time from another; all of the recording can, and told of one only, that foretells it."""
+    rng = np.random.default_rng(5)
+    model = compose(ModelSpec("unicycle", 0.02))
+    u = np.repeat(rng.uniform([0.1, -0.8], [0.5, 0.8], (30, 2)), 20, axis=0)
+    x, rows = np.zeros((1, 3)), [np.zeros(3)]
+    for k, row in enumerate(u):
+        x = model.nominal.step(x, row[None] * (0.6 if k >= 285 else 1.0), 0.02, model.parameters)
+        rows.append(x[0])
+    data = from_arrays(model, [(np.array(rows) + rng.normal(size=(601, 3)) * [1e-3, 1e-3, 3e-3], u)])
+    steps = steps_of(data)
+    given, everything = problem(data, steps.take(np.r_[:240, 360:600])), problem(data, steps)
+    change = registry().get("effects", "regime_change")
+    fits = [
+        fitted(given, evaluate(given, model), replace(model, effects=(Added(change, channel, {"time": 6.5, "gain": 0.6}),)))
+        for channel in ("w", "*")
+    ]
+    chosen = Selection(evaluate(given, model), fits[0], 1, (), (Scored("regime_change", "*", 1.0, fits[1]),))
+    dated = all_dated(given, everything, chosen)
+    for fit in (dated.fit, dated.rivals[0].fit):
+        assert fit.model.effects[0].p["time"] == pytest.approx(5.7, abs=0.2)
+    assert fits[1].model.effects[0].p["time"] == pytest.approx(6.5, abs=0.1)

@@ -14,7 +14,7 @@ from s2r_runtime.trace.hidden_pairs import two_together
 from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.retimed import dated
 from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, Scored, names
-from s2r_runtime.trace.selection import Selection, against_rivals, called_for, crowded
+from s2r_runtime.trace.selection import Selection, against_rivals, all_dated, called_for, crowded
 from s2r_runtime.trace.verdict import confirmed, foretelling, takes_far
 from s2r_runtime.trace.whole import Whole
 
@@ -71,7 +71,7 @@ def once_more(
         if rest is None or not {*rest.tokens} <= may_be_left:  # as it mostly is: no need to ask for rivals
             continue
         other = against_rivals(given, alone, bar)
-        other = confirmed(given, replace(other, fit=dated(given, whole.given, other.fit)), judged_on)
+        other = confirmed(given, all_dated(given, whole.given, other), judged_on)
         if other.fit is not alone.fit:
             rest = _all_explained(whole, other, structure, refused)
         if rest is None or not {*rest.tokens} <= may_be_left:

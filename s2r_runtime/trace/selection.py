@@ -16,6 +16,7 @@ from s2r_runtime.trace.changes import from_the_beginning
 from s2r_runtime.trace.exchange import exchanged, overtaken, parted, pruned, unbent
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, plainly, without
 from s2r_runtime.trace.friction import KINDS, with_friction
+from s2r_runtime.trace.retimed import dated
 from s2r_runtime.trace.rivals import CLOSE, simplified
 from s2r_runtime.trace.scores import STRICT, Bar, Scored, best_candidates, names, rescored
 from s2r_runtime.trace.slots import Slot, bounds_of, values_of
@@ -138,6 +139,12 @@ def _doing_something(given: Problem, fit: Fit) -> Fit:
 def _numbers(fit: Fit, place: int) -> list[tuple[Slot, float]]:
     """What was fitted of the effect at this place."""
     return [(slot, value) for slot, value in zip(fit.free, values_of(fit.model, fit.free).tolist(), strict=True) if slot.place == place]
+
+
+def all_dated(given: Problem, everything: Problem, chosen: Selection) -> Selection:
+    """With what was chosen and its rivals `dated` alike: a time that was chosen with what was held out in view foretells that better."""
+    rivals = tuple(s if s.fit is None else replace(s, fit=dated(given, everything, s.fit)) for s in chosen.rivals)
+    return replace(chosen, fit=dated(given, everything, chosen.fit), rivals=rivals)
 
 
 def crowded(fit: Fit) -> bool:

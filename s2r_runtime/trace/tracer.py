@@ -35,9 +35,8 @@ from s2r_runtime.trace.one_place import from_one_place
 from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.residual import Mask, acting, first_steps, rms, steps_of
 from s2r_runtime.trace.result import TraceResult
-from s2r_runtime.trace.retimed import dated
 from s2r_runtime.trace.second_look import astray, finer, once_more
-from s2r_runtime.trace.selection import select
+from s2r_runtime.trace.selection import all_dated, select
 from s2r_runtime.trace.straight import acted, alike_laid, changed_within, commanded, noisy, sampled, samples_of, straight, way_of
 from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import confirmed, foretold_too
@@ -140,7 +139,7 @@ def _traced(
         chosen = select(given, model, ahead, lambda share: say(60.0 + 20.0 * share, 100.0, "looking for effects"))
     whole = Whole(checked, model, ahead)
     chosen = foretold_too(given, chosen, judged_on, ahead)
-    chosen = confirmed(given, replace(chosen, fit=dated(given, whole.given, chosen.fit)), judged_on)
+    chosen = confirmed(given, all_dated(given, whole.given, chosen), judged_on)
     say(80.0, 100.0, "testing what is left")
     structure = whole.structure(chosen)
     if structure.matters or astray(chosen, structure, judged_on, seed):
