@@ -29,6 +29,7 @@ from s2r_runtime.trace.lack_of_fit import (
 )
 from s2r_runtime.trace.lack_of_fit_judged import Judged, Left
 from s2r_runtime.trace.one_stretch import in_one_stretch
+from s2r_runtime.trace.opposed import opposed
 from s2r_runtime.trace.patchwork import patchwork
 from s2r_runtime.trace.residual import first_steps
 from s2r_runtime.trace.selection import Selection, crowded
@@ -106,6 +107,8 @@ class Whole:
         found = lack_of_fit(looks, self.nominal, self._horizon)
         if crowded(fit) or self._patchwork(fit):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
+        if against := opposed(self.given, fit):
+            return replace(found, tokens=tuple(dict.fromkeys((*against, *found.tokens))), matters=True, share=1.0)
         if (looks.most > ALIKE or found.matters) and self._explained_without(fit, looks.left, found):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
         if found.matters and self._bent(found, fit):
