@@ -99,10 +99,10 @@ def significant(given: Problem, fit: Fit, base: Fit, tried: int, bar: Bar = STRI
         return reached > needed
     there = names(base.model)
     new = [i for i, slot in enumerate(fit.free) if name_of(fit.model.effects[slot.place]) not in there]
-    return reached > needed * scattered(scatter(given, fit)[new])
+    return reached > needed * _scattered(scatter(given, fit)[new])
 
 
-def scattered(ratios: Array) -> float:
+def _scattered(ratios: Array) -> float:
     """Times that scores of blocks scatter more than white noise, a ratio of variances: that of the number that does most so, 1 if chance
     alone makes one of so many as large (chi-squared, a degree of freedom a block). ratios: (k,) of standard deviations.
     """
