@@ -65,15 +65,15 @@ def _opposes(given: Problem, fit: Fit, j: int, named: list[int]) -> tuple[str, .
     own = root[:, None] * sensitivities(given, fit, fit.model, fit.free)[:, others]
     x = root[:, None] * fit.colour(fit.whiten(pushes), given.steps.joined).reshape(len(root), -1)
     r = root * objective(given, fit, bare).ravel()
-    numbers, rows = len(fit.free) - len(others), math.log(len(z))
+    numbers, price = len(fit.free) - len(others), 0.5 * math.log(len(z))
     left = _left(np.hstack([own, x]), r)
     ahead = 0.5 * (float(np.sum((root * z.ravel()) ** 2)) - left)
-    if ahead <= 0.5 * rows * (x.shape[1] - numbers) + math.log(1.0 / ALPHA):
+    if ahead <= price * (x.shape[1] - numbers) + math.log(1.0 / ALPHA):
         return ()
     gone = {token: np.delete(x, np.arange(x.shape[1])[group], axis=1) for token, group in GROUPS.items()}
     told = {token: 0.5 * (_left(np.hstack([own, rest]), r) - left) for token, rest in gone.items()}
     most = max(told.values())
-    sure = [token for token in told if told[token] > 1.5 * rows or told[token] == most]  # the price of the three terms of each
+    sure = [token for token in told if told[token] > 3.0 * price or told[token] == most]  # three terms each
     return tuple(sorted(sure, key=lambda token: -told[token]))
 
 
