@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from trace_sets.families import make
 
 from s2r_runtime.cli.main import main
 from s2r_runtime.models.composed import compose
@@ -52,6 +53,13 @@ def test_a_position_that_is_off_hides_no_late_heading():
     pose[1200:, 1] += 1.0
     found = late_pose(compose(ModelSpec("unicycle", 0.05)), [(Stream(t, pose), Stream(t, u))], ())
     assert found == {"theta": pytest.approx(4 * ROW_S, rel=0.05)}
+
+
+def test_rows_that_are_off_by_themselves_make_no_late_heading():
+    """A controller answers a position that is off, so that turns follow ways that nobody went; this car's heading seemed 0.48 s late."""
+    (run,) = make("one", 300022).recording.runs
+    t, pose = run.t, run.y[:, :3]
+    assert late_pose(compose(ModelSpec("unicycle", 0.04)), [(Stream(t, pose), Stream(t[:1], np.zeros((1, 2))))], ()) == {}
 
 
 def test_positions_that_come_late_are_told():

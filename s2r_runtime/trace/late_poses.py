@@ -61,6 +61,11 @@ APART, ROUNDS = 2.5, 3
 WILD = 5.0
 """Times the pace that is exceeded on a tenth of the rows: no motion, but a position that is off, and would say more than all others."""
 
+SPIKE, AROUND = 6.0, 2
+"""Times its usual distance from the median of the rows around (so many on either side) from which on a row is off by itself. A motion goes
+one way for longer than that; a row that is off stands at either end of two ways, which point where it is off to: as good as any slide.
+"""
+
 SHARES = (0.0, 0.2, 0.35, 0.45, 0.49)
 """Of the measurement's noise in the correlation of neighbours: -r / (q + 2 r)."""
 
@@ -122,9 +127,12 @@ class _Ways:
         self._speed = np.mean(speeds, axis=0) if speeds else None
         self._h = np.diff(self._t)
         self._unit = float(np.median(self._h))
-        self._dx, self._dy, self._theta = np.diff(x), np.diff(y), theta
+        off, turned = _spikes(np.column_stack([x, y])), _spikes(theta[:, None])
+        self._dx, self._dy = np.diff(x), np.diff(y)
+        self._theta = np.interp(self._t, self._t[~turned], theta[~turned])
         pace = np.hypot(self._dx, self._dy) / self._h
-        self._there = (self._h < APART * self._unit) & (pace <= WILD * np.quantile(pace, 0.9))
+        plain = ~(off[1:] | off[:-1])
+        self._there = plain & (self._h < APART * self._unit) & (pace <= WILD * np.quantile(pace[plain], 0.9))
         self._share = 0.0
 
     def late(self) -> float:
@@ -227,6 +235,14 @@ class _Ways:
             scale = max(math.sqrt(float(np.sum(weight * rest**2) / np.sum(weight))), 1e-300)
             weight = noises.weight(rest / scale)
         return float(np.sum(noises.log_density(rest / scale))) - len(y) * math.log(scale) - _logdet(len(y), share)
+
+
+def _spikes(values: Array) -> Mask:
+    """(n,) rows of values (n, m) that are off from those around them."""
+    padded = np.pad(values, ((AROUND, AROUND), (0, 0)), mode="edge")
+    apart = np.abs(values - np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * AROUND + 1, axis=0), axis=-1))
+    usual = np.quantile(np.abs(np.diff(values, axis=0)), 0.75, axis=0) / 1.15  # from row to row, also if it rests half of the time
+    return np.asarray(np.any((apart > SPIKE * usual) & (usual > 0.0), axis=1))
 
 
 def _peak(at: list[float], nats: list[float]) -> float:
