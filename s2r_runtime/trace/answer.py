@@ -28,7 +28,8 @@ from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.residual_noise import no_colour
 from s2r_runtime.trace.result import Found, Limit, TraceResult
 from s2r_runtime.trace.selection import Selection
-from s2r_runtime.trace.slots import Slot
+from s2r_runtime.trace.shrinkage import drawn_in
+from s2r_runtime.trace.slots import Slot, values_of
 from s2r_runtime.trace.verdict import Verdict, asked, final_fit, verdict_of, worth_its_risk
 
 Array = NDArray[np.float64]
@@ -52,13 +53,19 @@ def answered(
     there, near = given, chosen.fit
     if dataset.reconstruction is None:  # what a filter leaves has the filter's law, not the noise's
         fit, there, near = told(given, chosen.fit)
-        chosen = replace(chosen, fit=fit)
+        chosen = replace(chosen, fit=drawn_in(given, fit, there, near))
     integrals = endless(chosen.fit, lambda: widened(there, near, in_either_order(there, near)), checked.data)
     if integrals:
         structure = replace(structure, tokens=tuple(dict.fromkeys((*integrals, *structure.tokens))), matters=True, share=1.0)
     decided = _decided(dataset, checked, chosen, structure, judged_on, seed)
-    ranges = widened(there, near, in_either_order(there, near)) if decided.final is chosen.fit else {}
+    ranges = _with(chosen.fit, widened(there, near, in_either_order(there, near))) if decided.final is chosen.fit else {}
     return _recorded(dataset, checked, given, chosen, decided, ranges, judged_on, weights, kind)
+
+
+def _with(fit: Fit, ranges: dict[Slot, tuple[float, float]]) -> dict[Slot, tuple[float, float]]:
+    """The ranges, about the numbers as they are told: what was drawn in seldom leaves its own."""
+    told_as = dict(zip(fit.free, values_of(fit.model, fit.free).tolist(), strict=True))
+    return {slot: (min(low, told_as[slot]), max(high, told_as[slot])) for slot, (low, high) in ranges.items()}
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ time of a change) times the square of that ratio.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,8 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.fitting import Fit, Problem, objective, sensitivities, widening
 from s2r_runtime.trace.noise_doubt import doubted
-from s2r_runtime.trace.retimed import is_time, spread
+from s2r_runtime.trace.retimed import is_time
+from s2r_runtime.trace.retimed import spread as times_of
 from s2r_runtime.trace.slots import Free, Slot, bounds_of, values_of, with_values
 
 Array = NDArray[np.float64]
@@ -31,19 +32,41 @@ CHANGE_95 = 3.68
 BLOCKS = 20
 
 
-def intervals(given: Problem, fit: Fit) -> dict[Slot, tuple[float, float]]:
-    """(low, high) of every number that was fitted. Where the data say nothing of a parameter: its bounds."""
-    if not fit.free:
-        return {}
+@dataclass(frozen=True)
+class Spread:
+    """Of the k numbers of a fit. normal, covariance: (k, k) by Gauss-Newton; wider: (k,) times their standard deviations are larger."""
+
+    normal: Array
+    covariance: Array
+    wider: Array
+
+    @property
+    def widened(self) -> Array:
+        """(k, k) covariance that is as wide as the intervals are."""
+        return np.asarray(self.covariance * np.outer(self.wider, self.wider))
+
+
+def spread_of(given: Problem, fit: Fit) -> Spread:
+    """Of all numbers of the fit."""
     if given.floor.axes:  # as `plainly` fits
         fit = replace(fit, colour=noises.no_colour(fit.z.shape[1]))
     z = objective(given, fit, fit.model)
     j = sensitivities(given, fit, fit.model, fit.free)
     w = noises.weight(z).ravel()
     normal = j.T @ (j * w[:, None])
-    covariance = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
-    wider = widening(j * (w * z.ravel())[:, None], np.asarray(covariance), z.shape[1], BLOCKS)
-    wider = np.maximum(wider, doubted(given, fit))
+    covariance = np.asarray(np.linalg.pinv(normal, rcond=1e-12, hermitian=True))
+    wider = widening(j * (w * z.ravel())[:, None], covariance, z.shape[1], BLOCKS)
+    return Spread(normal, covariance, np.maximum(wider, doubted(given, fit)))
+
+
+def intervals(given: Problem, fit: Fit) -> dict[Slot, tuple[float, float]]:
+    """(low, high) of every number that was fitted. Where the data say nothing of a parameter: its bounds."""
+    if not fit.free:
+        return {}
+    if given.floor.axes:  # as `plainly` fits
+        fit = replace(fit, colour=noises.no_colour(fit.z.shape[1]))
+    spread = spread_of(given, fit)
+    normal, covariance, wider = spread.normal, spread.covariance, spread.wider
     found = {}
     values = values_of(fit.model, fit.free)
     for index, slot in enumerate(fit.free):
@@ -54,7 +77,7 @@ def intervals(given: Problem, fit: Fit) -> dict[Slot, tuple[float, float]]:
             drop = (CHANGE_95 if is_time(fit.model, slot) else 0.5 * NORMAL_95**2) * float(wider[index]) ** 2
             found[slot] = _profile(given, fit, index, value, s, drop, bounds.low, bounds.high)
             if is_time(fit.model, slot):
-                first, last = spread(given, fit, slot, drop)
+                first, last = times_of(given, fit, slot, drop)
                 found[slot] = min(found[slot][0], first), max(found[slot][1], last)
         else:
             found[slot] = float(max(value - NORMAL_95 * s, bounds.low)), float(min(value + NORMAL_95 * s, bounds.high))
