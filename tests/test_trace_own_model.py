@@ -8,6 +8,7 @@ from test_trace_first_look import _alike
 
 from s2r_runtime.effects.classes import same
 from s2r_runtime.errors import NotEnoughEvidence
+from s2r_runtime.models.bound import integrating, steps_coarsely
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
@@ -363,3 +364,82 @@ def test_a_rollout_from_nowhere_goes_nowhere_whatever_a_model_says_to_no_rows(tm
     model = compose(ModelSpec(str(path), 0.1))
     act = Acting(np.zeros((5, 1)), np.zeros((5, 1)))
     assert wherever(model, np.zeros((0, 1)), act, np.arange(0)).shape == (0, 1)
+
+
+POOL = """
+import numpy as np
+
+STATES = ("level",)
+INPUTS = ("pump",)
+PARAMS = {"lift": 0.05, "outflow": 0.04}
+
+
+def step(x, u, dt, params):
+    return x + dt * (params["lift"] * u - params["outflow"] * np.sqrt(np.maximum(x, 0.0)))
+"""
+"""In one Euler step, however long."""
+
+
+def _pool(tmp_path, text=POOL):
+    file = tmp_path / "pool.py"
+    file.write_text(text)
+    return compose(ModelSpec(str(file), 8.0))
+
+
+def _flowing(model, outflow=0.04, rows=800, seed=0):
+    """A pool that flows: in a hundredth of the model's step."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(0.5, 2.5, (rows // 10, 1)), 10, axis=0)
+    level, y = 2.0, [2.0]
+    for pump in u[:, 0].tolist():
+        for _ in range(100):
+            level += 0.08 * (0.05 * pump - outflow * math.sqrt(max(level, 0.0)))
+        y.append(level)
+    return from_arrays(model, [(np.array(y)[:, None] + rng.normal(size=(rows + 1, 1)) * 0.003, u)])
+
+
+def test_an_own_model_whose_steps_are_too_coarse_is_told_so_and_gets_no_other_valves(tmp_path):
+    model = _pool(tmp_path)
+    result = trace(_flowing(model), model)
+    assert [(e.name, e.channel) for e in result.effects] == [("integration_scheme", "*")]
+    assert "in a straight piece a step" in result.text()
+
+
+def test_what_else_is_wrong_is_told_beside_it_as_large_as_it_is(tmp_path):
+    model = _pool(tmp_path)
+    result = trace(_flowing(model, outflow=0.046), model)
+    assert {(e.name, e.channel) for e in result.effects} == {("integration_scheme", "*"), ("parameter_change", "outflow")}
+    ratio = next(e for e in result.effects if e.name == "parameter_change").parameters["ratio"]
+    assert ratio[0] == pytest.approx(1.15, rel=2e-3)
+
+
+@pytest.mark.parametrize("name", ["joint", "double_integrator"])
+def test_a_model_that_is_exact_is_not_asked_how_it_integrates(name):
+    assert not steps_coarsely(compose(ModelSpec(name, 0.1)).nominal)
+
+
+def test_how_an_own_model_integrates_is_asked_of_its_steps_alone(tmp_path):
+    assert steps_coarsely(_pool(tmp_path).nominal)
+    exact = POOL.replace("x + dt * (params[", "x * np.exp(-dt) + (1.0 - np.exp(-dt)) * (params[").replace(
+        "np.sqrt(np.maximum(x, 0.0))", "1.0"
+    )
+    assert not steps_coarsely(_pool(tmp_path, exact).nominal)
+    nowhere = POOL.replace("np.maximum(x, 0.0)", "np.where(x < 1e9, np.nan, x)")
+    assert not steps_coarsely(_pool(tmp_path, nowhere).nominal)
+
+
+def test_a_step_in_parts_is_off_by_a_higher_power_of_its_length(tmp_path):
+    """Against a solution in ten thousand steps: a step of Euler's is off by its square, one in parts by its fourth power."""
+    model = _pool(tmp_path)
+    finer = integrating(model.nominal, "exact")
+    x, u, p = np.array([[1.0], [3.0]]), np.array([[1.0], [0.2]]), model.nominal.parameters
+
+    def off(bound, dt):
+        true = x
+        for _ in range(10_000):
+            true = model.nominal.step(true, u, dt / 10_000, p)
+        return np.max(np.abs(bound.step(x, u, dt, p) - true))
+
+    assert off(model.nominal, 8.0) / off(model.nominal, 4.0) == pytest.approx(4.0, rel=0.1)
+    assert off(finer, 8.0) / off(finer, 4.0) == pytest.approx(16.0, rel=0.25)
+    assert off(finer, 8.0) < 0.01 * off(model.nominal, 8.0)

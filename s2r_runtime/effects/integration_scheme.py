@@ -6,14 +6,20 @@ S = [[s, -c], [c, s]] (it commutes with the turn into the world's axes, so the h
     euler   s = 1,                               c = 0
     exact   s = sin(phi)/phi,                    c = (1 - cos(phi))/phi                      (an arc)
     rk4     s = (1 + 4 cos(phi/2) + cos(phi))/6, c = (4 sin(phi/2) + sin(phi))/6             (Simpson's rule, constant twist)
+
+A model of one's own that says nothing of a pose, and that two half steps take elsewhere than one, is integrated by some rule. Under `exact`
+its own step is taken in parts (`models.bound`): an Euler step of seconds on a tank of minutes looks like wrong valves and a weak pump.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
 from s2r_runtime.effects.input_effect import Array, Values
 from s2r_runtime.hookspecs import NominalModel, Parameter
+from s2r_runtime.models.bound import BoundModel, steps_coarsely
 
 
 class IntegrationScheme:
@@ -27,8 +33,9 @@ class IntegrationScheme:
     once = True
 
     def channels(self, model: NominalModel) -> tuple[str, ...]:
-        """Models that say that they move a pose by Euler."""
-        return ("*",) if getattr(model, "integration", "") == "euler" else ()
+        """Models that say that they move a pose by Euler, and those that do not say how they integrate, if that is seen."""
+        rule = getattr(model, "integration", "")
+        return ("*",) if rule == "euler" or (not rule and steps_coarsely(model)) else ()
 
     def integrates(self, p: Values) -> str:
         """The scheme."""
@@ -51,7 +58,12 @@ class IntegrationScheme:
         return u
 
     def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
-        """The pose's move (n, 2) turned and shortened by S."""
+        """The pose's move (n, 2) turned and shortened by S; of a model of one's own, as its step in parts makes it."""
+        if isinstance(model, BoundModel) and model.finer:
+            step: Any = dt  # (n,), if the model takes steps of any length
+            return np.asarray(x_next + (model.step(x, u, step, model.parameters) - model.shared.step(x, u, step, model.parameters)))
+        if not getattr(model, "integration", ""):
+            return x_next
         px, py, theta = (model.states.index(name) for name in ("x", "y", "theta"))
         along, across = _factors(x_next[:, theta] - x[:, theta], p["scheme"])
         dx, dy = x_next[:, px] - x[:, px], x_next[:, py] - x[:, py]
@@ -61,8 +73,8 @@ class IntegrationScheme:
         return after
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
-        """`rk4` is left out: within a step it cannot be told from `exact`."""
-        return [{"scheme": "exact"}, {"scheme": "euler"}]
+        """`rk4` is left out: within a step it cannot be told from `exact`; and what a model of one's own does already."""
+        return [{"scheme": "exact"}, {"scheme": "euler"}] if getattr(model, "integration", "") else [{"scheme": "exact"}]
 
 
 def _factors(phi: Array, scheme: str) -> tuple[Array, Array]:

@@ -93,7 +93,7 @@ _WORDS: dict[str, Callable[[str, Values], str]] = {
     "regime_change": lambda what, p: f"from {p['time']:.4g} s on {what} does {_percent(p['gain'])} of what is commanded",
     "periodic_disturbance": lambda what, p: f"{what} swings by {p['amplitude']:.3g}, once in {1.0 / p['frequency']:.3g} s",
     "integration_scheme": lambda what, p: {
-        "exact": "the robot moves on arcs, the model in straight pieces",
+        "exact": "the robot moves on curves, the model in a straight piece a step",
         "rk4": "the model's integration is coarser than the motion",
         "euler": "the robot moves in straight pieces, as under an Euler step",
     }[p["scheme"]],
