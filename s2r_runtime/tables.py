@@ -60,13 +60,7 @@ def read_csv(path: Path | str, wanted: Sequence[str] | None = None, optional: Se
     Raises RecordingError, one line: file, line, column, value, what would be right.
     """
     path = Path(path)
-    rows = csv.reader(io.StringIO(_text(path), newline=""), strict=True)
-    try:
-        header = [name.strip() for name in next(rows)]
-    except StopIteration:
-        raise RecordingError(f"{path}: is empty, must start with a header row") from None
-    except csv.Error as error:
-        raise RecordingError(f"{path}: line 1: not CSV: {error}") from None
+    header, rows = _opened(path)
     names = _checked_names(path, header, wanted)
     for name in optional:
         if name not in header and (near := [h for h in header if h.lower() == name.lower()]):
@@ -80,6 +74,22 @@ def read_csv(path: Path | str, wanted: Sequence[str] | None = None, optional: Se
     segment = _segments(path, cells[header.index(SEGMENT)], lines) if SEGMENT in header else None
     _check_time(path, t, segment, lines)
     return Table(t, numbers, segment)
+
+
+def header_of(path: Path | str) -> list[str]:
+    """Names of the columns. Raises RecordingError as `read_csv`."""
+    return _opened(Path(path))[0]
+
+
+def _opened(path: Path) -> tuple[list[str], Reader]:
+    """The header, and the rows after it."""
+    rows = csv.reader(io.StringIO(_text(path), newline=""), strict=True)
+    try:
+        return [name.strip() for name in next(rows)], rows
+    except StopIteration:
+        raise RecordingError(f"{path}: is empty, must start with a header row") from None
+    except csv.Error as error:
+        raise RecordingError(f"{path}: line 1: not CSV: {error}") from None
 
 
 def _text(path: Path) -> str:

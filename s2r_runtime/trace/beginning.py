@@ -87,12 +87,15 @@ def _forgetting(model: ComposedModel, data: Dataset, run: Run, before: int, usua
 
 def _usual(model: ComposedModel, data: Dataset) -> Array:
     """(nx,) usual size of a residual, which tells how much an error of the first steps weighs. A speed that was not measured tells nothing:
-    it was made with the inputs.
+    it was made with the inputs. So was a hidden state, but it may be all that an input moves within a step: it counts by how well it is
+    known.
     """
     act = acting(model, data)
     steps = steps_of(data)
     size = np.median(np.abs(residual(model, steps, act)), axis=0) / 0.6745 + 1e-12 if len(steps) else np.ones(len(model.states))
-    size[[v for _, v in data.axes_without_speed]] = np.inf
+    made = data.reconstruction
+    for j, (_, v) in enumerate(data.axes_without_speed):
+        size[v] = max(made.errors[j], size[v]) if made is not None and made.hidden else np.inf
     return size
 
 

@@ -5,17 +5,24 @@ The whitened residual z of a model says what the errors of the measurements were
     e_k = R (s_{k-1} - F_k' s_k),       y_k - e_k: position and speed, smoothed        (s_{k-1} = 0 where step k begins anew)
 
 A speed that was smoothed under another model would take its side. Errors of such a speed are no errors of a measurement: models are
-told apart by those of what was measured.
+told apart by those of what was measured. Where a hidden state of somebody's own model is told by others, its law may bend, and models are
+told apart about where each of them has it (`retold`).
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.fitting import Fit, Problem
+from s2r_runtime.trace.residual import Steps
+
+if TYPE_CHECKING:
+    from s2r_runtime.trace.fitting import Fit, Problem
 
 Array = NDArray[np.float64]
 
@@ -24,26 +31,48 @@ def begun(given: Problem, fit: Fit) -> Array | None:
     """(rows of the runs laid end to end, nx) smoothed under the model; None where every state was measured."""
     if not given.floor.axes:
         return None
-    steps, model = given.steps, fit.model
-    f = given.jacobian(model)
-    s = fit.whiten.back(fit.z * noises.weight(fit.z))
-    before = np.where(steps.joined[:, None], np.concatenate([np.zeros((1, s.shape[1])), s[:-1]]), 0.0)
-    error = fit.noise.r * (before - np.einsum("kji,kj->ki", f, s))
+    steps = given.steps
     y = np.concatenate([run.y for run in given.data.runs])
-    y[steps.place + steps.run] = steps.y0 - error
+    y[steps.place + steps.run] = steps.y0 - _errors(given, fit)[0]
     return y
 
 
-def uncertain(fit: Fit, dt: float) -> Array:
-    """(nx,) variances of smoothed positions and speeds; of states that were measured, of their measurement.
+def retold(given: Problem, fit: Fit) -> Steps:
+    """The transitions with the states that were not measured where the model has them."""
+    unseen = [v for _, v in given.floor.axes]
+    y0, y1 = given.steps.y0.copy(), given.steps.y1.copy()
+    for y, error in zip((y0, y1), _errors(given, fit), strict=True):
+        y[:, unseen] -= error[:, unseen]
+    return replace(given.steps, y0=y0, y1=y1)
 
-    With l = Q dt^2 / R, the smoother averages over pi / l^(1/4) rows (the half-power frequency of a spline is l^(1/4) / 2 pi a row).
+
+def _errors(given: Problem, fit: Fit) -> tuple[Array, Array]:
+    """(n, nx) at the start of each step, and at its end."""
+    joined, f = given.steps.joined, given.jacobian(fit.model)
+    whiten, z = fit.whiten, fit.z
+    if given.bends:  # a fit is about where its own model has the states, and R is far too large for another F
+        whiten = noises.Whitener(fit.noise, f, joined)
+        z = whiten(given.residual(fit.model))
+    s = whiten.back(z * noises.weight(z))
+    none = np.zeros((1, s.shape[1]))
+    back = np.einsum("kji,kj->ki", f, s)
+    before = np.where(joined[:, None], np.concatenate([none, s[:-1]]), 0.0)
+    behind = np.where(np.append(joined[1:], False)[:, None], np.concatenate([back[1:], none]), 0.0)
+    return fit.noise.r * (before - back), fit.noise.r * (s - behind)
+
+
+def uncertain(fit: Fit, f: Array) -> Array:
+    """(nx,) variances of smoothed positions and speeds; of states that were measured, of their measurement. f: (n, nx, nx), F of the steps.
+
+    With l = Q g^2 / R, g = dp'/dv (of a position: dt), the smoother averages over pi / l^(1/4) rows (the half-power frequency of a spline
+    is l^(1/4) / 2 pi a row).
     """
     told = fit.noise.r.copy()
     for p, v in fit.noise.axes:
-        corner = (fit.noise.q[v] * dt * dt / fit.noise.r[p]) ** 0.25
+        g = max(float(np.sqrt(np.mean(f[:, p, v] ** 2))), 1e-300)
+        corner = (fit.noise.q[v] * g * g / fit.noise.r[p]) ** 0.25
         told[p] = fit.noise.r[p] * min(1.0, corner / np.pi)
-        told[v] = told[p] * (corner / dt) ** 2 / 3.0
+        told[v] = told[p] * (corner / g) ** 2 / 3.0
     return told
 
 

@@ -6,6 +6,7 @@ that it answers, plus what the daemon took to answer (`obs_seq` ties the two clo
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -19,6 +20,7 @@ from s2r_runtime.messages import CampaignFinished, Observed, Send, StartCampaign
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.robot_logs import content_digest, is_robot_log, read_robot_log
 from s2r_runtime.trace.dataset import Array, Dataset, Stream, columns_of, from_streams
+from s2r_runtime.trace.hidden import told_through
 from s2r_runtime.trace.late_poses import earlier, late_pose
 from s2r_runtime.trace.reconstruct import late_speeds, reconstruct
 from s2r_runtime.trace.unseen import unneeded, without
@@ -26,6 +28,9 @@ from s2r_runtime.trace.unseen import unneeded, without
 MCAP_MAGIC = b"\x89MCAP"
 
 Row = tuple[float, ...]
+
+MISSPELT = 0.75
+"""Likeness of names from which on one is the other, misspelt; upper and lower are 0.6 alike."""
 
 
 def load_dataset(
@@ -55,7 +60,7 @@ def load_dataset(
     if robots:
         segments, missing, content = _robot_segments(paths[0], model, transport)
     else:
-        segments, missing, content = _table_segments(paths[0], model, columns or {})
+        segments, missing, content = _table_segments(paths[0], model, columns or {}, hidden=not bandwidth)
     if behind is None:
         behind = {} if bandwidth else late_pose(model, segments, missing)
     names = [s for s in model.states if s not in missing]
@@ -88,18 +93,21 @@ def _is_log(path: Path) -> bool:
 
 
 def _table_segments(
-    path: Path, model: ComposedModel, columns: Mapping[str, str]
+    path: Path, model: ComposedModel, columns: Mapping[str, str], hidden: bool
 ) -> tuple[list[tuple[Stream, Stream]], tuple[str, ...], str]:
     """The segments, the states that the table does not have although they may be left out, and the digest of what it says, however it is
-    written. A column that the caller named must be there.
+    written. A column that the caller named must be there. hidden: whether states may be left out that others tell by the model alone.
     """
     from s2r_runtime.tables import read_csv
 
     names = columns_of(model, columns)
     free = {name for name in getattr(model.nominal, "follows", {}) if name not in columns}
+    free |= _hidden(path, model, free, columns) if hidden else set()
     table = read_csv(path, [names[n] for n in names if n not in free], optional=[names[n] for n in names if n in free])
-    missing = tuple(s for s in free if s not in table.columns or np.isnan(table.columns[s]).all())
-    missing = tuple(s for s in model.states if s in missing)
+    unsaid = {s for s in model.states if s not in columns and np.isnan(table.columns.get(s, np.array(np.nan))).all()}
+    if not unsaid <= free and not (hidden and told_through(model.nominal, [s for s in model.states if s in unsaid])):
+        unsaid &= free
+    missing = tuple(s for s in model.states if s in unsaid)
     states = np.column_stack([table.columns[names[s]] for s in model.states if s not in missing])
     inputs = np.column_stack([table.columns[names[i]] for i in model.inputs])
     where = np.zeros(len(table.t), dtype=np.int64) if table.segment is None else table.segment
@@ -110,6 +118,22 @@ def _table_segments(
         measured, commanded = ~np.isnan(y).all(axis=1), ~np.isnan(u).all(axis=1)
         given.append((Stream(t[measured], y[measured]), Stream(t[commanded], u[commanded])))
     return given, missing, table.content_digest([names[n] for n in names if n not in missing])
+
+
+def _hidden(path: Path, model: ComposedModel, free: set[str], columns: Mapping[str, str]) -> set[str]:
+    """States that the table does not have, and that other ones tell by the model (`hidden`). Not where it has a column that nobody asked
+    for, of nearly the same name: that is it, misspelt.
+    """
+    from s2r_runtime.tables import header_of
+
+    header = header_of(path)
+    there = {name for name in (*model.states, *model.inputs) if columns.get(name, name) in header}
+    lacks = [s for s in model.states if s not in {*there, *free, *columns}]
+    spare = [name for name in header if name not in {columns.get(one, one) for one in there}]
+    if not lacks or any(difflib.get_close_matches(name.lower(), [other.lower() for other in spare], 1, MISSPELT) for name in lacks):
+        return set()
+    missing = [s for s in model.states if s not in there]
+    return {*lacks} if told_through(model.nominal, missing) else set()
 
 
 def _robot_segments(

@@ -164,7 +164,8 @@ def noise_floor(fit: Fit, given: Held, seed: int) -> tuple[Array, Array]:
         fit = replace(fit, noise=evaluate(problem(given.data, given.steps), fit.model).noise)
     model, noise = fit.model, _as_seen(fit.noise, given.data)
     act = acting(model, given.data)
-    one = noise.one_step(state_jacobian(model, given.steps, act))
+    slope = state_jacobian(model, given.steps, act)
+    one = noise.one_step(slope)
     starts = rollout_starts_of(given)
     starts = starts[:: max(1, len(starts) // FLOOR_STARTS)]
     if not len(starts):
@@ -177,7 +178,7 @@ def noise_floor(fit: Fit, given: Held, seed: int) -> tuple[Array, Array]:
         ends = _coloured_ends(fit, given, act, starts[::FEWER], clean[::FEWER], rng)
         if ends is not None:
             return one, rms(ends)
-    known = uncertain(fit, given.data.dt) if fit.noise.axes else noise.r
+    known = uncertain(fit, slope) if fit.noise.axes else noise.r
     noisy = clean + rng.normal(size=clean.shape) * np.sqrt(known)
     far = farthest(clean)
     for h in range(given.horizon):

@@ -22,6 +22,7 @@ from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.answers import Known, kept
+from s2r_runtime.trace.begun import retold
 from s2r_runtime.trace.coarse import coarse
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.residual import TOGETHER, Steps, acting, advanced, near, predicted, side_by_side, state_jacobian
@@ -52,6 +53,9 @@ SETTLED = 0.3
 FLOORED = 2.0
 """Of its floor: process noise below it is not told from that."""
 
+RETOLD = 2
+"""Times that hidden states are told anew under a model, each about where they were: from a tenth off to a ten-thousandth."""
+
 ABOUT, STAYS = 4, 1e-3
 """Rounds of states and numbers in turn, at most; share of itself by which no number moves any more."""
 
@@ -68,6 +72,12 @@ class Problem:
     searches: dict[tuple[object, ...], object] = field(default_factory=dict, repr=False, compare=False)
     blind: dict[tuple[object, ...], object] = field(default_factory=dict, init=False, repr=False, compare=False)
     known: Known = field(default_factory=Known, init=False, repr=False, compare=False)
+
+    @property
+    def bends(self) -> bool:
+        """Whether states that were not measured follow a law that may bend: each model is asked about where it has them."""
+        made = self.data.reconstruction
+        return made is not None and made.hidden
 
     @cached_property
     def coarse(self) -> Problem:
@@ -145,6 +155,15 @@ def problem(data: Dataset, steps: Steps) -> Problem:
 
 def evaluate(given: Problem, model: ComposedModel, near: Noise | None = None) -> Fit:
     """The model as it stands, with its own noise. near: noise from which its estimate begins."""
+    fit = _evaluated(given, model, near)
+    for _ in range(RETOLD if given.bends else 0):
+        given = Problem(given.data, retold(given, fit), given.floor)
+        fit = _evaluated(given, model, fit.noise)
+    return fit
+
+
+def _evaluated(given: Problem, model: ComposedModel, near: Noise | None) -> Fit:
+    """About where the states stand that were not measured."""
     r, f = given.residual(model), given.jacobian(model)
     level = noises.estimate(r, f, given.steps.joined, given.floor, near)
     whiten = Whitener(level, f, given.steps.joined)

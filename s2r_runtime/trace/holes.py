@@ -23,6 +23,8 @@ BRIEF = 4
 def bridged(data: Dataset) -> Dataset:
     """The same; unchanged where some state is none of such an axis."""
     pairs = data.axes_without_speed
+    if data.reconstruction is not None and data.reconstruction.hidden:  # these are no rates of theirs
+        return data
     if {j for pair in pairs for j in pair} != set(range(len(data.states))):
         return data
     return replace(data, runs=tuple(_but_silences(i, run, _bridged(run, pairs, data.dt), data) for i, run in enumerate(data.runs)))

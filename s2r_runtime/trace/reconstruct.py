@@ -20,10 +20,12 @@ from numpy.typing import NDArray
 
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.hookspecs import Follows
+from s2r_runtime.models.bound import integrating, steps_coarsely
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
 from s2r_runtime.trace import differentiation
 from s2r_runtime.trace.fault import Fault
+from s2r_runtime.trace.hidden import smoothed_hidden, told_through
 from s2r_runtime.trace.late_speeds import late, of_differences
 from s2r_runtime.trace.position_faults import mended
 from s2r_runtime.trace.speeds import Smoothed, smoothed
@@ -79,6 +81,10 @@ class Reconstruction:
     """s by which speeds were late that the recording has (`late_speeds`)."""
     faults: tuple[Fault, ...] = ()
     """Of positions, found before anything was done to them (`position_faults`)."""
+    hidden: bool = False
+    """Whether `axes` are no axes, but what tells a hidden state of somebody's own model, and that state."""
+    in_parts: bool = False
+    """Whether the model's steps are taken in parts for that: what is found would take up what a coarse one makes of a hidden state."""
 
     def to_json(self) -> dict[str, object]:
         """docs/json.md's `reconstructed`."""
@@ -94,9 +100,14 @@ class Reconstruction:
             told = [f"{speed} comes {s:.2g} s late, as from a filter, and is not used: {of} tells it" for speed, s in self.late.items()]
             if len(told) == len(self.states):
                 return told
+            seen = who if self.hidden else "speeds"
+            parts = (
+                ["the model's steps are taken in parts: one by one they are too coarse for what was not measured"] if self.in_parts else []
+            )
             return [
                 *told,
-                f"{who} {were} not measured: what is left over is judged on {of} alone (speeds seen up to {self.bandwidth:g} Hz)",
+                f"{who} {were} not measured: what is left over is judged on {of} alone ({seen} seen up to {self.bandwidth:g} Hz)",
+                *parts,
             ]
         return [
             f"{who} {were} not measured but reconstructed within {self.bandwidth:g} Hz (--bandwidth HZ)",
@@ -113,14 +124,16 @@ def reconstruct(
     behind: Mapping[str, float] | None = None,
 ) -> tuple[list[tuple[Stream, Stream]], Reconstruction]:
     """Segments of (measured states in the model's order without the missing ones, inputs), filtered, with all states. bandwidth: Hz; None:
-    what the data bear. behind: speeds that were left out as they are late. Raises RecordingError if a missing state does not follow, or
-    if the rows are too few.
+    what the data bear. behind: speeds that were left out as they are late. Raises RecordingError if a missing state does not follow, nor is
+    told by another one, or if the rows are too few.
     """
-    _check_follows(model, missing, source)
     measured = [name for name in model.states if name not in missing]
     if bandwidth is None and (pairs := _axes_without_speed(model, missing)):
         given, done = _with_speeds(model, segments, pairs, source)
         return given, replace(done, late=dict(behind or {}))
+    if bandwidth is None and not {*missing} <= {*getattr(model.nominal, "follows", {})} and (pairs := told_through(model.nominal, missing)):
+        return _with_hidden(model, segments, pairs, source)
+    _check_follows(model, missing, source)
     angles = [measured.index(name) for name in model.nominal.angles if name in measured]
     given = [(complete(states), inputs) for states, inputs in segments]
     intervals = [np.diff(states.t) for states, _ in given if len(states.t) > 1]
@@ -226,6 +239,39 @@ def _with_speeds(
         if not made:
             raise RecordingError(f"{source}: {', '.join(missing)} cannot be told: no stretch without a gap is long enough")
     return made, Reconstruction(missing, shown, interval, needed, pairs, errors, apart, tuple(cleaned), faults=faults)
+
+
+def _with_hidden(
+    model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], pairs: tuple[tuple[str, str], ...], source: str
+) -> tuple[list[tuple[Stream, Stream]], Reconstruction]:
+    """Segments as they were received, with states of somebody's own model that others tell (`hidden`), on the same rows."""
+    missing = tuple(h for _, h in pairs)
+    measured = [name for name in model.states if name not in missing]
+    coarse = not model.nominal.integration and steps_coarsely(model.nominal)
+    nominal = integrating(model.nominal, "exact") if coarse else model.nominal
+    given = [(complete(fresh(states)), inputs) for states, inputs in segments]
+    spaces = [np.diff(states.t) for states, _ in given if len(states.t) > 1]
+    interval = snapped(float(np.median(np.concatenate(spaces))), model.dt) if spaces else model.dt
+    angles = [measured.index(name) for name in model.nominal.angles if name in measured]
+    made, known = [], []
+    for states, inputs in given:
+        parts = [part for part in _stretches(states, interval) if len(part.t) >= FEWEST]
+        whole = []
+        for part in parts:
+            x = np.zeros((len(part.t), len(model.states)))
+            x[:, [model.states.index(name) for name in measured]] = unwrapped(part.values, angles)
+            x, found = smoothed_hidden(nominal, part.t, x, held_between(inputs, part.t, 1), interval, pairs, source)
+            whole.append(Stream(part.t, x))
+            known.append(found)
+        if whole:
+            made.append((Stream(np.concatenate([w.t for w in whole]), np.concatenate([w.values for w in whole])), inputs))
+    if not made:
+        raise RecordingError(
+            f"{source}: {', '.join(missing)} cannot be told: no {FEWEST} rows without a gap on which {', '.join(measured)} were measured"
+        )
+    errors = tuple(float(np.median([found[j].error for found in known])) for j in range(len(pairs)))
+    shown = float(f"{min(max(one.bandwidth for found in known for one in found), 0.5 / interval):.2g}")
+    return made, Reconstruction(missing, shown, interval, shown, pairs, errors=errors, hidden=True, in_parts=coarse)
 
 
 def _mended(

@@ -35,7 +35,7 @@ STARTS = 1200
 
 def relevant(given: Problem, fit: Fit, base: Fit, horizon: int, bar: Bar = STRICT) -> bool:
     """Whether some state's error at one step, a quarter of the horizon or all of it falls by the bar's share, cross-validated."""
-    known = (begun(given, fit), uncertain(fit, given.data.dt)) if given.floor.axes else None
+    known = (begun(given, fit), uncertain(fit, given.jacobian(fit.model))) if given.floor.axes else None
     edges = _edges(given, fit, base)
     blind = [_blind(given, f, edges, known) for f in (base, fit)]
     for steps in sorted({1, max(1, horizon // 4), horizon}):

@@ -144,6 +144,8 @@ class _Search:
         if self._given.floor.axes and promising:
             quiet, screened = self._quietly
             promising = [*promising[:FIRST_LOOK], *((s, quiet) for s in _promising(screened, few, 0.0))]
+        if self._given.bends:  # a first look is about where another model has the states
+            promising = [(s, self._quietly[0]) for s in _promising(self._quietly[1], len(screened), -math.inf)]
         looked_at: list[tuple[Screened, Fit]] = []
         for s, under in promising:
             most = max((gain(fit, self.base) for _, fit in looked_at), default=0.0)
@@ -203,12 +205,13 @@ def rescored(found: Sequence[Scored], base: Fit, n: int, bar: Bar) -> list[Score
 
 
 def _promising(screened: Sequence[Screened], few: int, least: float) -> list[Screened]:
-    """The best of so many (effect, channel), each at its two best places in the list; least: nats."""
+    """The best of so many (effect, channel), each at its two best places in the list; least: nats, -inf for all of them."""
     kept: list[Screened] = []
     places: dict[tuple[str, str], int] = {}
     for s in screened:
         key = s.candidate.name, s.candidate.channel
-        if s.value <= max(HOPELESS, least, HOPELESS_SHARE * screened[0].value) or (key not in places and len(places) == few):
+        hopeless = math.isfinite(least) and s.value <= max(HOPELESS, least, HOPELESS_SHARE * screened[0].value)
+        if hopeless or (key not in places and len(places) == few):
             break
         places[key] = places.get(key, 0) + 1
         if places[key] <= PLACES:

@@ -49,9 +49,9 @@ class Selection:
     risky: bool = False
 
 
-def select(given: Problem, model: ComposedModel, horizon: int, progress: Callable[[float], None]) -> Selection:
-    """The effects that the transitions call for, and their rivals."""
-    return against_rivals(given, called_for(given, model, horizon, progress), STRICT)
+def select(given: Problem, model: ComposedModel, horizon: int, progress: Callable[[float], None], most: int = MOST) -> Selection:
+    """The effects that the transitions call for, `most` of them at most, and their rivals."""
+    return against_rivals(given, called_for(given, model, horizon, progress, most=most), STRICT)
 
 
 def called_for(
@@ -61,12 +61,13 @@ def called_for(
     progress: Callable[[float], None],
     bar: Bar = STRICT,
     before: Selection | None = None,
+    most: int = MOST,
 ) -> Selection:
-    """The effects alone, by any bar. before: what was selected with another one, from which it goes on."""
+    """The effects alone, by any bar, `most` at most. before: what was selected with another one, from which it goes on."""
     nominal = evaluate(given, model) if before is None else before.nominal
     fit, tried = (nominal, 0) if before is None else (before.fit, before.tried)
     ranking = [] if before is None else list(before.ranking)
-    for step in range(MOST - len(fit.added)):
+    for step in range(most - len(fit.added)):
         if ranking and not fit.added:
             found, columns = rescored(ranking, nominal, len(given.steps), bar), tried
         else:

@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, UsageError
-from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.models.composed import AppliedEffect, ComposedModel
+from s2r_runtime.plugins import registry
 from s2r_runtime.trace.answer import answered, with_time
 from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.begun import begun
@@ -35,8 +36,9 @@ from s2r_runtime.trace.one_place import from_one_place
 from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.residual import Mask, acting, first_steps, rms, steps_of
 from s2r_runtime.trace.result import TraceResult
+from s2r_runtime.trace.scores import names
 from s2r_runtime.trace.second_look import astray, finer, once_more
-from s2r_runtime.trace.selection import all_dated, select
+from s2r_runtime.trace.selection import MOST, all_dated, select
 from s2r_runtime.trace.straight import acted, alike_laid, changed_within, commanded, noisy, sampled, samples_of, straight, way_of
 from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import confirmed, foretold_too
@@ -59,6 +61,9 @@ FIT_STEPS = 4000
 
 FOLLOWS = 5.0
 """Standard deviations of the correlation of noise with an input, from which a state goes with the input."""
+
+RETOLD = 3
+"""Times that a hidden state is told anew under a model, each about where it was told to be: its law may bend."""
 
 MOVED, ASKED = 1.5, 5.0
 """A robot whose measurements lie apart after the horizon as they do after one step has stood still; it was asked to move if the
@@ -110,7 +115,7 @@ def _traced(
     asked, as_recorded = model, (dataset, test)
     if not model.inputs:
         raise NotEnoughEvidence(f"{dataset.source}: the model has no inputs; nothing can be traced of a robot that is asked nothing")
-    model, dataset, test = alike(model, dataset, test)
+    model, dataset, test = alike(_in_parts(model, dataset), dataset, test)
     _belongs(dataset, model)
     if test is not None:
         _belongs(test, model)
@@ -127,16 +132,21 @@ def _traced(
     _enough(dataset, model, fit_part, judged_on, ahead)
     given = problem(fit_part.data, fit_part.steps)
     say(5.0, 100.0, "looking for effects")
-    chosen = select(given, model, ahead, lambda share: say(5.0 + 55.0 * share, 100.0, "looking for effects"))
+    hidden = dataset.reconstruction is not None and dataset.reconstruction.hidden
+    chosen = select(given, model, ahead, lambda share: say(5.0 + 55.0 * share, 100.0, "looking for effects"), 1 if hidden else MOST)
     lines = _straight(as_recorded, asked, parts, checked, seen, given, chosen.fit)
     if lines is not None:
         return _traced(lines[0], asked, lines[1], horizon, seed, _from(60.0, say), norm, parts)
-    if given.floor.axes and any(chosen.fit.model.effects[place].effect.stage == "step" for place in chosen.fit.added):
+    for most in range(2, MOST + 1) if hidden else (MOST,):
+        if not _told_otherwise(given, chosen.fit, hidden):
+            break
         checked = replace(checked, data=_restated(checked, chosen.fit))  # what depends on a speed is seen where the speed is better known
         fit_part = part(checked.data, checked.left_out, seen, FIT_STEPS)
         judged_on = _held_out(checked, seen, test, model, horizon)
-        given = problem(fit_part.data, fit_part.steps)
-        chosen = select(given, model, ahead, lambda share: say(60.0 + 20.0 * share, 100.0, "looking for effects"))
+        given, before = problem(fit_part.data, fit_part.steps), names(chosen.fit.model)
+        chosen = select(given, model, ahead, lambda share: say(60.0 + 20.0 * share, 100.0, "looking for effects"), most)
+        if names(chosen.fit.model) == before:
+            break
     whole = Whole(checked, model, ahead)
     chosen = foretold_too(given, chosen, judged_on, ahead)
     chosen = confirmed(given, all_dated(given, whole.given, chosen), judged_on)
@@ -159,6 +169,15 @@ def _traced(
     result = replace(result, spec=msgspec.structs.replace(result.spec, dt=asked.dt), unseen=unseen)
     say(100.0, 100.0, result.verdict)
     return result
+
+
+def _in_parts(model: ComposedModel, data: Dataset) -> ComposedModel:
+    """The model with its steps taken in parts, where hidden states were told so."""
+    there = any(hasattr(a.effect, "integrates") for a in model.effects)
+    if data.reconstruction is None or not data.reconstruction.in_parts or there:
+        return model
+    finer = AppliedEffect(registry().get("effects", "integration_scheme"), "*", {"scheme": "exact"})
+    return replace(model, effects=(*model.effects, finer))
 
 
 def _from(begun: float, say: Progress) -> Progress:
@@ -234,20 +253,33 @@ def _held_out(checked: Checked, seen: Mask, test: Dataset | None, model: Compose
     return held(model, checked.data, steps.take(np.flatnonzero(~seen[steps.place])), checked.left_out, ~seen, horizon)
 
 
+def _told_otherwise(given: Problem, fit: Fit, hidden: bool) -> bool:
+    """Whether states that were not measured are others with what was found. A hidden state's law may bend anywhere, so that effects are
+    told one after the other, each about where the state is with those before it.
+    """
+    return bool(given.floor.axes) and any(hidden or fit.model.effects[place].effect.stage == "step" for place in fit.added)
+
+
 def _restated(checked: Checked, fit: Fit) -> Dataset:
-    """The recording with the speeds that were not measured as the model has them, which knows more than none."""
-    everything = problem(checked.data, steps_of(checked.data, checked.left_out))
-    states = begun(everything, evaluate(everything, fit.model, fit.noise))
-    if states is None:
-        return checked.data
-    rows = np.cumsum([0] + [len(run.y) for run in checked.data.runs])
+    """The recording with the states that were not measured as the model has them, which knows more than none."""
+    data = checked.data
+    for _ in range(RETOLD if data.reconstruction is not None and data.reconstruction.hidden else 1):
+        everything = problem(data, steps_of(data, checked.left_out))
+        states = begun(everything, evaluate(everything, fit.model, fit.noise))
+        data = data if states is None else _at(data, states)
+    return data
+
+
+def _at(data: Dataset, states: Array) -> Dataset:
+    """The same with states (rows of the runs laid end to end, nx) in the place of those that were not measured."""
+    rows = np.cumsum([0] + [len(run.y) for run in data.runs])
     runs = []
-    for run, a, b in zip(checked.data.runs, rows[:-1], rows[1:], strict=True):
+    for run, a, b in zip(data.runs, rows[:-1], rows[1:], strict=True):
         y = run.y.copy()
-        for _, v in checked.data.axes_without_speed:
+        for _, v in data.axes_without_speed:
             y[:, v] = np.where(np.isnan(y[:, v]), np.nan, states[a:b, v])
         runs.append(replace(run, y=y))
-    return replace(checked.data, runs=tuple(runs))
+    return replace(data, runs=tuple(runs))
 
 
 def _enough(data: Dataset, model: ComposedModel, fit_part: Part, judged_on: Held, ahead: int) -> None:
