@@ -186,6 +186,18 @@ def test_a_robot_that_stood_still_although_it_was_asked_to_move_shows_nothing(no
         trace(from_arrays(declared(), [(y, run.u[::5])]), declared())
 
 
+def test_a_slow_robot_under_a_loud_sensor_is_traced():
+    """In a second it goes no farther than its position jumps from row to row; in half a minute it does."""
+    nominal = compose(ModelSpec("unicycle", 0.1))
+    u = np.tile([0.3, 0.05], (900, 1))
+    x, rows = np.zeros((1, 3)), [np.zeros(3)]
+    for k in range(len(u)):
+        x = nominal.nominal.step(x, u[k : k + 1], 0.1, {})
+        rows.append(x[0])
+    noisy = np.array(rows) + np.random.default_rng(0).normal(size=(901, 3)) * [0.5, 0.5, 0.3]
+    assert trace(from_arrays(nominal, [(noisy, u)]), nominal).verdict == "none"
+
+
 def test_a_sensor_that_froze_halfway_is_a_fault():
     data = recordings([], 1, steps=STEPS, seed=42)[0]
     data.runs[0].y[STEPS // 2 :] = data.runs[0].y[STEPS // 2]

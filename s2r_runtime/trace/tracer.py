@@ -295,8 +295,11 @@ def _enough(data: Dataset, model: ComposedModel, fit_part: Part, judged_on: Held
     went, jitter = rms(displacement(here)), rms(model.difference(fit_part.steps.y1, fit_part.steps.y0))
     if np.all(went < MOVED * jitter + 1e-12) and np.any(rms(judge(model, here).ends) > ASKED * went):
         raise NotEnoughEvidence(f"{data.source}: the robot stood still although it was asked to move; nothing can be traced until it moves")
-    sooner = [replace(here, horizon=steps) for steps in (2, 3, 5, 10) if steps < ahead]
-    if all(np.all(rms(displacement(h)) < MOVED * jitter) for h in (here, *sooner)) and not _follows(fit_part, model):
+    longest = max((len(run.y) - 1 for run in fit_part.data.runs), default=0)
+    sooner = [steps for steps in (2, 3, 5, 10) if steps < ahead]
+    later = [times * ahead for times in (3, 10) if 2 * times * ahead < longest]  # a robot may be slow, and its sensor loud
+    gone = [displacement(replace(here, horizon=steps)) for steps in (ahead, *sooner, *later)]
+    if all(np.all(rms(way) < MOVED * jitter) for way in gone if len(way)) and not _follows(fit_part, model):
         raise NotEnoughEvidence(f"{data.source}: no state goes farther than its noise makes it jump from row to row; nothing can be traced")
 
 
