@@ -16,6 +16,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.errors import RecordingError
 from s2r_runtime.gap import Drive, Transitions
 from s2r_runtime.models.composed import ComposedModel, wrap
 from s2r_runtime.sensor_noise import stream_noise
@@ -24,6 +25,8 @@ Array = NDArray[np.float64]
 
 MAX_GAP = 1.5
 """Steps. In a longer hole both ends of a transition may be interpolated from the same two measurements: nothing was measured then."""
+MOST_STEPS = 100.0
+"""Of the model from row to row: more says that a unit of time is wrong, and the grid of them all would fill the memory."""
 SILENCE_S = 60.0
 """After so long without any row the drive begins anew, at rest."""
 DOUBT = "the transitions are of ordinary driving, one follows the other, and were not drawn independently"
@@ -65,6 +68,7 @@ def state_at(streams: Streams, column: int, when: Array, angle: bool, tolerance:
 def drive_transitions(model: ComposedModel, stretches: list[Streams], digest: str, source: str) -> Transitions:
     """All transitions of a drive, stretch after stretch. Stretches that hold no measured state are left out."""
     nx, nu = len(model.states), len(model.inputs)
+    _check_pace(model, stretches, source)
     parts = [part for stretch in stretches for part in _continuous(stretch)]
     x0, x1, u, t0 = [np.empty((0, nx))], [np.empty((0, nx))], [np.empty((0, nu))], [np.empty(0)]
     inputs, steps, offset = [np.empty((0, nu))], [np.empty(0, dtype=np.int64)], 0
@@ -97,6 +101,24 @@ def drive_transitions(model: ComposedModel, stretches: list[Streams], digest: st
         noise=streams_noise(model, parts),
         drive=drive,
     )
+
+
+def _check_pace(model: ComposedModel, stretches: list[Streams], source: str) -> None:
+    """Raises RecordingError where a grid of the model's steps would be nearly all holes, and too large for the memory, or where stamps are
+    so large that a float does not tell one step from the next.
+    """
+    for stretch in stretches:
+        told = float(np.spacing(np.max(np.abs(stretch.t), initial=0.0)))
+        if told > 0.5 * model.dt:
+            raise RecordingError(f"{source}: its stamps are so large that they tell {told:g} s at best, the model's step is {model.dt:g} s")
+    for column, name in enumerate(model.states):
+        intervals = np.concatenate([np.diff(s.t[np.isfinite(s.x[:, column])]) for s in stretches] or [np.empty(0)])
+        intervals = intervals[intervals > 0.0]
+        apart = float(np.median(intervals)) if len(intervals) else 0.0
+        if apart > MOST_STEPS * model.dt:
+            raise RecordingError(
+                f"{source}: {name} comes every {apart:g} s, the model's step is {model.dt:g} s, so nothing shows one step; is t in seconds?"
+            )
 
 
 def _continuous(streams: Streams) -> list[Streams]:

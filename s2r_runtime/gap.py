@@ -21,6 +21,7 @@ from s2r_runtime.bounds import check_probability, sample_size, scenario_confiden
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, UsageError
 from s2r_runtime.messages import SERIAL, Gap
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.profile_checks import HEAVIEST, LIGHTEST
 from s2r_runtime.whiteness import DEPENDENT, SERIAL_ALPHA, Whiteness, body_axes, serial_p, whiteness
 
 Array = NDArray[np.float64]
@@ -329,17 +330,20 @@ def _finite(model: ComposedModel, e: Array) -> Array:
 
 def _checked_weights(model: ComposedModel, weights: tuple[float, ...] | Array, kind: str) -> Array:
     w = np.asarray(weights, dtype=np.float64)
-    if w.shape != (len(model.states),) or not np.all((w > 0.0) & np.isfinite(w)):
-        raise UsageError(f"weights are {w.tolist()}, must be one number > 0 for each of {', '.join(model.states)}")
+    if w.shape != (len(model.states),) or not np.all((w >= LIGHTEST) & (w <= HEAVIEST)):
+        asked = f"one number > 0 for each of {', '.join(model.states)}, from {LIGHTEST:g} to {HEAVIEST:g}"
+        raise UsageError(f"weights are {w.tolist()}, must be {asked}")
     if kind not in {"ball", "box"}:
         raise UsageError(f"set is {kind!r}, must be ball or box")
     return w
 
 
 def _too_few(tr: Transitions, n: int, needed: int, epsilon: float, beta: float, discard: int) -> str:
+    out = f"; left out: {', '.join(f'{count} {reason}' for reason, count in sorted(tr.rejected.items()))}" if tr.rejected else ""
+    if not tr.independent and n == 0:
+        return f"{tr.source}: holds no transition: no two rows with all states are a step of the model apart{out}"
     if not tr.independent:
         return f"{tr.source}: {n} transitions are there, {discard} of them to be discarded: nothing is left"
-    out = f"; left out: {', '.join(f'{count} {reason}' for reason, count in sorted(tr.rejected.items()))}" if tr.rejected else ""
     return (
         f"{tr.source}: {n} independent transitions, {needed} are needed for epsilon {epsilon:g}, beta {beta:g} "
         f"and {discard} discarded: {needed - n} more{out}"

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 SHORTEST_S, LONGEST_S = 1e-9, 1e9
 """Times are kept in whole nanoseconds of 64 bits: no less than one, and 1e9 s (some 30 years) is well below what fits."""
 
+LIGHTEST, HEAVIEST = 1e-30, 1e30
+"""Weights of a state in the norm. Beyond, squares overflow or vanish, and with them what a state has to say."""
+
 Check = tuple[bool, str, object, str]
 
 
@@ -65,7 +68,7 @@ def _bounds(p: Profile) -> Iterator[Check]:
 
 def _norm(weights: dict[str, float]) -> Iterator[Check]:
     for name, weight in weights.items():
-        yield 0.0 < weight < math.inf, f"norm.weights.{name}", weight, "> 0 and finite"
+        yield LIGHTEST <= weight <= HEAVIEST, f"norm.weights.{name}", weight, f"> 0 and finite, from {LIGHTEST:g} to {HEAVIEST:g}"
 
 
 def _probabilities(p: Profile) -> Iterator[Check]:

@@ -126,10 +126,22 @@ def _checked_names(path: Path, header: list[str], wanted: Sequence[str] | None) 
 
 
 def _missing(missing: list[str], header: list[str]) -> str:
+    if len(header) == 1 and (other := [sign for sign in (";", "\t", "|") if sign in header[0]]):
+        names = ", ".join(map(repr, missing))
+        return f"lacks {names}; are its columns separated by commas? {other[0]!r} seems to stand between them; decimal numbers need a point"
+    if all(_is_number(name) for name in header):
+        return f"starts with numbers, must start with a header row that names the columns: {', '.join(missing)}, ..."
     near = {name: difflib.get_close_matches(name, header, 1, 0.5) or [h for h in header if h.lower() == name.lower()] for name in missing}
     listed = ", ".join(f"{name!r}" + (f" (nearest: {near[name][0]!r})" if near[name] else "") for name in missing)
-    hint = "; are its columns separated by commas?" if len(header) == 1 else ""
-    return f"lacks the column{'s' if len(missing) > 1 else ''} {listed}; it has: {', '.join(header)}{hint}"
+    return f"lacks the column{'s' if len(missing) > 1 else ''} {listed}; it has: {', '.join(header)}"
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _cells(path: Path, rows: Reader, width: int) -> tuple[list[tuple[str, ...]], list[int]]:
@@ -141,7 +153,8 @@ def _cells(path: Path, rows: Reader, width: int) -> tuple[list[tuple[str, ...]],
                 kept.append(row)
                 lines.append(rows.line_num)
             elif row:
-                raise RecordingError(f"{path}: line {rows.line_num}: has {len(row)} cells, the header has {width}")
+                commas = "; are there commas in decimal numbers? They need a point" if len(row) == 2 * width else ""
+                raise RecordingError(f"{path}: line {rows.line_num}: has {len(row)} cells, the header has {width}{commas}")
     except csv.Error as error:
         raise RecordingError(f"{path}: line {rows.line_num}: not CSV: {error}") from None
     if not kept:
@@ -166,7 +179,8 @@ def _number(path: Path, name: str, cell: str, line: int) -> float:
     try:
         return float(cell) if cell.strip() else math.nan
     except ValueError:
-        raise RecordingError(f"{path}: line {line}: column {name!r} is {cell!r}, must be a number (or blank: not received)") from None
+        must = "have a decimal point" if _is_number(cell.replace(",", ".")) else "be a number (or blank: not received)"
+        raise RecordingError(f"{path}: line {line}: column {name!r} is {cell!r}, must {must}") from None
 
 
 def _segments(path: Path, cells: tuple[str, ...], lines: list[int]) -> NDArray[np.int64]:

@@ -95,6 +95,11 @@ def test_segments_are_numbered_as_they_appear_and_time_may_start_again(write) ->
         ('t,x\n0,"1\n', "not CSV"),
         (b"t,x\n0,\xff\n", "line 2: not UTF-8 text (byte 0xff)"),
         (b"t,x\n0,\0\n", "line 2: holds a zero byte"),
+        ("t;x\n0,5;1\n", "';' seems to stand between them; decimal numbers need a point"),
+        ("t\tx\n0\t1\n", "'\\t' seems to stand between them"),
+        ("t,x\n0,0,1,5\n", "line 2: has 4 cells, the header has 2; are there commas in decimal numbers? They need a point"),
+        ('t,x\n0,"1,5"\n', "line 2: column 'x' is '1,5', must have a decimal point"),
+        ("0,1\n0.1,2\n", "starts with numbers, must start with a header row that names the columns: t, x"),
     ],
 )
 def test_what_is_wrong_is_named_on_one_line(write, text: str | bytes, message: str) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import math
 import sys
 import traceback
 from collections import OrderedDict
@@ -24,6 +25,7 @@ from s2r_runtime.canonical import digest
 from s2r_runtime.errors import ConfigError, one_line
 from s2r_runtime.hookspecs import Follows, NominalModel
 from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.tables import SEGMENT, TIME
 
 Array = NDArray[np.float64]
 
@@ -68,9 +70,12 @@ class FileModel:
         try:
             # a division by zero shows in the result, which is checked; a step in place may change what it is given
             with contextlib.redirect_stdout(sys.stderr), np.errstate(all="ignore"):
-                result = np.array(self.function(x.copy(), u.copy(), dt, dict(parameters)), dtype=np.float64)
+                given = np.asarray(self.function(x.copy(), u.copy(), dt, dict(parameters)))
+                result = np.array(given.real if np.iscomplexobj(given) else given, dtype=np.float64)
         except (Exception, SystemExit) as error:  # noqa: BLE001 - a user's file: whatever it raises is its report
             raise _failed(self.name, "step", error) from None
+        if np.iscomplexobj(given):
+            raise ConfigError(f"{self.name}: step returned complex numbers, must return real ones")
         if result.shape != x.shape:
             raise ConfigError(f"{self.name}: step returned shape {result.shape}, must be {x.shape}")
         if not np.isfinite(result).all():  # as it mostly is: asking which rows were given so takes as long as a simple step
@@ -107,7 +112,12 @@ def load_file_model(spec: ModelSpec, where: str) -> NominalModel:
         parameters = {str(k): float(v) for k, v in dict(module.PARAMS).items()}
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{path}: PARAMS must be a dict of numbers: {error}") from None
+    if wrong := [f"{name} = {value}" for name, value in parameters.items() if not math.isfinite(value)]:
+        raise ConfigError(f"{path}: PARAMS has {wrong[0]}, must be finite numbers")
     states, inputs, angles = (_names(path, module, name) for name in ("STATES", "INPUTS", "ANGLES"))
+    _check_columns(path, states, inputs)
+    if unknown := [name for name in angles if name not in states]:
+        raise ConfigError(f"{path}: ANGLES names {unknown[0]!r}, must name states: {', '.join(states)}")
     return FileModel(str(path), states, inputs, angles, parameters, module.step, _follows(path, module, states))
 
 
@@ -130,6 +140,18 @@ def _names(path: Path, module: ModuleType, name: str) -> tuple[str, ...]:
     if not isinstance(given, tuple | list) or not all(isinstance(one, str) for one in given):
         raise ConfigError(f"{path}: {name} is {given!r}, must be a tuple of names")
     return tuple(given)
+
+
+def _check_columns(path: Path, states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
+    """Each state and each input is a column of its own in a recording, beside those of the time and the run."""
+    for what, names in (("STATES", states), ("INPUTS", inputs)):
+        if not names:
+            raise ConfigError(f"{path}: {what} is empty, must name at least one")
+    names = (*states, *inputs)
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ConfigError(f"{path}: {twice[0]!r} stands {names.count(twice[0])} times in STATES and INPUTS, must stand there once")
+    if taken := [name for name in names if name in (TIME, SEGMENT)]:
+        raise ConfigError(f"{path}: {taken[0]!r} is no name for a state or an input: in recordings it is the column of the time or the run")
 
 
 def _follows(path: Path, module: ModuleType, states: tuple[str, ...]) -> dict[str, Follows]:

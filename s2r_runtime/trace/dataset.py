@@ -278,7 +278,13 @@ def _stretches(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], 
     pieces = [part for states, inputs in segments for part in _split(states, inputs, model)]
     pieces = [part for part in pieces if len(part[0].t) >= 2 and part[0].t[-1] - part[0].t[0] > 0.5 * model.dt]
     if not pieces:
-        raise RecordingError(f"{source}: has no two rows on which a state was measured")
+        spans = [float(states.t[-1] - states.t[0]) for states, _ in segments if len(states.t) >= 2]
+        if not spans:
+            raise RecordingError(f"{source}: has no two rows on which a state was measured")
+        raise RecordingError(
+            f"{source}: no two rows on which a state was measured are a step of the model, {model.dt:g} s, apart: the longest run lasts "
+            f"{max(spans):g} s"
+        )
     return pieces
 
 
