@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import errno
 import gzip
 import json
+import os
+import shlex
 import socket
 import subprocess
 import sys
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command_reference import verbs
 
+from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import writable
-from s2r_runtime.cli.main import parser
+from s2r_runtime.cli.main import main, parser
 from s2r_runtime.errors import UsageError
 from s2r_runtime.offline_ledger import open_ledger
 
@@ -234,6 +239,149 @@ def test_what_is_put_in_a_files_place_needs_the_folder_and_not_the_file(tmp_path
         writable(there, replaced=True)
     monkeypatch.setattr("os.access", lambda path, _mode: path == tmp_path)
     writable(there, replaced=True)
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    """A unicycle that turns at 80 % of what is commanded, 25 s at 10 Hz."""
+    rng, x, rows = np.random.default_rng(1), np.zeros(3), ["t,x,y,theta,v,w"]
+    for k in range(250):
+        u = rng.uniform([-0.2, -1.5], [0.4, 1.5]) if k % 8 == 0 else u  # noqa: F821 - of the row before
+        rows.append(",".join(f"{value:.6f}" for value in (0.1 * k, *(x + rng.normal(0.0, [1e-3, 1e-3, 3e-3])), *u)))
+        x = x + 0.1 * np.array([u[0] * np.cos(x[2]), u[0] * np.sin(x[2]), 0.8 * u[1]])
+    path = tmp_path / "drive.csv"
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("option", ["-o", "--report", "--suggest"])
+def test_no_output_of_a_trace_takes_the_place_of_what_it_reads(drive: Path, tmp_path: Path, option: str) -> None:
+    before, link = drive.read_bytes(), tmp_path / "link.csv"
+    link.symlink_to(drive)
+    refused(s2r("trace", drive, *MODEL, option, drive), 2, option, "is the recording")
+    refused(s2r("trace", drive, *MODEL, option, link), 2, option, "is the recording")
+    model = tmp_path / "model.toml"
+    model.write_text('[model]\nname = "unicycle"\ndt = 0.1\n')
+    refused(s2r("trace", drive, "--model", model, option, model), 2, option, "is the model")
+    assert drive.read_bytes() == before
+
+
+def test_outputs_do_not_take_each_others_place(drive: Path, tmp_path: Path) -> None:
+    refused(s2r("trace", drive, *MODEL, "-o", tmp_path / "a", "--report", tmp_path / "a"), 2, "--report", "is the file of -o")
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("verb", [("report",), ("log", "recover")])
+def test_no_output_takes_the_place_of_a_log(table: Path, verb: tuple[str, ...]) -> None:
+    refused(s2r(*verb, table, "-o", table), 2, "is the log")
+    assert table.read_text().startswith("segment,t")
+
+
+def test_no_output_takes_the_place_of_a_controller(table: Path, tmp_path: Path) -> None:
+    controller = tmp_path / "grid.py"
+    controller.write_bytes((ROOT / "controllers" / "grid.py").read_bytes())
+    given = (controller, "--profile", PROFILE, "--recording", table, "-o", controller)
+    refused(s2r("certify", *given), 2, "is the controller")
+    refused(s2r("synthesize", *given), 2, "is the controller")
+
+
+def test_a_file_that_cannot_be_written_leaves_what_was_there_and_loses_no_result(
+    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old = tmp_path / "model.toml"
+    old.write_text("precious")
+
+    def full(self: Path, *_: object, **__: object) -> int:
+        self.touch()
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_text", full)
+    assert main(["trace", str(drive), *MODEL, "-o", str(old)]) == 2
+    told = capsys.readouterr()
+    assert "input_gain on w" in told.out
+    assert "written to" not in told.out
+    assert told.err.splitlines()[-1] == f"s2r: {old}: cannot be written: No space left on device"
+    assert old.read_text() == "precious"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["drive.csv", "model.toml"]
+
+
+def test_a_file_that_is_written_anew_keeps_its_mode_and_a_device_is_written_to(tmp_path: Path) -> None:
+    old = tmp_path / "old.html"
+    old.write_text("old")
+    old.chmod(0o640)
+    output.write(old, "new")
+    assert (old.read_text(), old.stat().st_mode & 0o777) == ("new", 0o640)
+    output.write(Path(os.devnull), "gone")
+    assert not Path(os.devnull).is_file()
+
+
+def piped(code: str, *argv: str | Path) -> subprocess.CompletedProcess[str]:
+    """s2r in a shell, as `code` says; stdout buffered as it is by default."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    command = shlex.join([sys.executable, "-m", "s2r_runtime", *map(str, argv)])
+    return subprocess.run(["bash", "-c", code.format(command)], capture_output=True, text=True, timeout=100, check=False, env=environment)
+
+
+@pytest.mark.parametrize("how", ["{} | true; exit ${{PIPESTATUS[0]}}", "{} >&-", "{} 2>&- >/dev/null"])
+def test_who_does_not_listen_changes_no_exit_code(table: Path, how: str) -> None:
+    few = table.with_name("few.csv")
+    few.write_text("\n".join(table.read_text().splitlines()[:300]))
+    for argv, code in ((("gap", table, *MODEL), 0), (("gap", few, *MODEL), 3), (("--help",), 0)):
+        done = piped(how, *argv)
+        assert done.returncode == code, (argv, done.stderr)
+        assert all(line.startswith("s2r: ") for line in done.stderr.splitlines() if argv != ("--help",)), done.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+@pytest.mark.parametrize("options", [(), ("--json",)])
+def test_a_result_that_nobody_gets_is_no_success(table: Path, options: tuple[str, ...]) -> None:
+    refused(piped("{} >/dev/full", "gap", table, *MODEL, *options), 2, "cannot be written to stdout: No space left on device")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('ANGLES = ("theta",)', 'ANGLES = ("psi",)', ("ANGLES names 'psi'", "x, y, theta")),
+        ('("x", "y", "theta")', '("x", "x", "theta")', ("'x' stands 2 times", "must stand there once")),
+        ('("v", "w")', '("x", "w")', ("'x' stands 2 times in STATES and INPUTS",)),
+        ('("x", "y", "theta")', '("t", "y", "theta")', ("'t' is no name for a state",)),
+        ('("v", "w")', '("v", "segment")', ("'segment' is no name",)),
+        ('("v", "w")', "()", ("INPUTS is empty",)),
+        ("{}", '{"k": float("nan")}', ("PARAMS has k = nan", "finite")),
+        ("return x + 0.0", "return x + 1j", ("complex",)),
+    ],
+)
+@pytest.mark.parametrize("verb", ["gap", "trace"])
+def test_a_model_file_that_cannot_be_meant_is_one_line(
+    drive: Path, tmp_path: Path, verb: str, old: str, new: str, words: tuple[str, ...]
+) -> None:
+    names = 'STATES = ("x", "y", "theta")\nINPUTS = ("v", "w")\nPARAMS = {}\nANGLES = ("theta",)\n'
+    text = names + "\ndef step(x, u, dt, params):\n    return x + 0.0\n"
+    assert old in text
+    model = tmp_path / "model.py"
+    model.write_text(text.replace(old, new))
+    refused(s2r(verb, drive, "--model", model, "--dt", "0.1"), 78, "model.py", *words)
+
+
+@pytest.mark.parametrize(
+    ("argv", "code", "words"),
+    [
+        (("gap", "--dt", "1e-9"), 2, ("comes every 0.1 s", "1e-09 s")),
+        (("trace", "--dt", "1e9"), 2, ("no two rows", "1e+09 s", "24.9 s")),
+        (("gap", "--dt", "0.1", "--weight", "theta=1e300"), 2, ("--weight theta=1e300", "1e-30 to 1e+30")),
+        (("trace", "--dt", "0.1", "--suggest", "s.csv", "--suggest-duration", "1e9"), 2, ("--suggest-duration 1e+09", "10000 s")),
+    ],
+)
+def test_a_number_out_of_all_bounds_is_one_line(drive: Path, argv: tuple[str, ...], code: int, words: tuple[str, ...]) -> None:
+    refused(s2r(argv[0], drive, "--model", "unicycle", *argv[1:], cwd=drive.parent), code, *words)
+
+
+def test_stamps_that_tell_no_step_are_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "late.csv"
+    path.write_text("t,x,y,theta,v,w\n" + "".join(f"{10**18 + 200 * k},0,0,0,0.1,0\n" for k in range(100)))
+    refused(s2r("gap", path, *MODEL), 2, "stamps are so large", "128 s")
+    path.write_text("t,x,y,theta,v,w\n" + "".join(f"5,{k},0,0,0.1,0\n" for k in range(100)))
+    refused(s2r("gap", path, *MODEL), 3, "holds no transition")
 
 
 def test_a_socket_where_nobody_listens_is_told_in_words(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import controller_at, load_checked, writable
+from s2r_runtime.cli.choices import apart, controller_at, load_checked, writable
 from s2r_runtime.errors import UsageError
 
 if TYPE_CHECKING:
@@ -53,6 +53,8 @@ def run(args: argparse.Namespace) -> int:
     from s2r_runtime.cli.trials_verb import trials_of
 
     writable(args.output, replaced=True)  # now, because what is spent below stays spent, whatever becomes of the certificate
+    inputs = {"the controller": args.controller, "the profile": args.profile, "the recording": args.recording, "the model": args.model}
+    apart({"-o": args.output}, {**inputs, "the key": args.key})
     profile = load_checked(args.profile)
     model = profile_model(args, profile)
     key_path = args.key or keys.default_path()

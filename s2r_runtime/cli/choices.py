@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ import msgspec
 from s2r_runtime.errors import ConfigError, UsageError
 from s2r_runtime.modelspec import ModelSpec, load_model
 from s2r_runtime.profile import Profile, check_names, load_profile
+from s2r_runtime.profile_checks import HEAVIEST, LIGHTEST
 
 if TYPE_CHECKING:
     from s2r_runtime.controllers.hosted import ControllerFile
@@ -78,6 +80,28 @@ def writable(path: Path | None, *, replaced: bool = False) -> None:
         raise UsageError(f"{path}: cannot be written: permission denied")
 
 
+def apart(outputs: Mapping[str, Path | None], inputs: Mapping[str, Path | str | None]) -> None:
+    """Refuses an output that would take the place of a file that is read, or of another output. Raises UsageError.
+
+    outputs: option -> path. inputs: what a file is, in words -> path (or a name that is no file's).
+    """
+    read = {what: Path(path) for what, path in inputs.items() if path is not None}
+    for option, path in outputs.items():
+        if path is None:
+            continue
+        for what, other in read.items():
+            if _same_file(path, other):
+                raise UsageError(f"{option} {path}: is {what}, which would be lost; name another file")
+        read[f"the file of {option}"] = path
+
+
+def _same_file(one: Path, other: Path) -> bool:
+    """Whether writing to one changes the other. A device (/dev/null) takes any number of writers."""
+    if one.exists() and other.exists():
+        return one.is_file() and one.samefile(other)
+    return one.resolve() == other.resolve()
+
+
 def load_checked(path: Path) -> Profile:
     """A profile whose names of models, states, tasks and transports were checked too."""
     profile = load_profile(path)
@@ -92,8 +116,8 @@ def weights_of(states: tuple[str, ...], given: list[str], profile: Profile | Non
         name, value = pair(item, "--weight")
         if name not in states:
             raise UsageError(f"--weight {item}: the model has no state {name!r}; it has: {', '.join(states)}")
-        if value <= 0.0:
-            raise UsageError(f"--weight {item}: must be > 0")
+        if not LIGHTEST <= value <= HEAVIEST:
+            raise UsageError(f"--weight {item}: must be > 0, from {LIGHTEST:g} to {HEAVIEST:g}")
         weights[name] = value
     return tuple(weights.get(name, 1.0) for name in states)
 

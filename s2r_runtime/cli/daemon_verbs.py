@@ -188,15 +188,16 @@ def run_live_trace(args: argparse.Namespace) -> int:
         )
     answer = _call(args, {"verb": "trace", "text": args.live})
     found = answer.get("data")
-    if args.output and found:
-        args.output.write_text(str(found["model_toml"]), encoding="utf-8")
+    trouble = output.trouble_writing(args.output, str(found["model_toml"])) if args.output and found else ""
     if args.json:
         output.result_json(answer if answer["exit_code"] or not found else found)
     elif answer["exit_code"]:
         output.err(f"s2r: {answer['text']}")
     else:
         output.out(f"{answer['text']}\n{(found or {}).get('text', '')}")
-    return int(answer["exit_code"])
+    if trouble:
+        output.err(f"s2r: {trouble}")
+    return UsageError.exit_code if trouble else int(answer["exit_code"])
 
 
 def run_status(args: argparse.Namespace) -> int:

@@ -266,16 +266,16 @@ class Demonstration:
     def _step(self, command: str, why: str) -> None:
         output.out()
         output.out(output.styled(f"$ {command}", "bold") + (f"   # {why}" if why else ""))
-        sys.stdout.flush()
+        output.flush()
 
     def _tell(self, text: str) -> None:
         output.out(text)
-        sys.stdout.flush()
+        output.flush()
 
     def _say(self, text: str, style: str = "") -> None:
         for line in text.split("\n"):
             output.out("   " + (output.styled(line, style) if style else line))
-        sys.stdout.flush()
+        output.flush()
 
 
 def _fresh(out: Path | None) -> Path:
@@ -308,7 +308,7 @@ def _free_ports(number: int) -> list[int]:
 
 
 def _s2r(*argv: str) -> int:
-    sys.stdout.flush()
+    output.flush()
     return subprocess.call([sys.executable, "-m", "s2r_runtime.cli.main", *argv])
 
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import writable
+from s2r_runtime.cli.choices import apart, writable
 from s2r_runtime.errors import UsageError
 
 HEAD_BYTES = 32
@@ -89,11 +89,9 @@ def run_report(args: argparse.Namespace) -> int:
 
     _need(args.log)
     writable(args.output)
-    page = log_page(args.log)
-    try:
-        args.output.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"{args.output}: cannot be written: {error.strerror}") from None
+    for log in args.log:
+        apart({"-o": args.output}, {"the log": log})
+    output.write(args.output, log_page(args.log))
     output.out(f"report written to {args.output}")
     return 0
 
@@ -103,8 +101,7 @@ def run_recover(args: argparse.Namespace) -> int:
     from s2r_runtime.recording.salvage import recover
 
     _need([args.log])
-    if args.output.resolve() == args.log.resolve():
-        raise UsageError(f"-o {args.output}: is the log itself; the original is kept, name another file")
+    apart({"-o": args.output}, {"the log": args.log})
     writable(args.output)
     account = recover(args.log, args.output)
     if args.json:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
-import sys
 import traceback
 from collections.abc import Callable, Sequence
 from importlib import metadata
@@ -76,10 +75,15 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one verb and returns its exit code; errors of the user's are one line on stderr, never a traceback."""
-    args = parser().parse_args(argv)
-    run: Callable[[argparse.Namespace], int] = args.run
+    output.stand_in_for_closed_streams()
+    args = argparse.Namespace()
     try:
-        return run(args)
+        try:
+            args = parser().parse_args(argv)
+            run: Callable[[argparse.Namespace], int] = args.run
+            return run(args)
+        finally:
+            output.flush()  # also after --help, which ends by SystemExit
     except S2RError as error:
         missing = error.missing if isinstance(error, NotEnoughEvidence) else None
         output.fail(str(error), error.exit_code, as_json=getattr(args, "json", False), missing=missing)
@@ -87,10 +91,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         output.err("interrupted")
         return 130
-    except BrokenPipeError:
-        # the reader of our stdout is gone; nothing more can be said to it, and Python's own flush at exit would complain
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except Exception as error:  # noqa: BLE001 - a defect of ours: said as one, with its code
         if os.environ.get("S2R_TRACEBACK"):
             traceback.print_exc()

@@ -1,27 +1,87 @@
-"""How the command line speaks: results on stdout, everything else on stderr, progress only on a terminal."""
+"""How the command line speaks: results on stdout and in files that were asked for, all else on stderr, progress only on a terminal."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import shutil
 import sys
 import time
+from pathlib import Path
 from typing import Any, TextIO
 
 import msgspec
 
+from s2r_runtime.errors import UsageError
+
 _STYLES = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33"}
 
 
+def stand_in_for_closed_streams() -> None:
+    """Who starts a program with stdout or stderr closed wants to hear nothing there: Python then has None in its place."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 - open as long as the program is
+
+
 def out(text: str = "") -> None:
-    """A line of the result."""
-    sys.stdout.write(text + "\n")
+    """A line of the result. Raises UsageError if stdout does not take it (a full disk); a reader who has gone (`| head`) does not mind."""
+    _to_stdout(text + "\n")
+
+
+def flush() -> None:
+    """Sends off the lines that are still waiting, where a failure can be said. Raises as `out`."""
+    _to_stdout("")
 
 
 def err(text: str = "") -> None:
-    """A line about it."""
-    sys.stderr.write(text + "\n")
-    sys.stderr.flush()
+    """A line about it. Nobody who reads it any more is no reason to end otherwise."""
+    with contextlib.suppress(OSError):
+        sys.stderr.write(text + "\n")
+        sys.stderr.flush()
+
+
+def _to_stdout(text: str) -> None:
+    try:
+        sys.stdout.write(text)
+        if not text:
+            sys.stdout.flush()
+    except OSError as error:
+        # what is buffered would be tried again when Python ends, and complained about; what comes yet has nowhere to go either
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            raise UsageError(f"the result cannot be written to stdout: {error.strerror}") from None
+
+
+def trouble_writing(path: Path, text: str) -> str:
+    """As `write`, for a file beside which there is more to tell: what went wrong, or an empty text."""
+    try:
+        write(path, text)
+    except UsageError as error:
+        return str(error)
+    return ""
+
+
+def write(path: Path, text: str) -> None:
+    """A file that was asked for, as a whole: what was there before stays if it cannot be written (a full disk). Raises UsageError."""
+    target = path.resolve()
+    try:
+        if target.exists() and not (
+            target.is_file() and os.access(target.parent, os.W_OK)
+        ):  # /dev/stdout, or a folder that takes no new file
+            target.write_text(text, encoding="utf-8")
+            return
+        temporary = target.with_name(f".{target.name}.{os.getpid()}")
+        try:
+            temporary.write_text(text, encoding="utf-8")
+            if target.exists():
+                shutil.copymode(target, temporary)
+            temporary.replace(target)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
 
 
 def result_json(value: Any) -> None:
@@ -34,7 +94,8 @@ def fail(message: str, code: int, *, as_json: bool = False, missing: int | None 
     line = " ".join(message.split("\n"))
     err(f"s2r: {line}")
     if as_json:
-        result_json({"error": line, "exit_code": code} | ({"missing_samples": missing} if missing else {}))
+        with contextlib.suppress(UsageError):  # stdout may be what failed
+            result_json({"error": line, "exit_code": code} | ({"missing_samples": missing} if missing else {}))
 
 
 def styled(text: str, style: str, stream: TextIO | None = None) -> str:

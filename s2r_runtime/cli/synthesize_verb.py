@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import controller_at, count, load_checked, positive, writable
+from s2r_runtime.cli.choices import apart, controller_at, count, load_checked, positive, writable
 from s2r_runtime.errors import ControllerError, UsageError
 
 if TYPE_CHECKING:
@@ -55,6 +55,8 @@ def run(args: argparse.Namespace) -> int:
     if args.evaluations < 2 or args.scenarios < 1:
         raise UsageError("--evaluations must be at least 2, --scenarios at least 1")
     writable(args.output, replaced=True)
+    inputs = {"the controller": args.controller, "the profile": args.profile, "the recording": args.recording, "the model": args.model}
+    apart({"-o": args.output}, {**inputs, "the key": args.key})
     profile = load_checked(args.profile)
     model = profile_model(args, profile)
     controller = controller_at(args.controller, [])
@@ -73,7 +75,10 @@ def run(args: argparse.Namespace) -> int:
     if isinstance(done, Failed) or done.synthesis is None:
         raise ControllerError(f"{args.controller}: the search ended: {done.text if isinstance(done, Failed) else 'no result'}")
     found = done.synthesis
-    persistence.replace(args.output, candidates.with_parameters(controller, found.best.parameters))
+    try:
+        persistence.replace(args.output, candidates.with_parameters(controller, found.best.parameters))
+    except OSError as error:
+        raise UsageError(f"{args.output}: cannot be written: {error.strerror}") from None
     winner = controller_at(args.output, [])
     attempt = ledger.spend_attempt(winner.digest)
     beta = attempt_beta(profile.guarantee.beta, attempt)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Set
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import add_model_options, chosen_model, count, positive, weights_of, writable
+from s2r_runtime.cli.choices import add_model_options, apart, chosen_model, count, positive, weights_of, writable
 from s2r_runtime.cli.daemon_verbs import add_daemon_options, run_live_trace
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
 
@@ -17,6 +18,10 @@ if TYPE_CHECKING:
     from s2r_runtime.trace.dataset import Dataset
     from s2r_runtime.trace.result import TraceResult
     from s2r_runtime.trace.suggestion import Suggestion
+
+
+MOST_SUGGESTED = 100_000
+"""Steps of a drive: many are drawn side by side, and every rival is simulated under each."""
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -70,11 +75,18 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("trace: give a RECORDING, or --live with what the running daemon recorded")
     for path in (args.output, args.report, args.suggest):
         writable(path)
+    apart(
+        {"-o": args.output, "--report": args.report, "--suggest": args.suggest},
+        {"the recording": args.recording, "the test recording": args.test, "the model": args.model, "the profile": args.profile},
+    )
     if args.live:
         return run_live_trace(args)
     if args.suggest_duration and not args.suggest:
         raise UsageError("--suggest-duration: belongs to --suggest FILE.csv")
     model, profile = chosen_model(args)
+    if args.suggest_duration and args.suggest_duration > MOST_SUGGESTED * model.dt:
+        most = MOST_SUGGESTED * model.dt
+        raise UsageError(f"--suggest-duration {args.suggest_duration:g}: must be at most {most:g} s, {MOST_SUGGESTED} steps of the model")
     columns, transport = (dict(profile.columns), profile.transport) if profile else ({}, None)
     data = load_dataset(args.recording, model, columns, bandwidth=args.bandwidth, transport=transport)
     used = data.reconstruction.bandwidth if data.reconstruction and not data.reconstruction.axes else args.bandwidth
@@ -103,46 +115,52 @@ def run(args: argparse.Namespace) -> int:
         raise
     finally:
         bar.close()
-    _write(args, result, suggested)
+    files = _files(args, result, suggested)
+    trouble = {path: why for path, text in files.items() if (why := output.trouble_writing(path, text))}
     if args.json:
         told = result.to_json()
-        output.result_json(told | ({"suggested_sequence": suggested.to_json(str(args.suggest))} if suggested else {}))
+        drive = {"suggested_sequence": suggested.to_json(str(args.suggest) if args.suggest not in trouble else None)} if suggested else {}
+        output.result_json(told | drive)
     else:
-        _tell(args, result, suggested, changed=result.spec.effects != model.spec.effects)
-    return 0
+        _tell(args, result, suggested, files.keys() - trouble.keys(), changed=result.spec.effects != model.spec.effects)
+    for why in trouble.values():  # last: what was found is told all the same
+        output.err(f"s2r: {why}")
+    return UsageError.exit_code if trouble else 0
 
 
-def _write(args: argparse.Namespace, result: TraceResult, suggested: Suggestion | None) -> None:
-    """The files that were asked for."""
+def _files(args: argparse.Namespace, result: TraceResult, suggested: Suggestion | None) -> dict[Path, str]:
+    """Texts of the files that were asked for."""
     from s2r_runtime.modelspec import dump_model
 
+    files: dict[Path, str] = {}
     if args.output:
-        args.output.write_text(dump_model(result.spec, result.comments()), encoding="utf-8")
+        files[args.output] = dump_model(result.spec, result.comments())
     if suggested and suggested.u is not None:
-        args.suggest.write_text(suggested.to_csv(), encoding="utf-8")
+        files[args.suggest] = suggested.to_csv()
     if args.report:
         from s2r_runtime.report.trace_page import trace_page
 
-        args.report.write_text(trace_page(result, suggested), encoding="utf-8")
+        files[args.report] = trace_page(result, suggested)
+    return files
 
 
-def _tell(args: argparse.Namespace, result: TraceResult, suggested: Suggestion | None, *, changed: bool) -> None:
+def _tell(args: argparse.Namespace, result: TraceResult, suggested: Suggestion | None, written: Set[Path], *, changed: bool) -> None:
     output.out(result.text())
     if suggested:
-        _tell_drive(args.suggest, suggested)
-    if args.output:
+        _tell_drive(args.suggest if args.suggest in written else None, suggested)
+    if args.output in written:
         output.out(f"model written to {args.output}" + ("" if changed else " (unchanged: no effect was added)"))
-    if args.report:
+    if args.report in written:
         output.out(f"report written to {args.report}")
 
 
-def _tell_drive(path: Path, suggested: Suggestion) -> None:
+def _tell_drive(path: Path | None, suggested: Suggestion) -> None:
     from s2r_runtime.trace.account import labelled
 
     output.out("")
     for line in labelled("drive", suggested.lines()):
         output.out(line)
-    if suggested.u is not None:
+    if path is not None:
         output.out(f"drive written to {path}")
 
 
@@ -159,10 +177,11 @@ def _suggest_first(args: argparse.Namespace, model: ComposedModel, data: Dataset
 
     bounds, region = _allowed(profile)
     drive = suggest_first(model, data, bounds=bounds, region=region, duration=args.suggest_duration, seed=args.seed)
-    if drive.u is not None:
-        args.suggest.write_text(drive.to_csv(), encoding="utf-8")
+    trouble = output.trouble_writing(args.suggest, drive.to_csv()) if drive.u is not None else ""
     if not args.json:
-        _tell_drive(args.suggest, drive)
+        _tell_drive(args.suggest if drive.u is not None and not trouble else None, drive)
+    if trouble:
+        output.err(f"s2r: {trouble}")
 
 
 def _allowed(profile: Profile | None) -> tuple[dict[str, tuple[float, float]] | None, dict[str, tuple[float, float]] | None]:
