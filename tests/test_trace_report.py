@@ -18,6 +18,7 @@ from s2r_runtime.report import plots
 from s2r_runtime.report.page import Page
 from s2r_runtime.report.trace_page import trace_page
 from s2r_runtime.report.trace_section import add_trace
+from s2r_runtime.trace.account import loud
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.excitation import suggest
 from s2r_runtime.trace.found import Found, each_once, interval_text
@@ -236,6 +237,36 @@ def test_a_page_shows_the_shape_of_what_is_left_and_lends_it_no_name(pages):
     assert re.search(r'aria-label="what is left of \w+ against theta"', page)
     assert "it has no name" in page
     assert "What is left, and what it depends on" not in pages["traced"]
+
+
+def test_what_hardly_shows_in_single_steps_is_drawn_against_what_it_depends_on_all_the_same(results):
+    """Held-out steps are few: what was told by rollouts, or by what was fitted, need not stand out in them."""
+    page = trace_page(replace(results["unexplained"], depends_on=("w*v",)))
+    assert "hardly stands out of the noise" not in page
+    even = replace(results["none"], verdict="unexplained", depends_on=("v", "constant"))
+    page = trace_page(even)
+    assert "hardly stands out of the noise" in page
+    assert re.search(r'aria-label="what is left of \w+ against v"', page)
+    assert "mean of what is left, a step" in page
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_a_page_says_what_a_residual_follows_only_where_there_is_more_than_noise(results, pages, verdict):
+    told = re.findall(r"<h3>Residual (?:of )?([^<]*)</h3><p class=.?soft.?>[^<]*of what is not noise", pages[verdict])
+    beyond = [part.said for part in loud(results[verdict])] if verdict not in {"none", "sensor_fault"} else []
+    assert set(told) <= set(beyond)
+    assert bool(told) == (verdict not in {"none", "sensor_fault"})
+    assert pages[verdict].count("of what is not noise") == len(told)
+
+
+def test_a_page_of_a_name_that_leaves_something_says_that_it_explains_a_part(results):
+    for left, said in (
+        ((), "the residual is explained by the effects below"),
+        (("time",), "the effects below explain a part of the residual"),
+    ):
+        page = Page("", "")
+        add_trace(page, {**results["traced"].to_json(), "depends_on": [*left]})
+        assert f"traced: {said}." in page.html()
 
 
 def test_a_page_marks_the_faults_on_the_time_axis(pages):

@@ -14,7 +14,8 @@ import numpy as np
 from s2r_runtime.report import trace_plots as plots
 from s2r_runtime.report.page import Page
 from s2r_runtime.report.trace_section import add_trace
-from s2r_runtime.trace.shape import Shape, components, derived, has_pose, of_tokens, shape_of, variables, world
+from s2r_runtime.trace.account import FOLLOWED, loud
+from s2r_runtime.trace.shape import Shape, clearest, components, derived, has_pose, of_tokens, shape_of, variables, world
 from s2r_runtime.trace.views import correlations, over_time, stretches
 
 if TYPE_CHECKING:
@@ -24,10 +25,7 @@ CANDIDATES = 12
 """Candidates that are listed."""
 
 SHOWN = 0.05
-"""Share of what is left that a shape accounts for at least, to be drawn."""
-
-TOLD = 0.3
-"""Share from which on it is said what a residual follows."""
+"""Share of what is left that a shape accounts for at least, to be drawn without a word."""
 
 BEFORE_AFTER = (("before", "orange"), ("after", "blue"))
 
@@ -36,7 +34,7 @@ def trace_page(result: TraceResult, suggested: Any = None) -> str:
     """The page of `s2r trace --report`. suggested: the sequence of inputs that --suggest wrote, if it did."""
     r = result
     model = r.nominal.spec.name.rsplit("/", 1)[-1]
-    page = Page("Residual, traced", f"{r.source} · {r.n_rows} rows · {model}, step {r.nominal.dt:.4g} s", wide=True)
+    page = Page("Trace of a residual", f"{r.source} · {r.n_rows} rows · {model}, step {r.nominal.dt:.4g} s", wide=True)
     changed = r.model.effects != r.nominal.effects
     trace = r.to_json()
     add_trace(page, trace)
@@ -89,16 +87,21 @@ def _what_is_left(page: Page, r: TraceResult) -> None:
     parts, axes = components(r.nominal, r.held, *steps), world(r.nominal, *steps)
     over = variables(r.nominal, r.held)
     inputs = over[: len(r.nominal.inputs)]
-    drawn = []
+    drawn, faint = [], []
     for token, wanted in of_tokens(tokens, [*over, *derived(r.nominal, r.held)]):
         shapes = sorted((shape_of(p, wanted, inputs, after=True) for p in [*parts, *axes]), key=lambda s: -s.share)
         drawn += [(plots.shape(s, s.variable), _shape_said(token, s)) for s in shapes[:3] if s.variable is not None and s.share > SHOWN]
+        if wanted:
+            faint.append((token, clearest([*parts, *axes], wanted)))
         if axes and any(v.name == "x" for v in wanted):
             x, y = (r.held.steps.y0[:, r.nominal.states.index(name)] for name in ("x", "y"))
             drawn.append((plots.field(x, y, axes[0].after, axes[1].after, axes[0].unit), "position: mean residual by place"))
+    if not drawn and faint:
+        page.text("In single steps of what was held out it hardly stands out of the noise: what was fitted, or rollouts, show it.", "soft")
+        drawn = [(plots.shape(s, s.variable), _shape_said(token, s)) for token, s in faint if s.variable is not None]
     if drawn:
         page.panels(drawn)
-    else:
+    if "constant" in tokens or not drawn:
         means = [
             (p.name, f"{float(np.mean(p.after)):.3g} ± {1.96 * float(np.std(p.after)) / math.sqrt(len(p.after)):.2g} {p.unit}")
             for p in [*parts, *axes]
@@ -141,10 +144,12 @@ def _against(page: Page, r: TraceResult, changed: bool) -> None:
         page.text("Along: ahead of where the model had it, in the direction of the heading. Across: to the left of it.", "soft")
     page.key(BEFORE_AFTER if changed else [("residual", "blue")])
     over, more = variables(r.nominal, r.held), derived(r.nominal, r.held)
+    # within the noise, and beside measurements that are wrong, something accounts for most of next to nothing: that is no finding
+    told = set() if r.verdict in {"none", "sensor_fault"} else {part.name for part in loud(r)}
     for part in components(r.nominal, r.held, r.before.one_step, r.after.one_step, r.floor[0]):
         s = shape_of(part, [*over, *more], over[: len(r.nominal.inputs)])
         page.heading(f"Residual of {part.name}" if part.name in r.nominal.states else f"Residual {part.said}", 3)
-        if s.share > TOLD:
+        if part.name in told and s.share > FOLLOWED:
             page.text(f"{'Before: ' if changed else ''}{100.0 * s.share:.0f} % of what is not noise {s.said}.", "soft")
         drawn = [*over, *([s.variable] if s.variable in more else [])]
         page.panels((plots.against(part, v, changed=changed), "") for v in drawn if v is not None)

@@ -24,6 +24,10 @@ FAULTS = 40
 def add_trace(page: Page, trace: dict[str, Any]) -> None:
     """The section without figures. trace: as `s2r trace --json` prints it."""
     text, kind = SAY[trace["verdict"]]
+    shared, beside = trace.get("any_shape_of", []), trace.get("may_depend_on", [])
+    left = [token for token in trace["depends_on"] if token not in {*shared, *beside}]
+    if trace["verdict"] == "traced" and left:
+        text, kind = "the effects below explain a part of the residual.", "warn"
     page.text(f"{trace['verdict']}: {text}", f"verdict {kind}")
     rows = list(_rows(trace["effects"], ""))
     for e in trace["ambiguous_with"]:
@@ -33,11 +37,9 @@ def add_trace(page: Page, trace: dict[str, Any]) -> None:
         page.table(("", "effect", "acts on", "parameter", "value and 95 % interval", "that is"), rows)
     if trace["suggested_excitation"]:
         page.text(f"What would tell them apart: {trace['suggested_excitation']}")
-    shared = trace.get("any_shape_of", [])
     if shared:
         page.text(f"Or anything else that depends on {' and '.join(shared)}: where so many do alike, one without a name may, too.")
-    beside = trace.get("may_depend_on", [])
-    if left := [token for token in trace["depends_on"] if token not in {*shared, *beside}]:
+    if left:
         page.text("What is left depends on: " + ", ".join(left), "warn")
     if beside:
         page.text(f"Less sure, but something may depend on {', '.join(beside)}: look at the name again.", "warn")

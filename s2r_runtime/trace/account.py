@@ -134,13 +134,15 @@ def _left_over(r: TraceResult) -> list[str]:
         shapes = [s for s in strongest(parts, told, inputs) if s.share > SEEN and s.variable is not None] if told else []
         said = [f"{s.component.said}: {_percent(s.share)} of it, noise included, {s.said}" for s in shapes[:2]]
         hidden = ["structure, which the transitions that were held out do not show"]
-        return [*said, *away] or [_louder(part) for part in _loud(r)] or hidden
-    loud = _loud(r)
-    shapes = strongest(loud, over, inputs)
-    return [*(_told(s) for s in shapes[:3]), *away] if loud else [f"nothing beyond noise in one step{'; ' if away else ''}{''.join(away)}"]
+        return [*said, *away] or [_louder(part) for part in loud(r)] or hidden
+    beyond = loud(r)
+    shapes = strongest(beyond, over, inputs)
+    return (
+        [*(_told(s) for s in shapes[:3]), *away] if beyond else [f"nothing beyond noise in one step{'; ' if away else ''}{''.join(away)}"]
+    )
 
 
-def _loud(r: TraceResult) -> list[Component]:
+def loud(r: TraceResult) -> list[Component]:
     """Parts of the residual of one step that are beyond the noise on what was held out."""
     parts = components(r.nominal, r.held, r.before.one_step, r.after.one_step, r.floor[0])
     return [p for p in parts if float(rms(p.before)) > TOLD * p.floor]

@@ -217,6 +217,12 @@ def strongest(parts: Sequence[Component], over: Sequence[Variable], inputs: Sequ
     return sorted(shapes, key=lambda s: -s.share * _loudness(s.component, after=after))
 
 
+def clearest(parts: Sequence[Component], over: Sequence[Variable]) -> Shape:
+    """Of what is left after the repair: the component and the variable, of these alone, that go together best, however little that is."""
+    shapes = [Shape(part, v, None, share(v.values, part.after, part.floor, None, _most(v))) for part in parts for v in over]
+    return max(shapes, key=lambda s: s.share)
+
+
 def _loudness(part: Component, *, after: bool) -> float:
     return float(np.mean((part.after if after else part.before) ** 2)) / part.floor**2 if part.floor > 0.0 else 1.0
 
