@@ -259,6 +259,21 @@ def test_a_page_says_what_a_residual_follows_only_where_there_is_more_than_noise
     assert pages[verdict].count("of what is not noise") == len(told)
 
 
+def test_a_page_says_nothing_of_what_goes_along_with_a_residual_within_the_noise(results):
+    one_step, end = results["traced"].floor
+    for quiet in (replace(results["traced"], floor=(10.0 * one_step, end)), replace(results["traced"], verdict="sensor_fault")):
+        assert "of what is not noise" not in trace_page(quiet)
+
+
+def test_the_same_time_stands_at_the_same_place_in_residuals_over_time(pages):
+    figures = re.findall(r'<svg role="img" aria-label="residual of \w+ over time".*?</svg>', pages["traced"], re.DOTALL)
+    axes = [re.findall(r"[ML] (\S+) (\S+)", re.findall(r'<path d="([^"]*)"', figure)[1]) for figure in figures]  # after the paper
+    assert len(axes) == 3
+    assert axes[0] == axes[1] == axes[2]
+    left, right = min(float(x) for x, _ in axes[0]), max(float(x) for x, _ in axes[0])
+    assert (left, right) == pytest.approx((0.085 * 756.0, 0.99 * 756.0))
+
+
 def test_a_page_of_a_name_that_leaves_something_says_that_it_explains_a_part(results):
     for left, said in (
         ((), "the residual is explained by the effects below"),

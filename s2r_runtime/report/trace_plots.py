@@ -73,9 +73,14 @@ def against(part: Component, over: Variable, *, changed: bool) -> str:
     return svg(fig, f"residual of {part.name} against {over.name}")
 
 
+OVER_TIME = (0.085, 0.23, 0.905, 0.66)
+"""Of residuals over time in shares of the figure: left, bottom, width, height. Room for numbers of six characters and a fault's word."""
+
+
 def over_time(part: Component, all_of_it: OverTime, faults: Sequence[tuple[float, float, str]], *, changed: bool) -> str:
     """A component over all of the recording; what was held out shaded, faults of measurement in red."""
     fig, (ax,) = figure(BROAD, 2.1)
+    ax.set_position(OVER_TIME)  # one stands below the other: the same time must stand at the same place, however wide the numbers are
     limit = _frame(part.before, part.after)
     fy, uy = shown_as(part.unit, limit)
     for begin, end in all_of_it.held_out:
