@@ -74,7 +74,7 @@ def against(part: Component, over: Variable, *, changed: bool) -> str:
 
 
 OVER_TIME = (0.085, 0.23, 0.905, 0.66)
-"""Of residuals over time in shares of the figure: left, bottom, width, height. Room for numbers of six characters and a fault's word."""
+"""Of residuals over time in shares of the figure: left, bottom, width, height. Room for numbers and a fault's word."""
 
 
 def over_time(part: Component, all_of_it: OverTime, faults: Sequence[tuple[float, float, str]], *, changed: bool) -> str:
