@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "plugin-author.md").read_text(encoding="utf-8")
 SECTION = PAGE[PAGE.index("## An effect, whole") : PAGE.index("## A model of your own")]
-EFFECT, KIT, *_OTHERS = re.findall(r"^```python[^\n]*\n(.*?)^```$", SECTION, re.MULTILINE | re.DOTALL)
+EFFECT, KIT, ON_A_BASE, *_OTHERS = re.findall(r"^```python[^\n]*\n(.*?)^```$", SECTION, re.MULTILINE | re.DOTALL)
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +53,16 @@ def test_an_effect_takes_less_than_forty_lines() -> None:
 
 def test_the_example_passes_the_kit_in_the_lines_that_the_page_shows(installed: Path) -> None:
     done = _run(installed, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_mine.py")
+    assert done.returncode == 0, done.stdout
+    assert " passed" in done.stdout
+
+
+def test_an_effect_on_a_base_passes_the_kit_as_the_page_shows_it(installed: Path) -> None:
+    kit = (
+        "from s2r_runtime.testing import EffectKit\n\n\nclass TestSoftLimit(EffectKit):\n    effect, parameters = SoftLimit(), {'k': 0.5}\n"
+    )
+    (installed / "test_soft.py").write_text(f"{ON_A_BASE}\n\n{kit}", encoding="utf-8")
+    done = _run(installed, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_soft.py")
     assert done.returncode == 0, done.stdout
     assert " passed" in done.stdout
 
