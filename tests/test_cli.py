@@ -376,6 +376,11 @@ def test_a_number_out_of_all_bounds_is_one_line(drive: Path, argv: tuple[str, ..
     refused(s2r(argv[0], drive, "--model", "unicycle", *argv[1:], cwd=drive.parent), code, *words)
 
 
+def test_a_radius_may_be_zero_and_what_is_said_of_others_allows_for_that() -> None:
+    done = s2r("verify", ROOT / "controllers" / "grid.py", "--profile", PROFILE, "--radius", "-1")
+    refused(done, 2, "--radius", "-1 must be >= 0 and finite")
+
+
 def test_stamps_that_tell_no_step_are_one_line(tmp_path: Path) -> None:
     path = tmp_path / "late.csv"
     path.write_text("t,x,y,theta,v,w\n" + "".join(f"{10**18 + 200 * k},0,0,0,0.1,0\n" for k in range(100)))

@@ -146,7 +146,10 @@ def positive(text: str) -> float:
 
 def not_negative(text: str) -> float:
     """argparse type: a finite number >= 0."""
-    return 0.0 if text.strip("0.") == "" and "0" in text else positive(text)
+    try:
+        return 0.0 if text.strip("0.") == "" and "0" in text else positive(text)
+    except argparse.ArgumentTypeError as error:
+        raise argparse.ArgumentTypeError(str(error).replace("> 0", ">= 0")) from None
 
 
 def count(text: str) -> int:
