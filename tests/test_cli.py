@@ -20,6 +20,7 @@ from command_reference import verbs
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import writable
 from s2r_runtime.cli.main import main, parser
+from s2r_runtime.daemon import persistence
 from s2r_runtime.errors import UsageError
 from s2r_runtime.offline_ledger import open_ledger
 
@@ -303,6 +304,30 @@ def test_a_file_that_cannot_be_written_leaves_what_was_there_and_loses_no_result
     assert told.err.splitlines()[-1] == f"s2r: {old}: cannot be written: No space left on device"
     assert old.read_text() == "precious"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["drive.csv", "model.toml"]
+
+
+def test_a_certificate_that_cannot_be_written_tells_what_the_spent_attempt_showed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    campaign, key = tmp_path / "campaign.csv", tmp_path / "key.pem"
+    # a command of the profile acts a period late
+    rng, lines = np.random.default_rng(2), ["segment,t,x,y,theta,v,w"]
+    for i, v in enumerate(rng.uniform(0.0, 0.2, 200)):
+        lines += [f"{i},{0.033 * k:.3f},{0.033 * max(k - 1, 0) * v + rng.normal(0.0, 1e-6):.9f},0,0,{v:.9f},0" for k in range(3)]
+    campaign.write_text("\n".join(lines) + "\n")
+    assert main(["keys", "new", str(key)]) == 0
+    capsys.readouterr()
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(persistence, "replace", full)
+    given = ("certify", ROOT / "controllers" / "grid.py", "--profile", PROFILE, "--recording", campaign, "--key", key)
+    assert main([*map(str, given), "-o", str(tmp_path / "a.cert"), "--json"]) == 2
+    told = capsys.readouterr()
+    answer = json.loads(told.out)
+    assert (answer["passed"], answer["certificate"], answer["attempt"]) == (True, None, 1)
+    assert told.err == f"s2r: {tmp_path / 'a.cert'}: cannot be written: No space left on device\n"
 
 
 def test_a_file_that_is_written_anew_keeps_its_mode_and_a_device_is_written_to(tmp_path: Path) -> None:

@@ -77,9 +77,16 @@ def run(args: argparse.Namespace) -> int:
         attempt=attempt,
         beta=attempt_beta(beta, attempt),
     )
+    trouble = ""
     if result.passed:
-        _write(args.output, profile, model, controller, gap, result, trials, assumption, key)
-    _tell(args, gap, trials, result, epoch, ledger.spent(beta), beta)
+        try:
+            _write(args.output, profile, model, controller, gap, result, trials, assumption, key)
+        except UsageError as error:  # the attempt is spent: what it showed is told all the same
+            trouble = str(error)
+    _tell(args, gap, trials, result, epoch, ledger.spent(beta), beta, written=result.passed and not trouble)
+    if trouble:
+        output.err(f"s2r: {trouble}")
+        return UsageError.exit_code
     return 0 if result.passed else 1
 
 
@@ -125,7 +132,9 @@ def _write(
         raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def _tell(args: argparse.Namespace, gap: Gap, trials: Trials | None, result: Verification, epoch: int, spent: float, beta: float) -> None:
+def _tell(
+    args: argparse.Namespace, gap: Gap, trials: Trials | None, result: Verification, epoch: int, spent: float, beta: float, *, written: bool
+) -> None:
     """beta: of the whole budget."""
     from s2r_runtime.cli.evidence import print_verification
     from s2r_runtime.verify import verification_json
@@ -135,7 +144,7 @@ def _tell(args: argparse.Namespace, gap: Gap, trials: Trials | None, result: Ver
         output.result_json(
             {
                 **answer,
-                "certificate": str(args.output) if result.passed else None,
+                "certificate": str(args.output) if written else None,
                 "gap": gap,
                 "trials": trials,
                 "verified_radius": result.radius if result.passed else None,
@@ -149,4 +158,4 @@ def _tell(args: argparse.Namespace, gap: Gap, trials: Trials | None, result: Ver
     print_verification(answer)
     output.out(f"gap epoch {epoch}, verification attempt {result.attempt}: {spent:.4f} of beta {beta} spent")
     told = f"gap {gap.radius:.4g}, certified to {result.radius:.4g}: certificate written to {args.output}"
-    output.out(told if result.passed else "no certificate")
+    output.out(told if written else "no certificate")
