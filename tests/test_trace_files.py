@@ -141,3 +141,13 @@ def test_a_column_under_another_writing_is_not_taken_for_one_that_was_not_measur
     code, _, err = _trace(tmp_path, capsys, "joint", _csv("joint", *recorded["joint"], header=("t", "q", "QD", "force")))
     assert code == 2
     assert "lacks the column 'qd', and has 'QD'" in err
+
+
+def test_a_recording_to_judge_on_must_be_long_enough_to_judge(tmp_path, capsys, recorded):
+    t, y, u = recorded["unicycle"]
+    for name, rows in (("run.csv", len(t)), ("test.csv", 12)):
+        (tmp_path / name).write_text(_csv("unicycle", t[:rows], y[:rows], u[:rows]), encoding="utf-8")
+    code = main(["trace", str(tmp_path / "run.csv"), "--model", "unicycle", "--dt", str(DT), "--test", str(tmp_path / "test.csv")])
+    said = capsys.readouterr().err.strip()
+    assert code == 3
+    assert "test.csv: 11 usable transitions of 0.05 s, at least 24 are needed: 13 more" in said

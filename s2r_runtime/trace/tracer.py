@@ -53,6 +53,9 @@ Progress = Callable[[float, float, str], None]
 FEWEST = 60
 """Usable transitions below which nothing is said: a fit on 36 of them, and 24 to judge it."""
 
+JUDGED = 24
+"""Of these, the fewest that a recording to judge on must have by itself."""
+
 HORIZON_S, HORIZON_STEPS = 1.0, 10
 """Of rollouts where nobody says otherwise: a second is what a robot's controller looks ahead, and one step would show no error grow."""
 
@@ -129,6 +132,8 @@ def _traced(
     fit_part = part(checked.data, checked.left_out, seen, FIT_STEPS)
     judged_on = _held_out(checked, seen, test, model, horizon)
     ahead = max(1, min(round(horizon / dataset.dt), len(fit_part.steps) // 4))
+    if test is not None and len(judged_on.steps) < JUDGED:
+        raise _too_few(test, len(judged_on.steps), JUDGED)
     _enough(dataset, model, fit_part, judged_on, ahead)
     given = problem(fit_part.data, fit_part.steps)
     say(5.0, 100.0, "looking for effects")
@@ -236,10 +241,10 @@ def _measured(data: Dataset) -> None:
         raise _too_few(data, usable)
 
 
-def _too_few(data: Dataset, usable: int) -> NotEnoughEvidence:
-    more = max(FEWEST - usable, 1)
+def _too_few(data: Dataset, usable: int, fewest: int = FEWEST) -> NotEnoughEvidence:
+    more = max(fewest - usable, 1)
     return NotEnoughEvidence(
-        f"{data.source}: {usable} usable transitions of {data.dt:g} s, at least {FEWEST} are needed: {more} more", more
+        f"{data.source}: {usable} usable transitions of {data.dt:g} s, at least {fewest} are needed: {more} more", more
     )
 
 
