@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import msgspec
 import numpy as np
@@ -129,29 +130,26 @@ def _traced(
     say(0.0, 100.0, "looking for faults of measurement")
     checked = check(model, with_history(model, dataset))
     seen = fit_mask(checked.data, seed, everything=test is not None)
-    fit_part = part(checked.data, checked.left_out, seen, FIT_STEPS)
-    judged_on = _held_out(checked, seen, test, model, horizon)
-    ahead = max(1, min(round(horizon / dataset.dt), len(fit_part.steps) // 4))
-    if test is not None and len(judged_on.steps) < JUDGED:
-        raise _too_few(test, len(judged_on.steps), JUDGED)
-    _enough(dataset, model, fit_part, judged_on, ahead)
-    given = problem(fit_part.data, fit_part.steps)
+    cut = _cut(checked, seen, test, model, horizon)
+    ahead = max(1, min(round(horizon / dataset.dt), len(cut.fit_part.steps) // 4))
+    if test is not None and len(cut.judged_on.steps) < JUDGED:
+        raise _too_few(test, len(cut.judged_on.steps), JUDGED)
+    _enough(dataset, model, cut.fit_part, cut.judged_on, ahead)
     say(5.0, 100.0, "looking for effects")
-    hidden = dataset.reconstruction is not None and dataset.reconstruction.hidden
-    chosen = select(given, model, ahead, lambda share: say(5.0 + 55.0 * share, 100.0, "looking for effects"), 1 if hidden else MOST)
-    lines = _straight(as_recorded, asked, parts, checked, seen, given, chosen.fit)
+    hidden = cut.given.bends
+    chosen = select(cut.given, model, ahead, lambda share: say(5.0 + 55.0 * share, 100.0, "looking for effects"), 1 if hidden else MOST)
+    lines = _straight(as_recorded, asked, parts, checked, seen, cut.given, chosen.fit)
     if lines is not None:
         return _traced(lines[0], asked, lines[1], horizon, seed, _from(60.0, say), norm, parts)
     for most in range(2, MOST + 1) if hidden else (MOST,):
-        if not _told_otherwise(given, chosen.fit, hidden):
+        if not _told_otherwise(cut.given, chosen.fit):
             break
-        checked = replace(checked, data=_restated(checked, chosen.fit))  # what depends on a speed is seen where the speed is better known
-        fit_part = part(checked.data, checked.left_out, seen, FIT_STEPS)
-        judged_on = _held_out(checked, seen, test, model, horizon)
-        given, before = problem(fit_part.data, fit_part.steps), names(chosen.fit.model)
-        chosen = select(given, model, ahead, lambda share: say(60.0 + 20.0 * share, 100.0, "looking for effects"), most)
+        cut = _cut(replace(cut.checked, data=_restated(cut.checked, chosen.fit)), seen, test, model, horizon)
+        before = names(chosen.fit.model)
+        chosen = select(cut.given, model, ahead, lambda share: say(60.0 + 20.0 * share, 100.0, "looking for effects"), most)
         if names(chosen.fit.model) == before:
             break
+    checked, judged_on, given = cut.checked, cut.judged_on, cut.given
     whole = Whole(checked, model, ahead)
     chosen = foretold_too(given, chosen, judged_on, ahead)
     chosen = confirmed(given, all_dated(given, whole.given, chosen), judged_on)
@@ -174,6 +172,25 @@ def _traced(
     result = replace(result, spec=msgspec.structs.replace(result.spec, dt=asked.dt), unseen=unseen)
     say(100.0, 100.0, result.verdict)
     return result
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """A recording in two: what is fitted, and what is judged on."""
+
+    checked: Checked
+    fit_part: Part
+    judged_on: Held
+
+    @cached_property
+    def given(self) -> Problem:
+        """What is fitted, as a problem; asked for once there is enough of it."""
+        return problem(self.fit_part.data, self.fit_part.steps)
+
+
+def _cut(checked: Checked, seen: Mask, test: Dataset | None, model: ComposedModel, horizon: float) -> _Cut:
+    fit_part = part(checked.data, checked.left_out, seen, FIT_STEPS)
+    return _Cut(checked, fit_part, _held_out(checked, seen, test, model, horizon))
 
 
 def _in_parts(model: ComposedModel, data: Dataset) -> ComposedModel:
@@ -258,15 +275,17 @@ def _held_out(checked: Checked, seen: Mask, test: Dataset | None, model: Compose
     return held(model, checked.data, steps.take(np.flatnonzero(~seen[steps.place])), checked.left_out, ~seen, horizon)
 
 
-def _told_otherwise(given: Problem, fit: Fit, hidden: bool) -> bool:
+def _told_otherwise(given: Problem, fit: Fit) -> bool:
     """Whether states that were not measured are others with what was found. A hidden state's law may bend anywhere, so that effects are
     told one after the other, each about where the state is with those before it.
     """
-    return bool(given.floor.axes) and any(hidden or fit.model.effects[place].effect.stage == "step" for place in fit.added)
+    return bool(given.floor.axes) and any(given.bends or fit.model.effects[place].effect.stage == "step" for place in fit.added)
 
 
 def _restated(checked: Checked, fit: Fit) -> Dataset:
-    """The recording with the states that were not measured as the model has them, which knows more than none."""
+    """The recording with the states that were not measured as the model has them, which knows more than none: what depends on a speed is
+    seen where the speed is better known.
+    """
     data = checked.data
     for _ in range(RETOLD if data.reconstruction is not None and data.reconstruction.hidden else 1):
         everything = problem(data, steps_of(data, checked.left_out))
