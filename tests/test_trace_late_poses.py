@@ -62,6 +62,15 @@ def test_rows_that_are_off_by_themselves_make_no_late_heading():
     assert late_pose(compose(ModelSpec("unicycle", 0.04)), [(Stream(t, pose), Stream(t[:1], np.zeros((1, 2))))], ()) == {}
 
 
+def test_a_heading_that_wandered_off_for_a_while_is_not_late():
+    """The drift of a gyroscope looks like one that lags, as long as it lasts."""
+    for seed in (302010, 302019):
+        made = make("fault", seed)
+        (run,) = made.recording.runs
+        model = compose(ModelSpec(made.model["name"], made.model["dt"], made.model["parameters"]))
+        assert late_pose(model, [(Stream(run.t, run.y), Stream(run.t_u, run.u))], ()) == {}
+
+
 def test_positions_that_come_late_are_told():
     found = _late(late_rows=(4, 0))
     assert found == dict.fromkeys(("x", "y"), pytest.approx(4 * ROW_S, rel=0.05))

@@ -43,6 +43,11 @@ SEEN = 6.0
 CLEARLY = 15.0
 """Nats by which a shift must explain more than what slides: as rivals on which all the rest is asked (`rivals.NEAR`)."""
 
+BLOCKS, AGAINST = 10, 0.2
+"""Of time; and the share of what speaks for a delay in some that may speak against it in others. A sensor is late all the time: a heading
+that wandered off for a while looks late then, and not before or after.
+"""
+
 WHOLE = 2.0
 """Nats that a whole number of rows may explain less than the best shift: rows then lie on one another."""
 
@@ -157,8 +162,16 @@ class _Ways:
         most = max(self._shifted(best), *found)
         if not (LEAST_ROWS * self._unit < abs(best) < MOST_S and most > max(nats + CLEARLY, leading)):
             return 0.0
+        if not self._all_the_time(best, ways, [*still, *slides]):
+            return 0.0
         whole = self._unit * round(best / self._unit)
         return float(whole if whole and self._shifted(whole) > most - WHOLE else best)
+
+    def _all_the_time(self, by: float, ways: Array, columns: list[Array]) -> bool:
+        """Whether a shift explains more than what slides does in nearly all of the recording."""
+        more = self._each(self._of(by), self._still(by)) - self._each(ways, columns)
+        parts = np.array([part.sum() for part in np.array_split(more, BLOCKS)])
+        return bool(-np.sum(np.minimum(parts, 0.0)) <= AGAINST * np.sum(np.maximum(parts, 0.0)))
 
     def _shifted(self, by: float) -> float:
         return self._nats(self._of(by), self._still(by))
@@ -224,6 +237,10 @@ class _Ways:
 
     def _nats(self, ways: Array, columns: list[Array], share: float | None = None) -> float:
         """Log likelihood of ways aside, less what the columns make of them. Neighbours share the error of the row between them."""
+        return float(np.sum(self._each(ways, columns, share)))
+
+    def _each(self, ways: Array, columns: list[Array], share: float | None = None) -> Array:
+        """The same of each row that is there, in order of time."""
         share = self._share if share is None else share
         white = _white(np.column_stack([ways, *columns])[self._there], share)
         y, x = white[:, 0], white[:, 1:]
@@ -234,7 +251,7 @@ class _Ways:
             rest = y - x @ np.linalg.lstsq(root[:, None] * x, root * y, rcond=1e-9)[0]
             scale = max(math.sqrt(float(np.sum(weight * rest**2) / np.sum(weight))), 1e-300)
             weight = noises.weight(rest / scale)
-        return float(np.sum(noises.log_density(rest / scale))) - len(y) * math.log(scale) - _logdet(len(y), share)
+        return np.asarray(noises.log_density(rest / scale) - math.log(scale) - _logdet(len(y), share) / len(y))
 
 
 def _spikes(values: Array) -> Mask:
