@@ -304,3 +304,41 @@ def test_a_joint_that_jumps_by_two_of_its_rows_is_told(apart):
     found = check(model, from_streams(model, [(Stream(t, y), Stream(t, force[:, None]))], "a table")).faults
     assert [(f.kind, f.channel) for f in found] == ([("offset_jump", "q")] if apart else [])
     assert all(f.from_s == pytest.approx(t[700]) for f in found)
+
+
+TANK = """import numpy as np
+
+STATES, INPUTS, PARAMS = ("level",), ("pump",), {}
+
+
+def step(x, u, dt, params):
+    return np.maximum(x + dt * (0.25 * u - 0.18 * np.sqrt(np.maximum(x, 0.0))), 0.0)
+"""
+
+
+def _level(tmp_path, spoil, seed):
+    """A tank that is pumped into by turns, its level to half a centimetre."""
+    (tmp_path / "tank.py").write_text(TANK)
+    model = compose(ModelSpec(str(tmp_path / "tank.py"), 4.0))
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(0.6, 3.4, 60), rng.integers(4, 18, 60))[:, None]
+    level = np.full((1, 1), 4.0)
+    rows = [level[0]]
+    for k in range(len(u)):
+        level = model.nominal.step(level, u[k : k + 1], 4.0, {})
+        rows.append(level[0])
+    y = np.array(rows) + rng.normal(size=(len(rows), 1)) * 0.02
+    spoil(y)
+    y = np.round(y / 0.005) * 0.005
+    t = 4.0 * np.arange(len(y))
+    return check(model, from_streams(model, [(Stream(t, y), Stream(t[:-1], u))], "here")).faults
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_level_that_froze_while_the_tank_filled_is_told_though_it_would_have_settled(tmp_path, seed):
+    def spoil(y):
+        y[200:240] = y[200]
+
+    (fault,) = _level(tmp_path, spoil, seed)
+    assert fault.kind == "frozen"
+    assert (fault.from_s / 4.0, fault.to_s / 4.0) == pytest.approx((200, 239), abs=1)

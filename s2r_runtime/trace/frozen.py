@@ -11,7 +11,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.fault import FROZEN_ROWS, QUANTA, SIGMAS, Fault
 from s2r_runtime.trace.reach import Reach, predicted
-from s2r_runtime.trace.residual import Acting
+from s2r_runtime.trace.residual import Acting, advanced, first_steps
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -59,11 +59,13 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
                 bad[a + 1 : b + 1, j] = True
                 found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
                 continue
-            path = np.cumsum(np.nan_to_num(moves[a:b, j]))
-            expected, far = float(path[-1]), float(np.max(np.abs(path)))
+            if np.max(np.abs(np.cumsum(np.nan_to_num(moves[a:b, j])))) < least:
+                continue
+            path = _led(model, data, act, i, (a, min(b + 1, len(e))))[:, j] - float(run.y[a, j])
+            expected, far = float(path[b - a]), float(np.max(np.abs(path[: b - a + 1])))
             if far < least:
                 continue
-            off = float(e[min(b, len(e) - 1), j]) - expected
+            off = float(run.y[min(b + 1, len(e)), j] - run.y[a, j] - path[-1])
             off = math.remainder(off, math.tau) if name in model.nominal.angles else off
             caught_up = b < len(e) and abs(expected) > least and abs(off) < 0.5 * abs(expected)
             jitters = reach.noise[j] > QUANTA * quantum  # even where the robot stands
@@ -71,6 +73,23 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
                 bad[a + 1 : b + 1, j] = True
                 found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
     return found + _with_them(model, data, i, bad)
+
+
+def _led(model: ComposedModel, data: Dataset, act: Acting, i: int, within: tuple[int, int]) -> Array:
+    """(last - first + 1, nx) where the model goes over the steps [first, last) from a measured row: states that repeat go on from where it
+    led, others are as they were measured. From one place that repeats, what pulls a level or a speed back would pull at every step anew.
+    """
+    first, last = within
+    run, begun = data.runs[i], first_steps(data)[i]
+    still = np.all(run.y[first + 1 : first + FROZEN_ROWS + 1] == run.y[first], axis=0)
+    x = run.y[first].copy()
+    led = [x]
+    for k in range(first, last):
+        x = np.where(still, x, run.y[k])
+        after = advanced(model, x[None, :], act, slice(begun + k, begun + k + 1))[0]
+        x = np.where(np.isfinite(after), after, x)
+        led.append(x)
+    return np.array(led)
 
 
 def _with_them(model: ComposedModel, data: Dataset, i: int, bad: Mask) -> list[Fault]:
