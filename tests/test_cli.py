@@ -26,6 +26,7 @@ from s2r_runtime.offline_ledger import open_ledger
 
 ROOT = Path(__file__).parent.parent
 PROFILE = ROOT / "profiles" / "robotarium.toml"
+GRID = ROOT / "controllers" / "grid.py"
 
 
 def s2r(*argv: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -141,6 +142,7 @@ def test_a_bad_profile_is_one_line_that_says_what_would_be_right(tmp_path: Path,
         (("gap", "no.csv", *MODEL, "--epsilon", "2"), 2, ("between 0 and 1",)),
         (("audit", "no.mcap"), 2, ("no.mcap",)),
         (("verify", "no.py", "--profile", str(PROFILE), "--radius", "0.01"), 2, ("no.py",)),
+        (("verify", str(GRID), "--profile", str(PROFILE), "--radius", "1", "--param", "maargin=1"), 2, ("--param", "'maargin'")),
         (("status", "--robot", "nobody"), 2, ("nobody",)),
         (("profile", "check", "no.toml"), 78, ("no.toml",)),
     ],
@@ -394,6 +396,11 @@ def test_a_model_file_that_cannot_be_meant_is_one_line(
         (("gap", "--dt", "1e-9"), 2, ("comes every 0.1 s", "1e-09 s")),
         (("trace", "--dt", "1e9"), 2, ("no two rows", "1e+09 s", "24.9 s")),
         (("gap", "--dt", "0.1", "--weight", "theta=1e300"), 2, ("--weight theta=1e300", "1e-30 to 1e+30")),
+        (("trace", "--dt", "0.1", "--horizon", "0.01"), 2, ("--horizon 0.01", "the model's step, 0.1 s")),
+        (("trace", "--dt", "nan"), 2, ("--dt", "nan must be > 0 and finite")),
+        (("gap", "--dt", "fast"), 2, ("--dt", "'fast' is not a number")),
+        (("gap", "--dt", "0.1", "--weight", "x=nan"), 2, ("--weight x=nan", "NAME=NUMBER, finite")),
+        (("gap", "--dt", "0.1", "--param", "mas=1"), 2, ("--param mas", "no such parameter")),
         (("trace", "--dt", "0.1", "--suggest", "s.csv", "--suggest-duration", "1e9"), 2, ("--suggest-duration 1e+09", "10000 s")),
     ],
 )

@@ -17,7 +17,7 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec, dump_model
 from s2r_runtime.profile import load_profile
 from s2r_runtime.trace.dataset import from_arrays
-from s2r_runtime.trace.excitation import suggest, suggest_first
+from s2r_runtime.trace.excitation import advice, suggest, suggest_first
 from s2r_runtime.trace.suggestion import ENOUGH
 from s2r_runtime.trace.tracer import trace
 
@@ -143,6 +143,11 @@ def test_what_nothing_within_the_bounds_tells_apart_is_refused_in_a_line():
     assert "\n" not in refused.text()
     with pytest.raises(ValueError, match="tells apart"):
         refused.to_csv()
+
+
+def test_advice_says_a_thing_once():
+    model = compose(ModelSpec("unicycle", 0.05))
+    assert advice(model, [("track_scale", "theta"), ("input_gain", "w")]) == "Drive w: at least three sizes."
 
 
 def test_inputs_that_may_not_change_at_all_are_refused(tied):

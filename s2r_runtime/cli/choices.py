@@ -28,7 +28,7 @@ def add_model_options(verb: argparse.ArgumentParser) -> None:
         metavar="M",
         help="a model's name, a Python file, or a model TOML (written by s2r trace -o); with --profile it replaces the profile's model",
     )
-    verb.add_argument("--dt", type=float, metavar="DT", help="the model's step in s (with a name or a Python file)")
+    verb.add_argument("--dt", type=positive, metavar="DT", help="the model's step in s (with a name or a Python file)")
     verb.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the model; may be repeated")
 
 
@@ -50,9 +50,15 @@ def chosen_model(args: argparse.Namespace) -> tuple[ComposedModel, Profile | Non
         spec, where = _named(args.model, dt), "--model"
     if args.dt is not None:
         spec = _with_dt(spec, args.dt)
-    if args.param:
-        spec = msgspec.structs.replace(spec, parameters={**spec.parameters, **dict(pair(item, "--param") for item in args.param)})
-    return compose(resolve_source(spec, Path.cwd()), where), profile
+    spec = resolve_source(spec, Path.cwd())
+    if not args.param:
+        return compose(spec, where), profile
+    asked = msgspec.structs.replace(spec, parameters={**spec.parameters, **dict(pair(item, "--param") for item in args.param)})
+    try:
+        return compose(asked, where), profile
+    except ConfigError as error:
+        compose(spec, where)  # a model that is wrong without them too says so itself
+        raise UsageError(str(error).replace(f"{where}.parameters.", "--param ")) from None
 
 
 def controller_at(path: Path, parameters: list[str]) -> ControllerFile:
@@ -61,7 +67,14 @@ def controller_at(path: Path, parameters: list[str]) -> ControllerFile:
 
     if not path.is_file():
         raise UsageError(f"{path}: no such file; a controller is a Python file with control(x, theta, parameters)")
-    return controllers.load(path, dict(pair(item, "--param") for item in parameters))
+    asked = dict(pair(item, "--param") for item in parameters)
+    try:
+        return controllers.load(path, asked)
+    except ConfigError as error:
+        if not asked:
+            raise
+        controllers.load(path, {})  # a file that is wrong without them too says so itself
+        raise UsageError(f"--param: {error}") from None
 
 
 def writable(path: Path | None, *, replaced: bool = False) -> None:
@@ -167,8 +180,6 @@ def _named(name: str, dt: float) -> ModelSpec:
 
 
 def _with_dt(spec: ModelSpec, dt: float) -> ModelSpec:
-    if not 0.0 < dt < float("inf"):
-        raise UsageError(f"--dt is {dt}, must be > 0 s")
     if spec.fitted_on and dt != spec.dt:
         raise ConfigError(f"--dt {dt}: the model was fitted at a step of {spec.dt} s; its effects hold for that step")
     return msgspec.structs.replace(spec, dt=dt)
@@ -182,5 +193,5 @@ def pair(item: str, option: str) -> tuple[str, float]:
     except ValueError:
         number = float("nan")
     if not sign or not name or not abs(number) < float("inf"):
-        raise UsageError(f"{option} {item}: must be NAME=NUMBER")
+        raise UsageError(f"{option} {item}: must be NAME=NUMBER, finite")
     return name, number

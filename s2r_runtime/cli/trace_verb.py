@@ -87,6 +87,8 @@ def run(args: argparse.Namespace) -> int:
     if args.suggest_duration and args.suggest_duration > MOST_SUGGESTED * model.dt:
         most = MOST_SUGGESTED * model.dt
         raise UsageError(f"--suggest-duration {args.suggest_duration:g}: must be at most {most:g} s, {MOST_SUGGESTED} steps of the model")
+    if args.horizon and args.horizon < model.dt:
+        raise UsageError(f"--horizon {args.horizon:g}: must be at least the model's step, {model.dt:g} s")
     columns, transport = (dict(profile.columns), profile.transport) if profile else ({}, None)
     data = load_dataset(args.recording, model, columns, bandwidth=args.bandwidth, transport=transport)
     used = data.reconstruction.bandwidth if data.reconstruction and not data.reconstruction.axes else args.bandwidth

@@ -107,6 +107,8 @@ def advice(model: ComposedModel, tied: Iterable[tuple[str, str]]) -> str:
             if text not in needs:
                 needs.append(text)
     told = {channel: "; ".join(needs[:MOST_NEEDS]) for channel, needs in sorted(wanted.items(), reverse=True)}
+    if told.get("") in {needs for channel, needs in told.items() if channel}:
+        del told[""]  # what an input is to do anyway need not be said once more of none in particular
     parts = [f"{channel}: {needs}" if channel else f"{needs[0].upper()}{needs[1:]}" for channel, needs in told.items()]
     apart = " Change one input at a time while the others hold still." if len([c for c in wanted if c]) > 1 else ""
     return ("Drive " if next(iter(told)) else "") + ". ".join(parts) + "." + apart
