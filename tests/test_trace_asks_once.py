@@ -16,7 +16,7 @@ from s2r_runtime.models.double_integrator import DoubleIntegrator
 from s2r_runtime.models.file_model import FileModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import fitting, lack_of_fit, relevance, residual, scores
+from s2r_runtime.trace import fitting, lack_of_fit, relevance, residual, retimed, scores
 from s2r_runtime.trace.chains import Inputs
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import Held, noise_floor
@@ -130,6 +130,21 @@ def test_models_that_differ_in_what_acts_take_their_steps_together(monkeypatch):
         assert other is not None
         assert np.array_equal(one, other)
     assert rows == [3 * len(given.steps), len(given.steps), len(given.steps)]
+
+
+def test_times_that_are_tried_take_their_steps_together(monkeypatch):
+    given, fit = _given()
+    change = AppliedEffect(registry().get("effects", "regime_change"), "ax", {"time": 2.0, "gain": 0.8})
+    later = evaluate(given, insert(fit.model, change, 0))
+    slot = next(slot for slot in later.free if retimed.is_time(later.model, slot))
+    base = fitting.under_noise(given, fit.model, later.noise)
+    given.predicted(fit.model)
+    calls, step, times = [], DoubleIntegrator.step, np.linspace(1.0, 5.0, 20)
+    monkeypatch.setattr(DoubleIntegrator, "step", lambda self, x, *rest: (calls.append(len(x)), step(self, x, *rest))[1])
+    together = retimed._nats(given, later, base, slot, times)
+    assert len(calls) < len(times)
+    alone = [retimed._nats(given, later, base, slot, times[k : k + 1])[0] for k in range(len(times))]
+    assert together == pytest.approx(alone, rel=1e-9)
 
 
 def test_a_model_that_steps_nowhere_is_none_and_takes_no_other_with_it(monkeypatch):

@@ -216,6 +216,12 @@ def foretold_by(given: Problem, models: Sequence[ComposedModel]) -> list[Array |
     return found
 
 
+def predicted_by(given: Problem, models: Sequence[ComposedModel]) -> list[Array]:
+    """Where each leads, (n, nx), as `Problem.predicted`, of many that are asked for once."""
+    found = foretold_by(given, models)
+    return [given.predicted(model) if there is None else there for model, there in zip(models, found, strict=True)]
+
+
 def _foretold_together(given: Problem, models: Sequence[ComposedModel]) -> Iterable[Array | None]:
     """Of models with the same effects on the step."""
     n, place = len(given.steps), given.steps.place

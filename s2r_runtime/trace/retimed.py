@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, refine, sensitivities, sought, under_noise, without
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, predicted_by, refine, sensitivities, sought, under_noise, without
 from s2r_runtime.trace.slots import Slot, bounds_of, values_of, with_values
 
 Array = NDArray[np.float64]
@@ -100,7 +100,8 @@ def _curve(given: Problem, fit: Fit, slot: Slot) -> tuple[Array, Array]:
 def _nats(given: Problem, fit: Fit, base: Fit, slot: Slot, times: Array) -> Array:
     before = given.predicted(base.model)
     models = [_at(fit.model, slot, float(when)) for when in times]
-    moved = np.stack([0.0 * before if m is None else given.predicted(m) - before for m in models], axis=2)
+    there = iter(predicted_by(given, [m for m in models if m is not None]))
+    moved = np.array([0.0 * before if m is None else next(there) - before for m in models]).transpose(1, 2, 0)
     weights = np.sqrt(noises.weight(base.z)).ravel()
     z, c = weights * base.z.ravel(), weights[:, None] * base.whiten(moved).reshape(len(weights), -1)
     if base.free:
