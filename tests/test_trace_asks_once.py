@@ -177,6 +177,23 @@ def test_a_file_model_asks_which_rows_were_given_only_where_something_is_not_fin
     assert len(asked) == 2
 
 
+@pytest.mark.parametrize("where", [0, 1])
+def test_a_file_model_is_asked_once_of_a_table_and_anew_of_one_that_differs_anywhere(tmp_path, monkeypatch, where):
+    path = tmp_path / "robot.py"
+    path.write_text('STATES = ("q",)\nINPUTS = ("u",)\nPARAMS = {}\n\ndef step(x, u, dt, params):\n    return x + dt * u\n')
+    model, asked, called = compose(ModelSpec(str(path), DT_S)).nominal, [], FileModel._called
+    monkeypatch.setattr(FileModel, "_called", lambda self, *given: (asked.append(1), called(self, *given))[1])
+    tables = [np.zeros((ROWS, 1)), np.zeros((ROWS, 1))]
+    first = model.step(*tables, DT_S, {})
+    first[:] = 7.0  # of whoever asked
+    assert np.array_equal(model.step(*tables, DT_S, {}), np.zeros((ROWS, 1)))
+    assert len(asked) == 1
+    for row in range(ROWS):
+        tables[where][row] = 1.0
+        assert np.array_equal(model.step(*tables, DT_S, {}), tables[0] + DT_S * tables[1])
+    assert len(asked) == 1 + ROWS
+
+
 @pytest.mark.parametrize("dt", [0.1, np.full((40, 1), 0.1)])
 def test_a_sine_before_the_start_is_worked_out_for_the_rows_before_it_only(dt):
     p = {"frequency": 1.3, "amplitude": 0.7, "phase": 0.4}
