@@ -253,15 +253,15 @@ class _Aside:
 
     def __init__(self, z: Array, j: Array) -> None:
         self.z = z
-        self._j = j
         self._w = noises.weight(self.z)
+        self._tables: dict[int, tuple[Array, Array]] = {0: (j, j * self._w[:, None])}
 
     def look(self, probe: Probe, c: Array) -> tuple[float, ComposedModel]:
         """Log density of what the probe leaves, and the model that it means."""
-        best = self._left(self.z - c[:, 0], self._j) if c.shape[1] == 1 else (-np.inf, np.zeros(0))
+        best = self._left(self.z - c[:, 0], *self._tables[0]) if c.shape[1] == 1 else (-np.inf, np.zeros(0))
         value, start = best[0], probe.start
         if probe.free:
-            scaled, beta = self._left(self.z, np.hstack([c, self._j]))
+            scaled, beta = self._left(self.z, *self._beside(c))
             neutral = np.array([bounds_of(start, s).neutral or 0.0 for s in probe.free])
             size = beta[: c.shape[1]]
             values = neutral + size * (values_of(start, probe.free) - neutral)
@@ -273,14 +273,24 @@ class _Aside:
 
     def less(self, c: Array) -> float:
         """Log density of what is left by a part of c (m, 1); none if that is no part."""
-        value, beta = self._left(self.z, np.hstack([c, self._j]))
+        value, beta = self._left(self.z, *self._beside(c))
         return value if 0.0 < beta[0] < 1.0 else -math.inf
 
-    def _left(self, z: Array, x: Array) -> tuple[float, Array]:
-        """Log density of z less its weighted least squares on x (m, k); the coefficients."""
+    def _beside(self, c: Array) -> tuple[Array, Array]:
+        """c (m, a) and what moves aside, side by side, and the same weighted: tables that are filled again for the next c."""
+        j, jw = self._tables[0]
+        own = c.shape[1]
+        if own not in self._tables:
+            self._tables[own] = np.hstack([c, j]), np.hstack([c, jw])
+        x, xw = self._tables[own]
+        x[:, :own] = c
+        np.multiply(c, self._w[:, None], out=xw[:, :own])
+        return x, xw
+
+    def _left(self, z: Array, x: Array, xw: Array) -> tuple[float, Array]:
+        """Log density of z less its least squares on x (m, k), weighted: xw; the coefficients."""
         if not x.shape[1]:
             return float(np.sum(noises.log_density(z))), np.zeros(0)
-        xw = x * self._w[:, None]
         product = xw.T @ x
         if len(product) == 1:  # as it mostly is
             only = np.asarray(xw.T @ z / max(float(product[0, 0]), 1e-300), dtype=np.float64)
