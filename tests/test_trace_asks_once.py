@@ -16,7 +16,7 @@ from s2r_runtime.models.double_integrator import DoubleIntegrator
 from s2r_runtime.models.file_model import FileModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import fitting, lack_of_fit, relevance, residual, retimed, scores
+from s2r_runtime.trace import fields, fitting, lack_of_fit, relevance, residual, retimed, scores
 from s2r_runtime.trace.chains import Inputs
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import Held, noise_floor
@@ -293,3 +293,18 @@ def test_candidates_are_held_against_what_one_model_foretells(monkeypatch):
     told = [relevance.relevant(given, one, base, 20) for one in (other, fit, other)]
     assert told == [False, True, False]
     assert len([of for of in asked if of is base]) == len([of for of in asked if of is other]) == 3  # one a length of rollouts
+
+
+def test_a_field_that_was_looked_at_goes_on_from_there(monkeypatch):
+    given, fit = _given()
+    left = left_of(given, evaluate(given, without(fit.model, 0)))
+    offer = max(fields._offered(left), key=lambda offer: fields._marginal(left, offer.x, 1)[0])
+    whole, first = fields._marginal(left, offer.x, fields.PASSES), fields._marginal(left, offer.x, 1)
+    passes, evidence = [], fields.evidence
+    monkeypatch.setattr(fields, "evidence", lambda *asked: (passes.append(1), evidence(*asked))[1])
+    onward = fields._marginal(left, offer.x, fields.PASSES, first)
+    assert onward[0] == whole[0]
+    assert np.array_equal(onward[1], whole[1])
+    asked = len(passes)
+    fields._marginal(left, offer.x, fields.PASSES)
+    assert len(passes) == 2 * asked + 1

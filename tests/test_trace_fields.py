@@ -220,7 +220,7 @@ def test_only_fields_that_stand_out_are_looked_at(monkeypatch):
     """
     looked = []
     marginal = fields._marginal
-    monkeypatch.setattr(fields, "_marginal", lambda left, x, passes: looked.append(passes) or marginal(left, x, passes))
+    monkeypatch.setattr(fields, "_marginal", lambda left, x, passes, *first: looked.append(passes) or marginal(left, x, passes, *first))
     for slips in (0.0, 0.4):
         rng = np.random.default_rng(3)
         u = _held(rng, 600, [-0.5, -1.5], [0.5, 1.5])

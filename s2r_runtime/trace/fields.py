@@ -31,6 +31,8 @@ from s2r_runtime.trace.residual_noise import Whitener
 from s2r_runtime.trace.slots import free_of
 
 Array = NDArray[np.float64]
+Marginal = tuple[float, Array]
+"""(log marginal likelihood, slopes (m,))."""
 
 CELLS = (12, 40, 120)
 """Visited cells at most, by how fine a field is."""
@@ -154,16 +156,17 @@ def field(left: Left) -> Field | None:
     """The field that explains most of what a model leaves, if it is beyond noise of its own colour."""
     bare = bare_nats(left)
     looked, tried = _looked(left, _offered(left), bare, LOOKED_AT, SURE)
-    kept = [offer for nats, offer in looked if nats > LOOKS][:FITTED]
+    kept = [(offer, first) for nats, offer, first in looked if nats > LOOKS][:FITTED]
     if not kept:
         return None
-    fitted = sorted(((*_marginal(left, offer.x, PASSES), k) for k, offer in enumerate(kept)), key=lambda f: -f[0])
+    fitted = sorted(((*_marginal(left, offer.x, PASSES, first), k) for k, (offer, first) in enumerate(kept)), key=lambda f: -f[0])
     nats, beta, best = fitted[0]
     price = math.log(tried / ALPHA)
     if nats - bare < price:
         return None
-    also = tuple(kept[k].token for other, _, k in fitted[1:] if other > nats - ALIKE)
-    return Field(kept[best].token, also, kept[best].x, beta, nats - bare, lambda: _beyond(left, nats - price, kept[best].x, beta, price))
+    also = tuple(kept[k][0].token for other, _, k in fitted[1:] if other > nats - ALIKE)
+    told = kept[best][0]
+    return Field(told.token, also, told.x, beta, nats - bare, lambda: _beyond(left, nats - price, told.x, beta, price))
 
 
 def _beyond(left: Left, nats: float, x: Array, beta: Array, price: float) -> float:
@@ -191,11 +194,13 @@ def _scaled(x: Array, beta: Array) -> Array:
 
 def _looked(
     left: Left, offered: Iterable[_Offer], bare: float, most: int, sure: float = math.inf
-) -> tuple[list[tuple[float, _Offer]], int]:
-    """(nats at first look, offer), the best first, of those that stand out most, or beyond doubt; and how many were offered."""
+) -> tuple[list[tuple[float, _Offer, Marginal]], int]:
+    """(nats at first look, offer, its first pass), the best first, of those that stand out most, or beyond doubt; and how many were
+    offered.
+    """
     ranked, tried = _standing_out(left, offered)
-    looked = [(_marginal(left, offer.x, 1)[0] - bare, offer) for k, (far, offer) in enumerate(ranked) if k < most or far > sure]
-    return sorted(looked, key=lambda pair: -pair[0]), tried
+    passed = [(offer, _marginal(left, offer.x, 1)) for k, (far, offer) in enumerate(ranked) if k < most or far > sure]
+    return sorted(((first[0] - bare, offer, first) for offer, first in passed), key=lambda look: -look[0]), tried
 
 
 def _standing_out(left: Left, offered: Iterable[_Offer]) -> tuple[list[tuple[float, _Offer]], int]:
@@ -268,8 +273,8 @@ def wandering_nats(left: Left, least: float = 0.0) -> float:
     if least <= LOOKS or "pushes" in left.known:
         return max((nats for nats, _, _ in _pushes(left)), default=bare)
     looked, _ = _looked(left, _wandering(left), bare, DIRECTIONS)
-    kept = [offer for nats, offer in looked if nats > least][:FITTED]
-    return max((_marginal(left, offer.x, PASSES)[0] for offer in kept), default=bare)
+    kept = [(offer, first) for nats, offer, first in looked if nats > least][:FITTED]
+    return max((_marginal(left, offer.x, PASSES, first)[0] for offer, first in kept), default=bare)
 
 
 def _pushes(left: Left) -> list[tuple[float, _Offer, Array]]:
@@ -387,14 +392,17 @@ def _cells(place: Array, along: int) -> Array:
     return np.asarray(numbers[:, None] // sides % (along + 1), dtype=np.float64)
 
 
-def _marginal(left: Left, x: Array, passes: int) -> tuple[float, Array]:
+def _marginal(left: Left, x: Array, passes: int, first: Marginal | None = None) -> Marginal:
     """(log marginal likelihood, beta (m,)) of x (n, nx, m), the best of some passes of beta and noise in turn. What is left is judged, and
-    its price is taken, under one noise.
+    its price is taken, under one noise. first: what the first pass said, if that was asked before.
     """
     whiten, z, joined = left.fit.whiten, left.fit.z, left.given.steps.joined
     best, told, rest = -math.inf, np.asarray(np.zeros(x.shape[2])), left.r
     columns = np.asfortranarray(x.reshape(-1, x.shape[2]))  # as whitening takes them: they are copied once, not in every pass
-    for again in range(passes):
+    if first is not None:
+        best, told = first
+        rest = left.r - (columns @ told).reshape(left.r.shape)
+    for again in range(0 if first is None else 1, passes):
         if again:
             whiten = Whitener(noises.estimate(rest, left.f, joined, left.given.floor), left.f, joined)
             z = whiten(rest)
