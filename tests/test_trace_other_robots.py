@@ -130,3 +130,24 @@ def test_a_robot_that_answers_late_and_weakly_by_both_inputs_gets_all_its_names(
     assert delays
     assert delays == pytest.approx([late * DT] * len(delays), abs=0.01)
     assert [told["input_gain", name]["gain"][0] for name in ("v", "w")] == pytest.approx([0.3, 0.4], abs=0.005)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_commands_on_another_clock_from_some_time_on_have_not_lost_their_effect(seed):
+    """The robot goes on by what it is told, recorded 2.5 s away: no input that does nothing from then on makes it go there."""
+    rng = np.random.default_rng([53, seed])
+    u = _held(rng, [1.0, 1.0])
+    told = np.concatenate([u[: ROWS // 2], np.roll(u[ROWS // 2 :], 50, axis=0)])
+    found = trace(_driven(rng, u, lambda u, now, dt: np.array([u[0], 0.0, u[1]]), asked=told), UNICYCLE)
+    assert found.verdict == "unexplained"
+    assert not found.effects
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_wheel_drive_that_failed_on_the_way_is_named(seed):
+    rng = np.random.default_rng([54, seed])
+    u = _held(rng, [1.0, 1.0])
+    acts = u * np.where(np.arange(ROWS) < ROWS // 2, 1.0, 0.0)[:, None] ** [0, 1]
+    found = trace(_driven(rng, acts, lambda u, now, dt: np.array([u[0], 0.0, u[1]]), asked=u), UNICYCLE)
+    assert found.verdict in {"traced", "ambiguous"}
+    assert ("regime_change", "w") in {(e.name, e.channel) for e in found.effects}

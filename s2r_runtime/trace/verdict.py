@@ -75,6 +75,9 @@ MIXED = 0.75
 SILENT = 0.05
 """Of what is asked of an input: if less is left of it, effects have silenced it."""
 
+FEWEST_SILENT = 20
+"""Rollouts from which on it is told whether the robot goes while nothing is left of an input."""
+
 NOISIER = 3.0
 """Times what noise alone makes of the ends of rollouts from which on it is not noise that takes them there; it may be coloured."""
 
@@ -162,7 +165,7 @@ def verdict_of(
     noise_alone = 0.0 * floors[0] if structure.matters else floors[0]  # what is left was taken for noise, too
     if away or not foretells(after, given, noise_alone) or _withdrawn(chosen.fit, structure, given) or harms(before, after, floor):
         return "unexplained"
-    if _another_model(chosen.fit, before, given) or _silenced(chosen.fit, after, given):
+    if _another_model(chosen.fit, before, given) or _silenced(chosen.fit, after, given) or _silenced_for_a_while(chosen.fit, after, given):
         return "unexplained"
     return "ambiguous" if chosen.rivals else "traced"
 
@@ -199,6 +202,27 @@ def _silenced(fit: Fit, after: Judged, given: Held) -> bool:
     asked, acts = (np.std(u, axis=0) for u in _asked_and_acting(fit, given))
     share, goes = _off(after, given)
     return bool(np.any((asked > 0.0) & (acts < SILENT * asked)) and np.any(share[goes] >= NEARER))
+
+
+def _silenced_for_a_while(fit: Fit, after: Judged, given: Held) -> bool:
+    """The same of rollouts in which an input is asked for something and nothing is left of it from beginning to end: what stood still would
+    go nowhere. A robot that goes on as it did, but not as it is told, does so on another clock, or by another one's commands.
+    """
+    starts = rollout_starts_of(given)
+    if not any(fit.model.effects[i].effect.stage == "input" for i in fit.added) or len(after.ends) != len(starts):
+        return False
+    asked, acts = (acting(fit.model, given.data, chain).mean for chain in ((), None))
+    told, left = asked != 0.0, np.abs(acts) > SILENT * np.abs(asked)
+    for is_told, is_left in zip(told.T, left.T, strict=True):
+        some, any_left = (np.concatenate([[0], np.cumsum(yes)]) for yes in (is_told, is_left & is_told))
+        ends = starts + given.horizon
+        there = (some[ends] > some[starts]) & (any_left[ends] == any_left[starts])
+        if np.count_nonzero(there) < FEWEST_SILENT:
+            continue
+        share, goes = _off_at(after, given, there)
+        if np.any(share[goes] >= NEARER):
+            return True
+    return False
 
 
 def _asked_and_acting(fit: Fit, given: Held) -> tuple[Array, Array]:
@@ -310,8 +334,14 @@ def _beyond_noise(judged: Judged, given: Held, floor: Array) -> Mask:
 
 def _off(judged: Judged, given: Held) -> tuple[Array, Mask]:
     """(groups,) how far rollouts end from the measurement, over how far the state went; and whether it goes anywhere."""
+    return _off_at(judged, given, np.ones(len(judged.ends), dtype=bool))
+
+
+def _off_at(judged: Judged, given: Held, there: Mask) -> tuple[Array, Mask]:
+    """The same of some rollouts, (m,) there."""
     columns = _together(given.data.states)
-    gone, step, off = (_lengths(e, columns) for e in (displacement(given), given.steps.y1 - given.steps.y0, judged.ends))
+    way = displacement(given)
+    gone, step, off = (_lengths(e, columns) for e in (way[there], given.steps.y1 - given.steps.y0, judged.ends[there]))
     goes = gone > min(5.0, 0.5 * given.horizon) * step
     return off / np.maximum(gone, 1e-300), np.asarray(goes, dtype=bool)
 
