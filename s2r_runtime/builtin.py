@@ -52,7 +52,7 @@ _EFFECTS = {
     "heading_offset": "the heading is measured with a constant offset",
     "sensor_offset": "a state is measured with a constant offset",
     "sensor_lever_arm": "another point of the body is measured",
-    "integration_scheme": "the pose moves along arcs, not along the step's first tangent",
+    "integration_scheme": "the pose moves along arcs, not along the step's first tangent; an own model's steps are too coarse",
 }
 
 

@@ -288,6 +288,21 @@ def test_no_output_takes_the_place_of_a_controller(table: Path, tmp_path: Path) 
     refused(s2r("synthesize", *given), 2, "is the controller")
 
 
+def test_no_output_takes_the_place_of_the_file_behind_a_model(drive: Path, tmp_path: Path) -> None:
+    own, model = tmp_path / "own.py", tmp_path / "model.toml"
+    names = 'STATES = ("x", "y", "theta")\nINPUTS = ("v", "w")\nPARAMS = {}\nANGLES = ("theta",)\n'
+    text = names + "\n\ndef step(x, u, dt, params):\n    return x\n"
+    own.write_text(text)
+    model.write_text(f'[model]\nname = "{own}"\ndt = 0.1\n')
+    refused(s2r("trace", drive, "--model", model, "-o", own), 2, "is the model's file")
+    assert own.read_text() == text
+
+
+def test_a_model_may_be_written_into_a_pipe(drive: Path) -> None:
+    done = piped("{} | cat", "trace", drive, *MODEL, "-o", "/dev/stdout")
+    assert "[model]" in done.stdout, done.stderr
+
+
 def test_a_file_that_cannot_be_written_leaves_what_was_there_and_loses_no_result(
     drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

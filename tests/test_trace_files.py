@@ -151,3 +151,15 @@ def test_a_recording_to_judge_on_must_be_long_enough_to_judge(tmp_path, capsys, 
     said = capsys.readouterr().err.strip()
     assert code == 3
     assert "test.csv: 11 usable transitions of 0.05 s, at least 24 are needed: 13 more" in said
+
+
+def test_runs_of_two_rows_are_traced_whatever_goes_on_in_between(tmp_path, capsys, recorded):
+    """As a campaign's table has them: no rollout is longer than its one step."""
+    t, y, u = recorded["unicycle"]
+    rows = ["segment,t,x,y,theta,v,w"]
+    for k in range(0, ROWS - 1, 2):
+        rows += [f"{k},{t[j]:.6f}," + ",".join(f"{v:.6g}" for v in (*y[j], *u[j])) for j in (k, k + 1)]
+    path = tmp_path / "pairs.csv"
+    path.write_text("\n".join(rows) + "\n")
+    assert main(["trace", str(path), "--model", "unicycle", "--dt", str(DT), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["verdict"] != "sensor_fault"

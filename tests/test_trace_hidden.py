@@ -172,3 +172,93 @@ def test_a_model_that_gives_no_numbers_at_all_is_one_line(tmp_path):
     none = compose(ModelSpec(str(file), DT_S))
     with pytest.raises(RecordingError, match="upper cannot be told: the model gives no numbers for this recording"):
         load_dataset(_lower_only(tmp_path), none)
+
+
+def test_a_hidden_state_that_moves_nothing_for_a_while_is_told_where_it_does(tmp_path):
+    """A valve between the tanks that is open eight rows of twenty."""
+    file = tmp_path / "valve.py"
+    file.write_text(
+        TANKS.replace('INPUTS = ("pump",)', 'INPUTS = ("pump", "valve")').replace(
+            'params["k2"] * flow[:, 0]', 'params["k2"] * u[:, 1] * flow[:, 0]'
+        )
+    )
+    t, levels, u = _flown()
+    valve = (np.arange(ROWS) % 20 < 8).astype(float)
+    path = _table(tmp_path, {"t": t, "lower": levels[:, 1], "pump": u, "valve": valve})
+    told = load_dataset(path, compose(ModelSpec(str(file), DT_S)))
+    assert np.all(np.isfinite(told.runs[0].y))
+    never = _table(tmp_path, {"t": t, "lower": levels[:, 1], "pump": u, "valve": 0.0 * valve}, "never.csv")
+    with pytest.raises(RecordingError, match="upper cannot be told: nowhere in this recording does it move lower"):
+        load_dataset(never, compose(ModelSpec(str(file), DT_S)))
+
+
+WHOLE_STEPS = """
+import numpy as np
+
+STATES = ("a", "b")
+INPUTS = ("u",)
+PARAMS = {"k": 0.9}
+
+
+def step(x, u, dt, params):
+    return np.column_stack([params["k"] * x[:, 0] + 0.1 * u[:, 0], 0.8 * x[:, 1] + 0.2 * x[:, 0]])
+"""
+
+
+def test_a_model_of_whole_steps_is_not_taken_in_parts(tmp_path):
+    """As it was identified, whatever dt is: two of its halves are two of its steps."""
+    file = tmp_path / "whole.py"
+    file.write_text(WHOLE_STEPS)
+    model = compose(ModelSpec(str(file), 0.1))
+    rng = np.random.default_rng(0)
+    u, x, rows = np.repeat(rng.normal(size=100), 8), np.zeros((1, 2)), []
+    for pull in u:
+        rows.append(x[0, 1])
+        x = model.nominal.step(x, np.array([[0.8 * pull]]), 0.1, {"k": 0.9})
+    path = _table(tmp_path, {"t": 0.1 * np.arange(800), "b": np.array(rows) + 1e-3 * rng.normal(size=800), "u": u})
+    data = load_dataset(path, model)
+    assert not data.reconstruction.in_parts
+    result = trace(data, model)
+    assert [(e.name, e.channel) for e in result.effects] == [("input_gain", "u")]
+    assert result.effects[0].parameters["gain"][0] == pytest.approx(0.8, rel=0.01)
+
+
+def test_a_model_that_is_right_in_parts_is_written_in_parts(tmp_path, model, capsys):
+    written = tmp_path / "written.toml"
+    assert main(["trace", str(_lower_only(tmp_path)), "--model", model.spec.name, "--dt", "4", "-o", str(written), "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert (answer["verdict"], answer["reconstructed"]["steps_in_parts"]) == ("none", True)
+    assert "integration_scheme" in written.read_text()
+
+
+def test_a_telling_angle_may_be_kept_within_one_turn(tmp_path):
+    """A motor whose current nobody measured: its angle says how it turns, also where the file brings it back into a turn."""
+    text = """
+import numpy as np
+
+STATES = ("angle", "rate")
+INPUTS = ("volt",)
+PARAMS = {"k": 2.0}
+ANGLES = ("angle",)
+
+
+def step(x, u, dt, params):
+    rate = x[:, 1] + dt * (params["k"] * u[:, 0] - x[:, 1])
+    angle = x[:, 0] + dt * rate
+    return np.column_stack([np.arctan2(np.sin(angle), np.cos(angle)), rate])
+"""
+    rng = np.random.default_rng(0)
+    told = []
+    u = np.repeat(rng.uniform(-1.0, 3.0, 40), 15)
+    for name, back in (("turns.py", "angle"), ("one_turn.py", "np.arctan2(np.sin(angle), np.cos(angle))")):
+        file = tmp_path / name
+        file.write_text(text.replace("np.arctan2(np.sin(angle), np.cos(angle))", back))
+        model = compose(ModelSpec(str(file), 0.05))
+        angle, rate, rows = 0.0, 0.0, []
+        for volt in u:
+            rows.append(angle)
+            rate += 0.05 * (2.0 * volt - rate)
+            angle += 0.05 * rate
+        path = _table(tmp_path, {"t": 0.05 * np.arange(600), "angle": np.array(rows), "volt": u}, f"{name}.csv")
+        told.append(load_dataset(path, model).runs[0].y[:, 1])
+    assert np.allclose(*told, atol=1e-3)

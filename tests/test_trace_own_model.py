@@ -443,3 +443,42 @@ def test_a_step_in_parts_is_off_by_a_higher_power_of_its_length(tmp_path):
     assert off(model.nominal, 8.0) / off(model.nominal, 4.0) == pytest.approx(4.0, rel=0.1)
     assert off(finer, 8.0) / off(finer, 4.0) == pytest.approx(16.0, rel=0.25)
     assert off(finer, 8.0) < 0.01 * off(model.nominal, 8.0)
+
+
+def test_a_step_in_parts_is_the_same_whether_the_file_brings_headings_back_into_one_turn(tmp_path):
+    text = """
+import numpy as np
+
+STATES = ("theta", "w")
+INPUTS = ("u",)
+PARAMS = {}
+ANGLES = ("theta",)
+
+
+def step(x, u, dt, params):
+    theta = x[:, 0] + dt * x[:, 1]
+    return np.column_stack([BACK, x[:, 1] + dt * 5.0 * (u[:, 0] - x[:, 1])])
+"""
+    models = []
+    for name, back in (("turns.py", "theta"), ("one_turn.py", "np.arctan2(np.sin(theta), np.cos(theta))")):
+        (tmp_path / name).write_text(text.replace("BACK", back))
+        models.append(integrating(compose(ModelSpec(str(tmp_path / name), 0.1)).nominal, "exact"))
+    rng = np.random.default_rng(0)
+    x = np.column_stack([rng.uniform(-np.pi, np.pi, 20_000), rng.uniform(-3.0, 3.0, 20_000)])
+    free, kept = (model.step(x, np.zeros((20_000, 1)), 0.1, {}) for model in models)
+    off = np.remainder(kept - free + np.pi, 2.0 * np.pi) - np.pi
+    assert np.max(np.abs(off)) < 1e-9
+
+
+def test_where_a_frozen_state_would_lead_to_no_numbers_the_trace_goes_on(tmp_path):
+    model = _pool(tmp_path, POOL.replace("np.maximum(x, 0.0)", "np.where(x < 0.0, np.nan, x)"))
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(0.5, 2.5, (40, 1)), 10, axis=0)
+    u[200:300] = 0.0
+    level, y = 2.0, [2.0]
+    for pump in u[:, 0].tolist():
+        level += 8.0 * (0.05 * pump - 0.01 * math.sqrt(max(level, 0.0)))  # it drains at a quarter of what the model says
+        y.append(max(level, 0.0))
+    y = np.array(y)[:, None] + rng.normal(size=(401, 1)) * 0.003
+    y[210:290] = y[210]
+    assert trace(from_arrays(model, [(y, u)]), model).verdict in {"none", "traced", "ambiguous", "unexplained", "sensor_fault"}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import apart, controller_at, load_checked, writable
+from s2r_runtime.cli.choices import apart, controller_at, load_checked, own_file, writable
 from s2r_runtime.errors import UsageError
 
 if TYPE_CHECKING:
@@ -54,9 +54,10 @@ def run(args: argparse.Namespace) -> int:
 
     writable(args.output, replaced=True)  # now, because what is spent below stays spent, whatever becomes of the certificate
     inputs = {"the controller": args.controller, "the profile": args.profile, "the recording": args.recording, "the model": args.model}
-    apart({"-o": args.output}, {**inputs, "the key": args.key})
+    apart({"-o": args.output}, {**inputs, "the key": args.key or keys.default_path()})
     profile = load_checked(args.profile)
     model = profile_model(args, profile)
+    apart({"-o": args.output}, {"the model's file": own_file(model.spec)})
     key_path = args.key or keys.default_path()
     key = keys.load(key_path)
     controller = controller_at(args.controller, args.param)

@@ -108,6 +108,11 @@ def apart(outputs: Mapping[str, Path | None], inputs: Mapping[str, Path | str | 
         read[f"the file of {option}"] = path
 
 
+def own_file(spec: ModelSpec) -> str | None:
+    """The Python file that a model is in, if it is somebody's own: a TOML or a profile may name it."""
+    return spec.name if spec.name.endswith(".py") else None
+
+
 def _same_file(one: Path, other: Path) -> bool:
     """Whether writing to one changes the other. A device (/dev/null) takes any number of writers."""
     if one.exists() and other.exists():

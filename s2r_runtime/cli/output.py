@@ -65,13 +65,11 @@ def trouble_writing(path: Path, text: str) -> str:
 
 def write(path: Path, text: str) -> None:
     """A file that was asked for, as a whole: what was there before stays if it cannot be written (a full disk). Raises UsageError."""
-    target = path.resolve()
     try:
-        if target.exists() and not (
-            target.is_file() and os.access(target.parent, os.W_OK)
-        ):  # /dev/stdout, or a folder that takes no new file
-            target.write_text(text, encoding="utf-8")
+        if path.exists() and not (path.is_file() and os.access(path.resolve().parent, os.W_OK)):
+            path.write_text(text, encoding="utf-8")  # /dev/stdout (a pipe has no place of its own), or a folder that takes no new file
             return
+        target = path.resolve()
         temporary = target.with_name(f".{target.name}.{os.getpid()}")
         try:
             temporary.write_text(text, encoding="utf-8")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import apart, controller_at, count, load_checked, positive, writable
+from s2r_runtime.cli.choices import apart, controller_at, count, load_checked, own_file, positive, writable
 from s2r_runtime.errors import ControllerError, UsageError
 
 if TYPE_CHECKING:
@@ -56,9 +56,10 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--evaluations must be at least 2, --scenarios at least 1")
     writable(args.output, replaced=True)
     inputs = {"the controller": args.controller, "the profile": args.profile, "the recording": args.recording, "the model": args.model}
-    apart({"-o": args.output}, {**inputs, "the key": args.key})
+    apart({"-o": args.output}, {**inputs, "the key": args.key or keys.default_path()})
     profile = load_checked(args.profile)
     model = profile_model(args, profile)
+    apart({"-o": args.output}, {"the model's file": own_file(model.spec)})
     controller = controller_at(args.controller, [])
     if controller.modules and args.output.resolve().parent != args.controller.resolve().parent:
         raise UsageError(f"-o {args.output}: must lie beside {args.controller}, which imports {', '.join(controller.modules)} from there")

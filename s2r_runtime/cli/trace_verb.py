@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import add_model_options, apart, chosen_model, count, positive, weights_of, writable
+from s2r_runtime.cli.choices import add_model_options, apart, chosen_model, count, own_file, positive, weights_of, writable
 from s2r_runtime.cli.daemon_verbs import add_daemon_options, run_live_trace
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
 
@@ -84,6 +84,7 @@ def run(args: argparse.Namespace) -> int:
     if args.suggest_duration and not args.suggest:
         raise UsageError("--suggest-duration: belongs to --suggest FILE.csv")
     model, profile = chosen_model(args)
+    apart({"-o": args.output, "--report": args.report, "--suggest": args.suggest}, {"the model's file": own_file(model.spec)})
     if args.suggest_duration and args.suggest_duration > MOST_SUGGESTED * model.dt:
         most = MOST_SUGGESTED * model.dt
         raise UsageError(f"--suggest-duration {args.suggest_duration:g}: must be at most {most:g} s, {MOST_SUGGESTED} steps of the model")

@@ -73,8 +73,8 @@ class IntegrationScheme:
         return after
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
-        """`rk4` is left out: within a step it cannot be told from `exact`; and what a model of one's own does already."""
-        return [{"scheme": "exact"}, {"scheme": "euler"}] if getattr(model, "integration", "") else [{"scheme": "exact"}]
+        """`rk4` is left out: within a step it cannot be told from `exact`."""
+        return [{"scheme": "exact"}, {"scheme": "euler"}]
 
 
 def _factors(phi: Array, scheme: str) -> tuple[Array, Array]:

@@ -200,8 +200,8 @@ def _limits(value: object, at: Callable[..., tuple[float, float] | None]) -> tup
 
 
 def _spec(model: ComposedModel, final: Fit, data: Dataset) -> ModelSpec:
-    """The repaired model; the one given, if nothing was added."""
-    if not final.added:
+    """The repaired model; the one given, if nothing was added. Where steps were taken in parts, both have that."""
+    if not final.added and len(model.effects) == len(model.spec.effects):
         return model.spec
     effects = tuple(EffectSpec(a.effect.name, a.channel, a.p) for a in final.model.effects)
     fitted_on = tuple(dict.fromkeys((*model.spec.fitted_on, *data.digests)))

@@ -340,7 +340,8 @@ def thinned(
     """The same on the shortest steps that are independent of each other in both: unchanged, if they are. parts: S, where there are any."""
     apart = max(data.apart, test.apart if test else 1)
     whole = data.reconstruction is None or data.interval * MOST_PARTS > data.dt
-    if apart == 1 and whole and not (data.reconstruction and data.reconstruction.axes and data.dt > LONG_S):
+    made = data.reconstruction  # a hidden state's model may be one of whole steps: what is too coarse is asked of the model itself
+    if apart == 1 and whole and not (made and made.axes and not made.hidden and data.dt > LONG_S):
         return model, data, test
     longer = at_step(model, apart * model.dt)
     return longer, regridded(data, longer, parts), regridded(test, longer, parts) if test else None

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.fault import FROZEN_ROWS, QUANTA, SIGMAS, Fault
@@ -86,8 +87,12 @@ def _led(model: ComposedModel, data: Dataset, act: Acting, i: int, within: tuple
     led = [x]
     for k in range(first, last):
         x = np.where(still, x, run.y[k])
-        after = advanced(model, x[None, :], act, slice(begun + k, begun + k + 1))[0]
-        x = np.where(np.isfinite(after), after, x)
+        try:
+            after = advanced(model, x[None, :], act, slice(begun + k, begun + k + 1))
+        except ConfigError:  # somebody's own model gives no numbers where it would have led: there it stays
+            after = x[None, :]
+        move = model.difference(after, x[None, :])[0]  # of an angle by less than half a turn
+        x = x + np.where(np.isfinite(move), move, 0.0)
         led.append(x)
     return np.array(led)
 

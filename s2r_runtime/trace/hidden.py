@@ -3,7 +3,7 @@
     (p, h)+ = f(p, h, u)        p: measured, h: not, and df_p/dh is not zero
 
 h is where the model is stepped from, and no measurement (as the speed of an axis is, `speed_noise`): models are judged by what p says of
-them. It is told by p under the model as it is given, linearised about what is known so far, by as much smoothing as p itself asks for
+them. It is told by p under the nominal model, linearised about what is known so far, by as much smoothing as p itself asks for
 (`smoother`, with noise that moves h, and p through it: with g = df_p/dh,  G = (g^2/3 g/2; g/2 1)), until it stays where it is: the iterated
 Kalman smoother of A. Jazwinski, Stochastic processes and filtering theory, 1970. It begins with what the model makes of it from the first
 row that explains the rows after it best, every measured state being where it was measured.
@@ -15,7 +15,6 @@ import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +28,7 @@ Array = NDArray[np.float64]
 Pair = tuple[str, str]
 
 PROBED, SCALES, MOVES = 16, (0.1, 1.0, 10.0), 1e-9
-"""Random states of each size on which a model is asked what moves what, and what counts as nothing, over the size of what is moved."""
+"""Random states of each size on which a model is asked what moves what, and what counts as nothing, over what moves it."""
 
 STARTS, FIRST_ROWS = 60, 300
 """Values that a hidden state is tried at in the first row, of either sign and all sizes; rows that tell which it was."""
@@ -58,12 +57,16 @@ def told_through(nominal: NominalModel, missing: Sequence[str]) -> tuple[Pair, .
     def strength(of: Sequence[str]) -> float:
         return min(float(moves[column[p], column[h]]) for p, h in zip(of, hidden, strict=True))
 
-    best = max(permutations(measured, len(hidden)), key=strength)
+    from scipy.optimize import linear_sum_assignment
+
+    table = np.array([[math.log(max(float(moves[column[p], column[h]]), 1e-300)) for p in measured] for h in hidden])
+    _, chosen = linear_sum_assignment(table, maximize=True)
+    best = [measured[k] for k in chosen]
     return tuple(zip(best, hidden, strict=True)) if strength(best) > MOVES else ()
 
 
 def _moves(nominal: NominalModel) -> Array:
-    """(nx, nx) by how much state i is moved by state j in a short step, over its own size, where that is most."""
+    """(nx, nx) by how much state i is moved in a short step by a bit of state j, over that bit, where that is most."""
     rng, nx = np.random.default_rng(0), len(nominal.states)
     most = np.zeros((nx, nx))
     for scale in SCALES:
@@ -98,7 +101,14 @@ class _Rows:
     def on(self, x: Array, k: slice) -> Array:
         """Where the model leads from rows x (m, nx) under the inputs of k."""
         at = slice(*k.indices(len(self.u)))
-        return np.asarray(x + self.share[at] * (self.nominal.step(x, self.u[at], self.unit, self.nominal.parameters) - x))
+        return np.asarray(x + self.share[at] * self.moved(x, self.u[at]))
+
+    def moved(self, x: Array, u: Array) -> Array:
+        """Where rows x (m, nx) go in a usual step, less themselves; angles by less than half a turn."""
+        move = self.nominal.step(x, u, self.unit, self.nominal.parameters) - x
+        turns = [self.nominal.states.index(name) for name in self.nominal.angles]
+        move[:, turns] = np.remainder(move[:, turns] + np.pi, 2.0 * np.pi) - np.pi
+        return np.asarray(move)
 
 
 def smoothed_hidden(
@@ -109,13 +119,13 @@ def smoothed_hidden(
     """
     columns = [(nominal.states.index(p), nominal.states.index(h)) for p, h in pairs]
     rows = _begun(_Rows(nominal, t, x, u, unit), columns, source)
-    found = [_smoothed(rows, p, h) for p, h in columns]
+    found = [_smoothed(rows, p, h, source) for p, h in columns]
     for _ in range(ROUNDS):
         moved = 0.0
         for k, (p, h) in enumerate(columns):
             there = _as_far_as_it_goes(rows, h, found[k].speed)
             moved = max(moved, float(np.max(np.abs(there.x[:, h] - rows.x[:, h])) / max(float(np.std(there.x[:, h])), 1e-12)))
-            rows, found[k] = there, _smoothed(there, p, h)
+            rows, found[k] = there, _smoothed(there, p, h, source)
         if moved < STAYS:
             break
     return rows.x, found
@@ -134,21 +144,30 @@ def _begun(rows: _Rows, columns: Sequence[tuple[int, int]], source: str) -> _Row
     if not math.isfinite(float(np.min(off))):
         names = ", ".join(rows.nominal.states[h] for h in hidden)
         raise RecordingError(f"{source}: {names} cannot be told: the model gives no numbers for this recording, whatever {names} was")
-    x, ends = rows.x.copy(), _driven(rows, starts[:1], hidden, len(rows.x) - 1)
+    x, ends = rows.x.copy(), _driven(rows, starts[:1], hidden, len(rows.x) - 1, stays=True)
     x[0, hidden], x[1:, hidden] = starts[0], ends[:, 0, hidden]
     return replace(rows, x=x)
 
 
-def _driven(rows: _Rows, starts: Array, hidden: Sequence[int], until: int) -> Array:
-    """(until, m, nx) where the model leads from each row, hidden states running on from each of the starts (m, hidden)."""
+def _driven(rows: _Rows, starts: Array, hidden: Sequence[int], until: int, *, stays: bool = False) -> Array:
+    """(until, m, nx) where the model leads from each row, hidden states running on from each of the starts (m, hidden). stays: they stay
+    where they are in rows in which the model gives no numbers; else it raises ConfigError, as the model does.
+    """
     ends = np.zeros((until, len(starts), rows.x.shape[1]))
-    at = starts
+    at = last = starts
     for k in range(until):
         x = np.tile(rows.x[k], (len(starts), 1))
         x[:, hidden] = at
-        step = rows.nominal.step(x, np.tile(rows.u[k], (len(starts), 1)), rows.unit, rows.nominal.parameters)
-        ends[k] = x + rows.share[k] * (step - x)
-        at = ends[k][:, hidden]
+        u = np.tile(rows.u[k], (len(starts), 1))
+        try:
+            move = rows.moved(x, u)
+        except ConfigError:
+            if not stays or not k:
+                raise
+            x[:, hidden] = ends[k - 1][:, hidden] = last  # where it gave numbers the row before
+            move = np.zeros_like(x)
+        ends[k] = x + rows.share[k] * move
+        last, at = x[:, hidden], ends[k][:, hidden]
     return ends
 
 
@@ -180,12 +199,16 @@ def _as_far_as_it_goes(rows: _Rows, h: int, told: Array) -> _Rows:
     return rows
 
 
-def _smoothed(rows: _Rows, p: int, h: int) -> Smoothed:
+def _smoothed(rows: _Rows, p: int, h: int, source: str) -> Smoothed:
     """The hidden state of one pair, the others being where they are."""
     x, y, pair = rows.x, rows.x[:, p], [p, h]
     end, f = _linearised(rows, x, pair)
     g = f[:, 0, 1]
-    usual = float(np.median(np.abs(g)))
+    felt = np.abs(g[g != 0.0])
+    usual = float(np.median(felt)) if len(felt) else 0.0
+    if not usual > 0.0 or not np.all(np.isfinite(f)):
+        names = rows.nominal.states
+        raise RecordingError(f"{source}: {names[h]} cannot be told: nowhere in this recording does it move {names[p]}")
     g = np.where(np.abs(g) < LEAST_MOVED * usual, np.where(g < 0.0, -1.0, 1.0) * LEAST_MOVED * usual, g)
     f[:, 0, 1] = g
     scale = np.array([1.0, max(usual, 1e-300)])  # h as p feels it in a row
@@ -211,7 +234,7 @@ def _linearised(rows: _Rows, x: Array, pair: list[int]) -> tuple[Array, Array]:
     end = rows.on(x[:-1], every)
     f = np.zeros((len(x) - 1, 2, 2))
     for j, column in enumerate(pair):
-        bit = 1e-4 * max(float(np.std(x[:, column])), 1e-6)
+        bit = 1e-4 * max(float(np.std(x[:, column])), 1e-4 * float(np.max(np.abs(x[:, column]))), 1e-6)
         there = x[:-1].copy()
         for sign in (1.0, -1.0):
             there[:, column] = x[:-1, column] + sign * bit

@@ -59,6 +59,10 @@ SNAPPED = 0.01
 """A usual interval this near to a whole fraction of the model's step is that fraction: stamps are printed with a few digits."""
 
 
+IN_PARTS = "the model's steps are taken in parts (integration_scheme: exact), before and after: whole ones are too coarse to tell it"
+"""Of hidden states."""
+
+
 @dataclass(frozen=True)
 class Reconstruction:
     """States that were not measured; Hz within which they, and everything with them, were reconstructed; s between the rows used; Hz that
@@ -89,7 +93,7 @@ class Reconstruction:
     def to_json(self) -> dict[str, object]:
         """docs/json.md's `reconstructed`."""
         told: dict[str, object] = {"states": list(self.states), "bandwidth_hz": self.bandwidth}
-        return told | ({"late_s": self.late} if self.late else {})
+        return told | ({"late_s": self.late} if self.late else {}) | ({"steps_in_parts": True} if self.in_parts else {})
 
     def text(self) -> list[str]:
         """For a person."""
@@ -101,9 +105,7 @@ class Reconstruction:
             if len(told) == len(self.states):
                 return told
             seen = who if self.hidden else "speeds"
-            parts = (
-                ["the model's steps are taken in parts: one by one they are too coarse for what was not measured"] if self.in_parts else []
-            )
+            parts = [IN_PARTS] if self.in_parts else []
             return [
                 *told,
                 f"{who} {were} not measured: what is left over is judged on {of} alone ({seen} seen up to {self.bandwidth:g} Hz)",

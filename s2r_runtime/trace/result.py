@@ -17,7 +17,7 @@ from s2r_runtime.trace.errors import Held, Judged
 from s2r_runtime.trace.fault import Fault
 from s2r_runtime.trace.found import Found, Limit
 from s2r_runtime.trace.power import Visible
-from s2r_runtime.trace.reconstruct import Reconstruction
+from s2r_runtime.trace.reconstruct import IN_PARTS, Reconstruction
 from s2r_runtime.trace.verdict import Verdict
 from s2r_runtime.trace.views import views
 from s2r_runtime.trace.ways import Way
@@ -197,7 +197,9 @@ class TraceResult:
 
     def comments(self) -> tuple[str, ...]:
         """For the head of the model's TOML."""
+        parts = self.reconstruction is not None and self.reconstruction.in_parts
         found = () if self.left_as_given else tuple(e.text() for e in self.effects)
+        found += (IN_PARTS,) if parts else ()
         return (
             (f"Repaired by s2r trace on {self.source}: {self.verdict}", *found)
             if found

@@ -322,8 +322,8 @@ def _enough(data: Dataset, model: ComposedModel, fit_part: Part, judged_on: Held
     longest = max((len(run.y) - 1 for run in fit_part.data.runs), default=0)
     sooner = [steps for steps in (2, 3, 5, 10) if steps < ahead]
     later = [times * ahead for times in (3, 10) if 2 * times * ahead < longest]  # a robot may be slow, and its sensor loud
-    gone = [displacement(replace(here, horizon=steps)) for steps in (ahead, *sooner, *later)]
-    if all(np.all(rms(way) < MOVED * jitter) for way in gone if len(way)) and not _follows(fit_part, model):
+    gone = [way for steps in (ahead, *sooner, *later) if len(way := displacement(replace(here, horizon=steps)))]
+    if gone and all(np.all(rms(way) < MOVED * jitter) for way in gone) and not _follows(fit_part, model):
         raise NotEnoughEvidence(f"{data.source}: no state goes farther than its noise makes it jump from row to row; nothing can be traced")
 
 
