@@ -389,6 +389,7 @@ def test_a_result_that_nobody_gets_is_no_success(table: Path, options: tuple[str
         ('("x", "y", "theta")', '("t", "y", "theta")', ("'t' is no name for a state",)),
         ('("v", "w")', '("v", "segment")', ("'segment' is no name",)),
         ('("v", "w")', "()", ("INPUTS is empty",)),
+        ('("x", "y", "theta")\nINPUTS', "()\nINPUTS", ("STATES is empty",)),
         ("{}", '{"k": float("nan")}', ("PARAMS has k = nan", "finite")),
         ("return x + 0.0", "return x + 1j", ("complex",)),
     ],

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recordings, wandering
 
-from s2r_runtime.errors import NotEnoughEvidence, RecordingError
+from s2r_runtime.errors import ConfigError, NotEnoughEvidence, RecordingError
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
@@ -344,8 +344,11 @@ def test_a_heading_that_is_pushed_about_takes_no_name_from_wheels_that_go_as_the
 def test_a_model_that_nothing_can_ask_to_move_is_refused_in_a_line(tmp_path):
     path = tmp_path / "own.py"
     path.write_text('STATES, INPUTS, PARAMS = ("q",), (), {}\n\n\ndef step(x, u, dt, params):\n    return x - dt * x\n')
-    model, rng = compose(ModelSpec(str(path), 0.1)), np.random.default_rng(0)
-    y = 0.9 ** np.arange(301)[:, None] + rng.normal(size=(301, 1)) * 1e-3
+    with pytest.raises(ConfigError, match="INPUTS is empty"):
+        compose(ModelSpec(str(path), 0.1))
+    joint = compose(ModelSpec("joint", 0.1))
+    model = replace(joint, nominal=replace(joint.nominal, inputs=()))  # as a plug-in may offer one
+    y = np.random.default_rng(0).normal(size=(301, 2)) * 1e-3
     with pytest.raises(NotEnoughEvidence, match="the model has no inputs"):
         trace(from_arrays(model, [(y, np.zeros((300, 0)))]), model)
 
