@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.gap import Drive, Transitions
-from s2r_runtime.models.composed import ComposedModel, wrap
+from s2r_runtime.models.bound import wrap
+from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.sensor_noise import stream_noise
 
 Array = NDArray[np.float64]

@@ -29,7 +29,8 @@ from s2r_runtime.driving import MAX_GAP, Streams, drive_transitions, resolution,
 from s2r_runtime.errors import RecordingError, UsageError
 from s2r_runtime.gap import Transitions
 from s2r_runtime.messages import CampaignFinished, Observed, SampleTaken, Send, Started
-from s2r_runtime.models.composed import ComposedModel, wrap
+from s2r_runtime.models.bound import wrap
+from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.robot_logs import content_digest, is_robot_log, merged_rows, read_robot_log
 from s2r_runtime.sensor_noise import FEWEST, NORMAL_MAD
 from s2r_runtime.tables import read_csv

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from s2r_runtime.disturbance import LAWS, Ahead, DisturbanceLaw, GapSet
 from s2r_runtime.errors import ControllerError, UsageError
 from s2r_runtime.hookspecs import Scenario, Task
-from s2r_runtime.models.composed import ComposedModel, wrap
+from s2r_runtime.models.bound import wrap
+from s2r_runtime.models.composed import ComposedModel
 
 __all__ = ["LAWS", "Array", "Control", "GapSet", "Rollouts", "roll_out"]
 

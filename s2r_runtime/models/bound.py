@@ -6,6 +6,7 @@ the rest is the shared model's.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from weakref import WeakKeyDictionary
 
@@ -21,6 +22,11 @@ PROBE_S, PROBED, ROUNDING = 0.1, (1.0, 0.1, 10.0), 1e-7
 """Step at which a model is asked how it integrates, s; sizes of the states; and what is rounding, over what moved. A rule of the first
 order is off by half of the step over a time constant: a millionth for one of a day.
 """
+
+
+def wrap(angle: Array) -> Array:
+    """Angles in rad, to (-pi, pi]; any shape."""
+    return -((-angle + math.pi) % (2.0 * math.pi) - math.pi)
 
 
 @dataclass(eq=False)
@@ -49,7 +55,7 @@ class BoundModel:
         if not self.finer:
             return self.shared.step(x, u, dt, parameters)
         one, two, four = (self._in(parts, x, u, dt, parameters) for parts in (1, 2, 4))
-        two, four = (one + _turned(self, there - one) for there in (two, four))  # a step may bring a heading back into one turn
+        two, four = (one + turned(self, there - one) for there in (two, four))  # a step may bring a heading back into one turn
         return np.asarray(four + (5.0 * (four - two) + (one - two)) / 3.0)
 
     def _in(self, parts: int, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
@@ -111,23 +117,23 @@ def _coarse_at(model: NominalModel, scale: float) -> bool:
         there = x
         for _ in range(parts):
             there = model.step(there, u, lasts / parts, model.parameters)
-        return _turned(model, there - x)
+        return turned(model, there - x)
 
     try:
         one, two, four, hardly = gone(1), gone(2), gone(4), gone(1, SHORT * PROBE_S)
     except (ConfigError, ArithmeticError, ValueError):  # not everywhere does somebody's own model give numbers
         return False
     moved, apart, next_apart, stays = (
-        float(np.max(np.abs(e), initial=0.0)) for e in (one, _turned(model, two - one), _turned(model, four - two), hardly)
+        float(np.max(np.abs(e), initial=0.0)) for e in (one, turned(model, two - one), turned(model, four - two), hardly)
     )
     converges = next_apart < CONVERGES * apart and stays < 0.5 * moved
     return apart > ROUNDING * moved and converges
 
 
-def _turned(model: NominalModel, change: Array) -> Array:
+def turned(model: NominalModel, change: Array) -> Array:
     """A change of states (n, nx) by less than half a turn, where these are angles."""
     columns = [model.states.index(name) for name in model.angles]
     if columns:
         change = change.copy()
-        change[:, columns] = np.remainder(change[:, columns] + np.pi, 2.0 * np.pi) - np.pi
+        change[:, columns] = wrap(change[:, columns])
     return change

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from s2r_runtime.canonical import digest
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import Effect, NominalModel, Parameter
-from s2r_runtime.models.bound import BoundModel, bind, integrating
+from s2r_runtime.models.bound import BoundModel, bind, integrating, wrap
 from s2r_runtime.models.file_model import load_file_model
 from s2r_runtime.models.forces import Pushing, pushed
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
@@ -56,11 +56,6 @@ SETTLE_STEPS = 20_000
 def _never(dt: float, p: dict[str, Any]) -> bool:
     """An effect that does not say so changes nothing within a step."""
     return False
-
-
-def wrap(angle: Array) -> Array:
-    """Angles in rad, to (-pi, pi]; any shape."""
-    return -((-angle + math.pi) % (2.0 * math.pi) - math.pi)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.errors import ConfigError, RecordingError
 from s2r_runtime.hookspecs import NominalModel
+from s2r_runtime.models.bound import turned
 from s2r_runtime.trace.smoother import Smoother
 from s2r_runtime.trace.speeds import Smoothed
 
@@ -105,17 +106,14 @@ class _Rows:
 
     def moved(self, x: Array, u: Array) -> Array:
         """Where rows x (m, nx) go in a usual step, less themselves; angles by less than half a turn."""
-        move = self.nominal.step(x, u, self.unit, self.nominal.parameters) - x
-        turns = [self.nominal.states.index(name) for name in self.nominal.angles]
-        move[:, turns] = np.remainder(move[:, turns] + np.pi, 2.0 * np.pi) - np.pi
-        return np.asarray(move)
+        return turned(self.nominal, self.nominal.step(x, u, self.unit, self.nominal.parameters) - x)
 
 
 def smoothed_hidden(
     nominal: NominalModel, t: Array, x: Array, u: Array, unit: float, pairs: Sequence[Pair], source: str
 ) -> tuple[Array, list[Smoothed]]:
     """(n, nx) with the hidden states, and each of them. t: (n,); x: (n, nx) as measured; u: (n - 1, nu) held from row to row; unit: usual s
-    between rows. Raises RecordingError where no value of a hidden state lets the model give numbers.
+    between rows. Raises RecordingError where no value of a hidden state lets the model give numbers, or where it moves nothing.
     """
     columns = [(nominal.states.index(p), nominal.states.index(h)) for p, h in pairs]
     rows = _begun(_Rows(nominal, t, x, u, unit), columns, source)

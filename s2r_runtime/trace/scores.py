@@ -147,10 +147,9 @@ class _Search:
         if self._given.bends:  # a first look is about where another model has the states
             promising = [(s, self._quietly[0]) for s in _promising(self._quietly[1], len(screened), -math.inf)]
         looked_at: list[tuple[Screened, Fit]] = []
-        rounds = SETTLES if self._given.bends else 2  # what a hidden state takes up at first, it gives back slowly
         for s, under in promising:
             most = max((gain(fit, self.base) for _, fit in looked_at), default=0.0)
-            looked_at.append((s, self._refined(s, under, s.start, rounds, lambda fit, most=most: self._hopeless(fit, most))))  # type: ignore[misc]
+            looked_at.append((s, self._refined(s, under, s.start, 2, lambda fit, most=most: self._hopeless(fit, most))))  # type: ignore[misc]
         return screened, looked_at
 
     def _hopeless(self, fit: Fit, most: float) -> bool:
