@@ -1,6 +1,6 @@
 """Does what was named look more like something that has no name?
 
-The effects that were found on an input are taken out, and each shape (`shapes`) is put in their place and fitted. With L the log likelihood
+The effects that were found on an input, or on an axis, are taken out, and each shape (`shapes`, `state_shapes`) is put in their place and fitted. With L the log likelihood
 of the recording, noise re-estimated for each, the smaller of white and coloured, and a price per number,
 
     shape wins     L(shape) - L(named) > log(tried / ALPHA) + the price of numbers that it has more than they,
@@ -24,15 +24,19 @@ import numpy as np
 
 from s2r_runtime.hookspecs import Effect
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
+from s2r_runtime.models.forces import Axis, axes
 from s2r_runtime.trace.acceptance import accepted
 from s2r_runtime.trace.begun import begun, measured
 from s2r_runtime.trace.candidates import Candidate
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, without
+from s2r_runtime.trace.lack_of_fit_terms import token_of
 from s2r_runtime.trace.residual import acting, covered, first_steps, rms, rollout, rollout_starts
 from s2r_runtime.trace.scores import at_first_look
 from s2r_runtime.trace.screening import screen
 from s2r_runtime.trace.shapes import SHAPES, Shape
 from s2r_runtime.trace.slots import bounds_of, values_of
+from s2r_runtime.trace.state_shapes import STATE_SHAPES, Limit, StateShape
+from s2r_runtime.trace.state_shapes import starts as state_starts
 
 ALPHA, TOLD = 1e-3, 0.05
 """Chances that a shape wins against the truth, as far as the likelihood is right, and that it is told beside it."""
@@ -57,6 +61,9 @@ bends of all kinds are alike, and would leave no place for others.
 LEAST = 4.0
 """Nats that screening must give a shape where nothing was named."""
 
+LIMITS = tuple(shape for shape in STATE_SHAPES if isinstance(shape, Limit))
+"""An actuator that goes no farther and a tank that overflows look alike; a drag does not look like either."""
+
 STARTS = 600
 """Rollouts that errors are compared on at most."""
 
@@ -78,15 +85,23 @@ class Better:
 
 def better_shape(given: Problem, fit: Fit, horizon: int) -> Better | None:
     """The shape that explains most beyond the effects named on its input, of those that show, if any do; None if none is told."""
-    won = [found for channel in _inputs(fit) for found in [_challenge(given, fit, channel, horizon)] if found is not None]
-    return max(won, key=lambda better: (better.shows, better.nats), default=None)
+    won = [_challenge(given, fit, channel, horizon) for channel in _inputs(fit)]
+    won += [_challenge_on_axis(given, fit, axis, horizon) for axis in axes(fit.model.nominal)]
+    return _first(won)
+
+
+def _first(won: Sequence[Better | None]) -> Better | None:
+    return max((better for better in won if better is not None), key=lambda better: (better.shows, better.nats), default=None)
 
 
 def best_shape(given: Problem, base: Fit, horizon: int) -> Better | None:
     """The shape that explains most of what a model leaves, on whichever input; None if none would be taken if it were an effect."""
-    found = [(gain(fit, base) - _price(given, fit, base), fit) for channel in base.model.inputs for fit in _fits(given, base, channel)]
+    fits = [fit for channel in base.model.inputs for fit in _fits(given, base, channel)]
+    fits += _state_fits(given, base, _states(base, STATE_SHAPES))
+    tried = len(SHAPES) * len(base.model.inputs) + len(_states(base, STATE_SHAPES))
+    found = [(gain(fit, base) - _price(given, fit, base), fit) for fit in fits]
     for nats, fit in sorted(found, key=lambda pair: -pair[0]):
-        if nats > 0.0 and accepted(given, fit, base, len(SHAPES) * len(base.model.inputs), horizon):
+        if nats > 0.0 and accepted(given, fit, base, tried, horizon):
             return Better(_token(fit), nats)
     return None
 
@@ -105,15 +120,37 @@ def _challenge(given: Problem, fit: Fit, channel: str, horizon: int) -> Better |
         if a.effect.stage == "input" and a.channel in {channel, "*"}:
             bare = without(bare, i)
     base = fitted(given, fit, bare, 1)
+    least = REACHES * at_first_look(given, fit, base)
+    shapes = _fits(given, base, channel, least, _times(fit, channel), _plays(fit, channel))
+    return _won(given, fit, base, [*shapes, *_state_fits(given, base, _states(base, LIMITS), least)], horizon)
+
+
+def _challenge_on_axis(given: Problem, fit: Fit, axis: Axis, horizon: int) -> Better | None:
+    """Of what was named on an axis' speed or position."""
+    model = fit.model
+    own = {model.states[axis.velocity], model.states[axis.position]}
+    there = [i for i in fit.added if model.effects[i].channel in own and model.effects[i].effect.stage != "sensor"]
+    if not there:
+        return None
+    bare = model
+    for i in reversed(there):
+        bare = without(bare, i)
+    base = fitted(given, fit, bare, 1)
+    on = [(shape, channel) for shape, channel in _states(base, STATE_SHAPES) if channel in own]
+    return _won(given, fit, base, _state_fits(given, base, on, REACHES * at_first_look(given, fit, base)), horizon)
+
+
+def _won(given: Problem, fit: Fit, base: Fit, shapes: Sequence[Fit], horizon: int) -> Better | None:
+    """Of shapes in the place of what was named, the one that does best, if any is told. base: without what was named."""
     here = gain(fit, base)
     won: list[Better] = []
-    for shape in _fits(given, base, channel, REACHES * at_first_look(given, fit, base), _times(fit, channel), _plays(fit, channel)):
+    for shape in shapes:
         ahead = gain(shape, base) - here
         beyond = ahead - max(_price(given, shape, fit), 0.0)
         if beyond > math.log(len(SHAPES) / TOLD) and ahead > LITTLE * here:
             shows = beyond > math.log(len(SHAPES) / ALPHA) and ahead > MORE * here and _lower(given, fit, shape, horizon)
             won.append(Better(_token(shape), gain(shape, base) - _price(given, shape, base), shows))
-    return max(won, key=lambda better: (better.shows, better.nats), default=None)
+    return _first(won)
 
 
 def _price(given: Problem, fit: Fit, base: Fit) -> float:
@@ -159,6 +196,26 @@ def _fits(
     return sorted((fit for fit in fits if _outlasts(fit, given.data.dt)), key=lambda fit: -gain(fit, base))
 
 
+def _states(base: Fit, shapes: Sequence[StateShape]) -> list[tuple[StateShape, str]]:
+    """Shapes of states, each with the state that it may be of."""
+    return [(shape, channel) for shape in shapes for channel in shape.channels(base.model.nominal)]
+
+
+def _state_fits(given: Problem, base: Fit, on: Sequence[tuple[StateShape, str]], least: float = LEAST) -> list[Fit]:
+    """Shapes of states, beside what the model has, that do best, the best first."""
+    end = len(base.model.effects)
+    y = given.steps.y0
+    offered = [
+        Candidate(shape.name, channel, end, tuple(AppliedEffect(cast(Effect, shape), channel, dict(p)) for p in values))
+        for shape, channel in on
+        if (values := state_starts(shape, y[:, base.model.states.index(channel)]))
+    ]
+    screened, _ = screen(given, base, offered, math.inf) if offered else ([], 0)
+    enough = max(least, NEARLY * screened[0].value) if screened else least
+    fits = [fitted(given, base, s.start, 2) for s in screened[:FITTED] if s.value > max(enough, 0.0)]
+    return sorted(fits, key=lambda fit: -gain(fit, base))
+
+
 def _remembers(model: ComposedModel) -> bool:
     """Whether the last effect of a model, a shape, has memory."""
     return cast(Shape, model.effects[-1].effect).memory
@@ -174,6 +231,8 @@ def _outlasts(fit: Fit, dt: float) -> bool:
 def _token(fit: Fit) -> str:
     """What the last effect of a model, a shape, depends on."""
     last = fit.model.effects[-1]
+    if last.channel in fit.model.states:
+        return token_of(fit.model, last.channel)
     if getattr(last.effect, "with_time", False):
         return f"time*{last.channel}"
     memory = last.effect.hidden(1, fit.model.nominal, last.channel, fit.model.dt, last.p).size > 0

@@ -62,6 +62,9 @@ EQUAL = 0.0025
 ITSELF = 1e-4
 """The same, for an effect that stays what it is with a number less: to a hundredth. Friction that is a fortieth more one way exists."""
 
+IDLE = 1e-3
+"""Of what the strongest of several models adds, mean square: one that adds no more does nothing there."""
+
 PROBES, PROBE_STEPS = 8, 120
 """Runs and steps of the rich inputs."""
 
@@ -203,9 +206,13 @@ class _Rich:
         return self.apart(one, other) <= near * self.apart(other, less)
 
     def worst(self, models: Sequence[ComposedModel], less: ComposedModel) -> Array:
-        """(m,) of each model, how far it is at most from one of them, as a share of what that one adds to `less`; NaN if unknown."""
-        done = [max(self.apart(model, less), 1e-300) for model in models]
-        return np.array([np.max([self.apart(one, other) / size for other, size in zip(models, done, strict=True)]) for one in models])
+        """(m,) of each model, how far it is at most from one of them, as a share of what that one adds to `less`; NaN if unknown. What does
+        nothing on these inputs (a limit that they do not reach) says nothing there of the others.
+        """
+        done = [self.apart(model, less) for model in models]
+        least = IDLE * max(done)  # NaN if any is
+        asked = [(other, size) for other, size in zip(models, done, strict=True) if not size <= least]
+        return np.array([np.max([self.apart(one, other) / size for other, size in asked], initial=0.0) for one in models])
 
     def apart(self, one: ComposedModel, other: ComposedModel) -> float:
         """Mean square difference of their steps, on the scale of the steps themselves; NaN where a user's own model does not step there."""
