@@ -12,9 +12,8 @@ import numpy as np
 
 from s2r_runtime.effects.body_motion import body_motion, moved
 from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, force_unit, has_pose, size_of
-from s2r_runtime.effects.viscous_friction import lone_speeds
 from s2r_runtime.hookspecs import NominalModel, Parameter
-from s2r_runtime.models.forces import Axis, Push, axes, mass
+from s2r_runtime.models.forces import Axis, Push, axes, lone_speeds, mass
 
 SHARE = 0.05
 """Of the inputs' size: the first look; the response is linear."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, axis_of, force_unit, length_unit, size_of, usual_speed
+from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, force_unit, length_unit, size_of, usual_speed
 from s2r_runtime.hookspecs import NominalModel, Parameter
 from s2r_runtime.models.forces import PART_S, Axis, Push, axes, mass
 
@@ -36,8 +36,7 @@ class CubicStiffness(ForceEffect):
 
     def unit(self, model: NominalModel, channel: str, parameter: str) -> str:
         """Of force over length cubed."""
-        axis, force = axis_of(model, channel), force_unit(model)
-        length = length_unit(model, axis) if axis else "m"
+        force, length = force_unit(model), length_unit(model, channel)
         return f"1/({length}² s²)" if force == "m/s²" else f"{force}/{length}³"
 
     def push(self, x: Array, axis: Axis, model: NominalModel, channel: str, p: Values) -> Push | None:

@@ -9,16 +9,12 @@ from __future__ import annotations
 import numpy as np
 
 from s2r_runtime.effects.input_effect import replaced
-from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, axis_of, force_unit, length_unit, size_of, usual_speed
+from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, force_unit, length_unit, size_of, usual_speed
 from s2r_runtime.hookspecs import NominalModel, Parameter
-from s2r_runtime.models.forces import Axis, Push, mass
+from s2r_runtime.models.forces import Axis, Push, is_speed, mass
 
 SPEEDS = {"m/s", "rad/s"}
 """Units of inputs that are speeds. An input without a unit, in somebody's own model, may be one: the tracer asks if its name says so."""
-
-NAMES = ("speed", "vel", "omega", "rate")
-LETTERS = {"v", "vx", "vy", "vz", "w"}
-"""Parts of names of speeds, and words in them (cmd_v, w_ref). Nothing drags at a steering angle, a voltage or a valve."""
 
 INPUT_SHARE = 0.1
 RATE = 0.3
@@ -36,7 +32,7 @@ class QuadraticDrag(ForceEffect):
     side_by_side = True
 
     def channels(self, model: NominalModel) -> tuple[str, ...]:
-        """Inputs that are speeds, then the velocities of axes."""
+        """Inputs that are speeds, then the velocities of axes, and speeds without a position."""
         units: dict[str, str] = getattr(model, "units", {})
         inputs = [name for name in model.inputs if units.get(name, "m/s") in SPEEDS]
         return (*inputs, *(name for name in super().channels(model) if name not in inputs))
@@ -44,10 +40,9 @@ class QuadraticDrag(ForceEffect):
     def unit(self, model: NominalModel, channel: str, parameter: str) -> str:
         """One over a speed; of force over speed squared."""
         units: dict[str, str] = getattr(model, "units", {})
-        axis = axis_of(model, channel)
-        if channel in model.inputs or axis is None:
+        if channel in model.inputs:
             return "s/rad" if units.get(channel) == "rad/s" else "s/m"
-        force, length = force_unit(model), length_unit(model, axis)
+        force, length = force_unit(model), length_unit(model, channel)
         return f"1/{length}" if force == "m/s²" else f"{force} s²/{length}²"
 
     def pushes(self, model: NominalModel, channel: str) -> bool:
@@ -75,10 +70,8 @@ class QuadraticDrag(ForceEffect):
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
         """One is enough: the response is linear. None on an input that nothing says is a speed."""
         if channel in model.inputs:
-            name = channel.lower()
-            said = any(part in name for part in NAMES) or not LETTERS.isdisjoint(name.split("_"))
-            if not said and channel not in getattr(model, "units", {}):
-                return []
+            if channel not in getattr(model, "units", {}) and not is_speed(channel):
+                return []  # nothing drags at a steering angle, a voltage or a valve
             return [{"coefficient": INPUT_SHARE / size_of(u[:, [model.inputs.index(channel)]])}]
         return [{"coefficient": RATE * mass(model) / usual_speed(u, model, dt)}]
 

@@ -14,15 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.hookspecs import NominalModel, Parameter
-from s2r_runtime.models.forces import Axis, Push, axes, coupled, mass, mass_name, pushed
+from s2r_runtime.models.forces import POSE, Axis, Push, axes, coupled, lone_speeds, mass, mass_name, pushed
 
 Array = NDArray[np.float64]
 Values = dict[str, Any]
 
 REMEMBERED_S = 1.0
 """Of the order of what friction and a person who drives back and forth make of it."""
-
-POSE = {"x", "y", "theta"}
 
 
 class StepEffect:
@@ -63,12 +61,12 @@ class ForceEffect(StepEffect):
     varies = False
 
     def channels(self, model: NominalModel) -> tuple[str, ...]:
-        """The velocities of all axes."""
-        return tuple(model.states[axis.velocity] for axis in axes(model))
+        """The velocities of all axes, and speeds without a position."""
+        return (*(model.states[axis.velocity] for axis in axes(model)), *lone_speeds(model))
 
     def pushes(self, model: NominalModel, channel: str) -> bool:
         """Whether it acts by `push` there."""
-        return bool(axes(model))
+        return bool(axes(model)) or channel in lone_speeds(model)
 
     def push(self, x: Array, axis: Axis, model: NominalModel, channel: str, p: Values) -> Push | None:
         """What it adds on this axis at x (n, nx), accelerations; None where it does not act."""
@@ -108,12 +106,16 @@ def force_unit(model: NominalModel) -> str:
     return units.get(model.inputs[0], "N m" if mass_name(model) == "inertia" else "N")
 
 
-def length_unit(model: NominalModel, axis: Axis) -> str:
-    """Of an axis' position."""
+def length_unit(model: NominalModel, channel: str) -> str:
+    """Of the position of the axis whose position or velocity the channel is; of a speed that has none, what it goes in a second."""
     units: dict[str, str] = getattr(model, "units", {})
+    axis = axis_of(model, channel)
+    if axis is None:
+        return units.get(channel, "rad/s" if mass_name(model) == "inertia" else "m/s").removesuffix("/s")
+    name = model.states[axis.position]
     if coupled(model):
-        return units.get(model.states[axis.position], f"{model.states[axis.position]}'s unit")
-    return units.get(model.states[axis.position], "rad" if mass_name(model) == "inertia" else "m")
+        return units.get(name, f"{name}'s unit")
+    return units.get(name, "rad" if mass_name(model) == "inertia" else "m")
 
 
 def axis_of(model: NominalModel, channel: str) -> Axis | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, axis_of, force_unit, length_unit, size_of, usual_speed
+from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, force_unit, length_unit, size_of, usual_speed
 from s2r_runtime.hookspecs import NominalModel, Parameter
 from s2r_runtime.models.forces import Axis, Push, mass
 
@@ -34,8 +34,7 @@ class StribeckFriction(ForceEffect):
 
     def unit(self, model: NominalModel, channel: str, parameter: str) -> str:
         """Of a force, of a speed."""
-        axis = axis_of(model, channel)
-        return f"{length_unit(model, axis)}/s" if parameter == "velocity" and axis else force_unit(model)
+        return f"{length_unit(model, channel)}/s" if parameter == "velocity" else force_unit(model)
 
     def wrong(self, p: Values) -> str:
         """What is wrong with the values together."""

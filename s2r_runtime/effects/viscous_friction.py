@@ -10,17 +10,11 @@ A speed without a position, in somebody's own model (a flying robot's, under til
 
 from __future__ import annotations
 
-from weakref import WeakKeyDictionary
-
 import numpy as np
 
-from s2r_runtime.effects.quadratic_drag import LETTERS, NAMES
 from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, axis_of, force_unit, has_pose, length_unit
-from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import NominalModel, Parameter
-from s2r_runtime.models.bound import BoundModel
-from s2r_runtime.models.file_model import FileModel
-from s2r_runtime.models.forces import PROBE_S, Axis, Push, axes, coupled, mass
+from s2r_runtime.models.forces import Axis, Push, axes, coupled, mass
 
 START_RATE = 0.5
 """1/s: a slow loss; what it does to a step is in proportion to it."""
@@ -38,9 +32,9 @@ class ViscousFriction(ForceEffect):
     additive = True
 
     def channels(self, model: NominalModel) -> tuple[str, ...]:
-        """Velocities of axes; the speed of a car that is set at once; speeds without a position."""
+        """Velocities of axes, and speeds without a position; the speed of a car that is set at once."""
         car = has_pose(model) and "speed" in getattr(model, "reached", {})
-        return (*super().channels(model), *(("speed",) if car else ()), *lone_speeds(model))
+        return (*super().channels(model), *(("speed",) if car else ()))
 
     def unit(self, model: NominalModel, channel: str, parameter: str) -> str:
         """Of force over speed."""
@@ -48,15 +42,15 @@ class ViscousFriction(ForceEffect):
         force = force_unit(model)
         if axis is not None and coupled(model) and not getattr(model, "units", {}):
             return f"{model.inputs[axes(model).index(axis)]}/{channel}"  # one's own units, whatever they are
-        return "1/s" if axis is None or force == "m/s²" else f"{force} s/{length_unit(model, axis)}"
+        return "1/s" if not self.pushes(model, channel) or force == "m/s²" else f"{force} s/{length_unit(model, channel)}"
 
     def wrong(self, p: Values) -> str:
         """What is wrong with the values together."""
         return one_or_two(p, "coefficient")
 
     def pushes(self, model: NominalModel, channel: str) -> bool:
-        """On axes."""
-        return axis_of(model, channel) is not None
+        """On all but the speed of a car."""
+        return channel in super().channels(model)
 
     def frame(self, model: NominalModel, channel: str) -> str:
         """A car's loss of speed is a matter of its body."""
@@ -75,9 +69,6 @@ class ViscousFriction(ForceEffect):
         z = dt * np.where(x_next[:, speed] > 0.0, forward, backward)
         mean = np.where(z < 1e-8, 1.0 - 0.5 * z, -np.expm1(-z) / np.maximum(z, 1e-300))
         after = x_next.copy()
-        if not has_pose(model):
-            after[:, speed] = x[:, speed] * np.exp(-z) + mean * (x_next[:, speed] - x[:, speed])
-            return after
         for j in (model.states.index(name) for name in ("x", "y", "theta")):
             after[:, j] = x[:, j] + mean * (x_next[:, j] - x[:, j])
         after[:, speed] = x_next[:, speed] * np.exp(-z)
@@ -91,40 +82,6 @@ class ViscousFriction(ForceEffect):
         """One each way of saying it: the response is linear."""
         c = START_RATE * (mass(model) if self.pushes(model, channel) else 1.0)
         return [{"coefficient": c}, {"coefficient_positive": c, "coefficient_negative": c}]
-
-
-_LONE: WeakKeyDictionary[BoundModel, tuple[str, ...]] = WeakKeyDictionary()
-
-
-def lone_speeds(model: NominalModel) -> tuple[str, ...]:
-    """States of somebody's own model that are speeds by their names, without a position, and that the model itself does not slow down: a
-    loss that it knows has a parameter there.
-    """
-    if not isinstance(model, BoundModel) or has_pose(model) or not isinstance(model.shared, FileModel):
-        return ()
-    if model not in _LONE:
-        _LONE[model] = _lone_speeds(model)
-    return _LONE[model]
-
-
-def _lone_speeds(model: BoundModel) -> tuple[str, ...]:
-    moving = {model.states[axis.velocity] for axis in axes(model)}
-    named = [
-        s for s in model.states if s not in moving and (not LETTERS.isdisjoint(s.lower().split("_")) or any(n in s.lower() for n in NAMES))
-    ]
-    rng = np.random.default_rng(0)
-    x, u = rng.uniform(-1.0, 1.0, (8, len(model.states))), rng.uniform(-1.0, 1.0, (8, len(model.inputs)))
-    found = []
-    for name in named:
-        j, faster = model.states.index(name), x.copy()
-        faster[:, j] += 1.0
-        try:
-            kept = model.step(faster, u, PROBE_S, model.parameters)[:, j] - model.step(x, u, PROBE_S, model.parameters)[:, j]
-        except ConfigError:  # a user's model that cannot be stepped just anywhere
-            continue
-        if np.all(np.abs(kept - 1.0) < 1e-9):
-            found.append(name)
-    return tuple(found)
 
 
 def by_direction(p: Values, name: str, over: float) -> tuple[float, float]:

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import NominalModel
 from s2r_runtime.models.bound import BoundModel
+from s2r_runtime.models.file_model import FileModel
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -117,6 +118,48 @@ def _axes(model: NominalModel) -> tuple[Axis, ...]:
     return tuple(Axis(model.states.index(rates[name]), j) for j, name in enumerate(model.states) if name in rates)
 
 
+SPEEDS = ("speed", "vel", "omega", "rate")
+LETTERS = {"v", "vx", "vy", "vz", "w"}
+"""Parts of names of speeds, and words in them (cmd_v, w_ref)."""
+
+POSE = {"x", "y", "theta"}
+
+_LONE: WeakKeyDictionary[BoundModel, tuple[str, ...]] = WeakKeyDictionary()
+
+
+def lone_speeds(model: NominalModel) -> tuple[str, ...]:
+    """States of somebody's own model that are speeds by their names, without a position, and that the model itself does not slow down: a
+    loss that it knows has a parameter there. (A flying robot's, under tilt and thrust; a motor's.) Forces act on them as on an axis.
+    """
+    if not isinstance(model, BoundModel) or not isinstance(model.shared, FileModel):
+        return ()
+    if model not in _LONE:
+        _LONE[model] = () if POSE <= {*model.states} else _lone_speeds(model)
+    return _LONE[model]
+
+
+def is_speed(name: str) -> bool:
+    """Whether a name says so."""
+    return not LETTERS.isdisjoint(name.lower().split("_")) or any(part in name.lower() for part in SPEEDS)
+
+
+def _lone_speeds(model: BoundModel) -> tuple[str, ...]:
+    moving = {model.states[axis.velocity] for axis in axes(model)}
+    rng = np.random.default_rng(0)
+    x, u = rng.uniform(-1.0, 1.0, (8, len(model.states))), rng.uniform(-1.0, 1.0, (8, len(model.inputs)))
+    found = []
+    for name in (s for s in model.states if s not in moving and (is_speed(s) or s in NAMED_RATES)):
+        j, faster = model.states.index(name), x.copy()
+        faster[:, j] += 1.0
+        try:
+            kept = model.step(faster, u, PROBE_S, model.parameters)[:, j] - model.step(x, u, PROBE_S, model.parameters)[:, j]
+        except ConfigError:  # a user's model that cannot be stepped just anywhere
+            continue
+        if np.all(np.abs(kept - 1.0) < 1e-9):
+            found.append(name)
+    return tuple(found)
+
+
 def mass_name(model: NominalModel) -> str:
     """Name of the parameter by which forces are divided; empty if inputs are accelerations."""
     return next((name for name in ("mass", "inertia") if name in model.parameters), "")
@@ -189,6 +232,12 @@ def _response(x: Array, u: Array, model: BoundModel, dt: float) -> Array:
 
 def pushed(x: Array, u: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushing], dt: float | Array) -> Array:
     """The result of the step under u without these effects, x_next (n, nx), with all of them. dt: also of each row, (n,)."""
+    alone = {*lone_speeds(model)}.intersection(channel for _, channel, _ in pushing)
+    for name in sorted(alone):
+        x_next = _braked(x, x_next, model, [one for one in pushing if one[1] == name], dt)
+    pushing = [one for one in pushing if one[1] not in alone]
+    if not pushing:
+        return x_next
     if isinstance(model, BoundModel) and not isinstance(dt, np.ndarray) and coupled(model):
         return _pushed_together(x, u, x_next, model, pushing, dt)
     varies = any(effect.varies for effect, _, _ in pushing)
@@ -214,6 +263,24 @@ def pushed(x: Array, u: Array, x_next: Array, model: NominalModel, pushing: Sequ
             end, way = _glide(v, g, _together(x, k, model, pushing), dt)
         after[:, k.position] += way - (dt * v + 0.5 * dt * dt * g)
         after[:, k.velocity] = end
+    return after
+
+
+def _braked(x: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushing], dt: float | Array) -> Array:
+    """x_next (n, nx), under pushes on one speed that has no position."""
+    j = model.states.index(pushing[0][1])
+    axis = Axis(-1, j)  # no push on it asks where it is
+    varies = any(effect.varies for effect, _, _ in pushing)
+    parts = max(1, math.ceil(float(np.max(dt, initial=0.0)) / PART_S - 1e-9)) if varies else 1
+    given, at = (x_next[:, j] - x[:, j]) / dt, x.copy()
+    v = np.ascontiguousarray(x[:, j])
+    for _ in range(parts):
+        at[:, j] = v
+        if varies:
+            at[:, j] = _glide(v, given, _together(at, axis, model, pushing), 0.5 * dt / parts)[0]
+        v = _glide(v, given, _together(at, axis, model, pushing), dt / parts)[0]
+    after = x_next.copy()
+    after[:, j] = v
     return after
 
 

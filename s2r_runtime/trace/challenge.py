@@ -24,7 +24,7 @@ import numpy as np
 
 from s2r_runtime.hookspecs import Effect
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
-from s2r_runtime.models.forces import Axis, axes
+from s2r_runtime.models.forces import axes, lone_speeds
 from s2r_runtime.trace.acceptance import accepted
 from s2r_runtime.trace.begun import begun, measured
 from s2r_runtime.trace.candidates import Candidate
@@ -86,7 +86,8 @@ class Better:
 def better_shape(given: Problem, fit: Fit, horizon: int) -> Better | None:
     """The shape that explains most beyond the effects named on its input, of those that show, if any do; None if none is told."""
     won = [_challenge(given, fit, channel, horizon) for channel in _inputs(fit)]
-    won += [_challenge_on_axis(given, fit, axis, horizon) for axis in axes(fit.model.nominal)]
+    own = [{fit.model.states[axis.velocity], fit.model.states[axis.position]} for axis in axes(fit.model.nominal)]
+    won += [_challenge_on_axis(given, fit, there, horizon) for there in (*own, *({speed} for speed in lone_speeds(fit.model.nominal)))]
     return _first(won)
 
 
@@ -125,10 +126,9 @@ def _challenge(given: Problem, fit: Fit, channel: str, horizon: int) -> Better |
     return _won(given, fit, base, [*shapes, *_state_fits(given, base, _states(base, LIMITS), least)], horizon)
 
 
-def _challenge_on_axis(given: Problem, fit: Fit, axis: Axis, horizon: int) -> Better | None:
-    """Of what was named on an axis' speed or position."""
+def _challenge_on_axis(given: Problem, fit: Fit, own: set[str], horizon: int) -> Better | None:
+    """Of what was named on an axis. own: its speed and position, or a speed that has none."""
     model = fit.model
-    own = {model.states[axis.velocity], model.states[axis.position]}
     there = [i for i in fit.added if model.effects[i].channel in own and model.effects[i].effect.stage != "sensor"]
     if not there:
         return None

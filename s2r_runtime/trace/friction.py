@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
-from s2r_runtime.models.forces import axes
+from s2r_runtime.models.forces import axes, lone_speeds
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, foretold, insert
@@ -53,7 +53,7 @@ def with_friction(given: Problem, base: Fit) -> Fit | None:
 def _ones(given: Problem, model: ComposedModel) -> list[AppliedEffect]:
     """Each kind on each axis, at the size at which it would begin alone."""
     nominal, known = model.nominal, registry()
-    rates = [model.states[axis.velocity] for axis in axes(nominal)]
+    rates = [*(model.states[axis.velocity] for axis in axes(nominal)), *lone_speeds(nominal)]
     found = []
     for kind in KINDS:
         effect = known.get("effects", kind)

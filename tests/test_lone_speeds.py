@@ -1,0 +1,109 @@
+"""Speeds without a position, in somebody's own model: all friction and drag acts on them as on an axis."""
+
+import numpy as np
+import pytest
+
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.plugins import registry
+from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.tracer import trace
+
+DT = 0.02
+MOTOR = """
+import numpy as np
+STATES = ("omega",)
+INPUTS = ("torque",)
+PARAMS = {"inertia": 0.5}
+
+def step(x, u, dt, params):
+    return x + dt * u / params["inertia"]
+"""
+FLYING = """
+import numpy as np
+STATES = ("vx", "vy", "vz")
+INPUTS = ("roll", "pitch", "thrust")
+PARAMS = {"g": 9.81}
+
+def step(x, u, dt, params):
+    roll, pitch, thrust = u.T
+    a = thrust[:, None] * np.column_stack([np.sin(pitch) * np.cos(roll), -np.sin(roll), np.cos(roll) * np.cos(pitch)])
+    a[:, 2] -= params["g"]
+    return x + dt * a
+"""
+ONES = {
+    "viscous_friction": {"coefficient": 0.7},
+    "coulomb_friction": {"force": 0.8},
+    "stribeck_friction": {"force": 0.5, "static_force": 1.1, "velocity": 0.3},
+    "quadratic_drag": {"coefficient": 0.4},
+}
+
+
+@pytest.fixture
+def motor(tmp_path):
+    path = tmp_path / "motor.py"
+    path.write_text(MOTOR)
+    return lambda *effects: compose(ModelSpec(str(path), DT, {}, effects))
+
+
+@pytest.fixture
+def flying(tmp_path):
+    path = tmp_path / "flying.py"
+    path.write_text(FLYING)
+    return compose(ModelSpec(str(path), DT))
+
+
+@pytest.mark.parametrize("names", [*((name,) for name in ONES), ("viscous_friction", "coulomb_friction"), tuple(ONES)], ids=" ".join)
+def test_a_speed_without_a_position_is_braked_as_that_of_an_axis(motor, names):
+    rng = np.random.default_rng(0)
+    v, u = rng.uniform(-1.0, 1.0, (60, 1)), rng.uniform(-2.0, 2.0, (60, 1))
+    v[:5] = 0.0  # held, or not
+    alone = motor(*(EffectSpec(name, "omega", ONES[name]) for name in names))
+    axis = compose(ModelSpec("joint", DT, {"mass": 0.5}, tuple(EffectSpec(name, "qd", ONES[name]) for name in names)))
+    want = axis.advance(np.hstack([np.zeros_like(v), v]), u, u)[:, 1:]
+    assert np.allclose(alone.advance(v, u, u), want, rtol=1e-6, atol=1e-9)
+
+
+def test_what_brakes_it_has_units(motor):
+    model = motor().nominal
+    known = registry()
+    told = {name: [known.get("effects", name).unit(model, "omega", p) for p in ONES[name]] for name in ONES}
+    assert told == {
+        "viscous_friction": ["N m s/rad"],
+        "coulomb_friction": ["N m"],
+        "stribeck_friction": ["N m", "N m", "rad/s"],
+        "quadratic_drag": ["N m s²/rad²"],
+    }
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_dry_friction_of_a_motor_is_named(motor, seed):
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-1.0, 1.0, 60), 15)
+    v, seen = 0.0, [0.0]
+    for torque in u:
+        for _ in range(20):
+            free = v + DT / 20 * torque / 0.5
+            v = np.sign(free) * max(abs(free) - DT / 20 * 0.2 / 0.5, 0.0)
+        seen.append(v)
+    y = np.array(seen)[:, None] + 0.003 * rng.normal(size=(len(seen), 1))
+    result = trace(from_arrays(motor(), [(y, u[:, None])]), motor())
+    assert [(e.name, e.channel) for e in result.effects] == [("coulomb_friction", "omega")]
+    _, low, high = result.effects[0].parameters["force"][:3]
+    assert low < 0.2 < high
+
+
+def test_drag_with_the_square_of_each_speed_of_a_flying_robot_is_named(flying):
+    rng = np.random.default_rng(1)
+    held = [np.repeat(rng.uniform(-a, a, 60), 20) for a in (0.2, 0.2, 1.0)]
+    v, seen, asked = np.zeros(3), [np.zeros(3)], []
+    for k in range(1200):
+        u = np.array([held[0][k] + 0.15 * v[1], held[1][k] - 0.15 * v[0], 9.81 + held[2][k] - 0.8 * v[2]])
+        asked.append(u)
+        lift = u[2] * np.array([np.sin(u[1]) * np.cos(u[0]), -np.sin(u[0]), np.cos(u[0]) * np.cos(u[1])])
+        for _ in range(20):
+            v = v + DT / 20 * (lift - [0.0, 0.0, 9.81] - 0.15 * v * np.abs(v))
+        seen.append(v)
+    y = np.array(seen) + 0.01 * rng.normal(size=(1201, 3))
+    result = trace(from_arrays(flying, [(y, np.array(asked))]), flying)
+    assert {(e.name, e.channel) for e in result.effects} == {("quadratic_drag", s) for s in ("vx", "vy", "vz")}
