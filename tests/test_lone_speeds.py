@@ -5,6 +5,7 @@ import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.models.forces import is_speed
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.tracer import trace
@@ -107,3 +108,13 @@ def test_drag_with_the_square_of_each_speed_of_a_flying_robot_is_named(flying):
     y = np.array(seen) + 0.01 * rng.normal(size=(1201, 3))
     result = trace(from_arrays(flying, [(y, np.array(asked))]), flying)
     assert {(e.name, e.channel) for e in result.effects} == {("quadratic_drag", s) for s in ("vx", "vy", "vz")}
+
+
+def test_a_level_is_no_speed():
+    assert [name for name in ("level", "velocity", "cmd_v", "wheel_speed", "yaw_rate", "roll", "drive", "omega") if is_speed(name)] == [
+        "velocity",
+        "cmd_v",
+        "wheel_speed",
+        "yaw_rate",
+        "omega",
+    ]

@@ -118,9 +118,8 @@ def _axes(model: NominalModel) -> tuple[Axis, ...]:
     return tuple(Axis(model.states.index(rates[name]), j) for j, name in enumerate(model.states) if name in rates)
 
 
-SPEEDS = ("speed", "vel", "omega", "rate")
 LETTERS = {"v", "vx", "vy", "vz", "w"}
-"""Parts of names of speeds, and words in them (cmd_v, w_ref)."""
+"""Words in names of speeds (cmd_v, w_ref)."""
 
 POSE = {"x", "y", "theta"}
 
@@ -134,13 +133,16 @@ def lone_speeds(model: NominalModel) -> tuple[str, ...]:
     if not isinstance(model, BoundModel) or not isinstance(model.shared, FileModel):
         return ()
     if model not in _LONE:
-        _LONE[model] = () if POSE <= {*model.states} else _lone_speeds(model)
+        _LONE[model] = () if {*model.states} >= POSE else _lone_speeds(model)
     return _LONE[model]
 
 
 def is_speed(name: str) -> bool:
-    """Whether a name says so."""
-    return not LETTERS.isdisjoint(name.lower().split("_")) or any(part in name.lower() for part in SPEEDS)
+    """Whether a name says so. A level does not."""
+    return any(
+        word in LETTERS or "speed" in word or "omega" in word or word.startswith("vel") or word.endswith("rate")
+        for word in name.lower().split("_")
+    )
 
 
 def _lone_speeds(model: BoundModel) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """Does what was named look more like something that has no name?
 
-The effects that were found on an input, or on an axis, are taken out, and each shape (`shapes`, `state_shapes`) is put in their place and fitted. With L the log likelihood
-of the recording, noise re-estimated for each, the smaller of white and coloured, and a price per number,
+The effects that were found on an input, or on an axis, are taken out, and each shape (`shapes`, `state_shapes`) is put in their place and
+fitted. With L the log likelihood of the recording, noise re-estimated for each, the smaller of white and coloured, and a price per number,
 
     shape wins     L(shape) - L(named) > log(tried / ALPHA) + the price of numbers that it has more than they,
                    and by LITTLE of all that the named effects explain
