@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from s2r_runtime.models.composed import compose
-from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.models.forces import is_speed
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.tracer import trace
