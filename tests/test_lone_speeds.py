@@ -55,11 +55,12 @@ def flying(tmp_path):
 
 
 @pytest.mark.parametrize("names", [*((name,) for name in ONES), ("viscous_friction", "coulomb_friction"), tuple(ONES)], ids=" ".join)
-def test_a_speed_without_a_position_is_braked_as_that_of_an_axis(motor, names):
+def test_a_speed_without_a_position_is_braked_as_that_of_an_axis_over_its_mass(motor, names):
     rng = np.random.default_rng(0)
     v, u = rng.uniform(-1.0, 1.0, (60, 1)), rng.uniform(-2.0, 2.0, (60, 1))
     v[:5] = 0.0  # held, or not
-    alone = motor(*(EffectSpec(name, "omega", ONES[name]) for name in names))
+    over = {name: {k: v if k == "velocity" else v / 0.5 for k, v in p.items()} for name, p in ONES.items()}
+    alone = motor(*(EffectSpec(name, "omega", over[name]) for name in names))
     axis = compose(ModelSpec("joint", DT, {"mass": 0.5}, tuple(EffectSpec(name, "qd", ONES[name]) for name in names)))
     want = axis.advance(np.hstack([np.zeros_like(v), v]), u, u)[:, 1:]
     assert np.allclose(alone.advance(v, u, u), want, rtol=1e-6, atol=1e-9)
@@ -70,10 +71,10 @@ def test_what_brakes_it_has_units(motor):
     known = registry()
     told = {name: [known.get("effects", name).unit(model, "omega", p) for p in ONES[name]] for name in ONES}
     assert told == {
-        "viscous_friction": ["N m s/rad"],
-        "coulomb_friction": ["N m"],
-        "stribeck_friction": ["N m", "N m", "rad/s"],
-        "quadratic_drag": ["N m s²/rad²"],
+        "viscous_friction": ["1/s"],
+        "coulomb_friction": ["rad/s²"],
+        "stribeck_friction": ["rad/s²", "rad/s²", "rad/s"],
+        "quadratic_drag": ["1/rad"],
     }
 
 
@@ -91,7 +92,7 @@ def test_dry_friction_of_a_motor_is_named(motor, seed):
     result = trace(from_arrays(motor(), [(y, u[:, None])]), motor())
     assert [(e.name, e.channel) for e in result.effects] == [("coulomb_friction", "omega")]
     _, low, high = result.effects[0].parameters["force"][:3]
-    assert low < 0.2 < high
+    assert low < 0.2 / 0.5 < high
 
 
 def test_drag_with_the_square_of_each_speed_of_a_flying_robot_is_named(flying):

@@ -161,3 +161,27 @@ def test_an_effect_that_is_hardly_noticed_is_named_where_what_it_leaves_is_notic
     found = trace(from_arrays(model, [(y[0], u[0])]), model)
     assert found.verdict == "traced"
     assert [e.name for e in found.effects] == ["integration_scheme"]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_car_that_is_fast_when_the_recording_begins_had_been_for_longer_than_its_lag(seed):
+    """At 14 m/s with a lag of 0.8 s: what is left of it from rest is 0.3 m/s after three seconds, thirty times the speed's noise."""
+    rng = np.random.default_rng(seed)
+    rows, parts, dt = 900, 50, 0.1
+    u = np.zeros((rows, 2))
+    u[:, 1] = np.repeat(rng.uniform(12.0, 24.0, rows // 30), 30)
+    u[:60, 1] = 14.0
+    u[:, 0] = np.repeat(rng.uniform(-0.03, 0.03, rows // 15), 15)
+    x, y, theta, v = 0.0, 0.0, 0.0, 14.0
+    seen = [(x, y, theta, v)]
+    for steer, asked in u:
+        for _ in range(parts):
+            v += (asked - v) * (1.0 - math.exp(-dt / parts / 0.8))
+            x, y = x + dt / parts * v * math.cos(theta), y + dt / parts * v * math.sin(theta)
+            theta += dt / parts * v * math.tan(steer) / 2.7
+        seen.append((x, y, theta, v))
+    measured = np.array(seen) + rng.normal(size=(rows + 1, 4)) * [0.02, 0.02, 0.0015, 0.01]
+    model = compose(ModelSpec("bicycle", dt, {"wheel_base": 2.7}))
+    result = trace(from_arrays(model, [(measured, u)]), model)
+    assert {e.name for e in result.effects} == {"input_lag", "integration_scheme"}
+    assert result.depends_on == ()

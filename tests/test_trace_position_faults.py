@@ -91,3 +91,22 @@ def test_what_was_done_while_nothing_was_recorded_is_no_jump():
     t = np.concatenate([0.01 * np.arange(500), 7.0 + 0.01 * np.arange(500)])
     p = np.sin(t) + 1e-5 * np.random.default_rng(5).normal(size=1000)
     assert mended(Stream(t, p[:, None]), [(0, "q")], np.zeros((999, 1)), 0.0).faults == ()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_position_that_repeats_while_it_turns_round_leaps_and_is_frozen(seed):
+    """Its pace before and after says nothing of the way between."""
+    t = 0.01 * np.arange(4000)
+    p = 0.5 * np.cos(np.pi * t) + 1e-5 * np.random.default_rng(seed).normal(size=4000)
+    p[1985:2035] = p[1985]
+    assert [(f.kind, round(f.from_s, 2), round(f.to_s, 2)) for f in _checked(p, 0.01).faults] == [("frozen", 19.85, 20.34)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_position_that_stands_once_and_sets_out_again_is_not_frozen(seed):
+    t = 0.01 * np.arange(4000)
+    slow = np.clip(np.abs(t - 20.0) - 2.0, 0.0, None)
+    p = np.sign(t - 20.0) * slow**2 / (1.0 + slow)
+    noise = 1e-5 * np.random.default_rng(seed).normal(size=4000)
+    p = np.where(slow == 0.0, 0.0, p + noise)
+    assert _checked(p, 0.01).faults == ()

@@ -8,7 +8,7 @@ from __future__ import annotations
 from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, force_unit, size_of
 from s2r_runtime.effects.viscous_friction import by_direction, either_way, one_or_two
 from s2r_runtime.hookspecs import NominalModel, Parameter
-from s2r_runtime.models.forces import Axis, Push, mass
+from s2r_runtime.models.forces import Axis, Push, mass_on
 
 SHARES = (0.05, 0.3)
 """Of the inputs' size: friction that a motion mostly overcomes, and friction that often holds it."""
@@ -25,7 +25,7 @@ class CoulombFriction(ForceEffect):
 
     def unit(self, model: NominalModel, channel: str, parameter: str) -> str:
         """Of a force."""
-        return force_unit(model)
+        return force_unit(model, channel)
 
     def wrong(self, p: Values) -> str:
         """What is wrong with the values together."""
@@ -33,7 +33,7 @@ class CoulombFriction(ForceEffect):
 
     def push(self, x: Array, axis: Axis, model: NominalModel, channel: str, p: Values) -> Push | None:
         """Its deceleration."""
-        return Push(dry=by_direction(p, "force", mass(model))) if model.states[axis.velocity] == channel else None
+        return Push(dry=by_direction(p, "force", mass_on(model, channel))) if model.states[axis.velocity] == channel else None
 
     def simpler(self, p: Values) -> tuple[str, Values]:
         """The same either way."""

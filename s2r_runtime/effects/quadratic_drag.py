@@ -11,7 +11,7 @@ import numpy as np
 from s2r_runtime.effects.input_effect import replaced
 from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, force_unit, length_unit, size_of, usual_speed
 from s2r_runtime.hookspecs import NominalModel, Parameter
-from s2r_runtime.models.forces import Axis, Push, is_speed, mass
+from s2r_runtime.models.forces import Axis, Push, is_speed, mass_on
 
 SPEEDS = {"m/s", "rad/s"}
 """Units of inputs that are speeds. An input without a unit, in somebody's own model, may be one: the tracer asks if its name says so."""
@@ -42,8 +42,8 @@ class QuadraticDrag(ForceEffect):
         units: dict[str, str] = getattr(model, "units", {})
         if channel in model.inputs:
             return "s/rad" if units.get(channel) == "rad/s" else "s/m"
-        force, length = force_unit(model), length_unit(model, channel)
-        return f"1/{length}" if force == "m/s²" else f"{force} s²/{length}²"
+        force, length = force_unit(model, channel), length_unit(model, channel)
+        return f"1/{length}" if force.endswith("/s²") else f"{force} s²/{length}²"
 
     def pushes(self, model: NominalModel, channel: str) -> bool:
         """On axes; on inputs it changes what acts."""
@@ -53,7 +53,7 @@ class QuadraticDrag(ForceEffect):
         """Its rate at this speed, 1/s."""
         if model.states[axis.velocity] != channel:
             return None
-        rate = float(p["coefficient"]) / mass(model) * np.abs(x[:, axis.velocity])
+        rate = float(p["coefficient"]) / mass_on(model, channel) * np.abs(x[:, axis.velocity])
         return Push(rate=(rate, rate))
 
     def input_step(self, u: Array, z: Array, model: NominalModel, channel: str, dt: float, p: Values) -> tuple[Array, Array]:
@@ -73,7 +73,7 @@ class QuadraticDrag(ForceEffect):
             if channel not in getattr(model, "units", {}) and not is_speed(channel):
                 return []  # nothing drags at a steering angle, a voltage or a valve
             return [{"coefficient": INPUT_SHARE / size_of(u[:, [model.inputs.index(channel)]])}]
-        return [{"coefficient": RATE * mass(model) / usual_speed(u, model, dt)}]
+        return [{"coefficient": RATE * mass_on(model, channel) / usual_speed(u, model, dt)}]
 
 
 EFFECT = QuadraticDrag()

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.hookspecs import NominalModel, Parameter
-from s2r_runtime.models.forces import POSE, Axis, Push, axes, coupled, lone_speeds, mass, mass_name, pushed
+from s2r_runtime.models.forces import POSE, Axis, Push, axes, coupled, lone_speeds, mass, mass_name, pushed, turns
 
 Array = NDArray[np.float64]
 Values = dict[str, Any]
@@ -96,9 +96,11 @@ def has_pose(model: NominalModel) -> bool:
     return {*model.states} >= POSE
 
 
-def force_unit(model: NominalModel) -> str:
-    """Of what acts on an axis: the input's where it is divided by a mass, an acceleration otherwise."""
+def force_unit(model: NominalModel, channel: str = "") -> str:
+    """Of what acts on an axis: the input's where it is divided by a mass, an acceleration otherwise, and on a speed without a position."""
     units: dict[str, str] = getattr(model, "units", {})
+    if channel in lone_speeds(model):
+        return f"{length_unit(model, channel)}/s²"
     if coupled(model):
         return units.get(model.inputs[0], "input's unit")
     if not mass_name(model):
@@ -111,7 +113,7 @@ def length_unit(model: NominalModel, channel: str) -> str:
     units: dict[str, str] = getattr(model, "units", {})
     axis = axis_of(model, channel)
     if axis is None:
-        return units.get(channel, "rad/s" if mass_name(model) == "inertia" else "m/s").removesuffix("/s")
+        return units.get(channel, "rad/s" if turns(channel) else "m/s").removesuffix("/s")
     name = model.states[axis.position]
     if coupled(model):
         return units.get(name, f"{name}'s unit")

@@ -11,7 +11,7 @@ import numpy as np
 
 from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, force_unit, length_unit, size_of, usual_speed
 from s2r_runtime.hookspecs import NominalModel, Parameter
-from s2r_runtime.models.forces import Axis, Push, mass
+from s2r_runtime.models.forces import Axis, Push, mass_on
 
 FORCE_SHARE = 0.1
 STATIC = 2.0
@@ -34,7 +34,7 @@ class StribeckFriction(ForceEffect):
 
     def unit(self, model: NominalModel, channel: str, parameter: str) -> str:
         """Of a force, of a speed."""
-        return f"{length_unit(model, channel)}/s" if parameter == "velocity" else force_unit(model)
+        return f"{length_unit(model, channel)}/s" if parameter == "velocity" else force_unit(model, channel)
 
     def wrong(self, p: Values) -> str:
         """What is wrong with the values together."""
@@ -44,7 +44,7 @@ class StribeckFriction(ForceEffect):
         """Its deceleration at this speed, and what it holds."""
         if model.states[axis.velocity] != channel:
             return None
-        over = mass(model)
+        over = mass_on(model, channel)
         fast, still = float(p["force"]) / over, float(p["static_force"]) / over
         dry = fast + (still - fast) * np.exp(-((x[:, axis.velocity] / float(p["velocity"])) ** 2))
         return Push(dry=(dry, dry), hold=(still, still))

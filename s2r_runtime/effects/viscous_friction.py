@@ -14,7 +14,7 @@ import numpy as np
 
 from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, axis_of, force_unit, has_pose, length_unit
 from s2r_runtime.hookspecs import NominalModel, Parameter
-from s2r_runtime.models.forces import Axis, Push, axes, coupled, mass
+from s2r_runtime.models.forces import Axis, Push, axes, coupled, mass_on
 
 START_RATE = 0.5
 """1/s: a slow loss; what it does to a step is in proportion to it."""
@@ -39,10 +39,10 @@ class ViscousFriction(ForceEffect):
     def unit(self, model: NominalModel, channel: str, parameter: str) -> str:
         """Of force over speed."""
         axis = axis_of(model, channel)
-        force = force_unit(model)
+        force = force_unit(model, channel)
         if axis is not None and coupled(model) and not getattr(model, "units", {}):
             return f"{model.inputs[axes(model).index(axis)]}/{channel}"  # one's own units, whatever they are
-        return "1/s" if not self.pushes(model, channel) or force == "m/s²" else f"{force} s/{length_unit(model, channel)}"
+        return "1/s" if not self.pushes(model, channel) or force.endswith("/s²") else f"{force} s/{length_unit(model, channel)}"
 
     def wrong(self, p: Values) -> str:
         """What is wrong with the values together."""
@@ -58,7 +58,7 @@ class ViscousFriction(ForceEffect):
 
     def push(self, x: Array, axis: Axis, model: NominalModel, channel: str, p: Values) -> Push | None:
         """Its rates, 1/s."""
-        return Push(rate=by_direction(p, "coefficient", mass(model))) if model.states[axis.velocity] == channel else None
+        return Push(rate=by_direction(p, "coefficient", mass_on(model, channel))) if model.states[axis.velocity] == channel else None
 
     def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """The step with this force alone."""
@@ -80,7 +80,7 @@ class ViscousFriction(ForceEffect):
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
         """One each way of saying it: the response is linear."""
-        c = START_RATE * (mass(model) if self.pushes(model, channel) else 1.0)
+        c = START_RATE * (mass_on(model, channel) if self.pushes(model, channel) else 1.0)
         return [{"coefficient": c}, {"coefficient_positive": c, "coefficient_negative": c}]
 
 

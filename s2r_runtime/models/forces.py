@@ -121,6 +121,8 @@ def _axes(model: NominalModel) -> tuple[Axis, ...]:
 LETTERS = {"v", "vx", "vy", "vz", "w"}
 """Words in names of speeds (cmd_v, w_ref)."""
 
+TURNING = ("roll", "pitch", "yaw")
+
 POSE = {"x", "y", "theta"}
 
 _LONE: WeakKeyDictionary[BoundModel, tuple[str, ...]] = WeakKeyDictionary()
@@ -143,6 +145,11 @@ def is_speed(name: str) -> bool:
         word in LETTERS or "speed" in word or "omega" in word or word.startswith("vel") or word.endswith("rate")
         for word in name.lower().split("_")
     )
+
+
+def turns(name: str) -> bool:
+    """Whether a speed is one of turning, by its name."""
+    return "omega" in name.lower() or any(word in {"w", "qd"} or word.startswith(TURNING) for word in name.lower().split("_"))
 
 
 def _lone_speeds(model: BoundModel) -> tuple[str, ...]:
@@ -171,6 +178,11 @@ def mass(model: NominalModel) -> float:
     """By which a force is divided; 1 if inputs are accelerations."""
     name = mass_name(model)
     return float(model.parameters[name]) if name else 1.0
+
+
+def mass_on(model: NominalModel, channel: str) -> float:
+    """By which a force on a speed is divided. Whether a model's mass is that of a speed without a position, nobody says: 1."""
+    return 1.0 if channel in lone_speeds(model) else mass(model)
 
 
 def coupled(model: NominalModel) -> bool:

@@ -47,8 +47,8 @@ is given to it at most.
 """
 
 HELD_S, LEAST, MOST, SHARE = 10.0, 30, 300, 10
-"""For how long the first input is taken to have been held, s; in steps at least LEAST, and at most MOST or one SHARE-th of the run. A car at
-30 m/s that follows its command in a second is 1.5 m/s off after three, and 1.4 mm/s after ten.
+"""For how long the first input is taken to have been held, s; in steps at least LEAST, and at most MOST or one SHARE-th of the run. A car
+at 30 m/s that follows its command in a second is 1.5 m/s off after three, and 1.4 mm/s after ten.
 """
 
 

@@ -4,11 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
 SIGMAS = 8.0
 """Robust standard deviations from which a single residual is suspected."""
 
 FROZEN_ROWS = 5
 """Rows that repeat a state exactly before it counts as frozen."""
+
+RESTLESS, RESTS, REPEATS = 12, 60, 0.01
+"""Rows of exact repeats that are no rest of what jitters; rows elsewhere from which it is told that it does; share of these that repeats at
+most.
+"""
+
+LEAPS, USUALLY = 3.0, 0.99
+"""Times what all but a few changes from row to row stay within: what repeats, and then leaps by more, went on while nobody told it."""
 
 QUANTA = 6.0
 """Least changes by which a state must have moved on while it repeated: below that it may be resolution."""
@@ -22,3 +36,28 @@ class Fault:
     to_s: float
     channel: str
     kind: str
+
+
+def stretches(yes: Mask) -> list[tuple[int, int]]:
+    """[a, b) of each run of True in (K,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], yes.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def longest(yes: Mask, but: tuple[int, int]) -> int:
+    """Of runs of True other than [a, b)."""
+    return max((b - a for a, b in stretches(yes) if (a, b) != but), default=0)
+
+
+def leaps(change: Array, within: tuple[int, int]) -> bool:
+    """Whether a state that jitters, and so hardly ever repeats, repeats for long and leaps then: a robot that stood still sets out from
+    where it stood. change: (K,) from row to row, NaN across a pause; within: [a, b) that repeats.
+    """
+    a, b = within
+    if b - a < RESTLESS or b >= len(change) or not np.isfinite(change[b]):
+        return False
+    others = np.isfinite(change)
+    others[a : b + 1] = False
+    if np.count_nonzero(others) < RESTS or float(np.mean(change[others] == 0.0)) >= REPEATS:
+        return False
+    return bool(change[b] > LEAPS * np.quantile(change[others], USUALLY))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.fault import FROZEN_ROWS, QUANTA, SIGMAS, Fault
+from s2r_runtime.trace.fault import FROZEN_ROWS, QUANTA, REPEATS, RESTLESS, RESTS, SIGMAS, Fault, leaps, longest, stretches
 from s2r_runtime.trace.reach import Reach, predicted
 from s2r_runtime.trace.residual import Acting, advanced, first_steps
 
@@ -20,18 +20,22 @@ Mask = NDArray[np.bool_]
 LONG_FROZEN = 50
 """Rows of exact repeats that need no catching up to count as frozen."""
 
-RESTLESS, RESTS, REPEATS, ALTERNATES = 12, 60, 0.01, -0.3
-"""Rows of exact repeats that count as frozen, however little the robot moves, where a state jitters on other rows on which it hardly moves
-either: on at least so many of them, of which less than such a share repeat, and whose residuals alternate. Noise of a measurement has a
+ALTERNATES = -0.3
+"""Rows of exact repeats count as frozen, however little the robot moves, where a state jitters on other rows on which it hardly moves
+either: on at least RESTS of them, of which less than REPEATS repeat, and whose residuals alternate. Noise of a measurement has a
 correlation of -1/2 from one residual to the next; a slow motion, or an effect that the model lacks, has none below zero.
 """
+
+FARTHER = 4
+"""Times the longest exact repeats elsewhere (but rest) from which on a state that is told to change and does not is frozen."""
 
 FOLLOWS, FOLLOWED = 0.25, 0.9
 """Of what a frozen speed is off at most, how near to its command it is on other rows, and on which share of them at least."""
 
 
 def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: Reach) -> list[Fault]:
-    """Exact repeats through which the model moves the state by more than noise and quantisation, and after which it catches up.
+    """Exact repeats through which the model moves the state by more than noise and quantisation, and after which it catches up. A state
+    that hardly ever repeats elsewhere catches up by a leap, whatever the model says.
 
     Without catching up the robot itself may have stood still; only a long silence of a state that jitters otherwise is then a fault; or one
     of a state that jitters on other rows on which the robot stands, or nearly.
@@ -41,22 +45,24 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
         return []
     foretold = predicted(model, data, act, i)
     moves, e = model.difference(foretold, run.y[:-1]), model.difference(run.y[1:], foretold)
-    found = []
+    turned, found = np.abs(model.difference(run.y[1:], run.y[:-1])), []
     for j, name in enumerate(model.states):
         change = np.abs(np.diff(run.y[:, j]))
         if not np.isfinite(reach.noise[j]) or not np.any(change > 0.0):
             continue
         quantum = float(np.min(change[change > 0.0]))
         least = SIGMAS * reach.noise[j] + QUANTA * quantum
-        for a, b in _stretches(change == 0.0):
+        for a, b in stretches(change == 0.0):
             if b - a < FROZEN_ROWS:
                 continue
             if reach.instant[j]:
-                if b - a >= RESTLESS and _ignored(foretold[:, j], run.y[:, j], (a, b), least):
+                stuck = b - a >= FARTHER * longest((change == 0.0) & (np.abs(run.y[:-1, j]) > QUANTA * quantum), (a, b))
+                if b - a >= RESTLESS and _ignored(foretold[:, j], run.y[:, j], (a, b), QUANTA * quantum if stuck else least, stuck):
                     bad[a + 1 : b + 1, j] = True
                     found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
                 continue
-            if b - a >= RESTLESS and _restless(change, e[:, j], np.abs(moves[:, j]) < reach.noise[j], (a, b)):
+            rests = np.abs(moves[:, j]) < reach.noise[j]
+            if leaps(turned[:, j], (a, b)) or (b - a >= RESTLESS and _restless(change, e[:, j], rests, (a, b))):
                 bad[a + 1 : b + 1, j] = True
                 found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
                 continue
@@ -107,7 +113,7 @@ def _with_them(model: ComposedModel, data: Dataset, i: int, bad: Mask) -> list[F
         return []
     hardly = np.mean(still[~there], axis=0) < REPEATS
     found = []
-    for a, b in _stretches(there):
+    for a, b in stretches(there):
         for j, name in enumerate(model.states):
             if hardly[j] and not np.any(bad[a + 1 : b + 1, j]) and np.all(still[a:b, j]):
                 bad[a + 1 : b + 1, j] = True
@@ -115,9 +121,10 @@ def _with_them(model: ComposedModel, data: Dataset, i: int, bad: Mask) -> list[F
     return found
 
 
-def _ignored(foretold: Array, y: Array, within: tuple[int, int], least: float) -> bool:
-    """Whether a state that an input sets (a wheel's speed) stays through commands that it follows at all other times. Not at zero, where
-    robots stand, nor where every command is beyond it: that is a limit. foretold: (K,) by the command.
+def _ignored(foretold: Array, y: Array, within: tuple[int, int], least: float, stuck: bool) -> bool:
+    """Whether a state that an input sets (a wheel's speed) stays through commands that it follows at all other times, or far longer (stuck)
+    than it does at any other time. Not at zero, where robots stand, nor where every command is beyond it: that is a limit.
+    foretold: (K,) by the command.
     """
     a, b = within
     there, value = foretold[a:b], float(y[a])
@@ -125,6 +132,8 @@ def _ignored(foretold: Array, y: Array, within: tuple[int, int], least: float) -
     limit = bool(np.all(there * math.copysign(1.0, value) >= abs(value) - least))
     if missed < least or float(np.ptp(there)) < least or abs(value) < least or limit:
         return False
+    if stuck:
+        return True
     off = np.abs(y[1:] - foretold)
     followed = off < FOLLOWS * missed
     back = followed[b : b + FROZEN_ROWS]
@@ -144,9 +153,3 @@ def _restless(change: Array, e: Array, resting: Mask, within: tuple[int, int]) -
     first, second = (np.clip(part[pairs], -limit, limit) for part in (e[:-1], e[1:]))
     size = float(np.sqrt(np.sum(first**2) * np.sum(second**2)))
     return bool(np.count_nonzero(pairs) >= RESTS // 2 and size > 0.0 and float(np.sum(first * second)) < ALTERNATES * size)
-
-
-def _stretches(yes: Mask) -> list[tuple[int, int]]:
-    """[a, b) of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], yes.astype(np.int8), [0]])))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -5,7 +5,8 @@ A body's position goes on at its pace. With d_k = p_{k+1} - p_k over h_k, and m_
     off_k = d_k - m_k h_k                       of noise, rounding, and what accelerates the body
     jump:    |off_k| beyond noise, and beyond what the inputs do, with nothing like it beside
     spike:   one that is taken back within a few rows
-    frozen:  p repeats exactly, and then makes up for the way that the pace before and after says
+    frozen:  p repeats exactly, and then makes up for the way that the pace before and after says; or leaps, and hardly ever repeats
+             elsewhere
 
 A blow, or an end stop, changes the pace from v to w, and m is between them at that row: off is half of (v - w) h before it, and the other
 way after it, as if one row were wrong. So a jump and a spike must be beyond |w - v| h, too.
@@ -20,7 +21,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace.fault import FROZEN_ROWS, QUANTA, SIGMAS, Fault
+from s2r_runtime.trace.fault import FROZEN_ROWS, QUANTA, SIGMAS, Fault, leaps, stretches
 from s2r_runtime.trace.streams import Stream
 
 Array = NDArray[np.float64]
@@ -89,14 +90,16 @@ def _of_one(t: Array, p: Array, pushed: Array) -> tuple[Mask, list[int], list[tu
     noise = max(1.4826 * float(np.median(np.abs(off - np.median(off)))), quantum / 2.0)
     least = SIGMAS * noise + BEYOND * float(np.max(np.abs(pushed), initial=0.0)) * float(np.median(h)) ** 2
     told: list[tuple[int, int, str]] = []
-    for a, b in _repeats(d):
+    changed_by = np.where(h > APART * np.median(h), np.nan, np.abs(d))
+    for a, b in (one for one in stretches(d == 0.0) if one[1] - one[0] >= FROZEN_ROWS):
         around = np.concatenate(
             [d[max(a - AROUND, 0) : a] / h[max(a - AROUND, 0) : a], d[b + 1 : b + 1 + AROUND] / h[b + 1 : b + 1 + AROUND]]
         )
         if b >= len(d) or len(around) < AROUND:
             continue
         missed = float(np.median(around)) * float(t[b + 1] - t[a])
-        if abs(missed) > least + QUANTA * quantum and abs(float(d[b]) - missed) < MADE_UP * abs(missed):
+        made_up = abs(missed) > least + QUANTA * quantum and abs(float(d[b]) - missed) < MADE_UP * abs(missed)
+        if made_up or leaps(changed_by, (a, b)):
             lost[a + 1 : b + 1] = True
             off[max(a - AROUND, 0) : b + 1 + AROUND] = 0.0  # the pace there is told from rows that stand still
             told.append((a, b, "frozen"))
@@ -125,12 +128,6 @@ def _pace(v: Array) -> tuple[Array, Array]:
     blow = np.zeros(len(v))
     blow[1:-1] = np.abs(np.nanmedian(near[1:-1, AROUND:], axis=1) - np.nanmedian(near[1:-1, :AROUND], axis=1))
     return np.asarray(np.nanmedian(near, axis=1)), blow
-
-
-def _repeats(d: Array) -> list[tuple[int, int]]:
-    """[a, b) of steps that go nowhere, FROZEN_ROWS and more."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], (d == 0.0).astype(np.int8), [0]])))
-    return [(a, b) for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True) if b - a >= FROZEN_ROWS]
 
 
 def _alone(off: Array, k: int) -> bool:
