@@ -29,6 +29,9 @@ correlation of -1/2 from one residual to the next; a slow motion, or an effect t
 FARTHER = 4
 """Times the longest exact repeats elsewhere (but rest) from which on a state that is told to change and does not is frozen."""
 
+HALF = 0.5
+"""Of a leap, that the inputs do not ask for: a robot that stood may set out fast."""
+
 FOLLOWS, FOLLOWED = 0.25, 0.9
 """Of what a frozen speed is off at most, how near to its command it is on other rows, and on which share of them at least."""
 
@@ -62,7 +65,8 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
                     found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
                 continue
             rests = np.abs(moves[:, j]) < reach.noise[j]
-            if leaps(turned[:, j], (a, b)) or (b - a >= RESTLESS and _restless(change, e[:, j], rests, (a, b))):
+            unforetold = b < len(e) and abs(e[b, j]) > HALF * turned[b, j]
+            if (unforetold and leaps(turned[:, j], (a, b))) or (b - a >= RESTLESS and _restless(change, e[:, j], rests, (a, b))):
                 bad[a + 1 : b + 1, j] = True
                 found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
                 continue
