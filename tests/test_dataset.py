@@ -225,9 +225,9 @@ def test_what_was_before_a_run_is_told_from_its_first_steps():
         under_way[k + 1] = model.nominal.step(under_way[k : k + 1], u[k : k + 1], 0.1, {})[0]
     from_rest = np.concatenate([np.repeat(under_way[:1], 5, axis=0), under_way[:-5]])
     data = with_history(model, from_arrays(model, [(under_way, u), (from_rest, u)]))
-    assert np.isnan(data.runs[0].y[:30]).all()
-    assert np.array_equal(data.runs[0].u[:30], u[:30])
-    assert data.runs[0].start_s == pytest.approx(-3.0)
+    assert np.isnan(data.runs[0].y[:100]).all()
+    assert np.array_equal(data.runs[0].u[:100], np.tile(u[:1], (100, 1)))
+    assert data.runs[0].start_s == pytest.approx(-10.0)
     assert len(data.runs[1].y) == 41
     assert len(steps_of(data)) == 80
 
