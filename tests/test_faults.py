@@ -93,19 +93,6 @@ def test_an_encoder_that_stands_still_through_commands_is_frozen(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_an_encoder_that_follows_slowly_and_stands_still_far_longer_than_ever_is_frozen(seed):
-    """Seldom near its command, so that it cannot be told by that it follows."""
-
-    def freeze(y, u):
-        for k in range(len(u)):
-            y[k + 1, 4] = y[k, 4] + 0.1 * (u[k, 1] - y[k, 4])
-        y[:, 4] = np.rint(y[:, 4] / 0.06) * 0.06
-        y[750:950, 4] = y[750, 4]
-
-    assert [(f.kind, f.channel) for f in _wheels(seed, freeze)] == [("frozen", "wheel_right")]
-
-
-@pytest.mark.parametrize("seed", range(4))
 def test_a_wheel_at_its_limit_or_at_rest_is_not(seed):
     def limit(y, u):
         y[:, 3:] = np.clip(y[:, 3:], -5.04, 5.04)

@@ -111,11 +111,34 @@ def test_drag_with_the_square_of_each_speed_of_a_flying_robot_is_named(flying):
     assert {(e.name, e.channel) for e in result.effects} == {("quadratic_drag", s) for s in ("vx", "vy", "vz")}
 
 
-def test_a_level_is_no_speed():
-    assert [name for name in ("level", "velocity", "cmd_v", "wheel_speed", "yaw_rate", "roll", "drive", "omega") if is_speed(name)] == [
-        "velocity",
-        "cmd_v",
-        "wheel_speed",
-        "yaw_rate",
-        "omega",
-    ]
+DC_MOTOR = """
+import numpy as np
+STATES = ("current", "omega")
+INPUTS = ("volts",)
+PARAMS = {"R": 1.0, "L": 0.5, "k": 0.4, "J": 0.05}
+
+def step(x, u, dt, p):
+    i, w = x.T
+    return x + dt * np.column_stack([(u[:, 0] - p["R"] * i - p["k"] * w) / p["L"], p["k"] * i / p["J"]])
+"""
+
+
+@pytest.mark.parametrize("name", ONES)
+def test_what_brakes_a_motor_does_so_in_finer_steps_too(tmp_path, name):
+    """In parts of a step, what its speed does to its current comes back to it: the file itself does not slow it down."""
+    path = tmp_path / "dc.py"
+    path.write_text(DC_MOTOR)
+    brake = EffectSpec(name, "omega", ONES[name])
+    finer = EffectSpec("integration_scheme", "*", {"scheme": "exact"})
+    x, u = np.array([[0.5, 3.0]]), np.array([[2.0]])
+    plain, braked, both, fine = (
+        compose(ModelSpec(str(path), DT, {}, effects)).advance(x, u, u)[0, 1] for effects in ((), (brake,), (brake, finer), (finer,))
+    )
+    assert braked < plain - 1e-3
+    assert fine - both == pytest.approx(plain - braked, rel=0.05)
+
+
+def test_names_of_speeds():
+    speeds = ["velocity", "cmd_v", "wheel_speed", "yaw_rate", "omega", "linvel"]
+    others = ["level", "roll", "drive", "v_bat", "flow_rate", "accelerate"]
+    assert [name for name in (*speeds, *others) if is_speed(name)] == speeds

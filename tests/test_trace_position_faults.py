@@ -110,3 +110,15 @@ def test_a_position_that_stands_once_and_sets_out_again_is_not_frozen(seed):
     noise = 1e-5 * np.random.default_rng(seed).normal(size=4000)
     p = np.where(slow == 0.0, 0.0, p + noise)
     assert _checked(p, 0.01).faults == ()
+
+
+@pytest.mark.parametrize("begin", [0, 1000], ids=["at first", "once"])
+def test_a_position_that_stood_on_a_clean_encoder_and_is_kicked_is_not_frozen(begin):
+    rng = np.random.default_rng(0)
+    t = 0.01 * np.arange(3000)
+    p = np.where(t < 0.01 * begin, np.cos(np.pi * t / 10.0), np.cos(np.pi * begin / 1000.0)) + 1e-6 * rng.normal(size=3000) * (
+        t < 0.01 * begin
+    )
+    p[begin : begin + 60] = p[begin]
+    p[begin + 60 :] = p[begin] + np.cumsum(0.02 * np.exp(-0.3 * np.arange(2940 - begin)) + 1e-5 * rng.normal(size=2940 - begin))
+    assert [f for f in _checked(p, 0.01, pushed=100.0).faults if f.kind == "frozen"] == []

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -121,7 +121,7 @@ def _axes(model: NominalModel) -> tuple[Axis, ...]:
 LETTERS = {"v", "vx", "vy", "vz", "w"}
 """Words in names of speeds (cmd_v, w_ref)."""
 
-TURNING = ("roll", "pitch", "yaw")
+TURNING = ("roll", "pitch", "yaw", "turn")
 
 POSE = {"x", "y", "theta"}
 
@@ -140,10 +140,17 @@ def lone_speeds(model: NominalModel) -> tuple[str, ...]:
 
 
 def is_speed(name: str) -> bool:
-    """Whether a name says so. A level does not."""
+    """Whether a name says so. A level does not, nor a battery's voltage, nor a rate of flow."""
+    words = name.lower().split("_")
+    if any(word.startswith(("bat", "volt")) for word in words):
+        return False
     return any(
-        word in LETTERS or "speed" in word or "omega" in word or word.startswith("vel") or word.endswith("rate")
-        for word in name.lower().split("_")
+        word in LETTERS
+        or "speed" in word
+        or "omega" in word
+        or ("vel" in word and "level" not in word)
+        or (word.endswith("rate") and any(turn in name.lower() for turn in TURNING))
+        for word in words
     )
 
 
@@ -154,6 +161,7 @@ def turns(name: str) -> bool:
 
 def _lone_speeds(model: BoundModel) -> tuple[str, ...]:
     moving = {model.states[axis.velocity] for axis in axes(model)}
+    model = replace(model, finer=False, schemes={})  # in parts of a step, what a speed does to other states comes back to it
     rng = np.random.default_rng(0)
     x, u = rng.uniform(-1.0, 1.0, (8, len(model.states))), rng.uniform(-1.0, 1.0, (8, len(model.inputs)))
     found = []
@@ -283,7 +291,7 @@ def pushed(x: Array, u: Array, x_next: Array, model: NominalModel, pushing: Sequ
 def _braked(x: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushing], dt: float | Array) -> Array:
     """x_next (n, nx), under pushes on one speed that has no position."""
     j = model.states.index(pushing[0][1])
-    axis = Axis(-1, j)  # no push on it asks where it is
+    axis = Axis(x.shape[1], j)  # a push that asks where it is fails
     varies = any(effect.varies for effect, _, _ in pushing)
     parts = max(1, math.ceil(float(np.max(dt, initial=0.0)) / PART_S - 1e-9)) if varies else 1
     given, at = (x_next[:, j] - x[:, j]) / dt, x.copy()

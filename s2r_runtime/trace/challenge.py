@@ -123,7 +123,8 @@ def _challenge(given: Problem, fit: Fit, channel: str, horizon: int) -> Better |
     base = fitted(given, fit, bare, 1)
     least = REACHES * at_first_look(given, fit, base)
     shapes = _fits(given, base, channel, least, _times(fit, channel), _plays(fit, channel))
-    return _won(given, fit, base, [*shapes, *_state_fits(given, base, _states(base, LIMITS), least)], horizon)
+    limits = _states(base, LIMITS)
+    return _won(given, fit, base, [*shapes, *_state_fits(given, base, limits, least)], len(SHAPES) + len(limits), horizon)
 
 
 def _challenge_on_axis(given: Problem, fit: Fit, own: set[str], horizon: int) -> Better | None:
@@ -137,18 +138,20 @@ def _challenge_on_axis(given: Problem, fit: Fit, own: set[str], horizon: int) ->
         bare = without(bare, i)
     base = fitted(given, fit, bare, 1)
     on = [(shape, channel) for shape, channel in _states(base, STATE_SHAPES) if channel in own]
-    return _won(given, fit, base, _state_fits(given, base, on, REACHES * at_first_look(given, fit, base)), horizon)
+    return _won(given, fit, base, _state_fits(given, base, on, REACHES * at_first_look(given, fit, base)), len(on), horizon)
 
 
-def _won(given: Problem, fit: Fit, base: Fit, shapes: Sequence[Fit], horizon: int) -> Better | None:
-    """Of shapes in the place of what was named, the one that does best, if any is told. base: without what was named."""
+def _won(given: Problem, fit: Fit, base: Fit, shapes: Sequence[Fit], tried: int, horizon: int) -> Better | None:
+    """Of shapes in the place of what was named, the one that does best, if any is told. base: without what was named; tried: how many
+    shapes were.
+    """
     here = gain(fit, base)
     won: list[Better] = []
     for shape in shapes:
         ahead = gain(shape, base) - here
         beyond = ahead - max(_price(given, shape, fit), 0.0)
-        if beyond > math.log(len(SHAPES) / TOLD) and ahead > LITTLE * here:
-            shows = beyond > math.log(len(SHAPES) / ALPHA) and ahead > MORE * here and _lower(given, fit, shape, horizon)
+        if beyond > math.log(tried / TOLD) and ahead > LITTLE * here:
+            shows = beyond > math.log(tried / ALPHA) and ahead > MORE * here and _lower(given, fit, shape, horizon)
             won.append(Better(_token(shape), gain(shape, base) - _price(given, shape, base), shows))
     return _first(won)
 

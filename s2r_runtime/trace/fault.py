@@ -44,20 +44,17 @@ def stretches(yes: Mask) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def longest(yes: Mask, but: tuple[int, int]) -> int:
-    """Of runs of True other than [a, b)."""
-    return max((b - a for a, b in stretches(yes) if (a, b) != but), default=0)
-
-
 def leaps(change: Array, within: tuple[int, int]) -> bool:
-    """Whether a state that jitters, and so hardly ever repeats, repeats for long and leaps then: a robot that stood still sets out from
-    where it stood. change: (K,) from row to row, NaN across a pause; within: [a, b) that repeats.
+    """Whether a state that hardly ever repeats stops on its way, repeats for long, and leaps then: a robot comes to rest, and sets out from
+    there. One that stands when the recording begins may be kicked. change: (K,) from row to row, NaN across a pause; within: [a, b) that
+    repeats.
     """
     a, b = within
-    if b - a < RESTLESS or b >= len(change) or not np.isfinite(change[b]):
+    if b - a < RESTLESS or a < FROZEN_ROWS or b >= len(change) or not np.isfinite(change[b]):
         return False
     others = np.isfinite(change)
     others[a : b + 1] = False
     if np.count_nonzero(others) < RESTS or float(np.mean(change[others] == 0.0)) >= REPEATS:
         return False
-    return bool(change[b] > LEAPS * np.quantile(change[others], USUALLY))
+    on_its_way = np.nanmax(change[a - FROZEN_ROWS : a], initial=0.0) >= np.median(change[others])
+    return bool(on_its_way and change[b] > LEAPS * np.quantile(change[others], USUALLY))

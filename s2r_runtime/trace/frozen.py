@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.fault import FROZEN_ROWS, QUANTA, REPEATS, RESTLESS, RESTS, SIGMAS, Fault, leaps, longest, stretches
+from s2r_runtime.trace.fault import FROZEN_ROWS, QUANTA, REPEATS, RESTLESS, RESTS, SIGMAS, Fault, stretches
 from s2r_runtime.trace.reach import Reach, predicted
 from s2r_runtime.trace.residual import Acting, advanced, first_steps
 
@@ -26,19 +26,12 @@ either: on at least RESTS of them, of which less than REPEATS repeat, and whose 
 correlation of -1/2 from one residual to the next; a slow motion, or an effect that the model lacks, has none below zero.
 """
 
-FARTHER = 4
-"""Times the longest exact repeats elsewhere (but rest) from which on a state that is told to change and does not is frozen."""
-
-HALF = 0.5
-"""Of a leap, that the inputs do not ask for: a robot that stood may set out fast."""
-
 FOLLOWS, FOLLOWED = 0.25, 0.9
 """Of what a frozen speed is off at most, how near to its command it is on other rows, and on which share of them at least."""
 
 
 def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: Reach) -> list[Fault]:
-    """Exact repeats through which the model moves the state by more than noise and quantisation, and after which it catches up. A state
-    that hardly ever repeats elsewhere catches up by a leap, whatever the model says.
+    """Exact repeats through which the model moves the state by more than noise and quantisation, and after which it catches up.
 
     Without catching up the robot itself may have stood still; only a long silence of a state that jitters otherwise is then a fault; or one
     of a state that jitters on other rows on which the robot stands, or nearly.
@@ -48,7 +41,7 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
         return []
     foretold = predicted(model, data, act, i)
     moves, e = model.difference(foretold, run.y[:-1]), model.difference(run.y[1:], foretold)
-    turned, found = np.abs(model.difference(run.y[1:], run.y[:-1])), []
+    found = []
     for j, name in enumerate(model.states):
         change = np.abs(np.diff(run.y[:, j]))
         if not np.isfinite(reach.noise[j]) or not np.any(change > 0.0):
@@ -59,14 +52,11 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
             if b - a < FROZEN_ROWS:
                 continue
             if reach.instant[j]:
-                stuck = b - a >= FARTHER * longest((change == 0.0) & (np.abs(run.y[:-1, j]) > QUANTA * quantum), (a, b))
-                if b - a >= RESTLESS and _ignored(foretold[:, j], run.y[:, j], (a, b), QUANTA * quantum if stuck else least, stuck):
+                if b - a >= RESTLESS and _ignored(foretold[:, j], run.y[:, j], (a, b), least):
                     bad[a + 1 : b + 1, j] = True
                     found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
                 continue
-            rests = np.abs(moves[:, j]) < reach.noise[j]
-            unforetold = b < len(e) and abs(e[b, j]) > HALF * turned[b, j]
-            if (unforetold and leaps(turned[:, j], (a, b))) or (b - a >= RESTLESS and _restless(change, e[:, j], rests, (a, b))):
+            if b - a >= RESTLESS and _restless(change, e[:, j], np.abs(moves[:, j]) < reach.noise[j], (a, b)):
                 bad[a + 1 : b + 1, j] = True
                 found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
                 continue
@@ -125,10 +115,9 @@ def _with_them(model: ComposedModel, data: Dataset, i: int, bad: Mask) -> list[F
     return found
 
 
-def _ignored(foretold: Array, y: Array, within: tuple[int, int], least: float, stuck: bool) -> bool:
-    """Whether a state that an input sets (a wheel's speed) stays through commands that it follows at all other times, or far longer (stuck)
-    than it does at any other time. Not at zero, where robots stand, nor where every command is beyond it: that is a limit.
-    foretold: (K,) by the command.
+def _ignored(foretold: Array, y: Array, within: tuple[int, int], least: float) -> bool:
+    """Whether a state that an input sets (a wheel's speed) stays through commands that it follows at all other times. Not at zero, where
+    robots stand, nor where every command is beyond it: that is a limit. foretold: (K,) by the command.
     """
     a, b = within
     there, value = foretold[a:b], float(y[a])
@@ -136,8 +125,6 @@ def _ignored(foretold: Array, y: Array, within: tuple[int, int], least: float, s
     limit = bool(np.all(there * math.copysign(1.0, value) >= abs(value) - least))
     if missed < least or float(np.ptp(there)) < least or abs(value) < least or limit:
         return False
-    if stuck:
-        return True
     off = np.abs(y[1:] - foretold)
     followed = off < FOLLOWS * missed
     back = followed[b : b + FROZEN_ROWS]

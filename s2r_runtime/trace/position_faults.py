@@ -99,7 +99,7 @@ def _of_one(t: Array, p: Array, pushed: Array) -> tuple[Mask, list[int], list[tu
             continue
         missed = float(np.median(around)) * float(t[b + 1] - t[a])
         made_up = abs(missed) > least + QUANTA * quantum and abs(float(d[b]) - missed) < MADE_UP * abs(missed)
-        if made_up or leaps(changed_by, (a, b)):
+        if made_up or (abs(float(d[b])) > least + QUANTA * quantum and leaps(changed_by, (a, b))):
             lost[a + 1 : b + 1] = True
             off[max(a - AROUND, 0) : b + 1 + AROUND] = 0.0  # the pace there is told from rows that stand still
             told.append((a, b, "frozen"))

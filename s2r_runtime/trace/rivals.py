@@ -210,7 +210,7 @@ class _Rich:
         nothing on these inputs (a limit that they do not reach) says nothing there of the others.
         """
         done = [self.apart(model, less) for model in models]
-        least = IDLE * max(done)  # NaN if any is
+        least = IDLE * float(np.max(done))  # NaN if any is
         asked = [(other, size) for other, size in zip(models, done, strict=True) if not size <= least]
         return np.array([np.max([self.apart(one, other) / size for other, size in asked], initial=0.0) for one in models])
 

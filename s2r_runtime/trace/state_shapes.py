@@ -26,6 +26,9 @@ RATE = 0.3
 POWERS = (0.4, 1.5, 3.0, 5.0)
 """Where it begins, between and beyond those that have names."""
 
+SMALLEST = 1e-3
+"""Of the largest speed: below that a root's rate would have no end."""
+
 HIGH, LOW = (0.8, 0.9, 0.95, 0.98), (0.2, 0.1, 0.05, 0.02)
 """Shares of what was measured below which a limit is looked for, from above and from below."""
 
@@ -53,10 +56,6 @@ class Power(ForceEffect):
     def values(self, y: Array) -> list[Values]:
         """From which a fit begins. y: (n,) the state."""
         return [{"loss": RATE, "power": k} for k in POWERS]
-
-
-SMALLEST = 1e-3
-"""Of the largest speed: below that a root's rate would have no end."""
 
 
 class Limit(StepEffect):
