@@ -5,8 +5,8 @@ A body's position goes on at its pace. With d_k = p_{k+1} - p_k over h_k, and m_
     off_k = d_k - m_k h_k                       of noise, rounding, and what accelerates the body
     jump:    |off_k| beyond noise, and beyond what the inputs do, with nothing like it beside
     spike:   one that is taken back within a few rows
-    frozen:  p repeats exactly, and then makes up for the way that the pace before and after says; or leaps, and hardly ever repeats
-             elsewhere
+    frozen:  p repeats exactly, and then makes up for the way that the pace before and after says; or it stops on its way, as it
+             hardly ever repeats elsewhere, and leaps beyond what the inputs do
 
 A blow, or an end stop, changes the pace from v to w, and m is between them at that row: off is half of (v - w) h before it, and the other
 way after it, as if one row were wrong. So a jump and a spike must be beyond |w - v| h, too.
