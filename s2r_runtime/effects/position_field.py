@@ -21,8 +21,8 @@ from s2r_runtime.models.forces import Axis, Push, axes
 FIRST = 0.01
 """1/s, or 1/s², in each entry where the tracer begins; the response is linear."""
 
-TERMS = 16
-"""Of the series where A is at most a half: 0.5^16/17! is below 1e-18."""
+ROUNDING = 1e-18
+"""Terms of the series below it change nothing in double precision."""
 
 
 class PositionField(ForceEffect):
@@ -59,11 +59,12 @@ class PositionField(ForceEffect):
         if self.pushes(model, channel):
             return super().after_step(x, u, x_next, model, channel, dt, p)
         place = [model.states.index("x"), model.states.index("y")]
-        a = np.multiply.outer(dt, np.array(p["matrix"], dtype=np.float64))
-        f = _factor(a)
+        matrix = np.array(p["matrix"], dtype=np.float64)
+        each = np.asarray(dt, dtype=np.float64).reshape(-1, 1)
+        one, of_matrix = _factor(matrix, each)
+        went, there = x_next[:, place] - x[:, place], each * (x[:, place] @ matrix.T)
         after = x_next.copy()
-        there, went = x[:, place, None], (x_next[:, place] - x[:, place])[:, :, None]
-        after[:, place] += ((f - np.eye(2)) @ went + f @ a @ there)[:, :, 0]
+        after[:, place] += one * went + (1.0 + one) * there + of_matrix * ((went + there) @ matrix.T)
         return after
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
@@ -71,19 +72,34 @@ class PositionField(ForceEffect):
         return [{"matrix": [[FIRST, FIRST], [FIRST, FIRST]]}]
 
 
-def _factor(a: Array) -> Array:
-    """F of the docstring, (..., 2, 2): the series of a halved often enough, then F(2a) = F(a) (exp(a) + 1)/2, exp(a) = 1 + a F(a)."""
-    size = float(np.max(np.sum(np.abs(a), axis=-1), initial=0.0))
+def _factor(matrix: Array, dt: Array) -> tuple[Array, Array]:
+    """F - 1 of the docstring as p + q M, each of the shape of dt: the square of M is tr M - det M, and so is every power of it.
+
+    The series of A halved often enough, then F(2A) = F(A) (exp(A) + 1)/2, exp(A) = 1 + A F(A).
+    """
+    trace, det = float(matrix[0, 0] + matrix[1, 1]), float(matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0])
+    size = float(np.max(np.abs(dt), initial=0.0)) * float(np.max(np.sum(np.abs(matrix), axis=-1)))
     halved = max(0, math.ceil(math.log2(2.0 * size))) if size > 0.0 else 0
-    a = a / 2.0**halved
-    one = np.eye(2)
-    f = np.broadcast_to(one, a.shape)
-    for k in range(TERMS, 1, -1):
-        f = one + a @ f / k
+    step, size = dt / 2.0**halved, size / 2.0**halved
+    p, q = np.zeros_like(dt), np.zeros_like(dt)
+    for k in range(_terms(size), 1, -1):  # F - 1 = A/2 (1 + A/3 (1 + ...))
+        p, q = -step * q * det / k, step * (1.0 + p + q * trace) / k
     for _ in range(halved):
-        f = 0.5 * f @ (2.0 * one + a @ f)
-        a = 2.0 * a
-    return f
+        # with g = F - 1: F(2A) - 1 = g + A/2 (1 + g)^2
+        one = 1.0 + p
+        of_one, of_matrix = one * one - q * q * det, 2.0 * one * q + q * q * trace
+        p, q = p - 0.5 * step * of_matrix * det, q + 0.5 * step * (of_one + of_matrix * trace)
+        step = 2.0 * step
+    return p, q
+
+
+def _terms(size: float) -> int:
+    """After which those that are left are below rounding of the sum, where A is so large, at most a half."""
+    k, last = 1, 0.5 * size
+    while last > ROUNDING:
+        k += 1
+        last *= size / (k + 1)
+    return k
 
 
 EFFECT = PositionField()
