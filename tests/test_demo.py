@@ -105,6 +105,20 @@ def test_its_report_is_one_page_with_the_plots(story: tuple[Path, str]) -> None:
     assert re.findall(r"""(?:src|href)\s*=\s*["'](?!#|data:)[^"']+""", page) == []
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(480)
+def test_a_campaign_that_is_refused_for_its_order_is_drawn_once_more_and_no_oftener(tmp_path: Path) -> None:
+    """The robot's speed swings once in 500 s, so that a sample's error is like that of the one before."""
+    done = s2r("demo", "--effect", "periodic_disturbance:v frequency=0.002 amplitude=0.1 phase=0", "--out", tmp_path / "run")
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert done.stdout.count("were not drawn independently") == 2
+    assert done.stdout.count("once more, with a share of beta of its own") == 1
+    assert "after one step" not in done.stdout  # a refused campaign has no gap to tell
+    log = events(tmp_path / "run")
+    assert [e.gap.epoch for e in log if isinstance(e, m.JobFinished) and e.gap is not None] == [1, 2]
+    assert not any(isinstance(e, m.CertificateInstalled) or (isinstance(e, m.Send) and e.source == "controller") for e in log)
+
+
 def test_an_effect_that_the_robot_does_not_have_is_one_line(tmp_path: Path) -> None:
     done = s2r("demo", "--effect", "nonsense", "--out", tmp_path / "run")
     assert done.returncode == 78
