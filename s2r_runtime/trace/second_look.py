@@ -95,7 +95,7 @@ def _all_explained(whole: Whole, other: Selection, structure: Structure, refused
     """
     if names(other.fit.model) in refused or crowded(other.fit):
         return None
-    rest = None if whole.still(other, structure) else whole.structure(other)
+    rest = None if whole.falls_short(other) or whole.still(other, structure) else whole.structure(other)
     if rest is not None and not rest.matters:
         return rest
     refused.add(names(other.fit.model))

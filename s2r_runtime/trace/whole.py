@@ -43,6 +43,11 @@ CLEAR = 10.0
 NEARLY = 0.4
 """Of what effects explain: dictionaries that give less at first look are not judged."""
 
+SHORT = 1.05
+"""Times what effects explain that the best dictionary must explain, and CLEAR more, for them to leave some of it: with noise of its own,
+each is a little off.
+"""
+
 TWICE = 2.0
 """Times what the best dictionary explains that several together must explain to be told in its place: it does not do most of it."""
 
@@ -87,6 +92,11 @@ class Whole:
         """Whether another selection clearly leaves what was told as structure before."""
         fit = self._everywhere(other.fit)
         return still_left(left_of(self.given, fit), structure.tokens, self.nominal, self._horizon)
+
+    def falls_short(self, other: Selection) -> bool:
+        """Whether another selection explains clearly less than the best that has no name: then it leaves what that explains beyond it."""
+        told = gain(self._everywhere(other.fit), self.nominal)
+        return self._looks.most > told and self.unnamed.gain > SHORT * told + CLEAR
 
     def in_one_stretch(self, chosen: Selection) -> bool:
         """Whether a name comes from one stretch of the recording."""
