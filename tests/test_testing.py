@@ -16,9 +16,11 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import pytest
 
+from s2r_runtime.effects.step_effect import ForceEffect
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import Parameter
 from s2r_runtime.messages import Command, Frame, LinkChanged, Observation
+from s2r_runtime.models.forces import Axis, Push
 from s2r_runtime.testing import EffectKit, TransportKit, transport_kit
 
 
@@ -375,3 +377,24 @@ def test_effect_kit_fails_an_effect_that_breaks_the_contract(broken: type[WornOu
     model = registry().get("models", "unicycle")
     with pytest.raises(AssertionError):
         getattr(kit, test)([(model, "v")])
+
+
+class PushesOneAxis(ForceEffect):
+    """Has a channel for either axis, and acts on the first whichever is asked for."""
+
+    name = "pushes_one_axis"
+    parameters = (Parameter("force", "N", 0.0, 10.0, neutral=0.0),)
+
+    def push(self, x: Any, axis: Axis, model: Any, channel: str, p: dict[str, Any]) -> Push | None:
+        return Push(drive=p["force"]) if channel == model.states[axis.velocity] == "vx" else None
+
+
+def test_effect_kit_fails_a_force_that_no_axis_feels() -> None:
+    from s2r_runtime.plugins import registry
+
+    kit = EffectKit()
+    kit.effect, kit.parameters = PushesOneAxis(), {"force": 0.3}  # type: ignore[misc]
+    model = registry().get("models", "double_integrator")
+    kit.test_it_does_something_on_each_of_its_channels([(model, "vx")])
+    with pytest.raises(AssertionError, match="it does nothing on vy of double_integrator"):
+        kit.test_it_does_something_on_each_of_its_channels([(model, "vx"), (model, "vy")])

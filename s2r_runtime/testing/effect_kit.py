@@ -207,6 +207,19 @@ class EffectKit:
             expected = model.step(x, u, DT, model.parameters) if self.effect.stage == "step" else u if self.effect.stage == "input" else x
             np.testing.assert_allclose(self._step(model, channel, x, u, at), expected, rtol=1e-12, atol=1e-12)
 
+    def test_it_does_something_on_each_of_its_channels(self, cases: list[Case]) -> None:
+        """A force that no axis feels would be a name for nothing, and nobody would notice."""
+        if self.effect.stage != "step":
+            pytest.skip("does not act on a step")
+        done: dict[tuple[str, str], bool] = {}
+        for model, channel, p in self._tried(cases):
+            x, u = self._states(model, 32), self._inputs(model, 40)[:32]
+            without = model.step(x, u, DT, model.parameters)
+            here = (model.name, channel)
+            done[here] = done.get(here, False) or not np.array_equal(self._step(model, channel, x, u, p), without)
+        idle = [f"{channel} of {model}" for (model, channel), does in done.items() if not does]
+        assert not idle, f"it does nothing on {', '.join(idle)}"
+
     def test_parameters_have_units_and_bounds(self, cases: list[Case]) -> None:
         words = {*getattr(self.effect, "named", ()), *getattr(self.effect, "choices", {})}
         names = [p.name for p in self.effect.parameters]
