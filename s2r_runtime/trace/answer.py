@@ -14,7 +14,7 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.any_shape import any_shape_of
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.endless import endless
-from s2r_runtime.trace.errors import Held, Judged, Kind, gaps, judge, noise_floor
+from s2r_runtime.trace.errors import Held, Judged, Kind, at_most_seen, gaps, judge, noise_floor
 from s2r_runtime.trace.excitation import advice
 from s2r_runtime.trace.fault import Fault
 from s2r_runtime.trace.faults import Checked
@@ -87,7 +87,7 @@ def _decided(dataset: Dataset, checked: Checked, chosen: Selection, structure: S
     """The verdict, and what is left of the fit by it."""
     nominal = chosen.nominal
     before, after = judge(nominal.model, judged_on), judge(chosen.fit.model, judged_on)
-    floor = noise_floor(chosen.fit, judged_on, seed)
+    floor = at_most_seen(noise_floor(chosen.fit, judged_on, seed), chosen.fit.model, judged_on, after.ends)
     forgets = replace(chosen.fit, colour=no_colour(len(nominal.model.states)))  # a law with a memory takes up what the model lacks
     alone = floor if chosen.fit.added else noise_floor(forgets, judged_on, seed)
     last = max(run.start_s + float(np.sum(run.durations(dataset.dt))) for run in dataset.runs)
@@ -96,12 +96,13 @@ def _decided(dataset: Dataset, checked: Checked, chosen: Selection, structure: S
     if verdict == "unexplained" and not {*structure.tokens} - {"noise"}:  # what was named foretells nothing: what else it looks like
         structure = replace(structure, tokens=structure.likeliest or structure.tokens)
     final = final_fit(chosen, verdict)
+    told = before if final is nominal else after
     if verdict == "unexplained":
         level, colour = structure.noise or (chosen.fit.noise, chosen.fit.colour)  # the structure itself is no noise
-        floor = noise_floor(replace(final, noise=level, colour=colour), judged_on, seed)
+        floor = at_most_seen(noise_floor(replace(final, noise=level, colour=colour), judged_on, seed), final.model, judged_on, told.ends)
     elif final is not chosen.fit:
-        floor = noise_floor(final, judged_on, seed)
-    return _Decided(verdict, final, structure, faults, before, before if final is nominal else after, floor)
+        floor = at_most_seen(noise_floor(final, judged_on, seed), final.model, judged_on, told.ends)
+    return _Decided(verdict, final, structure, faults, before, told, floor)
 
 
 def _recorded(

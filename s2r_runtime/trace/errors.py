@@ -187,6 +187,21 @@ def noise_floor(fit: Fit, given: Held, seed: int) -> tuple[Array, Array]:
     return one, rms(model.difference(clean, noisy) + rng.normal(size=clean.shape) * np.sqrt(noise.r))
 
 
+def at_most_seen(floor: tuple[Array, Array], model: ComposedModel, given: Held, ends: Array) -> tuple[Array, Array]:
+    """A `noise_floor` of which the rollouts' is at most how far rollouts of the model mostly end off where it was fitted, or all of
+    them where it is judged, by `ends` (m, nx): noise is a part of that. A law with a memory that took up an event lets it happen all
+    the time.
+    """
+    one, rolled = floor
+    fitted_on = rollout_starts(given.data, given.horizon, given.left_out, ~given.within)
+    if given.data.axes_without_speed or not len(ends) or not len(fitted_on) or np.all(rolled <= rms(ends)):
+        return floor
+    starts = fitted_on[:: max(1, len(fitted_on) // FLOOR_STARTS)]
+    there = rollout(model, given.data, acting(model, given.data), starts, given.horizon).error
+    mostly = np.median(np.abs(there), axis=0) / 0.6745
+    return one, np.minimum(rolled, np.maximum(mostly, rms(ends)))
+
+
 def _coloured_ends(fit: Fit, given: Held, act: Acting, starts: Index, y: Array, rng: np.random.Generator) -> Array | None:
     """(m, nx) measured less foretold at the ends of rollouts from y (m, nx), where every step's residual is drawn by the noise's law:
 
