@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -21,11 +23,37 @@ def s2r(*argv: str | Path, timeout: float = 420) -> subprocess.CompletedProcess[
 
 @pytest.fixture(scope="module")
 def story(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A whole run with another seed than the docs', and another effect."""
+    """A whole run with another seed than the docs', and another effect. As the controller has begun to drive it hangs, as on a machine
+    that has no time for it.
+    """
     out = tmp_path_factory.mktemp("demo") / "run"
-    done = s2r("demo", "--seed", "7", "--effect", "input_gain:v gain=0.8", "--out", out)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return out, done.stdout
+    command = ["demo", "--seed", "7", "--effect", "input_gain:v gain=0.8", "--out", str(out)]
+    argv = [sys.executable, "-m", "s2r_runtime.cli.main", *command]
+    said: list[str] = []
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as demo:
+        assert demo.stdout is not None
+        for line in demo.stdout:
+            if "deployed under certificate" in line and not any("deployed under certificate" in before for before in said):
+                hang(out)
+            said.append(line)
+    assert demo.returncode == 0, "".join(said)
+    return out, "".join(said)
+
+
+def hang(out: Path) -> None:
+    """Stops the process of the controller that the daemon of this run has started."""
+    children = subprocess.run(["pgrep", "-f", "s2r_runtime.controllers"], capture_output=True, text=True, check=True).stdout.split()
+    ours = [pid for pid in map(int, children) if f"--state {out / 'state'}" in arguments(parent(pid))]
+    assert len(ours) == 1
+    os.kill(ours[0], signal.SIGSTOP)
+
+
+def parent(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[1])
+
+
+def arguments(pid: int) -> str:
+    return Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8").replace("\0", " ")
 
 
 def events(out: Path) -> list[object]:
@@ -51,6 +79,16 @@ def test_the_story_refuses_repairs_certifies_drives_and_revokes(story: tuple[Pat
     assert gaps[1].hold_radius < 0.2 * gaps[0].hold_radius
     assert any(isinstance(e, m.CertificateInstalled) for e in log)
     assert any(isinstance(e, m.Revoked) for e in log)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(480)
+def test_a_controller_that_hung_is_cleared_and_drives_again(story: tuple[Path, str]) -> None:
+    out, text = story
+    assert "reason: latched:controller_fault" in text
+    assert text.count("$ s2r clear controller_fault") == 1
+    stopped = [(e.reason, e.detail) for e in events(out) if isinstance(e, m.SourceStopped) and e.source == "controller"]
+    assert stopped[0][0] == "deadline"
 
 
 @pytest.mark.slow
