@@ -14,6 +14,7 @@ from s2r_runtime.trace.faults import Checked
 from s2r_runtime.trace.fitting import fitted, gain, insert
 from s2r_runtime.trace.patchwork import AS_MUCH, MOSTLY, patchwork
 from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.selection import Selection
 from s2r_runtime.trace.whole import Whole
 
 DT, PARTS = 0.05, 10
@@ -63,6 +64,20 @@ def test_names_that_follow_what_depends_on_the_speed_are_a_patchwork_of_that():
     assert {whole.unnamed.token} == {"speed"}
     assert patchwork(whole.given, fit, whole.nominal, whole.unnamed)
     assert not patchwork(whole.given, _named(whole, _effect(*BIAS)), whole.nominal, whole.unnamed), "one name is no patchwork"
+
+
+def test_what_explains_clearly_less_than_the_best_without_a_name_falls_short_of_it():
+    whole = _whole(lambda x, y, vx, vy, asked: (-0.8 * vx * vy, 0.8 * vx * vx))
+    bias = Selection(whole.nominal, _named(whole, _effect(*BIAS)), 1, (), ())
+    assert whole.unnamed.gain > 2.0 * max(gain(bias.fit, whole.nominal), 20.0), "far from any limit"
+    assert whole.falls_short(bias)
+
+
+def test_what_is_there_falls_short_of_nothing():
+    whole = _whole(lambda x, y, vx, vy, asked: (-0.3 * vx, -0.3 * vy))
+    drag = Selection(whole.nominal, _named(whole, _drag("vx"), _drag("vy")), 1, (), ())
+    assert gain(drag.fit, whole.nominal) > 100.0
+    assert not whole.falls_short(drag)
 
 
 def test_two_effects_that_are_there_are_none():

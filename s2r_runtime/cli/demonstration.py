@@ -7,6 +7,7 @@ robot stays parked; and the run ends with the audit of its own log.
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -50,6 +51,7 @@ class Demonstration:
         ports = _free_ports(2)
         profile = self._write_profile(ports)
         with ExitStack() as stack:
+            stack.enter_context(_unwound_by(signal.SIGTERM, signal.SIGHUP))
             robot = stack.enter_context(self._robot_process(ports))
             daemon = stack.enter_context(self._daemon(profile))
             held = self._loop(robot, profile)
@@ -320,6 +322,23 @@ def _fresh(out: Path | None) -> Path:
     except OSError as error:
         raise UsageError(f"{chosen}: cannot be made: {error.strerror}") from None
     return chosen.resolve()
+
+
+@contextmanager
+def _unwound_by(*numbers: signal.Signals) -> Iterator[None]:
+    """These end the demo as Ctrl-C does, with the robot and the daemon that it has started: neither is to outlive it."""
+
+    def leave(number: int, _frame: object) -> None:
+        for other in numbers:
+            signal.signal(other, signal.SIG_IGN)  # once is enough, and what ends them is not to be cut short
+        raise SystemExit(128 + number)
+
+    before = {number: signal.signal(number, leave) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _private(folder: Path) -> Path:

@@ -86,6 +86,11 @@ SURE = 10.0
 DIRECTIONS = 4
 """Pushes that wander, in some direction and as quickly, that are looked at where they must show at first look."""
 
+VANISHING = 1e-150
+"""Of what is whitened: the tail of a bump falls off without end, and products of numbers whose squares underflow take a processor many
+times as long as others.
+"""
+
 SETTLED = 0.5
 """Nats that a pass must gain for another one."""
 
@@ -409,6 +414,7 @@ def _marginal(left: Left, x: Array, passes: int, first: Marginal | None = None) 
         before, root = best, np.sqrt(noises.weight(np.clip(z, -CLIPPED, CLIPPED)))
         weighted = whiten.columns(columns)
         weighted *= root.reshape(-1, 1)
+        np.copyto(weighted, 0.0, where=np.abs(weighted) < VANISHING)
         product = weighted.T @ weighted  # half the work of a product of two
         slope = weighted.T @ (root * np.clip(whiten(left.r), -CLIPPED, CLIPPED)).ravel()
         ridge = evidence(product, slope).ridge
