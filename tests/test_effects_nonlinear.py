@@ -114,6 +114,15 @@ def test_a_field_of_accelerations_is_the_linear_system_that_it_says():
     assert np.max(np.abs(x1[0] - exact[:4])) < 2e-3 * np.max(np.abs(bare - exact[:4]))
 
 
+def test_a_length_of_a_step_that_is_no_number_leaves_the_other_rows_of_a_field_alone():
+    p = {"matrix": np.array([[-3.0, 1.0], [0.5, -2.0]])}
+    model, effect = composed("unicycle", 0.1).nominal, registry().get("effects", "position_field")
+    x, x_next, u = np.array([[0.5, -0.3, 0.2]] * 2), np.array([[0.52, -0.26, 0.2]] * 2), np.zeros((2, 2))
+    both, one = (effect.after_step(x, u, x_next, model, "*", np.array([0.1, dt]), p) for dt in (0.1, np.nan))
+    assert np.array_equal(one[0], both[0])
+    assert np.max(np.abs(both[0] - x_next[0])) > 0.1
+
+
 def test_drag_on_an_input_is_what_the_input_loses():
     model = composed("unicycle", 0.1, ("quadratic_drag", "v", {"coefficient": 0.4}))
     x1, _ = model.step(np.zeros((3, 3)), np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 1.0]]), model.at_rest(3))

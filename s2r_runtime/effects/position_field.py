@@ -73,12 +73,13 @@ class PositionField(ForceEffect):
 
 
 def _factor(matrix: Array, dt: Array) -> tuple[Array, Array]:
-    """F - 1 of the docstring as p + q M, each of the shape of dt: the square of M is tr M - det M, and so is every power of it.
+    """F - 1 of the docstring as p + q M, each of the shape of dt: the square of M is tr(M) M - det(M) 1, so every power of it is of
+    that form.
 
     The series of A halved often enough, then F(2A) = F(A) (exp(A) + 1)/2, exp(A) = 1 + A F(A).
     """
     trace, det = float(matrix[0, 0] + matrix[1, 1]), float(matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0])
-    size = float(np.max(np.abs(dt), initial=0.0)) * float(np.max(np.sum(np.abs(matrix), axis=-1)))
+    size = float(np.nanmax(np.abs(dt), initial=0.0)) * float(np.max(np.sum(np.abs(matrix), axis=-1)))
     halved = max(0, math.ceil(math.log2(2.0 * size))) if size > 0.0 else 0
     step, size = dt / 2.0**halved, size / 2.0**halved
     p, q = np.zeros_like(dt), np.zeros_like(dt)

@@ -189,8 +189,8 @@ def noise_floor(fit: Fit, given: Held, seed: int) -> tuple[Array, Array]:
 
 def at_most_seen(floor: tuple[Array, Array], model: ComposedModel, given: Held, ends: Array) -> tuple[Array, Array]:
     """A `noise_floor` of which the rollouts' is at most how far rollouts of the model mostly end off where it was fitted, or all of
-    them where it is judged, by `ends` (m, nx): noise is a part of that. A law with a memory that took up an event lets it happen all
-    the time.
+    them where it is judged, by `ends` (m, nx), whichever is more: noise is a part of that. A law with a memory that took up an event lets
+    it happen all the time.
     """
     one, rolled = floor
     fitted_on = rollout_starts(given.data, given.horizon, given.left_out, ~given.within)

@@ -95,7 +95,7 @@ class Whole:
 
     def falls_short(self, other: Selection) -> bool:
         """Whether another selection explains clearly less than the best that has no name: then it leaves what that explains beyond it."""
-        told = gain(self._everywhere(other.fit), self.nominal)
+        told = max(gain(self._everywhere(other.fit), self.nominal), 0.0)
         return self._looks.most > told and self.unnamed.gain > SHORT * told + CLEAR
 
     def in_one_stretch(self, chosen: Selection) -> bool:
