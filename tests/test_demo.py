@@ -133,16 +133,16 @@ def test_an_effect_that_the_robot_does_not_have_is_one_line(tmp_path: Path) -> N
 def test_a_demo_that_is_ended_takes_its_robot_and_its_daemon_with_it(tmp_path: Path) -> None:
     out = tmp_path / "run"
     argv = [sys.executable, "-m", "s2r_runtime.cli.main", "demo", "--out", str(out)]
-    demo = subprocess.Popen(argv, stdout=subprocess.PIPE, text=True)
-    try:
-        assert demo.stdout is not None
-        assert any("the sampler may drive" in line for line in demo.stdout)
-        every = [int(folder.name) for folder in Path("/proc").iterdir() if folder.name.isdecimal()]
-        theirs = [pid for pid in every if parent(pid) == demo.pid]
-        assert len(theirs) == 2, "the robot and the daemon"
-    finally:
-        demo.terminate()
-    assert demo.wait(60) == 128 + signal.SIGTERM
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True) as demo:
+        try:
+            assert demo.stdout is not None
+            assert any("the sampler may drive" in line for line in demo.stdout)
+            every = [int(folder.name) for folder in Path("/proc").iterdir() if folder.name.isdecimal()]
+            theirs = [pid for pid in every if parent(pid) == demo.pid]
+            assert len(theirs) == 2, "the robot and the daemon"
+        finally:
+            demo.terminate()
+    assert demo.returncode == 128 + signal.SIGTERM
     assert not any(Path(f"/proc/{pid}").exists() for pid in theirs)
     assert " ends at " in (out / "daemon.txt").read_text(encoding="utf-8"), "the daemon has closed its log"
 
