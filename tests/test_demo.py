@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from s2r_runtime import messages as m
-from s2r_runtime.cli.demonstration import DRIVES, Demonstration
+from s2r_runtime.cli.demonstration import DRIVES, Demonstration, _unwound_by
 from s2r_runtime.messages import SERIAL
 from s2r_runtime.recording.writer import read_all
 
@@ -213,6 +214,52 @@ def test_a_drive_ends_as_evidence_says_or_the_demo_says_that_it_does_not(
     said = capsys.readouterr().out
     assert words in said
     assert "the gate is still open" not in said
+
+
+@pytest.mark.parametrize(
+    ("answer", "held", "words"),
+    [
+        (FAILED, True, "still refused"),
+        ({"exit_code": 1, "text": "refused: watch_alarm: the gap of epoch 2 was refuted"}, True, "still refused"),
+        (BROKEN, False, "this was to end otherwise"),
+        ({**FAILED, "exit_code": 70}, False, "this was to end otherwise"),
+    ],
+)
+def test_a_repaired_model_that_is_refused_is_refused_for_what_was_measured(
+    answer: dict[str, object], held: bool, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    demo = Told(tmp_path / "run", answer)
+    with subprocess.Popen([sys.executable, "-c", ENDED]) as robot:
+        assert demo._drive(robot, Path("grid.py"), running=False) is held
+    assert words in capsys.readouterr().out
+
+
+def _hung_up_and_ended() -> None:
+    with _unwound_by(signal.SIGTERM, signal.SIGHUP):
+        os.kill(os.getpid(), signal.SIGHUP)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+@pytest.mark.parametrize(("change", "words"), [("nonsense", "unknown effect 'nonsense'"), ("input_gain:v", "lacks the parameter gain")])
+def test_a_change_that_the_robot_cannot_have_is_told_before_anything_begins(change: str, words: str, tmp_path: Path) -> None:
+    done = s2r("demo", "--change", change, "--out", tmp_path / "run", timeout=60)
+    assert done.returncode == 78
+    assert len(done.stderr.splitlines()) == 1
+    assert "--change" in done.stderr
+    assert words in done.stderr
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_hang_up_that_was_ignored_before_is_ignored_on() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with pytest.raises(SystemExit) as left:
+            _hung_up_and_ended()
+        assert left.value.code == 128 + signal.SIGTERM
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_a_drive_whose_robot_is_gone_is_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

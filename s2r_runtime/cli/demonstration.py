@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ START_S, STOP_S, CAMPAIGN_S = 20.0, 20.0, 900.0
 DRIVES = 8
 """So often the controller is let drive, at most: mostly the radius has grown meanwhile, so that it soon fails."""
 
-EVIDENCE = ("rollouts score below", "progress requirement does not hold", "the radius grew to", "the gap has grown to")
+EVIDENCE = ("rollouts score below", "progress requirement does not hold", "the radius grew to", "the gap has grown to", "was refuted")
 """Of refusals: what was measured, or what verification showed, and not that something failed."""
 
 
@@ -44,6 +44,8 @@ class Demonstration:
         self._effects = [e for e in (self._story.effects if effects is None else effects) if e != "none"]
         self._change = None if change == "none" else change or self._story.change
         self._robot.command(seed, self._effects)  # says at once if something is not installed
+        if change not in (None, "none"):
+            self._check(str(change))
         self._out = _fresh(out)
         self._begin = time.monotonic()
         self._socket = Path()
@@ -60,6 +62,14 @@ class Demonstration:
             held = self._loop(robot, profile)
             self._end_daemon(daemon)
         return self._afterwards(held)
+
+    def _check(self, change: str) -> None:
+        """Raises ConfigError where the robot, begun with it and ended at once, has no such effect: later it would tell nobody."""
+        argv = self._robot.command(self._seed, [change], connect=f"tcp/127.0.0.1:{_free_ports(1)[0]}")
+        with suppress(subprocess.TimeoutExpired):  # it has begun
+            done = subprocess.run(argv, input="quit\n", capture_output=True, text=True, timeout=START_S, check=False)
+            if done.returncode == ConfigError.exit_code and (said := done.stderr.strip()):
+                raise ConfigError(f"--change: {said.splitlines()[-1]}")
 
     # ------------------------------------------------------------------ the story
 

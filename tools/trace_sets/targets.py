@@ -101,7 +101,10 @@ def rows(records: list[Record]) -> list[Row]:
     told = [inside for r in [*one, *pairs] for _, inside in r["covered"]]
     share = [x for x in (reached(r) for r in [*strong, *pairs]) if x is not None]
     changed = [r for r in done if r.get("again") and r["verdict"] in {"traced", "ambiguous"}]
-    worse = [r["again"]["noisy"][1] > 1.02 * r["again"]["noisy"][0] for r in changed]
+    worse, worse_of_library = (
+        [r["again"]["noisy"][1] > 1.02 * r["again"]["noisy"][0] for r in some]
+        for some in (changed, [r for r in changed if r["family"] != "outside"])
+    )
     short = [r["cpu_s"] for r in done if 1000 <= r["n"] <= 1500]
     tiny = [r for r in records if r["family"] in {"tiny", "tiny_clean"} and r["outcome"] not in {"refused", "crash"}]
     lost = [
@@ -125,6 +128,7 @@ def rows(records: list[Record]) -> list[Row]:
         _figure("error reduction reached, 10th percentile", share, lambda v: float(np.quantile(v, 0.1)), 0.85),
         _share("95 % intervals that cover", told, 0.90, high=0.98),
         _share("repaired model worse than nominal", worse, 0.01, at_most=True),
+        _share("  of these, where the library has the effect", worse_of_library, 0.01, at_most=True),
         _figure("CPU s, 1000 to 1500 steps, 90th percentile", short, lambda v: float(np.quantile(v, 0.9)), 2.0, at_most=True, form=".2f"),
         _figure("CPU s, 50 000 to 100 000 steps, most", [r["cpu_s"] for r in done if r["n"] >= LARGE], max, 60.0, at_most=True, form=".1f"),
         _share("sensor faults: found and placed, no name lent", words([r for r in of("fault") if not r["truth"]], "found"), 0.80),
