@@ -36,6 +36,24 @@ def test_the_evidence_is_the_ratio_of_two_normal_densities():
         cov = np.eye(60) + x @ x.T / ridge
         told.append(0.5 * float(z @ z) - 0.5 * float(z @ np.linalg.solve(cov, z)) - 0.5 * float(np.linalg.slogdet(cov)[1]))
     assert found.log == pytest.approx(max(told), rel=1e-9)
+    product, ridge = x.T @ x, found.ridge
+    assert found.beta(x.T @ z) == pytest.approx(np.linalg.solve(product + ridge * np.eye(4), x.T @ z), rel=1e-9)
+    for times in (0.5, 1.0, 7.0):
+        whole = 0.5 * float(np.linalg.slogdet(np.eye(4) + product * (times / ridge))[1])
+        assert found.price(times) == pytest.approx(whole, rel=1e-9)
+
+
+def test_terms_that_are_one_another_cost_nothing_twice():
+    """The same column twice has one direction; the other one's eigenvalue is rounding, of either sign."""
+    rng = np.random.default_rng(2)
+    x, z = rng.normal(size=(60, 1)), rng.normal(size=60)
+    both = np.hstack([x, x])
+    found = evidence(both.T @ both, both.T @ z)
+    assert np.all(found.values >= 0.0)
+    assert found.price(3.0) == pytest.approx(0.5 * np.log1p(3.0 * 2.0 * float(x[:, 0] @ x[:, 0]) / found.ridge), rel=1e-9)
+    assert both @ found.beta(both.T @ z) == pytest.approx(
+        x[:, 0] * 2.0 * float(x[:, 0] @ z) / (2.0 * float(x[:, 0] @ x[:, 0]) + found.ridge), rel=1e-9
+    )
 
 
 def _slow(rng, n, keep):

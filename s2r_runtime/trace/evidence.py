@@ -9,7 +9,7 @@ terms, and breaks every tie between the two (but that with slow time and with co
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,17 +32,27 @@ TWICE = 2.0
 
 @dataclass(frozen=True)
 class Evidence:
-    """log: largest log evidence; ridge: the 1/tau^2 that has it."""
+    """log: largest log evidence; ridge: the 1/tau^2 that has it. values (m,), vectors (m, m): of K, none below 0."""
 
     log: float
     ridge: float
+    values: Array = field(repr=False)
+    vectors: Array = field(repr=False)
+
+    def beta(self, slope: Array) -> Array:
+        """(m,) (K + ridge)^-1 s."""
+        return np.asarray(self.vectors @ ((self.vectors.T @ slope) / (self.values + self.ridge)))
+
+    def price(self, times: float) -> float:
+        """1/2 log |I + times K / ridge|: what it costs that slopes of that spread may be anything."""
+        return 0.5 * float(np.sum(np.log1p(self.values * (times / self.ridge))))
 
 
 def evidence(product: Array, slope: Array) -> Evidence:
     """From K (m, m) and s (m,)."""
     values, vectors = np.linalg.eigh(product)
     told, best = _evidences(values, (vectors.T @ slope)[:, None], product)
-    return Evidence(float(told[0]), float(best[0]))
+    return Evidence(float(told[0]), float(best[0]), np.maximum(values, 0.0), vectors)
 
 
 def margin(white: Array, z: Array, weight: Array, least: float) -> float:

@@ -182,14 +182,17 @@ def _beyond(left: Left, nats: float, x: Array, beta: Array, price: float) -> flo
 
 def _beside_pushes(left: Left, x: Array, beta: Array) -> float:
     """Nats of a field, fitted to beta alone, beside the pushes that wander most: both may be there, and a push that is free to follow time
-    closely follows a field, too, and leaves more than both leave.
+    closely follows a field, too, and leaves more than both leave. One that adds nothing to the best of them is asked no further.
     """
     pushes = [_scaled(push.x, slopes) for _, push, slopes in _pushes(left)]
     if not pushes:
         return -math.inf
-    alone = max(bare_nats(left), wandering_nats(left))
-    beside = _marginal(left, np.concatenate([*pushes, _scaled(x, beta)], axis=2), PASSES)[0]
-    return beside - (alone if beside <= alone else max(alone, _marginal(left, np.concatenate(pushes, axis=2), PASSES)[0]))
+    own, alone = _scaled(x, beta), max(bare_nats(left), wandering_nats(left))
+    for some in (pushes[:1], pushes) if len(pushes) > 1 else (pushes,):
+        beside = _marginal(left, np.concatenate([*some, own], axis=2), PASSES)[0]
+        if beside <= alone:
+            return beside - alone
+    return beside - max(alone, _marginal(left, np.concatenate(pushes, axis=2), PASSES)[0])
 
 
 def _scaled(x: Array, beta: Array) -> Array:
@@ -417,14 +420,14 @@ def _marginal(left: Left, x: Array, passes: int, first: Marginal | None = None) 
         np.copyto(weighted, 0.0, where=np.abs(weighted) < VANISHING)
         product = weighted.T @ weighted  # half the work of a product of two
         slope = weighted.T @ (root * np.clip(whiten(left.r), -CLIPPED, CLIPPED)).ravel()
-        ridge = evidence(product, slope).ridge
-        beta: Array = np.asarray(np.linalg.solve(product + ridge * np.eye(len(slope)), slope))
+        told_by = evidence(product, slope)
+        beta = told_by.beta(slope)
         rest = left.r - (columns @ beta).reshape(left.r.shape)
         z = whiten(rest)
         less = _less(left, z)
         size = np.sum(np.einsum("km,km->k", weighted, weighted).reshape(left.r.shape), axis=0)
         finer = float(np.sum(size / less**2) / max(float(np.sum(size)), 1e-300))
-        price = 0.5 * float(np.linalg.slogdet(np.eye(len(slope)) + product * (finer / ridge))[1]) + 0.5 * ridge * float(beta @ beta)
+        price = told_by.price(finer) + 0.5 * told_by.ridge * float(beta @ beta)
         nats = _under_any_law(z / less, whiten, left) - price - len(z) * float(np.sum(np.log(less)))
         if nats > best:
             best, told = nats, beta

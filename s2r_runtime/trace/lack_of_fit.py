@@ -370,7 +370,7 @@ def _strength(left: Left, j: Judged, threshold: float) -> tuple[float, Judged]:
     x, push = white.reshape(-1, white.shape[2]), np.clip(left.fit.z, -CLIPPED, CLIPPED).ravel()
     weighted = x * weight.reshape(-1, 1)
     product, slope = x.T @ weighted, weighted.T @ push
-    beta = np.linalg.solve(product + evidence(product, slope).ridge * np.eye(len(slope)), slope)
+    beta = evidence(product, slope).beta(slope)
     return beyond[best], replace(j, betas=np.tile(beta, (BLOCKS, 1)))
 
 
