@@ -13,6 +13,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.any_shape import any_shape_of
 from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.domain import domain_of
 from s2r_runtime.trace.endless import endless
 from s2r_runtime.trace.errors import Held, Judged, Kind, at_most_seen, gaps, judge, noise_floor
 from s2r_runtime.trace.excitation import advice
@@ -156,6 +157,7 @@ def _recorded(
         noisy=dataset.noisy,
         behind=dataset.behind,
         unconfirmed=tuple((final.model.effects[place].effect.name, final.model.effects[place].channel) for place in idle),
+        domain=domain_of(model, (given.data, given.steps), (judged_on.data, judged_on.steps)),
         could_see=visible(given, final, chosen.tried),
     )
 

@@ -13,6 +13,8 @@ from s2r_runtime.effects.classes import same
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.account import account
+from s2r_runtime.trace.domain import Range
+from s2r_runtime.trace.domain import told as domain_told
 from s2r_runtime.trace.errors import Held, Judged
 from s2r_runtime.trace.fault import Fault
 from s2r_runtime.trace.found import Found, Limit
@@ -72,6 +74,8 @@ class TraceResult:
     """Standard deviations of the noise that was taken out of inputs."""
     behind: dict[str, float] = field(default_factory=dict)
     """s by which states came late against others of the pose, and were taken earlier."""
+    domain: tuple[Range, ...] = ()
+    """Of each state, then each input: where it was fitted and judged. Beyond that nothing speaks for what was found."""
 
     def same(self, found: Found) -> tuple[Found, ...]:
         """Of `ambiguous_with`: other names of the very same thing on this model."""
@@ -118,6 +122,8 @@ class TraceResult:
         if self.unconfirmed:
             names = ", ".join(f"{name} on {channel}" for name, channel in self.unconfirmed)
             lines.append(f"not confirmed: {names}; what it was judged on never asks for that, the fit alone speaks for it")
+        if self.effects:
+            lines.append(f"fitted and judged where {domain_told(self.domain)}; elsewhere untested")
         if self.left_as_given:
             lines.append("the model stays as it was given: what ties does little here, and on another drive it may do more harm than good")
         if self.nominal.dt != self.spec.dt:
@@ -190,6 +196,7 @@ class TraceResult:
             "inputs_late": self.way.late,
             "inputs_changed_within": self.way.within,
             "unconfirmed": [{"name": name, "channel": channel} for name, channel in self.unconfirmed],
+            "seen_within": {one.name: one.to_json() for one in self.domain},
             "step_s": self.nominal.dt,
             "n_fit": self.n_fit,
             "n_test": len(self.held.steps),
@@ -199,6 +206,7 @@ class TraceResult:
         """For the head of the model's TOML."""
         parts = self.reconstruction is not None and self.reconstruction.in_parts
         found = () if self.left_as_given else tuple(e.text() for e in self.effects)
+        found += (f"Fitted and judged where {domain_told(self.domain)}",) if found else ()
         found += (IN_PARTS,) if parts else ()
         return (
             (f"Repaired by s2r trace on {self.source}: {self.verdict}", *found)
