@@ -7,7 +7,7 @@ from dataclasses import replace
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.dataset import Dataset, in_finer_parts
-from s2r_runtime.trace.errors import Held, judge, noise_floor
+from s2r_runtime.trace.errors import Held, at_most_seen, judge, noise_floor
 from s2r_runtime.trace.faults import check
 from s2r_runtime.trace.fitting import Problem, fitted
 from s2r_runtime.trace.hidden_pairs import two_together
@@ -40,7 +40,8 @@ def astray(chosen: Selection, structure: Structure, judged_on: Held, seed: int) 
     if not chosen.fit.added or structure.tokens != ("noise",):  # as it mostly is: no need for rollouts
         return False
     judged = judge(chosen.nominal.model, judged_on), judge(chosen.fit.model, judged_on)
-    return takes_far(chosen, structure, judged, judged_on, noise_floor(chosen.fit, judged_on, seed)[1])
+    floor = at_most_seen(noise_floor(chosen.fit, judged_on, seed), chosen.fit.model, judged_on, judged[1].ends)
+    return takes_far(chosen, structure, judged, judged_on, floor[1])
 
 
 def once_more(
