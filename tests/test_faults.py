@@ -342,3 +342,92 @@ def test_a_level_that_froze_while_the_tank_filled_is_told_though_it_would_have_s
     (fault,) = _level(tmp_path, spoil, seed)
     assert fault.kind == "frozen"
     assert (fault.from_s / 4.0, fault.to_s / 4.0) == pytest.approx((200, 239), abs=1)
+
+
+def _slow_car(seed, spoil=None, noise=0.02, digits=None):
+    """(found frozen speeds, measured speed) of a car whose speed follows its commands with a lag of 0.4 s, which it knows nothing of."""
+    rng = np.random.default_rng(seed)
+    model = compose(ModelSpec("bicycle", 0.05, {"wheel_base": 0.33}))
+    u = commands(rng, 1, 1200, 0.05, [(-0.3, 0.3), (0.2, 2.0)], rest=0.0)[0]
+    speed, pose = [0.0], [np.zeros(3)]
+    for steer, wanted in u:
+        speed.append(wanted + (speed[-1] - wanted) * np.exp(-0.05 / 0.4))
+        went = 0.05 * 0.5 * (speed[-1] + speed[-2])
+        turned = went * np.tan(steer) / 0.33
+        middle = pose[-1][2] + 0.5 * turned
+        pose.append(pose[-1] + np.array([went * np.cos(middle), went * np.sin(middle), turned]))
+    y = np.column_stack([np.array(pose) + rng.normal(size=(1201, 3)) * [0.001, 0.001, 0.002], np.array(speed)])
+    if spoil:
+        spoil(y[:, 3])
+    y[:, 3] += noise * rng.normal(size=1201)
+    return model, u, y if digits is None else np.round(y, digits)
+
+
+def _frozen_of(model, u, y):
+    t = 0.05 * np.arange(len(y))
+    found = check(model, from_streams(model, [(Stream(t, y), Stream(t[:-1], u))], "here")).faults
+    return [(f.channel, round(f.from_s / 0.05), round(f.to_s / 0.05)) for f in found if f.kind == "frozen"]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_speed_that_repeats_exactly_and_jitters_otherwise_is_frozen(seed):
+    """However slowly it follows its commands."""
+    model, u, y = _slow_car(seed)
+    assert _frozen_of(model, u, y) == []
+    y[700:730, 3] = y[700, 3]
+    assert _frozen_of(model, u, y) == [("speed", 700, 729)]
+
+
+@pytest.mark.parametrize("digits", [None, 3, 6])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_speed_that_is_read_without_noise_may_be_even_for_a_while(seed, digits):
+    """It is never even elsewhere: only noise would not let it be so."""
+
+    def even(speed):
+        speed[700:730] = speed[700]
+
+    assert _frozen_of(*_slow_car(seed, even, noise=0.0, digits=digits)) == []
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_speed_at_the_end_of_its_sensor_or_at_rest_is_not_frozen(seed):
+    model, u, y = _slow_car(seed)
+    at_end = y.copy()
+    at_end[700:730, 3] = np.max(y[:, 3])
+    at_rest = y.copy()
+    at_rest[700:730, 3] = 0.0
+    assert _frozen_of(model, u, at_end) == []
+    assert _frozen_of(model, u, at_rest) == []
+
+
+def _outlying(rng, shape):
+    return np.where(rng.random((shape[0], 1)) < 0.03, rng.choice([-1.0, 1.0], shape) * rng.uniform(6.0, 12.0, shape), 0.0) * NOISE
+
+
+def _heavy(rng, shape):
+    return rng.standard_t(3, shape) * NOISE
+
+
+@pytest.mark.parametrize("law", [_outlying, _heavy])
+@pytest.mark.parametrize(("jump", "at"), [(0.08, 0), (-0.08, 1), (0.9, 2)])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_jump_among_outliers_is_told(law, jump, at, seed):
+    """Where wild rows are the sensor's noise, what stays is none of them."""
+
+    def spoil(y):
+        y += law(np.random.default_rng(seed), y.shape)
+        y[400:, at] += jump
+
+    found = [(f.kind, f.channel, round(f.from_s / DT), round(f.to_s / DT)) for f in _checked(spoil, seed=20 + seed).faults]
+    assert found == [("offset_jump", ("x", "y", "theta")[at], 400, STEPS)]
+
+
+@pytest.mark.parametrize("law", [_outlying, _heavy])
+def test_outliers_by_themselves_are_no_jump(law):
+    """Sixty recordings of either law."""
+    for seed in range(60):
+
+        def spoil(y, seed=seed):
+            y += law(np.random.default_rng([seed, 1]), y.shape)
+
+        assert [f for f in _checked(spoil, seed=100 + seed).faults if f.kind == "offset_jump"] == []

@@ -77,6 +77,7 @@ def check(model: ComposedModel, data: Dataset) -> Checked:
     left_out: list[tuple[int, int]] = []
     spikes: list[Fault] = []
     outliers = tails = 0
+    sure: list[Fault] = []
     for i in range(len(data.runs)):
         tails += int(np.count_nonzero(tails_of(model, data, act, i, reach).any(axis=1)))
         found += frozen(model, data, act, i, bad[i], reach)
@@ -84,6 +85,7 @@ def check(model: ComposedModel, data: Dataset) -> Checked:
         spikes += jumps.spikes
         found += jumps.offsets
         left_out += jumps.cut
+        sure += jumps.sure
         outliers += len(jumps.tails)
         if pose is not None:
             found += _inconsistent(model, data, act, i, bad[i], reach, pose)
@@ -95,7 +97,7 @@ def check(model: ComposedModel, data: Dataset) -> Checked:
         mask |= wild
     runs = tuple(replace(run, y=np.where(b.any(axis=1, keepdims=True), np.nan, run.y)) for run, b in zip(data.runs, bad, strict=True))
     if many:  # two of them in a row look like a jump
-        found = [f for f in found if f.kind != "offset_jump"]
+        found = [f for f in found if f.kind != "offset_jump" or f in sure]
     faults_ = tuple(sorted([*found, *([] if many else spikes)], key=lambda f: (f.from_s, f.channel)))
     return Checked(bridged(replace(data, runs=runs)), faults_, tuple(sorted(set(left_out))), outliers + (len(spikes) if many else 0))
 

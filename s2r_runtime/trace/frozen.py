@@ -1,4 +1,6 @@
-"""A state that repeats exactly while the model says that it moves: the sensor, or what carries its readings, stands still."""
+"""A state that repeats exactly while the model says that it moves, or a speed that jitters at all other times: the sensor, or what carries
+its readings, stands still.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +11,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.models.forces import axes, lone_speeds
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.fault import FROZEN_ROWS, QUANTA, REPEATS, RESTLESS, RESTS, SIGMAS, Fault, stretches
 from s2r_runtime.trace.reach import Reach, predicted
@@ -26,6 +29,9 @@ either: on at least RESTS of them, of which less than REPEATS repeat, and whose 
 correlation of -1/2 from one residual to the next; a slow motion, or an effect that the model lacks, has none below zero.
 """
 
+MOVING = 1.5
+"""Times that a speed bends from row to row by noise, for white noise 1.65 standard deviations, from which on no robot stands."""
+
 FOLLOWS, FOLLOWED = 0.25, 0.9
 """Of what a frozen speed is off at most, how near to its command it is on other rows, and on which share of them at least."""
 
@@ -34,13 +40,15 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
     """Exact repeats through which the model moves the state by more than noise and quantisation, and after which it catches up.
 
     Without catching up the robot itself may have stood still; only a long silence of a state that jitters otherwise is then a fault; or one
-    of a state that jitters on other rows on which the robot stands, or nearly.
+    of a state that jitters on other rows on which the robot stands, or nearly; or of a speed that jitters, and is not zero.
     """
     run = data.runs[i]
     if len(run.y) < FROZEN_ROWS + 1:
         return []
     foretold = predicted(model, data, act, i)
     moves, e = model.difference(foretold, run.y[:-1]), model.difference(run.y[1:], foretold)
+    alone = lone_speeds(model.nominal)
+    speeds = {i for i, state in enumerate(model.states) if reach.instant[i] or state in alone} | {k.velocity for k in axes(model.nominal)}
     found = []
     for j, name in enumerate(model.states):
         change = np.abs(np.diff(run.y[:, j]))
@@ -50,6 +58,10 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
         least = SIGMAS * reach.noise[j] + QUANTA * quantum
         for a, b in stretches(change == 0.0):
             if b - a < FROZEN_ROWS:
+                continue
+            if j in speeds and b - a >= RESTLESS and _stuck(run.y[:, j], e[:, j], (a, b), QUANTA * quantum):
+                bad[a + 1 : b + 1, j] = True
+                found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
                 continue
             if reach.instant[j]:
                 if b - a >= RESTLESS and _ignored(foretold[:, j], run.y[:, j], (a, b), least):
@@ -133,14 +145,39 @@ def _ignored(foretold: Array, y: Array, within: tuple[int, int], least: float) -
     return bool(np.count_nonzero(followed) > FOLLOWED * others and np.any(back))
 
 
+def _stuck(y: Array, e: Array, within: tuple[int, int], least: float) -> bool:
+    """Whether a speed y (K+1,) that jitters wherever it is not next to zero repeats a value that is not. Not its greatest one: there a sensor
+    may be at its end. e: (K,) its residuals; least: of jitter that is no rounding.
+
+    From row to row, noise of a measurement bends to and fro; what moves evenly, or follows its commands slowly, and is read without noise,
+    does not.
+    """
+    a, b = within
+    value, change, bend = float(y[a]), np.diff(y), np.concatenate([[np.nan, np.nan], np.diff(e, n=2)])
+    others = np.isfinite(change) & np.isfinite(bend)
+    others[a : b + 3] = False
+    if np.count_nonzero(others) < RESTS or not np.any(y * math.copysign(1.0, value) > abs(value)):
+        return False
+    jitter = float(np.median(np.abs(bend[others])))
+    others &= np.minimum(np.abs(y[1:]), np.abs(y[:-1])) > MOVING * jitter
+    if jitter <= least or abs(value) <= MOVING * jitter or np.count_nonzero(others) < RESTS:
+        return False
+    return float(np.mean(change[others] == 0.0)) < REPEATS and _alternates(bend, others)
+
+
 def _restless(change: Array, e: Array, resting: Mask, within: tuple[int, int]) -> bool:
     """Whether a state jitters on rows outside `within` on which it hardly moves. e: (K,) its residuals."""
     others = resting & np.isfinite(e)
     others[slice(*within)] = False
     if np.count_nonzero(others) < RESTS or float(np.mean(change[others] == 0.0)) >= REPEATS:
         return False
-    pairs = others[:-1] & others[1:]
-    limit = 3.0 * float(np.median(np.abs(e[others])))
+    return _alternates(e, others)
+
+
+def _alternates(e: Array, there: Mask) -> bool:
+    """Whether neighbours in e (K,), wild ones cut off, have the correlation of a measurement's noise. there: (K,) of which are asked."""
+    pairs = there[:-1] & there[1:]
+    limit = 3.0 * float(np.median(np.abs(e[there])))
     first, second = (np.clip(part[pairs], -limit, limit) for part in (e[:-1], e[1:]))
     size = float(np.sqrt(np.sum(first**2) * np.sum(second**2)))
     return bool(np.count_nonzero(pairs) >= RESTS // 2 and size > 0.0 and float(np.sum(first * second)) < ALTERNATES * size)

@@ -43,23 +43,27 @@ RIGHT_AT_FIRST = 0.3
 BRIEF = 4
 """Rows that a spike lasts at most; a jump that comes back later is an offset."""
 
+STAYS, FARTHER = 10, 2.0
+"""Rows over which a jump must stay, and times the largest residual of other steps that it must be, not to be one of many wild rows."""
+
 
 @dataclass(frozen=True)
 class Jumps:
     """Of one run: spikes; rows that the noise's own tail took away (`tails`, as spikes); offsets that stay; (run, step) transitions across
-    them.
+    them; of the offsets, those that are none of the noise's tail either.
     """
 
     spikes: list[Fault]
     tails: list[Fault]
     offsets: list[Fault]
     cut: list[tuple[int, int]]
+    sure: list[Fault]
 
 
 def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: Reach) -> Jumps:
     """Of run i; marks in `bad` what of it is wrong."""
     run = data.runs[i]
-    found = Jumps([], [], [], [])
+    found = Jumps([], [], [], [], [])
     if len(run.y) < 3:
         return found
     e = model.difference(run.y[1:], predicted(model, data, act, i))
@@ -88,6 +92,8 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
         if not reach.instant[j]:
             for k, back in _offsets(series, single):
                 _take_out(found, model, data, i, j, k, back, bad)
+                if _stays(series, k, single):
+                    found.sure.append(found.offsets[-1])
     return found
 
 
@@ -102,6 +108,15 @@ def _reached(series: Array, noise: float, least: float) -> float:
     if len(wild) < FEW:
         return 0.0
     return float(TAIL_SIGMAS * noise * (ONE_IN * len(wild)) ** np.mean(np.log(wild)))
+
+
+def _stays(series: Array, k: int, single: list[int]) -> bool:
+    """Whether a state mostly is off by the whole jump at step k on the rows after it, and none but jumps comes near to that."""
+    after, jump = np.cumsum(series[k : k + 1 + STAYS])[1:], float(series[k])
+    others = np.delete(np.abs(series), single)
+    if len(after) < STAYS or not len(others) or abs(jump) <= FARTHER * float(np.max(others)):
+        return False
+    return bool(abs(float(np.median(after)) - jump) < 0.35 * abs(jump))
 
 
 def _alone(series: Array, k: int) -> bool:
