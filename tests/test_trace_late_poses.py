@@ -9,7 +9,7 @@ from trace_sets.families import make
 from s2r_runtime.cli.main import main
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.trace.late_poses import earlier, late_pose
+from s2r_runtime.trace.late_poses import _answers_sooner, _turns_asked, earlier, late_pose
 from s2r_runtime.trace.streams import Stream
 
 PARTS, ROW_S, ROWS = 20, 0.025, 1600
@@ -108,3 +108,24 @@ def test_a_late_heading_is_a_fault_of_measurement_and_no_delay(tmp_path, capsys)
     assert told["states_late"] == {"theta": pytest.approx(4 * ROW_S, rel=0.05)}
     assert "taken that much earlier" in report.read_text()
     assert "what they spoil" not in report.read_text()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_heading_that_turns_when_it_is_asked_to_is_not_late(seed):
+    """What slides by its speed and yaw rate looks like a heading that is as many seconds late, to first order: the inputs tell."""
+    model, names = compose(ModelSpec("unicycle", 0.05)), ("x", "y", "theta")
+
+    def sooner(**what):
+        t, pose, u = _driven(seed=seed, **what)
+        return _answers_sooner(Stream(t, pose), _turns_asked(model, names, Stream(t, pose), Stream(t, u)), 0.14)
+
+    assert sooner(slip_s=0.14)
+    assert not sooner(late_rows=(0, 5.6))
+    assert not sooner(late_rows=(0, 12))  # it turns late, too
+
+
+def test_a_heading_is_not_asked_of_a_model_that_cannot_say():
+    t, pose, u = _driven(slip_s=0.14)
+    model = compose(ModelSpec("unicycle", 0.05))
+    few = Stream(t[:5], u[:5])
+    assert not _answers_sooner(Stream(t, pose), _turns_asked(model, ("x", "y", "theta"), Stream(t, pose), few), 0.14)

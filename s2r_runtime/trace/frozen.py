@@ -146,8 +146,8 @@ def _ignored(foretold: Array, y: Array, within: tuple[int, int], least: float) -
 
 
 def _stuck(y: Array, e: Array, within: tuple[int, int], least: float) -> bool:
-    """Whether a speed y (K+1,) that jitters wherever it is not next to zero repeats a value that is not. Not its greatest one: there a sensor
-    may be at its end. e: (K,) its residuals; least: of jitter that is no rounding.
+    """Whether a speed y (K+1,) that jitters wherever it is not next to zero repeats a value that is not. Not its greatest one: there a
+    sensor may be at its end. e: (K,) its residuals; least: of jitter that is no rounding.
 
     From row to row, noise of a measurement bends to and fro; what moves evenly, or follows its commands slowly, and is read without noise,
     does not.

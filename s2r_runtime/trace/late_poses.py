@@ -8,7 +8,8 @@ To first order that is a robot that slides sideways, and turns as late as its he
 explain the way aside clearly better than all that slides (slip, tyres, a measured point ahead of the axle, in proportion to w), and no
 worse than these with a lead or a lag of their own (w'), their numbers paid for. Nothing that slides looks ahead of how it turns, but tyres
 and whatever hovers follow it late: positions are late only if they clearly are no slide that follows by a lag, either, at no price for its
-numbers; or if they are as late along the way, against a measured speed. Inputs are not asked: what acts late there is another matter.
+numbers; or if they are as late along the way, against a measured speed. Inputs are not asked how late they act, which is another
+matter; but a heading that turns with them by far sooner than it is late would have turned before it was asked to.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.fault import Fault
@@ -57,6 +59,9 @@ SHIFTS = (0.4, 0.6, 0.75, 0.9, 1.0, 1.1, 1.25, 1.4, 1.6)
 ALONG, SAME = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0), 0.25
 """Times how late positions are by their course, that are tried along the way; and by how much that may be another one."""
 
+SOONER, TURNS = 0.5, (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
+"""Of how late a heading is, by which at least it must seem to answer the inputs; and times that, at which it is asked to."""
+
 LAGS = (0.25, 0.5, 0.75, 1.0, 1.5)
 """Time constants with which a slide may follow, times how late positions seem to be."""
 
@@ -82,13 +87,49 @@ def late_pose(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], m
         return {}
     speeds = next((own for own in SPEEDS if {*own} <= {*names}), ())
     columns = [names.index(name) for name in (*POSE, *speeds)]
-    states = max((states for states, _ in segments), key=lambda states: len(states.t))
-    states = complete(fresh(Stream(states.t, states.values[:, columns])))
+    whole, inputs = max(segments, key=lambda segment: len(segment[0].t))
+    states = complete(fresh(Stream(whole.t, whole.values[:, columns])))
     if len(states.t) < FEWEST:
         return {}
     states = Stream(states.t[:LOOKED_AT], unwrapped(states.values[:LOOKED_AT], [2]))
     by = _Ways(states).late()
+    if by > 0.0 and _answers_sooner(states, _turns_asked(model, names, whole, inputs), by):
+        return {}
     return {"theta": by} if by > 0.0 else {"x": -by, "y": -by} if by < 0.0 else {}
+
+
+def _turns_asked(model: ComposedModel, names: Sequence[str], states: Stream, inputs: Stream) -> Stream:
+    """(m, 1) by how much the heading has turned when each input begins to act, by the model, from where the robot was measured. names: of
+    the states that were.
+    """
+    there = np.isfinite(inputs.values).all(axis=1)
+    t, u = inputs.t[there], inputs.values[there]
+    x = np.zeros((len(t), len(model.states)))
+    for name, y in zip(names, states.values.T, strict=True):
+        good, column = np.isfinite(y), model.states.index(name)
+        y = np.unwrap(y[good]) if name in model.nominal.angles else y[good]
+        x[:, column] = np.interp(t, states.t[good], y)
+    try:
+        rate = model.difference(model.advance(x.copy(), u, u), x)[:, model.states.index("theta")] / model.dt
+    except ConfigError:  # somebody's own model need not step from where another state is not known
+        return Stream(t[:0], t[:0, None])
+    return Stream(t, np.concatenate([[0.0], np.cumsum(rate[:-1] * np.diff(t))])[:, None])
+
+
+def _answers_sooner(states: Stream, asked: Stream, late: float) -> bool:
+    """Whether the heading in states (x, y, theta, ...) clearly answers what turns it by less than SOONER times what it is late by."""
+    if len(asked.t) < FEWEST:
+        return False
+    theta, h = np.diff(states.values[:, 2]), np.diff(states.t)
+    nats = []
+    for share in TURNS:
+        turned = np.diff(np.interp(states.t - share * late, asked.t, asked.values[:, 0]))
+        white = _white(np.column_stack([theta, turned, h]), SHARES[-1])
+        rest = white[:, 0] - white[:, 1:] @ np.linalg.lstsq(white[:, 1:], white[:, 0], rcond=1e-9)[0]
+        scale = max(1.4826 * float(np.median(np.abs(rest))), 1e-12)
+        nats.append(float(np.sum(noises.log_density(rest / scale))) - len(rest) * math.log(scale))
+    best = int(np.argmax(nats))
+    return TURNS[best] < SOONER and nats[best] > max(n for n, share in zip(nats, TURNS, strict=True) if share >= SOONER) + CLEARLY
 
 
 def earlier(segments: Sequence[tuple[Stream, Stream]], names: Sequence[str], behind: Mapping[str, float]) -> list[tuple[Stream, Stream]]:
