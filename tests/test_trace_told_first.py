@@ -1,11 +1,16 @@
 """Of several things that what is left may depend on, the one that explains most is told first."""
 
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
+from trace_robots import declared, recordings
 
 from s2r_runtime.trace import whole
 from s2r_runtime.trace.answer import _in_order
 from s2r_runtime.trace.challenge import Better
 from s2r_runtime.trace.lack_of_fit import Structure
+from s2r_runtime.trace.tracer import trace
 
 
 def test_what_is_left_comes_first_where_no_name_is_given():
@@ -22,3 +27,45 @@ def test_of_a_field_and_a_shape_the_one_that_explains_more_comes_first(nats, fir
     asked = whole.Whole.__new__(whole.Whole)
     asked.__dict__.update(_looks=None, nominal=None, _horizon=1, _shape=Better("memory(v)", 17.0))
     assert asked._of_nominal().tokens[0] == first
+
+
+def _likened(weighed, unnamed, shape=None, field=None):
+    """What is told of a dictionary that is likeliest, of one that foretells other blocks of time best, of a shape and a field."""
+    asked = whole.Whole.__new__(whole.Whole)
+    looks = SimpleNamespace(weighed=weighed, field=field, chosen=([], {}), left=None)
+    given = SimpleNamespace(floor=SimpleNamespace(axes=()))
+    asked.__dict__.update(_looks=looks, given=given, unnamed=SimpleNamespace(token=unnamed[0], gain=unnamed[1]), _shape=shape)
+    return asked._looks_like
+
+
+def _field(*tokens, nats):
+    return SimpleNamespace(tokens=tokens, nats=nats)
+
+
+def test_a_place_that_was_visited_once_is_told_though_nothing_foretells_it():
+    """Dictionaries and fields are weighed alike; by what they foretell only where noise of some colour does nearly as well."""
+    assert _likened((("v*w",), 214.0), ("position", 40.0), field=_field("time*w", nats=140.0)) == ("v*w",)
+    assert _likened((("v*w",), 214.0), ("position", 40.0), field=_field("time*w", nats=240.0)) == ("time*w",)
+    assert _likened((("heading",), 2.0), ("position", 40.0), field=_field("time*w", nats=45.0)) == ("position",)
+    assert _likened((("heading",), 2.0), ("position", 40.0), field=_field("time*w", nats=55.0)) == ("time*w",)
+
+
+def test_of_fields_that_do_alike_the_one_of_the_likeliest_dictionary_comes_first():
+    assert _likened((("position",), 45.0), ("w", 9.0), field=_field("time*v", "position", nats=61.0)) == ("position", "time*v")
+
+
+def test_a_shape_is_told_where_it_is_clearly_likelier():
+    assert _likened((("w",), 30.0), ("w", 9.0), shape=Better("memory(w)", 50.0)) == ("memory(w)",)
+    assert _likened((("w",), 48.0), ("w", 9.0), shape=Better("memory(w)", 50.0)) == ("w",)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_turn_by_speed_and_turning_is_not_taken_for_a_drift(seed):
+    """It yaws more by a share of v |w|: as places, headings and times go with the inputs, each explains some of it."""
+
+    def outside(x, v, w):
+        return v, w + 1.2 * v * np.abs(w), 0.0 * v, 0.0 * v
+
+    (data,) = recordings([], 1, steps=700, seed=70 + seed, outside=outside)
+    found = trace(data, declared())
+    assert found.depends_on[0] in {"v*w", "v", "w"}

@@ -74,13 +74,15 @@ SECONDS = ("out", "back", "up", "down", "small", "large", "time_constant")
 
 @dataclass(frozen=True)
 class Better:
-    """A shape that does. nats: beyond the model without anything on that input, its numbers paid for. shows: it wins, and in some rollout,
-    too, beside the effects that were named.
+    """A shape that does. nats: beyond the model without anything on that input, its numbers paid for, which cost `price`. shows: it wins,
+    and in some rollout, too, beside the effects that were named. fit: with it.
     """
 
     token: str
     nats: float
     shows: bool = True
+    fit: Fit | None = None
+    price: float = 0.0
 
 
 def better_shape(given: Problem, fit: Fit, horizon: int) -> Better | None:
@@ -103,7 +105,7 @@ def best_shape(given: Problem, base: Fit, horizon: int) -> Better | None:
     found = [(gain(fit, base) - _price(given, fit, base), fit) for fit in fits]
     for nats, fit in sorted(found, key=lambda pair: -pair[0]):
         if nats > 0.0 and accepted(given, fit, base, tried, horizon):
-            return Better(_token(fit), nats)
+            return Better(_token(fit), nats, fit=fit, price=_price(given, fit, base))
     return None
 
 

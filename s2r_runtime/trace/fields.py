@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.evidence import evidence
-from s2r_runtime.trace.fitting import slopes
+from s2r_runtime.trace.fitting import Fit, slopes
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
 from s2r_runtime.trace.lack_of_fit_terms import directions_of, own_pushes, quieter
 from s2r_runtime.trace.residual import acting
@@ -256,13 +256,20 @@ def wanders(nominal: Left, named: Left) -> bool:
 
 def as_noise(left: Left, judged: Judged) -> bool:
     """Whether a push that wanders explains what a dictionary does, and more, or noise of some colour what only sliding shows."""
-    nats = nats_of(left, judged)
+    nats = nats_of(left, judged.x)
     return max(nats, judged.gain) <= 0.0 or wandering_nats(left) > bare_nats(left) + max(nats, 0.0) + ALIKE
 
 
-def nats_of(left: Left, judged: Judged) -> float:
-    """What a dictionary explains as a field is judged: beyond noise of any colour, by its marginal likelihood, with noise of its own."""
-    return _marginal(left, judged.x, PASSES)[0] - bare_nats(left)
+def nats_of(left: Left, x: Array) -> float:
+    """What a dictionary x (n, nx, m) explains as a field is judged: beyond noise of any colour, by its marginal likelihood, with noise of
+    its own.
+    """
+    return _marginal(left, x, PASSES)[0] - bare_nats(left)
+
+
+def nats_of_fit(left: Left, fit: Fit, price: float) -> float:
+    """The same of another model, the numbers of which cost so much."""
+    return _under_any_law(fit.z, fit.whiten, left) - bare_nats(left) - price
 
 
 def bare_nats(left: Left) -> float:

@@ -45,6 +45,9 @@ ALPHA = 1e-3
 FEW = 6
 """Dictionaries that are judged with their own noise, after a first look under the model's."""
 
+WEIGHED = 12
+"""Dictionaries, the best at first look, of which the likeliest is told where there is structure."""
+
 NOTHING = 1.0
 """Nats at first look up to which a dictionary says nothing, and is not judged any closer."""
 
@@ -146,7 +149,7 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
         others = [] if windows is None else [windows.gain]
         if left.fit.added and looks.field is not None and looks.field.beyond > 0.0:
             others.append(looks.field.nats)
-        if others and max(others) > nats_of(left, chosen[-1]):
+        if others and max(others) > nats_of(left, chosen[-1].x):
             chosen = []
     if chosen:
         matters, share = _weight_of(left, nominal, chosen[-1], horizon)
@@ -232,6 +235,21 @@ class Looks:
     def field(self) -> Field | None:
         """The smooth random field that explains most of what is left; none is looked for where a speed was not measured."""
         return None if self.left.given.floor.axes else field(self.left)
+
+    @cached_property
+    def weighed(self) -> tuple[tuple[str, ...], float]:
+        """What the likeliest of WEIGHED dictionaries depends on, others that say the same after it; and its nats, on a field's scale. What
+        holds in all blocks of time gains most where one is foretold from the others (`judged`): of what depends on a place that was
+        visited once, that says little.
+        """
+        nats: dict[str, float] = {}
+        for first, i in self.looked[:WEIGHED]:
+            if first > NOTHING:
+                token, x = self.found[i]
+                token = TOKENS.get(token, token)
+                nats[token] = max(nats.get(token, -math.inf), nats_of(self.left, leading(self.left, x)))
+        most = max(nats.values(), default=0.0)
+        return tuple(sorted((t for t in nats if nats[t] > most - ALIKE), key=lambda t: -nats[t])), most
 
     @cached_property
     def judged(self) -> list[Judged]:

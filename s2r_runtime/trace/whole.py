@@ -12,7 +12,7 @@ from s2r_runtime.trace.about import about_states
 from s2r_runtime.trace.challenge import MORE as SHAPED
 from s2r_runtime.trace.challenge import Better, best_shape, better_shape
 from s2r_runtime.trace.faults import Checked
-from s2r_runtime.trace.fields import Field, beats, wanders
+from s2r_runtime.trace.fields import Field, beats, nats_of, nats_of_fit, wanders
 from s2r_runtime.trace.fitting import Fit, evaluate, fitted, gain, problem
 from s2r_runtime.trace.holdout import part
 from s2r_runtime.trace.lack_of_fit import (
@@ -137,7 +137,7 @@ class Whole:
         if seen and (self.unnamed.gain > CLEAR or self._together):
             tokens = self._looks_like
         elif seen and self._field is not None and self._field.beyond > CLEAR:
-            tokens = self._field.tokens  # it was seen by sliding only, which names what it tries
+            tokens = self._looks_like  # it was seen by sliding only, which names what it tries
         else:
             tokens = () if self._shape is None else (self._shape.token,)
         more = (found.for_a_while or found.varies) and self._shape is not None and found.nats > self._shape.nats
@@ -178,16 +178,27 @@ class Whole:
 
     @cached_property
     def _looks_like(self) -> tuple[str, ...]:
-        """What all that the nominal model lacks depends on most: by the best dictionary, or by two that say little alone, or by a shape or
-        a field that does better.
+        """What all that the nominal model lacks depends on most: by the likeliest dictionary, or by two that say little alone, or by a
+        shape or a field that does better. All are weighed alike: by the likelihood under noise of their own, of any colour, less the
+        price of their numbers. Where noise of some colour does nearly as well, or speeds were not measured, by what they foretell of
+        other blocks of time.
         """
-        tokens: tuple[str, ...] = (self.unnamed.token,)
-        nats = self.unnamed.gain
+        left, shape, field = self._looks.left, self._shape, self._field
+        tokens, nats = ((), 0.0) if self.given.floor.axes else self._looks.weighed
+        weighed = nats > CLEAR
+        if not weighed:
+            tokens, nats = (self.unnamed.token,), self.unnamed.gain
         if self._together:
-            tokens, nats = as_told(self._together), self._together[-1].gain
-        if self._shape is not None and self._shape.nats >= MORE * nats + ALIKE:
-            tokens, nats = (self._shape.token,), self._shape.nats
-        return self._field.tokens if self._field is not None and self._field.nats > nats + CLEAR else tokens
+            both = self._together[-1]
+            more = nats_of(left, both.x) if weighed else both.gain
+            tokens, nats = (as_told(self._together), more) if more > nats + ALIKE else (tokens, nats)
+        if shape is not None:
+            more = nats_of_fit(left, shape.fit, shape.price) if weighed and shape.fit is not None else shape.nats
+            tokens, nats = ((shape.token,), more) if more >= MORE * nats + ALIKE else (tokens, nats)
+        if field is not None and field.nats > nats + (ALIKE if weighed else CLEAR):
+            first = tokens[:1] if tokens[0] in field.tokens else ()
+            tokens = tuple(dict.fromkeys((*first, *field.tokens)))
+        return tokens
 
     @property
     def _together(self) -> list[Judged]:
