@@ -344,7 +344,7 @@ def test_a_level_that_froze_while_the_tank_filled_is_told_though_it_would_have_s
     assert (fault.from_s / 4.0, fault.to_s / 4.0) == pytest.approx((200, 239), abs=1)
 
 
-def _slow_car(seed, spoil=None, noise=0.02, digits=None):
+def _slow_car(seed, spoil=None, noise=0.02, digits=None, made=None):
     """(found frozen speeds, measured speed) of a car whose speed follows its commands with a lag of 0.4 s, which it knows nothing of."""
     rng = np.random.default_rng(seed)
     model = compose(ModelSpec("bicycle", 0.05, {"wheel_base": 0.33}))
@@ -359,6 +359,8 @@ def _slow_car(seed, spoil=None, noise=0.02, digits=None):
     y = np.column_stack([np.array(pose) + rng.normal(size=(1201, 3)) * [0.001, 0.001, 0.002], np.array(speed)])
     if spoil:
         spoil(y[:, 3])
+    if made:
+        made(y[:, 3], u)
     y[:, 3] += noise * rng.normal(size=1201)
     return model, u, y if digits is None else np.round(y, digits)
 
@@ -378,6 +380,27 @@ def test_a_speed_that_repeats_exactly_and_jitters_otherwise_is_frozen(seed):
     assert _frozen_of(model, u, y) == [("speed", 700, 729)]
 
 
+def test_a_speed_that_froze_twice_is_frozen_twice():
+    model, u, y = _slow_car(1)
+    y[300:330, 3], y[700:730, 3] = y[300, 3], y[700, 3]
+    assert _frozen_of(model, u, y) == [("speed", 300, 329), ("speed", 700, 729)]
+
+
+@pytest.mark.parametrize("digits", [None, 4])
+@pytest.mark.parametrize("lag", [1e-6, 0.01, 0.4])
+@pytest.mark.parametrize("gain", [0.8, 1.0])
+def test_a_speed_that_follows_other_commands_every_row_need_not_jitter(gain, lag, digits):
+    """Nor if it is slower than its commands, or follows late: what goes with them is no noise. They are held once."""
+
+    def even(speed, u):
+        u[:, 1] = np.random.default_rng(7).uniform(0.5, 2.0, len(u))
+        u[700:731, 1] = u[700, 1]
+        for k, wanted in enumerate(u[:, 1]):
+            speed[k + 1] = gain * wanted + (speed[k] - gain * wanted) * np.exp(-0.05 / lag)
+
+    assert _frozen_of(*_slow_car(2, noise=0.0, digits=digits, made=even)) == []
+
+
 @pytest.mark.parametrize("digits", [None, 3, 6])
 @pytest.mark.parametrize("seed", range(4))
 def test_a_speed_that_is_read_without_noise_may_be_even_for_a_while(seed, digits):
@@ -394,6 +417,7 @@ def test_a_speed_at_the_end_of_its_sensor_or_at_rest_is_not_frozen(seed):
     model, u, y = _slow_car(seed)
     at_end = y.copy()
     at_end[700:730, 3] = np.max(y[:, 3])
+    at_end[400, 3] += 0.3  # one row that is off is no end
     at_rest = y.copy()
     at_rest[700:730, 3] = 0.0
     assert _frozen_of(model, u, at_end) == []
@@ -420,6 +444,15 @@ def test_a_jump_among_outliers_is_told(law, jump, at, seed):
 
     found = [(f.kind, f.channel, round(f.from_s / DT), round(f.to_s / DT)) for f in _checked(spoil, seed=20 + seed).faults]
     assert found == [("offset_jump", ("x", "y", "theta")[at], 400, STEPS)]
+
+
+def test_a_spike_does_not_hide_a_jump_among_outliers():
+    def spoil(y):
+        y += _outlying(np.random.default_rng(3), y.shape)
+        y[400:, 0] += 0.08
+        y[600, 0] += 0.06
+
+    assert ("offset_jump", "x", 400) in [(f.kind, f.channel, round(f.from_s / DT)) for f in _checked(spoil, seed=23).faults]
 
 
 @pytest.mark.parametrize("law", [_outlying, _heavy])

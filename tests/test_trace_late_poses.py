@@ -9,7 +9,7 @@ from trace_sets.families import make
 from s2r_runtime.cli.main import main
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.trace.late_poses import _answers_sooner, _turns_asked, earlier, late_pose
+from s2r_runtime.trace.late_poses import _asked, _turns_sooner, earlier, late_pose
 from s2r_runtime.trace.streams import Stream
 
 PARTS, ROW_S, ROWS = 20, 0.025, 1600
@@ -110,22 +110,69 @@ def test_a_late_heading_is_a_fault_of_measurement_and_no_delay(tmp_path, capsys)
     assert "what they spoil" not in report.read_text()
 
 
+NAMES = ("x", "y", "theta")
+
+
+def _sooner(t, pose, inputs, model=None):
+    """Whether a heading seems to answer inputs (a Stream) sooner than one that is 0.14 s late can."""
+    model, states = model or compose(ModelSpec("unicycle", 0.05)), Stream(t, pose)
+    return _turns_sooner(states, _asked(model, NAMES, states, inputs), 0.14)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_a_heading_that_turns_when_it_is_asked_to_is_not_late(seed):
     """What slides by its speed and yaw rate looks like a heading that is as many seconds late, to first order: the inputs tell."""
-    model, names = compose(ModelSpec("unicycle", 0.05)), ("x", "y", "theta")
-
-    def sooner(**what):
-        t, pose, u = _driven(seed=seed, **what)
-        return _answers_sooner(Stream(t, pose), _turns_asked(model, names, Stream(t, pose), Stream(t, u)), 0.14)
-
-    assert sooner(slip_s=0.14)
-    assert not sooner(late_rows=(0, 5.6))
-    assert not sooner(late_rows=(0, 12))  # it turns late, too
+    t, pose, u = _driven(slip_s=0.14, seed=seed)
+    assert _sooner(t, pose, Stream(t, u))
+    for rows in (5.6, 12.0):  # it may turn late, too
+        t, pose, u = _driven(late_rows=(0, rows), seed=seed)
+        assert not _sooner(t, pose, Stream(t, u))
 
 
-def test_a_heading_is_not_asked_of_a_model_that_cannot_say():
+def test_it_makes_no_difference_how_inputs_are_written():
+    """Each input stands until another value of it is written."""
     t, pose, u = _driven(slip_s=0.14)
-    model = compose(ModelSpec("unicycle", 0.05))
-    few = Stream(t[:5], u[:5])
-    assert not _answers_sooner(Stream(t, pose), _turns_asked(model, ("x", "y", "theta"), Stream(t, pose), few), 0.14)
+    few = np.flatnonzero(np.append(True, np.any(u[1:] != u[:-1], axis=1)))
+    apart = u.copy()
+    apart[1::2, 0], apart[::2, 1] = np.nan, np.nan
+    assert _sooner(t, pose, Stream(t[few], u[few]))
+    assert _sooner(t, pose, Stream(t, apart))
+
+
+@pytest.mark.parametrize(("heading", "stamps"), [(5.6, 5), (5.6, 4), (3.0, 3)])
+def test_inputs_that_are_stamped_late_say_nothing_of_a_heading(heading, stamps):
+    """Positions answer them before they are asked to."""
+    t, pose, u = _driven(late_rows=(0, heading))
+    assert not _sooner(t, pose, Stream(t + stamps * ROW_S, u))
+
+
+MEASURED = """
+import numpy as np
+
+STATES, INPUTS, PARAMS, ANGLES = ("x", "y", "theta", "load"), ("v", "w"), {}, ("theta",)
+
+
+def step(x, u, dt, params):
+    after = x.copy()
+    after[:, 0] += dt * u[:, 0] * np.cos(x[:, 2])
+    after[:, 1] += dt * u[:, 0] * np.sin(x[:, 2])
+    after[:, 2] += dt * u[:, 1]
+    return after
+"""
+
+
+def test_a_state_without_a_value_ends_no_question_about_the_heading(tmp_path):
+    """Another state, of somebody's own model, that the longest segment lacks."""
+    path = tmp_path / "loaded.py"
+    path.write_text(MEASURED)
+    model = compose(ModelSpec(str(path), 0.05))
+    t, pose, u = _driven(late_rows=(0, 4))
+    lacking = np.column_stack([pose, np.full(len(t), np.nan)])
+    assert late_pose(model, [(Stream(t, lacking), Stream(t, u))], ()) == {"theta": pytest.approx(4 * ROW_S, rel=0.05)}
+
+
+def test_a_yaw_rate_that_is_measured_is_no_input():
+    """What the model makes of a state is not what the inputs ask for."""
+    t, pose, _ = _driven(late_rows=(0, 5.6))
+    assert not _sooner(t, pose, Stream(t, np.zeros((len(t), 2))))
+    assert not _sooner(t, pose, Stream(t[:0], np.zeros((0, 2))))

@@ -72,7 +72,7 @@ SECONDS = ("out", "back", "up", "down", "small", "large", "time_constant")
 """Numbers of shapes that are times."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Better:
     """A shape that does. nats: beyond the model without anything on that input, its numbers paid for, which cost `price`. shows: it wins,
     and in some rollout, too, beside the effects that were named. fit: with it.

@@ -1,4 +1,5 @@
-"""Where a repaired model was fitted and judged: the range of every state and input in which all but a hundredth of its transitions lie.
+"""Where a repaired model was fitted or judged: the range of every state and input in which all but a hundredth of its transitions lie, each
+by itself: what was seen together is less.
 
 Friction that was found on one carpet, or at one speed, need not be there on another: beyond these ranges nothing that was measured speaks
 for what was found. An angle's range is the shortest arc that holds as many; none is told where that leaves out next to nothing.
@@ -26,7 +27,7 @@ BEYOND = 0.01
 ONE = 1e-9
 """Of a value: a range that is no wider is that value."""
 
-ALL_ROUND = math.pi / 4.0
+ALL_ROUND = math.pi / 18.0
 """rad: an arc that leaves out less goes all round."""
 
 
@@ -50,17 +51,19 @@ class Range:
         unit = f" {self.unit}" if self.unit else ""
         span = self.high - self.low
         if span <= ONE * max(abs(self.low), abs(self.high)):
-            return f"{self.name} {self.low:.3g}{unit} only"
+            return f"{self.name} {self.low:.6g}{unit} only"
         places = max(2 - math.floor(math.log10(span)), 0)  # to a hundredth of the span: 0, not -0.000709, where the other end is 1
         low, high = (_short(f"{round(end, places) + 0.0:.{places}f}") for end in (self.low, self.high))
         return f"{self.name} from {low} to {high}{unit}"
 
 
 def domain_of(model: ComposedModel, *seen: tuple[Dataset, Steps]) -> tuple[Range, ...]:
-    """Of every state of a model as given, then every input, over all transitions seen: those that were fitted, and those judged on."""
+    """Of every state of a model as given, then every input, as it was asked, over all transitions seen: those that
+    were fitted, and those judged on.
+    """
     units = getattr(model.nominal, "units", {})
     states = np.concatenate([steps.y0 for _, steps in seen])
-    asked = np.concatenate([acting(model, data).mean[steps.place] for data, steps in seen])
+    asked = np.concatenate([acting(model, data, ()).mean[steps.place] for data, steps in seen])
 
     def ranges() -> Iterator[Range]:
         for name, y in zip(model.states, states.T, strict=True):

@@ -30,7 +30,7 @@ TWICE = 2.0
 """Times the evidence of the best slide: where slides have much, so has whatever wanders, and the next slide may have more."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """log: largest log evidence; ridge: the 1/tau^2 that has it. values (m,), vectors (m, m): of K, none below 0."""
 

@@ -184,7 +184,7 @@ def _beside_pushes(left: Left, x: Array, beta: Array) -> float:
     """Nats of a field, fitted to beta alone, beside the pushes that wander most: both may be there, and a push that is free to follow time
     closely follows a field, too, and leaves more than both leave. One that adds nothing to the best of them is asked no further.
     """
-    pushes = [_scaled(push.x, slopes) for _, push, slopes in _pushes(left)]
+    pushes = [_scaled(push.x, own) for _, push, own in _pushes(left)]
     if not pushes:
         return -math.inf
     own, alone = _scaled(x, beta), max(bare_nats(left), wandering_nats(left))

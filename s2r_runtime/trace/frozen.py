@@ -29,6 +29,9 @@ either: on at least RESTS of them, of which less than REPEATS repeat, and whose 
 correlation of -1/2 from one residual to the next; a slow motion, or an effect that the model lacks, has none below zero.
 """
 
+BENDS = 5
+"""Rows after which a bend of an input is over, less those that it takes."""
+
 MOVING = 1.5
 """Times that a speed bends from row to row by noise, for white noise 1.65 standard deviations, from which on no robot stands."""
 
@@ -47,8 +50,9 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
         return []
     foretold = predicted(model, data, act, i)
     moves, e = model.difference(foretold, run.y[:-1]), model.difference(run.y[1:], foretold)
-    alone = lone_speeds(model.nominal)
-    speeds = {i for i, state in enumerate(model.states) if reach.instant[i] or state in alone} | {k.velocity for k in axes(model.nominal)}
+    speeds = {model.states.index(name) for name in lone_speeds(model.nominal)} | {axis.velocity for axis in axes(model.nominal)}
+    speeds |= {*np.flatnonzero(reach.instant).tolist()}
+    asked = run.u.reshape(len(run.y) - 1, -1, run.u.shape[1]).mean(axis=1)
     found = []
     for j, name in enumerate(model.states):
         change = np.abs(np.diff(run.y[:, j]))
@@ -59,7 +63,7 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
         for a, b in stretches(change == 0.0):
             if b - a < FROZEN_ROWS:
                 continue
-            if j in speeds and b - a >= RESTLESS and _stuck(run.y[:, j], e[:, j], (a, b), QUANTA * quantum):
+            if j in speeds and b - a >= RESTLESS and _stuck(run.y[:, j], e[:, j], asked, a, QUANTA * quantum):
                 bad[a + 1 : b + 1, j] = True
                 found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
                 continue
@@ -145,24 +149,46 @@ def _ignored(foretold: Array, y: Array, within: tuple[int, int], least: float) -
     return bool(np.count_nonzero(followed) > FOLLOWED * others and np.any(back))
 
 
-def _stuck(y: Array, e: Array, within: tuple[int, int], least: float) -> bool:
-    """Whether a speed y (K+1,) that jitters wherever it is not next to zero repeats a value that is not. Not its greatest one: there a
-    sensor may be at its end. e: (K,) its residuals; least: of jitter that is no rounding.
+def _stuck(y: Array, e: Array, u: Array, first: int, least: float) -> bool:
+    """Whether a speed y (K+1,) that jitters wherever it is not next to zero is not from its row `first` on, which it repeats. Not one that
+    hardly any exceeds: there a sensor may be at its end. e: (K,) its residuals; u: (K, nu) what was asked; least: of jitter that is no
+    rounding.
 
-    From row to row, noise of a measurement bends to and fro; what moves evenly, or follows its commands slowly, and is read without noise,
-    does not.
+    From row to row, noise of a measurement bends to and fro, whatever the inputs do; what moves evenly, or follows its commands in any
+    way, and is read without noise, does not. Where it repeats for as long elsewhere is not asked.
     """
-    a, b = within
-    value, change, bend = float(y[a]), np.diff(y), np.concatenate([[np.nan, np.nan], np.diff(e, n=2)])
-    others = np.isfinite(change) & np.isfinite(bend)
-    others[a : b + 3] = False
-    if np.count_nonzero(others) < RESTS or not np.any(y * math.copysign(1.0, value) > abs(value)):
+    value, change = float(y[first]), np.diff(y)
+    others = np.isfinite(change) & np.isfinite(e)
+    for a, b in stretches(change == 0.0):
+        if b - a >= FROZEN_ROWS:
+            others[a : b + 3] = False
+    others[:BENDS] = False
+    if np.count_nonzero(others) < RESTS or np.count_nonzero(np.abs(y) > abs(value)) < FROZEN_ROWS:
         return False
-    jitter = float(np.median(np.abs(bend[others])))
+    bend = _unasked(_bends(e[:, None])[:, 0], u, others)
+    others &= np.isfinite(bend)
+    jitter = float(np.median(np.abs(bend[others]))) if np.any(others) else 0.0
     others &= np.minimum(np.abs(y[1:]), np.abs(y[:-1])) > MOVING * jitter
     if jitter <= least or abs(value) <= MOVING * jitter or np.count_nonzero(others) < RESTS:
         return False
     return float(np.mean(change[others] == 0.0)) < REPEATS and _alternates(bend, others)
+
+
+def _bends(values: Array) -> Array:
+    """(K, c) second differences of values (K, c), at the last of three rows; NaN for the first two."""
+    return np.concatenate([np.full((2, values.shape[1]), np.nan), np.diff(values, n=2, axis=0)])[: len(values)]
+
+
+def _unasked(bend: Array, u: Array, there: Mask) -> Array:
+    """bend (K,) less what of it goes with bends of the inputs (K, nu), up to BENDS rows ago. there: (K,) by which that is told."""
+    asked = _bends(u)
+    lagged = np.column_stack([np.roll(asked, lag, axis=0) for lag in range(BENDS - 1)])
+    told = there & np.isfinite(bend) & np.isfinite(lagged).all(axis=1)
+    told[:BENDS] = False
+    if np.count_nonzero(told) < RESTS:
+        return np.full(len(bend), np.nan)
+    rest = bend - np.nan_to_num(lagged) @ np.linalg.lstsq(lagged[told], bend[told], rcond=1e-9)[0]
+    return np.where(np.isfinite(lagged).all(axis=1), rest, np.nan)
 
 
 def _restless(change: Array, e: Array, resting: Mask, within: tuple[int, int]) -> bool:

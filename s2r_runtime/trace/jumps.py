@@ -92,7 +92,7 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
         if not reach.instant[j]:
             for k, back in _offsets(series, single):
                 _take_out(found, model, data, i, j, k, back, bad)
-                if _stays(series, k, single):
+                if _stays(series, k, (bad[1:, j] | bad[:-1, j], single)):
                     found.sure.append(found.offsets[-1])
     return found
 
@@ -110,10 +110,13 @@ def _reached(series: Array, noise: float, least: float) -> float:
     return float(TAIL_SIGMAS * noise * (ONE_IN * len(wild)) ** np.mean(np.log(wild)))
 
 
-def _stays(series: Array, k: int, single: list[int]) -> bool:
-    """Whether a state mostly is off by the whole jump at step k on the rows after it, and none but jumps comes near to that."""
+def _stays(series: Array, k: int, apart: tuple[Mask, list[int]]) -> bool:
+    """Whether a state mostly is off by the whole jump at step k on the rows after it, and nothing else comes near to that: of steps that
+    are not taken out (K,), nor jumps.
+    """
     after, jump = np.cumsum(series[k : k + 1 + STAYS])[1:], float(series[k])
-    others = np.delete(np.abs(series), single)
+    out, jumps = apart
+    others = np.abs(series)[~(out | np.isin(np.arange(len(series)), jumps))]
     if len(after) < STAYS or not len(others) or abs(jump) <= FARTHER * float(np.max(others)):
         return False
     return bool(abs(float(np.median(after)) - jump) < 0.35 * abs(jump))

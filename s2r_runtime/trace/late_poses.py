@@ -9,13 +9,15 @@ explain the way aside clearly better than all that slides (slip, tyres, a measur
 worse than these with a lead or a lag of their own (w'), their numbers paid for. Nothing that slides looks ahead of how it turns, but tyres
 and whatever hovers follow it late: positions are late only if they clearly are no slide that follows by a lag, either, at no price for its
 numbers; or if they are as late along the way, against a measured speed. Inputs are not asked how late they act, which is another
-matter; but a heading that turns with them by far sooner than it is late would have turned before it was asked to.
+matter; but a heading that turns with them by far sooner than it is late would have turned before it was asked to, if positions show
+that inputs are not stamped late themselves. (Inputs that were measured by the late sensor itself are beyond that.)
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +27,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.fault import Fault
 from s2r_runtime.trace.speeds import less_noise
-from s2r_runtime.trace.streams import Stream, complete, fresh, unwrapped
+from s2r_runtime.trace.streams import Stream, complete, fresh, held, unwrapped
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -60,7 +62,7 @@ ALONG, SAME = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0), 0.25
 """Times how late positions are by their course, that are tried along the way; and by how much that may be another one."""
 
 SOONER, TURNS = 0.5, (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
-"""Of how late a heading is, by which at least it must seem to answer the inputs; and times that, at which it is asked to."""
+"""Of how late a heading is, by which at least it must seem to answer the inputs; and times that, at which it is asked to, and before."""
 
 LAGS = (0.25, 0.5, 0.75, 1.0, 1.5)
 """Time constants with which a slide may follow, times how late positions seem to be."""
@@ -93,43 +95,68 @@ def late_pose(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], m
         return {}
     states = Stream(states.t[:LOOKED_AT], unwrapped(states.values[:LOOKED_AT], [2]))
     by = _Ways(states).late()
-    if by > 0.0 and _answers_sooner(states, _turns_asked(model, names, whole, inputs), by):
+    if by > 0.0 and _turns_sooner(states, _asked(model, names, whole, inputs), by):
         return {}
     return {"theta": by} if by > 0.0 else {"x": -by, "y": -by} if by < 0.0 else {}
 
 
-def _turns_asked(model: ComposedModel, names: Sequence[str], states: Stream, inputs: Stream) -> Stream:
-    """(m, 1) by how much the heading has turned when each input begins to act, by the model, from where the robot was measured. names: of
-    the states that were.
-    """
-    there = np.isfinite(inputs.values).all(axis=1)
-    t, u = inputs.t[there], inputs.values[there]
+@dataclass(frozen=True)
+class _Asked:
+    """How far the inputs have turned the robot, rad, and taken it ahead, m, by stamps t (m,), by the model, from where it was measured."""
+
+    t: Array
+    turned: Array
+    gone: Array
+
+
+def _asked(model: ComposedModel, names: Sequence[str], states: Stream, inputs: Stream) -> _Asked | None:
+    """names: of the states that were measured. None where the model does not say, or inputs neither turn nor drive it."""
+    theta = model.states.index("theta")
+    t = np.union1d(states.t, inputs.t)
+    at = np.searchsorted(inputs.t, t, side="right") - 1
+    t, at = t[at >= 0], at[at >= 0]  # before the first one nobody knows
+    if len(t) < 2:
+        return None
+    u = held(inputs.values)[at]
     x = np.zeros((len(t), len(model.states)))
     for name, y in zip(names, states.values.T, strict=True):
-        good, column = np.isfinite(y), model.states.index(name)
-        y = np.unwrap(y[good]) if name in model.nominal.angles else y[good]
-        x[:, column] = np.interp(t, states.t[good], y)
+        good = np.isfinite(y)
+        if good.any():
+            y = np.unwrap(y[good]) if name in model.nominal.angles else y[good]
+            x[:, model.states.index(name)] = np.interp(t, states.t[good], y)
     try:
-        rate = model.difference(model.advance(x.copy(), u, u), x)[:, model.states.index("theta")] / model.dt
+        apart = model.difference(model.advance(x.copy(), u, u), model.advance(x.copy(), 0.0 * u, 0.0 * u)) / model.dt
     except ConfigError:  # somebody's own model need not step from where another state is not known
-        return Stream(t[:0], t[:0, None])
-    return Stream(t, np.concatenate([[0.0], np.cumsum(rate[:-1] * np.diff(t))])[:, None])
+        return None
+    ahead = sum(apart[:, model.states.index(name)] * way for name, way in (("x", np.cos(x[:, theta])), ("y", np.sin(x[:, theta]))))
+    turned, gone = (np.concatenate([[0.0], np.cumsum(rate[:-1] * np.diff(t))]) for rate in (apart[:, theta], np.asarray(ahead)))
+    return _Asked(t, turned, gone) if np.any(turned) and np.any(gone) else None
 
 
-def _answers_sooner(states: Stream, asked: Stream, late: float) -> bool:
-    """Whether the heading in states (x, y, theta, ...) clearly answers what turns it by less than SOONER times what it is late by."""
-    if len(asked.t) < FEWEST:
+def _turns_sooner(states: Stream, asked: _Asked | None, late: float) -> bool:
+    """Whether the heading in states (x, y, theta, ...) clearly answers what turns it by less than SOONER times what it is late by, and
+    positions do not answer what drives them before they are asked to: then stamps of inputs would be late.
+    """
+    if asked is None:
         return False
-    theta, h = np.diff(states.values[:, 2]), np.diff(states.t)
+    x, y, theta = states.values.T[:3]
+    middle = 0.5 * (theta[1:] + theta[:-1])
+    tried = np.array([-share for share in TURNS[:0:-1]] + [*TURNS])
+    turns = _nats_late(np.diff(theta), states.t, (asked.t, asked.turned), late * tried)
+    ways = _nats_late(np.cos(middle) * np.diff(x) + np.sin(middle) * np.diff(y), states.t, (asked.t, asked.gone), late * tried)
+    in_time, soon = tried > -SOONER, tried < SOONER
+    return bool(max(ways[in_time]) > max(ways[~in_time]) + CLEARLY and max(turns[soon]) > max(turns[~soon]) + CLEARLY)
+
+
+def _nats_late(ways: Array, t: Array, asked: tuple[Array, Array], late: Array) -> Array:
+    """Log likelihoods of ways (n,) between stamps t (n + 1,), in proportion to what was asked so many seconds before."""
     nats = []
-    for share in TURNS:
-        turned = np.diff(np.interp(states.t - share * late, asked.t, asked.values[:, 0]))
-        white = _white(np.column_stack([theta, turned, h]), SHARES[-1])
+    for by in late.tolist():
+        white = _white(np.column_stack([ways, np.diff(np.interp(t - by, *asked)), np.diff(t)]), SHARES[-1])
         rest = white[:, 0] - white[:, 1:] @ np.linalg.lstsq(white[:, 1:], white[:, 0], rcond=1e-9)[0]
         scale = max(1.4826 * float(np.median(np.abs(rest))), 1e-12)
         nats.append(float(np.sum(noises.log_density(rest / scale))) - len(rest) * math.log(scale))
-    best = int(np.argmax(nats))
-    return TURNS[best] < SOONER and nats[best] > max(n for n, share in zip(nats, TURNS, strict=True) if share >= SOONER) + CLEARLY
+    return np.array(nats)
 
 
 def earlier(segments: Sequence[tuple[Stream, Stream]], names: Sequence[str], behind: Mapping[str, float]) -> list[tuple[Stream, Stream]]:

@@ -75,7 +75,7 @@ class TraceResult:
     behind: dict[str, float] = field(default_factory=dict)
     """s by which states came late against others of the pose, and were taken earlier."""
     domain: tuple[Range, ...] = ()
-    """Of each state, then each input: where it was fitted and judged. Beyond that nothing speaks for what was found."""
+    """Of each state, then each input: where it was fitted or judged. Beyond that nothing speaks for what was found."""
 
     def same(self, found: Found) -> tuple[Found, ...]:
         """Of `ambiguous_with`: other names of the very same thing on this model."""
@@ -123,7 +123,7 @@ class TraceResult:
             names = ", ".join(f"{name} on {channel}" for name, channel in self.unconfirmed)
             lines.append(f"not confirmed: {names}; what it was judged on never asks for that, the fit alone speaks for it")
         if self.effects:
-            lines.append(f"fitted and judged where {domain_told(self.domain)}; elsewhere untested")
+            lines.append(f"fitted or judged where {domain_told(self.domain)}; elsewhere untested")
         if self.left_as_given:
             lines.append("the model stays as it was given: what ties does little here, and on another drive it may do more harm than good")
         if self.nominal.dt != self.spec.dt:
@@ -206,7 +206,7 @@ class TraceResult:
         """For the head of the model's TOML."""
         parts = self.reconstruction is not None and self.reconstruction.in_parts
         found = () if self.left_as_given else tuple(e.text() for e in self.effects)
-        found += (f"Fitted and judged where {domain_told(self.domain)}",) if found else ()
+        found += (f"Fitted or judged where {domain_told(self.domain)}",) if found else ()
         found += (IN_PARTS,) if parts else ()
         return (
             (f"Repaired by s2r trace on {self.source}: {self.verdict}", *found)
