@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from s2r_runtime.models.composed import compose
+from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.plugins import registry
 from s2r_runtime.trace import fields
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.fields import SEEN, field
-from s2r_runtime.trace.fitting import evaluate, problem
+from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
 from s2r_runtime.trace.lack_of_fit import _wanders, left_of
 from s2r_runtime.trace.lack_of_fit_judged import Judged
 from s2r_runtime.trace.residual import steps_of
@@ -284,3 +285,23 @@ def test_what_is_slow_in_a_short_drive_and_foretells_little_is_a_push_that_wande
     little = Judged("position", x, 12.0, 1.0, np.zeros((8, 2)))
     assert _wanders(left, little, enough=30.0)
     assert not _wanders(left, replace(little, gain=40.0), enough=30.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_model_and_a_dictionary_that_say_the_same_are_weighed_alike(seed):
+    """A gain of one input, fitted as a number and as a dictionary of one term: both explain the same, and pay about the same for it."""
+    rng = np.random.default_rng(seed)
+    u = _held(rng, 400, [-0.5, -1.2], [0.5, 1.2])
+    data, model = _recording(_driven(rng, u, lambda k, x, v, w: (v, 0.9 * w)), u)
+    given = problem(data, steps_of(data))
+    nominal = evaluate(given, model)
+    left = left_of(given, nominal)
+    gain = insert(model, AppliedEffect(registry().get("effects", "input_gain"), "w", {"gain": 0.9}), 0)
+    fit = fitted(given, nominal, gain)
+    price = 0.5 * math.log(len(given.steps))
+    as_model = fields.nats_of_fit(left, fit, price)
+    as_term = fields.nats_of(left, (given.predicted(model) - given.predicted(gain))[:, :, None])
+    assert fields.nats_of_fit(left, nominal, 0.0) == pytest.approx(0.0)
+    assert as_model == pytest.approx(fields.nats_of_fit(left, fit, 0.0) - price)
+    assert min(as_model, as_term) > 50.0
+    assert as_model - 12.0 < as_term < as_model + 3.0  # a term may be of any size: that costs up to log(1e5) / 2 more
