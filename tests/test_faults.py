@@ -457,8 +457,8 @@ def test_a_spike_does_not_hide_a_jump_among_outliers():
 
 @pytest.mark.parametrize("law", [_outlying, _heavy])
 def test_outliers_by_themselves_are_no_jump(law):
-    """Sixty recordings of either law."""
-    for seed in range(60):
+    """Thirty recordings of either law."""
+    for seed in range(30):
 
         def spoil(y, seed=seed):
             y += law(np.random.default_rng([seed, 1]), y.shape)

@@ -32,7 +32,7 @@ def test_of_a_field_and_a_shape_the_one_that_explains_more_comes_first(nats, fir
 def _likened(weighed, unnamed, shape=None, field=None):
     """What is told of a dictionary that is likeliest, of one that foretells other blocks of time best, of a shape and a field."""
     asked = whole.Whole.__new__(whole.Whole)
-    looks = SimpleNamespace(weighed=weighed, field=field, chosen=([], {}), left=None)
+    looks = SimpleNamespace(weighed=dict(weighed), field=field, chosen=([], {}), left=None)
     given = SimpleNamespace(floor=SimpleNamespace(axes=()))
     asked.__dict__.update(_looks=looks, given=given, unnamed=SimpleNamespace(token=unnamed[0], gain=unnamed[1]), _shape=shape)
     return asked._looks_like
@@ -44,19 +44,26 @@ def _field(*tokens, nats):
 
 def test_a_place_that_was_visited_once_is_told_though_nothing_foretells_it():
     """Dictionaries and fields are weighed alike; by what they foretell only where noise of some colour does nearly as well."""
-    assert _likened((("v*w",), 214.0), ("position", 40.0), field=_field("time*w", nats=140.0)) == ("v*w",)
-    assert _likened((("v*w",), 214.0), ("position", 40.0), field=_field("time*w", nats=240.0)) == ("time*w",)
-    assert _likened((("heading",), 2.0), ("position", 40.0), field=_field("time*w", nats=45.0)) == ("position",)
-    assert _likened((("heading",), 2.0), ("position", 40.0), field=_field("time*w", nats=55.0)) == ("time*w",)
+    assert _likened({"v*w": 214.0}, ("position", 40.0), field=_field("time*w", nats=140.0)) == ("v*w",)
+    assert _likened({"v*w": 214.0}, ("position", 40.0), field=_field("time*w", nats=240.0)) == ("time*w",)
+    assert _likened({"heading": 2.0}, ("position", 40.0), field=_field("time*w", nats=45.0)) == ("position",)
+    assert _likened({"heading": 2.0}, ("position", 40.0), field=_field("time*w", nats=55.0)) == ("time*w",)
 
 
 def test_of_fields_that_do_alike_the_one_of_the_likeliest_dictionary_comes_first():
-    assert _likened((("position",), 45.0), ("w", 9.0), field=_field("time*v", "position", nats=61.0)) == ("position", "time*v")
+    assert _likened({"position": 45.0}, ("w", 9.0), field=_field("time*v", "position", nats=61.0)) == ("position", "time*v")
+
+
+def test_what_foretells_best_is_told_beside_what_is_likeliest():
+    """If it is half as likely at least. Dictionaries that are as likely are told together."""
+    assert _likened({"force": 233.0, "speed": 204.0}, ("speed", 359.0)) == ("force", "speed")
+    assert _likened({"v": 73.0, "w": 4.0}, ("w", 78.0)) == ("v",)
+    assert _likened({"memory(w)": 44.9, "time*w": 44.8, "w": 18.0}, ("w", 9.0)) == ("memory(w)", "time*w")
 
 
 def test_a_shape_is_told_where_it_is_clearly_likelier():
-    assert _likened((("w",), 30.0), ("w", 9.0), shape=Better("memory(w)", 50.0)) == ("memory(w)",)
-    assert _likened((("w",), 48.0), ("w", 9.0), shape=Better("memory(w)", 50.0)) == ("w",)
+    assert _likened({"w": 30.0}, ("w", 9.0), shape=Better("memory(w)", 50.0)) == ("memory(w)",)
+    assert _likened({"w": 48.0}, ("w", 9.0), shape=Better("memory(w)", 50.0)) == ("w",)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -237,10 +237,9 @@ class Looks:
         return None if self.left.given.floor.axes else field(self.left)
 
     @cached_property
-    def weighed(self) -> tuple[tuple[str, ...], float]:
-        """What the likeliest of WEIGHED dictionaries depends on, others that say the same after it; and its nats, on a field's scale. What
-        holds in all blocks of time gains most where one is foretold from the others (`judged`): of what depends on a place that was
-        visited once, that says little.
+    def weighed(self) -> dict[str, float]:
+        """Nats of WEIGHED dictionaries by what they depend on, on a field's scale, the most first. What holds in all blocks of time gains
+        most where one is foretold from the others (`judged`): of what depends on a place that was visited once, that says little.
         """
         nats: dict[str, float] = {}
         for first, i in self.looked[:WEIGHED]:
@@ -248,8 +247,7 @@ class Looks:
                 token, x = self.found[i]
                 token = TOKENS.get(token, token)
                 nats[token] = max(nats.get(token, -math.inf), nats_of(self.left, leading(self.left, x)))
-        most = max(nats.values(), default=0.0)
-        return tuple(sorted((t for t in nats if nats[t] > most - ALIKE), key=lambda t: -nats[t])), most
+        return dict(sorted(nats.items(), key=lambda pair: -pair[1]))
 
     @cached_property
     def judged(self) -> list[Judged]:

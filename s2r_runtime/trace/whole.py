@@ -51,6 +51,9 @@ each is a little off.
 TWICE = 2.0
 """Times what the best dictionary explains that several together must explain to be told in its place: it does not do most of it."""
 
+HALF = 0.5
+"""Of what is told: a dictionary that foretells other blocks of time best, and is as likely as that, is told, too."""
+
 SOMEWHAT = 0.2
 """The same where one dictionary is held against several names: at first look it sees little beside all that it is not about."""
 
@@ -184,9 +187,12 @@ class Whole:
         other blocks of time.
         """
         left, shape, field = self._looks.left, self._shape, self._field
-        tokens, nats = ((), 0.0) if self.given.floor.axes else self._looks.weighed
+        each = {} if self.given.floor.axes else self._looks.weighed
+        nats = max(each.values(), default=0.0)
         weighed = nats > CLEAR
-        if not weighed:
+        if weighed:
+            tokens = tuple(token for token in each if each[token] > nats - ALIKE)
+        else:
             tokens, nats = (self.unnamed.token,), self.unnamed.gain
         if self._together:
             both = self._together[-1]
@@ -198,7 +204,8 @@ class Whole:
         if field is not None and field.nats > nats + (ALIKE if weighed else CLEAR):
             first = tokens[:1] if tokens[0] in field.tokens else ()
             tokens = tuple(dict.fromkeys((*first, *field.tokens)))
-        return tokens
+        foretells = weighed and self.unnamed.gain > CLEAR and each.get(self.unnamed.token, 0.0) > HALF * nats
+        return tuple(dict.fromkeys((*tokens, self.unnamed.token))) if foretells else tokens
 
     @property
     def _together(self) -> list[Judged]:
