@@ -146,6 +146,16 @@ def test_inputs_that_are_stamped_late_say_nothing_of_a_heading(heading, stamps):
     assert not _sooner(t, pose, Stream(t + stamps * ROW_S, u))
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_the_inputs_say_goes_before_the_ways(seed):
+    """Yaw rates that the late sensor itself measured turn with it: by the ways alone the heading is late, and that cannot be told then."""
+    t, pose, u = _driven(late_rows=(0, 4), seed=seed)
+    measured = np.column_stack([u[:, 0], np.concatenate([np.full(4, u[0, 1]), u[:-4, 1]])])
+    model = compose(ModelSpec("unicycle", 0.05))
+    assert late_pose(model, [(Stream(t, pose), Stream(t, u))], ()) == {"theta": pytest.approx(4 * ROW_S, rel=0.05)}
+    assert late_pose(model, [(Stream(t, pose), Stream(t, measured))], ()) == {}
+
+
 MEASURED = """
 import numpy as np
 

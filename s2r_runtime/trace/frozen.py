@@ -63,18 +63,14 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
         for a, b in stretches(change == 0.0):
             if b - a < FROZEN_ROWS:
                 continue
-            if j in speeds and b - a >= RESTLESS and _stuck(run.y[:, j], e[:, j], asked, a, QUANTA * quantum):
-                bad[a + 1 : b + 1, j] = True
-                found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
-                continue
-            if reach.instant[j]:
-                if b - a >= RESTLESS and _ignored(foretold[:, j], run.y[:, j], (a, b), least):
-                    bad[a + 1 : b + 1, j] = True
-                    found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
-                continue
-            if b - a >= RESTLESS and _restless(change, e[:, j], np.abs(moves[:, j]) < reach.noise[j], (a, b)):
-                bad[a + 1 : b + 1, j] = True
-                found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
+            told = b - a >= RESTLESS and j in speeds and _stuck(run.y[:, j], e[:, j], asked, a, QUANTA * quantum)
+            if b - a >= RESTLESS and not told and reach.instant[j]:
+                told = _ignored(foretold[:, j], run.y[:, j], (a, b), least)
+            elif b - a >= RESTLESS and not told:
+                told = _restless(change, e[:, j], np.abs(moves[:, j]) < reach.noise[j], (a, b))
+            if told:
+                found.append(_taken_out(data, i, j, name, (a, b), bad))
+            if told or reach.instant[j]:
                 continue
             if np.max(np.abs(np.cumsum(np.nan_to_num(moves[a:b, j])))) < least:
                 continue
@@ -87,8 +83,7 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
             caught_up = b < len(e) and abs(expected) > least and abs(off) < 0.5 * abs(expected)
             jitters = reach.noise[j] > QUANTA * quantum  # even where the robot stands
             if caught_up or (b - a > LONG_FROZEN and jitters and far > 10.0 * reach.move[j]):
-                bad[a + 1 : b + 1, j] = True
-                found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
+                found.append(_taken_out(data, i, j, name, (a, b), bad))
     return found + _with_them(model, data, i, bad)
 
 
@@ -126,9 +121,16 @@ def _with_them(model: ComposedModel, data: Dataset, i: int, bad: Mask) -> list[F
     for a, b in stretches(there):
         for j, name in enumerate(model.states):
             if hardly[j] and not np.any(bad[a + 1 : b + 1, j]) and np.all(still[a:b, j]):
-                bad[a + 1 : b + 1, j] = True
-                found.append(Fault(run.start_s + data.dt * a, run.start_s + data.dt * b, name, "frozen"))
+                found.append(_taken_out(data, i, j, name, (a, b), bad))
     return found
+
+
+def _taken_out(data: Dataset, i: int, j: int, name: str, within: tuple[int, int], bad: Mask) -> Fault:
+    """State j of run i, which repeats over the steps [a, b), marked in `bad` (K+1, nx) on the rows that repeat the first one."""
+    a, b = within
+    bad[a + 1 : b + 1, j] = True
+    begun = data.runs[i].start_s
+    return Fault(begun + data.dt * a, begun + data.dt * b, name, "frozen")
 
 
 def _ignored(foretold: Array, y: Array, within: tuple[int, int], least: float) -> bool:
