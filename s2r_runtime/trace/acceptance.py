@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.changes import happens
-from s2r_runtime.trace.fitting import SCORE_BLOCKS, WIDEST, Fit, Problem, gain, objective, refine, scatter
+from s2r_runtime.trace.fitting import SCORE_BLOCKS, WIDEST, Fit, Problem, gain, objective, refine, scatter, sought
 from s2r_runtime.trace.relevance import relevant
 from s2r_runtime.trace.scores import STRICT, Bar, limited, name_of, names
 from s2r_runtime.trace.slots import bounds_of, values_of
@@ -32,7 +32,7 @@ SOME = 4
 """Rounds of parameters under another law of noise."""
 
 BY_CHANCE = 0.05
-"""Chance of white noise to scatter as much between blocks of time, from which on it is taken to be white."""
+"""Chance that scores scatter less between blocks of time than their lower bound says."""
 
 
 def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int, bar: Bar = STRICT, ahead: float = 0.0) -> bool:
@@ -99,18 +99,21 @@ def significant(given: Problem, fit: Fit, base: Fit, tried: int, bar: Bar = STRI
         return reached > needed
     there = names(base.model)
     new = [i for i, slot in enumerate(fit.free) if name_of(fit.model.effects[slot.place]) not in there]
-    return reached > needed * _scattered(scatter(given, fit)[new])
+    wanders = any(noises.wandering(f.z, given.steps.joined, f.colour) is not None for f in (fit, base))
+    return reached > needed * _scattered(scatter(given, fit)[new], wanders or any(sought(fit.model, fit.free[i]) for i in new))
 
 
-def _scattered(ratios: Array) -> float:
-    """Times that scores of blocks scatter more than white noise, a ratio of variances: that of the number that does most so, 1 if chance
-    alone makes one of so many as large (chi-squared, a degree of freedom a block). ratios: (k,) of standard deviations.
+def _scattered(ratios: Array, wanders: bool) -> float:
+    """Times that scores of blocks scatter more than white noise, a ratio of variances, of the number that does most so: its lower bound
+    (chi-squared, a degree of freedom a block, BY_CHANCE shared by all numbers). wanders: noise does so by another test, too, or an effect
+    was found somewhere in time or among frequencies (`sought`), where noise does most: then all of it, once it is beyond chance.
+    ratios: (k,) of standard deviations.
     """
     from scipy.special import gammaincinv
 
     most = float(np.max(ratios, initial=1.0)) ** 2
     by_chance = 2.0 * float(gammaincinv(0.5 * SCORE_BLOCKS, 1.0 - BY_CHANCE / max(len(ratios), 1))) / SCORE_BLOCKS
-    return most if most > by_chance else 1.0
+    return 1.0 if most <= by_chance else most if wanders else most / by_chance
 
 
 def _beyond_wandering(given: Problem, fit: Fit, base: Fit, needed: float) -> bool:

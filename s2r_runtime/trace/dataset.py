@@ -337,25 +337,32 @@ def regridded(data: Dataset, model: ComposedModel, in_parts: int = 0, substeps: 
 def thinned(
     model: ComposedModel, data: Dataset, test: Dataset | None = None, parts: int = MOST_PARTS
 ) -> tuple[ComposedModel, Dataset, Dataset | None]:
-    """The same on the shortest steps that are independent of each other in both: unchanged, if they are. parts: S, where there are any."""
+    """The same on the shortest steps that are independent of each other in both: unchanged, if they are, unless steps shall be in more
+    parts. parts: S, where there are any.
+    """
     apart = max(data.apart, test.apart if test else 1)
     whole = data.reconstruction is None or data.interval * MOST_PARTS > data.dt
     made = data.reconstruction  # a hidden state's model may be one of whole steps: what is too coarse is asked of the model itself
-    if apart == 1 and whole and not (made and made.axes and not made.hidden and data.dt > LONG_S):
+    if apart == 1 and whole and not (made and made.axes and not made.hidden and data.dt > LONG_S) and parts == MOST_PARTS:
         return model, data, test
     longer = at_step(model, apart * model.dt)
     return longer, regridded(data, longer, parts), regridded(test, longer, parts) if test else None
 
 
 def in_finer_parts(data: Dataset, model: ComposedModel) -> Dataset | None:
-    """The same with steps in more parts, if inputs change within those that it has."""
+    """The same with each step taken in the parts that its inputs have, or in more of them if it is so already and inputs change within
+    those; None if they do not.
+    """
     rows = [np.diff(inputs.t) for _, inputs in data.segments]
     spacing = float(np.median(np.concatenate(rows))) if rows else 0.0
-    many = math.floor(min(FINER_PARTS, data.dt / spacing + ALIGNED) / data.substeps) if spacing > 0.0 else 0
-    if not data.in_parts or many < 2:
+    within = data.substeps if data.in_parts else 1
+    many = data.dt / spacing + ALIGNED if data.in_parts and spacing > 0.0 else data.substeps
+    times = math.floor(max(min(FINER_PARTS, many), data.substeps) / within)
+    if times < 2:
         return None
-    finer = regridded(data, model, many * data.substeps)
-    return finer if any(np.any(np.ptp(run.u.reshape(-1, many, run.u.shape[1]), axis=1)) for run in finer.runs) else None
+    finer = regridded(data, model, max(times * within, 2 * MOST_PARTS))
+    each = finer.substeps // within
+    return finer if any(np.any(np.ptp(run.u.reshape(-1, each, run.u.shape[1]), axis=1)) for run in finer.runs) else None
 
 
 def least_parts(model: ComposedModel) -> int:

@@ -392,6 +392,29 @@ def about(given: Problem, fit: Fit) -> Problem:
     return replace(given, steps=replace(begin, y1=steps.y1 - moved))
 
 
+def nearer(given: Problem, fit: Fit, base: Fit) -> float:
+    """Nats that a fit explains beyond another one more than `gain` tells, where each is asked about where the robot was (`about`): a force
+    that bends with a noisy state looks like noise of the process else. None if speeds were not measured: those are smoothed ones already.
+    """
+    if given.floor.axes:
+        return 0.0
+    one, other = (_where_it_was(given, f)[1] for f in (fit, base))
+    white, coloured = one.white - max(other.white, base.white), one.coloured - max(other.coloured, base.coloured)
+    return max(min(white, coloured) - gain(fit, base), 0.0)
+
+
+def _where_it_was(given: Problem, fit: Fit) -> tuple[Problem, Fit]:
+    """The transitions about where the robot was, and the fit on them, states and numbers in turn."""
+    problem = given
+    for _ in range(ABOUT if fit.free else 1):
+        before = values_of(fit.model, fit.free)
+        problem = about(given, evaluate(given, fit.model, fit.noise))
+        fit = fitted(problem, evaluate(problem, fit.model, fit.noise), fit.model, 2)
+        if np.allclose(values_of(fit.model, fit.free), before, rtol=STAYS, atol=0.0):
+            break
+    return problem, fit
+
+
 def told(given: Problem, fit: Fit) -> tuple[Fit, Problem, Fit]:
     """The fit with its numbers as they are told; the problem on which they are (`about`), and the fit on that."""
     turned = [
@@ -401,13 +424,7 @@ def told(given: Problem, fit: Fit) -> tuple[Fit, Problem, Fit]:
     if given.floor.axes or not fit.free:  # where speeds were not measured, the model is stepped from smoothed ones as it is
         fit = settled(given, fit)
         return fit, given, fit
-    problem, near = given, fit
-    for _ in range(ABOUT):
-        before = values_of(near.model, near.free)
-        problem = about(given, evaluate(given, near.model, near.noise))
-        near = fitted(problem, evaluate(problem, near.model, near.noise), near.model, 2)
-        if np.allclose(values_of(near.model, near.free), before, rtol=STAYS, atol=0.0):
-            break
+    problem, near = _where_it_was(given, fit)
     near = settled(problem, near)
     fit = evaluate(given, near.model, near.noise)
     return replace(fit, colour=noises.wandering(fit.z, given.steps.joined, fit.colour) or fit.colour), problem, near

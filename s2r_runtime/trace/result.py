@@ -129,7 +129,16 @@ class TraceResult:
         if self.nominal.dt != self.spec.dt:
             longer = f"fitted and judged on steps of {self.nominal.dt:g} s, the shortest that are independent"
             lines.append(f"{longer}; the model's are {self.spec.dt:g} s")
+        elif self._parts > 1:
+            lines.append(
+                f"each step in {self._parts} parts, within which inputs change: their means over whole steps leave more than noise"
+            )
         return tuple(lines)
+
+    @property
+    def _parts(self) -> int:
+        """Into how many parts a step of the model was cut for what it says."""
+        return self.held.data.substeps if self.held.data.in_parts else 1
 
     def _inputs_taken(self) -> list[str]:
         """How inputs were taken that the recording has samples of."""
@@ -198,6 +207,7 @@ class TraceResult:
             "unconfirmed": [{"name": name, "channel": channel} for name, channel in self.unconfirmed],
             "seen_within": {one.name: one.to_json() for one in self.domain},
             "step_s": self.nominal.dt,
+            "step_parts": self._parts,
             "n_fit": self.n_fit,
             "n_test": len(self.held.steps),
         }

@@ -88,7 +88,9 @@ CONTENDS, SETTLES = 15.0, 6
 (a gain and how fast a pose drifts), two rounds leave more than that open.
 """
 
-STRICT = Bar(1e-3)
+STRICT = Bar(1e-2)
+"""One clean recording in a hundred may be given a name, and Schwarz's price is paid besides: the likelihood is never quite right."""
+
 LENIENT, ALONE = Bar(0.3, 1.5), Bar(0.3, 1.5, 0.01)
 """For where structure is shown already, beside what was named and where nothing was: it shows in rollouts, so what leaves nothing of it may
 do a little less on a part of the data.

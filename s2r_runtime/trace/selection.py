@@ -14,7 +14,7 @@ from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.acceptance import accepted
 from s2r_runtime.trace.changes import from_the_beginning
 from s2r_runtime.trace.exchange import exchanged, overtaken, parted, pruned, unbent
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, plainly, without
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, nearer, plainly, without
 from s2r_runtime.trace.friction import KINDS, with_friction
 from s2r_runtime.trace.retimed import dated
 from s2r_runtime.trace.rivals import CLOSE, simplified
@@ -113,15 +113,20 @@ def against_rivals(given: Problem, chosen: Selection, bar: Bar) -> Selection:
 def one_more(given: Problem, chosen: Selection, horizon: int, foretells: Callable[[Fit, Fit], float]) -> Selection:
     """With an effect besides that falls short of what is needed on what was fitted, but not on all of the recording. foretells: nats by
     which one model foretells what was not fitted better than another one does: the probability of both parts is that of one times that
-    of the other, given the first, so they add. It counts for no more than the fit does.
+    of the other, given the first, so they add. It counts for no more than the fit does, which is asked about where the robot was.
     """
     fit = chosen.fit
     if len(fit.added) >= MOST or crowded(fit):
         return chosen
     for s in best_candidates(given, fit)[0][:CLOSE_BY]:
-        if s.fit is None or crowded(s.fit) or gain(s.fit, fit) < SHORT * STRICT.needed(chosen.tried, s.fit.k - fit.k, len(given.steps)):
+        if s.fit is None or crowded(s.fit):
             continue
-        ahead = min(foretells(s.fit, fit), gain(s.fit, fit))
+        needed, reached = STRICT.needed(chosen.tried, s.fit.k - fit.k, len(given.steps)), gain(s.fit, fit)
+        if s.fit.white - fit.white >= SHORT * needed:
+            reached += nearer(given, s.fit, fit)
+        if reached < SHORT * needed:
+            continue
+        ahead = reached - gain(s.fit, fit) + min(foretells(s.fit, fit), reached)
         if ahead > 0.0 and accepted(given, s.fit, fit, chosen.tried, horizon, ahead=ahead):
             more, found = overtaken(given, plainly(given, _doing_something(given, fitted(given, s.fit, s.fit.model))), STRICT)
             return replace(chosen, fit=more, rivals=tuple(found))

@@ -151,7 +151,7 @@ def _traced(
             break
     checked, judged_on, given = cut.checked, cut.judged_on, cut.given
     whole = Whole(checked, model, ahead)
-    chosen = foretold_too(given, chosen, judged_on, ahead)
+    chosen = foretold_too(given, whole.given, chosen, judged_on, ahead)
     chosen = confirmed(given, all_dated(given, whole.given, chosen), judged_on)
     say(80.0, 100.0, "testing what is left")
     structure = whole.structure(chosen)

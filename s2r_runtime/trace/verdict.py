@@ -106,9 +106,24 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
     return replace(chosen, fit=fit, rivals=tuple(found), risky=risky)
 
 
-def foretold_too(given: Problem, chosen: Selection, judged_on: Held, horizon: int) -> Selection:
-    """With an effect besides that only all of the recording shows."""
-    return one_more(given, chosen, horizon, lambda fit, base: foretelling(judged_on, [base, fit])[1])
+def foretold_too(given: Problem, everything: Problem, chosen: Selection, judged_on: Held, horizon: int) -> Selection:
+    """With an effect besides that only all of the recording shows. everything: of all its transitions."""
+
+    def ahead(fit: Fit, base: Fit) -> float:
+        told = foretelling(judged_on, [base, fit])[1]
+        return told if told <= 0.0 else max(told, _of_all(everything, fit, base) - gain(fit, base))
+
+    return one_more(given, chosen, horizon, ahead)
+
+
+def _of_all(everything: Problem, fit: Fit, base: Fit) -> float:
+    """Nats that a model explains of all transitions beyond another one, numbers and noise fitted on all of them: one law of noise for the
+    whole recording is told more sharply than one for each of its parts.
+    """
+    if any(foretold(everything, one.model) is None for one in (base, fit)):
+        return -math.inf
+    less, more = (fitted(everything, evaluate(everything, one.model, one.noise), one.model) for one in (base, fit))
+    return gain(more, less)
 
 
 def foretelling(judged_on: Held, fits: list[Fit]) -> list[float]:
