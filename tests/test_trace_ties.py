@@ -159,7 +159,7 @@ def test_two_effects_that_foretell_no_better_what_was_not_fitted_are_not_taken(t
 @pytest.mark.parametrize(("ratios", "taken"), [([1.3], 1.0), ([1.0, 1.4], 1.0), ([1.4], 1.96), ([1.0, 2.0], 4.0), ([], 1.0)])
 def test_scores_of_ten_blocks_scatter_by_as_much_as_chance_makes_them(ratios, taken):
     """Of one number, 1.35 times in one of 20 recordings; of two, 1.43 times."""
-    assert _scattered(np.array(ratios)) == pytest.approx(taken)
+    assert _scattered(np.array(ratios), True) == pytest.approx(taken)
 
 
 def _traced_pair(folder, seed):

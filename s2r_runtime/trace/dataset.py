@@ -354,15 +354,22 @@ def in_finer_parts(data: Dataset, model: ComposedModel) -> Dataset | None:
     those; None if they do not.
     """
     rows = [np.diff(inputs.t) for _, inputs in data.segments]
-    spacing = float(np.median(np.concatenate(rows))) if rows else 0.0
-    within = data.substeps if data.in_parts else 1
-    many = data.dt / spacing + ALIGNED if data.in_parts and spacing > 0.0 else data.substeps
-    times = math.floor(max(min(FINER_PARTS, many), data.substeps) / within)
-    if times < 2:
+    if not rows:
+        return None
+    spacing = float(np.median(np.concatenate(rows)))
+    whole = not data.in_parts
+    within = 1 if whole else data.substeps
+    many = data.substeps if whole else min(FINER_PARTS, data.dt / spacing + ALIGNED) if spacing > 0.0 else 0.0
+    times = math.floor(many / within)
+    if times < 2 or (whole and not _changes(data, times)):
         return None
     finer = regridded(data, model, max(times * within, 2 * MOST_PARTS))
-    each = finer.substeps // within
-    return finer if any(np.any(np.ptp(run.u.reshape(-1, each, run.u.shape[1]), axis=1)) for run in finer.runs) else None
+    return finer if _changes(finer, finer.substeps // within) else None
+
+
+def _changes(data: Dataset, parts: int) -> bool:
+    """Whether inputs change within so many parts of a step that lie together."""
+    return any(bool(np.any(np.ptp(run.u.reshape(-1, parts, run.u.shape[1]), axis=1))) for run in data.runs)
 
 
 def least_parts(model: ComposedModel) -> int:
