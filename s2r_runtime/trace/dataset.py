@@ -335,36 +335,44 @@ def regridded(data: Dataset, model: ComposedModel, in_parts: int = 0, substeps: 
 
 
 def thinned(
-    model: ComposedModel, data: Dataset, test: Dataset | None = None, parts: int = MOST_PARTS
+    model: ComposedModel, data: Dataset, test: Dataset | None = None, parts: int | None = None
 ) -> tuple[ComposedModel, Dataset, Dataset | None]:
-    """The same on the shortest steps that are independent of each other in both: unchanged, if they are, unless steps shall be in more
-    parts. parts: S, where there are any.
+    """The same on the shortest steps that are independent of each other in both: unchanged, if they are, unless `parts` of them are asked
+    for. parts: S, or None for as many as are usual where steps were made longer.
     """
     apart = max(data.apart, test.apart if test else 1)
     whole = data.reconstruction is None or data.interval * MOST_PARTS > data.dt
     made = data.reconstruction  # a hidden state's model may be one of whole steps: what is too coarse is asked of the model itself
-    if apart == 1 and whole and not (made and made.axes and not made.hidden and data.dt > LONG_S) and parts == MOST_PARTS:
+    if parts is None and apart == 1 and whole and not (made and made.axes and not made.hidden and data.dt > LONG_S):
         return model, data, test
     longer = at_step(model, apart * model.dt)
-    return longer, regridded(data, longer, parts), regridded(test, longer, parts) if test else None
+
+    def again(one: Dataset) -> Dataset:
+        if apart > 1:
+            return regridded(one, longer, parts or MOST_PARTS)
+        if not one.segments:  # arrays: inputs change with their rows
+            return one
+        return replace(regridded(one, longer, parts or MOST_PARTS), campaign=one.campaign)  # the step is the same, and so are its samples
+
+    return longer, again(data), again(test) if test else None
 
 
 def in_finer_parts(data: Dataset, model: ComposedModel) -> Dataset | None:
     """The same with each step taken in the parts that its inputs have, or in more of them if it is so already and inputs change within
-    those; None if they do not.
+    those; None if they do not, or where a hidden state was told by whole steps.
     """
-    rows = [np.diff(inputs.t) for _, inputs in data.segments]
-    if not rows:
+    told_by_whole = data.reconstruction is not None and data.reconstruction.hidden
+    if not data.segments or (told_by_whole and not data.in_parts):
         return None
-    spacing = float(np.median(np.concatenate(rows)))
-    whole = not data.in_parts
-    within = 1 if whole else data.substeps
-    many = data.substeps if whole else min(FINER_PARTS, data.dt / spacing + ALIGNED) if spacing > 0.0 else 0.0
-    times = math.floor(many / within)
-    if times < 2 or (whole and not _changes(data, times)):
+    if not data.in_parts:
+        finer = max(data.substeps, 2 * MOST_PARTS)  # more than there are of a step that was made longer
+        return regridded(data, model, finer) if data.substeps > 1 and _changes(data, data.substeps) else None
+    spacing = float(np.median(np.concatenate([np.diff(inputs.t) for _, inputs in data.segments])))
+    times = math.floor(min(FINER_PARTS, data.dt / spacing + ALIGNED) / data.substeps) if spacing > 0.0 else 0
+    if times < 2:
         return None
-    finer = regridded(data, model, max(times * within, 2 * MOST_PARTS))
-    return finer if _changes(finer, finer.substeps // within) else None
+    finer_still = regridded(data, model, times * data.substeps)
+    return finer_still if _changes(finer_still, times) else None
 
 
 def _changes(data: Dataset, parts: int) -> bool:

@@ -394,9 +394,9 @@ def about(given: Problem, fit: Fit) -> Problem:
 
 def nearer(given: Problem, fit: Fit, base: Fit) -> float:
     """Nats that a fit explains beyond another one more than `gain` tells, where each is asked about where the robot was (`about`): a force
-    that bends with a noisy state looks like noise of the process else. None if speeds were not measured: those are smoothed ones already.
+    that bends with a noisy state looks like noise of the process else. 0 where states were reconstructed: those are smoothed already.
     """
-    if given.floor.axes:
+    if given.floor.axes or given.data.reconstruction is not None:
         return 0.0
     one, other = (_where_it_was(given, f)[1] for f in (fit, base))
     white, coloured = one.white - max(other.white, base.white), one.coloured - max(other.coloured, base.coloured)

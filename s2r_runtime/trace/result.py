@@ -129,7 +129,7 @@ class TraceResult:
         if self.nominal.dt != self.spec.dt:
             longer = f"fitted and judged on steps of {self.nominal.dt:g} s, the shortest that are independent"
             lines.append(f"{longer}; the model's are {self.spec.dt:g} s")
-        elif self._parts > 1:
+        elif self._parts > 1 and self.reconstruction is None:
             lines.append(
                 f"each step in {self._parts} parts, within which inputs change: their means over whole steps leave more than noise"
             )

@@ -2,35 +2,72 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+
+import numpy as np
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.dataset import Dataset, in_finer_parts
 from s2r_runtime.trace.errors import Held, at_most_seen, judge, noise_floor
 from s2r_runtime.trace.faults import check
-from s2r_runtime.trace.fitting import Problem, fitted
+from s2r_runtime.trace.fitting import Fit, Problem, fitted, problem
 from s2r_runtime.trace.hidden_pairs import two_together
 from s2r_runtime.trace.lack_of_fit import Structure
+from s2r_runtime.trace.residual import acting, predicted, steps_of
+from s2r_runtime.trace.residual_noise import Whitener
 from s2r_runtime.trace.retimed import dated
 from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, Scored, names
 from s2r_runtime.trace.selection import Selection, against_rivals, all_dated, called_for, crowded
 from s2r_runtime.trace.verdict import confirmed, foretelling, takes_far
 from s2r_runtime.trace.whole import Whole
 
+MAKES = 0.5
+"""Of what structure is told by, in nats, that inputs within steps must make at the least to be the reason."""
 
-def finer(dataset: Dataset, model: ComposedModel, chosen: Selection, ahead: int) -> int | None:
+INTEGRATES = 0.1
+"""Of what parts of steps make, that may come of the model's integration: a model whose own steps are too coarse is not tried on finer ones,
+which nobody has.
+"""
+
+
+def finer(dataset: Dataset, model: ComposedModel, chosen: Selection, structure: Structure, ahead: int) -> int | None:
     """Parts of a step in which nothing is left by what was found, or by the model as given, if there are such: then it is what inputs do
-    within the parts there are. Of what they do a part has the mean, and a position more.
+    within steps, or within the parts that they are in already. A step has the mean of what they do, and a position more.
     """
     data = in_finer_parts(dataset, model)
     if data is None:
         return None
+    makes = _makes(dataset, data, chosen.fit)
+    if makes < MAKES * max([structure.nats, *structure.gains.values()]):
+        return None
+    if not dataset.in_parts:
+        means = _with_means(data)
+        if any(_makes(replace(means, in_parts=False), means, fit) > INTEGRATES * makes for fit in (chosen.nominal, chosen.fit)):
+            return None
     checked = check(model, with_history(model, data))
     whole = Whole(checked, model, ahead)
     nominal = whole.nominal
     fit = nominal if not chosen.fit.added else fitted(whole.given, nominal, chosen.fit.model)
     return None if whole.structure(replace(chosen, nominal=nominal, fit=fit)).matters else data.substeps
+
+
+def _makes(dataset: Dataset, data: Dataset, fit: Fit) -> float:
+    """Nats that residuals of the same steps in other parts are apart, under the noise of a fit: structure can owe no more to them."""
+    steps, others = steps_of(dataset), steps_of(data)
+    if len(steps) != len(others):
+        return math.inf
+    apart = fit.model.difference(*(predicted(fit.model, s, acting(fit.model, d)) for s, d in ((others, data), (steps, dataset))))
+    whiten = Whitener(fit.noise, problem(dataset, steps).jacobian(fit.model), steps.joined)
+    return 0.5 * float(np.sum(whiten(apart) ** 2))
+
+
+def _with_means(data: Dataset) -> Dataset:
+    """The same with each step's mean input in all of its parts."""
+    s = data.substeps
+    means = [np.repeat(run.u.reshape(-1, s, run.u.shape[1]).mean(axis=1), s, axis=0) for run in data.runs]
+    return replace(data, runs=tuple(replace(run, u=u) for run, u in zip(data.runs, means, strict=True)))
 
 
 def astray(chosen: Selection, structure: Structure, judged_on: Held, seed: int) -> bool:

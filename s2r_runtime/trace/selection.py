@@ -126,8 +126,9 @@ def one_more(given: Problem, chosen: Selection, horizon: int, foretells: Callabl
             reached += nearer(given, s.fit, fit)
         if reached < SHORT * needed:
             continue
-        ahead = reached - gain(s.fit, fit) + min(foretells(s.fit, fit), reached)
-        if ahead > 0.0 and accepted(given, s.fit, fit, chosen.tried, horizon, ahead=ahead):
+        told = foretells(s.fit, fit)
+        ahead = reached - gain(s.fit, fit) + min(told, reached)
+        if told > 0.0 and accepted(given, s.fit, fit, chosen.tried, horizon, ahead=ahead):
             more, found = overtaken(given, plainly(given, _doing_something(given, fitted(given, s.fit, s.fit.model))), STRICT)
             return replace(chosen, fit=more, rivals=tuple(found))
     return chosen

@@ -27,7 +27,7 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.trace.answer import answered, with_time
 from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.begun import begun
-from s2r_runtime.trace.dataset import MOST_PARTS, Dataset, thinned
+from s2r_runtime.trace.dataset import Dataset, thinned
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.errors import Held, Kind, displacement, held, judge
 from s2r_runtime.trace.faults import Checked, check
@@ -112,9 +112,9 @@ def _traced(
     seed: int,
     say: Progress,
     norm: tuple[tuple[float, ...] | None, Kind],
-    parts: int = MOST_PARTS,
+    parts: int | None = None,
 ) -> TraceResult:
-    """parts: S, of a thinned recording."""
+    """parts: S, of each step, where they were asked for (`finer`)."""
     weights, kind = norm
     asked, as_recorded = model, (dataset, test)
     if not model.inputs:
@@ -157,8 +157,8 @@ def _traced(
     structure = whole.structure(chosen)
     if structure.matters or astray(chosen, structure, judged_on, seed):
         chosen, structure = once_more(given, whole, chosen, structure, judged_on, ahead)
-    if structure.matters and parts == MOST_PARTS:
-        more = finer(dataset, model, chosen, ahead)
+    if structure.matters and parts is None:
+        more = finer(dataset, model, chosen, structure, ahead)
         if more is not None:
             return _traced(as_recorded[0], asked, as_recorded[1], horizon, seed, _from(80.0, say), norm, more)
     say(90.0, 100.0, "judging on held-out data")
@@ -208,7 +208,13 @@ def _from(begun: float, say: Progress) -> Progress:
 
 
 def _straight(
-    recorded: tuple[Dataset, Dataset | None], asked: ComposedModel, parts: int, checked: Checked, seen: Mask, given: Problem, fit: Fit
+    recorded: tuple[Dataset, Dataset | None],
+    asked: ComposedModel,
+    parts: int | None,
+    checked: Checked,
+    seen: Mask,
+    given: Problem,
+    fit: Fit,
 ) -> tuple[Dataset, Dataset | None] | None:
     """The recordings with inputs that moved on between the rows, if the motion says that they did."""
     if recorded[0].way or not (sampled(recorded[0]) or commanded(recorded[0])):

@@ -30,6 +30,7 @@ from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import Mask, acting, first_steps, predicted, rms
 from s2r_runtime.trace.residual_noise import OUTLIER
 from s2r_runtime.trace.rivals import representative, tied
+from s2r_runtime.trace.scores import STRICT
 from s2r_runtime.trace.selection import Selection, one_more
 from s2r_runtime.trace.slots import slots_of
 
@@ -107,11 +108,14 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
 
 
 def foretold_too(given: Problem, everything: Problem, chosen: Selection, judged_on: Held, horizon: int) -> Selection:
-    """With an effect besides that only all of the recording shows. everything: of all its transitions."""
+    """With an effect besides that only all of the recording shows. everything: transitions of all of it (as many as are fitted at most)."""
 
     def ahead(fit: Fit, base: Fit) -> float:
         told = foretelling(judged_on, [base, fit])[1]
-        return told if told <= 0.0 else max(told, _of_all(everything, fit, base) - gain(fit, base))
+        if told <= 0.0 or len(everything.steps) <= len(given.steps):
+            return told
+        dearer = STRICT.price(fit.k - base.k, len(everything.steps)) - STRICT.price(fit.k - base.k, len(given.steps))
+        return max(told, _of_all(everything, fit, base) - gain(fit, base) - dearer)
 
     return one_more(given, chosen, horizon, ahead)
 
