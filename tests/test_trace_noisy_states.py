@@ -10,7 +10,7 @@ from trace_robots import commands, drive
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace import selection, verdict
+from s2r_runtime.trace import second_look, selection, verdict
 from s2r_runtime.trace.acceptance import BY_CHANCE, _scattered
 from s2r_runtime.trace.dataset import from_arrays, from_streams
 from s2r_runtime.trace.fitting import SCORE_BLOCKS, evaluate, fitted, gain, insert, nearer, problem
@@ -170,6 +170,18 @@ def test_what_commands_do_within_steps_is_no_structure():
     assert result.to_json()["step_parts"] == 10
     judged = trace(data, model, test=from_arrays(model, [(y, u)]))  # arrays have no stamps: their inputs change with their rows
     assert len(judged.held.steps) == 400
+
+
+def test_parts_in_which_a_model_gives_no_numbers_are_no_reason(monkeypatch):
+    """What was left by whole steps stays left, and the trace ends."""
+    rng = np.random.default_rng(4)
+    u = _held(rng, 400, [-2.0, -2.0], [2.0, 2.0])
+    y = _late(u, np.zeros(4), _mass, 0.02) + rng.normal(size=(401, 4)) * [7e-5, 7e-5, 1e-4, 1e-4]
+    model = compose(ModelSpec("double_integrator", 0.02, {}, ()))
+    monkeypatch.setattr(second_look, "foretold", lambda given, model: None)
+    result = trace(_streams(model, y, u, 0.02), model)
+    assert result.verdict == "unexplained"
+    assert result.to_json()["step_parts"] == 1
 
 
 @pytest.mark.parametrize("seed", [4, 6])

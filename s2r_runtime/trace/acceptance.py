@@ -17,6 +17,7 @@ from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.changes import happens
 from s2r_runtime.trace.fitting import SCORE_BLOCKS, WIDEST, Fit, Problem, gain, objective, refine, scatter, sought
 from s2r_runtime.trace.relevance import relevant
+from s2r_runtime.trace.residual_noise import Colour
 from s2r_runtime.trace.scores import STRICT, Bar, limited, name_of, names
 from s2r_runtime.trace.slots import bounds_of, values_of
 
@@ -93,14 +94,17 @@ def significant(given: Problem, fit: Fit, base: Fit, tried: int, bar: Bar = STRI
     each = noises.log_density(fit.z).sum(axis=1) - noises.log_density(base.z).sum(axis=1)
     if reached - max(float(np.max(each, initial=0.0)), 0.0) <= needed:
         return False
-    if reached > needed and not _beyond_wandering(given, fit, base, needed - ahead):
+    if reached <= needed:
         return False
-    if reached <= needed or reached > WIDEST**2 * needed or not fit.free:
-        return reached > needed
+    law, bare = (noises.wandering(f.z, given.steps.joined, f.colour) for f in (fit, base))
+    if not _beyond_wandering(given, fit, base, law, bare, needed - ahead):
+        return False
+    if reached > WIDEST**2 * needed or not fit.free:
+        return True
     there = names(base.model)
     new = [i for i, slot in enumerate(fit.free) if name_of(fit.model.effects[slot.place]) not in there]
-    wanders = any(noises.wandering(f.z, given.steps.joined, f.colour) is not None for f in (fit, base))
-    return reached > needed * _scattered(scatter(given, fit)[new], wanders or any(sought(fit.model, fit.free[i]) for i in new))
+    wanders = law is not None or bare is not None or any(sought(fit.model, fit.free[i]) for i in new)
+    return reached > needed * _scattered(scatter(given, fit)[new], wanders)
 
 
 def _scattered(ratios: Array, wanders: bool) -> float:
@@ -116,13 +120,13 @@ def _scattered(ratios: Array, wanders: bool) -> float:
     return 1.0 if most <= by_chance else most if wanders else most / by_chance
 
 
-def _beyond_wandering(given: Problem, fit: Fit, base: Fit, needed: float) -> bool:
+def _beyond_wandering(given: Problem, fit: Fit, base: Fit, law: Colour | None, bare: Colour | None, needed: float) -> bool:
     """Whether an effect gains as much where what is left with it wanders: under the law of that, and with that law estimated without the
     effect, too. In closed loop inputs answer what wanders, a moment later: an effect on them then takes up a part of it. Under that law,
     estimates are those of the prediction error (L. Ljung, System identification, 1999, ch. 13: in closed loop right if the noise's law is).
+    law, bare: what wanders with the effect, and without it (`residual_noise.wandering`).
     """
     joined = given.steps.joined
-    law, bare = (noises.wandering(f.z, joined, f.colour) for f in (fit, base))
     if law is None and bare is not None:  # an effect explains more than the law of all that is left without it
         with_it, without = (noises.log_likelihood(f.z, f.whiten, c, joined) for f, c in ((fit, fit.colour), (base, bare)))
         return with_it - without > needed

@@ -12,10 +12,10 @@ from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.dataset import Dataset, in_finer_parts
 from s2r_runtime.trace.errors import Held, at_most_seen, judge, noise_floor
 from s2r_runtime.trace.faults import check
-from s2r_runtime.trace.fitting import Fit, Problem, fitted, problem
+from s2r_runtime.trace.fitting import Fit, Problem, fitted, foretold, problem
 from s2r_runtime.trace.hidden_pairs import two_together
 from s2r_runtime.trace.lack_of_fit import Structure
-from s2r_runtime.trace.residual import acting, predicted, steps_of
+from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.residual_noise import Whitener
 from s2r_runtime.trace.retimed import dated
 from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, Scored, names
@@ -40,11 +40,11 @@ def finer(dataset: Dataset, model: ComposedModel, chosen: Selection, structure: 
     if data is None:
         return None
     makes = _makes(dataset, data, chosen.fit)
-    if makes < MAKES * max([structure.nats, *structure.gains.values()]):
+    if not makes >= MAKES * max([structure.nats, *structure.gains.values()]):
         return None
     if not dataset.in_parts:
         means = _with_means(data)
-        if any(_makes(replace(means, in_parts=False), means, fit) > INTEGRATES * makes for fit in (chosen.nominal, chosen.fit)):
+        if not all(_makes(replace(means, in_parts=False), means, fit) <= INTEGRATES * makes for fit in (chosen.nominal, chosen.fit)):
             return None
     checked = check(model, with_history(model, data))
     whole = Whole(checked, model, ahead)
@@ -54,13 +54,15 @@ def finer(dataset: Dataset, model: ComposedModel, chosen: Selection, structure: 
 
 
 def _makes(dataset: Dataset, data: Dataset, fit: Fit) -> float:
-    """Nats that residuals of the same steps in other parts are apart, under the noise of a fit: structure can owe no more to them."""
-    steps, others = steps_of(dataset), steps_of(data)
-    if len(steps) != len(others):
-        return math.inf
-    apart = fit.model.difference(*(predicted(fit.model, s, acting(fit.model, d)) for s, d in ((others, data), (steps, dataset))))
-    whiten = Whitener(fit.noise, problem(dataset, steps).jacobian(fit.model), steps.joined)
-    return 0.5 * float(np.sum(whiten(apart) ** 2))
+    """Nats that residuals of the same steps in other parts are apart, under a fit's noise: structure can owe no more to them. NaN, which
+    is no reason for parts, if the steps are others, or a user's own model gives no numbers there.
+    """
+    before, after = (problem(d, steps_of(d)) for d in (dataset, data))
+    there = [foretold(given, fit.model) for given in (before, after)]
+    if len(before.steps) != len(after.steps) or there[0] is None or there[1] is None:
+        return math.nan
+    whiten = Whitener(fit.noise, before.jacobian(fit.model), before.steps.joined)
+    return 0.5 * float(np.sum(whiten(fit.model.difference(there[1], there[0])) ** 2))
 
 
 def _with_means(data: Dataset) -> Dataset:
