@@ -25,7 +25,10 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_configure(config):
-    """A home of its own for every process that runs tests, and for what it starts."""
+    """A home of its own for every process that runs tests, and for what it starts; and one thread for its linear algebra, as the verbs have
+    it: several that wait for each other on two busy cores take many times as long as one.
+    """
+    os.environ.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
     home = tempfile.TemporaryDirectory(prefix="s2r-tests-home-")
     config.add_cleanup(home.cleanup)
     for name in ("XDG_CONFIG_HOME", "XDG_STATE_HOME"):

@@ -245,6 +245,15 @@ def test_what_acts_at_the_ends_of_steps_is_exact_behind_a_lag_a_ramp_and_a_delay
         assert acting(one, data).end[:, 0] == pytest.approx(ends, abs=off)
 
 
+@pytest.mark.parametrize("delay", [0.0, 0.02, 0.05, 0.1234, 0.35, 2.0, 9.0])
+def test_a_delay_of_even_rows_ends_them_as_one_of_rows_of_any_length_does(delay):
+    model = compose(ModelSpec("differential_drive", 0.05, {}, (EffectSpec("input_delay", "*", {"delay": delay}),)))
+    u = np.random.default_rng(3).normal(size=(60, 3, 2))
+    effect = model.effects[0].effect
+    even, uneven = (effect.at_end((u, u, u), None, model.nominal, "*", dt, {"delay": delay}) for dt in (0.05, np.full((60, 1, 1), 0.05)))
+    assert np.array_equal(even, uneven)
+
+
 def test_a_delay_may_stand_before_or_behind_a_lag_and_the_wheel_is_where_both_have_it():
     lag, delay = EffectSpec("input_lag", "cmd_left", {"time_constant": 0.08}), EffectSpec("input_delay", "cmd_left", {"delay": 0.034})
     u = np.repeat(np.random.default_rng(4).normal(size=(15, 2)).round(1), 4, axis=0)

@@ -16,8 +16,9 @@ from s2r_runtime.models.double_integrator import DoubleIntegrator
 from s2r_runtime.models.file_model import FileModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import fields, fitting, lack_of_fit, relevance, residual, retimed, scores
+from s2r_runtime.trace import exchange, fields, fitting, lack_of_fit, relevance, residual, retimed, scores
 from s2r_runtime.trace.chains import Inputs
+from s2r_runtime.trace.changes import rivals_that_happen
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import Held, noise_floor
 from s2r_runtime.trace.fields import Field
@@ -308,3 +309,59 @@ def test_a_field_that_was_looked_at_goes_on_from_there(monkeypatch):
     asked = len(passes)
     fields._marginal(left, offer.x, fields.PASSES)
     assert len(passes) == 2 * asked + 1
+
+
+def test_a_candidate_that_is_fitted_already_is_not_fitted_again(monkeypatch):
+    given, fit = _given()
+    (place,) = fit.added
+    base = fitted(given, fit, without(fit.model, place), 1)
+    mine = scores.name_of(fit.model.effects[place])
+    began: list[tuple[tuple[str, str], ...]] = []
+
+    def counted(given, start, model, rounds, hopeless):
+        began.append(scores.names(model))
+        return fitted(given, start, model, rounds, hopeless)
+
+    monkeypatch.setattr(scores, "fitted", counted)
+    itself = scores.Scored(*mine, fitting.gain(fit, base), fit)
+    found, _ = scores.best_candidates(given, base, known=itself)
+    assert found[0] is itself
+    assert began
+    assert (mine,) not in began
+    given.searches.clear()
+    again, _ = scores.best_candidates(given, base)
+    assert (mine,) in began
+    assert {(s.name, s.channel) for s in found} == {(s.name, s.channel) for s in again}
+
+
+def test_a_rival_takes_its_place_at_once_and_only_then_are_the_others_asked_again(monkeypatch):
+    """Drag, dry friction in the place of the other axis' drag, and a push."""
+    drags = [EffectSpec("viscous_friction", name, {"coefficient": 0.3}) for name in ("vx", "vy")]
+    push = EffectSpec("constant_disturbance", "world", {"x": 0.2, "y": 0.1})
+    robot, model = (compose(ModelSpec("double_integrator", DT_S, {}, effects)) for effects in ((*drags, push), ()))
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.uniform(-1.0, 1.0, (ROWS // 10, 2)), 20, axis=0)
+    x, hidden, rows = np.zeros((1, 4)), robot.at_rest(1), [np.zeros(4)]
+    for k in range(len(u)):
+        x, hidden = robot.step(x, u[k : k + 1], hidden)
+        rows.append(x[0])
+    data = from_arrays(model, [(np.array(rows) + 0.002 * rng.normal(size=(len(rows), 4)), u)])
+    given = problem(data, steps_of(data))
+    dry = AppliedEffect(registry().get("effects", "coulomb_friction"), "vy", {"force": 0.1})
+    start = evaluate(given, model)
+    for a in (robot.effects[0], dry, robot.effects[2]):
+        start = fitted(given, start, insert(start.model, a, len(start.model.effects)))
+    asked: list[tuple[str, str]] = []
+
+    def counted(given, fit, places):
+        asked.extend(scores.name_of(fit.model.effects[place]) for place in places)
+        return rivals_that_happen(given, fit, places)
+
+    monkeypatch.setattr(exchange, "rivals_that_happen", counted)
+    fit, rivals = exchange.overtaken(given, start, scores.STRICT)
+    ahead, behind = ("viscous_friction", "vx"), ("constant_disturbance", "world")
+    assert asked[:3] == [ahead, ("coulomb_friction", "vy"), ("viscous_friction", "vy")]
+    assert sorted(asked[3:]) == sorted([ahead, behind])
+    assert {scores.name_of(fit.model.effects[i]) for i in fit.added} == {ahead, ("viscous_friction", "vy"), behind}
+    kept = {*scores.names(fit.model)}
+    assert all(len({*scores.names(s.fit.model)} - kept) == 1 for s in rivals if s.fit is not None)

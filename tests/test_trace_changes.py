@@ -87,7 +87,7 @@ def test_a_change_before_the_robot_moves_is_no_rival(monkeypatch):
         found("regime_change", {"time": 3.0, "gain": 0.95}),
         found("input_gain_asymmetry", {"gain_positive": 0.9, "gain_negative": 0.9}),
     ]
-    monkeypatch.setattr(changes, "rivals", lambda given, fit: others)
+    monkeypatch.setattr(changes, "rivals_of", lambda given, fit, place: others)
     assert rivals_that_happen(given, gain.fit) == others[1:]
 
 

@@ -73,6 +73,10 @@ class InputDelay(InputEffect):
             whole, _ = _steps(p["delay"], float(np.min(dt)))
             line = np.concatenate([u, before], axis=1).reshape(len(u), whole + 2, u.shape[1])
             return replaced(acting, model, channel, line[:, whole])
+        if not mixed and not isinstance(dt, np.ndarray):
+            whole, _ = _steps(p["delay"], dt)
+            line = np.concatenate([np.zeros((whole, *u.shape[1:])), u])
+            return replaced(acting, model, channel, line[: len(u)])
         lasts = np.broadcast_to(dt, (len(u), *u.shape[1:-1], 1))[..., 0].reshape(len(u), -1)
         runs = u.reshape(len(u), lasts.shape[1], -1)
         late = np.stack([_before(runs[:, i], lasts[:, i], float(p["delay"]), mixed=mixed) for i in range(lasts.shape[1])], axis=1)

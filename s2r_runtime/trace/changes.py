@@ -7,6 +7,7 @@ one at a time: a change of all at the first moment explains more than either, an
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, foretold, gain, sought, under_noise
-from s2r_runtime.trace.rivals import CLOSE, rivals
+from s2r_runtime.trace.rivals import CLOSE, rivals_of
 from s2r_runtime.trace.scores import Bar, Scored, name_of
 from s2r_runtime.trace.slots import Added, Slot, bounds_of, values_of, with_values
 
@@ -47,10 +48,12 @@ def _always(given: Problem, fit: Fit, slot: Slot) -> bool:
     return under_noise(given, model, fit.noise).white > float(np.sum(noises.log_density(fit.z))) - fit.whiten.logdet - CLOSE
 
 
-def rivals_that_happen(given: Problem, fit: Fit) -> list[Scored]:
-    """`rivals`, less those that say of a change that it happens where it does not: what was found says so better."""
-    found = rivals(given, fit)
-    return [s for s in found if s.fit is None or happens(given, s.fit)] if happens(given, fit) else found
+def rivals_that_happen(given: Problem, fit: Fit, places: Sequence[int] | None = None) -> list[Scored]:
+    """Rivals of all effects, or of those at these places, less those that say of a change that it happens where it does not: what was
+    found says so better.
+    """
+    found = [s for place in (fit.added if places is None else places) for s in rivals_of(given, fit, place)]
+    return [s for s in found if s.fit is None or happens(given, s.fit)] if found and happens(given, fit) else found
 
 
 def from_the_beginning(given: Problem, fit: Fit, bar: Bar) -> Fit:

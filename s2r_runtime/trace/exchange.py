@@ -20,6 +20,7 @@ from s2r_runtime.trace.scores import Bar, Scored, at_first_look, best_candidates
 from s2r_runtime.trace.slots import Added, slots_of, values_of
 
 Array = NDArray[np.float64]
+Name = tuple[str, str]
 
 BENT = 3.0
 """Standard deviations by which a number must change to have been bent by what the model lacks beside."""
@@ -89,16 +90,30 @@ def _lagging(given: Problem, fit: Fit, bar: Bar) -> Fit:
 
 
 def overtaken(given: Problem, fit: Fit, bar: Bar) -> tuple[Fit, list[Scored]]:
-    """The fit with its rivals. One that does better beside all that was found takes its place, which earlier rounds could not know."""
-    found = rivals_that_happen(given, fit)
-    for _ in fit.added:
-        better = [(gain(s.fit, fit) - bar.price(s.fit.k - fit.k, len(given.steps)), s.fit) for s in found if s.fit is not None]
+    """The fit with its rivals. One that does better beside all that was found takes its place at once, which earlier rounds could not know;
+    then all others are asked again, from the effect that is now there on.
+    """
+    found: dict[Name, list[Scored]] = {}
+    waiting, left = _names(fit), len(fit.added)
+    while waiting:
+        who = waiting.pop(0)
+        place = next(place for place in fit.added if name_of(fit.model.effects[place]) == who)
+        found[who] = rivals_that_happen(given, fit, [place])
+        better = [(gain(s.fit, fit) - bar.price(s.fit.k - fit.k, len(given.steps)), s.fit) for s in found[who] if s.fit is not None]
         more, best = max(better, key=lambda pair: pair[0], default=(0.0, fit))
-        if more <= CLOSE:
-            break
+        if more <= CLOSE or not left:
+            continue
+        there = [name for name in _names(fit) if name != who]
         fit = plainly(given, from_the_beginning(given, fitted(given, best, best.model), bar))
-        found = rivals_that_happen(given, fit)
-    return fit, found
+        now = _names(fit)
+        first = next((i for i, name in enumerate(now) if name not in there), 0)
+        waiting, found, left = now[first:] + now[:first], {}, left - 1
+    return fit, [s for who in _names(fit) for s in found[who]]
+
+
+def _names(fit: Fit) -> list[Name]:
+    """(effect, channel) of what was added, in its order."""
+    return [name_of(fit.model.effects[place]) for place in fit.added]
 
 
 def pruned(given: Problem, fit: Fit, tried: int, horizon: int, bar: Bar) -> Fit:

@@ -69,22 +69,21 @@ PROBES, PROBE_STEPS = 8, 120
 """Runs and steps of the rich inputs."""
 
 
-def rivals(given: Problem, fit: Fit) -> list[Scored]:
-    """Models with one effect replaced by another, of which the likelihood says nearly the same."""
+def rivals_of(given: Problem, fit: Fit, place: int) -> list[Scored]:
+    """Models with another effect at this place, of which the likelihood says nearly the same."""
     found = []
-    rich = _rich(given, fit.model) if fit.added else None
-    for place in fit.added:
-        mine = name_of(fit.model.effects[place])
-        base = fitted(given, fit, without(fit.model, place), 1)
-        here = gain(fit, base)
-        for s in best_candidates(given, base, FITTED, against=at_first_look(given, fit, base) - NEAR)[0]:
-            if s.fit is None or (s.name, s.channel) == mine or not limited(s.fit) or not _contends(given, s.fit, fit, base):
-                continue
-            numberless = not slots_of(fit.model.effects[place], place)
-            if numberless and _coincidence(here, gain(s.fit, base)) > CLOSE:
-                continue
-            if (s.fit.k <= fit.k and not numberless) or rich is None or not rich.same(s.fit.model, fit.model, base.model):
-                found.append(s)
+    mine = name_of(fit.model.effects[place])
+    base = fitted(given, fit, without(fit.model, place), 1)
+    here = gain(fit, base)
+    itself = Scored(*mine, here - STRICT.price(fit.k - base.k, len(given.steps)), fit)
+    for s in best_candidates(given, base, FITTED, against=at_first_look(given, fit, base) - NEAR, known=itself)[0]:
+        if s.fit is None or (s.name, s.channel) == mine or not limited(s.fit) or not _contends(given, s.fit, fit, base):
+            continue
+        numberless = not slots_of(fit.model.effects[place], place)
+        if numberless and _coincidence(here, gain(s.fit, base)) > CLOSE:
+            continue
+        if (s.fit.k <= fit.k and not numberless) or not _rich(given, fit.model).same(s.fit.model, fit.model, base.model):
+            found.append(s)
     return found
 
 

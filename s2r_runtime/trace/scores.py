@@ -104,13 +104,17 @@ def at_first_look(given: Problem, fit: Fit, base: Fit) -> float:
     return min(gain(fit, base), under_noise(given, fit.model, base.noise).white - base.white)
 
 
-def best_candidates(given: Problem, base: Fit, few: int = FEW, bar: Bar = STRICT, against: float = 0.0) -> tuple[list[Scored], int]:
+def best_candidates(
+    given: Problem, base: Fit, few: int = FEW, bar: Bar = STRICT, against: float = 0.0, known: Scored | None = None
+) -> tuple[list[Scored], int]:
     """The candidates for one more effect, fitted, best score first; and how many starts were looked at. against: nats that
-    they must come up to, `at_first_look`.
+    they must come up to, `at_first_look`. known: one of them that is fitted already.
     """
     search = _search(given, base)
     scored: dict[tuple[str, str], Scored] = {}
-    screened, looked_at = search.fitted(few, REACHES * against)
+    if known is not None:
+        scored[known.name, known.channel] = known
+    screened, looked_at = search.fitted(few, REACHES * against, known)
     for s, fit in looked_at:
         value = gain(fit, base) - bar.price(fit.k - base.k, len(given.steps))
         key = (s.candidate.name, s.candidate.channel)
@@ -119,7 +123,7 @@ def best_candidates(given: Problem, base: Fit, few: int = FEW, bar: Bar = STRICT
     best = max((s.score for s in scored.values()), default=0.0)
     close = [one for one in scored.values() if one.score > best - CONTENDS] if best > 0.0 else []
     for one in close if len(close) > 1 else ():
-        if one.fit is not None:
+        if one.fit is not None and one is not known:
             fit = search.settled(one.fit)
             scored[one.name, one.channel] = replace(one, score=gain(fit, base) - bar.price(fit.k - base.k, len(given.steps)), fit=fit)
     for s in screened:
@@ -139,8 +143,8 @@ class _Search:
         self._first, self.tried = screen(given, base, self._offered)
         self._fits: dict[int, tuple[object, Fit]] = {}
 
-    def fitted(self, few: int, least: float) -> tuple[list[Screened], list[tuple[Screened, Fit]]]:
-        """All as screened, and those fitted that screening makes promising. least: nats."""
+    def fitted(self, few: int, least: float, known: Scored | None = None) -> tuple[list[Screened], list[tuple[Screened, Fit]]]:
+        """All as screened, and those fitted that screening makes promising. least: nats. known: one that is fitted already."""
         screened = self._first
         promising = [(s, self.base) for s in _promising(screened, few, least)]
         if self._given.floor.axes and promising:
@@ -149,8 +153,11 @@ class _Search:
         if self._given.bends:  # a first look is about where another model has the states
             promising = [(s, self._quietly[0]) for s in _promising(self._quietly[1], len(screened), -math.inf)]
         looked_at: list[tuple[Screened, Fit]] = []
+        there = gain(known.fit, self.base) if known is not None and known.fit is not None else 0.0
         for s, under in promising:
-            most = max((gain(fit, self.base) for _, fit in looked_at), default=0.0)
+            if known is not None and (s.candidate.name, s.candidate.channel) == (known.name, known.channel):
+                continue
+            most = max(there, *(gain(fit, self.base) for _, fit in looked_at), 0.0)
             looked_at.append((s, self._refined(s, under, s.start, 2, lambda fit, most=most: self._hopeless(fit, most))))  # type: ignore[misc]
         return screened, looked_at
 
