@@ -81,6 +81,19 @@ def test_a_parameter_that_is_another_one_is_named_with_its_value(tmp_path, robot
     assert channel in found.text()
 
 
+def test_parameters_that_changed_together_are_the_step_with_all_of_them(tmp_path):
+    """What two change together is more than both alone do: a lift that is stronger flows out of a wider hole."""
+    model = _model(tmp_path)
+    both = tuple(EffectSpec("parameter_change", name, {"ratio": ratio}) for name, ratio in (("outflow", 1.5), ("lift", 0.7)))
+    values = {**model.parameters, "outflow": 1.5 * model.parameters["outflow"], "lift": 0.7 * model.parameters["lift"]}
+    rng = np.random.default_rng(0)
+    x, u = rng.uniform(0.5, 5.0, (20, 1)), rng.uniform(0.0, 3.0, (20, 1))
+    for effects in (both, both[::-1]):
+        repaired = compose(ModelSpec(model.spec.name, DT_S, {}, effects))
+        there, _ = repaired.step(x, u, repaired.at_rest(20))
+        assert there == pytest.approx(model.nominal.step(x, u, DT_S, values), rel=1e-12)
+
+
 def test_a_model_that_is_right_gets_no_other_parameters(tmp_path):
     model = _model(tmp_path)
     assert trace(_drive(model), model).verdict == "none"

@@ -36,9 +36,12 @@ class ParameterChange(StepEffect):
 
     def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: Any, p: Values) -> Array:
         """The difference that the other value makes to the nominal step."""
+        return x_next + (model.step(x, u, dt, self.rebound(model, channel, p)) - model.step(x, u, dt, model.parameters))
+
+    def rebound(self, model: NominalModel, channel: str, p: Values) -> dict[str, float]:
+        """The model's parameters with this one, beside which the next one is asked: what two change together is more than both alone do."""
         usual = model.parameters[channel]
-        other = {**model.parameters, channel: float(p["ratio"]) * usual if usual else float(p["value"])}
-        return x_next + (model.step(x, u, dt, other) - model.step(x, u, dt, model.parameters))
+        return {**model.parameters, channel: float(p["ratio"]) * usual if usual else float(p["value"])}
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
         """A little to either side: a parameter may act in any way."""

@@ -16,11 +16,10 @@ from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.changes import from_the_beginning, happens, rivals_that_happen
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, foretold, gain, objective, plainly, sensitivities, without
 from s2r_runtime.trace.rivals import CLOSE
-from s2r_runtime.trace.scores import Bar, Scored, at_first_look, best_candidates, name_of, unlimited
+from s2r_runtime.trace.scores import Bar, Name, Scored, at_first_look, best_candidates, name_of, unlimited
 from s2r_runtime.trace.slots import Added, slots_of, values_of
 
 Array = NDArray[np.float64]
-Name = tuple[str, str]
 
 BENT = 3.0
 """Standard deviations by which a number must change to have been bent by what the model lacks beside."""

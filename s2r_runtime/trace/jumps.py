@@ -43,6 +43,9 @@ RIGHT_AT_FIRST = 0.3
 BRIEF = 4
 """Rows that a spike lasts at most; a jump that comes back later is an offset."""
 
+STRAYS = 0.001
+"""Share of rows that are away by what a late stamp could do, up to which they are left out: more are how this robot's rows are stamped."""
+
 STAYS, FARTHER = 10, 2.0
 """Rows over which a jump must stay, and times the largest residual of other steps that it must be, not to be one of many wild rows."""
 
@@ -77,11 +80,13 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
         tail = max(float(reach.tail[j]), _reached(series, float(reach.noise[j]), float(for_one_step)))
         lost = np.isnan(run.y[:, j])
         single: list[int] = []
+        strays: list[tuple[int, int]] = []
         for k in np.flatnonzero(np.abs(series) > for_one_step).tolist():
             if bad[k, j] or bad[k + 1, j]:  # the end of something that is taken out already
                 continue
             rows = _there_and_back(series, k)
-            if rows is not None and abs(float(series[k])) <= limit:  # a row that was stamped late is as far away, and back
+            if rows is not None and abs(float(series[k])) <= limit and _on_its_way(change[:, j], rows, float(for_one_step)):
+                strays.append(rows)
                 continue
             if rows is not None:
                 bad[rows[0] : rows[1] + 1, j] = True
@@ -89,6 +94,9 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
                 kind.append(Fault(run.start_s + data.dt * rows[0], run.start_s + data.dt * rows[1], name, "spike"))
             elif _alone(series, k) and not np.any((lost | bad[:, j])[max(k - 1, 0) : k + 3]):  # where rows lack, the way back is not seen
                 single.append(k)
+        for first, last in {*strays} if len({*strays}) <= STRAYS * len(run.y) else ():  # it may be a stamp, of which many are no spikes
+            bad[first : last + 1, j] = True
+            found.tails.append(Fault(run.start_s + data.dt * first, run.start_s + data.dt * last, name, "spike"))
         if not reach.instant[j]:
             for k, back in _offsets(series, single):
                 _take_out(found, model, data, i, j, k, back, bad)
@@ -159,6 +167,15 @@ def _there_and_back(series: Array, k: int) -> tuple[int, int] | None:
             if len(legs) == length + 1 and abs(float(np.sum(legs))) < 0.35 * abs(float(series[k])):
                 return begin + 1, begin + length
     return None
+
+
+def _on_its_way(change: Array, rows: tuple[int, int], off: float) -> bool:
+    """Whether rows that are away lie between the rows before and after, or no more than `off` beside: one that was stamped late, or early,
+    is as far away, and back.
+    """
+    before = np.cumsum(change[rows[0] - 1 : rows[1] + 1])  # from the row before
+    low, high = min(0.0, float(before[-1])) - off, max(0.0, float(before[-1])) + off
+    return bool(np.all((before[:-1] >= low) & (before[:-1] <= high)))
 
 
 def _offsets(series: Array, single: list[int]) -> list[tuple[int, int | None]]:

@@ -8,7 +8,7 @@ score   gain less price
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,6 +18,9 @@ from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, under_noise
 from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.screening import Screened, screen
 from s2r_runtime.trace.slots import Added, bounds_of, values_of
+
+Name = tuple[str, str]
+"""(effect, channel)."""
 
 FEW = 10
 """Effects that are fitted as composed models, after screening."""
@@ -105,19 +108,25 @@ def at_first_look(given: Problem, fit: Fit, base: Fit) -> float:
 
 
 def best_candidates(
-    given: Problem, base: Fit, few: int = FEW, bar: Bar = STRICT, against: float = 0.0, known: Scored | None = None
+    given: Problem,
+    base: Fit,
+    few: int = FEW,
+    bar: Bar = STRICT,
+    against: float = 0.0,
+    known: Scored | None = None,
+    refused: Collection[Name] = (),
 ) -> tuple[list[Scored], int]:
     """The candidates for one more effect, fitted, best score first; and how many starts were looked at. against: nats that
-    they must come up to, `at_first_look`. known: one of them that is fitted already.
+    they must come up to, `at_first_look`. known: one of them that is fitted already. refused: those that need not be asked again.
     """
     search = _search(given, base)
     scored: dict[tuple[str, str], Scored] = {}
     if known is not None:
         scored[known.name, known.channel] = known
-    screened, looked_at = search.fitted(few, REACHES * against, known)
+    screened, looked_at = search.fitted(few, REACHES * against, known, refused)
     for s, fit in looked_at:
         value = gain(fit, base) - bar.price(fit.k - base.k, len(given.steps))
-        key = (s.candidate.name, s.candidate.channel)
+        key = s.of
         if key not in scored or value > scored[key].score:
             scored[key] = Scored(*key, value, fit)
     best = max((s.score for s in scored.values()), default=0.0)
@@ -127,8 +136,19 @@ def best_candidates(
             fit = search.settled(one.fit)
             scored[one.name, one.channel] = replace(one, score=gain(fit, base) - bar.price(fit.k - base.k, len(given.steps)), fit=fit)
     for s in screened:
-        scored.setdefault((s.candidate.name, s.candidate.channel), Scored(s.candidate.name, s.candidate.channel, min(s.value, 0.0)))
+        scored.setdefault(s.of, Scored(*s.of, min(s.value, 0.0)))
     return sorted(scored.values(), key=lambda s: (s.fit is None, -s.score)), search.tried
+
+
+def overlooked(given: Problem, base: Fit, found: Sequence[Scored], bar: Bar, needed: float) -> list[Scored]:
+    """Candidates that looked hopeless only beside those which were fitted, where these turned out to be none; best score first. needed: of
+    nats, for one of them at first sight.
+    """
+    refused = {(s.name, s.channel) for s in found if s.fit is not None}
+    best = max((s.value for s in _search(given, base).screened if s.of not in refused), default=0.0)
+    if not refused or best < needed:
+        return []
+    return best_candidates(given, base, bar=bar, against=needed, refused=refused)[0]
 
 
 class _Search:
@@ -143,19 +163,29 @@ class _Search:
         self._first, self.tried = screen(given, base, self._offered)
         self._fits: dict[int, tuple[object, Fit]] = {}
 
-    def fitted(self, few: int, least: float, known: Scored | None = None) -> tuple[list[Screened], list[tuple[Screened, Fit]]]:
-        """All as screened, and those fitted that screening makes promising. least: nats. known: one that is fitted already."""
-        screened = self._first
+    @property
+    def screened(self) -> list[Screened]:
+        """All, at first sight."""
+        return self._first
+
+    def fitted(
+        self, few: int, least: float, known: Scored | None = None, refused: Collection[Name] = ()
+    ) -> tuple[list[Screened], list[tuple[Screened, Fit]]]:
+        """All as screened but those refused, and those fitted that screening makes promising. least: nats. known: one that is fitted
+        already.
+        """
+        screened = [s for s in self._first if s.of not in refused]
         promising = [(s, self.base) for s in _promising(screened, few, least)]
         if self._given.floor.axes and promising:
-            quiet, screened = self._quietly
+            quiet, everything = self._quietly
+            screened = [s for s in everything if s.of not in refused]
             promising = [*promising[:FIRST_LOOK], *((s, quiet) for s in _promising(screened, few, 0.0))]
         if self._given.bends:  # a first look is about where another model has the states
             promising = [(s, self._quietly[0]) for s in _promising(self._quietly[1], len(screened), -math.inf)]
         looked_at: list[tuple[Screened, Fit]] = []
         there = gain(known.fit, self.base) if known is not None and known.fit is not None else 0.0
         for s, under in promising:
-            if known is not None and (s.candidate.name, s.candidate.channel) == (known.name, known.channel):
+            if known is not None and s.of == (known.name, known.channel):
                 continue
             most = max(there, *(gain(fit, self.base) for _, fit in looked_at), 0.0)
             looked_at.append((s, self._refined(s, under, s.start, 2, lambda fit, most=most: self._hopeless(fit, most))))  # type: ignore[misc]
@@ -218,7 +248,7 @@ def _promising(screened: Sequence[Screened], few: int, least: float) -> list[Scr
     kept: list[Screened] = []
     places: dict[tuple[str, str], int] = {}
     for s in screened:
-        key = s.candidate.name, s.candidate.channel
+        key = s.of
         hopeless = math.isfinite(least) and s.value <= max(HOPELESS, least, HOPELESS_SHARE * screened[0].value)
         if hopeless or (key not in places and len(places) == few):
             break

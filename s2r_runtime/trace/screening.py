@@ -63,6 +63,11 @@ class Screened:
     less: float = -math.inf
     """Nats that it would gain if it did only a part of what it does, as no values of its own may say."""
 
+    @property
+    def of(self) -> tuple[str, str]:
+        """(effect, channel)."""
+        return self.candidate.name, self.candidate.channel
+
 
 @dataclass(frozen=True)
 class Probe:

@@ -6,7 +6,7 @@ came later (`exchange`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from s2r_runtime.models.composed import ComposedModel
@@ -18,7 +18,7 @@ from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, near
 from s2r_runtime.trace.friction import KINDS, with_friction
 from s2r_runtime.trace.retimed import dated
 from s2r_runtime.trace.rivals import CLOSE, simplified
-from s2r_runtime.trace.scores import STRICT, Bar, Scored, best_candidates, names, rescored
+from s2r_runtime.trace.scores import STRICT, Bar, Scored, best_candidates, names, overlooked, rescored
 from s2r_runtime.trace.slots import Slot, bounds_of, values_of
 
 MOST, MOST_ON_ONE = 5, 3
@@ -76,8 +76,10 @@ def called_for(
         tried = max(tried, columns)
         ranking = ranking or found
         progress(0.1 + 0.6 * (step + 1) / (MOST + 1))
-        offered = (from_the_beginning(given, s.fit, bar) for s in found if s.fit is not None)
-        chosen = next((other for other in offered if accepted(given, other, fit, tried, horizon, bar)), None)
+        chosen = _first_of(found, given, fit, tried, horizon, bar)
+        if chosen is None:  # they may have hidden others, by how much they seemed to explain
+            others = overlooked(given, fit, found, bar, bar.needed(tried, 1, len(given.steps)))
+            chosen = _first_of(others, given, fit, tried, horizon, bar)
         chosen = chosen if fit.added else _of_all_axes(given, nominal, chosen, tried, horizon, bar)
         if chosen is None:
             break
@@ -88,6 +90,12 @@ def called_for(
     fit = unbent(given, simplified(given, pruned(given, fit, tried, horizon, bar)), tried, bar)
     progress(0.8)
     return Selection(nominal, plainly(given, fit), tried, tuple(ranking), ())
+
+
+def _first_of(found: Sequence[Scored], given: Problem, base: Fit, tried: int, horizon: int, bar: Bar) -> Fit | None:
+    """The best of these that is called for beside the base."""
+    offered = (from_the_beginning(given, s.fit, bar) for s in found if s.fit is not None)
+    return next((other for other in offered if accepted(given, other, base, tried, horizon, bar)), None)
 
 
 def _of_all_axes(given: Problem, nominal: Fit, chosen: Fit | None, tried: int, horizon: int, bar: Bar) -> Fit | None:

@@ -55,7 +55,13 @@ def smoothed(t: Array, y: Array, pushed: Array) -> Smoothed:
 
 
 def less_noise(t: Array, y: Array, ratio: float | None = None) -> tuple[Array, float, float]:
-    """(n,) y without its noise, the standard deviation of that, and log r. t, y: (n,), n >= FEWEST; ratio: log r, if it is known."""
+    """(n,) y without its noise, the standard deviation of that, and log r. t, y: (n,), of which FEWEST stamps differ; ratio: log r, if it
+    is known. Of rows with one stamp, the first one counts.
+    """
+    new = np.append(True, np.diff(t) > 0.0)
+    if not new.all():
+        found, scale, ratio = less_noise(t[new], y[new], ratio)
+        return found[np.cumsum(new) - 1], scale, ratio
     h, weight, still = np.diff(t) / float(np.median(np.diff(t))), np.ones(len(t)), np.zeros(len(t) - 1)
     if ratio is None:
         ratio, _ = _likeliest(h, y, weight, (still,))

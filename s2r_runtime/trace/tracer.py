@@ -113,8 +113,11 @@ def _traced(
     say: Progress,
     norm: tuple[tuple[float, ...] | None, Kind],
     parts: int | None = None,
+    under: ComposedModel | None = None,
 ) -> TraceResult:
-    """parts: S, of each step, where they were asked for (`finer`)."""
+    """parts: S, of each step, where they were asked for (`finer`). under: the model under which faults of measurement are looked for; None:
+    the one that is asked about.
+    """
     weights, kind = norm
     asked, as_recorded = model, (dataset, test)
     if not model.inputs:
@@ -128,9 +131,10 @@ def _traced(
     check_plausible(model, dataset)
     dataset, test = from_one_place(model, dataset), None if test is None else from_one_place(model, test)
     say(0.0, 100.0, "looking for faults of measurement")
-    checked = check(model, with_history(model, dataset))
+    checked = check(under or model, with_history(model, dataset))
+    tested = None if test is None else check(under or model, with_history(model, test))
     seen = fit_mask(checked.data, seed, everything=test is not None)
-    cut = _cut(checked, seen, test, model, horizon)
+    cut = _cut(checked, seen, tested, model, horizon)
     ahead = max(1, min(round(horizon / dataset.dt), len(cut.fit_part.steps) // 4))
     if test is not None and len(cut.judged_on.steps) < JUDGED:
         raise _too_few(test, len(cut.judged_on.steps), JUDGED)
@@ -140,11 +144,11 @@ def _traced(
     chosen = select(cut.given, model, ahead, lambda share: say(5.0 + 55.0 * share, 100.0, "looking for effects"), 1 if hidden else MOST)
     lines = _straight(as_recorded, asked, parts, checked, seen, cut.given, chosen.fit)
     if lines is not None:
-        return _traced(lines[0], asked, lines[1], horizon, seed, _from(60.0, say), norm, parts)
+        return _traced(lines[0], asked, lines[1], horizon, seed, _from(60.0, say), norm, parts, under)
     for most in range(2, MOST + 1) if hidden else (MOST,):
         if not _told_otherwise(cut.given, chosen.fit):
             break
-        cut = _cut(replace(cut.checked, data=_restated(cut.checked, chosen.fit)), seen, test, model, horizon)
+        cut = _cut(replace(cut.checked, data=_restated(cut.checked, chosen.fit)), seen, tested, model, horizon)
         before = names(chosen.fit.model)
         chosen = select(cut.given, model, ahead, lambda share: say(60.0 + 20.0 * share, 100.0, "looking for effects"), most)
         if names(chosen.fit.model) == before:
@@ -157,10 +161,12 @@ def _traced(
     structure = whole.structure(chosen)
     if structure.matters or astray(chosen, structure, judged_on, seed):
         chosen, structure = once_more(given, whole, chosen, structure, judged_on, ahead)
+    if under is None and _more_faults(chosen.fit, model, dataset, checked):
+        return _traced(as_recorded[0], asked, as_recorded[1], horizon, seed, _from(80.0, say), norm, parts, chosen.fit.model)
     if structure.matters and parts is None:
         more = finer(dataset, model, chosen, structure, ahead)
         if more is not None:
-            return _traced(as_recorded[0], asked, as_recorded[1], horizon, seed, _from(80.0, say), norm, more)
+            return _traced(as_recorded[0], asked, as_recorded[1], horizon, seed, _from(80.0, say), norm, more, under)
     say(90.0, 100.0, "judging on held-out data")
     w = np.ones(len(model.states)) if weights is None else np.array([weights[asked.states.index(s)] for s in model.states])
     result = answered(dataset, checked, given, chosen, structure, judged_on, seed, w, kind)
@@ -188,9 +194,20 @@ class _Cut:
         return problem(self.fit_part.data, self.fit_part.steps)
 
 
-def _cut(checked: Checked, seen: Mask, test: Dataset | None, model: ComposedModel, horizon: float) -> _Cut:
+def _cut(checked: Checked, seen: Mask, tested: Checked | None, model: ComposedModel, horizon: float) -> _Cut:
     fit_part = part(checked.data, checked.left_out, seen, FIT_STEPS)
-    return _Cut(checked, fit_part, _held_out(checked, seen, test, model, horizon))
+    return _Cut(checked, fit_part, _held_out(checked, seen, tested, model, horizon))
+
+
+def _more_faults(fit: Fit, model: ComposedModel, data: Dataset, checked: Checked) -> bool:
+    """Whether rows are clearly off by what was found that might have been the robot by the model as given: commands that it seemed to carry
+    out at once could have taken it there.
+    """
+    if not fit.added or data.reconstruction is not None:
+        return False
+    known = {(f.kind, f.channel) for f in checked.faults}
+    found = check(fit.model, with_history(model, data)).faults
+    return any(f.kind in {"spike", "offset_jump"} and (f.kind, f.channel) not in known for f in found)
 
 
 def _in_parts(model: ComposedModel, data: Dataset) -> ComposedModel:
@@ -271,12 +288,11 @@ def _too_few(data: Dataset, usable: int, fewest: int = FEWEST) -> NotEnoughEvide
     )
 
 
-def _held_out(checked: Checked, seen: Mask, test: Dataset | None, model: ComposedModel, horizon: float) -> Held:
+def _held_out(checked: Checked, seen: Mask, tested: Checked | None, model: ComposedModel, horizon: float) -> Held:
     """The transitions that the fit does not see."""
-    if test is not None:
-        other = check(model, with_history(model, test))
-        everything = np.ones(sum(len(run.y) - 1 for run in other.data.runs), dtype=bool)
-        return held(model, other.data, steps_of(other.data, other.left_out), other.left_out, everything, horizon)
+    if tested is not None:
+        everything = np.ones(sum(len(run.y) - 1 for run in tested.data.runs), dtype=bool)
+        return held(model, tested.data, steps_of(tested.data, tested.left_out), tested.left_out, everything, horizon)
     steps = steps_of(checked.data, checked.left_out)
     return held(model, checked.data, steps.take(np.flatnonzero(~seen[steps.place])), checked.left_out, ~seen, horizon)
 

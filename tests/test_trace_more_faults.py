@@ -1,0 +1,98 @@
+"""Rows that are off by no more than the model as given allows: a joint's encoder among its speeds, a heading that jumps behind a lag."""
+
+import numpy as np
+import pytest
+
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.trace.dataset import Dataset, Stream, from_arrays, from_streams
+from s2r_runtime.trace.faults import check
+from s2r_runtime.trace.tracer import trace
+
+DT_S, ROWS, FAST = 0.01, 3000, 1154
+FRICTION = (EffectSpec("coulomb_friction", "qd", {"force": 1.5}), EffectSpec("viscous_friction", "qd", {"coefficient": 1.2}))
+JOINT = compose(ModelSpec("joint", DT_S, {"mass": 2.0}))
+CART = compose(ModelSpec("unicycle", 0.05))
+
+
+def _joint(off: float) -> Dataset:
+    """A joint that sweeps to and fro at up to 4 m/s, read to 20 um, with one sample of its position off while it is fast."""
+    robot = compose(ModelSpec("joint", DT_S, {"mass": 2.0}, FRICTION))
+    rng, t = np.random.default_rng(3), DT_S * np.arange(ROWS)
+    u = (40.0 * np.sin(2.0 * np.pi * 1.3 * t) + 15.0 * np.sin(2.0 * np.pi * 3.1 * t + 1.0))[:, None]
+    x, hidden, rows = np.zeros((1, 2)), robot.at_rest(1), [np.zeros(2)]
+    for k in range(ROWS):
+        x, hidden = robot.step(x, u[k : k + 1], hidden)
+        rows.append(x[0])
+    y = np.array(rows) + rng.normal(size=(ROWS + 1, 2)) * [2e-5, 2e-3]
+    y[FAST, 0] += off
+    return from_arrays(JOINT, [(y, u)])
+
+
+@pytest.mark.parametrize("off", [0.05, -0.05, 0.02, -0.02])
+def test_one_bad_sample_hides_no_friction(off):
+    """Beyond its neighbours it is a spike; between them it may be a stamp, of which a single one is left out as well."""
+    result = trace(_joint(off), JOINT)
+    found = {(e.name, e.channel): [v for v, *_ in e.parameters.values()] for e in result.effects}
+    assert found == {
+        ("coulomb_friction", "qd"): [pytest.approx(1.5, rel=0.01)],
+        ("viscous_friction", "qd"): [pytest.approx(1.2, rel=0.01)],
+    }
+    if abs(off) == 0.05:
+        assert [(f.kind, f.channel, f.from_s, f.to_s) for f in result.faults] == [("spike", "q", *[pytest.approx(FAST * DT_S)] * 2)]
+    else:
+        assert (result.faults, result.outliers) == ((), 1)
+
+
+def test_rows_that_are_often_stamped_late_are_how_they_are_stamped():
+    data, rng = _joint(0.0), np.random.default_rng(0)
+    (run,) = data.runs
+    late = np.sort(rng.choice(np.arange(10, ROWS - 10), 20, replace=False))
+    run.y[late] = 0.5 * (run.y[late] + run.y[late - 1])  # read half a row earlier than they say
+    found = check(JOINT, data)
+    assert (found.faults, found.outliers) == ((), 0)
+    assert not np.isnan(found.data.runs[0].y).any()
+
+
+def _cart(jump: float, seed: int = 1) -> Dataset:
+    """A cart that turns to and fro by steps, late and slowly; from half of the drive on its heading is read with an offset."""
+    slow = (EffectSpec("input_delay", "*", {"delay": 0.1}), *(EffectSpec("input_lag", u, {"time_constant": 0.12}) for u in ("v", "w")))
+    robot = compose(ModelSpec("unicycle", 0.05, {}, slow))
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform([0.0, -1.5], [0.5, 1.5], (120, 2)), 20, axis=0)
+    x, hidden, rows = np.zeros((1, 3)), robot.at_rest(1), [np.zeros(3)]
+    for k in range(len(u)):
+        x, hidden = robot.step(x, u[k : k + 1], hidden)
+        rows.append(x[0])
+    y = np.array(rows) + rng.normal(size=(len(rows), 3)) * [0.001, 0.001, 0.004]
+    y[1200:, 2] += jump
+    return from_arrays(CART, [(y, u)])
+
+
+def test_a_heading_that_jumps_by_what_the_commands_ask_within_a_step_is_seen_under_what_was_found():
+    data = _cart(0.15)
+    assert check(CART, data).faults == ()
+    result = trace(data, CART)
+    assert [(f.kind, f.channel, f.from_s) for f in result.faults] == [("offset_jump", "theta", pytest.approx(60.0))]
+    named = {(e.name, e.channel) for e in (*result.effects, *result.partial)}
+    assert named == {("input_delay", "*"), ("input_lag", "v"), ("input_lag", "w")}
+
+
+def test_without_a_jump_nothing_is_taken_for_one():
+    result = trace(_cart(0.0), CART)
+    assert (result.verdict, result.faults) == ("traced", ())
+    assert {(e.name, e.channel) for e in result.effects} == {("input_delay", "*"), ("input_lag", "v"), ("input_lag", "w")}
+
+
+@pytest.mark.filterwarnings("error")
+def test_inputs_that_were_sent_twice_with_one_stamp_warn_nobody():
+    rng = np.random.default_rng(0)
+    t = np.sort(np.repeat(DT_S * np.arange(600), np.where(rng.random(600) < 0.1, 2, 1)))
+    u = np.sin(2.0 * np.pi * 1.3 * t)[:, None]
+    states = Stream(DT_S * np.arange(600), np.zeros((600, 2)))
+    x = np.zeros((1, 2))
+    for k in range(1, 600):
+        x = JOINT.step(x, np.array([[np.sin(2.0 * np.pi * 1.3 * DT_S * (k - 1))]]), JOINT.at_rest(1))[0]
+        states.values[k] = x[0]
+    noisy = Stream(states.t, states.values + rng.normal(size=(600, 2)) * [1e-4, 1e-3])
+    assert trace(from_streams(JOINT, [(noisy, Stream(t, u))], "here"), JOINT).verdict == "none"
