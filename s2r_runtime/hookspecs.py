@@ -191,6 +191,8 @@ class Effect(Protocol):
     - `frame(model, channel) -> str` (stage `step`): "body" if it changes the motion of the body (it then applies before a pose is
       integrated along it), "sliding" if it depends on that motion (after "body"), "world" if it adds to the motion along the world's
       axes (after that);
+    - `rebound(model, channel, p) -> dict[str, float]` (stage `step`): the model's parameters as they are with it; the next effect that has
+      this gets the model with them, so that several together are one model with all of them;
     - `integrates(p) -> str`: it is the scheme by which a pose is integrated; effects see it as the `integration` of their model;
     - `pushes(model, channel) -> bool`, `push(x, axis, model, channel, p) -> Push | None` and `varies`: it is a force on an axis
       (`models.forces`). A model solves for all its forces together, and does not call `after_step`;

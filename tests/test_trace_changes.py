@@ -1,4 +1,4 @@
-"""A change that may as well have been there from the beginning is none."""
+"""A change that may as well have been there from the beginning is none, nor is a sine that the drive makes."""
 
 from dataclasses import replace
 
@@ -17,6 +17,7 @@ from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.scores import STRICT, Scored, name_of
 from s2r_runtime.trace.selection import Selection, all_dated
 from s2r_runtime.trace.slots import Added
+from s2r_runtime.trace.tracer import trace
 
 DT_S, STANDS, CHANGED_S = 0.1, 40, 30.0
 
@@ -113,3 +114,34 @@ def test_a_rival_is_dated_as_what_was_chosen_is():
     for fit in (dated.fit, dated.rivals[0].fit):
         assert fit.model.effects[0].p["time"] == pytest.approx(5.7, abs=0.2)
     assert fits[1].model.effects[0].p["time"] == pytest.approx(6.5, abs=0.1)
+
+
+def _of_a_sine(robots, seed):
+    """What is named of a robot that turns to and fro at 0.45 Hz."""
+    model, robot = (compose(ModelSpec("unicycle", 0.05, {}, effects)) for effects in ((), robots))
+    rng, t = np.random.default_rng(seed), 0.05 * np.arange(1500)
+    u = np.column_stack([0.3 + 0.1 * np.sin(2.0 * np.pi * 0.17 * t), 0.9 * np.sin(2.0 * np.pi * 0.4464 * t)])
+    x, hidden, rows = np.zeros((1, 3)), robot.at_rest(1), [np.zeros(3)]
+    for k in range(len(u)):
+        x, hidden = robot.step(x, u[k : k + 1], hidden)
+        rows.append(x[0])
+    return trace(from_arrays(model, [(np.array(rows) + rng.normal(size=(len(rows), 3)) * [0.001, 0.001, 0.003], u)]), model)
+
+
+SLOW = EffectSpec("input_lag", "w", {"time_constant": 0.1})
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_sine_at_the_frequency_of_the_drive_is_a_gain_and_a_delay(seed):
+    """A gain, a delay and a lag: of a drive of one frequency two numbers can be told, and no sine of its own."""
+    late = EffectSpec("input_delay", "w", {"delay": 0.1})
+    found = _of_a_sine((EffectSpec("input_gain", "w", {"gain": 0.94}), SLOW, late), seed)
+    assert len(found.effects) == 2
+    assert {(e.name, e.channel) for e in found.effects} <= {(f"input_{name}", "w") for name in ("gain", "delay", "lag")}
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_sine_at_another_frequency_is_one(seed):
+    found = _of_a_sine((SLOW, EffectSpec("periodic_disturbance", "w", {"frequency": 1.3, "amplitude": 0.05, "phase": 0.4})), seed)
+    assert [(e.name, e.channel) for e in found.effects] == [("input_lag", "w"), ("periodic_disturbance", "w")]
+    assert found.effects[1].parameters["frequency"][0] == pytest.approx(1.3, abs=0.01)

@@ -22,7 +22,7 @@ from s2r_runtime.trace.relevance import _edges, relevant
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.scores import best_candidates, names
 from s2r_runtime.trace.screening import probes_of, screen
-from s2r_runtime.trace.selection import Selection, _doing_something
+from s2r_runtime.trace.selection import Selection, doing_something
 from s2r_runtime.trace.slots import Added
 
 JOINT, WHEELS = ModelSpec("joint", DT, {"mass": 1.0}, ()), ModelSpec("differential_drive", DT, {}, ())
@@ -328,5 +328,5 @@ def test_an_effect_that_came_to_do_nothing_beside_a_later_one_is_left_out():
     late = Added(registry().get("effects", "input_delay"), "force", {"delay": 0.0})
     lag = Added(registry().get("effects", "input_lag"), "force", {"time_constant": 0.1})
     both = evaluate(given, insert(insert(model, lag, 0), late, 0))
-    assert names(_doing_something(given, both).model) == (("input_lag", "force"),)
-    assert names(_doing_something(given, evaluate(given, insert(model, lag, 0))).model) == (("input_lag", "force"),)
+    assert names(doing_something(given, both).model) == (("input_lag", "force"),)
+    assert names(doing_something(given, evaluate(given, insert(model, lag, 0))).model) == (("input_lag", "force"),)

@@ -215,12 +215,12 @@ class ComposedModel:
     def corrected(self, x: Array, u: Array, x_next: Array, given: BoundModel, dt: Any = None) -> Array:
         """x_next (n, nx), true, as effects of stage `step` change it. given: how it was reached (`integration`); dt: `lasts`."""
         dt = self.dt if dt is None else dt
-        as_it_is = given
+        changed: dict[str, float] | None = None
         for a in self._after:
             rebound = getattr(a.effect, "rebound", None)
-            x_next = a.effect.after_step(x, u, x_next, as_it_is if rebound else given, a.channel, dt, a.p)
-            if rebound:
-                as_it_is = replace(as_it_is, parameters=rebound(as_it_is, a.channel, a.p), schemes={})
+            as_it_is = given if rebound is None or changed is None else replace(given, parameters=changed, schemes={})
+            x_next = a.effect.after_step(x, u, x_next, as_it_is, a.channel, dt, a.p)
+            changed = changed if rebound is None else rebound(as_it_is, a.channel, a.p)
         return pushed(x, u, x_next, given, self._forces, dt) if self._forces else x_next
 
     def true(self, x: Array) -> Array:

@@ -1,14 +1,17 @@
-"""What changes at one time: whether it does, and what it is if it does not.
+"""What depends on the time: whether it does, and what it is if it does not.
 
 A change that explains no more than one that began before the recording is none. Of one input that is a gain, which is looked for by itself.
 Of all inputs alike (both wheels smaller than said, a thrust that is weaker) it is a gain of each, two effects, of which the search takes
-one at a time: a change of all at the first moment explains more than either, and a drift of all comes near to it.
+one at a time: a change of all at the first moment explains more than either, and a drift of all comes near to it. So it is with a sine
+where the drive is one: at its frequency any gain and any delay are a sine, and one sine explains as much as both.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -57,27 +60,55 @@ def rivals_that_happen(given: Problem, fit: Fit, places: Sequence[int] | None = 
 
 
 def from_the_beginning(given: Problem, fit: Fit, bar: Bar) -> Fit:
-    """With a gain of each input in the place of a change of all that does not happen, and of a drift of all that explains less."""
+    """With a gain of each input in the place of a change of all that does not happen, and of a drift of all that explains less; and with
+    what the input itself makes of an input in the place of a sine that explains no more: of a drive that is a sine, one at its frequency
+    is any gain and any delay.
+    """
     for place in fit.added:
-        drifts = fit.model.effects[place].effect.name == "input_gain_drift"
-        model = _of_each(fit.model, place)
-        if model is None or foretold(given, model) is None or not (drifts or not happens(given, fit)):
+        name = fit.model.effects[place].effect.name
+        drifts, sine = name == "input_gain_drift", name == "periodic_disturbance"
+        if not (drifts or sine or not happens(given, fit)):
             continue
-        other = fitted(given, fit, model)
-        more = gain(other, fit) - bar.price(other.k - fit.k, len(given.steps))
-        if more > (CLOSE if drifts else -CLOSE):
-            return other
+        for models in _of_the_drive(fit.model, place, 1 if given.bends else 2) if sine else [_of_each(fit.model, place)]:
+            others = [fitted(given, fit, model) for model in models if foretold(given, model) is not None]
+            better = [(gain(other, fit) - bar.price(other.k - fit.k, len(given.steps)), other) for other in others]
+            more, best = max(better, key=lambda pair: pair[0], default=(-math.inf, fit))
+            if more > (CLOSE if drifts else -CLOSE):
+                return best
     return fit
 
 
-def _of_each(model: ComposedModel, place: int) -> ComposedModel | None:
-    """The model with a gain of each input that has none, in the place of what acts on all of them; None where nothing does there."""
+def _of_the_drive(model: ComposedModel, place: int, most: int) -> list[list[ComposedModel]]:
+    """The model with a gain, a delay or a lag of its input, as far as it has none, in the place of a sine on it; then with two of them, if
+    `most` are two.
+    """
+    there, channel = model.effects, model.effects[place].channel
+    if channel not in model.inputs:
+        return []
+    others = {name_of(a) for i, a in enumerate(there) if i != place}
+    offered = [
+        Added(registry().get("effects", name), channel, {number: start})
+        for name, number, start in (
+            ("input_gain", "gain", 1.0),
+            ("input_delay", "delay", model.dt),
+            ("input_lag", "time_constant", model.dt),
+        )
+    ]
+    new = [a for a in offered if not {name_of(a), (a.effect.name, "*")} & others and channel in a.effect.channels(model.nominal)]
+    return [
+        [replace(model, effects=(*there[:place], *some, *there[place + 1 :])) for some in combinations(new, many)]
+        for many in range(1, most + 1)
+    ]
+
+
+def _of_each(model: ComposedModel, place: int) -> list[ComposedModel]:
+    """The model with a gain of each input that has none, in the place of what acts on all of them, if something does there."""
     a = model.effects[place]
     number = OF_ALL.get(name_of(a))
     effect = registry().get("effects", "input_gain")
     there = model.effects
     inputs = [name for name in model.inputs if all(name_of(b) != (effect.name, name) for b in there)]
     if number is None or not {*inputs} <= {*effect.channels(model.nominal)} or not inputs:
-        return None
+        return []
     gains = [Added(effect, name, {"gain": a.p.get(number, 1.0)}) for name in inputs]
-    return replace(model, effects=(*there[:place], *gains, *there[place + 1 :]))
+    return [replace(model, effects=(*there[:place], *gains, *there[place + 1 :]))]

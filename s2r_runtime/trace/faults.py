@@ -8,12 +8,18 @@
     offset_jump  one transition by more than the inputs could move the state, and it stays there; to the end, or until it jumps back
 
 A fault must be beyond what any effect on the input could do: an effect that the model lacks is not to be explained away as a
-fault. Spikes on more than RARE of the rows are no faults but heavy tails: they are left out too, and counted as outliers.
+fault. Spikes on more than RARE of the rows are no faults but heavy tails: they are left out too, and counted as outliers. So are rows that
+are away by what a late stamp could do, where there are next to none: of more, it is how this robot's rows are stamped.
+
+What was found narrows what an input can do: a robot that follows its commands late does not turn by a tenth of a radian within a step.
+Under a model that is believed, positions and headings are looked at once more for single jumps. Speeds are not: whatever the robot hits
+makes them jump.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,7 +31,7 @@ from s2r_runtime.trace.fault import Fault
 from s2r_runtime.trace.frozen import frozen
 from s2r_runtime.trace.heading import departures
 from s2r_runtime.trace.holes import bridged
-from s2r_runtime.trace.jumps import WILD_SIGMAS, jumps_of, tails_of
+from s2r_runtime.trace.jumps import WILD_SIGMAS, Jumps, jumps_of, tails_of
 from s2r_runtime.trace.reach import Reach, predicted, reach_of
 from s2r_runtime.trace.residual import Acting, acting
 
@@ -46,6 +52,12 @@ LONG = 3.5
 ONE_STEP, MOVED = 0.3, 6.0
 """Of a step, by which a usual interval may differ from it to be one; standard deviations that the state must move in it to be seen to."""
 
+STRAYS = 0.001
+"""Share of rows that are away by what a late stamp could do, up to which they are left out; one always is."""
+
+FEW = 3
+"""Jumps that show only under what was found; of more, it is the robot that jumps, which meets something."""
+
 MANY_ROWS = 60
 """Rows of a run in which a heading's departure from the motion is looked for."""
 
@@ -63,8 +75,8 @@ class Checked:
     outliers: int
 
 
-def check(model: ComposedModel, data: Dataset) -> Checked:
-    """Finds the faults and takes them out."""
+def check(model: ComposedModel, data: Dataset, under: ComposedModel | None = None) -> Checked:
+    """Finds the faults and takes them out. under: what was found, under which a few more jumps may show."""
     act = acting(model, data)
     reach = reach_of(model, data, act)
     faults = [_of_pause(model, data, act, pause, reach) for pause in data.pauses]
@@ -78,6 +90,7 @@ def check(model: ComposedModel, data: Dataset) -> Checked:
     spikes: list[Fault] = []
     outliers = tails = 0
     sure: list[Fault] = []
+    strays: list[tuple[int, Fault]] = []
     for i in range(len(data.runs)):
         tails += int(np.count_nonzero(tails_of(model, data, act, i, reach).any(axis=1)))
         found += frozen(model, data, act, i, bad[i], reach)
@@ -87,9 +100,20 @@ def check(model: ComposedModel, data: Dataset) -> Checked:
         left_out += jumps.cut
         sure += jumps.sure
         outliers += len(jumps.tails)
+        strays += [(i, stray) for stray in jumps.strays]
         if pose is not None:
             found += _inconsistent(model, data, act, i, bad[i], reach, pose)
     rows = sum(len(run.y) for run in data.runs)
+    for i, stray in strays if len(strays) <= max(STRAYS * rows, 1.0) else ():
+        first, last = (round((at - data.runs[i].start_s) / data.dt) for at in (stray.from_s, stray.to_s))
+        bad[i][first : last + 1, model.states.index(stray.channel)] = True
+        outliers += 1
+    for jumps in [] if under is None else _under(under, data, bad, found):
+        spikes += jumps.spikes
+        found += jumps.offsets
+        left_out += jumps.cut
+        sure += jumps.offsets
+        outliers += len(jumps.tails)
     many = max(tails, len({f.from_s for f in spikes}) + outliers) > max(RARE * rows, 3.0)
     for i, mask in enumerate(bad) if many else ():
         wild = tails_of(model, data, act, i, reach, WILD_SIGMAS) & ~mask
@@ -100,6 +124,22 @@ def check(model: ComposedModel, data: Dataset) -> Checked:
         found = [f for f in found if f.kind != "offset_jump" or f in sure]
     faults_ = tuple(sorted([*found, *([] if many else spikes)], key=lambda f: (f.from_s, f.channel)))
     return Checked(bridged(replace(data, runs=runs)), faults_, tuple(sorted(set(left_out))), outliers + (len(spikes) if many else 0))
+
+
+def _under(model: ComposedModel, data: Dataset, bad: list[Mask], known: Sequence[Fault]) -> list[Jumps]:
+    """Spikes and jumps of positions and headings under another model that are not known yet; marked in `bad`. None if they are more than
+    FEW.
+    """
+    act, there = acting(model, data), {(f.kind, f.channel, f.from_s) for f in known}
+    reach = reach_of(model, data, act)
+    marks = [mask.copy() for mask in bad]
+    found = [jumps_of(model, data, act, i, marks[i], reach, of_positions=True) for i in range(len(data.runs))]
+    found = [replace(jumps, offsets=[f for f in jumps.offsets if (f.kind, f.channel, f.from_s) not in there]) for jumps in found]
+    if not 0 < sum(len(jumps.offsets) + len(jumps.spikes) for jumps in found) <= FEW:
+        return []
+    for mask, mark in zip(bad, marks, strict=True):
+        mask |= mark
+    return found
 
 
 def _of_pause(model: ComposedModel, data: Dataset, act: Acting, pause: Pause, reach: Reach) -> Fault | None:

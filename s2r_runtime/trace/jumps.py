@@ -43,9 +43,6 @@ RIGHT_AT_FIRST = 0.3
 BRIEF = 4
 """Rows that a spike lasts at most; a jump that comes back later is an offset."""
 
-STRAYS = 0.001
-"""Share of rows that are away by what a late stamp could do, up to which they are left out: more are how this robot's rows are stamped."""
-
 STAYS, FARTHER = 10, 2.0
 """Rows over which a jump must stay, and times the largest residual of other steps that it must be, not to be one of many wild rows."""
 
@@ -53,7 +50,8 @@ STAYS, FARTHER = 10, 2.0
 @dataclass(frozen=True)
 class Jumps:
     """Of one run: spikes; rows that the noise's own tail took away (`tails`, as spikes); offsets that stay; (run, step) transitions across
-    them; of the offsets, those that are none of the noise's tail either.
+    them; of the offsets, those that are none of the noise's tail either; rows that are away by no more than a late stamp could do
+    (`strays`, as spikes), which are not marked.
     """
 
     spikes: list[Fault]
@@ -61,12 +59,13 @@ class Jumps:
     offsets: list[Fault]
     cut: list[tuple[int, int]]
     sure: list[Fault]
+    strays: list[Fault]
 
 
-def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: Reach) -> Jumps:
-    """Of run i; marks in `bad` what of it is wrong."""
+def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: Reach, *, of_positions: bool = False) -> Jumps:
+    """Of run i; marks in `bad` what of it is wrong. of_positions: no other states are looked at."""
     run = data.runs[i]
-    found = Jumps([], [], [], [], [])
+    found = Jumps([], [], [], [], [], [])
     if len(run.y) < 3:
         return found
     e = model.difference(run.y[1:], predicted(model, data, act, i))
@@ -74,19 +73,22 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
     pose = {"x", "y", "theta"} if getattr(model.nominal, "integration", None) is not None else set()
     goes_on = pose | {model.states[axis.position] for axis in axes(model.nominal)}  # as its speed says, which is a state of its own
     for j, name in enumerate(model.states):
+        if of_positions and name not in goes_on:
+            continue
         series = np.nan_to_num(change[:, j] if reach.instant[j] else e[:, j])
         limit = SIGMAS * reach.noise[j] + BEYOND * reach.move[j]
         for_one_step = SIGMAS * reach.noise[j] + BEYOND * (reach.turn if name in goes_on else reach.move)[j]
         tail = max(float(reach.tail[j]), _reached(series, float(reach.noise[j]), float(for_one_step)))
         lost = np.isnan(run.y[:, j])
         single: list[int] = []
-        strays: list[tuple[int, int]] = []
         for k in np.flatnonzero(np.abs(series) > for_one_step).tolist():
             if bad[k, j] or bad[k + 1, j]:  # the end of something that is taken out already
                 continue
             rows = _there_and_back(series, k)
-            if rows is not None and abs(float(series[k])) <= limit and _on_its_way(change[:, j], rows, float(for_one_step)):
-                strays.append(rows)
+            if rows is not None and abs(float(series[k])) <= limit:  # a row that was stamped late is as far away, and back
+                stray = Fault(run.start_s + data.dt * rows[0], run.start_s + data.dt * rows[1], name, "spike")
+                if stray not in found.strays:
+                    found.strays.append(stray)
                 continue
             if rows is not None:
                 bad[rows[0] : rows[1] + 1, j] = True
@@ -94,9 +96,6 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
                 kind.append(Fault(run.start_s + data.dt * rows[0], run.start_s + data.dt * rows[1], name, "spike"))
             elif _alone(series, k) and not np.any((lost | bad[:, j])[max(k - 1, 0) : k + 3]):  # where rows lack, the way back is not seen
                 single.append(k)
-        for first, last in {*strays} if len({*strays}) <= STRAYS * len(run.y) else ():  # it may be a stamp, of which many are no spikes
-            bad[first : last + 1, j] = True
-            found.tails.append(Fault(run.start_s + data.dt * first, run.start_s + data.dt * last, name, "spike"))
         if not reach.instant[j]:
             for k, back in _offsets(series, single):
                 _take_out(found, model, data, i, j, k, back, bad)
@@ -167,15 +166,6 @@ def _there_and_back(series: Array, k: int) -> tuple[int, int] | None:
             if len(legs) == length + 1 and abs(float(np.sum(legs))) < 0.35 * abs(float(series[k])):
                 return begin + 1, begin + length
     return None
-
-
-def _on_its_way(change: Array, rows: tuple[int, int], off: float) -> bool:
-    """Whether rows that are away lie between the rows before and after, or no more than `off` beside: one that was stamped late, or early,
-    is as far away, and back.
-    """
-    before = np.cumsum(change[rows[0] - 1 : rows[1] + 1])  # from the row before
-    low, high = min(0.0, float(before[-1])) - off, max(0.0, float(before[-1])) + off
-    return bool(np.all((before[:-1] >= low) & (before[:-1] <= high)))
 
 
 def _offsets(series: Array, single: list[int]) -> list[tuple[int, int | None]]:

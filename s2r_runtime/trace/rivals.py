@@ -71,7 +71,8 @@ PROBES, PROBE_STEPS = 8, 120
 
 def rivals_of(given: Problem, fit: Fit, place: int) -> list[Scored]:
     """Models with another effect at this place, of which the likelihood says nearly the same."""
-    found = []
+    found: list[Scored] = []
+    rich: _Rich | None = None
     mine = name_of(fit.model.effects[place])
     base = fitted(given, fit, without(fit.model, place), 1)
     here = gain(fit, base)
@@ -82,8 +83,11 @@ def rivals_of(given: Problem, fit: Fit, place: int) -> list[Scored]:
         numberless = not slots_of(fit.model.effects[place], place)
         if numberless and _coincidence(here, gain(s.fit, base)) > CLOSE:
             continue
-        if (s.fit.k <= fit.k and not numberless) or not _rich(given, fit.model).same(s.fit.model, fit.model, base.model):
-            found.append(s)
+        if s.fit.k > fit.k or numberless:
+            rich = rich or _rich(given, fit.model)
+            if rich.same(s.fit.model, fit.model, base.model):
+                continue
+        found.append(s)
     return found
 
 

@@ -32,9 +32,12 @@ which nobody has.
 """
 
 
-def finer(dataset: Dataset, model: ComposedModel, chosen: Selection, structure: Structure, ahead: int) -> int | None:
+def finer(
+    dataset: Dataset, model: ComposedModel, chosen: Selection, structure: Structure, ahead: int, under: ComposedModel | None = None
+) -> int | None:
     """Parts of a step in which nothing is left by what was found, or by the model as given, if there are such: then it is what inputs do
-    within steps, or within the parts that they are in already. A step has the mean of what they do, and a position more.
+    within steps, or within the parts that they are in already. A step has the mean of what they do, and a position more. under: as `check`
+    has it.
     """
     data = in_finer_parts(dataset, model)
     if data is None:
@@ -46,7 +49,7 @@ def finer(dataset: Dataset, model: ComposedModel, chosen: Selection, structure: 
         means = _with_means(data)
         if not all(_makes(replace(means, in_parts=False), means, fit) <= INTEGRATES * makes for fit in (chosen.nominal, chosen.fit)):
             return None
-    checked = check(model, with_history(model, data))
+    checked = check(model, with_history(model, data), under)
     whole = Whole(checked, model, ahead)
     nominal = whole.nominal
     fit = nominal if not chosen.fit.added else fitted(whole.given, nominal, chosen.fit.model)

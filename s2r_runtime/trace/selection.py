@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
+from s2r_runtime.plugins import registry
 from s2r_runtime.trace.acceptance import accepted
 from s2r_runtime.trace.changes import from_the_beginning
 from s2r_runtime.trace.exchange import exchanged, overtaken, parted, pruned, unbent
@@ -114,7 +115,7 @@ def against_rivals(given: Problem, chosen: Selection, bar: Bar) -> Selection:
     """With its rivals, one of which may take its place. A crowd is not believed, whatever its rivals."""
     if crowded(chosen.fit):
         return chosen
-    fit, found = overtaken(given, chosen.fit, bar)
+    fit, found = overtaken(given, doing_something(given, chosen.fit), bar)
     return replace(chosen, fit=fit, rivals=tuple(found))
 
 
@@ -131,24 +132,29 @@ def one_more(given: Problem, chosen: Selection, horizon: int, foretells: Callabl
         if s.fit is None or crowded(s.fit):
             continue
         needed, reached = STRICT.needed(chosen.tried, s.fit.k - fit.k, len(given.steps)), gain(s.fit, fit)
-        if s.channel not in {"*", *fit.model.inputs} and s.fit.white - fit.white >= SHORT * needed:
+        if not _on_inputs(s, fit) and s.fit.white - fit.white >= SHORT * needed:
             reached += nearer(given, s.fit, fit)
         if reached < SHORT * needed:
             continue
         told = foretells(s.fit, fit)
         ahead = reached - gain(s.fit, fit) + min(told, reached)
         if told > 0.0 and accepted(given, s.fit, fit, chosen.tried, horizon, ahead=ahead):
-            more, found = overtaken(given, plainly(given, _doing_something(given, fitted(given, s.fit, s.fit.model))), STRICT)
+            more, found = overtaken(given, plainly(given, doing_something(given, fitted(given, s.fit, s.fit.model))), STRICT)
             return replace(chosen, fit=more, rivals=tuple(found))
     return chosen
 
 
-def _doing_something(given: Problem, fit: Fit) -> Fit:
+def _on_inputs(s: Scored, fit: Fit) -> bool:
+    """Whether a candidate changes what acts. A drag may be on an input, or on a speed that was measured."""
+    return registry().get("effects", s.name).stage == "input" and s.channel in {"*", *fit.model.inputs}
+
+
+def doing_something(given: Problem, fit: Fit) -> Fit:
     """Less the effects that came to do nothing beside a later one: a delay of 0 s that a lag took over from."""
     for place in fit.added:
         ends = [(bounds_of(fit.model, slot).neutral, value) for slot, value in _numbers(fit, place)]
         if ends and all(neutral is not None and abs(value - neutral) <= IDLE * max(abs(neutral), 1.0) for neutral, value in ends):
-            return _doing_something(given, fitted(given, fit, without(fit.model, place)))
+            return doing_something(given, fitted(given, fit, without(fit.model, place)))
     return fit
 
 

@@ -115,9 +115,7 @@ def _traced(
     parts: int | None = None,
     under: ComposedModel | None = None,
 ) -> TraceResult:
-    """parts: S, of each step, where they were asked for (`finer`). under: the model under which faults of measurement are looked for; None:
-    the one that is asked about.
-    """
+    """parts: S, of each step, where they were asked for (`finer`). under: what was found before, under which more faults show."""
     weights, kind = norm
     asked, as_recorded = model, (dataset, test)
     if not model.inputs:
@@ -131,8 +129,8 @@ def _traced(
     check_plausible(model, dataset)
     dataset, test = from_one_place(model, dataset), None if test is None else from_one_place(model, test)
     say(0.0, 100.0, "looking for faults of measurement")
-    checked = check(under or model, with_history(model, dataset))
-    tested = None if test is None else check(under or model, with_history(model, test))
+    checked = check(model, with_history(model, dataset), under)
+    tested = None if test is None else check(model, with_history(model, test), under)
     seen = fit_mask(checked.data, seed, everything=test is not None)
     cut = _cut(checked, seen, tested, model, horizon)
     ahead = max(1, min(round(horizon / dataset.dt), len(cut.fit_part.steps) // 4))
@@ -161,15 +159,19 @@ def _traced(
     structure = whole.structure(chosen)
     if structure.matters or astray(chosen, structure, judged_on, seed):
         chosen, structure = once_more(given, whole, chosen, structure, judged_on, ahead)
-    if under is None and _more_faults(chosen.fit, model, dataset, checked):
-        return _traced(as_recorded[0], asked, as_recorded[1], horizon, seed, _from(80.0, say), norm, parts, chosen.fit.model)
     if structure.matters and parts is None:
-        more = finer(dataset, model, chosen, structure, ahead)
+        more = finer(dataset, model, chosen, structure, ahead, under)
         if more is not None:
             return _traced(as_recorded[0], asked, as_recorded[1], horizon, seed, _from(80.0, say), norm, more, under)
     say(90.0, 100.0, "judging on held-out data")
     w = np.ones(len(model.states)) if weights is None else np.array([weights[asked.states.index(s)] for s in model.states])
     result = answered(dataset, checked, given, chosen, structure, judged_on, seed, w, kind)
+    if (
+        under is None
+        and result.effects
+        and any(_more_faults(chosen.fit, model, one, there) for one, there in ((dataset, checked), (test, tested)))
+    ):
+        return _traced(as_recorded[0], asked, as_recorded[1], horizon, seed, _from(90.0, say), norm, parts, chosen.fit.model)
     if result.verdict == "unexplained" and chosen.fit.added and not {*result.depends_on} - {"noise"}:
         result = replace(result, depends_on=whole.likeliest or result.depends_on)
     if result.verdict in {"traced", "ambiguous"} and whole.in_one_stretch(chosen):
@@ -199,15 +201,13 @@ def _cut(checked: Checked, seen: Mask, tested: Checked | None, model: ComposedMo
     return _Cut(checked, fit_part, _held_out(checked, seen, tested, model, horizon))
 
 
-def _more_faults(fit: Fit, model: ComposedModel, data: Dataset, checked: Checked) -> bool:
+def _more_faults(fit: Fit, model: ComposedModel, data: Dataset | None, checked: Checked | None) -> bool:
     """Whether rows are clearly off by what was found that might have been the robot by the model as given: commands that it seemed to carry
     out at once could have taken it there.
     """
-    if not fit.added or data.reconstruction is not None:
+    if data is None or checked is None or data.reconstruction is not None or not fit.added:
         return False
-    known = {(f.kind, f.channel) for f in checked.faults}
-    found = check(fit.model, with_history(model, data)).faults
-    return any(f.kind in {"spike", "offset_jump"} and (f.kind, f.channel) not in known for f in found)
+    return check(model, with_history(model, data), fit.model).faults != checked.faults
 
 
 def _in_parts(model: ComposedModel, data: Dataset) -> ComposedModel:

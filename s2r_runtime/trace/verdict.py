@@ -30,8 +30,8 @@ from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import Mask, acting, first_steps, predicted, rms
 from s2r_runtime.trace.residual_noise import OUTLIER
 from s2r_runtime.trace.rivals import representative, tied
-from s2r_runtime.trace.scores import STRICT
-from s2r_runtime.trace.selection import Selection, one_more
+from s2r_runtime.trace.scores import STRICT, names
+from s2r_runtime.trace.selection import Selection, doing_something, one_more
 from s2r_runtime.trace.slots import slots_of
 
 Array = NDArray[np.float64]
@@ -100,11 +100,19 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
     gone = fit is not chosen.fit  # rivals of a model with more effects are none of this one
     found = rivals_that_happen(given, fit) if gone else list(chosen.rivals)
     risky = False
+    fit, found = doing_something(given, fit), [s if s.fit is None else replace(s, fit=doing_something(given, s.fit)) for s in found]
     if found:
         fits = [fit, *(s.fit for s in found if s.fit is not None)]
         fit, found, risky = representative(given, *tied(given, fit, found, foretelling(judged_on, fits)))
+        found = [s for s in found if s.fit is None or _one_for_another(fit, s.fit)]
     fit = fit if fit is chosen.fit else plainly(given, fit)
     return replace(chosen, fit=fit, rivals=tuple(found), risky=risky)
+
+
+def _one_for_another(fit: Fit, other: Fit) -> bool:
+    """Whether one effect stands in the place of another. What says the same in more effects is no tie: a delay of all is one of each."""
+    mine, theirs = {*names(fit.model)}, {*names(other.model)}
+    return len(theirs - mine) == 1 and len(mine - theirs) == 1
 
 
 def foretold_too(given: Problem, everything: Problem, chosen: Selection, judged_on: Held, horizon: int) -> Selection:

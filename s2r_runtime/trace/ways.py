@@ -55,7 +55,7 @@ def less_noise_of(inputs: Stream, ratios: Sequence[float] = ()) -> tuple[Stream,
     ratios: the latter, where it is known.
     """
     values, told = inputs.values.copy(), [math.nan] * inputs.values.shape[1]
-    sure = moving([inputs]) & np.isfinite(inputs.values).all(axis=0) & (np.count_nonzero(np.diff(inputs.t)) >= FEWEST)
+    sure = moving([inputs]) & np.isfinite(inputs.values).all(axis=0) & (np.count_nonzero(np.diff(inputs.t)) + 1 >= FEWEST)
     for j in np.flatnonzero(sure).tolist():
         known = ratios[j] if ratios else None
         if known is None or math.isfinite(known):
