@@ -109,7 +109,7 @@ def test_its_report_is_one_page_with_the_plots(story: tuple[Path, str]) -> None:
     assert re.findall(r"""(?:src|href)\s*=\s*["'](?!#|data:)[^"']+""", page) == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(480)
 def test_a_campaign_that_is_refused_for_its_order_is_drawn_once_more_and_no_oftener(tmp_path: Path) -> None:
     """The robot's speed swings once in 500 s, so that a sample's error is like that of the one before."""
