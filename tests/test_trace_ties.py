@@ -1,5 +1,7 @@
 """Which explanations tie, which one is the likeliest, and two effects that hide each other."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_trace_for_a_while import DT, _held, _unicycle
@@ -8,7 +10,7 @@ from trace_sets.families import make
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import second_look
+from s2r_runtime.trace import second_look, verdict
 from s2r_runtime.trace.acceptance import _scattered
 from s2r_runtime.trace.any_shape import any_shape_of
 from s2r_runtime.trace.dataset import from_arrays
@@ -17,7 +19,7 @@ from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.rivals import SURELY, rivals_of, simplified, tied
 from s2r_runtime.trace.scores import Scored, _search, names, unlimited
-from s2r_runtime.trace.selection import Selection
+from s2r_runtime.trace.selection import Selection, doing_something
 from s2r_runtime.trace.tracer import load_dataset, trace
 from s2r_runtime.trace.verdict import confirmed, harms
 
@@ -226,6 +228,29 @@ def test_rivals_are_those_of_what_held_out_data_confirm():
     }
     assert left.rivals
     assert all(len(s.fit.added) == len(left.fit.added) == 1 for s in left.rivals)
+
+
+def test_what_has_an_effect_more_beside_one_that_does_nothing_is_no_tie(monkeypatch):
+    """A gain of 1 of the turning is not told. A model with a bias in its place, a little likelier, has then one effect more than what is
+    told, and none of what is told is gone from it.
+    """
+    u = _held(np.random.default_rng(11), 400, [0.1, -1.0], [0.5, 1.0])
+    given, model = _problem(u)
+    gain_of = registry().get("effects", "input_gain")
+    one = fitted(given, evaluate(given, model), insert(model, AppliedEffect(gain_of, "v", {"gain": 0.8}), 0))
+    fit = evaluate(given, insert(one.model, AppliedEffect(gain_of, "w", {"gain": 1.0}), 0))
+    with_bias = evaluate(given, insert(one.model, AppliedEffect(registry().get("effects", "input_bias"), "w", {"bias": 1e-3}), 0))
+    told = doing_something(given, fit)
+    assert [told.model.effects[i].channel for i in told.added] == ["v"]
+    likelier = replace(with_bias, white=told.white + 4.5, coloured=told.coloured + 4.5)
+    for name in ("asked", "_once"):
+        monkeypatch.setattr(verdict, name, lambda *_: False)
+    monkeypatch.setattr(verdict, "foretelling", lambda judged_on, fits: [0.0 for _ in fits])
+    here = held(model, given.data, given.steps, (), np.ones(400, dtype=bool), 1.0)
+    chosen = Selection(evaluate(given, model), fit, 100, (), (Scored("input_bias", "w", 1.0, likelier),))
+    left = confirmed(given, chosen, here)
+    assert [left.fit.model.effects[i].channel for i in left.fit.added] == ["v"]
+    assert left.rivals == ()
 
 
 def _bias(channel="w"):

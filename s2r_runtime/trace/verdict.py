@@ -14,6 +14,7 @@ traced         otherwise
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -30,7 +31,7 @@ from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import Mask, acting, first_steps, predicted, rms
 from s2r_runtime.trace.residual_noise import OUTLIER
 from s2r_runtime.trace.rivals import representative, tied
-from s2r_runtime.trace.scores import STRICT, names
+from s2r_runtime.trace.scores import STRICT, Scored, names
 from s2r_runtime.trace.selection import Selection, doing_something, one_more
 from s2r_runtime.trace.slots import slots_of
 
@@ -101,18 +102,23 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
     found = rivals_that_happen(given, fit) if gone else list(chosen.rivals)
     risky = False
     fit, found = doing_something(given, fit), [s if s.fit is None else replace(s, fit=doing_something(given, s.fit)) for s in found]
+    found = _in_its_place(fit, found)
     if found:
         fits = [fit, *(s.fit for s in found if s.fit is not None)]
         fit, found, risky = representative(given, *tied(given, fit, found, foretelling(judged_on, fits)))
-        found = [s for s in found if s.fit is None or _one_for_another(fit, s.fit)]
+        found = _in_its_place(fit, found)
     fit = fit if fit is chosen.fit else plainly(given, fit)
     return replace(chosen, fit=fit, rivals=tuple(found), risky=risky)
 
 
-def _one_for_another(fit: Fit, other: Fit) -> bool:
-    """Whether one effect stands in the place of another. What says the same in more effects is no tie: a delay of all is one of each."""
-    mine, theirs = {*names(fit.model)}, {*names(other.model)}
-    return len(theirs - mine) == 1 and len(mine - theirs) == 1
+def _in_its_place(fit: Fit, found: Sequence[Scored]) -> list[Scored]:
+    """Those that have one effect in the place of another. What says the same in more effects is no tie: a delay of all is one of each."""
+    mine, kept = {*names(fit.model)}, []
+    for s in found:
+        theirs = {*names(s.fit.model)} if s.fit is not None else set()
+        if len(theirs - mine) == len(mine - theirs) == 1:
+            kept.append(s)
+    return kept
 
 
 def foretold_too(given: Problem, everything: Problem, chosen: Selection, judged_on: Held, horizon: int) -> Selection:
