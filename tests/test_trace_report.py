@@ -206,6 +206,8 @@ def _fields(result):
         (0.8, None, None, "-", "0.8"),
         (1.5, 1.2, 1e6, "m/s", "1.5 m/s (at least 1.2)"),
         (12345.6, 12000.0, 12700.0, "N", "1.235e+04 N (95 %: 1.2e+04 to 1.27e+04)"),
+        (0.7963, 1e-6, 1e9, "m/s²", "0.7963 m/s² (not limited by these data)"),
+        (3.0, 7e-15, 22.4, "s", "3 s (at most 22.4)"),
     ],
 )
 def test_a_value_is_written_as_exactly_as_it_is_known(value, low, high, unit, text):

@@ -52,6 +52,18 @@ def test_what_was_not_fitted_decides_between_explanations_that_tie():
     assert [(s.name, s.channel, s.fit) for s in rest] == [("input_gain", "v", one)]
 
 
+@pytest.mark.parametrize(("white", "behind", "tie"), [(40.0, 8.0, True), (12.0, 8.0, False), (40.0, 30.0, False), (-40.0, 8.0, False)])
+def test_what_only_the_colour_of_noise_decides_is_not_decided(white, behind, tie):
+    """By noise without a memory the other one is likelier by `white`, by noise with one it is less likely by `behind`: nobody knows which
+    law holds of a rig whose model is coarse."""
+    u = np.column_stack([np.full(400, 0.3), _held(np.random.default_rng(11), 400, [-1.0], [1.0])[:, 0]])
+    given, model = _problem(u)
+    one = _with(given, model, "input_gain", "v", gain=0.8)
+    other = replace(_with(given, model, "input_bias", "v", bias=-0.06), white=one.white + white, coloured=one.coloured - behind)
+    found = [Scored("input_bias", "v", 1.0, other)]
+    assert tied(given, one, found, [0.0, 0.0]) == (one, found if tie else [])
+
+
 def test_what_many_explanations_share_is_all_that_is_known():
     """Of an input at one speed a gain, an offset and a limit say one thing; two may be just the two that are there."""
     u = np.column_stack([np.full(400, 0.3), _held(np.random.default_rng(11), 400, [-1.0], [1.0])[:, 0]])

@@ -232,7 +232,8 @@ def _beyond_doubt(r: TraceResult) -> list[str]:
             return ["structure; what it depends on cannot be told"]
         return [f"what no input and no state foretells: {away}"] if away else ["nothing beyond noise"]
     if _shown(r) == ("noise",):
-        return ["coloured noise: correlated in time, whatever the inputs do", *([away] if away else [])]
+        whatever = "" if r.may_depend_on else ", whatever the inputs do"
+        return [f"coloured noise: correlated in time{whatever}", *([away] if away else [])]
     percent = f"{100.0 * r.share_left:.0f} %" if r.share_left >= 0.01 else "under 1 %"
     much = f" ({percent} of what the model lacked)" if r.effects else ""
     lines = [f"structure{much} that depends on {', '.join(_shown(r))}"]

@@ -155,6 +155,7 @@ def _recorded(
         reconstruction=dataset.reconstruction,
         way=dataset.way,
         noisy=dataset.noisy,
+        measured_forces=dataset.measured_forces,
         behind=dataset.behind,
         unconfirmed=tuple((final.model.effects[place].effect.name, final.model.effects[place].channel) for place in idle),
         domain=domain_of(model, (given.data, given.steps), (judged_on.data, judged_on.steps)),

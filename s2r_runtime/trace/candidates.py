@@ -18,6 +18,7 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.fitting import insert
 from s2r_runtime.trace.leftover import Leftover
+from s2r_runtime.trace.measured_forces import on_motion
 from s2r_runtime.trace.residual import times
 from s2r_runtime.trace.slots import Added
 
@@ -56,6 +57,8 @@ def candidates(model: ComposedModel, data: Dataset, left: Leftover | None = None
         if getattr(effect, "timed", False) and not data.in_order:
             continue
         for channel in effect.channels(model.nominal):
+            if data.measured_forces and not on_motion(model, name, effect.stage, channel):
+                continue
             if canonical(model.for_effects, name, channel) != (name, channel):
                 continue  # the same thing under another name is looked for already
             if (name, channel) in taken or (channel == "*" and len(model.inputs) == 1 and len(effect.channels(model.nominal)) > 1):

@@ -87,7 +87,7 @@ class Better:
 
 def better_shape(given: Problem, fit: Fit, horizon: int) -> Better | None:
     """The shape that explains most beyond the effects named on its input, of those that show, if any do; None if none is told."""
-    won = [_challenge(given, fit, channel, horizon) for channel in _inputs(fit)]
+    won = [_challenge(given, fit, channel, horizon) for channel in _inputs(given, fit)]
     own = [{fit.model.states[axis.velocity], fit.model.states[axis.position]} for axis in axes(fit.model.nominal)]
     won += [_challenge_on_axis(given, fit, there, horizon) for there in (*own, *({speed} for speed in lone_speeds(fit.model.nominal)))]
     return _first(won)
@@ -99,9 +99,10 @@ def _first(won: Sequence[Better | None]) -> Better | None:
 
 def best_shape(given: Problem, base: Fit, horizon: int) -> Better | None:
     """The shape that explains most of what a model leaves, on whichever input; None if none would be taken if it were an effect."""
-    fits = [fit for channel in base.model.inputs for fit in _fits(given, base, channel)]
+    on = () if given.data.measured_forces else base.model.inputs
+    fits = [fit for channel in on for fit in _fits(given, base, channel)]
     fits += _state_fits(given, base, _states(base, STATE_SHAPES))
-    tried = len(SHAPES) * len(base.model.inputs) + len(_states(base, STATE_SHAPES))
+    tried = len(SHAPES) * len(on) + len(_states(base, STATE_SHAPES))
     found = [(gain(fit, base) - _price(given, fit, base), fit) for fit in fits]
     for nats, fit in sorted(found, key=lambda pair: -pair[0]):
         if nats > 0.0 and accepted(given, fit, base, tried, horizon):
@@ -109,8 +110,10 @@ def best_shape(given: Problem, base: Fit, horizon: int) -> Better | None:
     return None
 
 
-def _inputs(fit: Fit) -> list[str]:
-    """Inputs on which effects were named."""
+def _inputs(given: Problem, fit: Fit) -> list[str]:
+    """Inputs on which effects were named, if these were commanded."""
+    if given.data.measured_forces:
+        return []
     named = [fit.model.effects[i] for i in fit.added if fit.model.effects[i].effect.stage == "input"]
     channels = [c for a in named for c in (fit.model.inputs if a.channel == "*" else (a.channel,))]
     return [c for c in dict.fromkeys(channels) if c in fit.model.inputs]  # drag may act on a speed

@@ -320,7 +320,8 @@ def _offered(left: Left) -> Iterator[_Offer]:
     y = quieter(given, left.fit.noise, left.r)
     u = act.mean[given.steps.place]
     body, world = directions_of(given, model, act)
-    own = [u[:, [j]] * push for j, push in enumerate(own_pushes(given, model, act))]
+    commanded = not given.data.measured_forces
+    own = [u[:, [j]] * push for j, push in enumerate(own_pushes(given, model, act))] if commanded else []
     named = _named(left)
     moved = _apart([*_moved(left), *named] if set(model.states) >= BODY else [*own, *named])
     for place in _places(model.states, y):
@@ -330,7 +331,7 @@ def _offered(left: Left) -> Iterator[_Offer]:
         if name in model.states:
             angle = y[:, model.states.index(name)]
             yield from _over("heading", np.column_stack([np.cos(angle), np.sin(angle)]), [*moved, *body])
-    for j, name in enumerate(model.inputs):
+    for j, name in enumerate(model.inputs if commanded else ()):
         size = max(float(np.max(np.abs(u[:, j]))), 1e-12)
         if given.data.in_order:
             yield from _over(f"time*{name}", given.steps.t[:, None], [own[j]], CELLS[:SLOW])

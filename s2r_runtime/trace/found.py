@@ -70,7 +70,8 @@ def interval_text(value: float, low: Limit, high: Limit, unit: str) -> str:
     """`0.1000 rad/s (5.730 deg/s) (95 %: 0.0980 to 0.1020)`; an end at a parameter's bound says that the data do not limit it there."""
     plain = "" if unit == "-" else unit
     ends = (low, high) if isinstance(low, float) and isinstance(high, float) else None
-    within = ends is not None and abs(ends[0]) < UNLIMITED and abs(ends[1]) < UNLIMITED
+    known = [_limits(end, value) for end in ends or ()]
+    within = all(known) and ends is not None
     width = 0.5 * (ends[1] - ends[0]) if ends is not None and within else 0.0
     turned = degrees(plain)
     seen = max(min(width, 2.0 * abs(value)), 0.01 * width)  # of a number that is hardly known its first digit, not a zero
@@ -80,8 +81,13 @@ def interval_text(value: float, low: Limit, high: Limit, unit: str) -> str:
         return text
     if within:
         return f"{text} (95 %: {_rounded(ends[0], width)} to {_rounded(ends[1], width)})"
-    said = [f"at least {ends[0]:.4g}" if abs(ends[0]) < UNLIMITED else "", f"at most {ends[1]:.4g}" if abs(ends[1]) < UNLIMITED else ""]
+    said = [f"at least {ends[0]:.4g}" if known[0] else "", f"at most {ends[1]:.4g}" if known[1] else ""]
     return f"{text} ({', '.join(s for s in said if s) or 'not limited by these data'})"
+
+
+def _limits(end: float, value: float) -> bool:
+    """Whether an end of an interval says anything: not if it is at a bound far off, or so near to 0 that this is one."""
+    return abs(end) < UNLIMITED and not 0.0 < abs(end) < abs(value) / UNLIMITED
 
 
 def _rounded(value: float, width: float) -> str:

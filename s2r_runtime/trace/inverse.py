@@ -10,7 +10,7 @@ error of inverse dynamic identification (A. Janot, M. Gautier, M. Brunot, Data s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -36,6 +36,9 @@ CLOSE = 1e-7
 
 FARTHEST = 100.0
 """Times the input's size that the one that the motion takes may be away: a model that asks for more explains nothing."""
+
+TINY = 1e-12
+"""Of what was commanded, squared: what acts is nothing below it."""
 
 ROWS = 200_000
 """At most; of a longer recording a part of that length at the beginning."""
@@ -74,19 +77,30 @@ def inverse(model: ComposedModel, data: Dataset, held_out: Steps) -> Inverse | N
     return Inverse(fine, steps, stretches, band) if stretches else None
 
 
-def input_relative(model: ComposedModel, given: Inverse) -> float | None:
-    """See above. None where nothing was commanded: the share of nothing is no number."""
+def input_relative(model: ComposedModel, given: Inverse, *, acting_too: bool = False) -> float | None:
+    """See above. None where nothing was commanded: the share of nothing is no number. acting_too: over what is left of it where it acts,
+    where that is less than what was commanded (a force that acts by itself is nothing of it); next to infinite where nothing is left.
+    """
     model = model if model.dt == given.data.dt else at_step(model, given.data.dt)
     act = acting(model, given.data)
     here = act.at(given.steps.place)
     commanded = acting(model, given.data, ()).mean[given.steps.place]
     error = here.mean - _needed(model, given.steps, here)
-    lost, whole = np.zeros(error.shape[1]), np.zeros(error.shape[1])
-    for a, b in given.stretches:
-        lost += np.sum(differentiation.low_pass(error[a:b], given.data.dt, given.bandwidth) ** 2, axis=0)
-        whole += np.sum(differentiation.low_pass(commanded[a:b], given.data.dt, given.bandwidth) ** 2, axis=0)
+    lost, whole, acts = (
+        sum(np.sum(differentiation.low_pass(e[a:b], given.data.dt, given.bandwidth) ** 2, axis=0) for a, b in given.stretches)
+        for e in (error, commanded, here.mean - _by_itself(model, given) if acting_too else commanded)
+    )
     used = whole > 0.0
-    return float(np.sqrt(np.mean(lost[used] / whole[used]))) if used.any() else None
+    if not used.any():
+        return None
+    over = np.maximum(np.minimum(whole, acts), TINY * whole) if acting_too else whole
+    return float(np.sqrt(np.mean(lost[used] / over[used])))
+
+
+def _by_itself(model: ComposedModel, given: Inverse) -> Array:
+    """(n, nu) what acts if nothing is commanded."""
+    silent = replace(given.data, runs=tuple(replace(run, u=0.0 * run.u, turned=None) for run in given.data.runs))
+    return acting(model, silent).mean[given.steps.place]
 
 
 def _needed(model: ComposedModel, steps: Steps, act: Acting) -> Array:

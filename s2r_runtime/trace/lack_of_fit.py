@@ -34,6 +34,7 @@ from s2r_runtime.trace.fitting import gain as explained
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, SLOWLY, Judged, Left, first_look, judge, leading
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
 from s2r_runtime.trace.lack_of_fit_together import pairs
+from s2r_runtime.trace.measured_forces import about_inputs
 from s2r_runtime.trace.residual import Mask, acting, covered, rms, rollout, rollout_starts
 from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
 
@@ -69,6 +70,11 @@ SLOW = 3.0
 SEEN = 1.25
 """Times the evidence under the noise of the model that the gain of what is slow counts at most: where a position wanders a little, terms
 that follow it make the noise of the process look like none, and all that comes after is foretold by that.
+"""
+
+MUCH = 0.3
+"""Of what is left in a step: a dictionary that foretells more of it is told beside a name, although no rollout shows it, as is one that
+rollouts show and that may be what wanders by itself.
 """
 
 DOUBLED = 2.0
@@ -140,6 +146,8 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     left, found = looks.left, looks.found
     chosen, gains = looks.chosen
     varying = uneven(left)
+    if varying is not None and left.given.data.measured_forces and about_inputs(left.fit.model, varying.judged.token):
+        varying = None
     number = varying.judged if varying is not None and varying.sure else None
     wanders = left.law is not None and np.any(left.law.slow.sum(axis=1) > 0.0)  # else what is left is steadier than white noise
     coloured = ("noise",) if np.any(left.fit.colour.strength > COLOURED) or wanders else ()
@@ -151,9 +159,10 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
             others.append(looks.field.nats)
         if others and max(others) > nats_of(left, chosen[-1].x):
             chosen = []
+    shows = False
     if chosen:
-        matters, share = _weight_of(left, nominal, chosen[-1], horizon)
-        if matters and not _wanders(left, chosen[-1], SLOW * math.log(len(looks.found) / ALPHA)):
+        shows, share = _weight_of(left, nominal, chosen[-1], horizon)
+        if shows and not _wanders(left, chosen[-1], SLOW * math.log(len(looks.found) / ALPHA)):
             first = [] if number is None or number.gain <= chosen[-1].gain else [number]
             return Structure(as_told([*first, *chosen]), True, share, gains, noise=_beside(left, chosen[-1]))
     varied = looks.field
@@ -168,7 +177,9 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     windows = None if chosen else windows or _for_a_while(left)
     matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
     if windows is None or not matters:  # a number that may vary is told with the name, if no rollout shows it
-        return Structure(coloured, False, 0.0, gains, beside=() if varying is None else (varying.judged.token,))
+        seen = as_told(chosen) if chosen and left.fit.added and (shows or _share_of(left, chosen[-1]) > MUCH) else ()
+        also = () if varying is None else (varying.judged.token,)
+        return Structure(coloured, False, 0.0, gains, beside=tuple(dict.fromkeys((*also, *seen))))
     tokens = may_depend_on(left, windows, found)
     return Structure(tokens, True, share, gains, for_a_while=True, noise=_beside(left, windows), nats=windows.gain)
 
@@ -298,6 +309,8 @@ def dictionaries_of(left: Left) -> list[tuple[str, Array]]:
     given, fit = left.given, left.fit
     spread = np.ones(left.r.shape[1]) if given.floor.axes else fit.noise.one_step(left.f)
     offered = dictionaries(given, fit.model, acting(fit.model, given.data), fit.noise, left.r)
+    if given.data.measured_forces:  # what is left is the noise of the inputs
+        offered = ((token, terms) for token, terms in offered if not about_inputs(fit.model, token))
     return [(token, x) for token, terms in offered if (x := _columns(terms, spread)).shape[2]]
 
 
@@ -414,6 +427,14 @@ def _weight_of(left: Left, nominal: Fit, judged: Judged, horizon: int, least: fl
             if a > 0.0 and max(b, n) > worst * a:
                 worst, share = max(b, n) / a, max(n * n - a * a, 0.0) / max(b * b - a * a, n * n - a * a)
     return matters, share
+
+
+def _share_of(left: Left, judged: Judged) -> float:
+    """Of what is left in a step of some state, noise included, the share (of squares) that a dictionary foretells elsewhere in time."""
+    if judged.gain <= 0.0:
+        return 0.0
+    rest = left.r - np.einsum("kim,km->ki", judged.x, judged.betas[left.block])
+    return float(np.max(1.0 - np.sum(rest**2, axis=0) / np.maximum(np.sum(left.r**2, axis=0), 1e-300)))
 
 
 def _to_their_rounding(left: Left, judged: Judged) -> Mask:

@@ -152,6 +152,7 @@ def pushes_by_token(given: Problem, model: ComposedModel, act: Acting) -> list[t
         (f"time*{name}", u[:, j][:, None] * push)
         for j, (name, push) in enumerate(zip(model.inputs, own_pushes(given, model, act), strict=True))
     ]
+    own = [] if given.data.measured_forces else own
     return [(token, push) for token, push in [*own, *(("time", d) for d in (*body, *world))] if np.any(push)]
 
 

@@ -10,13 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.effects.classes import same
-from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.plugins import registry
 from s2r_runtime.trace.account import account
 from s2r_runtime.trace.domain import Range
 from s2r_runtime.trace.domain import told as domain_told
 from s2r_runtime.trace.errors import Held, Judged
 from s2r_runtime.trace.fault import Fault
+from s2r_runtime.trace.fitting import insert
 from s2r_runtime.trace.found import Found, Limit
 from s2r_runtime.trace.power import Visible
 from s2r_runtime.trace.reconstruct import IN_PARTS, Reconstruction
@@ -72,6 +74,8 @@ class TraceResult:
     """As the dataset's: how inputs went that the recording has samples of."""
     noisy: dict[str, float] = field(default_factory=dict)
     """Standard deviations of the noise that was taken out of inputs."""
+    measured_forces: bool = False
+    """As the dataset's: the inputs were taken for measurements, and not for commands."""
     behind: dict[str, float] = field(default_factory=dict)
     """s by which states came late against others of the pose, and were taken earlier."""
     domain: tuple[Range, ...] = ()
@@ -158,6 +162,12 @@ class TraceResult:
                 lines.append(
                     f"some inputs went on changing between the rows, as the motion says: taken on their way to the next one ({each})"
                 )
+        if self.measured_forces:
+            names = ", ".join(self.nominal.inputs)
+            lines.append(
+                f"{names}: taken for a measurement with noise of its own, not for a command, as the inverse model says; what acts on it, "
+                "and how it scales, cannot be told here"
+            )
         if self.noisy:
             each = ", ".join(f"{name} {size:.2g}" for name, size in self.noisy.items())
             lines.append(f"inputs are noisy samples, as the motion says: noise was taken out of them (standard deviation: {each})")
@@ -167,6 +177,15 @@ class TraceResult:
     def horizon_s(self) -> float:
         """Of the rollouts."""
         return self.held.horizon * self.held.data.dt
+
+    @property
+    def explaining(self) -> ComposedModel:
+        """The model of the answer, with what explains a part only."""
+        model = self.model
+        for found in self.partial:
+            effect = AppliedEffect(registry().get("effects", found.name), found.channel, found.values)
+            model = insert(model, effect, len(model.effects))
+        return model
 
     def to_json(self) -> dict[str, Any]:
         """Plain data; numbers in SI."""
@@ -202,6 +221,7 @@ class TraceResult:
             "unmeasured": list(self.unseen),
             "inputs_moved_on": 0.5 * self.way.most,
             "inputs_noise": self.noisy,
+            "inputs_measured": self.measured_forces,
             "inputs_late": self.way.late,
             "inputs_changed_within": self.way.within,
             "unconfirmed": [{"name": name, "channel": channel} for name, channel in self.unconfirmed],

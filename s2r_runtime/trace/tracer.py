@@ -41,6 +41,7 @@ from s2r_runtime.trace.scores import names
 from s2r_runtime.trace.second_look import astray, finer, once_more
 from s2r_runtime.trace.selection import MOST, all_dated, select
 from s2r_runtime.trace.straight import acted, alike_laid, changed_within, commanded, noisy, sampled, samples_of, straight, way_of
+from s2r_runtime.trace.throttled import says_better, throttled
 from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import confirmed, foretold_too
 from s2r_runtime.trace.ways import Way, moving
@@ -166,6 +167,11 @@ def _traced(
     say(90.0, 100.0, "judging on held-out data")
     w = np.ones(len(model.states)) if weights is None else np.array([weights[asked.states.index(s)] for s in model.states])
     result = answered(dataset, checked, given, chosen, structure, judged_on, seed, w, kind)
+    if not dataset.measured_forces and throttled(chosen.fit, judged_on):
+        taken = [None if one is None else replace(one, measured_forces=True) for one in as_recorded]
+        other = _traced(taken[0] or dataset, asked, taken[1], horizon, seed, _from(90.0, say), norm, parts, under)
+        if says_better(other.explaining, chosen.fit.model, judged_on):
+            return other
     if (
         under is None
         and result.effects
@@ -234,7 +240,7 @@ def _straight(
     fit: Fit,
 ) -> tuple[Dataset, Dataset | None] | None:
     """The recordings with inputs that moved on between the rows, if the motion says that they did."""
-    if recorded[0].way or not (sampled(recorded[0]) or commanded(recorded[0])):
+    if recorded[0].way or recorded[0].measured_forces or not (sampled(recorded[0]) or commanded(recorded[0])):
         return None
     less, data, test = alike(asked, *recorded)  # a recording without a state is laid for the model without it
     samples = samples_of(data)

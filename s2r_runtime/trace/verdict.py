@@ -34,6 +34,7 @@ from s2r_runtime.trace.rivals import representative, tied
 from s2r_runtime.trace.scores import STRICT, Scored, names
 from s2r_runtime.trace.selection import Selection, doing_something, one_more
 from s2r_runtime.trace.slots import slots_of
+from s2r_runtime.trace.throttled import unfollowed
 
 Array = NDArray[np.float64]
 
@@ -74,7 +75,7 @@ MATTERS = 1.5
 MIXED = 0.75
 """Of what an input does in its own place: as much of another input in it is not what crosses over from there, but another model's input."""
 
-SILENT = 0.05
+SILENT = 0.1
 """Of what is asked of an input: if less is left of it, effects have silenced it."""
 
 FEWEST_SILENT = 20
@@ -200,6 +201,8 @@ def verdict_of(
         return "unexplained"
     if _another_model(chosen.fit, before, given) or _silenced(chosen.fit, after, given) or _silenced_for_a_while(chosen.fit, after, given):
         return "unexplained"
+    if unfollowed(chosen.fit, given):
+        return "unexplained"
     return "ambiguous" if chosen.rivals else "traced"
 
 
@@ -234,7 +237,7 @@ def _silenced(fit: Fit, after: Judged, given: Held) -> bool:
         return False
     asked, acts = (np.std(u, axis=0) for u in _asked_and_acting(fit, given))
     share, goes = _off(after, given)
-    return bool(np.any((asked > 0.0) & (acts < SILENT * asked)) and np.any(share[goes] >= NEARER))
+    return bool(np.any((asked > 0.0) & (acts < SILENT * asked)) and np.any(share[goes] >= FORETELLS))
 
 
 def _silenced_for_a_while(fit: Fit, after: Judged, given: Held) -> bool:
@@ -253,7 +256,7 @@ def _silenced_for_a_while(fit: Fit, after: Judged, given: Held) -> bool:
         if np.count_nonzero(there) < FEWEST_SILENT:
             continue
         share, goes = _off_at(after, given, there)
-        if np.any(share[goes] >= NEARER):
+        if np.any(share[goes] >= FORETELLS):
             return True
     return False
 

@@ -1,0 +1,141 @@
+"""Torques that were measured beside a motion that a position loop made: noise in them is no force that the joint did not follow."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from s2r_runtime.models.composed import AppliedEffect, compose
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.plugins import registry
+from s2r_runtime.trace.dataset import Dataset, from_arrays
+from s2r_runtime.trace.errors import held
+from s2r_runtime.trace.fitting import evaluate, insert, problem
+from s2r_runtime.trace.inverse import input_relative
+from s2r_runtime.trace.measured_forces import about_inputs, on_motion
+from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.throttled import says_better, throttled, unfollowed
+from s2r_runtime.trace.tracer import trace
+
+DT_S, ROWS, MASS, VISCOUS, DRY = 0.004, 570, 0.2, 6.7, 0.5
+JOINT = compose(ModelSpec("joint", DT_S, {"mass": MASS}))
+INPUT_EFFECTS = {"input_gain", "input_gain_drift", "input_saturation", "input_deadband", "input_gain_asymmetry", "periodic_disturbance"}
+
+
+def _arm(seed: int, noise: float) -> Dataset:
+    """An arm's joint that a loop takes along a planned move, with the ripple of its gear. Friction takes up nearly all of the torque, which
+    is measured with noise that remembers five rows.
+    """
+    rng, t = np.random.default_rng(seed), DT_S * np.arange(ROWS + 1)
+    v = np.interp(t, [0.0, 0.9, 1.4, 2.4], [0.45, 0.9, 0.9, 0.45]) + 0.01 * np.sin(2.0 * np.pi * 11.0 * t)
+    q = -1.2 + np.cumsum(np.append(0.0, 0.5 * DT_S * (v[1:] + v[:-1])))
+    torque, late = MASS * np.gradient(v, t) + VISCOUS * v + DRY, np.zeros(ROWS + 1)
+    for k in range(1, ROWS + 1):
+        late[k] = 0.8 * late[k - 1] + 0.6 * rng.normal()
+    y = np.column_stack([q, v]) + rng.normal(size=(ROWS + 1, 2)) * [1e-5, 2e-3]
+    return from_arrays(JOINT, [(y, (torque + noise * late)[:-1, None])])
+
+
+def _commanded(seed: int, *effects: EffectSpec, noise: float = 2e-3) -> Dataset:
+    """The same joint, driven by forces that are commanded."""
+    robot = compose(ModelSpec("joint", DT_S, {"mass": MASS}, effects))
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-2.0, 2.0, ROWS // 10 + 1), 10)[:ROWS, None]
+    x, hidden, rows = np.zeros((1, 2)), robot.at_rest(1), [np.zeros(2)]
+    for k in range(ROWS):
+        x, hidden = robot.step(x, u[k : k + 1], hidden)
+        rows.append(x[0])
+    return from_arrays(JOINT, [(np.array(rows) + rng.normal(size=(ROWS + 1, 2)) * [1e-5, noise], u)])
+
+
+@pytest.mark.parametrize("noise", [0.2, 0.5])
+@pytest.mark.parametrize("seed", range(4))
+def test_friction_that_takes_up_the_whole_torque_is_no_motor_that_does_nothing(seed, noise):
+    """A torque of 3.5 to 6.5 N m, 0.2 of which moves the joint: as a command it would do a thirtieth of what it says."""
+    result = trace(_arm(seed, noise), JOINT)
+    told = [*result.effects, *result.partial]
+    assert result.measured_forces
+    assert result.to_json()["inputs_measured"]
+    assert not {e.name for e in told} & INPUT_EFFECTS
+    (viscous,) = [e.values["coefficient"] for e in told if e.name == "viscous_friction"]
+    assert min(abs(viscous / size - 1.0) for size in (VISCOUS, VISCOUS + DRY / 0.7)) < 0.06  # beside dry friction, or with that in it
+    assert any("taken for a measurement" in line for line in result.done_to_data)
+    assert not any(about_inputs(JOINT, token) for token in result.depends_on)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_torque_that_is_hardly_more_than_noise_gets_no_confident_name_of_an_input(seed):
+    result = trace(_arm(seed, 1.0), JOINT)
+    assert result.measured_forces
+    assert not {e.name for e in result.effects} & INPUT_EFFECTS
+    assert result.after.input_relative is None or result.after.input_relative <= result.before.input_relative * 1.01
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_force_of_something_else_gets_no_name(seed):
+    """Another joint's column: the robot goes, and not by this."""
+    data, rng = _arm(seed, 0.2), np.random.default_rng(50 + seed)
+    other = 4.0 + np.cumsum(rng.normal(size=(ROWS, 1)) * 0.05, axis=0)
+    result = trace(replace(data, runs=tuple(replace(run, u=other) for run in data.runs)), JOINT)
+    assert not {e.name for e in result.effects} & INPUT_EFFECTS
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [("input_gain", {"gain": 0.3}), ("input_deadband", {"width": 1.0}), ("input_saturation", {"low": -0.5, "high": 0.5})],
+)
+def test_what_throttles_a_command_keeps_its_name(name, values):
+    data = _commanded(4, EffectSpec(name, "force", values))
+    result = trace(data, JOINT)
+    assert [e.name for e in result.effects] == [name]
+    assert not result.measured_forces
+    assert result.effects[0].values == {k: pytest.approx(v, rel=0.05) for k, v in values.items()}
+
+
+def _with(name, channel, **values):
+    return insert(JOINT, AppliedEffect(registry().get("effects", name), channel, values), 0)
+
+
+def test_an_effect_on_the_input_is_judged_by_what_it_leaves_of_the_command():
+    """The same error of the force, over a tenth of it: without noise a gain of 0.1 makes 0.9 of the command an error, nine times what is
+    left."""
+    data = _commanded(1, noise=0.0)
+    steps = steps_of(data)
+    judged_on = held(JOINT, data, steps, (), np.ones(ROWS, dtype=bool), 0.5)
+    gain, both = _with("input_gain", "force", gain=0.1), _with("input_bias", "force", bias=1.0)
+    assert input_relative(gain, judged_on.inverse) == pytest.approx(0.9, rel=0.01)
+    assert input_relative(gain, judged_on.inverse, acting_too=True) == pytest.approx(9.0, rel=0.01)
+    plain, acting = (input_relative(both, judged_on.inverse, acting_too=too) for too in (False, True))
+    assert plain == acting  # a force that acts by itself is nothing of what was commanded
+    fit = evaluate(problem(data, steps), gain)
+    assert (throttled(fit, judged_on), unfollowed(fit, judged_on)) == (True, True)
+    assert says_better(JOINT, gain, judged_on)
+    assert not says_better(gain, JOINT, judged_on)
+    mild = evaluate(problem(data, steps), _with("input_gain", "force", gain=0.8))
+    assert not throttled(mild, judged_on)
+    assert not unfollowed(mild, judged_on)
+
+
+def test_nothing_is_throttled_where_inputs_are_no_forces():
+    cart = compose(ModelSpec("unicycle", 0.1))
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-1.0, 1.0, (200, 2))
+    x, rows = np.zeros((1, 3)), [np.zeros(3)]
+    for k in range(200):
+        x, _ = cart.step(x, u[k : k + 1], cart.at_rest(1))
+        rows.append(x[0])
+    data = from_arrays(cart, [(np.array(rows), u)])
+    judged_on = held(cart, data, steps_of(data), (), np.ones(200, dtype=bool), 1.0)
+    fit = evaluate(
+        problem(data, steps_of(data)), insert(cart, AppliedEffect(registry().get("effects", "input_gain"), "v", {"gain": 0.1}), 0)
+    )
+    assert not throttled(fit, judged_on)
+    assert not says_better(cart, fit.model, judged_on)
+
+
+def test_which_effects_and_which_structure_are_about_the_inputs():
+    assert [on_motion(JOINT, "input_gain", "input", channel) for channel in ("force", "*", "qd")] == [False, False, True]  # drag is on qd
+    assert on_motion(JOINT, "input_bias", "input", "force")
+    assert on_motion(JOINT, "coulomb_friction", "step", "qd")
+    tokens = ("force", "memory(force)", "time*force", "force*force", "speed", "position", "time", "noise")
+    assert [about_inputs(JOINT, token) for token in tokens] == [True, True, True, True, False, False, False, False]
