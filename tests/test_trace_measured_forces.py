@@ -11,10 +11,10 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import Dataset, from_arrays
 from s2r_runtime.trace.errors import held
 from s2r_runtime.trace.fitting import evaluate, insert, problem
-from s2r_runtime.trace.inverse import input_relative
+from s2r_runtime.trace.inverse import by_noise, followed
 from s2r_runtime.trace.measured_forces import about_inputs, on_motion
 from s2r_runtime.trace.residual import steps_of
-from s2r_runtime.trace.throttled import says_better, throttled, unfollowed
+from s2r_runtime.trace.throttled import refuted, says_forces
 from s2r_runtime.trace.tracer import trace
 
 DT_S, ROWS, MASS, VISCOUS, DRY = 0.004, 570, 0.2, 6.7, 0.5
@@ -36,16 +36,19 @@ def _arm(seed: int, noise: float) -> Dataset:
     return from_arrays(JOINT, [(y, (torque + noise * late)[:-1, None])])
 
 
-def _commanded(seed: int, *effects: EffectSpec, noise: float = 2e-3) -> Dataset:
-    """The same joint, driven by forces that are commanded."""
+def _commanded(seed: int, *effects: EffectSpec, noise: float = 2e-3, slowly: bool = False, rows: int = ROWS) -> Dataset:
+    """The same joint, driven by forces that are commanded: held for ten steps each, or swaying slowly."""
     robot = compose(ModelSpec("joint", DT_S, {"mass": MASS}, effects))
-    rng = np.random.default_rng(seed)
-    u = np.repeat(rng.uniform(-2.0, 2.0, ROWS // 10 + 1), 10)[:ROWS, None]
-    x, hidden, rows = np.zeros((1, 2)), robot.at_rest(1), [np.zeros(2)]
-    for k in range(ROWS):
+    rng, t = np.random.default_rng(seed), DT_S * np.arange(rows)
+    held_for_ten = np.repeat(rng.uniform(-2.0, 2.0, rows // 10 + 1), 10)[:rows]
+    tones = zip((0.08, 0.17, 0.35), rng.uniform(0.0, 2.0 * np.pi, 3), strict=True)
+    swaying = 4.0 / 3.0 * np.sum([np.sin(2.0 * np.pi * f * t + phase) for f, phase in tones], axis=0)
+    u = (swaying if slowly else held_for_ten)[:, None]
+    x, hidden, states = np.zeros((1, 2)), robot.at_rest(1), [np.zeros(2)]
+    for k in range(rows):
         x, hidden = robot.step(x, u[k : k + 1], hidden)
-        rows.append(x[0])
-    return from_arrays(JOINT, [(np.array(rows) + rng.normal(size=(ROWS + 1, 2)) * [1e-5, noise], u)])
+        states.append(x[0])
+    return from_arrays(JOINT, [(np.array(states) + rng.normal(size=(rows + 1, 2)) * [1e-5, noise], u)])
 
 
 @pytest.mark.parametrize("noise", [0.2, 0.5])
@@ -63,57 +66,87 @@ def test_friction_that_takes_up_the_whole_torque_is_no_motor_that_does_nothing(s
     assert not any(about_inputs(JOINT, token) for token in result.depends_on)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_torque_that_is_hardly_more_than_noise_gets_no_confident_name_of_an_input(seed):
+@pytest.mark.parametrize("seed", range(4))
+def test_a_torque_that_varies_hardly_more_than_its_noise_gets_no_name(seed):
     result = trace(_arm(seed, 1.0), JOINT)
-    assert result.measured_forces
-    assert not {e.name for e in result.effects} & INPUT_EFFECTS
-    assert result.after.input_relative is None or result.after.input_relative <= result.before.input_relative * 1.01
+    assert (result.verdict, result.effects) == ("unexplained", ())
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_force_of_something_else_gets_no_name(seed):
-    """Another joint's column: the robot goes, and not by this."""
+    """Another joint's column: the robot goes, and not by this. It is about as large as friction would be, and does not vary like that."""
     data, rng = _arm(seed, 0.2), np.random.default_rng(50 + seed)
     other = 4.0 + np.cumsum(rng.normal(size=(ROWS, 1)) * 0.05, axis=0)
     result = trace(replace(data, runs=tuple(replace(run, u=other) for run in data.runs)), JOINT)
-    assert not {e.name for e in result.effects} & INPUT_EFFECTS
+    assert (result.verdict, result.effects, result.measured_forces) == ("unexplained", (), False)
 
 
+def test_what_a_log_of_ours_says_was_sent_was_a_command():
+    """It is not asked whether a torque was measured; what throttles it by so much is refuted all the same."""
+    result = trace(replace(_arm(0, 0.5), commanded=True), JOINT)
+    assert (result.verdict, result.effects, result.measured_forces) == ("unexplained", (), False)
+
+
+@pytest.mark.parametrize("noise", [2e-3, 0.02, 0.06])
 @pytest.mark.parametrize(
     ("name", "values"),
-    [("input_gain", {"gain": 0.3}), ("input_deadband", {"width": 1.0}), ("input_saturation", {"low": -0.5, "high": 0.5})],
+    [("input_gain", {"gain": 0.2}), ("input_saturation", {"low": -0.3, "high": 0.3}), ("input_deadband", {"width": 1.0})],
 )
-def test_what_throttles_a_command_keeps_its_name(name, values):
-    data = _commanded(4, EffectSpec(name, "force", values))
-    result = trace(data, JOINT)
+def test_what_throttles_a_command_keeps_its_name(name, values, noise):
+    """However loud the sensor of its speed: that makes more of the force which the motion takes than is left, and refutes nothing."""
+    result = trace(_commanded(5, EffectSpec(name, "force", values), noise=noise), JOINT)
     assert [e.name for e in result.effects] == [name]
     assert not result.measured_forces
     assert result.effects[0].values == {k: pytest.approx(v, rel=0.05) for k, v in values.items()}
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.05])
+def test_a_weak_motor_with_friction_is_told_from_a_strong_one_with_more(noise):
+    """As a measurement the command would be friction of 6.7 N m s/rad, but for what moves the joint, which is small where it sways."""
+    friction = EffectSpec("viscous_friction", "qd", {"coefficient": 1.34})
+    result = trace(_commanded(2, EffectSpec("input_gain", "force", {"gain": 0.2}), friction, noise=noise, slowly=True, rows=1500), JOINT)
+    told = {e.name: e.values for e in result.effects}
+    assert told == {
+        "input_gain": {"gain": pytest.approx(0.2, rel=0.02)},
+        "viscous_friction": {"coefficient": pytest.approx(1.34, rel=0.02)},
+    }
+    assert not result.measured_forces
 
 
 def _with(name, channel, **values):
     return insert(JOINT, AppliedEffect(registry().get("effects", name), channel, values), 0)
 
 
-def test_an_effect_on_the_input_is_judged_by_what_it_leaves_of_the_command():
-    """The same error of the force, over a tenth of it: without noise a gain of 0.1 makes 0.9 of the command an error, nine times what is
-    left."""
+def test_what_is_left_of_a_command_is_held_against_the_force_that_the_motion_takes():
+    """Without noise a joint that follows its command takes 0.9 of it more than a gain of 0.1 leaves."""
     data = _commanded(1, noise=0.0)
     steps = steps_of(data)
     judged_on = held(JOINT, data, steps, (), np.ones(ROWS, dtype=bool), 0.5)
     gain, both = _with("input_gain", "force", gain=0.1), _with("input_bias", "force", bias=1.0)
-    assert input_relative(gain, judged_on.inverse) == pytest.approx(0.9, rel=0.01)
-    assert input_relative(gain, judged_on.inverse, acting_too=True) == pytest.approx(9.0, rel=0.01)
-    plain, acting = (input_relative(both, judged_on.inverse, acting_too=too) for too in (False, True))
-    assert plain == acting  # a force that acts by itself is nothing of what was commanded
+    told = followed(gain, judged_on.inverse)
+    assert told.off / told.asked == pytest.approx(0.9, rel=0.02)  # wild values are cut off
+    assert told.left / told.asked == pytest.approx(0.1, rel=1e-6)
+    beside = followed(both, judged_on.inverse)
+    assert beside.left == pytest.approx(beside.asked)  # a force that acts by itself is nothing of what was commanded
     fit = evaluate(problem(data, steps), gain)
-    assert (throttled(fit, judged_on), unfollowed(fit, judged_on)) == (True, True)
-    assert says_better(JOINT, gain, judged_on)
-    assert not says_better(gain, JOINT, judged_on)
-    mild = evaluate(problem(data, steps), _with("input_gain", "force", gain=0.8))
-    assert not throttled(mild, judged_on)
-    assert not unfollowed(mild, judged_on)
+    assert refuted(fit, judged_on)
+    assert says_forces(JOINT, judged_on)
+    assert not says_forces(gain, judged_on)
+    assert not refuted(evaluate(problem(data, steps), _with("input_gain", "force", gain=0.8)), judged_on)  # no more than a fifth too little
+
+
+def test_what_noise_makes_of_the_force_is_seldom_exceeded_and_not_by_far():
+    """The most of 20 draws: exceeded once in 21 times, and near to what the same noise made of the recording. Of 40 recordings more than
+    seven beyond it come by chance once in 1900.
+    """
+    shares = []
+    for seed in range(40):
+        data = _commanded(seed, noise=0.1)
+        judged_on = held(JOINT, data, steps_of(data), (), np.ones(ROWS, dtype=bool), 0.5)
+        made, drawn = followed(JOINT, judged_on.inverse).off, by_noise(JOINT, judged_on.inverse, np.array([1e-10, 0.1**2]))
+        shares.append(float(made[0] / np.max(drawn)))
+    assert sum(share > 1.0 for share in shares) <= 7
+    assert 0.4 < np.median(shares) < 1.0
 
 
 def test_nothing_is_throttled_where_inputs_are_no_forces():
@@ -129,8 +162,8 @@ def test_nothing_is_throttled_where_inputs_are_no_forces():
     fit = evaluate(
         problem(data, steps_of(data)), insert(cart, AppliedEffect(registry().get("effects", "input_gain"), "v", {"gain": 0.1}), 0)
     )
-    assert not throttled(fit, judged_on)
-    assert not says_better(cart, fit.model, judged_on)
+    assert not refuted(fit, judged_on)
+    assert not says_forces(cart, judged_on)
 
 
 def test_which_effects_and_which_structure_are_about_the_inputs():

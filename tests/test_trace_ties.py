@@ -52,6 +52,30 @@ def test_what_was_not_fitted_decides_between_explanations_that_tie():
     assert [(s.name, s.channel, s.fit) for s in rest] == [("input_gain", "v", one)]
 
 
+def test_ties_of_one_effect_outlast_another_one_that_gives_way(monkeypatch):
+    """What was held out says of w that it is an offset: on v, where a gain and an offset are one thing, they still tie, beside that."""
+    u = np.column_stack([np.full(400, 0.3), _held(np.random.default_rng(11), 400, [-1.0], [1.0])[:, 0]])
+    given, model = _problem(u)
+    gain_v = _with(given, model, "input_gain", "v", gain=0.8).model
+    bias_v = _with(given, model, "input_bias", "v", bias=-0.06).model
+    bare = evaluate(given, model)
+    both = fitted(given, bare, _more(gain_v, "input_gain", "w", gain=0.9))
+    on_v, on_w = (fitted(given, bare, m) for m in (_more(bias_v, "input_gain", "w", gain=0.9), _more(gain_v, "input_bias", "w", bias=0.01)))
+    found = [Scored("input_bias", "v", 1.0, on_v), Scored("input_bias", "w", 1.0, on_w)]
+
+    def of_w(_, fits):
+        return [500.0 * (("input_bias", "w") in names(fit.model)) for fit in fits]
+
+    monkeypatch.setattr(verdict, "foretelling", of_w)
+    best, ties = verdict._likeliest(given, both, found, None)
+    assert names(best.model) == (("input_bias", "w"), ("input_gain", "v"))
+    assert [(s.name, s.channel, names(s.fit.model)) for s in ties] == [("input_bias", "v", (("input_bias", "v"), ("input_bias", "w")))]
+
+
+def _more(model, name, channel, **p):
+    return insert(model, AppliedEffect(registry().get("effects", name), channel, p), len(model.effects))
+
+
 @pytest.mark.parametrize(("white", "behind", "tie"), [(40.0, 8.0, True), (12.0, 8.0, False), (40.0, 30.0, False), (-40.0, 8.0, False)])
 def test_what_only_the_colour_of_noise_decides_is_not_decided(white, behind, tie):
     """By noise without a memory the other one is likelier by `white`, by noise with one it is less likely by `behind`: nobody knows which

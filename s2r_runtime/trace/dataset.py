@@ -154,6 +154,8 @@ class Dataset:
     """How inputs went that the recording has samples of (`straight`)."""
     noisy: dict[str, float] = field(default_factory=dict)
     """Standard deviations of the noise that was taken out of inputs for that."""
+    commanded: bool = False
+    """The inputs are known to be what was commanded: a log of ours says what was sent."""
     measured_forces: bool = False
     """The inputs are forces that were measured, with noise of their own, and not commanded (`measured_forces`)."""
     behind: dict[str, float] = field(default_factory=dict)
@@ -333,7 +335,8 @@ def _after(early: int, y: Array) -> Array:
 def regridded(data: Dataset, model: ComposedModel, in_parts: int = 0, substeps: int = 0) -> Dataset:
     """The same recording on the grid of a model with another step. in_parts, substeps: as `from_streams`."""
     again = from_streams(model, data.segments, data.source, data.digests, data.paths, data.reconstruction, in_parts, substeps)
-    return replace(again, way=data.way, noisy=data.noisy, measured_forces=data.measured_forces, behind=data.behind)
+    again = replace(again, commanded=data.commanded, measured_forces=data.measured_forces)
+    return replace(again, way=data.way, noisy=data.noisy, behind=data.behind)
 
 
 def thinned(

@@ -56,7 +56,7 @@ def load_dataset(
     source = ", ".join(str(p) for p in paths)
     robots = is_robot_log(paths[0])
     if _is_log(paths[0]) and not robots:
-        return from_streams(model, _log_segments(paths, model, epoch), source, digests, paths)
+        return replace(from_streams(model, _log_segments(paths, model, epoch), source, digests, paths), commanded=True)
     if robots:
         segments, missing, content = _robot_segments(paths[0], model, transport)
     else:

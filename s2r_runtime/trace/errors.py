@@ -162,7 +162,7 @@ def noise_floor(fit: Fit, given: Held, seed: int) -> tuple[Array, Array]:
     """
     if fit.noise.axes != given.data.axes_without_speed and len(given.steps):  # another recording, with other states measured
         fit = replace(fit, noise=evaluate(problem(given.data, given.steps), fit.model).noise)
-    model, noise = fit.model, _as_seen(fit.noise, given.data)
+    model, noise = fit.model, as_measured(fit.noise, given.data)
     act = acting(model, given.data)
     slope = state_jacobian(model, given.steps, act)
     one = noise.one_step(slope)
@@ -236,7 +236,7 @@ def _each_on(model: ComposedModel, states: Sequence[Array], act: Acting, place: 
     return wherever(model, np.concatenate(states), act, np.tile(place, len(states))).reshape(len(states), *states[0].shape)
 
 
-def _as_seen(noise: Noise, data: Dataset) -> Noise:
+def as_measured(noise: Noise, data: Dataset) -> Noise:
     """With the errors of speeds that were not measured, instead of the bounds for them."""
     r = noise.r.copy()
     for (_, v), error in zip(data.axes_without_speed, data.reconstruction.errors if data.reconstruction else (), strict=False):

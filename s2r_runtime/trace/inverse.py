@@ -20,7 +20,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import differentiation
 from s2r_runtime.trace.dataset import Dataset, regridded
 from s2r_runtime.trace.reconstruct import at_step
-from s2r_runtime.trace.residual import Acting, Steps, acting, steps_of, wherever
+from s2r_runtime.trace.residual import Acting, Steps, acting, rms, steps_of, wherever
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -37,8 +37,11 @@ CLOSE = 1e-7
 FARTHEST = 100.0
 """Times the input's size that the one that the motion takes may be away: a model that asks for more explains nothing."""
 
-TINY = 1e-12
-"""Of what was commanded, squared: what acts is nothing below it."""
+DRAWS = 20
+"""Of noise: the largest of so many is exceeded by chance once in so many and one times."""
+
+WILD = 4.0
+"""Robust standard deviations at which an error counts no more."""
 
 ROWS = 200_000
 """At most; of a longer recording a part of that length at the beginning."""
@@ -77,24 +80,66 @@ def inverse(model: ComposedModel, data: Dataset, held_out: Steps) -> Inverse | N
     return Inverse(fine, steps, stretches, band) if stretches else None
 
 
-def input_relative(model: ComposedModel, given: Inverse, *, acting_too: bool = False) -> float | None:
-    """See above. None where nothing was commanded: the share of nothing is no number. acting_too: over what is left of it where it acts,
-    where that is less than what was commanded (a force that acts by itself is nothing of it); next to infinite where nothing is left.
-    """
+def input_relative(model: ComposedModel, given: Inverse) -> float | None:
+    """See above. None where nothing was commanded: the share of nothing is no number."""
     model = model if model.dt == given.data.dt else at_step(model, given.data.dt)
     act = acting(model, given.data)
     here = act.at(given.steps.place)
     commanded = acting(model, given.data, ()).mean[given.steps.place]
-    error = here.mean - _needed(model, given.steps, here)
-    lost, whole, acts = (
-        sum(np.sum(differentiation.low_pass(e[a:b], given.data.dt, given.bandwidth) ** 2, axis=0) for a, b in given.stretches)
-        for e in (error, commanded, here.mean - _by_itself(model, given) if acting_too else commanded)
-    )
+    lost, whole = (np.sum(_filtered(e, given) ** 2, axis=0) for e in (here.mean - _needed(model, given.steps, here), commanded))
     used = whole > 0.0
-    if not used.any():
-        return None
-    over = np.maximum(np.minimum(whole, acts), TINY * whole) if acting_too else whole
-    return float(np.sqrt(np.mean(lost[used] / over[used])))
+    return float(np.sqrt(np.mean(lost[used] / whole[used]))) if used.any() else None
+
+
+@dataclass(frozen=True)
+class Followed:
+    """How well the motion goes by the forces that were recorded, each input by itself, (nu,). off: rms of a - u*, wild values cut off;
+    left: rms of what is left of a force where it acts (what acts by itself is none of it); asked, varies: rms of the force, and of the
+    force less its mean.
+    """
+
+    off: Array
+    left: Array
+    asked: Array
+    varies: Array
+
+
+def followed(model: ComposedModel, given: Inverse) -> Followed:
+    """By a model."""
+    model = model if model.dt == given.data.dt else at_step(model, given.data.dt)
+    here = acting(model, given.data).at(given.steps.place)
+    commanded = acting(model, given.data, ()).mean[given.steps.place]
+    error, left = here.mean - _needed(model, given.steps, here), here.mean - _by_itself(model, given)
+    error, left, asked = (_filtered(e, given) for e in (error, left, commanded))
+    return Followed(_tame(error), rms(left), rms(asked), np.std(asked, axis=0))
+
+
+def by_noise(model: ComposedModel, given: Inverse, r: Array) -> Array:
+    """(DRAWS, nu) what noise of the measurements, of variances r (nx,), makes of `Followed.off`, drawn so often."""
+    model = model if model.dt == given.data.dt else at_step(model, given.data.dt)
+    here = acting(model, given.data).at(given.steps.place)
+    needed, rng = _needed(model, given.steps, here), np.random.default_rng(0)
+    drawn = [_filtered(_needed(model, _shaken(given, r, rng), here) - needed, given) for _ in range(DRAWS)]
+    return np.array([_tame(e) for e in drawn])
+
+
+def _shaken(given: Inverse, r: Array, rng: np.random.Generator) -> Steps:
+    """The steps with noise of these variances on every measurement."""
+    steps = given.steps
+    rows = steps.place + steps.run  # a run has one row more than it has steps
+    e = rng.normal(size=(int(rows[-1]) + 2, len(r))) * np.sqrt(r)
+    return replace(steps, y0=steps.y0 + e[rows], y1=steps.y1 + e[rows + 1])
+
+
+def _filtered(e: Array, given: Inverse) -> Array:
+    """(m, nu) h * e of all stretches."""
+    return np.concatenate([differentiation.low_pass(e[a:b], given.data.dt, given.bandwidth) for a, b in given.stretches])
+
+
+def _tame(e: Array) -> Array:
+    """(nu,) rms, wild values cut off."""
+    usual = np.median(np.abs(e), axis=0) / 0.6745
+    return rms(np.clip(e, -WILD * usual, WILD * usual))
 
 
 def _by_itself(model: ComposedModel, given: Inverse) -> Array:

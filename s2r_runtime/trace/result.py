@@ -30,6 +30,12 @@ Array = NDArray[np.float64]
 __all__ = ["Found", "Limit", "TraceResult"]
 
 
+MEASURED = (
+    "{}: taken for a measurement with noise of its own, not for a command, as the inverse model says; what acts on it, and how it scales, "
+    "cannot be told here"
+)
+
+
 @dataclass(frozen=True)
 class TraceResult:
     """`spec`: the repaired model; the given one, if nothing was added, or if what ties does little here and may do harm elsewhere.
@@ -163,11 +169,7 @@ class TraceResult:
                     f"some inputs went on changing between the rows, as the motion says: taken on their way to the next one ({each})"
                 )
         if self.measured_forces:
-            names = ", ".join(self.nominal.inputs)
-            lines.append(
-                f"{names}: taken for a measurement with noise of its own, not for a command, as the inverse model says; what acts on it, "
-                "and how it scales, cannot be told here"
-            )
+            lines.append(MEASURED.format(", ".join(self.nominal.inputs)))
         if self.noisy:
             each = ", ".join(f"{name} {size:.2g}" for name, size in self.noisy.items())
             lines.append(f"inputs are noisy samples, as the motion says: noise was taken out of them (standard deviation: {each})")
@@ -238,6 +240,7 @@ class TraceResult:
         found = () if self.left_as_given else tuple(e.text() for e in self.effects)
         found += (f"Fitted or judged where {domain_told(self.domain)}",) if found else ()
         found += (IN_PARTS,) if parts else ()
+        found += (MEASURED.format(", ".join(self.nominal.inputs)),) if found and self.measured_forces else ()
         return (
             (f"Repaired by s2r trace on {self.source}: {self.verdict}", *found)
             if found

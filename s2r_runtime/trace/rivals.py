@@ -108,7 +108,7 @@ def tied(given: Problem, fit: Fit, found: list[Scored], ahead: Sequence[float]) 
     best = int(np.argmax(paid)) if np.max(paid) > paid[0] + SETTLED else 0
     behind, beaten = nats[best] - nats, paid[best] - paid
     near = (beaten <= CLOSE * wide) | ((behind <= CLOSE * wide) & (beaten <= SURELY * wide))
-    white = np.array([one.white for one in fits])
+    white = np.array([one.white - STRICT.price(one.k - fit.k, len(given.steps)) for one in fits])
     near |= (white - white[best] > NEAR) & (behind <= NEAR)  # by noise without a memory it is the other way round, and by far
     left = [i for i in np.flatnonzero(near).tolist() if i != best]
     return fits[best], [found[i - 1] if i else Scored(*_gone(fit, fits[best]), found[0].score, fit) for i in left]

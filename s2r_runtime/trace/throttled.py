@@ -1,8 +1,9 @@
 """When are forces that were recorded taken for measurements (`measured_forces`)?
 
-Where effects throttle them, and the inverse model of effects on the motion says far better which forces were measured: |u - u*| over |u|,
-with u* the force that the motion takes, as in identification by the inverse model (A. Janot, M. Gautier, M. Brunot, Data set and reference
-models of EMPS, 2019). Of effects on the input it is the same of what they leave of it: a gain of 0.03 takes a force thirty times as large.
+Where effects throttle them, and are refuted by it: the force that the motion takes, u*, is far from what they leave of the recorded one,
+for how little that is, beyond what the noise of the measurements makes of u*. A gain of 0.03 takes a force thirty times as large. Then
+effects on the motion are asked, and believed if the recorded force varies with u* by their inverse model (identification by the inverse
+model: A. Janot, M. Gautier, M. Brunot, Data set and reference models of EMPS, 2019).
 """
 
 from __future__ import annotations
@@ -10,40 +11,36 @@ from __future__ import annotations
 import numpy as np
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.errors import Held
+from s2r_runtime.trace.errors import Held, as_measured
 from s2r_runtime.trace.fitting import Fit
-from s2r_runtime.trace.inverse import input_relative
-from s2r_runtime.trace.residual import acting
+from s2r_runtime.trace.inverse import by_noise, followed
 
-THROTTLED = 0.7
-"""Of the forces that were recorded, rms: effects that let through less of one throttle it."""
+THROTTLED = (0.1, 0.3), (0.7, 1.0)
+"""Shares of a force that was recorded, rms, below which effects that leave less throttle it; and how far, over what they leave, the force
+that the motion takes may be from it. Several effects together may look a little like any motion, and the less is left of a command the
+less that says.
+"""
 
-BETTER, WELL = 0.8, 0.5
-"""Times the error of the inverse model of what throttles, and share of the force, below which that of effects on the motion is believed."""
-
-FAR = 2.0
-"""Times what is left of a force that the force which the motion takes is away from it. Noise makes 1 of a joint that friction holds."""
+WELL = 0.75
+"""Of how a recorded force varies, by which the inverse model of effects on the motion may be off: half of the variance."""
 
 
-def throttled(fit: Fit, judged_on: Held) -> bool:
-    """Whether effects leave little of a force that was recorded."""
+def refuted(fit: Fit, judged_on: Held) -> bool:
+    """Whether effects throttle a force, and the motion does not go by what they leave of it."""
     if judged_on.inverse is None or not any(fit.model.effects[i].effect.stage == "input" for i in fit.added):
         return False
-    asked, acts = (np.sqrt(np.mean(acting(fit.model, judged_on.data, chain).mean ** 2, axis=0)) for chain in ((), None))
-    return bool(np.any((asked > 0.0) & (acts < THROTTLED * asked)))
-
-
-def says_better(model: ComposedModel, other: ComposedModel, judged_on: Held) -> bool:
-    """Whether the inverse model of one says the forces that were measured far better than that of another one does."""
-    mine, theirs = (None if judged_on.inverse is None else input_relative(m, judged_on.inverse, acting_too=True) for m in (model, other))
-    return mine is not None and theirs is not None and mine < WELL and mine < BETTER * theirs
-
-
-def unfollowed(fit: Fit, judged_on: Held) -> bool:
-    """Whether the force that the motion takes is FAR from what effects leave of a throttled one: the robot does not go by it, and nothing
-    is known of what acts on it.
-    """
-    if judged_on.inverse is None or not throttled(fit, judged_on):
+    told = followed(fit.model, judged_on.inverse)
+    suspected = [(told.asked > 0.0) & (told.left < share * told.asked) & (told.off > far * told.left) for share, far in THROTTLED]
+    if not np.any(suspected):
         return False
-    off = input_relative(fit.model, judged_on.inverse, acting_too=True)
-    return off is not None and off > FAR
+    noise = by_noise(fit.model, judged_on.inverse, as_measured(fit.noise, judged_on.data).r)
+    beyond = np.sqrt(np.where(told.off > np.max(noise, axis=0), told.off**2 - np.mean(noise**2, axis=0), 0.0))
+    return any(bool(np.any(those & (beyond > far * told.left))) for those, (_, far) in zip(suspected, THROTTLED, strict=True))
+
+
+def says_forces(model: ComposedModel, judged_on: Held) -> bool:
+    """Whether the inverse model says how the recorded forces vary."""
+    if judged_on.inverse is None:
+        return False
+    told = followed(model, judged_on.inverse)
+    return bool(np.any(told.varies > 0.0) and np.all(told.off <= WELL * told.varies))

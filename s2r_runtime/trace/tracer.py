@@ -41,7 +41,7 @@ from s2r_runtime.trace.scores import names
 from s2r_runtime.trace.second_look import astray, finer, once_more
 from s2r_runtime.trace.selection import MOST, all_dated, select
 from s2r_runtime.trace.straight import acted, alike_laid, changed_within, commanded, noisy, sampled, samples_of, straight, way_of
-from s2r_runtime.trace.throttled import says_better, throttled
+from s2r_runtime.trace.throttled import refuted, says_forces
 from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import confirmed, foretold_too
 from s2r_runtime.trace.ways import Way, moving
@@ -167,10 +167,10 @@ def _traced(
     say(90.0, 100.0, "judging on held-out data")
     w = np.ones(len(model.states)) if weights is None else np.array([weights[asked.states.index(s)] for s in model.states])
     result = answered(dataset, checked, given, chosen, structure, judged_on, seed, w, kind)
-    if not dataset.measured_forces and throttled(chosen.fit, judged_on):
-        taken = [None if one is None else replace(one, measured_forces=True) for one in as_recorded]
-        other = _traced(taken[0] or dataset, asked, taken[1], horizon, seed, _from(90.0, say), norm, parts, under)
-        if says_better(other.explaining, chosen.fit.model, judged_on):
+    if under is None and not (dataset.commanded or dataset.measured_forces) and refuted(chosen.fit, judged_on):
+        taken = replace(as_recorded[0], measured_forces=True)
+        other = _traced(taken, asked, as_recorded[1], horizon, seed, _from(90.0, say), norm, parts)
+        if says_forces(other.explaining, judged_on):
             return other
     if (
         under is None

@@ -31,10 +31,10 @@ from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import Mask, acting, first_steps, predicted, rms
 from s2r_runtime.trace.residual_noise import OUTLIER
 from s2r_runtime.trace.rivals import representative, tied
-from s2r_runtime.trace.scores import STRICT, Scored, names
+from s2r_runtime.trace.scores import STRICT, Scored, name_of, names
 from s2r_runtime.trace.selection import Selection, doing_something, one_more
-from s2r_runtime.trace.slots import slots_of
-from s2r_runtime.trace.throttled import unfollowed
+from s2r_runtime.trace.slots import Added, slots_of
+from s2r_runtime.trace.throttled import refuted
 
 Array = NDArray[np.float64]
 
@@ -105,11 +105,52 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
     fit, found = doing_something(given, fit), [s if s.fit is None else replace(s, fit=doing_something(given, s.fit)) for s in found]
     found = _in_its_place(fit, found)
     if found:
-        fits = [fit, *(s.fit for s in found if s.fit is not None)]
-        fit, found, risky = representative(given, *tied(given, fit, found, foretelling(judged_on, fits)))
+        fit, found, risky = representative(given, *_likeliest(given, fit, found, judged_on))
         found = _in_its_place(fit, found)
     fit = fit if fit is chosen.fit else plainly(given, fit)
     return replace(chosen, fit=fit, rivals=tuple(found), risky=risky)
+
+
+def _likeliest(given: Problem, fit: Fit, found: list[Scored], judged_on: Held) -> tuple[Fit, list[Scored]]:
+    """The likeliest explanation on all of the recording, and those that tie with it. One that takes the place of an effect does so beside
+    the others: their own rivals are asked once more beside it.
+    """
+    for _ in fit.added:
+        fits = [fit, *(s.fit for s in found if s.fit is not None)]
+        best, ties = tied(given, fit, found, foretelling(judged_on, fits))
+        if best is fit or len(fit.added) < 2:
+            return best, ties
+        found = [*_beside(given, fit, best, found), Scored(*_only_in(fit, best), found[0].score, fit)]
+        fit = best
+    fits = [fit, *(s.fit for s in found if s.fit is not None)]
+    return tied(given, fit, found, foretelling(judged_on, fits))
+
+
+def _only_in(fit: Fit, other: Fit) -> tuple[str, str]:
+    """The effect of one model that another one has another in the place of."""
+    return next(name for name in names(fit.model) if name not in names(other.model))
+
+
+def _beside(given: Problem, fit: Fit, best: Fit, found: Sequence[Scored]) -> list[Scored]:
+    """Rivals of what was found beside the best one: with the effect that has changed since changed in them, too, and all that they share
+    with it as it is there. The one that changed it is none; others in its place stay.
+    """
+    gone, came = _only_in(fit, best), _only_in(best, fit)
+    there = {name_of(a): a for a in best.model.effects if isinstance(a, Added)}
+    moved = []
+    for s in found:
+        if s.fit is None or s.fit is best:
+            continue
+        mine = names(s.fit.model)
+        if gone not in mine:
+            moved.append(s)
+        elif came not in mine:
+            as_now = {gone: there[came]} | there
+            effects = (as_now.get(name_of(a), a) if isinstance(a, Added) else a for a in s.fit.model.effects)
+            model = replace(s.fit.model, effects=tuple(effects))
+            if foretold(given, model) is not None:
+                moved.append(replace(s, fit=fitted(given, best, model)))
+    return moved
 
 
 def _in_its_place(fit: Fit, found: Sequence[Scored]) -> list[Scored]:
@@ -201,7 +242,7 @@ def verdict_of(
         return "unexplained"
     if _another_model(chosen.fit, before, given) or _silenced(chosen.fit, after, given) or _silenced_for_a_while(chosen.fit, after, given):
         return "unexplained"
-    if unfollowed(chosen.fit, given):
+    if refuted(chosen.fit, given):
         return "unexplained"
     return "ambiguous" if chosen.rivals else "traced"
 
