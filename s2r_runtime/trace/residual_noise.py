@@ -5,7 +5,8 @@
 
 S = L L^T is banded (2 nx - 1 below the diagonal); whitened residual z = L^-1 r. Q and R maximise, state by state, the likelihood of
 that state's residual alone (tridiagonal), the others' measurement noise in it taken from the round before: consistent, and a
-thousand times cheaper than the whole likelihood. What remains correlated in z is taken up by an autoregression per state.
+thousand times cheaper than the whole likelihood. Where that of others hides a state's own (a precise position beside a loud speed), the
+whole one is maximised (`together`). What remains correlated in z is taken up by an autoregression per state.
 
 Errors have tails: a value of z has the density (1 - TAIL) N(0, 1) + TAIL N(0, WIDE^2), so one wild value costs a few nats, not z^2/2.
 """
@@ -49,6 +50,19 @@ WANDERS = 1.5
 NARROWEST = 0.7
 """Least standard deviation of z that is believed: below it the noise stands at its floor, which is meant to stay (and far below it
 there is no noise whose colour could be told)."""
+
+HIDDEN = 1.0
+"""Times its own noise that of others in a state's residual, from which on that residual alone says too little of it: an encoder beside a
+speed that is as loud as a filter leaves it.
+"""
+
+DRAWN = 16
+"""Columns of what S^-1 makes of noise: of a thousand steps the slope along a variance is then known to a few hundredths of its scatter."""
+
+ROUNDS, HALVINGS, FARTHEST_MOVE, NEAR_ENOUGH, AT_BOUND = 40, 6, 2.0, 0.02, 1e-6
+"""Steps of scoring; halvings of one; its length at most, in logarithms; nats that the next one would bring, below which it is not made;
+how near a bound is there.
+"""
 
 ENOUGH = 6000
 """Steps from which Q and R are estimated at most; their relative error is then about 2 %."""
@@ -159,6 +173,8 @@ def estimate(r: Array, f: Array, joined: Mask, floor: Noise, near: Noise | None 
     extra = np.where(few, rough * robust, 0.0)
     extra[:, [v for _, v in floor.axes]] = 0.0
     noise = _by_state(r, f, joined, extra, near, floor)
+    if hidden_by_others(f, noise):
+        noise = together(r, f, joined, extra, noise if near is None else near, floor)
     for _ in range(2):
         z = Whitener(noise, f, joined, extra)(r)
         wild = np.abs(z) > OUTLIER
@@ -167,8 +183,76 @@ def estimate(r: Array, f: Array, joined: Mask, floor: Noise, near: Noise | None 
         seen = np.where(np.isin(range(r.shape[1]), [v for _, v in floor.axes]), 0.0, noise.r)
         own = noise.q + seen + f**2 @ seen
         extra += np.where(wild, (z**2 / 4.0) * (own + extra), 0.0)
-        noise = _by_state(r, f, joined, extra, noise, floor)
+        noise = (together if hidden_by_others(f, noise) else _by_state)(r, f, joined, extra, noise, floor)
     return noise
+
+
+def hidden_by_others(f: Array, noise: Noise) -> bool:
+    """Whether others' measurement noise hides some state's own in its residual."""
+    if noise.axes:
+        return False
+    share = np.mean(f**2, axis=0)  # (nx, nx) of state j's variance in the residual of state i
+    own = noise.q + noise.r * (1.0 + np.diag(share))
+    return bool(np.any(share @ noise.r - np.diag(share) * noise.r > HIDDEN * own))
+
+
+def together(r: Array, f: Array, joined: Mask, extra: Array, near: Noise, floor: Noise) -> Noise:
+    """Q and R of all states by maximum likelihood of the whole residual, over their logarithms, from `near`: scoring with the average
+    information, as `state_noise` does for one state. With V the covariance that a variance makes, s = S^-1 r and s' ~ N(0, S^-1) drawn,
+
+        slope  v/2 (s' V s - E s'' V s''),      bend  v_i v_j / 2 (V_i s)' S^-1 (V_j s)
+    """
+    nx, least = r.shape[1], np.log(np.concatenate([floor.q, floor.r]))
+    logs = np.maximum(np.log(np.maximum(np.concatenate([near.q, near.r]), 1e-300)), least)
+    drawn = np.random.default_rng(0).normal(size=(*r.shape, DRAWN))
+    goes_on = np.append(joined[1:], False)[:, None, None]
+
+    def at(logs: Array) -> tuple[Whitener, float]:
+        v = np.exp(logs)
+        whiten = Whitener(Noise(v[:nx], v[nx:]), f, joined, extra)
+        return whiten, float(0.5 * np.sum(whiten(r) ** 2)) + whiten.logdet
+
+    whiten, cost = at(logs)
+    for _ in range(ROUNDS):
+        s = whiten.back(np.concatenate([whiten(r)[:, :, None], drawn], axis=2))
+        first = -np.einsum("kji,kjc->kic", f, s)  # what the error of a step's first measurement is in both steps that have it
+        first[1:] += np.where(goes_on[:-1], s[:-1], 0.0)
+        last = np.where(goes_on, 0.0, s)  # and of the end of a run, which is in one
+        sizes = np.concatenate([np.sum(s**2, axis=0), np.sum(first**2, axis=0) + np.sum(last**2, axis=0)])
+        slope = 0.5 * np.exp(logs) * (sizes[:, 0] - np.mean(sizes[:, 1:], axis=1))
+        ends = np.where(goes_on[:, :, 0], np.append(first[1:, :, 0], np.zeros((1, nx)), axis=0), last[:, :, 0])
+        each = np.eye(nx)[None]
+        of_r = ends[:, None, :] * each - f * first[:, None, :, 0]
+        table = whiten(np.concatenate([s[:, :, :1] * each, of_r], axis=2)).reshape(-1, 2 * nx) * np.exp(logs)
+        move, brings = _scored(slope, 0.5 * table.T @ table, logs - least)
+        if brings < NEAR_ENOUGH:
+            break
+        for halving in range(HALVINGS):
+            there = np.maximum(logs + 0.5**halving * move, least)
+            other, reached = at(there)
+            if reached < cost:
+                break
+        if reached >= cost:
+            break
+        logs, whiten, cost = there, other, reached
+    return Noise(np.exp(logs[:nx]), np.exp(logs[nx:]))
+
+
+def _scored(slope: Array, bend: Array, room: Array) -> tuple[Array, float]:
+    """A step of scoring, (m,), and the nats that it would bring. What is at its least and would fall stays. room: above it. Where the
+    slope is steeper than the bend, a variance grows or shrinks by e at most: one that is next to nothing has hardly a bend.
+    """
+    free, move = np.ones(len(slope), dtype=bool), np.zeros(len(slope))
+    while free.any():
+        move[:] = 0.0
+        part = bend[np.ix_(free, free)]
+        move[free] = np.linalg.solve(part + np.diag(np.maximum(np.abs(slope[free]) - np.diag(part), 0.0) + 1e-9), slope[free])
+        stays = free & (room <= AT_BOUND) & (move < 0.0)
+        if not stays.any():
+            break
+        free &= ~stays
+    move *= min(1.0, FARTHEST_MOVE / max(float(np.max(np.abs(move))), 1e-300))
+    return move, float(slope @ move - 0.5 * move @ bend @ move)
 
 
 def _middle(joined: Mask, most: int) -> slice:
