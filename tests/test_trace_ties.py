@@ -67,6 +67,9 @@ def test_ties_of_one_effect_outlast_another_one_that_gives_way(monkeypatch):
         return [500.0 * (("input_bias", "w") in names(fit.model)) for fit in fits]
 
     monkeypatch.setattr(verdict, "foretelling", of_w)
+    third = fitted(given, bare, _more(bias_v, "input_bias", "w", bias=0.01))  # has the winner in the place of another effect
+    best, ties = verdict._likeliest(given, both, [*found, Scored("input_bias", "v", 1.0, third)], None)
+    assert [names(s.fit.model) for s in ties].count((("input_bias", "v"), ("input_bias", "w"))) >= 1
     best, ties = verdict._likeliest(given, both, found, None)
     assert names(best.model) == (("input_bias", "w"), ("input_gain", "v"))
     assert [(s.name, s.channel, names(s.fit.model)) for s in ties] == [("input_bias", "v", (("input_bias", "v"), ("input_bias", "w")))]

@@ -132,7 +132,7 @@ def dataset(model: ComposedModel, cut: Cut, source: str, digests: tuple[str, ...
             if any(len(values) != len(names) for _, values in rows):
                 raise RecordingError(f"{source}: its rows are not of {', '.join(names)}")
     segments = [(_stream(one.states, len(model.states)), _stream(one.inputs, len(model.inputs))) for one in cut.segments]
-    return from_streams(model, segments, source, digests)
+    return replace(from_streams(model, segments, source, digests), commanded=True)
 
 
 def _stream(rows: Rows, width: int) -> Any:

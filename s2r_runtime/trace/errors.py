@@ -160,9 +160,8 @@ def noise_floor(fit: Fit, given: Held, seed: int) -> tuple[Array, Array]:
 
     Noise that is correlated in time keeps its law: what a sensor has wrong for a while does not add up as what pushes the robot does.
     """
-    if fit.noise.axes != given.data.axes_without_speed and len(given.steps):  # another recording, with other states measured
-        fit = replace(fit, noise=evaluate(problem(given.data, given.steps), fit.model).noise)
-    model, noise = fit.model, as_measured(fit.noise, given.data)
+    fit = _there(fit, given)
+    model, noise = fit.model, _as_measured(fit.noise, given.data)
     act = acting(model, given.data)
     slope = state_jacobian(model, given.steps, act)
     one = noise.one_step(slope)
@@ -236,7 +235,19 @@ def _each_on(model: ComposedModel, states: Sequence[Array], act: Acting, place: 
     return wherever(model, np.concatenate(states), act, np.tile(place, len(states))).reshape(len(states), *states[0].shape)
 
 
-def as_measured(noise: Noise, data: Dataset) -> Noise:
+def noise_there(fit: Fit, given: Held) -> Noise:
+    """The noise of a fit on what is held out."""
+    return _as_measured(_there(fit, given).noise, given.data)
+
+
+def _there(fit: Fit, given: Held) -> Fit:
+    """A fit with its noise on what is held out, which may be another recording, with other states measured."""
+    if fit.noise.axes == given.data.axes_without_speed or not len(given.steps):
+        return fit
+    return replace(fit, noise=evaluate(problem(given.data, given.steps), fit.model).noise)
+
+
+def _as_measured(noise: Noise, data: Dataset) -> Noise:
     """With the errors of speeds that were not measured, instead of the bounds for them."""
     r = noise.r.copy()
     for (_, v), error in zip(data.axes_without_speed, data.reconstruction.errors if data.reconstruction else (), strict=False):

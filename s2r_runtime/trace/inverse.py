@@ -40,8 +40,8 @@ FARTHEST = 100.0
 DRAWS = 20
 """Of noise: the largest of so many is exceeded by chance once in so many and one times."""
 
-WILD = 4.0
-"""Robust standard deviations at which an error counts no more."""
+WILD, FEW = 4.0, 0.05
+"""Robust standard deviations at which an error counts no more, and share of the rows below which such are outliers."""
 
 ROWS = 200_000
 """At most; of a longer recording a part of that length at the beginning."""
@@ -137,9 +137,10 @@ def _filtered(e: Array, given: Inverse) -> Array:
 
 
 def _tame(e: Array) -> Array:
-    """(nu,) rms, wild values cut off."""
-    usual = np.median(np.abs(e), axis=0) / 0.6745
-    return rms(np.clip(e, -WILD * usual, WILD * usual))
+    """(nu,) rms, wild values cut off if they are few: a robot that mostly rests has more of them when it moves."""
+    most = WILD * np.median(np.abs(e), axis=0) / 0.6745
+    few = np.mean(np.abs(e) > most, axis=0) < FEW
+    return rms(np.clip(e, np.where(few, -most, -np.inf), np.where(few, most, np.inf)))
 
 
 def _by_itself(model: ComposedModel, given: Inverse) -> Array:

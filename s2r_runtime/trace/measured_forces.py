@@ -9,8 +9,7 @@ robot by a known amount:
     y_{k+1} (-) f(y_k, u_k) = -B e_k + noise,      B of the nominal model
 
 so only effects on the motion are offered then (and a constant force), and nothing of what is left is asked about the inputs, with which the
-noise goes. That is done where effects throttle the forces that were recorded, and is believed where the inverse model of what it finds says
-far better which forces were measured than that of the effects does (`throttled`), each over what it leaves of them.
+noise goes. `throttled` says when.
 """
 
 from __future__ import annotations

@@ -57,10 +57,10 @@ speed that is as loud as a filter leaves it.
 """
 
 DRAWN = 16
-"""Columns of what S^-1 makes of noise: of a thousand steps the slope along a variance is then known to a few hundredths of its scatter."""
+"""Columns of what S^-1 makes of signs by chance: the slope along a variance is then known to a quarter of its own scatter, or better."""
 
 ROUNDS, HALVINGS, FARTHEST_MOVE, NEAR_ENOUGH, AT_BOUND = 40, 6, 2.0, 0.02, 1e-6
-"""Steps of scoring; halvings of one; its length at most, in logarithms; nats that the next one would bring, below which it is not made;
+"""Steps of scoring; halvings of one; its length at most, in logarithms; nats that the next one must promise and the last one have brought;
 how near a bound is there.
 """
 
@@ -173,8 +173,9 @@ def estimate(r: Array, f: Array, joined: Mask, floor: Noise, near: Noise | None 
     extra = np.where(few, rough * robust, 0.0)
     extra[:, [v for _, v in floor.axes]] = 0.0
     noise = _by_state(r, f, joined, extra, near, floor)
-    if hidden_by_others(f, noise):
-        noise = together(r, f, joined, extra, noise if near is None else near, floor)
+    hidden = hidden_by_others(f, noise)
+    if hidden:
+        noise = together(r, f, joined, extra, noise if near is None else _likelier(r, f, joined, extra, noise, near, floor), floor)
     for _ in range(2):
         z = Whitener(noise, f, joined, extra)(r)
         wild = np.abs(z) > OUTLIER
@@ -183,7 +184,7 @@ def estimate(r: Array, f: Array, joined: Mask, floor: Noise, near: Noise | None 
         seen = np.where(np.isin(range(r.shape[1]), [v for _, v in floor.axes]), 0.0, noise.r)
         own = noise.q + seen + f**2 @ seen
         extra += np.where(wild, (z**2 / 4.0) * (own + extra), 0.0)
-        noise = (together if hidden_by_others(f, noise) else _by_state)(r, f, joined, extra, noise, floor)
+        noise = (together if hidden else _by_state)(r, f, joined, extra, noise, floor)
     return noise
 
 
@@ -196,15 +197,26 @@ def hidden_by_others(f: Array, noise: Noise) -> bool:
     return bool(np.any(share @ noise.r - np.diag(share) * noise.r > HIDDEN * own))
 
 
+def _likelier(r: Array, f: Array, joined: Mask, extra: Array, one: Noise, other: Noise, floor: Noise) -> Noise:
+    """The likelier one of two, none below the floor: what another model left may lie where scoring does not come away from."""
+
+    def cost(noise: Noise) -> float:
+        whiten = Whitener(Noise(np.maximum(noise.q, floor.q), np.maximum(noise.r, floor.r)), f, joined, extra)
+        return float(0.5 * np.sum(whiten(r) ** 2)) + whiten.logdet
+
+    return one if cost(one) <= cost(other) else other
+
+
 def together(r: Array, f: Array, joined: Mask, extra: Array, near: Noise, floor: Noise) -> Noise:
     """Q and R of all states by maximum likelihood of the whole residual, over their logarithms, from `near`: scoring with the average
-    information, as `state_noise` does for one state. With V the covariance that a variance makes, s = S^-1 r and s' ~ N(0, S^-1) drawn,
+    information, as `state_noise` does for one state. With V the covariance that a variance makes, s = S^-1 r and s' drawn with
+    covariance S^-1,
 
         slope  v/2 (s' V s - E s'' V s''),      bend  v_i v_j / 2 (V_i s)' S^-1 (V_j s)
     """
     nx, least = r.shape[1], np.log(np.concatenate([floor.q, floor.r]))
     logs = np.maximum(np.log(np.maximum(np.concatenate([near.q, near.r]), 1e-300)), least)
-    drawn = np.random.default_rng(0).normal(size=(*r.shape, DRAWN))
+    drawn = np.random.default_rng(0).choice([-1.0, 1.0], size=(*r.shape, DRAWN))
     goes_on = np.append(joined[1:], False)[:, None, None]
 
     def at(logs: Array) -> tuple[Whitener, float]:
@@ -232,9 +244,11 @@ def together(r: Array, f: Array, joined: Mask, extra: Array, near: Noise, floor:
             other, reached = at(there)
             if reached < cost:
                 break
-        if reached >= cost:
+        if not reached < cost:
             break
-        logs, whiten, cost = there, other, reached
+        won, logs, whiten, cost = cost - reached, there, other, reached
+        if won < NEAR_ENOUGH:
+            break
     return Noise(np.exp(logs[:nx]), np.exp(logs[nx:]))
 
 
@@ -251,6 +265,7 @@ def _scored(slope: Array, bend: Array, room: Array) -> tuple[Array, float]:
         if not stays.any():
             break
         free &= ~stays
+        move[:] = 0.0
     move *= min(1.0, FARTHEST_MOVE / max(float(np.max(np.abs(move))), 1e-300))
     return move, float(slope @ move - 0.5 * move @ bend @ move)
 

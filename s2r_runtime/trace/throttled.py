@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.errors import Held, as_measured
+from s2r_runtime.trace.errors import Held, noise_there
 from s2r_runtime.trace.fitting import Fit
 from s2r_runtime.trace.inverse import by_noise, followed
 
@@ -21,8 +21,10 @@ that the motion takes may be from it. Several effects together may look a little
 less that says.
 """
 
-WELL = 0.75
-"""Of how a recorded force varies, by which the inverse model of effects on the motion may be off: half of the variance."""
+WELL, HARDLY = 0.7, 0.05
+"""Of how a recorded force varies, by which the inverse model of effects on the motion may be off: half of the variance. Of its size, below
+which it does not vary, and says nothing.
+"""
 
 
 def refuted(fit: Fit, judged_on: Held) -> bool:
@@ -33,7 +35,7 @@ def refuted(fit: Fit, judged_on: Held) -> bool:
     suspected = [(told.asked > 0.0) & (told.left < share * told.asked) & (told.off > far * told.left) for share, far in THROTTLED]
     if not np.any(suspected):
         return False
-    noise = by_noise(fit.model, judged_on.inverse, as_measured(fit.noise, judged_on.data).r)
+    noise = by_noise(fit.model, judged_on.inverse, noise_there(fit, judged_on).r)
     beyond = np.sqrt(np.where(told.off > np.max(noise, axis=0), told.off**2 - np.mean(noise**2, axis=0), 0.0))
     return any(bool(np.any(those & (beyond > far * told.left))) for those, (_, far) in zip(suspected, THROTTLED, strict=True))
 
@@ -43,4 +45,5 @@ def says_forces(model: ComposedModel, judged_on: Held) -> bool:
     if judged_on.inverse is None:
         return False
     told = followed(model, judged_on.inverse)
-    return bool(np.any(told.varies > 0.0) and np.all(told.off <= WELL * told.varies))
+    used = told.varies > HARDLY * told.asked
+    return bool(used.any() and np.all(told.off[used] <= WELL * told.varies[used]))

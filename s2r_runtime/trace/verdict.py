@@ -142,9 +142,9 @@ def _beside(given: Problem, fit: Fit, best: Fit, found: Sequence[Scored]) -> lis
         if s.fit is None or s.fit is best:
             continue
         mine = names(s.fit.model)
-        if gone not in mine:
+        if gone not in mine or came in mine:  # it is another one in the same place, or has the old one in the place of a third
             moved.append(s)
-        elif came not in mine:
+        else:
             as_now = {gone: there[came]} | there
             effects = (as_now.get(name_of(a), a) if isinstance(a, Added) else a for a in s.fit.model.effects)
             model = replace(s.fit.model, effects=tuple(effects))
