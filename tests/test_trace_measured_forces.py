@@ -1,10 +1,12 @@
 """Torques that were measured beside a motion that a position loop made: noise in them is no force that the joint did not follow."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from s2r_runtime.daemon import trace_job
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
@@ -172,3 +174,24 @@ def test_which_effects_and_which_structure_are_about_the_inputs():
     assert on_motion(JOINT, "coulomb_friction", "step", "qd")
     tokens = ("force", "memory(force)", "time*force", "force*force", "speed", "position", "time", "noise")
     assert [about_inputs(JOINT, token) for token in tokens] == [True, True, True, True, False, False, False, False]
+
+
+def test_an_input_that_does_not_vary_says_nothing_of_the_others():
+    """A plane robot that is pushed along x alone: its y, asked for nothing, is no reason to disbelieve what is said of x."""
+    plane = compose(ModelSpec("double_integrator", 0.02))
+    rng = np.random.default_rng(3)
+    u = np.column_stack([np.repeat(rng.uniform(-1.0, 1.0, 40), 10), np.zeros(400)])
+    x, rows = np.zeros((1, 4)), [np.zeros(4)]
+    for k in range(400):
+        x, _ = plane.step(x, u[k : k + 1], plane.at_rest(1))
+        rows.append(x[0])
+    data = from_arrays(plane, [(np.array(rows) + 1e-5 * rng.normal(size=(401, 4)), u)])
+    judged_on = held(plane, data, steps_of(data), (), np.ones(400, dtype=bool), 0.5)
+    assert followed(plane, judged_on.inverse).varies[1] == 0.0
+    assert says_forces(plane, judged_on)
+
+
+def test_what_the_daemon_cuts_out_of_its_stream_was_commanded():
+    stamps = [100_000_000 * k for k in range(6)]  # ns
+    one = SimpleNamespace(states=[(t, (1e-9 * t, 0.0)) for t in stamps], inputs=[(t, (1.0,)) for t in stamps])
+    assert trace_job.dataset(compose(ModelSpec("joint", 0.1)), SimpleNamespace(segments=[one]), "stream", ()).commanded
