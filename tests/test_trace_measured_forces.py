@@ -13,7 +13,7 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.trace.dataset import Dataset, from_arrays
 from s2r_runtime.trace.errors import held
 from s2r_runtime.trace.fitting import evaluate, insert, problem
-from s2r_runtime.trace.inverse import by_noise, followed
+from s2r_runtime.trace.inverse import off, off_by_noise, recorded
 from s2r_runtime.trace.measured_forces import about_inputs, on_motion
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.throttled import refuted, says_forces
@@ -125,10 +125,10 @@ def test_what_is_left_of_a_command_is_held_against_the_force_that_the_motion_tak
     steps = steps_of(data)
     judged_on = held(JOINT, data, steps, (), np.ones(ROWS, dtype=bool), 0.5)
     gain, both = _with("input_gain", "force", gain=0.1), _with("input_bias", "force", bias=1.0)
-    told = followed(gain, judged_on.inverse)
-    assert told.off / told.asked == pytest.approx(0.9, rel=0.02)  # wild values are cut off
+    told = recorded(gain, judged_on.inverse)
+    assert off(gain, judged_on.inverse) / told.asked == pytest.approx(0.9, rel=0.02)  # wild values are cut off
     assert told.left / told.asked == pytest.approx(0.1, rel=1e-6)
-    beside = followed(both, judged_on.inverse)
+    beside = recorded(both, judged_on.inverse)
     assert beside.left == pytest.approx(beside.asked)  # a force that acts by itself is nothing of what was commanded
     fit = evaluate(problem(data, steps), gain)
     assert refuted(fit, judged_on)
@@ -145,7 +145,7 @@ def test_what_noise_makes_of_the_force_is_seldom_exceeded_and_not_by_far():
     for seed in range(40):
         data = _commanded(seed, noise=0.1)
         judged_on = held(JOINT, data, steps_of(data), (), np.ones(ROWS, dtype=bool), 0.5)
-        made, drawn = followed(JOINT, judged_on.inverse).off, by_noise(JOINT, judged_on.inverse, np.array([1e-10, 0.1**2]))
+        made, drawn = off(JOINT, judged_on.inverse), off_by_noise(JOINT, judged_on.inverse, np.array([1e-10, 0.1**2]))
         shares.append(float(made[0] / np.max(drawn)))
     assert sum(share > 1.0 for share in shares) <= 7
     assert 0.4 < np.median(shares) < 1.0
@@ -187,7 +187,7 @@ def test_an_input_that_does_not_vary_says_nothing_of_the_others():
         rows.append(x[0])
     data = from_arrays(plane, [(np.array(rows) + 1e-5 * rng.normal(size=(401, 4)), u)])
     judged_on = held(plane, data, steps_of(data), (), np.ones(400, dtype=bool), 0.5)
-    assert followed(plane, judged_on.inverse).varies[1] == 0.0
+    assert recorded(plane, judged_on.inverse).varies[1] == 0.0
     assert says_forces(plane, judged_on)
 
 

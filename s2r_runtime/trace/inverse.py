@@ -82,45 +82,59 @@ def inverse(model: ComposedModel, data: Dataset, held_out: Steps) -> Inverse | N
 
 def input_relative(model: ComposedModel, given: Inverse) -> float | None:
     """See above. None where nothing was commanded: the share of nothing is no number."""
-    model = model if model.dt == given.data.dt else at_step(model, given.data.dt)
-    act = acting(model, given.data)
-    here = act.at(given.steps.place)
-    commanded = acting(model, given.data, ()).mean[given.steps.place]
-    lost, whole = (np.sum(_filtered(e, given) ** 2, axis=0) for e in (here.mean - _needed(model, given.steps, here), commanded))
+    lost, whole = (np.sum(e**2, axis=0) for e in (_off(model, given), _commanded(model, given)))
     used = whole > 0.0
     return float(np.sqrt(np.mean(lost[used] / whole[used]))) if used.any() else None
 
 
 @dataclass(frozen=True)
-class Followed:
-    """How well the motion goes by the forces that were recorded, each input by itself, (nu,). off: rms of a - u*, wild values cut off;
-    left: rms of what is left of a force where it acts (what acts by itself is none of it); asked, varies: rms of the force, and of the
-    force less its mean.
+class Recorded:
+    """Of the forces that were recorded, (nu,) each: their rms, that of them less their mean, and that of what is left of them where they
+    act (what acts by itself is none of it).
     """
 
-    off: Array
-    left: Array
     asked: Array
     varies: Array
+    left: Array
 
 
-def followed(model: ComposedModel, given: Inverse) -> Followed:
-    """By a model."""
-    model = model if model.dt == given.data.dt else at_step(model, given.data.dt)
-    here = acting(model, given.data).at(given.steps.place)
-    commanded = acting(model, given.data, ()).mean[given.steps.place]
-    error, left = here.mean - _needed(model, given.steps, here), here.mean - _by_itself(model, given)
-    error, left, asked = (_filtered(e, given) for e in (error, left, commanded))
-    return Followed(_tame(error), rms(left), rms(asked), np.std(asked, axis=0))
+def recorded(model: ComposedModel, given: Inverse) -> Recorded:
+    """Through a model."""
+    model, here = _here(model, given)
+    silent = replace(given.data, runs=tuple(replace(run, u=0.0 * run.u, turned=None) for run in given.data.runs))
+    by_itself = acting(model, silent).mean[given.steps.place]
+    asked = _commanded(model, given)
+    return Recorded(rms(asked), np.std(asked, axis=0), rms(_filtered(here.mean - by_itself, given)))
 
 
-def by_noise(model: ComposedModel, given: Inverse, r: Array) -> Array:
-    """(DRAWS, nu) what noise of the measurements, of variances r (nx,), makes of `Followed.off`, drawn so often."""
-    model = model if model.dt == given.data.dt else at_step(model, given.data.dt)
-    here = acting(model, given.data).at(given.steps.place)
+def off(model: ComposedModel, given: Inverse) -> Array:
+    """(nu,) rms of a - u*, wild values cut off."""
+    return _tame(_off(model, given))
+
+
+def off_by_noise(model: ComposedModel, given: Inverse, r: Array) -> Array:
+    """(DRAWS, nu) what noise of the measurements, of variances r (nx,), makes of `off`, drawn so often."""
+    model, here = _here(model, given)
     needed, rng = _needed(model, given.steps, here), np.random.default_rng(0)
     drawn = [_filtered(_needed(model, _shaken(given, r, rng), here) - needed, given) for _ in range(DRAWS)]
     return np.array([_tame(e) for e in drawn])
+
+
+def _here(model: ComposedModel, given: Inverse) -> tuple[ComposedModel, Acting]:
+    """The model at the recording's rate, and what acts over the steps."""
+    model = model if model.dt == given.data.dt else at_step(model, given.data.dt)
+    return model, acting(model, given.data).at(given.steps.place)
+
+
+def _commanded(model: ComposedModel, given: Inverse) -> Array:
+    """(m, nu) h * u."""
+    return _filtered(acting(model, given.data, ()).mean[given.steps.place], given)
+
+
+def _off(model: ComposedModel, given: Inverse) -> Array:
+    """(m, nu) h * (a - u*)."""
+    model, here = _here(model, given)
+    return _filtered(here.mean - _needed(model, given.steps, here), given)
 
 
 def _shaken(given: Inverse, r: Array, rng: np.random.Generator) -> Steps:
@@ -141,12 +155,6 @@ def _tame(e: Array) -> Array:
     most = WILD * np.median(np.abs(e), axis=0) / 0.6745
     few = np.mean(np.abs(e) > most, axis=0) < FEW
     return rms(np.clip(e, np.where(few, -most, -np.inf), np.where(few, most, np.inf)))
-
-
-def _by_itself(model: ComposedModel, given: Inverse) -> Array:
-    """(n, nu) what acts if nothing is commanded."""
-    silent = replace(given.data, runs=tuple(replace(run, u=0.0 * run.u, turned=None) for run in given.data.runs))
-    return acting(model, silent).mean[given.steps.place]
 
 
 def _needed(model: ComposedModel, steps: Steps, act: Acting) -> Array:

@@ -14,6 +14,7 @@ Errors have tails: a value of z has the density (1 - TAIL) N(0, 1) + TAIL N(0, W
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -175,7 +176,7 @@ def estimate(r: Array, f: Array, joined: Mask, floor: Noise, near: Noise | None 
     noise = _by_state(r, f, joined, extra, near, floor)
     hidden = hidden_by_others(f, noise)
     if hidden:
-        noise = together(r, f, joined, extra, noise if near is None else _likelier(r, f, joined, extra, noise, near, floor), floor)
+        noise = together(r, f, joined, extra, (noise,) if near is None else (noise, near), floor)
     for _ in range(2):
         z = Whitener(noise, f, joined, extra)(r)
         wild = np.abs(z) > OUTLIER
@@ -184,7 +185,7 @@ def estimate(r: Array, f: Array, joined: Mask, floor: Noise, near: Noise | None 
         seen = np.where(np.isin(range(r.shape[1]), [v for _, v in floor.axes]), 0.0, noise.r)
         own = noise.q + seen + f**2 @ seen
         extra += np.where(wild, (z**2 / 4.0) * (own + extra), 0.0)
-        noise = (together if hidden else _by_state)(r, f, joined, extra, noise, floor)
+        noise = together(r, f, joined, extra, (noise,), floor) if hidden else _by_state(r, f, joined, extra, noise, floor)
     return noise
 
 
@@ -197,25 +198,14 @@ def hidden_by_others(f: Array, noise: Noise) -> bool:
     return bool(np.any(share @ noise.r - np.diag(share) * noise.r > HIDDEN * own))
 
 
-def _likelier(r: Array, f: Array, joined: Mask, extra: Array, one: Noise, other: Noise, floor: Noise) -> Noise:
-    """The likelier one of two, none below the floor: what another model left may lie where scoring does not come away from."""
-
-    def cost(noise: Noise) -> float:
-        whiten = Whitener(Noise(np.maximum(noise.q, floor.q), np.maximum(noise.r, floor.r)), f, joined, extra)
-        return float(0.5 * np.sum(whiten(r) ** 2)) + whiten.logdet
-
-    return one if cost(one) <= cost(other) else other
-
-
-def together(r: Array, f: Array, joined: Mask, extra: Array, near: Noise, floor: Noise) -> Noise:
-    """Q and R of all states by maximum likelihood of the whole residual, over their logarithms, from `near`: scoring with the average
-    information, as `state_noise` does for one state. With V the covariance that a variance makes, s = S^-1 r and s' drawn with
-    covariance S^-1,
+def together(r: Array, f: Array, joined: Mask, extra: Array, near: Sequence[Noise], floor: Noise) -> Noise:
+    """Q and R of all states by maximum likelihood of the whole residual, over their logarithms, from the likeliest of `near` (what another
+    model left may lie where this does not come away from): scoring with the average information, as `state_noise` does for one state.
+    With V the covariance that a variance makes, s = S^-1 r and s' drawn with covariance S^-1,
 
         slope  v/2 (s' V s - E s'' V s''),      bend  v_i v_j / 2 (V_i s)' S^-1 (V_j s)
     """
     nx, least = r.shape[1], np.log(np.concatenate([floor.q, floor.r]))
-    logs = np.maximum(np.log(np.maximum(np.concatenate([near.q, near.r]), 1e-300)), least)
     drawn = np.random.default_rng(0).choice([-1.0, 1.0], size=(*r.shape, DRAWN))
     goes_on = np.append(joined[1:], False)[:, None, None]
 
@@ -224,7 +214,8 @@ def together(r: Array, f: Array, joined: Mask, extra: Array, near: Noise, floor:
         whiten = Whitener(Noise(v[:nx], v[nx:]), f, joined, extra)
         return whiten, float(0.5 * np.sum(whiten(r) ** 2)) + whiten.logdet
 
-    whiten, cost = at(logs)
+    starts = [np.maximum(np.log(np.maximum(np.concatenate([one.q, one.r]), 1e-300)), least) for one in near]
+    logs, (whiten, cost) = min(((start, at(start)) for start in starts), key=lambda begun: begun[1][1])
     for _ in range(ROUNDS):
         s = whiten.back(np.concatenate([whiten(r)[:, :, None], drawn], axis=2))
         first = -np.einsum("kji,kjc->kic", f, s)  # what the error of a step's first measurement is in both steps that have it
@@ -260,7 +251,8 @@ def _scored(slope: Array, bend: Array, room: Array) -> tuple[Array, float]:
     while free.any():
         move[:] = 0.0
         part = bend[np.ix_(free, free)]
-        move[free] = np.linalg.solve(part + np.diag(np.maximum(np.abs(slope[free]) - np.diag(part), 0.0) + 1e-9), slope[free])
+        steep = np.maximum(np.abs(slope[free]) - np.diag(part), 0.0)
+        move[free] = np.linalg.solve(part + np.diag(steep + 1e-9 * (1.0 + np.diag(part))), slope[free])
         stays = free & (room <= AT_BOUND) & (move < 0.0)
         if not stays.any():
             break

@@ -111,10 +111,10 @@ def tied(given: Problem, fit: Fit, found: list[Scored], ahead: Sequence[float]) 
     white = np.array([one.white - STRICT.price(one.k - fit.k, len(given.steps)) for one in fits])
     near |= (white - white[best] > NEAR) & (behind <= NEAR)  # by noise without a memory it is the other way round, and by far
     left = [i for i in np.flatnonzero(near).tolist() if i != best]
-    return fits[best], [found[i - 1] if i else Scored(*_gone(fit, fits[best]), found[0].score, fit) for i in left]
+    return fits[best], [found[i - 1] if i else Scored(*only_in(fit, fits[best]), found[0].score, fit) for i in left]
 
 
-def _gone(fit: Fit, other: Fit) -> tuple[str, str]:
+def only_in(fit: Fit, other: Fit) -> tuple[str, str]:
     """The effect of one model that the other does not have."""
     there = {name_of(other.model.effects[place]) for place in other.added}
     return next(name for place in fit.added if (name := name_of(fit.model.effects[place])) not in there)

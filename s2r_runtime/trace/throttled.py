@@ -9,11 +9,14 @@ model: A. Janot, M. Gautier, M. Brunot, Data set and reference models of EMPS, 2
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.errors import Held, noise_there
 from s2r_runtime.trace.fitting import Fit
-from s2r_runtime.trace.inverse import by_noise, followed
+from s2r_runtime.trace.inverse import off, off_by_noise, recorded
+
+Array = NDArray[np.float64]
 
 THROTTLED = (0.1, 0.3), (0.7, 1.0)
 """Shares of a force that was recorded, rms, below which effects that leave less throttle it; and how far, over what they leave, the force
@@ -31,19 +34,25 @@ def refuted(fit: Fit, judged_on: Held) -> bool:
     """Whether effects throttle a force, and the motion does not go by what they leave of it."""
     if judged_on.inverse is None or not any(fit.model.effects[i].effect.stage == "input" for i in fit.added):
         return False
-    told = followed(fit.model, judged_on.inverse)
-    suspected = [(told.asked > 0.0) & (told.left < share * told.asked) & (told.off > far * told.left) for share, far in THROTTLED]
-    if not np.any(suspected):
+    told = recorded(fit.model, judged_on.inverse)
+    throttled = [(told.asked > 0.0) & (told.left < share * told.asked) for share, _ in THROTTLED]
+    if not np.any(throttled):
         return False
-    noise = by_noise(fit.model, judged_on.inverse, noise_there(fit, judged_on).r)
-    beyond = np.sqrt(np.where(told.off > np.max(noise, axis=0), told.off**2 - np.mean(noise**2, axis=0), 0.0))
-    return any(bool(np.any(those & (beyond > far * told.left))) for those, (_, far) in zip(suspected, THROTTLED, strict=True))
+
+    def beyond(error: Array) -> bool:
+        return any(bool(np.any(those & (error > far * told.left))) for those, (_, far) in zip(throttled, THROTTLED, strict=True))
+
+    error = off(fit.model, judged_on.inverse)
+    if not beyond(error):
+        return False
+    noise = off_by_noise(fit.model, judged_on.inverse, noise_there(fit, judged_on).r)
+    return beyond(np.sqrt(np.where(error > np.max(noise, axis=0), error**2 - np.mean(noise**2, axis=0), 0.0)))
 
 
 def says_forces(model: ComposedModel, judged_on: Held) -> bool:
     """Whether the inverse model says how the recorded forces vary."""
     if judged_on.inverse is None:
         return False
-    told = followed(model, judged_on.inverse)
+    told = recorded(model, judged_on.inverse)
     used = told.varies > HARDLY * told.asked
-    return bool(used.any() and np.all(told.off[used] <= WELL * told.varies[used]))
+    return bool(used.any() and np.all((off(model, judged_on.inverse) <= WELL * told.varies)[used]))

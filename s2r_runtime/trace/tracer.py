@@ -167,7 +167,8 @@ def _traced(
     say(90.0, 100.0, "judging on held-out data")
     w = np.ones(len(model.states)) if weights is None else np.array([weights[asked.states.index(s)] for s in model.states])
     result = answered(dataset, checked, given, chosen, structure, judged_on, seed, w, kind)
-    if under is None and not (dataset.commanded or dataset.measured_forces) and refuted(chosen.fit, judged_on):
+    asked_once = under is None and not (dataset.commanded or dataset.measured_forces)
+    if asked_once and result.verdict == "unexplained" and refuted(chosen.fit, judged_on):
         taken = replace(as_recorded[0], measured_forces=True)
         other = _traced(taken, asked, as_recorded[1], horizon, seed, _from(90.0, say), norm, parts)
         if says_forces(other.explaining, judged_on):

@@ -30,7 +30,7 @@ from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, foretold, 
 from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import Mask, acting, first_steps, predicted, rms
 from s2r_runtime.trace.residual_noise import OUTLIER
-from s2r_runtime.trace.rivals import representative, tied
+from s2r_runtime.trace.rivals import only_in, representative, tied
 from s2r_runtime.trace.scores import STRICT, Scored, name_of, names
 from s2r_runtime.trace.selection import Selection, doing_something, one_more
 from s2r_runtime.trace.slots import Added, slots_of
@@ -115,27 +115,21 @@ def _likeliest(given: Problem, fit: Fit, found: list[Scored], judged_on: Held) -
     """The likeliest explanation on all of the recording, and those that tie with it. One that takes the place of an effect does so beside
     the others: their own rivals are asked once more beside it.
     """
-    for _ in fit.added:
+    for _ in range(len(fit.added) + 1):
         fits = [fit, *(s.fit for s in found if s.fit is not None)]
         best, ties = tied(given, fit, found, foretelling(judged_on, fits))
         if best is fit or len(fit.added) < 2:
-            return best, ties
-        found = [*_beside(given, fit, best, found), Scored(*_only_in(fit, best), found[0].score, fit)]
+            break
+        found = [*_beside(given, fit, best, found), Scored(*only_in(fit, best), found[0].score, fit)]
         fit = best
-    fits = [fit, *(s.fit for s in found if s.fit is not None)]
-    return tied(given, fit, found, foretelling(judged_on, fits))
-
-
-def _only_in(fit: Fit, other: Fit) -> tuple[str, str]:
-    """The effect of one model that another one has another in the place of."""
-    return next(name for name in names(fit.model) if name not in names(other.model))
+    return best, ties
 
 
 def _beside(given: Problem, fit: Fit, best: Fit, found: Sequence[Scored]) -> list[Scored]:
     """Rivals of what was found beside the best one: with the effect that has changed since changed in them, too, and all that they share
     with it as it is there. The one that changed it is none; others in its place stay.
     """
-    gone, came = _only_in(fit, best), _only_in(best, fit)
+    gone, came = only_in(fit, best), only_in(best, fit)
     there = {name_of(a): a for a in best.model.effects if isinstance(a, Added)}
     moved = []
     for s in found:
