@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import signal
@@ -89,15 +88,16 @@ def test_nothing_but_recovery_and_sampler_commands_went_out_without_a_certificat
 
 @pytest.mark.slow
 @pytest.mark.timeout(480)
-def test_its_log_passes_the_audit_by_anybody_who_has_the_public_key(story: tuple[Path, str], tmp_path: Path) -> None:
-    out, _ = story
-    logs = sorted((out / "logs").glob("*.mcap"))
-    done = s2r("audit", *logs, "--key", out / "state" / "key.pub", "--json")
-    answer = json.loads(done.stdout)
-    assert (done.returncode, answer["ok"], answer["chain"], answer["first_difference"]) == (0, True, "intact", None)
-    assert s2r("keys", "new", tmp_path / "other.pem").returncode == 0
-    other = s2r("audit", *logs, "--key", tmp_path / "other.pub")
-    assert other.returncode == 1
+def test_its_log_passes_the_audit_by_the_public_key_alone(story: tuple[Path, str]) -> None:
+    """The demo runs it: a process of its own, given the log and the key, as the last but one command of the story."""
+    out, text = story
+    (log,) = (out / "logs").glob("*.mcap")
+    command, audited = text.split("$ s2r audit ", 1)[1].split("$ s2r report", 1)[0].split("\n", 1)
+    assert command.startswith(f"{log} --key {out / 'state' / 'key.pub'} --rerun-controllers")
+    assert audited.startswith("holds: ")
+    assert re.search(r"^chain        intact; signed by ed25519:[0-9a-f]+, the trusted key;", audited, re.MULTILINE)
+    assert re.search(r" [1-9][0-9]* verifications run again$", audited, re.MULTILINE)
+    assert "exit code" not in audited
 
 
 @pytest.mark.slow

@@ -271,6 +271,8 @@ def test_an_old_copy_of_the_state_gives_back_no_attempt_no_revocation_and_no_sto
     assert (code, "forgets epochs or attempts" in said) == (78, True), said
     persistence.replace(file, persistence.seal("state", memory))
     assert rig.s2r("audit", *map(str, rig.log_files()), "--key", str(rig.state / "key.pub")).returncode == 0
+    assert rig.s2r("keys", "new", str(rig.state / "other.pem")).returncode == 0
+    assert rig.s2r("audit", *map(str, rig.log_files()), "--key", str(rig.state / "other.pub")).returncode == 1
 
 
 def interrupted(rig: Rig) -> tuple[Path, Path]:

