@@ -115,7 +115,8 @@ def failure(r: Record) -> str:
     """One line: which set, what is true, what was answered."""
     what = "+".join(f"{e['name']}({e['channel']})" + _values(e["parameters"]) for e in r["truth"]) or r.get("kind") or "nothing"
     said = "+".join(f"{e['name']}({e['channel']})" + _values(e["parameters"]) for e in r.get("effects", []))
-    ties = " ~ " + ",".join(f"{e['name']}({e['channel']})" for e in r["ambiguous_with"]) if r.get("ambiguous_with") else ""
+    rivals = ",".join(f"{e['name']}({e['channel']})" for e in r.get("ambiguous_with", ()) if not e["same_thing"])
+    ties = f" ~ {rivals}" if rivals else ""
     left = f" left: {','.join(r['depends_on'])}" if r.get("depends_on") else ""
     part = " partial: " + "+".join(f"{e['name']}({e['channel']})" for e in r["partial"]) if r.get("partial") else ""
     wanted = f" depends: {'|'.join(r['true_depends_on'])}" if "true_depends_on" in r else ""

@@ -103,19 +103,25 @@ def _nameless(r: TraceResult) -> list[str]:
 
 def _known(r: TraceResult, e: Found) -> list[str]:
     """An effect, and other names for it."""
-    return [*_effect(e), *(f"      the same thing on this model: {other.text()}" for other in r.same(e))]
+    others = [other for other in r.same(e) if (other.name, other.channel) != (e.name, "*")]  # on all of one input
+    return [*_effect(e), *(line for other in others for line in _broken(f"      the same thing on this model: {other.text()}"))]
 
 
 def _effect(e: Found) -> list[str]:
+    words = e.words()
+    return [*_broken(f"  {e.text()}"), *([f"      {words}"] if words else [])]
+
+
+def _broken(line: str) -> list[str]:
+    """Between numbers, to fit."""
     lines, text = [], ""
-    for piece in e.text().split(", "):
+    for piece in line.split(", "):
         if text and len(text) + len(piece) + 4 > WIDTH:
             lines.append(f"{text},")
             text = f"      {piece}"
         else:
-            text = f"{text}, {piece}" if text else f"  {piece}"
-    words = e.words()
-    return [*lines, text, *([f"      {words}"] if words else [])]
+            text = f"{text}, {piece}" if text else piece
+    return [*lines, text]
 
 
 def _left_over(r: TraceResult) -> list[str]:

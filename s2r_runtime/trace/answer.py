@@ -28,6 +28,7 @@ from s2r_runtime.trace.orders import in_either_order
 from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.residual_noise import no_colour
 from s2r_runtime.trace.result import Found, Limit, TraceResult
+from s2r_runtime.trace.same_thing import other_names
 from s2r_runtime.trace.selection import Selection
 from s2r_runtime.trace.shrinkage import drawn_in
 from s2r_runtime.trace.slots import Slot, values_of
@@ -131,7 +132,7 @@ def _recorded(
         verdict=verdict,
         effects=effects,
         partial=() if final is chosen.fit else tuple(_found(model, chosen.fit, place, {}) for place in chosen.fit.added),
-        ambiguous_with=ties,
+        ambiguous_with=each_once((*ties, *(other for e in (*effects, *ties) for other in other_names(final.model, e)))),
         candidates=tuple((s.name, s.channel, s.score) for s in chosen.ranking),
         depends_on=tuple(dict.fromkeys((*shared, *left))),
         any_shape_of=shared,

@@ -89,7 +89,7 @@ class TraceResult:
 
     def same(self, found: Found) -> tuple[Found, ...]:
         """Of `ambiguous_with`: other names of the very same thing on this model."""
-        alike = {(name, channel) for name, channel, _ in same(self.nominal.nominal, found.name, found.channel, found.values)}
+        alike = {(name, channel) for name, channel, _ in same(self.model.for_effects, found.name, found.channel, found.values)}
         return tuple(e for e in self.ambiguous_with if (e.name, e.channel) in alike)
 
     @cached_property
