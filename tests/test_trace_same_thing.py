@@ -1,5 +1,7 @@
 """What was found goes by other names on some models: they stand beside it with its numbers, and are no tie."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from trace_robots import declared, recordings
@@ -112,3 +114,15 @@ def test_of_one_input_all_inputs_is_no_other_name_that_a_person_is_told():
     assert {(e.name, e.channel) for e in found.ambiguous_with} >= {("input_delay", "*"), ("mass_change", "*")}
     assert "mass_change on *" in found.text()
     assert "input_delay on *" not in found.text()
+
+
+def test_a_rival_with_numbers_of_its_own_is_another_thing():
+    """A point before the middle, too, is no coupling, although one beside it is."""
+    found = trace(recordings([("input_gain", "w", {"gain": 0.8})], 1, steps=700, seed=3)[0], declared())
+    coupling = Found("input_coupling", "v", {"from": ("w", None, None, ""), "coefficient": (-0.2, None, None, "m")})
+    beside = Found("sensor_lever_arm", "*", {"x": (0.0, None, None, "m"), "y": (0.2, None, None, "m")})
+    before = replace(beside, parameters={**beside.parameters, "x": (0.01, None, None, "m")})
+    for other, rivals in ((beside, ()), (before, (before,))):
+        told = replace(found, verdict="ambiguous", effects=(coupling,), ambiguous_with=(other,))
+        assert told.rivals == rivals
+        assert told.same(coupling) == (() if rivals else (other,))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -89,8 +90,8 @@ class TraceResult:
 
     def same(self, found: Found) -> tuple[Found, ...]:
         """Of `ambiguous_with`: other names of the very same thing on this model."""
-        alike = {(name, channel) for name, channel, _ in same(self.model.for_effects, found.name, found.channel, found.values)}
-        return tuple(e for e in self.ambiguous_with if (e.name, e.channel) in alike)
+        alike = {(name, channel): p for name, channel, p in same(self.model.for_effects, found.name, found.channel, found.values)}
+        return tuple(e for e in self.ambiguous_with if _alike(e.values, alike.get((e.name, e.channel))))
 
     @cached_property
     def rivals(self) -> tuple[Found, ...]:
@@ -254,3 +255,11 @@ class TraceResult:
     def plots(self) -> dict[str, Any]:
         """Arrays, as lists: residuals of what was held out over time and against what they may depend on, autocorrelation, rollouts."""
         return views(self)
+
+
+def _alike(values: dict[str, Any], others: dict[str, Any] | None) -> bool:
+    """Whether they are the very same: a point beside the middle and before it is another thing than one beside it, which is a coupling."""
+    if others is None or values.keys() != others.keys():
+        return False
+    pairs = [(v, others[name]) for name, v in values.items()]
+    return all(math.isclose(v, o, rel_tol=1e-9) if isinstance(v, float) and isinstance(o, float) else v == o for v, o in pairs)
