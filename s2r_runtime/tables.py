@@ -1,4 +1,4 @@
-"""Recordings in table form: CSV, or CSV.gz (docs/log-format.md).
+"""Recordings in table form: CSV, or CSV.gz (docs/recordings.md).
 
 A header row; `t` in seconds; one column for each measured state and each input; an optional `segment` column for runs that are
 not contiguous (any labels; the rows of one run stand together); a blank cell means *not received at this stamp*. Stamps do not

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from trace_robots import declared, recordings
+from trace_robots import DT, NOISE, ROBOTARIUM, declared, drive, recordings
 
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
@@ -126,3 +126,25 @@ def test_a_rival_with_numbers_of_its_own_is_another_thing():
         told = replace(found, verdict="ambiguous", effects=(coupling,), ambiguous_with=(other,))
         assert told.rivals == rivals
         assert told.same(coupling) == (() if rivals else (other,))
+
+
+def test_of_several_effects_each_rival_says_which_it_stands_for():
+    """A robot that only ever turns at 0 or 1 rad/s does not tell a gain from a limit; what slows its speed is told."""
+    rng = np.random.default_rng(4)
+    u = np.zeros((1, 900, 2))
+    u[0, :, 0] = np.repeat(rng.uniform(-0.15, 0.15, 45), 20)
+    u[0, :, 1] = np.repeat(rng.integers(0, 2, 60), 15)
+    effects = (*ROBOTARIUM, ("input_gain", "w", {"gain": 0.8}), ("input_lag", "v", {"time_constant": 0.2}))
+    y = drive(rng, "unicycle", u, effects, DT, NOISE)
+    found = trace(from_arrays(declared(), [(y[0], u[0])]), declared())
+    assert found.verdict == "ambiguous"
+    turning = [e for e in found.effects if e.channel in {"w", "theta"}]
+    assert len(turning) == 1
+    assert len(found.effects) == 2
+    instead = {(e["name"], e["channel"]): [(f["name"], f["channel"]) for f in e["instead_of"]] for e in found.to_json()["ambiguous_with"]}
+    assert len(instead) > 1
+    assert set(map(tuple, instead.values())) == {((turning[0].name, turning[0].channel),)}
+    assert found.text().count(f"in place of {turning[0].name} on {turning[0].channel}") == len(found.rivals)
+    page = Page("", "")
+    add_trace(page, found.to_json())
+    assert page.html().count(f"or, in place of {turning[0].name} on {turning[0].channel}") == len(found.rivals)

@@ -1,4 +1,4 @@
-"""Kinematic bicycle about the rear axle (docs/tracing.md): speed reaches its command at once, pose by Euler with the new speed.
+"""Kinematic bicycle about the rear axle (docs/recordings.md): speed reaches its command at once, pose by Euler with the new speed.
 
 speed+ = speed_cmd,  x+ = x + dt speed+ cos(theta),  y+ = y + dt speed+ sin(theta),  theta+ = theta + dt speed+ tan(steer_cmd) / L
 """

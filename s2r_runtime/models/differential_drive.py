@@ -1,4 +1,4 @@
-"""Differential drive (docs/tracing.md): wheels reach their command at once, pose by Euler with the new wheel speeds.
+"""Differential drive (docs/recordings.md): wheels reach their command at once, pose by Euler with the new wheel speeds.
 
 left+ = cmd_left,  right+ = cmd_right,  v = R (left+ + right+) / 2,  w = R (right+ - left+) / track
 x+ = x + dt v cos(theta),  y+ = y + dt v sin(theta),  theta+ = theta + dt w

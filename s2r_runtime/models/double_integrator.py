@@ -1,4 +1,4 @@
-"""Planar double integrator (docs/tracing.md), exact for an input that is constant over the step.
+"""Planar double integrator (docs/recordings.md), exact for an input that is constant over the step.
 
 p+ = p + dt v + dt²/2 a,  v+ = v + dt a,  for each axis
 """

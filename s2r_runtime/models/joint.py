@@ -1,6 +1,6 @@
 """One joint driven by a force (or, with an inertia for the mass, by a torque), exact for an input constant over the step.
 
-a = force / mass,  q+ = q + dt qd + dt²/2 a,  qd+ = qd + dt a   (docs/tracing.md)
+a = force / mass,  q+ = q + dt qd + dt²/2 a,  qd+ = qd + dt a   (docs/recordings.md)
 """
 
 from __future__ import annotations

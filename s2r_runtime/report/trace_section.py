@@ -31,7 +31,7 @@ def add_trace(page: Page, trace: dict[str, Any]) -> None:
     page.text(f"{trace['verdict']}: {text}", f"verdict {kind}")
     rows = list(_rows(trace["effects"], ""))
     for e in trace["ambiguous_with"]:
-        rows += _rows([e], "the same thing on this model" if e.get("same_thing", trace["verdict"] != "ambiguous") else "or")
+        rows += _rows([e], _role(e, trace))
     rows += _rows(trace.get("partial", ()), "explains a part only")
     if rows:
         page.table(("", "effect", "acts on", "parameter", "value and 95 % interval", "that is"), rows)
@@ -47,6 +47,14 @@ def add_trace(page: Page, trace: dict[str, Any]) -> None:
     # what no dictionary took up of a structure without a name is still in it
     _errors(page, trace["error"], "noise alone" if trace["verdict"] != "unexplained" else "noise as estimated")
     _gap(page, trace.get("gap") or {})
+
+
+def _role(rival: dict[str, Any], trace: dict[str, Any]) -> str:
+    """Of an entry of `ambiguous_with`; beside several effects it says which of them it stands for."""
+    role = "the same thing on this model" if rival.get("same_thing", trace["verdict"] != "ambiguous") else "or"
+    told = [f"{e['name']} on {e['channel']}" for e in rival.get("instead_of", ())]
+    where = "as" if role != "or" else "in place of"
+    return f"{role}, {where} {' and '.join(told)}" if told and len(trace["effects"]) > 1 else role
 
 
 def _rows(effects: Sequence[dict[str, Any]], role: str) -> Iterator[tuple[str, str, str, str, str, str]]:

@@ -86,13 +86,19 @@ def _wanders(r: TraceResult) -> bool:
 def _explained(r: TraceResult) -> list[str]:
     lines = [line for e in r.effects for line in _known(r, e)]
     if r.rivals:
-        where = "cannot be told from" + (", each in place of one of them" if len(r.effects) > 1 else "")
-        lines += [f"{where}:", *(line for e in r.rivals for line in _known(r, e))]
+        lines += ["cannot be told from:", *(line for e in r.rivals for line in [*_known(r, e), *_in_place_of(r, e)])]
         lines += labelled("or", _nameless(r))
         lines += labelled("try next", [r.suggested_excitation or "", "(--suggest FILE.csv writes such a drive)"])
     if r.partial:
         lines += ["explains a part only, so no name is lent to it:", *(line for e in r.partial for line in _effect(e))]
     return lines
+
+
+def _in_place_of(r: TraceResult, e: Found) -> list[str]:
+    """Which of several effects a rival would replace."""
+    if len(r.effects) < 2 or not e.instead_of:
+        return []
+    return [f"      in place of {' and '.join(f'{name} on {channel}' for name, channel in e.instead_of)}"]
 
 
 def _nameless(r: TraceResult) -> list[str]:

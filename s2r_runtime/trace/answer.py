@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -126,7 +126,9 @@ def _recorded(
     rivals = [s.fit for s in chosen.rivals if s.fit is not None] if verdict == "ambiguous" else []
     left = _in_order(structure, verdict)
     shared = tuple(token for token in any_shape_of(final, rivals, given.data, given.steps) if token not in left)
-    ties = each_once(_found(model, fit, place, {}) for fit in rivals for place in _new(fit, final))
+    ties = each_once(
+        replace(_found(model, fit, place, {}), instead_of=_names(final, _new(final, fit))) for fit in rivals for place in _new(fit, final)
+    )
     adopted = final if worth_its_risk(chosen, decided.before, decided.after) else chosen.nominal
     return TraceResult(
         verdict=verdict,
@@ -182,6 +184,11 @@ def _new(fit: Fit, other: Fit) -> list[int]:
     """Places of the effects of one fit that the other does not have."""
     there = {(a.effect.name, a.channel) for a in other.model.effects}
     return [i for i in fit.added if (fit.model.effects[i].effect.name, fit.model.effects[i].channel) not in there]
+
+
+def _names(fit: Fit, places: Sequence[int]) -> tuple[tuple[str, str], ...]:
+    """(effect, channel) at each place."""
+    return tuple((fit.model.effects[i].effect.name, fit.model.effects[i].channel) for i in places)
 
 
 def _found(model: ComposedModel, fit: Fit, place: int, ranges: dict[Slot, tuple[float, float]]) -> Found:

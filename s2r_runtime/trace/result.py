@@ -200,7 +200,10 @@ class TraceResult:
             "effects": [e.to_json() for e in self.effects],
             "candidates": [{"name": n, "channel": c, "score": round(s, 3)} for n, c, s in self.candidates],
             "left_as_given": self.left_as_given,
-            "ambiguous_with": [{**e.to_json(), "same_thing": e in alike} for e in self.ambiguous_with],
+            "ambiguous_with": [
+                {**e.to_json(), "same_thing": e in alike, "instead_of": [{"name": n, "channel": c} for n, c in e.instead_of]}
+                for e in self.ambiguous_with
+            ],
             "partial": [e.to_json() for e in self.partial],
             "depends_on": list(self.depends_on),
             "may_depend_on": list(self.may_depend_on),

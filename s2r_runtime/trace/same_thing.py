@@ -17,10 +17,12 @@ def other_names(model: ComposedModel, found: Found) -> tuple[Found, ...]:
     """All of them, with intervals where those of what was found have two ends."""
     low, high = (_at_end(model, found, end) for end in (0, 1))
     called = []
+    instead_of = found.instead_of or ((found.name, found.channel),)
     for (name, channel), values in _called(model, found, found.values).items():
         unit = registry().get("effects", name).unit
         ends = {p: _between(low.get((name, channel), {}).get(p), high.get((name, channel), {}).get(p)) for p in values}
-        called.append(Found(name, channel, {p: (value, *ends[p], unit(model.nominal, channel, p)) for p, value in values.items()}))
+        numbers = {p: (value, *ends[p], unit(model.nominal, channel, p)) for p, value in values.items()}
+        called.append(Found(name, channel, numbers, instead_of))
     return tuple(called)
 
 
