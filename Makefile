@@ -87,6 +87,7 @@ $(STAMP): pyproject.toml constraints.txt plugins/zenoh/pyproject.toml plugins/ca
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt \
 	    --editable '.[report,dev]' --editable plugins/zenoh --editable plugins/can --editable plugins/mavlink --editable 'plugins/standins[sim]' \
 	    --editable plugins/ros2
+	@$(BIN)/python -m compileall -q s2r_runtime plugins  # else each start does it again where PYTHONDONTWRITEBYTECODE is set
 	@touch $(STAMP)
 
 clean:

@@ -26,7 +26,7 @@ def add_model_options(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--model",
         metavar="M",
-        help="a model's name, a Python file, or a model TOML (written by s2r trace -o); with --profile it replaces the profile's model",
+        help="a model's name, a Python file, or a model TOML (docs/recordings.md; s2r trace -o writes one); replaces a profile's",
     )
     verb.add_argument("--dt", type=positive, metavar="DT", help="the model's step in s (with a name or a Python file)")
     verb.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the model; may be repeated")

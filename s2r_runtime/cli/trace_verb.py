@@ -61,7 +61,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "it traces with its profile's model, and proposes the repaired one (s2r adopt)",
     )
     add_daemon_options(verb)
-    verb.add_argument("-o", "--output", type=Path, metavar="MODEL.toml", help="write the repaired model")
+    verb.add_argument(
+        "-o", "--output", type=Path, metavar="MODEL.toml", help="write the repaired model; as it was given, where nothing was found"
+    )
     verb.add_argument("--report", type=Path, metavar="FILE.html", help="write a self-contained page with plots")
     verb.add_argument("--json", action="store_true", help="print one JSON object")
     verb.set_defaults(run=run)
