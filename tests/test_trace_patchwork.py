@@ -188,3 +188,22 @@ def test_a_steady_push_is_part_of_no_patchwork_although_the_square_of_a_two_valu
     as_much = replace(whole.unnamed, token=of_input, gain=AS_MUCH * gain(fit, whole.nominal))
     assert only_pushes(fit.model, 1, whole.given.data, whole.given.steps)
     assert not patchwork(whole.given, fit, whole.nominal, as_much)
+
+
+def test_what_goes_with_a_commanded_speed_goes_with_the_speed_that_a_car_is_set_to():
+    """A heading that is measured off by little, and a bias of the steering: both are more, the faster the car goes."""
+    rng = np.random.default_rng(7)
+    command = np.column_stack([np.repeat(rng.uniform(-0.3, 0.3, 40), 20), np.repeat(rng.uniform(1.0, 5.0, 40), 20)])
+    pose, rows = np.array([0.0, 0.0, 0.0]), [np.zeros(4)]
+    for steer, speed in command:
+        for _ in range(PARTS):
+            pose = pose + DT / PARTS * speed * np.array([np.cos(pose[2]), np.sin(pose[2]), np.tan(steer + 0.01)])
+        rows.append(np.append(pose, speed))
+    model = compose(ModelSpec("bicycle", DT, {"wheel_base": 1.0}, (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),)))
+    y = np.array(rows) + [0.0, 0.0, 0.01, 0.0] + rng.normal(size=(801, 4)) * [0.01, 0.01, 0.005, 0.02]
+    whole = Whole(Checked(from_arrays(model, [(y, command)]), (), (), 0), model, 20)
+    fit = _named(whole, _effect("input_bias", "steer_cmd", {"bias": 0.01}), _effect("heading_offset", "theta", {"angle": 0.01}))
+    named = gain(fit, whole.nominal)
+    assert all(gain(_named(whole, fit.model.effects[p]), whole.nominal) < MOSTLY * named for p in fit.added)
+    for token, found in (("speed", False), ("speed_cmd", False), ("position", True)):
+        assert patchwork(whole.given, fit, whole.nominal, replace(whole.unnamed, token=token, gain=named)) is found

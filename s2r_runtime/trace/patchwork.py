@@ -9,16 +9,19 @@ What tells: it depends on one thing, and a dictionary of that (`lack_of_fit_term
 The dictionary's gain is that on blocks which its numbers never saw, that of the names on what they were fitted to. Two effects that are
 there give two dependences, of which one dictionary has one; where both are about the same (dry friction and drag, about the speed; wheels
 that slip and a bias of the steering, which turns a car the more, the faster it goes), one dictionary has both, and that says nothing
-against them. Nor does it say anything against a steady push, if what is commanded has two values: the square of that is one, too.
+against them. A state that a model sets to what is commanded (a car's speed) is one thing with that command. Nor does it say anything
+against a steady push, if what is commanded has two values: the square of that is one, too.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
+from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.about import about, carried, only_pushes
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, without
 from s2r_runtime.trace.lack_of_fit_judged import Judged
+from s2r_runtime.trace.lack_of_fit_terms import token_of
 
 AS_MUCH = 0.95
 """Of what all names explain: of two effects that are there, one dictionary explained up to 0.89, but for pairs of which one is MOSTLY
@@ -39,10 +42,15 @@ def patchwork(given: Problem, fit: Fit, nominal: Fit, unnamed: Judged) -> bool:
     atoms = set(unnamed.token.split("*"))
     seen = atoms | {atom.removeprefix("memory(").removesuffix(")") for atom in atoms}  # what an input was has in it what it is
     varied = [place for place in fit.added if not only_pushes(fit.model, place, given.data, given.steps)]
-    each = [(about(fit.model, place, given.data, given.steps), place) for place in varied]
-    if all(atoms <= one or one <= seen or atoms <= one | carried(fit.model, place, given.data, given.steps) for one, place in each):
+    each = [(about(fit.model, place, given.data, given.steps), carried(fit.model, place, given.data, given.steps)) for place in varied]
+    if all(atoms <= _with_set(fit.model, one | more) or one <= seen for one, more in each):
         return False
     return all(gain(alone, nominal) <= MOSTLY * named for alone in _each_alone(given, fit))
+
+
+def _with_set(model: ComposedModel, tokens: set[str]) -> set[str]:
+    """With the states that are set to one of these inputs, as they are told."""
+    return tokens | {token_of(model, state) for state, name in getattr(model.nominal, "reached", {}).items() if name in tokens}
 
 
 def _each_alone(given: Problem, fit: Fit) -> Iterator[Fit]:
