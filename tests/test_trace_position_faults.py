@@ -122,3 +122,12 @@ def test_a_position_that_stood_on_a_clean_encoder_and_is_kicked_is_not_frozen(be
     p[begin : begin + 60] = p[begin]
     p[begin + 60 :] = p[begin] + np.cumsum(0.02 * np.exp(-0.3 * np.arange(2940 - begin)) + 1e-5 * rng.normal(size=2940 - begin))
     assert [f for f in _checked(p, 0.01, pushed=100.0).faults if f.kind == "frozen"] == []
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_position_that_froze_at_rest_and_springs_to_where_the_robot_went_meanwhile_is_frozen(seed):
+    """It was held at a set point, and was sent elsewhere; it had not been on its way, and is not under way when readings come again."""
+    t = 0.002 * np.arange(1500)
+    p = 0.2 * np.exp(-t / 0.05) + 0.1 * np.clip((t - 2.05) / 0.1, 0.0, 1.0) + 1e-6 * np.random.default_rng(seed).normal(size=1500)
+    p[1000:1100] = p[1000]
+    assert [(f.kind, round(f.from_s, 3), round(f.to_s, 3)) for f in _checked(p, 0.002).faults] == [("frozen", 2.0, 2.198)]

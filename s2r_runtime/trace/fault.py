@@ -50,11 +50,25 @@ def leaps(change: Array, within: tuple[int, int]) -> bool:
     repeats.
     """
     a, b = within
+    usual = _usual(change, within)
+    return usual is not None and bool(np.nanmax(change[a - FROZEN_ROWS : a], initial=0.0) >= usual[0] and change[b] > LEAPS * usual[1])
+
+
+def springs(change: Array, within: tuple[int, int]) -> bool:
+    """The same of a position that need not have been on its way, if it goes on by far less than it leaps: kicked, it would be under way."""
+    _, b = within
+    usual = _usual(change, within)
+    after = change[b + 1 : b + 1 + FROZEN_ROWS]
+    return usual is not None and bool(np.any(np.isfinite(after)) and change[b] > LEAPS * max(usual[1], float(np.nanmax(after))))
+
+
+def _usual(change: Array, within: tuple[int, int]) -> tuple[float, float] | None:
+    """By how much a state changes in the middle, and at most but for a few rows; None where it repeats for too short, or elsewhere, too."""
+    a, b = within
     if b - a < RESTLESS or a < FROZEN_ROWS or b >= len(change) or not np.isfinite(change[b]):
-        return False
+        return None
     others = np.isfinite(change)
     others[a : b + 1] = False
     if np.count_nonzero(others) < RESTS or float(np.mean(change[others] == 0.0)) >= REPEATS:
-        return False
-    on_its_way = np.nanmax(change[a - FROZEN_ROWS : a], initial=0.0) >= np.median(change[others])
-    return bool(on_its_way and change[b] > LEAPS * np.quantile(change[others], USUALLY))
+        return None
+    return float(np.median(change[others])), float(np.quantile(change[others], USUALLY))

@@ -6,7 +6,7 @@ A body's position goes on at its pace. With d_k = p_{k+1} - p_k over h_k, and m_
     jump:    |off_k| beyond noise, and beyond what the inputs do, with nothing like it beside
     spike:   one that is taken back within a few rows
     frozen:  p repeats exactly, and then makes up for the way that the pace before and after says; or it stops on its way, as it
-             hardly ever repeats elsewhere, and leaps beyond what the inputs do
+             hardly ever repeats elsewhere, and leaps beyond what the inputs do; or leaps so from rest, and is not under way then
 
 A blow, or an end stop, changes the pace from v to w, and m is between them at that row: off is half of (v - w) h before it, and the other
 way after it, as if one row were wrong. So a jump and a spike must be beyond |w - v| h, too.
@@ -21,7 +21,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace.fault import FROZEN_ROWS, QUANTA, SIGMAS, Fault, leaps, stretches
+from s2r_runtime.trace.fault import FROZEN_ROWS, QUANTA, SIGMAS, Fault, leaps, springs, stretches
 from s2r_runtime.trace.streams import Stream
 
 Array = NDArray[np.float64]
@@ -99,7 +99,8 @@ def _of_one(t: Array, p: Array, pushed: Array) -> tuple[Mask, list[int], list[tu
             continue
         missed = float(np.median(around)) * float(t[b + 1] - t[a])
         made_up = abs(missed) > least + QUANTA * quantum and abs(float(d[b]) - missed) < MADE_UP * abs(missed)
-        if made_up or (abs(float(d[b])) > least + QUANTA * quantum and leaps(changed_by, (a, b))):
+        far = abs(float(d[b])) > least + QUANTA * quantum
+        if made_up or (far and (leaps(changed_by, (a, b)) or springs(changed_by, (a, b)))):
             lost[a + 1 : b + 1] = True
             off[max(a - AROUND, 0) : b + 1 + AROUND] = 0.0  # the pace there is told from rows that stand still
             told.append((a, b, "frozen"))
