@@ -1,6 +1,6 @@
 # make run    sets everything up and runs the whole loop on the built-in robot over real Zenoh
 # make test   sets everything up and runs the tests
-# make test-long  the tests that need minutes each: measured recordings, ties broken by suggested drives
+# make test-long  the tests that take long: measured recordings, ties broken by suggested drives, further seeds
 # make check  format, lint, types, import walls, docs
 # make bench  the figures that the docs state, as ratios in one run
 # make mutation  does a test notice every small change of the gate, the certificate and the core, and is every line of them run

@@ -61,7 +61,7 @@ def read_csv(path: Path | str, wanted: Sequence[str] | None = None, optional: Se
     """
     path = Path(path)
     header, rows = _opened(path)
-    names = _checked_names(path, header, wanted)
+    names = _checked_names(path, header, wanted, optional)
     for name in optional:
         if name not in header and (near := [h for h in header if h.lower() == name.lower()]):
             raise RecordingError(f"{path}: lacks the column {name!r}, and has {near[0]!r}; column names must match exactly")
@@ -112,11 +112,11 @@ def _text(path: Path) -> str:
     return text
 
 
-def _checked_names(path: Path, header: list[str], wanted: Sequence[str] | None) -> list[str]:
+def _checked_names(path: Path, header: list[str], wanted: Sequence[str] | None, optional: Sequence[str]) -> list[str]:
     """The columns to read, without `t` and `segment`."""
     if not any(header):
         raise RecordingError(f"{path}: is empty, must start with a header row")
-    for name in header:
+    for name in (name for name in header if name) if wanted is None else (TIME, SEGMENT, *wanted, *optional):
         if header.count(name) > 1:
             raise RecordingError(f"{path}: column {name!r} is there {header.count(name)} times, must be there once")
     needed = [TIME, *(name for name in wanted or () if name != TIME)]

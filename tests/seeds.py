@@ -6,5 +6,5 @@ import pytest
 
 
 def first(soon: int, cases: Iterable[object]) -> list[object]:
-    """The cases, of which those after the first so many are `long`: what they show is shown by the others, at the same price each."""
+    """The cases, of which those after the first so many are `long`: they show much the same as the others, at the same price each."""
     return [case if i < soon else pytest.param(case, marks=pytest.mark.long) for i, case in enumerate(cases)]

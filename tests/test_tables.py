@@ -136,3 +136,10 @@ def test_a_hundred_thousand_rows_are_read_exactly(write) -> None:
     body = "\n".join(f"{k * 0.01:.2f},{a!r},{b!r},{c!r}" for k, (a, b, c) in enumerate(values.tolist()))
     table = read_csv(write(f"t,x,y,v\n{body}\n"), ("x", "y", "v"))
     np.testing.assert_array_equal(np.column_stack([table.columns[c] for c in ("x", "y", "v")]), values)
+
+
+@pytest.mark.parametrize("text", ["t,x,note,note\n0,1,a,b\n1,2,a,b\n", "t,x,,\n0,1,,\n1,2,,\n"])
+def test_columns_that_nobody_asked_for_may_be_anything(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text(text)
+    assert read_csv(path, ["x"]).columns["x"].tolist() == [1.0, 2.0]

@@ -161,7 +161,7 @@ def test_the_json_tells_every_key_of_its_page_and_no_other(results):
 def test_the_same_thing_under_another_name_is_no_rival(results):
     """A unicycle's gain of w is its track_scale."""
     gain = Found("input_gain", "w", {"gain": (0.8, 0.79, 0.81, "-")})
-    other = Found("track_scale", "theta", {"gain": (0.8, None, None, "-")})
+    other = Found("track_scale", "theta", {"gain": (0.8, None, None, "-")}, (("input_gain", "w"),), same_thing=True)
     limit = Found("input_saturation", "w", {"high": (0.8, None, None, "rad/s")})
     result = results["traced"]
     for verdict, ambiguous_with, rivals in (("traced", (other,), ()), ("ambiguous", (other, limit), (limit,))):

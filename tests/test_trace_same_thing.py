@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace as replace_spec
 from trace_robots import DT, NOISE, ROBOTARIUM, declared, drive, recordings
 
 from s2r_runtime.models.composed import AppliedEffect, compose
@@ -20,6 +21,13 @@ ARCS = (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),)
 UNICYCLE = compose(ModelSpec("unicycle", 0.05, {}, ARCS))
 JOINT = compose(ModelSpec("joint", 0.01, {"mass": 0.3}))
 PLANE = compose(ModelSpec("double_integrator", 0.05))
+
+
+def _called(model, found, before=(), after=()):
+    """Other names of an effect, beside others."""
+    effects = (*model.spec.effects, *before, EffectSpec(found.name, found.channel, found.values), *after)
+    whole = compose(replace_spec(model.spec, effects=effects))
+    return other_names(whole, len(model.spec.effects) + len(before), found)
 
 
 @pytest.mark.parametrize(
@@ -41,7 +49,7 @@ PLANE = compose(ModelSpec("double_integrator", 0.05))
     ],
 )
 def test_other_names_have_the_numbers_as_they_are_called_there(model, found, called):
-    told = {(e.name, e.channel): {name: value[:3] for name, value in e.parameters.items()} for e in other_names(model, found)}
+    told = {(e.name, e.channel): {name: value[:3] for name, value in e.parameters.items()} for e in _called(model, found)}
     assert told == {
         key: {name: tuple(v if v is None else pytest.approx(v) for v in value) for name, value in p.items()} for key, p in called.items()
     }
@@ -50,7 +58,7 @@ def test_other_names_have_the_numbers_as_they_are_called_there(model, found, cal
 @pytest.mark.parametrize("end", [None, -2.0])
 def test_an_end_that_is_none_by_the_other_name_is_not_told(end):
     """An interval without an end, and a gain below zero, which no mass makes."""
-    (mass,) = other_names(JOINT, Found("input_gain", "force", {"gain": (0.8, end, 1.0, "-")}))
+    (mass,) = _called(JOINT, Found("input_gain", "force", {"gain": (0.8, end, 1.0, "-")}))
     assert mass.parameters["ratio"][:3] == (pytest.approx(1.25), None, None)
 
 
@@ -59,7 +67,7 @@ def test_by_each_name_the_model_does_the_same():
     x, u = rng.normal(size=(20, 2)), rng.normal(size=(20, 1))
     found = Found("input_gain", "force", {"gain": (0.8, None, None, "-")})
     steps = []
-    for e in (found, *other_names(JOINT, found)):
+    for e in (found, *_called(JOINT, found)):
         model = compose(ModelSpec("joint", 0.01, {"mass": 0.3}, (EffectSpec(e.name, e.channel, e.values),)))
         steps.append(model.step(x, u, model.at_rest(20))[0])
     assert len(steps) == 2
@@ -82,17 +90,15 @@ def test_a_trace_tells_them_and_stays_traced():
 def test_a_point_beside_the_middle_is_a_speed_by_turning_where_the_robot_moves_on_arcs():
     """Only the scheme that is composed with the model says that it does."""
     arm = compose(ModelSpec("unicycle", 0.05, {}, (*ARCS, EffectSpec("sensor_lever_arm", "*", {"x": 0.0, "y": 0.2}))))
-    told = other_names(UNICYCLE, Found("sensor_lever_arm", "*", {"x": (0.0, None, None, "m"), "y": (0.2, 0.1, 0.3, "m")}))
+    told = _called(UNICYCLE, Found("sensor_lever_arm", "*", {"x": (0.0, None, None, "m"), "y": (0.2, 0.1, 0.3, "m")}))
     assert [(e.name, e.channel, e.values) for e in told] == [("input_coupling", "v", {"from": "w", "coefficient": pytest.approx(-0.2)})]
     other = AppliedEffect(registry().get("effects", "input_coupling"), "v", told[0].values)
     coupled = compose(ModelSpec("unicycle", 0.05, {}, (EffectSpec("input_coupling", "v", other.p), *ARCS)))
     rng = np.random.default_rng(1)
     x, u = rng.normal(size=(20, 3)), rng.normal(size=(20, 2))
     assert np.allclose(arm.step(x, u, arm.at_rest(20))[0], coupled.step(x, u, coupled.at_rest(20))[0], atol=1e-12)
-    assert (
-        other_names(compose(ModelSpec("unicycle", 0.05)), Found("sensor_lever_arm", "*", {"x": (0.0, 0, 0, "m"), "y": (0.2, 0, 0, "m")}))
-        == ()
-    )
+    plainly = Found("sensor_lever_arm", "*", {"x": (0.0, None, None, "m"), "y": (0.2, None, None, "m")})
+    assert _called(compose(ModelSpec("unicycle", 0.05)), plainly) == ()
 
 
 def test_of_one_input_all_inputs_is_no_other_name_that_a_person_is_told():
@@ -114,18 +120,68 @@ def test_of_one_input_all_inputs_is_no_other_name_that_a_person_is_told():
     assert {(e.name, e.channel) for e in found.ambiguous_with} >= {("input_delay", "*"), ("mass_change", "*")}
     assert "mass_change on *" in found.text()
     assert "input_delay on *" not in found.text()
+    page = Page("", "")
+    add_trace(page, found.to_json())
+    assert "mass_change" in page.html()
+    assert page.html().count("input_delay") == 1
 
 
-def test_a_rival_with_numbers_of_its_own_is_another_thing():
-    """A point before the middle, too, is no coupling, although one beside it is."""
+def test_a_rival_is_another_thing_whatever_its_name():
+    """A point before the middle, too, is no coupling, although one beside it is. Of two names for one rival the first is told."""
     found = trace(recordings([("input_gain", "w", {"gain": 0.8})], 1, steps=700, seed=3)[0], declared())
     coupling = Found("input_coupling", "v", {"from": ("w", None, None, ""), "coefficient": (-0.2, None, None, "m")})
-    beside = Found("sensor_lever_arm", "*", {"x": (0.0, None, None, "m"), "y": (0.2, None, None, "m")})
-    before = replace(beside, parameters={**beside.parameters, "x": (0.01, None, None, "m")})
-    for other, rivals in ((beside, ()), (before, (before,))):
-        told = replace(found, verdict="ambiguous", effects=(coupling,), ambiguous_with=(other,))
-        assert told.rivals == rivals
-        assert told.same(coupling) == (() if rivals else (other,))
+    instead = (("input_coupling", "v"),)
+    before = Found("sensor_lever_arm", "*", {"x": (0.01, None, None, "m"), "y": (0.2, None, None, "m")}, instead)
+    gain = Found("input_gain", "v", {"gain": (0.8, None, None, "-")}, instead)
+    slip = Found("longitudinal_slip", "*", {"ratio": (0.2, None, None, "-")}, instead)
+    told = replace(found, verdict="ambiguous", effects=(coupling,), ambiguous_with=(before, gain, slip))
+    assert told.rivals == (before, gain)
+    assert told.same(coupling) == ()
+
+
+LIMIT, BIAS = EffectSpec("input_saturation", "w", {"low": -0.5, "high": 0.5}), EffectSpec("input_bias", "force", {"bias": 0.2})
+SLIDES = EffectSpec("lateral_slip", "*", {"coefficient": 0.1})
+TURNS = Found("input_gain", "w", {"gain": (0.7, None, None, "")})
+PUSHES = Found("input_gain", "force", {"gain": (0.7, None, None, "")})
+SLOWLY = (EffectSpec("input_lag", "force", {"time_constant": 0.1}), EffectSpec("coulomb_friction", "qd", {"force": 0.1}))
+
+
+@pytest.mark.parametrize(
+    ("model", "found", "before", "after", "names"),
+    [
+        (UNICYCLE, TURNS, (), (LIMIT,), set()),
+        (UNICYCLE, TURNS, (LIMIT,), (), {"track_scale"}),
+        (UNICYCLE, TURNS, (), (SLIDES,), {"track_scale"}),
+        (JOINT, PUSHES, (), (BIAS,), set()),
+        (JOINT, PUSHES, (BIAS,), (), {"mass_change"}),
+        (JOINT, PUSHES, SLOWLY, (), {"mass_change"}),
+        (UNICYCLE, TURNS, (EffectSpec("input_delay", "*", {"delay": 3.0}),), (LIMIT,), set()),
+        (UNICYCLE, TURNS, (), (LIMIT, EffectSpec("input_delay", "*", {"delay": 3.0})), set()),
+        (UNICYCLE, TURNS, (), (EffectSpec("regime_change", "w", {"time": 9.0, "gain": 0.5}),), {"track_scale"}),
+    ],
+    ids=[
+        "before a limit",
+        "behind a limit",
+        "beside slip",
+        "before a bias",
+        "behind a bias",
+        "beside a lag and friction",
+        "late, before a limit",
+        "before a limit, late",
+        "before a change",
+    ],
+)
+def test_a_name_is_told_only_where_the_whole_model_goes_on_as_it_did(model, found, before, after, names):
+    assert {e.name for e in _called(model, found, before, after) if e.channel != "*" or e.name != found.name} == names
+
+
+def test_two_effects_that_share_another_name_both_have_it():
+    first, second = (Found("input_bias", axis, {"bias": (0.3, 0.2, 0.4, "")}) for axis in ("ax", "ay"))
+    both = [_called(PLANE, first), _called(PLANE, second)]
+    assert [[(e.name, e.values, e.instead_of) for e in names if e.name == "constant_disturbance"] for names in both] == [
+        [("constant_disturbance", {"x": 0.3, "y": 0.0}, (("input_bias", "ax"),))],
+        [("constant_disturbance", {"x": 0.0, "y": 0.3}, (("input_bias", "ay"),))],
+    ]
 
 
 def test_of_several_effects_each_rival_says_which_it_stands_for():

@@ -192,7 +192,7 @@ def _candidates(page: Page, trace: dict[str, Any]) -> None:
         "Score of each effect alone on the given model: nats of likelihood gained, less the price of its parameters. Green: found.", "soft"
     )
     found = {(e["name"], e["channel"]) for e in trace["effects"]}
-    rivals = {(e["name"], e["channel"]) for e in trace["ambiguous_with"]}
+    rivals = {(e["name"], e["channel"]) for e in trace["ambiguous_with"] if not e.get("same_thing")}
     rows = []
     for c in trace["candidates"][:CANDIDATES]:
         key = c["name"], c["channel"]

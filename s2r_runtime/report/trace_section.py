@@ -31,7 +31,8 @@ def add_trace(page: Page, trace: dict[str, Any]) -> None:
     page.text(f"{trace['verdict']}: {text}", f"verdict {kind}")
     rows = list(_rows(trace["effects"], ""))
     for e in trace["ambiguous_with"]:
-        rows += _rows([e], _role(e, trace))
+        if not _all_of_one(e):
+            rows += _rows([e], _role(e, trace))
     rows += _rows(trace.get("partial", ()), "explains a part only")
     if rows:
         page.table(("", "effect", "acts on", "parameter", "value and 95 % interval", "that is"), rows)
@@ -47,6 +48,11 @@ def add_trace(page: Page, trace: dict[str, Any]) -> None:
     # what no dictionary took up of a structure without a name is still in it
     _errors(page, trace["error"], "noise alone" if trace["verdict"] != "unexplained" else "noise as estimated")
     _gap(page, trace.get("gap") or {})
+
+
+def _all_of_one(other: dict[str, Any]) -> bool:
+    """Whether it is the same effect on all inputs, of which there is one: nothing that a person need be told."""
+    return bool(other.get("same_thing")) and other["channel"] == "*" and other["name"] in {e["name"] for e in other.get("instead_of", ())}
 
 
 def _role(rival: dict[str, Any], trace: dict[str, Any]) -> str:

@@ -119,12 +119,13 @@ def _effect(e: Found) -> list[str]:
 
 
 def _broken(line: str) -> list[str]:
-    """Between numbers, to fit."""
+    """Between numbers, to fit; what goes on stands four columns in."""
     lines, text = [], ""
+    on = " " * (len(line) - len(line.lstrip()) + 4)
     for piece in line.split(", "):
         if text and len(text) + len(piece) + 4 > WIDTH:
             lines.append(f"{text},")
-            text = f"      {piece}"
+            text = f"{on}{piece}"
         else:
             text = f"{text}, {piece}" if text else piece
     return [*lines, text]

@@ -134,7 +134,10 @@ def _recorded(
         verdict=verdict,
         effects=effects,
         partial=() if final is chosen.fit else tuple(_found(model, chosen.fit, place, {}) for place in chosen.fit.added),
-        ambiguous_with=each_once((*ties, *(other for e in (*effects, *ties) for other in other_names(final.model, e)))),
+        ambiguous_with=(
+            *ties,
+            *(other for place, e in zip(final.added, effects, strict=True) for other in other_names(final.model, place, e)),
+        ),
         candidates=tuple((s.name, s.channel, s.score) for s in chosen.ranking),
         depends_on=tuple(dict.fromkeys((*shared, *left))),
         any_shape_of=shared,

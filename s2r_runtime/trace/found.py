@@ -23,13 +23,14 @@ DIGITS = 1
 @dataclass(frozen=True)
 class Found:
     """An effect. parameters: name -> (value, low, high, unit); low and high: 95 % interval, None where there is none. instead_of: (effect,
-    channel) of what was found in whose place it may stand, as a rival or by another name.
+    channel) of what was found in whose place it may stand: as a rival, or as the same_thing by another name.
     """
 
     name: str
     channel: str
     parameters: dict[str, Value]
     instead_of: tuple[tuple[str, str], ...] = ()
+    same_thing: bool = False
 
     @property
     def values(self) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -90,20 +89,17 @@ class TraceResult:
 
     def same(self, found: Found) -> tuple[Found, ...]:
         """Of `ambiguous_with`: other names of the very same thing on this model."""
-        alike = {(name, channel): p for name, channel, p in same(self.model.for_effects, found.name, found.channel, found.values)}
-        return tuple(e for e in self.ambiguous_with if _alike(e.values, alike.get((e.name, e.channel))))
+        return tuple(e for e in self.ambiguous_with if e.same_thing and e.instead_of == ((found.name, found.channel),))
 
     @cached_property
     def rivals(self) -> tuple[Found, ...]:
         """Of `ambiguous_with`: other things, which these data cannot tell from what was found. Of several names for a thing the first."""
-        if self.verdict != "ambiguous":
-            return ()
-        known = [e for found in self.effects for e in (found, *self.same(found))]
+        known: set[tuple[str, str]] = set()
         kept: list[Found] = []
         for e in self.ambiguous_with:
-            if e not in known:
+            if not e.same_thing and (e.name, e.channel) not in known:
                 kept.append(e)
-                known += [e, *self.same(e)]
+                known |= {(name, channel) for name, channel, _ in same(self.model.for_effects, e.name, e.channel, e.values)}
         return tuple(kept)
 
     @property
@@ -194,14 +190,13 @@ class TraceResult:
         """Plain data; numbers in SI."""
         states = self.nominal.states
         units: dict[str, str] = getattr(self.nominal.nominal, "units", {})
-        alike = [e for found in self.effects for e in self.same(found)]
         return {
             "verdict": self.verdict,
             "effects": [e.to_json() for e in self.effects],
             "candidates": [{"name": n, "channel": c, "score": round(s, 3)} for n, c, s in self.candidates],
             "left_as_given": self.left_as_given,
             "ambiguous_with": [
-                {**e.to_json(), "same_thing": e in alike, "instead_of": [{"name": n, "channel": c} for n, c in e.instead_of]}
+                {**e.to_json(), "same_thing": e.same_thing, "instead_of": [{"name": n, "channel": c} for n, c in e.instead_of]}
                 for e in self.ambiguous_with
             ],
             "partial": [e.to_json() for e in self.partial],
@@ -258,11 +253,3 @@ class TraceResult:
     def plots(self) -> dict[str, Any]:
         """Arrays, as lists: residuals of what was held out over time and against what they may depend on, autocorrelation, rollouts."""
         return views(self)
-
-
-def _alike(values: dict[str, Any], others: dict[str, Any] | None) -> bool:
-    """Whether they are the very same: a point beside the middle and before it is another thing than one beside it, which is a coupling."""
-    if others is None or values.keys() != others.keys():
-        return False
-    pairs = [(v, others[name]) for name, v in values.items()]
-    return all(math.isclose(v, o, rel_tol=1e-9) if isinstance(v, float) and isinstance(o, float) else v == o for v, o in pairs)
