@@ -126,17 +126,17 @@ def test_of_one_input_all_inputs_is_no_other_name_that_a_person_is_told():
     assert page.html().count("input_delay") == 1
 
 
-def test_a_rival_is_another_thing_whatever_its_name():
-    """A point before the middle, too, is no coupling, although one beside it is. Of two names for one rival the first is told."""
+def test_of_two_names_for_one_rival_the_first_is_told_and_none_of_what_was_found():
+    """A push ahead that fitted a little to the side, too, is a bias of the speed all the same."""
     found = trace(recordings([("input_gain", "w", {"gain": 0.8})], 1, steps=700, seed=3)[0], declared())
-    coupling = Found("input_coupling", "v", {"from": ("w", None, None, ""), "coefficient": (-0.2, None, None, "m")})
-    instead = (("input_coupling", "v"),)
-    before = Found("sensor_lever_arm", "*", {"x": (0.01, None, None, "m"), "y": (0.2, None, None, "m")}, instead)
+    bias = Found("input_bias", "v", {"bias": (0.02, None, None, "m/s")})
+    instead = (("input_bias", "v"),)
+    push = Found("constant_disturbance", "body", {"x": (0.02, None, None, "m/s"), "y": (1e-4, None, None, "m/s")}, instead)
     gain = Found("input_gain", "v", {"gain": (0.8, None, None, "-")}, instead)
     slip = Found("longitudinal_slip", "*", {"ratio": (0.2, None, None, "-")}, instead)
-    told = replace(found, verdict="ambiguous", effects=(coupling,), ambiguous_with=(before, gain, slip))
-    assert told.rivals == (before, gain)
-    assert told.same(coupling) == ()
+    told = replace(found, verdict="ambiguous", effects=(bias,), ambiguous_with=(push, gain, slip))
+    assert told.rivals == (gain,)
+    assert told.same(bias) == ()
 
 
 LIMIT, BIAS = EffectSpec("input_saturation", "w", {"low": -0.5, "high": 0.5}), EffectSpec("input_bias", "force", {"bias": 0.2})

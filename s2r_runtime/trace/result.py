@@ -93,14 +93,19 @@ class TraceResult:
 
     @cached_property
     def rivals(self) -> tuple[Found, ...]:
-        """Of `ambiguous_with`: other things, which these data cannot tell from what was found. Of several names for a thing the first."""
-        known: set[tuple[str, str]] = set()
+        """Of `ambiguous_with`: other things, which these data cannot tell from what was found. Of several names for a thing the first, also
+        where one could be a little more than the other one can: a push ahead, and a bias of the speed.
+        """
+        known = {name for e in self.effects for name in self._names_of(e)}
         kept: list[Found] = []
         for e in self.ambiguous_with:
             if not e.same_thing and (e.name, e.channel) not in known:
                 kept.append(e)
-                known |= {(name, channel) for name, channel, _ in same(self.model.for_effects, e.name, e.channel, e.values)}
+                known |= self._names_of(e)
         return tuple(kept)
+
+    def _names_of(self, e: Found) -> set[tuple[str, str]]:
+        return {(name, channel) for name, channel, _ in same(self.model.for_effects, e.name, e.channel, e.values)}
 
     @property
     def blind(self) -> tuple[tuple[str, str], ...]:
