@@ -188,7 +188,7 @@ def test_outliers_on_many_rows_are_counted_and_no_faults():
 
     checked = _checked(spoil)
     assert checked.faults == ()
-    assert checked.outliers > 30
+    assert 30 < checked.outliers <= 45  # rows, each of which is wild in several states
 
 
 def test_outliers_that_an_input_could_have_made_are_left_out_where_tails_are_heavy():

@@ -45,6 +45,11 @@ MISTAKES = {
     "degrees": ("unicycle", lambda y, u: (y * [1, 1, 180 / np.pi], u), "theta seems to be in degrees"),
     "x and y": ("unicycle", lambda y, u: (y[:, [1, 0, 2]], u), "the columns x and y seem to be exchanged"),
     "inputs": ("bicycle", lambda y, u: (y, u[:, ::-1]), "the columns steer_cmd and speed_cmd seem to be exchanged"),
+    "left and right": (
+        "differential_drive",
+        lambda y, u: (y[:, [0, 1, 2, 4, 3]], u[:, ::-1]),
+        "wheel_right, cmd_left and cmd_right seem to be",
+    ),
     "clockwise": ("unicycle", lambda y, u: (y * [1, 1, -1], u), "seems to"),
     "compass": ("bicycle", lambda y, u: (np.column_stack([y[:, :2], np.pi / 2 - y[:, 2], y[:, 3]]), u), "clockwise from y"),
     "millimetres": ("unicycle", lambda y, u: (y * [1000, 1000, 1], u), "x and y seem to be in mm"),

@@ -10,7 +10,7 @@ from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recor
 
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, RecordingError
 from s2r_runtime.models.composed import AppliedEffect, compose
-from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.report.trace_page import trace_page
 from s2r_runtime.trace import lack_of_fit as lack_of_fit_of
@@ -426,3 +426,14 @@ def test_arrays_that_are_no_recording_are_refused_in_a_line(spoil, error, said):
     y = drive(rng, "unicycle", u[None], ROBOTARIUM, DT, NOISE)[0]
     with pytest.raises(error, match=said.replace("1e+", r"1e\+")):
         trace(from_arrays(declared(), [spoil(y, u)]), declared())
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_way_that_is_none_of_the_commands_gets_no_name(seed):
+    """A random walk: what silences every input leaves noise, step by step, and a robot that goes by itself. No limit does that."""
+    rng = np.random.default_rng([71, seed])
+    u = commands(rng, 1, 700, DT, [(-0.2, 0.2), (-1.0, 1.0)])[0]
+    walk = np.cumsum(rng.normal(size=(701, 3)) * [0.01, 0.01, 0.03], axis=0)
+    model = compose(ModelSpec("unicycle", DT, {}, (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),)))
+    found = trace(from_arrays(model, [(walk, u)]), model)
+    assert (found.verdict, found.effects) == ("unexplained", ())

@@ -122,3 +122,19 @@ def test_what_another_model_left_is_no_trap(seed):
     whiten = [Whitener(noise, f, joined) for noise in (alone, after)]
     nats = [float(-0.5 * np.sum(w(r) ** 2)) - w.logdet for w in whiten]
     assert nats[1] > nats[0] - 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_sensor_that_is_more_precise_than_a_model_is_meant_to_be_makes_no_coloured_noise(seed):
+    """Where it goes far in a step, the least noise of the process is as large as the encoder's: what is left is steadier than that."""
+    joint, rng, rows = compose(ModelSpec("joint", 0.02, {"mass": 2.0})), np.random.default_rng(seed), 800
+    u = np.repeat(rng.uniform(-20.0, 20.0, rows // 16), 16)[:, None]
+    x, states = np.zeros((1, 2)), []
+    for k in range(rows):
+        states.append(x[0])
+        x, _ = joint.step(x, u[k : k + 1], joint.at_rest(1))
+    data = from_arrays(joint, [(np.array([*states, x[0]]) + rng.normal(size=(rows + 1, 2)) * [1e-5, 1e-3], u)])
+    given = problem(data, steps_of(data))
+    assert given.floor.q[0] > 0.1 * 1e-5**2
+    result = trace(data, joint)
+    assert (result.verdict, result.depends_on) == ("none", ())

@@ -22,6 +22,7 @@ from s2r_runtime.trace.account import loud
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.excitation import suggest
 from s2r_runtime.trace.found import Found, each_once, interval_text
+from s2r_runtime.trace.plain_words import in_words
 from s2r_runtime.trace.tracer import trace
 from s2r_runtime.trace.views import envelope, spread, stretches
 
@@ -391,3 +392,12 @@ def test_a_page_of_a_hundred_thousand_rows_stays_a_page():
     y[0, 60_000:, 1] += 2.0
     page = trace_page(trace(from_arrays(UNICYCLE, [(y[0], u[0])]), UNICYCLE))
     assert len(page.encode()) < 2_000_000
+
+
+@pytest.mark.parametrize(
+    ("gain", "unit"), [(0.2777, "km/h"), (0.1047, "revolutions a minute"), (0.01745, "degrees"), (0.29, ""), (1.0, "")]
+)
+def test_a_gain_that_is_just_that_of_a_unit_is_asked_about(gain, unit):
+    words = in_words("input_gain", "v", {"gain": gain})
+    assert words.startswith(f"v does {100.0 * gain:.3g} % of what is commanded")
+    assert words.endswith(f"(is it told in {unit}?)" if unit else "commanded")

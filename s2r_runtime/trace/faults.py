@@ -123,7 +123,18 @@ def check(model: ComposedModel, data: Dataset, under: ComposedModel | None = Non
     if many:  # two of them in a row look like a jump
         found = [f for f in found if f.kind != "offset_jump" or f in sure]
     faults_ = tuple(sorted([*found, *([] if many else spikes)], key=lambda f: (f.from_s, f.channel)))
-    return Checked(bridged(replace(data, runs=runs)), faults_, tuple(sorted(set(left_out))), outliers + (len(spikes) if many else 0))
+    return Checked(bridged(replace(data, runs=runs)), faults_, tuple(sorted(set(left_out))), _untold(data, bad, faults_))
+
+
+def _untold(data: Dataset, bad: list[Mask], faults_: Sequence[Fault]) -> int:
+    """Rows that are taken out and lie in no fault that is told."""
+    count = 0
+    for run, mask in zip(data.runs, bad, strict=True):
+        t, there = run.start_s + data.dt * np.arange(len(mask)), mask.any(axis=1)
+        for f in (f for f in faults_ if f.kind != "offset_jump"):
+            there &= (t < f.from_s - 0.5 * data.dt) | (t > f.to_s + 0.5 * data.dt)
+        count += int(np.count_nonzero(there))
+    return count
 
 
 def _under(model: ComposedModel, data: Dataset, bad: list[Mask], known: Sequence[Fault]) -> list[Jumps]:

@@ -29,7 +29,7 @@ from s2r_runtime.trace.constancy import uneven
 from s2r_runtime.trace.episodes import episodes, may_depend_on
 from s2r_runtime.trace.evidence import evidence, margin
 from s2r_runtime.trace.fields import Field, as_noise, field, nats_of
-from s2r_runtime.trace.fitting import Fit, Problem
+from s2r_runtime.trace.fitting import FLOORED, Fit, Problem
 from s2r_runtime.trace.fitting import gain as explained
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, SLOWLY, Judged, Left, first_look, judge, leading
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
@@ -149,8 +149,7 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     if varying is not None and left.given.data.measured_forces and about_inputs(left.fit.model, varying.judged.token):
         varying = None
     number = varying.judged if varying is not None and varying.sure else None
-    wanders = left.law is not None and np.any(left.law.slow.sum(axis=1) > 0.0)  # else what is left is steadier than white noise
-    coloured = ("noise",) if np.any(left.fit.colour.strength > COLOURED) or wanders else ()
+    coloured = ("noise",) if _coloured(left) else ()
     windows: Judged | None = None
     if chosen and chosen[-1].gain <= 0.0:  # it was seen by sliding only: that names what it tries
         windows = _for_a_while(left)
@@ -192,6 +191,16 @@ def still_left(left: Left, tokens: tuple[str, ...], nominal: Fit, horizon: int) 
     chosen = looks.chosen[0] if looks.looked else []
     sure = chosen and chosen[-1].gain > SLOW * math.log(len(looks.found) / ALPHA)
     return bool(sure) and _weight_of(left, nominal, chosen[-1], horizon)[0]
+
+
+def _coloured(left: Left) -> bool:
+    """Whether noise clearly has a colour: it remembers, or wanders. Not where it is steadier than white noise; nor where the process has no
+    more than its least noise, and neighbours pull apart: of a sensor more precise than any model is meant to be.
+    """
+    colour, noise = left.fit.colour, left.fit.noise
+    there = (noise.q > FLOORED * left.given.floor.q) | (colour.coefficients.sum(axis=1) >= 0.0)
+    wanders = left.law is not None and np.any(left.law.slow.sum(axis=1)[there] > 0.0)
+    return bool(wanders or np.any(colour.strength[there] > COLOURED))
 
 
 def _for_a_while(left: Left) -> Judged | None:

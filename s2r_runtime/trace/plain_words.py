@@ -45,6 +45,15 @@ def _percent(ratio: float) -> str:
     return f"{100.0 * ratio:.3g} %"
 
 
+UNITS, JUST = ((1.0 / 3.6, "km/h"), (math.pi / 30.0, "revolutions a minute"), (math.pi / 180.0, "degrees"), (1e-3, "thousandths")), 3e-3
+"""What commands are when the robot does so much of them, and how near to it, as a share."""
+
+
+def _gain(what: str, p: Values) -> str:
+    unit = next((f" (is it told in {unit}?)" for factor, unit in UNITS if abs(p["gain"] / factor - 1.0) < JUST), "")
+    return f"{what} does {_percent(p['gain'])} of what is commanded{unit}"
+
+
 def _way(value: float) -> str:
     return "more" if value > 0.0 else "less"
 
@@ -76,7 +85,7 @@ def _disturbance(what: str, p: Values) -> str:
 
 
 _WORDS: dict[str, Callable[[str, Values], str]] = {
-    "input_gain": lambda what, p: f"{what} does {_percent(p['gain'])} of what is commanded",
+    "input_gain": _gain,
     "input_gain_asymmetry": lambda what, p: (
         f"{what} does {_percent(p['gain_positive'])} of a positive command, {_percent(p['gain_negative'])} of a negative one"
     ),

@@ -296,6 +296,7 @@ def _mistakes(model: ComposedModel) -> Iterator[_Mistake]:
             if kind == "inputs":
                 yield _mistake(kind, f"{name} seems to have the other sign", partial(_scaled, [j], -1.0))
     yield from _speeds_together(model, units)
+    yield from _sides_exchanged(model)
     if {"x", "y"} <= set(model.states):
         both = [model.states.index("x"), model.states.index("y")]
         yield _mistake("states", "x and y seem to be in mm, must be in m", partial(_scaled, both, 1e-3))
@@ -327,6 +328,16 @@ def _speeds_together(model: ComposedModel, units: dict[str, str]) -> Iterator[_M
                 partial(_scaled, inputs, factor),
                 SURELY,
             )
+
+
+def _sides_exchanged(model: ComposedModel) -> Iterator[_Mistake]:
+    """What is commanded of two sides, together with what is measured of it: each wheel goes as it is told, and the robot the other way."""
+    there = [(s, i) for s, i in model.nominal.reached.items() if s in model.states]
+    for one, other in combinations(there, 2):
+        states, inputs = ((one[k], other[k]) for k in (0, 1))
+        of_states, of_inputs = _exchanged("states", model.states, (states,)), _exchanged("inputs", model.inputs, (inputs,))
+        said = f"the columns {states[0]} and {states[1]}, {inputs[0]} and {inputs[1]} seem to be exchanged"
+        yield _Mistake(said, of_states.states, of_inputs.inputs, WELL)
 
 
 def _exchanged(kind: str, names: tuple[str, ...], pairs: tuple[tuple[str, str], ...]) -> _Mistake:

@@ -75,6 +75,11 @@ MATTERS = 1.5
 MIXED = 0.75
 """Of what an input does in its own place: as much of another input in it is not what crosses over from there, but another model's input."""
 
+GOES, STIRS = 5.0, 2.0
+"""Times as far as in a step that a state goes in the horizon, if it goes anywhere; and if it does not stand still: noise of a sensor makes
+as much of a step as of the horizon, what drifts at random the root of so many steps.
+"""
+
 SILENT = 0.1
 """Of what is asked of an input: if less is left of it, effects have silenced it."""
 
@@ -271,7 +276,7 @@ def _silenced(fit: Fit, after: Judged, given: Held) -> bool:
     if not any(fit.model.effects[i].effect.stage == "input" for i in fit.added) or not len(after.ends):
         return False
     asked, acts = (np.std(u, axis=0) for u in _asked_and_acting(fit, given))
-    share, goes = _off(after, given)
+    share, goes = _off_at(after, given, np.ones(len(after.ends), dtype=bool), STIRS)
     return bool(np.any((asked > 0.0) & (acts < SILENT * asked)) and np.any(share[goes] >= FORETELLS))
 
 
@@ -408,12 +413,12 @@ def _off(judged: Judged, given: Held) -> tuple[Array, Mask]:
     return _off_at(judged, given, np.ones(len(judged.ends), dtype=bool))
 
 
-def _off_at(judged: Judged, given: Held, there: Mask) -> tuple[Array, Mask]:
-    """The same of some rollouts, (m,) there."""
+def _off_at(judged: Judged, given: Held, there: Mask, farther: float = GOES) -> tuple[Array, Mask]:
+    """The same of some rollouts, (m,) there. farther: times a step, from which on a state goes anywhere."""
     columns = _together(given.data.states)
     way = displacement(given)
     gone, step, off = (_lengths(e, columns) for e in (way[there], given.steps.y1 - given.steps.y0, judged.ends[there]))
-    goes = gone > min(5.0, 0.5 * given.horizon) * step
+    goes = gone > min(farther, 0.5 * given.horizon) * step
     return off / np.maximum(gone, 1e-300), np.asarray(goes, dtype=bool)
 
 
