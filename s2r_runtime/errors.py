@@ -23,13 +23,16 @@ class RecordingError(UsageError):
 
 
 class NotEnoughEvidence(S2RError):
-    """The data do not carry the statement. `missing`: how many more independent samples would (0: not a matter of number)."""
+    """The data do not carry the statement. `missing`: how many more independent samples would (0: not a matter of number). `also`: what
+    `--json` tells besides.
+    """
 
     exit_code = 3
 
     def __init__(self, message: str, missing: int = 0) -> None:
         super().__init__(message)
         self.missing = missing
+        self.also: dict[str, object] = {}
 
 
 class ConfigError(S2RError):

@@ -232,3 +232,20 @@ def test_a_recording_in_which_nothing_was_asked_gets_a_first_drive_where_a_profi
     assert len(table) == round(5 / 0.033)
     assert np.abs(table[:, 1]).max() <= 0.2
     assert np.abs(table[:, 2]).max() > 1.0
+
+
+def test_a_first_drive_is_told_as_json_too(tmp_path, capsys):
+    """Beside the error: of twenty rows, where the inputs' bounds are seen; and where nothing was ever asked, why there is none."""
+    y, u = recorded([], two_yaw_rates(np.random.default_rng(5)))
+    file, model = tmp_path / "drive.csv", tmp_path / "unicycle.toml"
+    model.write_text(dump_model(UNICYCLE.spec))
+    for name, inputs, told in (("short", u[:19], True), ("still", 0.0 * u[:200], False)):
+        recording = tmp_path / f"{name}.csv"
+        _written(recording, y[: len(inputs) + 1], inputs)
+        assert main(["trace", str(recording), "--model", str(model), "--suggest", str(file), "--json"]) == 3
+        answer = json.loads(capsys.readouterr().out)
+        assert answer["exit_code"] == 3
+        drive_next = answer["suggested_sequence"]
+        assert (drive_next["file"], drive_next["refused"] is None) == (str(file) if told else None, told)
+        assert file.exists() is told
+        file.unlink(missing_ok=True)

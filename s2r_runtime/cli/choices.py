@@ -28,7 +28,9 @@ def add_model_options(verb: argparse.ArgumentParser) -> None:
         metavar="M",
         help="a model's name, a Python file, or a model TOML (docs/recordings.md; s2r trace -o writes one); replaces a profile's",
     )
-    verb.add_argument("--dt", type=positive, metavar="DT", help="the model's step in s (with a name or a Python file)")
+    verb.add_argument(
+        "--dt", type=positive, metavar="DT", help="the model's step in s (needed with a name or a Python file; else instead of the file's)"
+    )
     verb.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the model; may be repeated")
 
 

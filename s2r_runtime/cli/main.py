@@ -85,8 +85,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         finally:
             output.flush()  # also after --help, which ends by SystemExit
     except S2RError as error:
-        missing = error.missing if isinstance(error, NotEnoughEvidence) else None
-        output.fail(str(error), error.exit_code, as_json=getattr(args, "json", False), missing=missing)
+        missing, also = (error.missing, error.also) if isinstance(error, NotEnoughEvidence) else (None, {})
+        output.fail(str(error), error.exit_code, as_json=getattr(args, "json", False), missing=missing, also=also)
         return error.exit_code
     except KeyboardInterrupt:
         output.err("interrupted")

@@ -8,7 +8,9 @@ import os
 import shutil
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TextIO
 
 import msgspec
@@ -87,13 +89,15 @@ def result_json(value: Any) -> None:
     out(json.dumps(msgspec.to_builtins(value), allow_nan=False))
 
 
-def fail(message: str, code: int, *, as_json: bool = False, missing: int | None = None) -> None:
-    """An error: one line on stderr, and with `--json` an object on stdout as well."""
+def fail(
+    message: str, code: int, *, as_json: bool = False, missing: int | None = None, also: Mapping[str, object] = MappingProxyType({})
+) -> None:
+    """An error: one line on stderr, and with `--json` an object on stdout as well, with what there is also to tell."""
     line = " ".join(message.split("\n"))
     err(f"s2r: {line}")
     if as_json:
         with contextlib.suppress(UsageError):  # stdout may be what failed
-            result_json({"error": line, "exit_code": code} | ({"missing_samples": missing} if missing else {}))
+            result_json({"error": line, "exit_code": code} | ({"missing_samples": missing} if missing else {}) | dict(also))
 
 
 def styled(text: str, style: str, stream: TextIO | None = None) -> str:

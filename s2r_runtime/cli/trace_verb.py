@@ -113,10 +113,10 @@ def run(args: argparse.Namespace) -> int:
         if args.suggest:
             bar(100.0, 100.0, "looking for a drive")
         suggested = _suggested(args, result, profile) if args.suggest else None
-    except NotEnoughEvidence:
+    except NotEnoughEvidence as error:
         bar.close()
         if args.suggest:
-            _suggest_first(args, model, data, profile)
+            error.also = _suggest_first(args, model, data, profile)
         raise
     finally:
         bar.close()
@@ -176,17 +176,19 @@ def _suggested(args: argparse.Namespace, result: TraceResult, profile: Profile |
     return suggest(result, bounds=bounds, region=region, duration=args.suggest_duration, seed=args.seed)
 
 
-def _suggest_first(args: argparse.Namespace, model: ComposedModel, data: Dataset, profile: Profile | None) -> None:
-    """For a recording that cannot be traced: a first drive, where a profile says what is allowed."""
+def _suggest_first(args: argparse.Namespace, model: ComposedModel, data: Dataset, profile: Profile | None) -> dict[str, object]:
+    """For a recording that cannot be traced: a first drive, where a profile says what is allowed. What `--json` tells of it."""
     from s2r_runtime.trace.excitation import suggest_first
 
     bounds, region = _allowed(profile)
     drive = suggest_first(model, data, bounds=bounds, region=region, duration=args.suggest_duration, seed=args.seed)
     trouble = output.trouble_writing(args.suggest, drive.to_csv()) if drive.u is not None else ""
+    written = args.suggest if drive.u is not None and not trouble else None
     if not args.json:
-        _tell_drive(args.suggest if drive.u is not None and not trouble else None, drive)
+        _tell_drive(written, drive)
     if trouble:
         output.err(f"s2r: {trouble}")
+    return {"suggested_sequence": drive.to_json(None if written is None else str(written))}
 
 
 def _allowed(profile: Profile | None) -> tuple[dict[str, tuple[float, float]] | None, dict[str, tuple[float, float]] | None]:
