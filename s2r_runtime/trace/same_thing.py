@@ -53,8 +53,9 @@ def _goes_on(model: ComposedModel, place: int, other: AppliedEffect) -> bool:
     """Whether the model does the same with another effect in this place, or at the end of its list."""
     before, after = (tuple(_soon(model, a) for a in part) for part in (model.effects[:place], model.effects[place + 1 :]))
     orders = (*before, model.effects[place], *after), (*before, other, *after), (*before, *after, other)
-    usual, *tried = (_walked(replace(model, effects=order)) for order in orders)
-    return usual is not None and any(there is not None and _alike(there, usual) for there in tried)
+    with np.errstate(all="ignore"):  # anywhere is also where numbers leave what a computer holds: what does is not alike
+        usual, *tried = (_walked(replace(model, effects=order)) for order in orders)
+        return usual is not None and any(there is not None and _alike(there, usual) for there in tried)
 
 
 def _soon(model: ComposedModel, a: AppliedEffect) -> AppliedEffect:
