@@ -157,18 +157,22 @@ def test_what_a_car_makes_of_a_bias_of_its_steering_goes_with_its_speed():
     assert carried(model, 1, data, steps) == set(), "what acts on no input is tried as it is"
 
 
-def test_slip_and_a_bias_of_the_steering_are_no_patchwork_of_the_speed():
-    rng = np.random.default_rng(5)
+def _car(seed, steer_off, goes=1.0, heading_off=0.0):
+    """All of a drive of a car of 1 m, with a bias of its steering, wheels that slip and a heading that is measured off."""
+    rng = np.random.default_rng(seed)
     command = np.column_stack([np.repeat(rng.uniform(-0.3, 0.3, 40), 20), np.repeat(rng.uniform(1.0, 5.0, 40), 20)])
     pose, rows = np.array([0.0, 0.0, 0.0]), [np.zeros(4)]
     for steer, speed in command:
         for _ in range(PARTS):
-            v = 0.98 * speed
-            pose = pose + DT / PARTS * np.array([v * np.cos(pose[2]), v * np.sin(pose[2]), v * np.tan(steer + 0.02)])
+            pose = pose + DT / PARTS * goes * speed * np.array([np.cos(pose[2]), np.sin(pose[2]), np.tan(steer + steer_off)])
         rows.append(np.append(pose, speed))
     model = compose(ModelSpec("bicycle", DT, {"wheel_base": 1.0}, (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),)))
-    y = np.array(rows) + rng.normal(size=(801, 4)) * [0.01, 0.01, 0.005, 0.02]
-    whole = Whole(Checked(from_arrays(model, [(y, command)]), (), (), 0), model, 20)
+    y = np.array(rows) + [0.0, 0.0, heading_off, 0.0] + rng.normal(size=(801, 4)) * [0.01, 0.01, 0.005, 0.02]
+    return Whole(Checked(from_arrays(model, [(y, command)]), (), (), 0), model, 20)
+
+
+def test_slip_and_a_bias_of_the_steering_are_no_patchwork_of_the_speed():
+    whole = _car(5, 0.02, goes=0.98)
     fit = _named(whole, _effect("input_bias", "steer_cmd", {"bias": 0.02}), _effect("longitudinal_slip", "*", {"ratio": 0.02}))
     named, of_speed = gain(fit, whole.nominal), "speed_cmd"
     assert all(gain(_named(whole, a), whole.nominal) < MOSTLY * named for a in [fit.model.effects[p] for p in fit.added])
@@ -192,16 +196,7 @@ def test_a_steady_push_is_part_of_no_patchwork_although_the_square_of_a_two_valu
 
 def test_what_goes_with_a_commanded_speed_goes_with_the_speed_that_a_car_is_set_to():
     """A heading that is measured off by little, and a bias of the steering: both are more, the faster the car goes."""
-    rng = np.random.default_rng(7)
-    command = np.column_stack([np.repeat(rng.uniform(-0.3, 0.3, 40), 20), np.repeat(rng.uniform(1.0, 5.0, 40), 20)])
-    pose, rows = np.array([0.0, 0.0, 0.0]), [np.zeros(4)]
-    for steer, speed in command:
-        for _ in range(PARTS):
-            pose = pose + DT / PARTS * speed * np.array([np.cos(pose[2]), np.sin(pose[2]), np.tan(steer + 0.01)])
-        rows.append(np.append(pose, speed))
-    model = compose(ModelSpec("bicycle", DT, {"wheel_base": 1.0}, (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),)))
-    y = np.array(rows) + [0.0, 0.0, 0.01, 0.0] + rng.normal(size=(801, 4)) * [0.01, 0.01, 0.005, 0.02]
-    whole = Whole(Checked(from_arrays(model, [(y, command)]), (), (), 0), model, 20)
+    whole = _car(7, 0.01, heading_off=0.01)
     fit = _named(whole, _effect("input_bias", "steer_cmd", {"bias": 0.01}), _effect("heading_offset", "theta", {"angle": 0.01}))
     named = gain(fit, whole.nominal)
     assert all(gain(_named(whole, fit.model.effects[p]), whole.nominal) < MOSTLY * named for p in fit.added)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -29,6 +29,7 @@ from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.residual_noise import no_colour
 from s2r_runtime.trace.result import Found, Limit, TraceResult
 from s2r_runtime.trace.same_thing import other_names
+from s2r_runtime.trace.scores import name_of
 from s2r_runtime.trace.selection import Selection
 from s2r_runtime.trace.shrinkage import drawn_in
 from s2r_runtime.trace.slots import Slot, values_of
@@ -127,7 +128,9 @@ def _recorded(
     left = _in_order(structure, verdict)
     shared = tuple(token for token in any_shape_of(final, rivals, given.data, given.steps) if token not in left)
     ties = each_once(
-        replace(_found(model, fit, place, {}), instead_of=_names(final, _new(final, fit))) for fit in rivals for place in _new(fit, final)
+        replace(_found(model, fit, place, {}), instead_of=tuple(name_of(final.model.effects[i]) for i in _new(final, fit)))
+        for fit in rivals
+        for place in _new(fit, final)
     )
     adopted = final if worth_its_risk(chosen, decided.before, decided.after) else chosen.nominal
     return TraceResult(
@@ -185,13 +188,8 @@ def with_time(result: TraceResult) -> TraceResult:
 
 def _new(fit: Fit, other: Fit) -> list[int]:
     """Places of the effects of one fit that the other does not have."""
-    there = {(a.effect.name, a.channel) for a in other.model.effects}
-    return [i for i in fit.added if (fit.model.effects[i].effect.name, fit.model.effects[i].channel) not in there]
-
-
-def _names(fit: Fit, places: Sequence[int]) -> tuple[tuple[str, str], ...]:
-    """(effect, channel) at each place."""
-    return tuple((fit.model.effects[i].effect.name, fit.model.effects[i].channel) for i in places)
+    there = {name_of(a) for a in other.model.effects}
+    return [i for i in fit.added if name_of(fit.model.effects[i]) not in there]
 
 
 def _found(model: ComposedModel, fit: Fit, place: int, ranges: dict[Slot, tuple[float, float]]) -> Found:

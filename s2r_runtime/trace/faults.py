@@ -117,7 +117,6 @@ def check(model: ComposedModel, data: Dataset, under: ComposedModel | None = Non
     many = max(tails, len({f.from_s for f in spikes}) + outliers) > max(RARE * rows, 3.0)
     for i, mask in enumerate(bad) if many else ():
         wild = tails_of(model, data, act, i, reach, WILD_SIGMAS) & ~mask
-        outliers += int(np.count_nonzero(wild.any(axis=1)))
         mask |= wild
     runs = tuple(replace(run, y=np.where(b.any(axis=1, keepdims=True), np.nan, run.y)) for run, b in zip(data.runs, bad, strict=True))
     if many:  # two of them in a row look like a jump

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Name = tuple[str, str]
 """(effect, channel)."""
 
-TRIED, STEPS, DECADES, ALIKE = 24, 12, (-2.0, 2.0), 1e-9
+TRIED, STEPS, DECADES, ALIKE = 24, 12, (-2.0, 2.0), 1e-12
 """Robots and steps on which two models are held against each other, powers of ten within which their states and inputs are, from row to row
 elsewhere, and what counts as alike, of the larger.
 """
