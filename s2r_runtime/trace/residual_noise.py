@@ -127,7 +127,9 @@ class Whitener:
                 break
         else:
             raise ValueError("the noise has no positive definite covariance")
-        self.logdet = float(np.sum(np.log(self._lower[0])))
+        self._size = self._lower[0].copy()
+        self._lower /= self._size  # L = U D, ones on U's diagonal: rows wait for one another, and most of all for divisions
+        self.logdet = float(np.sum(np.log(self._size)))
 
     def __call__(self, r: Array) -> Array:
         """Same shape as r."""
@@ -137,14 +139,16 @@ class Whitener:
         """The same of r (n nx, m)."""
         from scipy.linalg import lapack
 
-        z, _ = lapack.dtbtrs(self._lower, r, uplo="L")
+        z, _ = lapack.dtbtrs(self._lower, r, uplo="L", diag="U")
+        z /= self._size[:, None]
         return np.asarray(z)
 
     def back(self, z: Array) -> Array:
         """L^-T z for z (n, nx) or (n, nx, m), same shape: S^-1 r of z = L^-1 r."""
         from scipy.linalg import lapack
 
-        r, _ = lapack.dtbtrs(self._lower, z.reshape(z.shape[0] * z.shape[1], -1), uplo="L", trans="T")
+        scaled = z.reshape(z.shape[0] * z.shape[1], -1) / self._size[:, None]
+        r, _ = lapack.dtbtrs(self._lower, scaled, uplo="L", trans="T", diag="U")
         return np.asarray(r).reshape(z.shape)
 
 

@@ -300,5 +300,9 @@ class _Aside:
         if len(product) == 1:  # as it mostly is
             only = np.asarray(xw.T @ z / max(float(product[0, 0]), 1e-300), dtype=np.float64)
             return float(np.sum(noises.log_density(z - x @ only))), only
-        beta = np.linalg.lstsq(product + 1e-10 * np.diag(np.diag(product)), xw.T @ z, rcond=1e-12)[0]
+        product += 1e-10 * np.diag(np.diag(product))
+        try:
+            beta = np.linalg.solve(product, xw.T @ z)
+        except np.linalg.LinAlgError:  # a column of nothing
+            beta = np.linalg.lstsq(product, xw.T @ z, rcond=1e-12)[0]
         return float(np.sum(noises.log_density(z - x @ beta))), np.asarray(beta)

@@ -43,6 +43,11 @@ CLEAR = 10.0
 NEARLY = 0.4
 """Of what effects explain: dictionaries that give less at first look are not judged."""
 
+LITTLE = 0.05
+"""Of what effects explain: where no dictionary explains so much of what they leave at first look, none explains more than they do. Of those
+that did, among 110 recordings with effects inside and outside the library, none had less than 0.4 left.
+"""
+
 SHORT = 1.05
 """Times what effects explain that the best dictionary must explain, and CLEAR more, for them to leave some of it: with noise of its own,
 each is a little off.
@@ -122,7 +127,7 @@ class Whole:
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
         if against := opposed(self.given, fit):
             return replace(found, tokens=tuple(dict.fromkeys((*against, *found.tokens))), matters=True, share=1.0)
-        if (looks.most > ALIKE or found.matters) and self._explained_without(fit, looks.left, found):
+        if (looks.most > ALIKE or found.matters) and self._explained_without(fit, looks, found):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
         if found.matters and self._bent(found, fit):
             return replace(found, share=1.0)
@@ -153,11 +158,11 @@ class Whole:
             return False
         return patchwork(self.given, fit, self.nominal, self.unnamed)
 
-    def _explained_without(self, fit: Fit, left: Left, found: Structure) -> bool:
-        """Whether something without a name explains more than what was named."""
-        if self._unnamed_explains_more(fit, found.matters):
+    def _explained_without(self, fit: Fit, looks: Looks, found: Structure) -> bool:
+        """Whether something without a name explains more than what was named. looks: at what that leaves."""
+        if looks.most > LITTLE * gain(fit, self.nominal) and self._unnamed_explains_more(fit, found.matters):
             return True
-        return not self.given.floor.axes and self._no_name(found, left)
+        return not self.given.floor.axes and self._no_name(found, looks.left)
 
     def _no_name(self, found: Structure, named: Left) -> bool:
         """Whether a field explains more than what was named, or a push that wanders as much."""
