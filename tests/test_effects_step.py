@@ -175,7 +175,8 @@ def test_forces_are_divided_by_the_mass_that_is_used_not_by_the_default():
         ("joint", ("coulomb_friction", "qd", {"force": 1.0, "force_positive": 1.0}), "must have either force or both"),
         ("joint", ("coulomb_friction", "qd", {"force": -1.0}), "must be in [0.0"),
         ("joint", ("coulomb_friction", "qd", {"force": [[1.0, 0.0], [0.0, 1.0]]}), "must be a number"),
-        ("unicycle", ("viscous_friction", "v", {"coefficient": 1.0}), "must be one of: none on this model"),
+        ("unicycle", ("viscous_friction", "v", {"coefficient": 1.0}), "(viscous_friction): acts on nothing that the model unicycle has"),
+        ("joint", ("viscos_friction", "qd", {}), "model.effects[0] (viscos_friction): unknown effect 'viscos_friction'; did you mean"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line(model, effect, said):
@@ -183,6 +184,15 @@ def test_what_makes_no_sense_is_refused_in_one_line(model, effect, said):
         composed(model, 0.1, effect)
     assert said in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("name", "right"), [("effects", "[[model.effects]]"), ("parameters", "[model.parameters]")])
+def test_a_model_file_never_loses_what_stands_beside_its_table(tmp_path, name, right):
+    path = tmp_path / "model.toml"
+    path.write_text(f'[model]\nname = "joint"\ndt = 0.01\n\n{f"[[{name}]]" if name == "effects" else f"[{name}]"}\nmass = 2.0\n')
+    with pytest.raises(ConfigError) as error:
+        load_model(path)
+    assert str(error.value) == f"{path}: has {name} beside [model], where nothing reads them; they must be in it: {right}"
 
 
 def test_a_model_with_such_effects_survives_its_file(tmp_path):

@@ -321,11 +321,15 @@ def compose(spec: ModelSpec, where: str = "model") -> ComposedModel:
     nominal = bind(shared, spec.parameters)
     applied: list[AppliedEffect] = []
     for index, entry in enumerate(spec.effects):
-        effect = registry().get("effects", entry.name)
         place = f"{where}.effects[{index}] ({entry.name})"
+        effect = _of_name(entry.name, place)
         channels = effect.channels(nominal)
+        if not channels:
+            raise ConfigError(
+                f"{place}: acts on nothing that the model {spec.name} has, must be an effect of such models (docs/effects.md)"
+            )
         if entry.channel not in channels:
-            raise ConfigError(f"{place}: channel is {entry.channel!r}, must be one of: {', '.join(channels) or 'none on this model'}")
+            raise ConfigError(f"{place}: channel is {entry.channel!r}, must be one of: {', '.join(channels)}")
         if getattr(effect, "once", False) and any(a.effect is effect for a in applied):
             raise ConfigError(f"{place}: is there twice, must be there once")
         applied.append(AppliedEffect(effect, entry.channel, _effect_parameters(effect, entry, nominal, place)))
@@ -338,6 +342,14 @@ def _registered(spec: ModelSpec, where: str) -> NominalModel:
     except ConfigError as error:
         raise ConfigError(f"{where}.name: {error}") from None
     return model
+
+
+def _of_name(name: str, where: str) -> Effect:
+    try:
+        effect: Effect = registry().get("effects", name)
+    except ConfigError as error:
+        raise type(error)(f"{where}: {error}") from None
+    return effect
 
 
 def _words(effect: Effect, channel: str, nominal: NominalModel, parameter: str) -> tuple[str, ...] | None:
