@@ -86,7 +86,8 @@ REFUSED = {
     "last state": (_without(-1), "in every row although the model moves it: it was not measured"),
     "exchanged": (_swapped, "seem to be exchanged"),
     "twenty rows": (lambda name, t, y, u: _csv(name, t[:20], y[:20], u[:20]), "at least 60 are needed: 41 more"),
-    "one row": (lambda name, t, y, u: _csv(name, t[:1], y[:1], u[:1]), "has no two rows on which a state was measured"),
+    "one row": (lambda name, t, y, u: _csv(name, t[:1], y[:1], u[:1]), "a state was measured at one moment only, on 1 row; "),
+    "one moment": (lambda name, t, y, u: _csv(name, 0.0 * t + 0.5, y, u), "a state was measured at one moment only, on "),
     "nothing was done": (lambda name, t, y, u: _csv(name, t, 0.0 * y, 0.0 * u), "every input is zero"),
     "nothing but noise": (
         lambda name, t, y, u: _csv(name, t, np.random.default_rng(3).normal(0.0, 0.3, y.shape), u),
@@ -94,6 +95,7 @@ REFUSED = {
     ),
     "one row again and again": (lambda name, t, y, u: _csv(name, t, 0.0 * y + y[90], 0.0 * u + u[90] + 0.1), "asked to move"),
 }
+TOO_LITTLE = {"twenty rows", "one row", "one moment", "nothing was done", "nothing but noise", "one row again and again"}
 
 
 @pytest.mark.parametrize("name", BOUNDS)
@@ -101,7 +103,7 @@ REFUSED = {
 def test_what_is_wrong_is_said_in_one_line(tmp_path, capsys, recorded, case, name):
     spoil, said = REFUSED[case]
     code, answer, err = _trace(tmp_path, capsys, name, spoil(name, *recorded[name]))
-    assert code in {2, 3}
+    assert code == (3 if case in TOO_LITTLE else 2)
     assert answer.get("verdict") is None
     assert said in err
     assert "\n" not in err
@@ -163,3 +165,16 @@ def test_runs_of_two_rows_are_traced_whatever_goes_on_in_between(tmp_path, capsy
     path.write_text("\n".join(rows) + "\n")
     assert main(["trace", str(path), "--model", "unicycle", "--dt", str(DT), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["verdict"] != "sensor_fault"
+
+
+def test_rollouts_shorter_than_asked_are_said(tmp_path, capsys, recorded):
+    t, y, u = recorded["unicycle"]
+    (tmp_path / "run.csv").write_text(_csv("unicycle", t, y, u))
+    lengths = []
+    for asked in ("1", "60"):
+        assert main(["trace", str(tmp_path / "run.csv"), "--model", "unicycle", "--dt", str(DT), "--horizon", asked, "--json"]) == 0
+        out, err = capsys.readouterr()
+        lengths.append(json.loads(out)["error"]["before"]["rollout_horizon_s"])
+        assert ("--horizon 60: rollouts of " in err) == (asked == "60")
+    assert lengths[0] == pytest.approx(1.0)
+    assert lengths[0] < lengths[1] < 0.5 * ROWS * DT

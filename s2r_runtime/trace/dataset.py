@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.errors import RecordingError
+from s2r_runtime.errors import NotEnoughEvidence, RecordingError
 from s2r_runtime.gap import Transitions
 from s2r_runtime.models.composed import SUBSTEPS, ComposedModel
 from s2r_runtime.tables import LARGEST
@@ -237,7 +237,8 @@ def from_streams(
     """Segments of (states, inputs), both as received. reconstruction: what was done to them before. in_parts: S, if the model
     is to take each part of a step by itself; substeps: S, if it is known, and the model takes steps whole.
 
-    Raises RecordingError if states come too seldom for the model's dt, or never, or inputs at another time.
+    Raises RecordingError if states come too seldom for the model's dt, or inputs at another time, NotEnoughEvidence if states were
+    measured at one moment only.
     """
     dt = model.dt
     stretches = _stretches(model, segments, source)
@@ -275,19 +276,25 @@ def from_streams(
 
 
 def _stretches(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], source: str) -> list[tuple[Stream, Stream]]:
-    """What is in one piece, and long enough for a step. Raises RecordingError if nothing is, or clocks or units of time differ."""
+    """What is in one piece, and long enough for a step. Raises NotEnoughEvidence if there is one moment only, RecordingError if nothing is
+    long enough, or clocks or units of time differ.
+    """
     for states, inputs in segments:
         _check_same_clock(states, inputs, source)
     _check_seconds(segments, model.dt, source)
     pieces = [part for states, inputs in segments for part in _split(states, inputs, model)]
     pieces = [part for part in pieces if len(part[0].t) >= 2 and part[0].t[-1] - part[0].t[0] > 0.5 * model.dt]
     if not pieces:
-        spans = [float(states.t[-1] - states.t[0]) for states, _ in segments if len(states.t) >= 2]
-        if not spans:
-            raise RecordingError(f"{source}: has no two rows on which a state was measured")
+        longest = max((float(states.t[-1] - states.t[0]) for states, _ in segments if len(states.t)), default=0.0)
+        if longest <= 0.0:
+            rows = sum(len(states.t) for states, _ in segments)
+            raise NotEnoughEvidence(
+                f"{source}: a state was measured at one moment only, on {rows} row{'s' if rows != 1 else ''}; how it changes is told by "
+                f"rows that are a step of the model, {model.dt:g} s, apart"
+            )
         raise RecordingError(
             f"{source}: no two rows on which a state was measured are a step of the model, {model.dt:g} s, apart: the longest run lasts "
-            f"{max(spans):g} s"
+            f"{longest:g} s"
         )
     return pieces
 

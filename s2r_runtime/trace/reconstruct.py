@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.errors import RecordingError
+from s2r_runtime.errors import NotEnoughEvidence, RecordingError
 from s2r_runtime.hookspecs import Follows
 from s2r_runtime.models.bound import integrating, steps_coarsely
 from s2r_runtime.models.composed import ComposedModel
@@ -140,7 +140,7 @@ def reconstruct(
     given = [(complete(states), inputs) for states, inputs in segments]
     intervals = [np.diff(states.t) for states, _ in given if len(states.t) > 1]
     if not intervals:
-        raise RecordingError(f"{source}: has no two rows on which {', '.join(measured)} were measured")
+        raise NotEnoughEvidence(f"{source}: has no two rows on which {', '.join(measured)} were measured; how they change is told by many")
     interval = snapped(float(np.median(np.concatenate(intervals))), model.dt)
     laid = [[_laid(part, interval, angles) for part in _stretches(states, interval)] for states, _ in given]
     rows = [part.values for parts in laid for part in parts if len(part.t) > 2]
