@@ -131,10 +131,27 @@ def test_a_command_before_the_recording_began_that_nobody_recorded_is_let_be_for
     begin = len(data.runs[0].y) - len(states)
     assert 5 <= there[0] - begin <= 0.05 * len(states)
     found = trace(from_arrays(model, [(states, inputs)]), model)
+    rows = there[0] - begin
+    assert found.to_json()["first_left_out"] == [{"from_s": 0.0, "to_s": pytest.approx(dt * rows)}]
+    assert f"left out: 0 to {dt * rows:.4g} s; what acts at first remembers a command from before the recording" in " ".join(
+        found.text().split()
+    )
     assert {(e.name, e.channel) for e in found.effects} >= {("input_lag", "w")}
     assert next(e for e in found.effects if e.channel == "w").parameters["time_constant"][0] == pytest.approx(0.0164, rel=0.05)
     known = with_history(model, from_arrays(model, [(states[50:], inputs[50:])]))  # all that acts had been held
     assert np.flatnonzero(~np.isnan(known.runs[0].y).any(axis=1))[0] == len(known.runs[0].y) - len(states[50:])
+
+
+def test_a_limit_that_is_met_in_the_first_rows_alone_is_no_command_from_before():
+    """Nothing is found that remembers, so these rows count: the model does not explain them. Somebody may have held the robot, once."""
+    rng, dt = np.random.default_rng(11), 0.01
+    u = commands(rng, 1, 480, dt, [(-15.0, 15.0)], rest=0.0, hold=(0.1, 0.4))
+    u[0, :7], u[0, 7:10] = 16.7, -16.7
+    y = drive(rng, "joint", u, [("input_saturation", "force", {"low": -16.3, "high": 16.3})], dt, [2e-5, 1e-4])
+    found = trace(from_arrays(_model("joint"), [(y[0], u[0])]), _model("joint"))
+    assert found.verdict == "unexplained"
+    assert any("force" in token for token in found.depends_on)
+    assert found.forgetting == ()
 
 
 def test_one_delay_of_all_inputs_gives_way_to_as_long_a_lag_of_each():

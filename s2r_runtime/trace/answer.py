@@ -166,6 +166,7 @@ def _recorded(
         noisy=dataset.noisy,
         measured_forces=dataset.measured_forces,
         behind=dataset.behind,
+        forgetting=checked.data.forgetting,
         unconfirmed=tuple((final.model.effects[place].effect.name, final.model.effects[place].channel) for place in idle),
         domain=domain_of(model, (given.data, given.steps), (judged_on.data, judged_on.steps)),
         could_see=visible(given, final, chosen.tried),

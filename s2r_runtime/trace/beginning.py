@@ -9,6 +9,7 @@ first is taken to have been commanded before, whatever the first command is. A w
 
 The first command need not have been held for long, and not all inputs change at once. If the first steps of a run that was under way are
 far off, and those after them are not, something remembers another command, which nobody recorded: these rows only let it be forgotten.
+They are told; and where nothing is found that remembers, they count after all: a limit may be met at the start alone.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def with_history(model: ComposedModel, data: Dataset) -> Dataset:
     usual = _usual(model, data)
     reached = [(model.states.index(x), model.inputs.index(u)) for x, u in getattr(model.nominal, "reached", {}).items()]
     size = np.max(np.abs(np.concatenate([run.u for run in data.runs])), axis=0)
-    runs = []
+    runs, forgetting = [], []
     for run in data.runs:
         steps = int(np.clip(HELD_S / data.dt, LEAST, max(MOST, len(run.y) // SHARE)))
         guessed = _acted(model, data, run, steps, usual)
@@ -67,12 +68,18 @@ def with_history(model: ComposedModel, data: Dataset) -> Dataset:
                 before[u] = run.y[0, x] if abs(run.y[0, x]) > MOVING * size[u] else 0.0
                 guessed[u] = False
         laid = _preceded(data, run, steps, before) if np.any(before) else run
-        runs.append(_forgetting(model, data, laid, len(laid.y) - len(run.y), usual) if guessed.any() else laid)
-    return replace(data, runs=tuple(runs))
+        first = 0 if data.from_first or not guessed.any() else _forgetting(model, data, laid, len(laid.y) - len(run.y), usual)
+        if first:
+            forgetting.append((run.start_s, run.start_s + float(np.sum(run.durations(data.dt)[:first]))))
+            y = laid.y.copy()
+            y[: len(laid.y) - len(run.y) + first] = np.nan
+            laid = replace(laid, y=y)
+        runs.append(laid)
+    return replace(data, runs=tuple(runs), forgetting=tuple(forgetting))
 
 
-def _forgetting(model: ComposedModel, data: Dataset, run: Run, before: int, usual: Array) -> Run:
-    """A run that was under way, after so many steps of what was before, less the rows in which that shows not to have been so."""
+def _forgetting(model: ComposedModel, data: Dataset, run: Run, before: int, usual: Array) -> int:
+    """First rows, after so many steps of what was before, in which a run that was under way shows that something else was before."""
     rows = len(run.y) - before
     most = int(PART * rows)
     first = replace(data, runs=(run,))
@@ -80,11 +87,7 @@ def _forgetting(model: ComposedModel, data: Dataset, run: Run, before: int, usua
     off = np.any(np.abs(residual(model, steps, acting(model, first))) > WILD * usual, axis=1)
     there = off[: most + 1] & (steps.place[: most + 1] == before + np.arange(min(most + 1, len(off))))
     wild = int(np.argmin(there)) if not there.all() else 0  # what goes on is no matter of the beginning
-    if not wild:
-        return run
-    y = run.y.copy()
-    y[: before + min(FORGOTTEN * wild, most)] = np.nan
-    return replace(run, y=y)
+    return min(FORGOTTEN * wild, most)
 
 
 def _usual(model: ComposedModel, data: Dataset) -> Array:

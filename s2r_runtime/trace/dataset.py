@@ -160,6 +160,10 @@ class Dataset:
     """The inputs are forces that were measured, with noise of their own, and not commanded (`measured_forces`)."""
     behind: dict[str, float] = field(default_factory=dict)
     """s by which states came late against others, and were taken earlier (`late_poses`)."""
+    from_first: bool = False
+    """The first rows of runs count, whatever the model makes of them: nothing remembers what was before (`beginning`)."""
+    forgetting: tuple[tuple[float, float], ...] = ()
+    """From and to, s: first rows of runs that are left out, in which something may act on that nobody recorded (`beginning`)."""
 
     @cached_property
     def chains(self) -> Inputs:
@@ -343,7 +347,7 @@ def regridded(data: Dataset, model: ComposedModel, in_parts: int = 0, substeps: 
     """The same recording on the grid of a model with another step. in_parts, substeps: as `from_streams`."""
     again = from_streams(model, data.segments, data.source, data.digests, data.paths, data.reconstruction, in_parts, substeps)
     again = replace(again, commanded=data.commanded, measured_forces=data.measured_forces)
-    return replace(again, way=data.way, noisy=data.noisy, behind=data.behind)
+    return replace(again, way=data.way, noisy=data.noisy, behind=data.behind, from_first=data.from_first)
 
 
 def thinned(

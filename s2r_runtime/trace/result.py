@@ -84,6 +84,8 @@ class TraceResult:
     """As the dataset's: the inputs were taken for measurements, and not for commands."""
     behind: dict[str, float] = field(default_factory=dict)
     """s by which states came late against others of the pose, and were taken earlier."""
+    forgetting: tuple[tuple[float, float], ...] = ()
+    """As the dataset's: first rows of runs that were left out, from and to, s."""
     domain: tuple[Range, ...] = ()
     """Of each state, then each input: where it was fitted or judged. Beyond that nothing speaks for what was found."""
 
@@ -130,6 +132,9 @@ class TraceResult:
             comes, was = ("comes", "was") if len(self.behind) == 1 else ("come", "were")
             by = next(iter(self.behind.values()))
             lines.append(f"{who} {comes} {by:.3g} s late against {others}, as the motion says, and {was} taken that much earlier")
+        if self.forgetting:
+            each = ", ".join(f"{a:.4g} to {b:.4g} s" for a, b in self.forgetting[:3]) + (", ..." if len(self.forgetting) > 3 else "")
+            lines.append(f"left out: {each}; what acts at first remembers a command from before the recording")
         lines += self._inputs_taken()
         if self.unconfirmed:
             names = ", ".join(f"{name} on {channel}" for name, channel in self.unconfirmed)
@@ -220,6 +225,7 @@ class TraceResult:
             "states_late": self.behind,
             "faults": [{"from_s": f.from_s, "to_s": f.to_s, "channel": f.channel, "kind": f.kind} for f in self.faults],
             "outliers": self.outliers,
+            "first_left_out": [{"from_s": a, "to_s": b} for a, b in self.forgetting],
             "could_see": [
                 {"name": v.name, "channel": v.channel, "parameter": v.parameter, "size": v.size, "unit": v.unit} for v in self.could_see
             ],

@@ -160,6 +160,9 @@ def _traced(
     structure = whole.structure(chosen)
     if structure.matters or astray(chosen, structure, judged_on, seed):
         chosen, structure = once_more(given, whole, chosen, structure, judged_on, ahead)
+    if not structure.matters and checked.data.forgetting and dataset.reconstruction is None and not _remembers(chosen.fit.model):
+        taken, also = replace(as_recorded[0], from_first=True), as_recorded[1] and replace(as_recorded[1], from_first=True)
+        return _traced(taken, asked, also, horizon, seed, _from(80.0, say), norm, parts, under)
     if structure.matters and parts is None:
         more = finer(dataset, model, chosen, structure, ahead, under)
         if more is not None:
@@ -215,6 +218,12 @@ def _more_faults(fit: Fit, model: ComposedModel, data: Dataset | None, checked: 
     if data is None or checked is None or data.reconstruction is not None or not fit.added:
         return False
     return check(model, with_history(model, data), fit.model).faults != checked.faults
+
+
+def _remembers(model: ComposedModel) -> bool:
+    """Whether something acts on that an input did before. What is timed has the time among what it hides."""
+    own = [(a.effect.hidden(1, model.nominal, a.channel, model.dt, a.p).size, a) for a in model.effects if a.effect.stage == "input"]
+    return any(size > int(getattr(a.effect, "timed", False)) for size, a in own)
 
 
 def _in_parts(model: ComposedModel, data: Dataset) -> ComposedModel:
