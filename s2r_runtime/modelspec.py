@@ -60,9 +60,9 @@ def load_model(path: Path) -> ModelSpec:
         raise ConfigError(f"{path}: not TOML: {error}") from None
     if "model" not in table:
         raise ConfigError(f"{path}: has no [model] table")
-    for name, right in (("effects", "[[model.effects]]"), ("parameters", "[model.parameters]")):
+    for name in ModelSpec.__struct_fields__:
         if name in table:
-            raise ConfigError(f"{path}: has {name} beside [model], where nothing reads them; they must be in it: {right}")
+            raise ConfigError(f"{path}: has {name} beside [model], where nothing reads it; it must be in that table")
     try:
         return msgspec.convert(table["model"], ModelSpec)
     except msgspec.ValidationError as error:

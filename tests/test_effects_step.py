@@ -176,7 +176,7 @@ def test_forces_are_divided_by_the_mass_that_is_used_not_by_the_default():
         ("joint", ("coulomb_friction", "qd", {"force": -1.0}), "must be in [0.0"),
         ("joint", ("coulomb_friction", "qd", {"force": [[1.0, 0.0], [0.0, 1.0]]}), "must be a number"),
         ("unicycle", ("viscous_friction", "v", {"coefficient": 1.0}), "(viscous_friction): acts on nothing that the model unicycle has"),
-        ("joint", ("viscos_friction", "qd", {}), "model.effects[0] (viscos_friction): unknown effect 'viscos_friction'; did you mean"),
+        ("joint", ("viscos_friction", "qd", {}), "model.effects[0].name: unknown effect 'viscos_friction'; did you mean"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line(model, effect, said):
@@ -186,13 +186,20 @@ def test_what_makes_no_sense_is_refused_in_one_line(model, effect, said):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(("name", "right"), [("effects", "[[model.effects]]"), ("parameters", "[model.parameters]")])
-def test_a_model_file_never_loses_what_stands_beside_its_table(tmp_path, name, right):
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ('[model]\nname = "joint"\ndt = 0.01\n[[effects]]\nname = "input_gain"\n', "effects"),
+        ('[model]\nname = "joint"\ndt = 0.01\n[parameters]\nmass = 2.0\n', "parameters"),
+        ('fitted_on = ["sha256:0"]\n[model]\nname = "joint"\ndt = 0.01\n', "fitted_on"),
+    ],
+)
+def test_a_model_file_never_loses_what_stands_beside_its_table(tmp_path, text, name):
     path = tmp_path / "model.toml"
-    path.write_text(f'[model]\nname = "joint"\ndt = 0.01\n\n{f"[[{name}]]" if name == "effects" else f"[{name}]"}\nmass = 2.0\n')
+    path.write_text(text)
     with pytest.raises(ConfigError) as error:
         load_model(path)
-    assert str(error.value) == f"{path}: has {name} beside [model], where nothing reads them; they must be in it: {right}"
+    assert str(error.value) == f"{path}: has {name} beside [model], where nothing reads it; it must be in that table"
 
 
 def test_a_model_with_such_effects_survives_its_file(tmp_path):

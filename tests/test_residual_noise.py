@@ -40,6 +40,10 @@ def test_the_likelihood_of_whitening_is_that_of_the_full_covariance():
     z = whiten(residual)
     assert float(np.sum(z * z)) == pytest.approx(residual.ravel() @ np.linalg.solve(s, residual.ravel()))
     assert whiten.logdet == pytest.approx(0.5 * np.linalg.slogdet(s)[1])
+    several = np.stack([residual, 3.0 * residual[::-1]], axis=2)
+    solved = np.linalg.solve(s, several.reshape(12, 2)).reshape(several.shape)
+    assert np.allclose(whiten.back(z), solved[:, :, 0], rtol=1e-10)
+    assert np.allclose(whiten.back(whiten(several)), solved, rtol=1e-10)
 
 
 @pytest.mark.parametrize(("q", "r"), [((1e-9, 1e-9), (1.0, 4.0)), ((0.5, 2.0), (1.0, 4.0)), ((3.0, 3.0), (1e-4, 1e-4))])

@@ -1,5 +1,6 @@
 """What takes a tracer's time is asked of a model once: rounds of a fit, and what follows it, go back to what they know."""
 
+import math
 from collections import deque
 from dataclasses import replace
 from functools import partial
@@ -16,11 +17,12 @@ from s2r_runtime.models.double_integrator import DoubleIntegrator
 from s2r_runtime.models.file_model import FileModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import exchange, fields, fitting, lack_of_fit, relevance, residual, retimed, scores
+from s2r_runtime.trace import exchange, fields, fitting, lack_of_fit, relevance, residual, retimed, scores, selection, whole
 from s2r_runtime.trace.chains import Inputs
 from s2r_runtime.trace.changes import rivals_that_happen
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import Held, noise_floor
+from s2r_runtime.trace.faults import Checked
 from s2r_runtime.trace.fields import Field
 from s2r_runtime.trace.fitting import Problem, evaluate, fitted, foretold, foretold_by, insert, problem, scatter, without
 from s2r_runtime.trace.lack_of_fit import left_of
@@ -269,6 +271,35 @@ def test_a_candidate_that_a_round_leaves_far_behind_gets_no_other_one(monkeypatc
         found.append((len(rounds), best[0].name, best[0].channel, best[0].score))
     assert found[1][0] < found[0][0]
     assert found[1][1:] == found[0][1:]
+
+
+def test_what_is_far_from_needed_is_not_asked_how_it_began(monkeypatch):
+    given, fit = _given()
+    asked, found = [], []
+    began = selection.from_the_beginning
+    monkeypatch.setattr(selection, "from_the_beginning", lambda *of: (asked.append(1), began(*of))[1])
+    for share in (-math.inf, selection.NEAR):
+        asked.clear()
+        monkeypatch.setattr(selection, "NEAR", share)
+        chosen = selection.called_for(replace(given, searches={}), without(fit.model, 0), 20, lambda share: None)
+        found.append((len(asked), scores.names(chosen.fit.model), chosen.fit.white))
+    assert found[1][0] < found[0][0]
+    assert found[1][1:] == found[0][1:]
+
+
+def test_no_dictionary_explains_more_where_next_to_nothing_is_left(monkeypatch):
+    given, fit = _given()
+    asked, found = [], []
+    explains = whole.explains_more
+    monkeypatch.setattr(whole, "explains_more", lambda *of, left: (asked.append(1), explains(*of, left=left))[1])
+    monkeypatch.setattr(whole, "ALIKE", -math.inf)
+    for share in (-math.inf, whole.LITTLE):
+        asked.clear()
+        monkeypatch.setattr(whole, "LITTLE", share)
+        everything = whole.Whole(Checked(given.data, (), (), 0), without(fit.model, 0), 20)
+        structure = everything.structure(selection.Selection(everything.nominal, fit, 1, (), ()))
+        found.append((len(asked), structure.tokens, structure.matters))
+    assert found == [(1, *found[1][1:]), (0, *found[1][1:])]
 
 
 def test_what_a_field_is_beyond_other_noise_is_not_asked_where_no_rollout_shows_it(monkeypatch):

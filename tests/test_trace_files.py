@@ -86,8 +86,14 @@ REFUSED = {
     "last state": (_without(-1), "in every row although the model moves it: it was not measured"),
     "exchanged": (_swapped, "seem to be exchanged"),
     "twenty rows": (lambda name, t, y, u: _csv(name, t[:20], y[:20], u[:20]), "at least 60 are needed: 41 more"),
-    "one row": (lambda name, t, y, u: _csv(name, t[:1], y[:1], u[:1]), "a state was measured at one moment only, on 1 row; "),
-    "one moment": (lambda name, t, y, u: _csv(name, 0.0 * t + 0.5, y, u), "a state was measured at one moment only, on "),
+    "one row": (
+        lambda name, t, y, u: _csv(name, t[:1], y[:1], u[:1]),
+        "at one moment only, on 1 row; how it changes is told by rows that are a step",
+    ),
+    "one moment": (
+        lambda name, t, y, u: _csv(name, 0.0 * t + 0.5, y, u),
+        "at one moment only, on 260 rows; how it changes is told by rows that are a step",
+    ),
     "nothing was done": (lambda name, t, y, u: _csv(name, t, 0.0 * y, 0.0 * u), "every input is zero"),
     "nothing but noise": (
         lambda name, t, y, u: _csv(name, t, np.random.default_rng(3).normal(0.0, 0.3, y.shape), u),
@@ -167,6 +173,15 @@ def test_runs_of_two_rows_are_traced_whatever_goes_on_in_between(tmp_path, capsy
     assert json.loads(capsys.readouterr().out)["verdict"] != "sensor_fault"
 
 
+def test_no_state_is_another_thing_than_one_moment(tmp_path, capsys, recorded):
+    t, y, u = recorded["unicycle"]
+    code, _, err = _trace(tmp_path, capsys, "unicycle", _csv("unicycle", t, np.nan * y, u))
+    assert (code, "has no row on which a state was measured" in err) == (2, True)
+    t, y, u = recorded["joint"]
+    code, _, err = _trace(tmp_path, capsys, "joint", _csv("joint", t[:1], y[:1, :1], u[:1], ["t", "q", "force"]))
+    assert (code, "qd cannot be told: fewer than " in err) == (3, True)
+
+
 def test_rollouts_shorter_than_asked_are_said(tmp_path, capsys, recorded):
     t, y, u = recorded["unicycle"]
     (tmp_path / "run.csv").write_text(_csv("unicycle", t, y, u))
@@ -175,6 +190,7 @@ def test_rollouts_shorter_than_asked_are_said(tmp_path, capsys, recorded):
         assert main(["trace", str(tmp_path / "run.csv"), "--model", "unicycle", "--dt", str(DT), "--horizon", asked, "--json"]) == 0
         out, err = capsys.readouterr()
         lengths.append(json.loads(out)["error"]["before"]["rollout_horizon_s"])
-        assert ("--horizon 60: rollouts of " in err) == (asked == "60")
+        said = f"--horizon 60: what was judged on bears no such rollouts; they are {lengths[-1]:.4g} s long"
+        assert (said in err) == (asked == "60")
     assert lengths[0] == pytest.approx(1.0)
     assert lengths[0] < lengths[1] < 0.5 * ROWS * DT

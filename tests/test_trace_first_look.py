@@ -20,8 +20,9 @@ from s2r_runtime.trace.hidden_pairs import TAKEN, _nats, _nats_beside, _nats_of_
 from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.relevance import _edges, relevant
 from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.residual_noise import weight
 from s2r_runtime.trace.scores import best_candidates, names
-from s2r_runtime.trace.screening import probes_of, screen
+from s2r_runtime.trace.screening import _Aside, probes_of, screen
 from s2r_runtime.trace.selection import Selection, doing_something
 from s2r_runtime.trace.slots import Added
 
@@ -45,6 +46,17 @@ def _drive(spec, effects, u, sigma, seed=21):
 def _alike(fits):
     """Where what was not fitted is foretold as well by each."""
     return [0.0] * len(fits)
+
+
+@pytest.mark.parametrize("second", [1.0, 1e-6, 0.0])
+def test_what_moves_aside_is_weighted_least_squares_whatever_its_scale(second):
+    """A column of nothing moves nothing."""
+    rng = np.random.default_rng(5)
+    z, j = rng.standard_t(3, 80), rng.normal(size=(80, 2)) * [1.0, second]
+    root = np.sqrt(weight(z))
+    beta = np.linalg.lstsq(root[:, None] * j / [1.0, second or 1.0], root * z, rcond=1e-12)[0] / [1.0, second or 1.0]
+    _, found = _Aside(z, j)._left(z, j, j * root[:, None] ** 2)
+    assert found == pytest.approx(beta, rel=1e-6)
 
 
 def test_a_limit_that_depends_on_the_direction_is_fitted_from_one_that_does_not():

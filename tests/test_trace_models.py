@@ -12,6 +12,7 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
+from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.exchange import parted
 from s2r_runtime.trace.fitting import evaluate, fitted, problem
 from s2r_runtime.trace.residual import steps_of
@@ -133,7 +134,7 @@ def test_a_command_before_the_recording_began_that_nobody_recorded_is_let_be_for
     found = trace(from_arrays(model, [(states, inputs)]), model)
     rows = there[0] - begin
     assert found.to_json()["first_left_out"] == [{"from_s": 0.0, "to_s": pytest.approx(dt * rows)}]
-    assert f"left out: 0 to {dt * rows:.4g} s; what acts at first remembers a command from before the recording" in " ".join(
+    assert f"left out: 0 to {dt * rows:.4g} s; what acts there may follow a command from before the recording" in " ".join(
         found.text().split()
     )
     assert {(e.name, e.channel) for e in found.effects} >= {("input_lag", "w")}
@@ -152,6 +153,31 @@ def test_a_limit_that_is_met_in_the_first_rows_alone_is_no_command_from_before()
     assert found.verdict == "unexplained"
     assert any("force" in token for token in found.depends_on)
     assert found.forgetting == ()
+
+
+@pytest.mark.parametrize("remembers", [False, True])
+def test_first_rows_count_where_nothing_remembers_and_are_told_where_something_does(tmp_path, remembers):
+    """Of files that lack the wheels' speeds, of the one that is fitted and of the one that is judged on."""
+    name = "differential_drive"
+    model, dt, before = _model(name), ROBOTS[name][0], 40
+    effect, asked = ("input_saturation", "cmd_left", {"low": -9.0, "high": 9.0}), (9.6, 9.6)
+    if remembers:
+        effect, asked = ("input_lag", "cmd_left", {"time_constant": 0.08}), (4.0, 7.0)
+    read = []
+    for i in (0, 1):
+        rng = np.random.default_rng(20 + i)
+        u = commands(rng, 1, 260 + before, dt, [(-3.0, 8.0)] * 2, rest=0.0, hold=(0.2, 0.8))
+        u[0, : before - 1], u[0, before - 1 : before + 3] = [asked[0], 2.0], [asked[1], 2.0]
+        y = drive(rng, name, u, [effect], dt, 1e-5)[0]
+        table = np.column_stack([dt * np.arange(260), y[before:-1, :3], u[0, before:]])
+        path = tmp_path / f"{i}.csv"
+        np.savetxt(path, table, delimiter=",", header=",".join(["t", "x", "y", "theta", *INPUTS[name]]), comments="")
+        read.append(load_dataset(path, model))
+    found = trace(read[0], model, test=read[1])
+    assert {(e.name, e.channel) for e in found.effects} == {effect[:2]}
+    told = " ".join(found.text().split())
+    assert bool(found.to_json()["first_left_out"]) == remembers
+    assert (f" of {tmp_path}/1.csv; what acts there may follow" in told) == remembers
 
 
 def test_one_delay_of_all_inputs_gives_way_to_as_long_a_lag_of_each():

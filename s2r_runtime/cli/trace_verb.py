@@ -41,7 +41,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--horizon",
         type=positive,
         metavar="S",
-        help="length of the rollouts in s (default 1, or 10 steps if they take longer; at most what the recording bears)",
+        help="length of the rollouts in s (default 1, or 10 steps if they take longer; shorter where what is judged on is)",
     )
     verb.add_argument("--seed", type=count, default=0, help="seed of everything random in it (default 0)")
     verb.add_argument(
@@ -131,8 +131,8 @@ def run(args: argparse.Namespace) -> int:
         output.result_json(told | drive)
     else:
         _tell(args, result, suggested, files.keys() - trouble.keys(), changed=result.spec.effects != model.spec.effects)
-    if args.horizon and result.horizon_s < args.horizon - 0.5 * result.nominal.dt:
-        output.err(f"s2r: --horizon {args.horizon:g}: rollouts of {result.horizon_s:.4g} s are the longest that this recording bears")
+    if args.horizon and result.held.horizon < round(args.horizon / result.nominal.dt):
+        output.err(f"s2r: --horizon {args.horizon:g}: what was judged on bears no such rollouts; they are {result.horizon_s:.4g} s long")
     for why in trouble.values():  # last: what was found is told all the same
         output.err(f"s2r: {why}")
     return UsageError.exit_code if trouble else 0

@@ -124,7 +124,9 @@ def weights(profile: Profile, states: Sequence[str]) -> tuple[float, ...]:
 
 
 def dataset(model: ComposedModel, cut: Cut, source: str, digests: tuple[str, ...]) -> Dataset:
-    """The stretch on the model's grid. Raises RecordingError if its rows are not of this model, or too far apart."""
+    """The stretch on the model's grid. Raises RecordingError if its rows are not of this model, or too far apart,
+    NotEnoughEvidence if it is of one moment only.
+    """
     from s2r_runtime.trace.dataset import from_streams
 
     for segment in cut.segments:

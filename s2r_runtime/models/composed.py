@@ -321,13 +321,11 @@ def compose(spec: ModelSpec, where: str = "model") -> ComposedModel:
     nominal = bind(shared, spec.parameters)
     applied: list[AppliedEffect] = []
     for index, entry in enumerate(spec.effects):
+        effect = _of_name(entry.name, f"{where}.effects[{index}]")
         place = f"{where}.effects[{index}] ({entry.name})"
-        effect = _of_name(entry.name, place)
         channels = effect.channels(nominal)
         if not channels:
-            raise ConfigError(
-                f"{place}: acts on nothing that the model {spec.name} has, must be an effect of such models (docs/effects.md)"
-            )
+            raise ConfigError(f"{place}: acts on nothing that the model {spec.name} has; docs/effects.md says on what each effect acts")
         if entry.channel not in channels:
             raise ConfigError(f"{place}: channel is {entry.channel!r}, must be one of: {', '.join(channels)}")
         if getattr(effect, "once", False) and any(a.effect is effect for a in applied):
@@ -348,7 +346,7 @@ def _of_name(name: str, where: str) -> Effect:
     try:
         effect: Effect = registry().get("effects", name)
     except ConfigError as error:
-        raise type(error)(f"{where}: {error}") from None
+        raise ConfigError(f"{where}.name: {error}") from None
     return effect
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.fitting import without
 from s2r_runtime.trace.lack_of_fit_terms import token_of
@@ -32,8 +32,13 @@ def about(model: ComposedModel, place: int, data: Dataset, steps: Steps) -> set[
         return found | _tried(model, place, data, steps, of_states=True) | _tried(model, place, data, steps, of_states=False)
     names = model.inputs if a.channel == "*" else (a.channel,)
     reads = a.effect.reads(model.nominal, a.channel) if hasattr(a.effect, "reads") else ()
-    remembers = a.effect.hidden(1, model.nominal, a.channel, model.dt, a.p).size > len(found)  # what is timed has the time there
-    return found | {*names, *reads} | ({f"memory({name})" for name in names} if remembers else set())
+    return found | {*names, *reads} | ({f"memory({name})" for name in names} if remembers(model, a) else set())
+
+
+def remembers(model: ComposedModel, a: AppliedEffect) -> bool:
+    """Whether what acts by an effect on an input depends on what was asked before. What is timed has the time among what it hides."""
+    hidden = a.effect.hidden(1, model.nominal, a.channel, model.dt, a.p).size if a.effect.stage == "input" else 0
+    return bool(hidden > int(getattr(a.effect, "timed", False)))
 
 
 def carried(model: ComposedModel, place: int, data: Dataset, steps: Steps) -> set[str]:

@@ -9,7 +9,8 @@ first is taken to have been commanded before, whatever the first command is. A w
 
 The first command need not have been held for long, and not all inputs change at once. If the first steps of a run that was under way are
 far off, and those after them are not, something remembers another command, which nobody recorded: these rows only let it be forgotten.
-They are told; and where nothing is found that remembers, they count after all: a limit may be met at the start alone.
+They are told; and where all is explained, and nothing found that remembers, they count after all (`tracer`): a limit may be met at the
+start alone.
 """
 
 from __future__ import annotations
@@ -54,7 +55,9 @@ at 30 m/s that follows its command in a second is 1.5 m/s off after three, and 1
 
 
 def with_history(model: ComposedModel, data: Dataset) -> Dataset:
-    """The dataset, its runs that began under way with what is taken to have been before: rows without a measurement."""
+    """The dataset, its runs that began under way with what is taken to have been before: rows without a measurement. Those in which
+    something else that was before may act on have none either, and are its `forgetting`, unless all count (`Dataset.from_first`).
+    """
     usual = _usual(model, data)
     reached = [(model.states.index(x), model.inputs.index(u)) for x, u in getattr(model.nominal, "reached", {}).items()]
     size = np.max(np.abs(np.concatenate([run.u for run in data.runs])), axis=0)
@@ -68,11 +71,12 @@ def with_history(model: ComposedModel, data: Dataset) -> Dataset:
                 before[u] = run.y[0, x] if abs(run.y[0, x]) > MOVING * size[u] else 0.0
                 guessed[u] = False
         laid = _preceded(data, run, steps, before) if np.any(before) else run
-        first = 0 if data.from_first or not guessed.any() else _forgetting(model, data, laid, len(laid.y) - len(run.y), usual)
-        if first:
-            forgetting.append((run.start_s, run.start_s + float(np.sum(run.durations(data.dt)[:first]))))
+        early = len(laid.y) - len(run.y)
+        rows = 0 if data.from_first or not guessed.any() else _forgetting(model, data, laid, early, usual)
+        if rows:
+            forgetting.append((run.start_s, run.start_s + float(np.sum(run.durations(data.dt)[:rows]))))
             y = laid.y.copy()
-            y[: len(laid.y) - len(run.y) + first] = np.nan
+            y[: early + rows] = np.nan
             laid = replace(laid, y=y)
         runs.append(laid)
     return replace(data, runs=tuple(runs), forgetting=tuple(forgetting))

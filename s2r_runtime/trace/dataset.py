@@ -161,7 +161,7 @@ class Dataset:
     behind: dict[str, float] = field(default_factory=dict)
     """s by which states came late against others, and were taken earlier (`late_poses`)."""
     from_first: bool = False
-    """The first rows of runs count, whatever the model makes of them: nothing remembers what was before (`beginning`)."""
+    """The first rows of runs count, whatever the model makes of them: the tracer found nothing that remembers what was before."""
     forgetting: tuple[tuple[float, float], ...] = ()
     """From and to, s: first rows of runs that are left out, in which something may act on that nobody recorded (`beginning`)."""
 
@@ -241,8 +241,8 @@ def from_streams(
     """Segments of (states, inputs), both as received. reconstruction: what was done to them before. in_parts: S, if the model
     is to take each part of a step by itself; substeps: S, if it is known, and the model takes steps whole.
 
-    Raises RecordingError if states come too seldom for the model's dt, or inputs at another time, NotEnoughEvidence if states were
-    measured at one moment only.
+    Raises RecordingError if states come too seldom for the model's dt, or never, or inputs at another time, NotEnoughEvidence if states
+    were measured at one moment only.
     """
     dt = model.dt
     stretches = _stretches(model, segments, source)
@@ -289,12 +289,14 @@ def _stretches(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], 
     pieces = [part for states, inputs in segments for part in _split(states, inputs, model)]
     pieces = [part for part in pieces if len(part[0].t) >= 2 and part[0].t[-1] - part[0].t[0] > 0.5 * model.dt]
     if not pieces:
-        longest = max((float(states.t[-1] - states.t[0]) for states, _ in segments if len(states.t)), default=0.0)
-        if longest <= 0.0:
-            rows = sum(len(states.t) for states, _ in segments)
+        longest = max((float(states.t[-1] - states.t[0]) for states, _ in segments if len(states.t)), default=-1.0)
+        if longest < 0.0:
+            raise RecordingError(f"{source}: has no row on which a state was measured")
+        if longest == 0.0:
+            rows, each = sum(len(states.t) for states, _ in segments), "" if len(segments) == 1 else " of each run"
             raise NotEnoughEvidence(
-                f"{source}: a state was measured at one moment only, on {rows} row{'s' if rows != 1 else ''}; how it changes is told by "
-                f"rows that are a step of the model, {model.dt:g} s, apart"
+                f"{source}: a state was measured at one moment{each} only, on {rows} row{'s' if rows != 1 else ''}; how it changes is told "
+                f"by rows that are a step of the model, {model.dt:g} s, apart"
             )
         raise RecordingError(
             f"{source}: no two rows on which a state was measured are a step of the model, {model.dt:g} s, apart: the longest run lasts "

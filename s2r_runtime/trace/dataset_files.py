@@ -49,7 +49,8 @@ def load_dataset(
     needs: unseen.py). transport: the profile's, for a log in a robot's own format. behind: s by which states of the pose come late, if that
     is known from another recording (None: as this one says, `late_poses`).
 
-    Raises RecordingError (unreadable, lacks a column that does not follow from others, too slow for the model's dt).
+    Raises RecordingError (unreadable, lacks a column that does not follow from others, too slow for the model's dt), NotEnoughEvidence
+    if states were measured at one moment only, or too seldom for what was not measured.
     """
     paths = tuple(Path(p) for p in ([path] if isinstance(path, str | Path) else path))
     digests = tuple(_digest(p) for p in paths)

@@ -98,7 +98,7 @@ class Judged:
 
 
 def held(model: ComposedModel, data: Dataset, steps: Steps, left_out: tuple[tuple[int, int], ...], within: Mask, horizon_s: float) -> Held:
-    """With the longest horizon up to the one asked for that some row has ahead of it."""
+    """With the horizon asked for, halved until some row has that much ahead of it."""
     ahead = max(1, round(horizon_s / data.dt))
     while ahead > 1 and not len(rollout_starts(data, ahead, left_out, within)):
         ahead = max(1, ahead // 2)

@@ -127,7 +127,7 @@ def reconstruct(
 ) -> tuple[list[tuple[Stream, Stream]], Reconstruction]:
     """Segments of (measured states in the model's order without the missing ones, inputs), filtered, with all states. bandwidth: Hz; None:
     what the data bear. behind: speeds that were left out as they are late. Raises RecordingError if a missing state does not follow, nor is
-    told by another one, or if the rows are too few.
+    told by another one, NotEnoughEvidence if the rows are too few.
     """
     measured = [name for name in model.states if name not in missing]
     if bandwidth is None and (pairs := _axes_without_speed(model, missing)):
@@ -145,7 +145,7 @@ def reconstruct(
     laid = [[_laid(part, interval, angles) for part in _stretches(states, interval)] for states, _ in given]
     rows = [part.values for parts in laid for part in parts if len(part.t) > 2]
     if not rows:
-        raise RecordingError(f"{source}: {', '.join(missing)} cannot be reconstructed: no three rows follow one another without a gap")
+        raise NotEnoughEvidence(f"{source}: {', '.join(missing)} cannot be reconstructed: no three rows follow one another without a gap")
     band = _checked(bandwidth, interval, source) if bandwidth else differentiation.bandwidth(rows, interval)
     made = []
     for parts, (_, inputs) in zip(laid, given, strict=True):
@@ -216,7 +216,7 @@ def _with_speeds(
     given = [(complete(fresh(states)), inputs) for states, inputs in segments]
     given = [(Stream(s.t, unwrapped(s.values, angles)), inputs) for s, inputs in given if len(s.t) >= FEWEST]
     if not given:
-        raise RecordingError(
+        raise NotEnoughEvidence(
             f"{source}: {', '.join(missing)} cannot be told: fewer than {FEWEST} rows on which {', '.join(measured)} were measured"
         )
     interval = snapped(float(np.median(np.concatenate([np.diff(s.t) for s, _ in given]))), model.dt)
@@ -239,7 +239,7 @@ def _with_speeds(
         cleaned = [part for s, u in made for _, part in _filtered(s, less_noise_of(u)[0], interval, band)]
         made = [both for s, u in made for both in _filtered(s, u, interval, band)]
         if not made:
-            raise RecordingError(f"{source}: {', '.join(missing)} cannot be told: no stretch without a gap is long enough")
+            raise NotEnoughEvidence(f"{source}: {', '.join(missing)} cannot be told: no stretch without a gap is long enough")
     return made, Reconstruction(missing, shown, interval, needed, pairs, errors, apart, tuple(cleaned), faults=faults)
 
 
@@ -268,7 +268,7 @@ def _with_hidden(
         if whole:
             made.append((Stream(np.concatenate([w.t for w in whole]), np.concatenate([w.values for w in whole])), inputs))
     if not made:
-        raise RecordingError(
+        raise NotEnoughEvidence(
             f"{source}: {', '.join(missing)} cannot be told: no {FEWEST} rows without a gap on which {', '.join(measured)} were measured"
         )
     errors = tuple(float(np.median([found[j].error for found in known])) for j in range(len(pairs)))

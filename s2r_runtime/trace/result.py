@@ -85,7 +85,7 @@ class TraceResult:
     behind: dict[str, float] = field(default_factory=dict)
     """s by which states came late against others of the pose, and were taken earlier."""
     forgetting: tuple[tuple[float, float], ...] = ()
-    """As the dataset's: first rows of runs that were left out, from and to, s."""
+    """As the dataset's: first rows of runs of the recording that were left out, from and to, s."""
     domain: tuple[Range, ...] = ()
     """Of each state, then each input: where it was fitted or judged. Beyond that nothing speaks for what was found."""
 
@@ -132,9 +132,10 @@ class TraceResult:
             comes, was = ("comes", "was") if len(self.behind) == 1 else ("come", "were")
             by = next(iter(self.behind.values()))
             lines.append(f"{who} {comes} {by:.3g} s late against {others}, as the motion says, and {was} taken that much earlier")
-        if self.forgetting:
-            each = ", ".join(f"{a:.4g} to {b:.4g} s" for a, b in self.forgetting[:3]) + (", ..." if len(self.forgetting) > 3 else "")
-            lines.append(f"left out: {each}; what acts at first remembers a command from before the recording")
+        of_test = self.held.data.forgetting if self.held.data.source != self.source else ()
+        for stretches, of in ((self.forgetting, ""), (of_test, f" of {self.held.data.source}")):
+            each = ", ".join(f"{a:.4g} to {b:.4g} s" for a, b in stretches[:3]) + (", ..." if len(stretches) > 3 else "")
+            lines += [f"left out: {each}{of}; what acts there may follow a command from before the recording"] if stretches else []
         lines += self._inputs_taken()
         if self.unconfirmed:
             names = ", ".join(f"{name} on {channel}" for name, channel in self.unconfirmed)

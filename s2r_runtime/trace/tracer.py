@@ -5,6 +5,8 @@
     3  effects are selected, noise estimated under each hypothesis                     selection, fitting, residual_noise
     4  what is left is tested for structure, named by what it depends on               lack_of_fit, whole
     5  if something is left, the library is asked once more                            second_look
+       if all is explained by what remembers nothing, first rows that were left out    beginning
+       count, and all is asked again
     6  a verdict; errors and gap before and after on what was held out                 verdict, errors, answer
 
 Deterministic: the same recording, model and seed give the same result.
@@ -24,6 +26,7 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, UsageError
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.plugins import registry
+from s2r_runtime.trace.about import remembers
 from s2r_runtime.trace.answer import answered, with_time
 from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.begun import begun
@@ -39,7 +42,7 @@ from s2r_runtime.trace.residual import Mask, acting, first_steps, rms, steps_of
 from s2r_runtime.trace.result import TraceResult
 from s2r_runtime.trace.scores import names
 from s2r_runtime.trace.second_look import astray, finer, once_more
-from s2r_runtime.trace.selection import MOST, all_dated, select
+from s2r_runtime.trace.selection import MOST, Selection, all_dated, select
 from s2r_runtime.trace.straight import acted, alike_laid, changed_within, commanded, noisy, sampled, samples_of, straight, way_of
 from s2r_runtime.trace.throttled import refuted, says_forces
 from s2r_runtime.trace.unseen import alike
@@ -160,9 +163,11 @@ def _traced(
     structure = whole.structure(chosen)
     if structure.matters or astray(chosen, structure, judged_on, seed):
         chosen, structure = once_more(given, whole, chosen, structure, judged_on, ahead)
-    if not structure.matters and checked.data.forgetting and dataset.reconstruction is None and not _remembers(chosen.fit.model):
-        taken, also = replace(as_recorded[0], from_first=True), as_recorded[1] and replace(as_recorded[1], from_first=True)
-        return _traced(taken, asked, also, horizon, seed, _from(80.0, say), norm, parts, under)
+    left_out = checked.data.forgetting or (tested is not None and tested.data.forgetting)
+    if left_out and not dataset.from_first and not structure.matters and dataset.reconstruction is None and _nothing_remembers(chosen):
+        # structure may be a memory without a name, and what was reconstructed is as little known where it begins
+        also = None if as_recorded[1] is None else replace(as_recorded[1], from_first=True)
+        return _traced(replace(as_recorded[0], from_first=True), asked, also, horizon, seed, _from(80.0, say), norm, parts, under)
     if structure.matters and parts is None:
         more = finer(dataset, model, chosen, structure, ahead, under)
         if more is not None:
@@ -220,10 +225,10 @@ def _more_faults(fit: Fit, model: ComposedModel, data: Dataset | None, checked: 
     return check(model, with_history(model, data), fit.model).faults != checked.faults
 
 
-def _remembers(model: ComposedModel) -> bool:
-    """Whether something acts on that an input did before. What is timed has the time among what it hides."""
-    own = [(a.effect.hidden(1, model.nominal, a.channel, model.dt, a.p).size, a) for a in model.effects if a.effect.stage == "input"]
-    return any(size > int(getattr(a.effect, "timed", False)) for size, a in own)
+def _nothing_remembers(chosen: Selection) -> bool:
+    """Whether by nothing that was found, nor by what ties with it, an input acts on that was asked before."""
+    models = [chosen.fit.model, *(s.fit.model for s in chosen.rivals if s.fit is not None)]
+    return not any(remembers(model, a) for model in models for a in model.effects)
 
 
 def _in_parts(model: ComposedModel, data: Dataset) -> ComposedModel:

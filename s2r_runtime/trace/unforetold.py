@@ -74,6 +74,7 @@ def shares(model: ComposedModel, data: Dataset, starts: Index, error: Array, amo
     error = trimmed(error - np.median(error, axis=0) if pushed else error)
     gone = trimmed(model.difference(y[rows + steps_ahead(data)].copy(), y[rows]))
     bent = np.concatenate([np.diff(run.y, 2, axis=0) for run in data.runs])
+    # nanmedian of a table goes row by row, and this is asked of dozens of them
     noise = np.array([np.median(b[np.isfinite(b)]) for b in np.abs(bent.T)]) / 0.6745 / math.sqrt(6.0)
     goes = gone > GOES * noise + 1e-12
     if among is not None:
