@@ -311,7 +311,7 @@ def _waits(nominal: BoundModel, a: AppliedEffect, channel: str) -> bool:
 
 def compose(spec: ModelSpec, where: str = "model") -> ComposedModel:
     """The model that a spec describes. Raises ConfigError (unknown names with the nearest known one, bad parameters)."""
-    shared = load_file_model(spec, where) if spec.name.endswith(".py") else _registered(spec, where)
+    shared: NominalModel = load_file_model(spec, where) if spec.name.endswith(".py") else _registered("models", spec.name, where)
     for name in spec.parameters:
         if name not in shared.parameters:
             known = ", ".join(shared.parameters) or "none"
@@ -321,7 +321,7 @@ def compose(spec: ModelSpec, where: str = "model") -> ComposedModel:
     nominal = bind(shared, spec.parameters)
     applied: list[AppliedEffect] = []
     for index, entry in enumerate(spec.effects):
-        effect = _of_name(entry.name, f"{where}.effects[{index}]")
+        effect: Effect = _registered("effects", entry.name, f"{where}.effects[{index}]")
         place = f"{where}.effects[{index}] ({entry.name})"
         channels = effect.channels(nominal)
         if not channels:
@@ -334,20 +334,11 @@ def compose(spec: ModelSpec, where: str = "model") -> ComposedModel:
     return ComposedModel(spec, nominal, tuple(applied))
 
 
-def _registered(spec: ModelSpec, where: str) -> NominalModel:
+def _registered(kind: str, name: str, where: str) -> Any:
     try:
-        model: NominalModel = registry().get("models", spec.name)
+        return registry().get(kind, name)
     except ConfigError as error:
         raise ConfigError(f"{where}.name: {error}") from None
-    return model
-
-
-def _of_name(name: str, where: str) -> Effect:
-    try:
-        effect: Effect = registry().get("effects", name)
-    except ConfigError as error:
-        raise ConfigError(f"{where}.name: {error}") from None
-    return effect
 
 
 def _words(effect: Effect, channel: str, nominal: NominalModel, parameter: str) -> tuple[str, ...] | None:
