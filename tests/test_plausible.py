@@ -240,6 +240,31 @@ def test_wind_that_carries_a_robot_as_its_mirror_image_would_go_is_wind():
     check_plausible(_model("unicycle"), _data(_model("unicycle"), y, u))
 
 
+def _hardly_turning(seed, heading):
+    t = DT * np.arange(STEPS)
+    u = np.column_stack([0.5 + 0.3 * np.sin(0.9 * t), 0.1 * np.sin(0.6 * t + 0.3)])
+    return _stepped("unicycle", u, EffectSpec("input_delay", "*", {"delay": 0.0}), 1e-3 * (1 + seed), heading), u
+
+
+@pytest.mark.parametrize("off", [0.645, 1.2, -0.9, 2.5])
+@pytest.mark.parametrize("mirrored", [0.0, 0.5 * np.pi, np.pi], ids=["y", "x and y", "x"])
+def test_a_heading_that_is_off_is_no_axis_that_was_mirrored(off, mirrored):
+    """It hardly turns, and goes as with a mirrored axis, which lies half way between where it heads and where it says so."""
+    y, u = _hardly_turning(1, 0.5 * (mirrored - off))
+    y[:, 2] += off
+    check_plausible(_model("unicycle"), _data(_model("unicycle"), y, u))
+
+
+@pytest.mark.parametrize("heading", [0.35, 1.2, 2.3])
+@pytest.mark.parametrize(
+    ("mirrored", "said"), [(lambda y: y * [1, -1, 1], "y seems to"), (lambda y: y[:, [1, 0, 2]], "x and y seem to be exchanged")]
+)
+def test_a_mirrored_axis_is_told_though_it_hardly_turns(heading, mirrored, said):
+    y, u = _hardly_turning(2, heading)
+    with pytest.raises(RecordingError, match=said):
+        check_plausible(_model("unicycle"), _data(_model("unicycle"), mirrored(y), u))
+
+
 def test_a_rate_in_another_unit_than_its_position_is_told():
     y, u = _driven("joint")
     with pytest.raises(RecordingError, match="qd seems to be in mm/s"):

@@ -62,6 +62,14 @@ def test_rows_that_are_off_by_themselves_make_no_late_heading():
     assert late_pose(compose(ModelSpec("unicycle", 0.04)), [(Stream(t, pose), Stream(t[:1], np.zeros((1, 2))))], ()) == {}
 
 
+def test_a_short_recording_is_not_cut_down_to_what_a_long_delay_leaves():
+    """Half a second at 1000 Hz, and a heading that is 1.2 rad off: one that stands still past the end seemed 0.49 s late."""
+    made = make("one", 386005)
+    (run,) = made.recording.runs
+    model = compose(ModelSpec(made.model["name"], made.model["dt"], made.model["parameters"]))
+    assert late_pose(model, [(Stream(run.t, run.y), Stream(run.t_u, run.u))], ()) == {}
+
+
 def test_a_heading_that_wandered_off_for_a_while_is_not_late():
     """The drift of a gyroscope looks like one that lags, as long as it lasts."""
     for seed in (302010, 302019):

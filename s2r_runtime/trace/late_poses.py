@@ -41,6 +41,9 @@ FEWEST, LOOKED_AT = 200, 6000
 LEAST_ROWS, MOST_S = 0.75, 0.5
 """What it must be late by: an odometry that adds up steps along the heading before, or after them, is half a row off; and longest, s."""
 
+MOST_SHARE = 0.25
+"""And of the recording, longest: past its end no heading is known, and one that stands still there is as good as one that is off."""
+
 SEEN = 6.0
 """Standard errors of what slides in proportion to w, below which there is nothing to ask."""
 
@@ -200,6 +203,7 @@ class _Ways:
         self._speed = np.mean(speeds, axis=0) if speeds else None
         self._h = np.diff(self._t)
         self._unit = float(np.median(self._h))
+        self._longest = min(MOST_S, MOST_SHARE * float(self._t[-1] - self._t[0]))
         off, turned = _spikes(np.column_stack([x, y])), _spikes(theta[:, None])
         self._dx, self._dy = np.diff(x), np.diff(y)
         self._theta = np.interp(self._t, self._t[~turned], theta[~turned])
@@ -211,7 +215,7 @@ class _Ways:
     def late(self) -> float:
         """s by which the heading is late, positions if it is negative; 0: nobody can tell."""
         guess = self._guess()
-        if not LEAST_ROWS * self._unit < abs(guess) / SHIFTS[0] or abs(guess) * SHIFTS[0] > MOST_S:
+        if not LEAST_ROWS * self._unit < abs(guess) / SHIFTS[0] or abs(guess) * SHIFTS[0] > self._longest:
             return 0.0
         self._theta = less_noise(self._t, self._theta)[0]
         ways, still = self._of(0.0), self._still(0.0)
@@ -228,7 +232,7 @@ class _Ways:
         found = [self._shifted(by) for by in tried]
         best = _peak(tried, found)
         most = max(self._shifted(best), *found)
-        if not (LEAST_ROWS * self._unit < abs(best) < MOST_S and most > max(nats + CLEARLY, leading)):
+        if not (LEAST_ROWS * self._unit < abs(best) < self._longest and most > max(nats + CLEARLY, leading)):
             return 0.0
         if not self._all_the_time(best, ways, [*still, *slides]):
             return 0.0

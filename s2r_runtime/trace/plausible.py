@@ -7,8 +7,8 @@ mistake taken back it foretells well (E < WELL, and by far better): then that is
 that nothing else follows (a car's speed) may be wrong alone: the same with the largest in the place of the mean, and NOTHING_ALONE.
 A position and its rate, or all states, may be so many times too large together (degrees, cm), or of the other sign. Where inputs so many
 times larger do the same (a mass under a force), only the number itself tells: 180/pi to EXACTLY is no mass.
-What an input that does nothing, or a steady push (wind, a slope), explains nearly as well is no mistake, and neither is what would part a
-position from its rate.
+What an input that does nothing, or a steady push (wind, a slope), explains nearly as well is no mistake, and neither is what a heading
+that is off explains clearly better, or what would part a position from its rate.
 
 Inputs that come after the motion that they cause are on another clock: the model foretells a tenth of a second far better with the inputs
 earlier by some steps than with any delay. Where that lead grows over the recording, the clocks run at different rates. Friction makes a
@@ -36,7 +36,7 @@ from s2r_runtime.trace.never_measured import check_measured
 from s2r_runtime.trace.residual import Index, acting, advanced, predicted, rollout, rollout_starts, steps_of
 from s2r_runtime.trace.scales import SCALES, Scale, axis_pairs, groups
 from s2r_runtime.trace.streams import Stream
-from s2r_runtime.trace.unforetold import FEWEST_STARTS, each_unforetold, steps_ahead, trimmed, unforetold
+from s2r_runtime.trace.unforetold import FEWEST_STARTS, each_unforetold, some_starts, steps_ahead, trimmed, unforetold, ways_of
 
 Array = NDArray[np.float64]
 Change = Callable[[Array], Array]
@@ -132,11 +132,14 @@ def _check_columns(model: ComposedModel, data: Dataset) -> None:
     mistakes = list(_mistakes(model))
     known = zip(_if_each_taken_back(model, few, mistakes), mistakes, strict=True)
     tried = [(e, m) for e, m in known if e is not None and _moves_as_well(model, few, m)]
-    otherwise = _otherwise(model, few)
     for measure, nothing in ((np.mean, NOTHING), (np.max, NOTHING_ALONE)):
         as_it_is = float(measure(every))
         best, said = min([(float(measure(e)), m.said) for e, m in tried if measure(e) < m.well], default=(math.inf, ""))
-        if as_it_is > nothing and best < min([BETTER * as_it_is, *(DEAD * float(measure(e)) for e in otherwise)]):
+        if as_it_is <= nothing or best >= BETTER * as_it_is:
+            continue
+        if _heading_off(model, few, measure) < DEAD * best:
+            continue
+        if best < DEAD * min((float(measure(e)) for e in _otherwise(model, few)), default=math.inf):
             raise RecordingError(f"{data.source}: {said}: so read, the model errs by {best:.0%} of the motion; as it is, by {as_it_is:.0%}")
 
 
@@ -166,6 +169,8 @@ def _check_scales(model: ComposedModel, data: Dataset) -> None:
     for e, (group, scale) in sorted(zip(_errs(model, few, changes), offered, strict=True), key=lambda one: one[0]):
         if not e < (limit if scale.times >= FAR else min(limit, SURELY)):
             return
+        if _heading_off(model, few, np.mean) < DEAD * e:
+            continue
         if scale.zero == 0.0 and not e < pushed:  # another zero is a steady push, told from others by its number
             continue
         gains = (every_input, *([j] for j in every_input if 1.0 / FAR < abs(scale.times) < FAR))
@@ -352,6 +357,20 @@ def _otherwise(model: ComposedModel, data: Dataset) -> list[Array]:
     """E where it is no mistake: each input by itself does nothing; something pushes steadily (wind, a slope)."""
     dead = _if_each_taken_back(model, data, [_mistake("inputs", "", partial(_scaled, [j], 0.0)) for j in range(len(model.inputs))])
     return [e for e in (*dead, unforetold(model, data, pushed=True)) if e is not None]
+
+
+def _heading_off(model: ComposedModel, data: Dataset, measure: Callable[[Array], np.floating]) -> float:
+    """E with the heading turned by what the way goes aside of it, all in all; infinite where there is none. A robot that hardly turned goes
+    much the same with axes exchanged or mirrored.
+    """
+    starts = some_starts(data)
+    if not {"x", "y", "theta"} <= set(model.states) or not len(starts):
+        return math.inf
+    way, foretold = ways_of(model, data, starts)
+    x, y, theta = (model.states.index(name) for name in ("x", "y", "theta"))
+    by = np.angle(np.nansum((way[:, x] + 1j * way[:, y]) * (foretold[:, x] - 1j * foretold[:, y])))
+    (turned,) = _if_each_taken_back(model, data, [_mistake("states", "", partial(_rescaled, [theta], 1.0, -float(by)))])
+    return math.inf if turned is None else float(measure(turned))
 
 
 def _moves_as_well(model: ComposedModel, data: Dataset, mistake: _Mistake) -> bool:

@@ -64,6 +64,16 @@ def some_starts(data: Dataset) -> Index:
     return starts if len(starts) >= FEWEST_STARTS else starts[:0]
 
 
+def ways_of(model: ComposedModel, data: Dataset, starts: Index) -> tuple[Array, Array]:
+    """(n, nx) of each rollout: how far it went, and how far it was foretold to go."""
+    with np.errstate(all="ignore"):
+        error = rollout(model, data, acting(model, data), starts, steps_ahead(data)).error
+    rows = starts + np.searchsorted(first_steps(data), starts, side="right") - 1
+    y = np.concatenate([run.y for run in data.runs])
+    gone = model.difference(y[rows + steps_ahead(data)].copy(), y[rows])
+    return gone, gone - error
+
+
 def shares(model: ComposedModel, data: Dataset, starts: Index, error: Array, among: list[int] | None, pushed: bool) -> Array | None:
     """Errors (n, nx) over how far each state goes."""
     if not len(starts):
