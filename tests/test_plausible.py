@@ -293,6 +293,24 @@ def test_friction_in_a_loop_is_no_clock_that_is_late(seed, friction, dry):
     check_plausible(model, from_streams(model, [(Stream(t, np.array(rows)), Stream(t, np.array(forces)))], "here.csv"))
 
 
+@pytest.mark.parametrize("hertz", [2.0, 4.3, 7.0])
+@pytest.mark.parametrize("dry", [0.2, 0.5])
+def test_dry_friction_on_a_fast_sine_is_no_clock_that_is_late(hertz, dry):
+    """The joint turns round while it is foretold: how it went at the start says little of which way friction pushed since."""
+    model, dt, n = compose(ModelSpec("joint", 0.002)), 0.002, 700
+    t = dt * np.arange(n)
+    u = np.sin(2.0 * np.pi * hertz * t + 0.4)[:, None]
+    friction = EffectSpec("coulomb_friction", "qd", {"force_positive": 0.8 * dry, "force_negative": 1.2 * dry})
+    robot = compose(ModelSpec("joint", dt, {}, (EffectSpec("input_gain", "force", {"gain": 0.8}), friction)))
+    x, hidden, rows = np.zeros((1, 2)), robot.at_rest(1), []
+    for row in u:
+        rows.append(x[0])
+        x, hidden = robot.step(x, row[None], hidden)
+    y = np.array(rows)
+    y = y + np.random.default_rng(4).normal(size=y.shape) * 0.02 * y.std(axis=0)
+    check_plausible(model, from_streams(model, [(Stream(t, y), Stream(t, u))], "here.csv"))
+
+
 def test_a_joint_whose_clock_is_late_is_still_found():
     name = "joint"
     y, u = _driven(name)

@@ -33,7 +33,7 @@ from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.accelerations import check_accelerations
 from s2r_runtime.trace.dataset import Dataset, Run, regridded
 from s2r_runtime.trace.never_measured import check_measured
-from s2r_runtime.trace.residual import Index, acting, advanced, predicted, rollout, rollout_starts, steps_of
+from s2r_runtime.trace.residual import Index, acting, advanced, first_steps, predicted, rollout, rollout_starts, steps_of
 from s2r_runtime.trace.scales import SCALES, Scale, axis_pairs, groups
 from s2r_runtime.trace.streams import Stream
 from s2r_runtime.trace.unforetold import FEWEST_STARTS, each_unforetold, some_starts, steps_ahead, trimmed, unforetold, ways_of
@@ -450,7 +450,7 @@ def _check_clocks(model: ComposedModel, data: Dataset) -> None:
     if len(starts) < FEWEST_STARTS:
         return
     size = np.median(np.abs(_errors(model, few, 0, starts, ahead)), axis=0) / 0.6745 + 1e-12
-    aside = _pushed_aside(model, few, starts)
+    aside = _pushed_aside(model, few, starts, ahead)
 
     def costs(lead: int, of: Dataset = few) -> list[float]:
         z = _errors(model, of, lead, starts, ahead) / size
@@ -512,17 +512,21 @@ def _errors(model: ComposedModel, data: Dataset, lead: int, starts: Index, ahead
     return np.nan_to_num(error, nan=1e300, posinf=1e300, neginf=-1e300)
 
 
-def _pushed_aside(model: ComposedModel, data: Dataset, starts: Index) -> Array | None:
-    """(n, k) what friction and springs could go with at the start of rollouts: each state, and which way it goes. None for a robot on a
-    plane, whose inputs set its speeds: what it does now tells what was asked a moment ago.
+def _pushed_aside(model: ComposedModel, data: Dataset, starts: Index, ahead: int) -> Array | None:
+    """(n, k) what friction and springs could go with in rollouts: each state at the start, which way it goes there, and how much of the
+    rollout a rate goes either way. None for a robot on a plane, whose inputs set its speeds: what it does now tells what was asked a
+    moment ago.
     """
     if {"x", "y", "theta"} <= set(model.states):
         return None
-    begin = np.cumsum([0] + [len(run.y) - 1 for run in data.runs])
-    y = np.concatenate([run.y for run in data.runs])[starts + np.searchsorted(begin, starts, side="right") - 1]
+    begin = first_steps(data)
+    every = np.concatenate([run.y for run in data.runs])
+    rows = starts + np.searchsorted(begin, starts, side="right") - 1
     rates = [axis.velocity for axis in axes(model.nominal)]
+    y = every[rows]
     y = y - np.where(np.isin(np.arange(y.shape[1]), rates), 0.0, y.mean(axis=0))
-    return np.column_stack([np.ones(len(y)), y, np.sign(y)])
+    ways = np.cumsum(np.nan_to_num(np.sign(every[:, rates])), axis=0)
+    return np.column_stack([np.ones(len(y)), y, np.sign(y), (ways[rows + ahead] - ways[rows]) / ahead])
 
 
 def _less(z: Array, aside: Array) -> Array:
