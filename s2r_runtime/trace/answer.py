@@ -33,6 +33,7 @@ from s2r_runtime.trace.scores import name_of
 from s2r_runtime.trace.selection import Selection
 from s2r_runtime.trace.shrinkage import drawn_in
 from s2r_runtime.trace.slots import Slot, values_of
+from s2r_runtime.trace.unplaced import before_changes
 from s2r_runtime.trace.verdict import Verdict, asked, final_fit, verdict_of, worth_its_risk
 
 Array = NDArray[np.float64]
@@ -167,6 +168,7 @@ def _recorded(
         measured_forces=dataset.measured_forces,
         behind=dataset.behind,
         forgetting=checked.data.forgetting,
+        unplaced=len(before_changes(checked.data)) if dataset.unplaced else 0,
         unconfirmed=tuple((final.model.effects[place].effect.name, final.model.effects[place].channel) for place in idle),
         domain=domain_of(model, (given.data, given.steps), (judged_on.data, judged_on.steps)),
         could_see=visible(given, final, chosen.tried),

@@ -162,6 +162,8 @@ class Dataset:
     """s by which states came late against others, and were taken earlier (`late_poses`)."""
     from_first: bool = False
     """The first rows of runs count, whatever the model makes of them: the tracer found nothing that remembers what was before."""
+    unplaced: bool = False
+    """Commands changed between rows, nobody knows when: transitions in which one does are left out (`unplaced`)."""
     forgetting: tuple[tuple[float, float], ...] = ()
     """From and to, s: first rows of runs that are left out, in which something may act on that nobody recorded (`beginning`)."""
 
@@ -349,7 +351,7 @@ def regridded(data: Dataset, model: ComposedModel, in_parts: int = 0, substeps: 
     """The same recording on the grid of a model with another step. in_parts, substeps: as `from_streams`."""
     again = from_streams(model, data.segments, data.source, data.digests, data.paths, data.reconstruction, in_parts, substeps)
     again = replace(again, commanded=data.commanded, measured_forces=data.measured_forces)
-    return replace(again, way=data.way, noisy=data.noisy, behind=data.behind, from_first=data.from_first)
+    return replace(again, way=data.way, noisy=data.noisy, behind=data.behind, from_first=data.from_first, unplaced=data.unplaced)
 
 
 def thinned(

@@ -348,9 +348,9 @@ def _of_states(
         yield "position", [one, *position, *squares, *(a**3 for a in position)], [*body, *world]
         for a in position:
             yield "position", [f(np.pi * k * a) for k in range(1, WAVES + 1) for f in (np.sin, np.cos)], world or body
-        moving = _moving(model, y)
-        if moving:
-            yield "position", [c * f for c in _patches(position) for f in moving], body
+        rubbed = [term for i in _speeds(model) for term in _rubbed(_patches(position), y[:, i], _pushing(body, i))]
+        if rubbed:
+            yield "position", rubbed, None
     speed = [_scaled(y[:, i], centred=False) for i, name in enumerate(model.states) if name in VELOCITIES]
     if speed:
         known |= set(VELOCITIES)
@@ -384,7 +384,21 @@ def _not_its_rate(given: Problem, model: ComposedModel) -> Iterator[Terms]:
 
 def _moving(model: ComposedModel, y: Array) -> Terms:
     """What friction goes with, of each speed of the states y (n, nx)."""
-    return [f for i, name in enumerate(model.states) if name in VELOCITIES for f in _dry(y[:, i])]
+    return [f for i in _speeds(model) for f in _dry(y[:, i])]
+
+
+def _speeds(model: ComposedModel) -> list[int]:
+    return [i for i, name in enumerate(model.states) if name in VELOCITIES]
+
+
+def _pushing(directions: Sequence[Array], i: int) -> list[Array]:
+    """Those that push state i."""
+    return [d for d in directions if np.any(d[:, i])]
+
+
+def _rubbed(patches: Terms, v: Array, directions: Sequence[Array]) -> Terms:
+    """Friction of one speed on patches of the floor: it brakes that speed, and no other."""
+    return _push([c * f for c in patches for f in _dry(v)], directions)
 
 
 def _dry(v: Array) -> tuple[Array, Array]:

@@ -86,6 +86,8 @@ class TraceResult:
     """s by which states came late against others of the pose, and were taken earlier."""
     forgetting: tuple[tuple[float, float], ...] = ()
     """As the dataset's: first rows of runs of the recording that were left out, from and to, s."""
+    unplaced: int = 0
+    """Transitions that were left out since a command changed in them, nobody knows when."""
     domain: tuple[Range, ...] = ()
     """Of each state, then each input: where it was fitted or judged. Beyond that nothing speaks for what was found."""
 
@@ -136,6 +138,11 @@ class TraceResult:
         for stretches, of in ((self.forgetting, ""), (of_test, f" of {self.held.data.source}")):
             each = ", ".join(f"{a:.4g} to {b:.4g} s" for a, b in stretches[:3]) + (", ..." if len(stretches) > 3 else "")
             lines += [f"left out: {each}{of}; what acts there may follow a command from before the recording"] if stretches else []
+        if self.unplaced:
+            lines.append(
+                f"left out: {self.unplaced} transitions in which a command changes; it changed between the rows, which do not say when "
+                "(record commands with stamps of their own)"
+            )
         lines += self._inputs_taken()
         if self.unconfirmed:
             names = ", ".join(f"{name} on {channel}" for name, channel in self.unconfirmed)
@@ -237,6 +244,7 @@ class TraceResult:
             "inputs_measured": self.measured_forces,
             "inputs_late": self.way.late,
             "inputs_changed_within": self.way.within,
+            "changes_left_out": self.unplaced,
             "unconfirmed": [{"name": name, "channel": channel} for name, channel in self.unconfirmed],
             "seen_within": {one.name: one.to_json() for one in self.domain},
             "step_s": self.nominal.dt,

@@ -45,6 +45,7 @@ from s2r_runtime.trace.second_look import astray, finer, once_more
 from s2r_runtime.trace.selection import MOST, Selection, all_dated, select
 from s2r_runtime.trace.straight import acted, alike_laid, changed_within, commanded, noisy, sampled, samples_of, straight, way_of
 from s2r_runtime.trace.throttled import refuted, says_forces
+from s2r_runtime.trace.unplaced import before_changes, only_before_changes
 from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import confirmed, foretold_too
 from s2r_runtime.trace.ways import Way, moving
@@ -122,6 +123,16 @@ def _traced(
     """parts: S, of each step, where they were asked for (`finer`). under: what was found before, under which more faults show."""
     weights, kind = norm
     asked, as_recorded = model, (dataset, test)
+
+    def _less_changes() -> TraceResult | None:
+        """Without the transitions in which commands change, if that leaves nothing."""
+        less = replace(as_recorded[0], unplaced=True), None if as_recorded[1] is None else replace(as_recorded[1], unplaced=True)
+        try:
+            result = _traced(less[0], asked, less[1], horizon, seed, _from(90.0, say), norm, parts, under)
+        except NotEnoughEvidence:
+            return None
+        return None if _structure_of(result) else result
+
     if not model.inputs:
         raise NotEnoughEvidence(f"{dataset.source}: the model has no inputs; nothing can be traced of a robot that is asked nothing")
     model, dataset, test = alike(_in_parts(model, dataset), dataset, test)
@@ -133,8 +144,8 @@ def _traced(
     check_plausible(model, dataset)
     dataset, test = from_one_place(model, dataset), None if test is None else from_one_place(model, test)
     say(0.0, 100.0, "looking for faults of measurement")
-    checked = check(model, with_history(model, dataset), under)
-    tested = None if test is None else check(model, with_history(model, test), under)
+    checked = _checked(model, dataset, under)
+    tested = None if test is None else _checked(model, test, under)
     seen = fit_mask(checked.data, seed, everything=test is not None)
     cut = _cut(checked, seen, tested, model, horizon)
     ahead = max(1, min(round(horizon / dataset.dt), len(cut.fit_part.steps) // 4))
@@ -146,7 +157,8 @@ def _traced(
     chosen = select(cut.given, model, ahead, lambda share: say(5.0 + 55.0 * share, 100.0, "looking for effects"), 1 if hidden else MOST)
     lines = _straight(as_recorded, asked, parts, checked, seen, cut.given, chosen.fit)
     if lines is not None:
-        return _traced(lines[0], asked, lines[1], horizon, seed, _from(60.0, say), norm, parts, under)
+        placed = _traced(lines[0], asked, lines[1], horizon, seed, _from(60.0, say), norm, parts, under)
+        return (_less_changes() if lines[0].way.within and _structure_of(placed) else None) or placed
     for most in range(2, MOST + 1) if hidden else (MOST,):
         if not _told_otherwise(cut.given, chosen.fit):
             break
@@ -187,6 +199,11 @@ def _traced(
         and any(_more_faults(chosen.fit, model, one, there) for one, there in ((dataset, checked), (test, tested)))
     ):
         return _traced(as_recorded[0], asked, as_recorded[1], horizon, seed, _from(90.0, say), norm, parts, chosen.fit.model)
+    untimed = not (dataset.unplaced or dataset.commanded or dataset.way) and commanded(dataset)
+    if untimed and only_before_changes(whole.given, whole.everywhere(chosen.fit)):
+        less = _less_changes()
+        if less is not None:
+            return less
     if result.verdict == "unexplained" and chosen.fit.added and not {*result.depends_on} - {"noise"}:
         result = replace(result, depends_on=whole.likeliest or result.depends_on)
     if result.verdict in {"traced", "ambiguous"} and whole.in_one_stretch(chosen):
@@ -225,6 +242,17 @@ def _more_faults(fit: Fit, model: ComposedModel, data: Dataset | None, checked: 
     return check(model, with_history(model, data), fit.model).faults != checked.faults
 
 
+def _checked(model: ComposedModel, data: Dataset, under: ComposedModel | None) -> Checked:
+    """Without its faults, and without transitions in which a command changed that could not be placed."""
+    found = check(model, with_history(model, data), under)
+    return replace(found, left_out=(*found.left_out, *before_changes(found.data))) if data.unplaced else found
+
+
+def _structure_of(result: TraceResult) -> set[str]:
+    """Tokens of what is left."""
+    return {*result.depends_on} - {"noise"}
+
+
 def _nothing_remembers(chosen: Selection) -> bool:
     """Whether by nothing that was found, nor by what ties with it, an input acts on that was asked before."""
     models = [chosen.fit.model, *(s.fit.model for s in chosen.rivals if s.fit is not None)]
@@ -255,7 +283,7 @@ def _straight(
     fit: Fit,
 ) -> tuple[Dataset, Dataset | None] | None:
     """The recordings with inputs that moved on between the rows, if the motion says that they did."""
-    if recorded[0].way or recorded[0].measured_forces or not (sampled(recorded[0]) or commanded(recorded[0])):
+    if recorded[0].way or recorded[0].unplaced or recorded[0].measured_forces or not (sampled(recorded[0]) or commanded(recorded[0])):
         return None
     less, data, test = alike(asked, *recorded)  # a recording without a state is laid for the model without it
     samples = samples_of(data)

@@ -57,6 +57,11 @@ each is a little off.
 TWICE = 2.0
 """Times what the best dictionary explains that several together must explain to be told in its place: it does not do most of it."""
 
+QUIET = 2.0
+"""Nats of the best dictionary at first look below which no shape is asked about: it must explain as much as an effect to count, and they
+say, term by term, whatever a shape does.
+"""
+
 HALF = 0.5
 """Of what is told: a dictionary that foretells other blocks of time best, and is as likely as that, is told, too."""
 
@@ -99,19 +104,19 @@ class Whole:
 
     def still(self, other: Selection, structure: Structure) -> bool:
         """Whether another selection clearly leaves what was told as structure before."""
-        fit = self._everywhere(other.fit)
+        fit = self.everywhere(other.fit)
         return still_left(left_of(self.given, fit), structure.tokens, self.nominal, self._horizon)
 
     def falls_short(self, other: Selection) -> bool:
         """Whether another selection explains clearly less than the best that has no name: then it leaves what that explains beyond it."""
-        told = max(gain(self._everywhere(other.fit), self.nominal), 0.0)
+        told = max(gain(self.everywhere(other.fit), self.nominal), 0.0)
         return self._looks.most > told and self.unnamed.gain > SHORT * told + CLEAR
 
     def in_one_stretch(self, chosen: Selection) -> bool:
         """Whether a name comes from one stretch of the recording."""
-        return in_one_stretch(self.given, self._everywhere(chosen.fit))
+        return in_one_stretch(self.given, self.everywhere(chosen.fit))
 
-    def _everywhere(self, fit: Fit) -> Fit:
+    def everywhere(self, fit: Fit) -> Fit:
         """Fitted to all of the recording: numbers of a part are a little off elsewhere, and that is no structure."""
         if id(fit) not in self._fitted:
             here = evaluate(self.given, fit.model)
@@ -121,7 +126,7 @@ class Whole:
     def _structure(self, chosen: Fit) -> Structure:
         if not chosen.added:
             return self._of_nominal()
-        fit = self._everywhere(chosen)
+        fit = self.everywhere(chosen)
         looks = Looks(left_of(self.given, fit))
         found = lack_of_fit(looks, self.nominal, self._horizon)
         if crowded(fit) or self._patchwork(fit):
@@ -227,5 +232,7 @@ class Whole:
 
     @cached_property
     def _shape(self) -> Better | None:
-        """The shape that explains most of it."""
+        """The shape that explains most of it; none where no dictionary says anything."""
+        if self._looks.most < QUIET:
+            return None
         return best_shape(self.given, self.nominal, self._horizon)

@@ -1,0 +1,83 @@
+"""Commands that changed between two rows, nobody knows when: the transitions in which they did are left out and told, and no others."""
+
+import numpy as np
+import pytest
+from trace_robots import GEOMETRY, drive
+
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.trace.dataset import from_streams
+from s2r_runtime.trace.streams import Stream
+from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.unplaced import before_changes
+
+DT, PARTS, ROWS = 0.05, 20, 1200
+NOISE = {"differential_drive": [1e-3, 1e-3, 1e-3, 5e-3, 5e-3], "bicycle": [1e-3, 1e-3, 1e-3, 2e-3], "unicycle": [1e-3, 1e-3, 1e-3]}
+BOUNDS = {"differential_drive": ([-3.0, -3.0], [8.0, 8.0]), "bicycle": ([-0.4, 0.3], [0.4, 1.5]), "unicycle": ([0.1, -1.2], [0.8, 1.2])}
+
+
+def _model(name):
+    return compose(ModelSpec(name, DT, GEOMETRY.get(name, {}), (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),)))
+
+
+def _filled_up(name, seed=0, on_rows=False, effects=(), after=lambda u: u, rows=ROWS):
+    """Streams of a table whose commands came every 12.7 rows, or on rows, and stand on the rows from then on. after: what acts of them."""
+    rng = np.random.default_rng(seed)
+    every = 12 * PARTS if on_rows else int(12.7 * PARTS)
+    low, high = BOUNDS[name]
+    levels = rng.uniform(low, high, (PARTS * rows // every + 1, len(low)))
+    fine = np.repeat(levels, every, axis=0)[: PARTS * rows]
+    y = drive(rng, name, after(fine)[None], list(effects), DT / PARTS, 0.0)[0][:-1:PARTS]
+    t = DT * np.arange(rows)
+    return Stream(t, y + rng.normal(size=y.shape) * NOISE[name]), Stream(t, fine[::PARTS])
+
+
+@pytest.mark.parametrize("name", NOISE)
+def test_commands_of_another_clock_leave_out_the_transitions_in_which_they_change(name):
+    model = _model(name)
+    data = from_streams(model, [_filled_up(name)], "here.csv")
+    found = trace(data, model)
+    assert found.verdict == "none"
+    assert found.depends_on == ()
+    told, json = " ".join(found.text().split()), found.to_json()
+    if json["inputs_changed_within"]:  # the motion said when each came
+        assert json["changes_left_out"] == 0
+        return
+    changed = np.flatnonzero(np.any(np.diff(data.segments[0][1].values, axis=0), axis=1))
+    assert json["changes_left_out"] == len(before_changes(data)) == len(changed)
+    assert f"left out: {json['changes_left_out']} transitions in which a command changes" in told
+
+
+def test_an_effect_beside_them_is_named_and_the_other_recording_loses_its_changes_too():
+    name = "differential_drive"
+    model, slow = _model(name), [("input_gain", "cmd_left", {"gain": 0.9})]
+    data, test = (from_streams(model, [_filled_up(name, seed, effects=slow)], f"{seed}.csv") for seed in (1, 2))
+    found = trace(data, model, test=test)
+    assert {(e.name, e.channel) for e in found.effects} == {("input_gain", "cmd_left")}
+    assert found.effects[0].parameters["gain"][0] == pytest.approx(0.9, abs=0.002)
+    assert found.unplaced == len(before_changes(data))
+    assert not {(i, k) for i, k in before_changes(test)} & {(0, int(place)) for place in found.held.steps.place}
+
+
+def test_a_lag_on_rows_is_a_lag():
+    name = "differential_drive"
+    slow = [("input_lag", channel, {"time_constant": 2.0 * DT}) for channel in ("cmd_left", "cmd_right")]
+    model = _model(name)
+    found = trace(from_streams(model, [_filled_up(name, on_rows=True, effects=slow)], "here.csv"), model)
+    assert {(e.name, e.channel) for e in found.effects} >= {("input_lag", "cmd_left")}
+    assert found.unplaced == 0
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+def test_what_shoots_over_after_a_change_is_not_left_out(rows):
+    """It has no name, and comes after the change: leaving out the transitions before would explain nothing."""
+
+    def shoots_over(u):
+        late = np.concatenate([np.repeat(u[:1], rows * PARTS, axis=0), u[: -rows * PARTS]])
+        return u + 0.4 * (u - late)
+
+    name = "differential_drive"
+    model = _model(name)
+    found = trace(from_streams(model, [_filled_up(name, on_rows=True, after=shoots_over)], "here.csv"), model)
+    assert found.verdict == "unexplained" or found.depends_on
+    assert found.unplaced == 0
