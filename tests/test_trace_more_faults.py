@@ -148,3 +148,25 @@ def test_inputs_that_were_sent_twice_with_one_stamp_warn_nobody():
         states.values[k] = x[0]
     noisy = Stream(states.t, states.values + rng.normal(size=(600, 2)) * [1e-4, 1e-3])
     assert trace(from_streams(JOINT, [(noisy, Stream(t, u))], "here"), JOINT).verdict == "none"
+
+
+@pytest.mark.parametrize(("at", "wrong_before"), [(0.38, False), (0.2, False), (0.6, True), (0.75, True)])
+def test_of_a_heading_that_jumps_for_good_the_part_is_wrong_that_leaves_the_course(at, wrong_before):
+    """However long that part is; a compass that was put right is no effect."""
+    rng, n = np.random.default_rng(8), 1200
+    u = np.repeat(rng.uniform([0.1, -2.0], [0.25, 2.0], (n // 15, 2)), 15, axis=0)
+    robot, x, rows = CART, np.zeros((1, 3)), []
+    hidden = robot.at_rest(1)
+    for row in u:
+        rows.append(x[0])
+        x, hidden = robot.step(x, row[None], hidden)
+    y = np.array(rows) + rng.normal(size=(n, 3)) * [1e-3, 1e-3, 7e-3]
+    jump = round(at * n)
+    y[slice(0, jump) if wrong_before else slice(jump, n), 2] += 0.5
+    found = trace(from_arrays(CART, [(y, u[:-1])]), CART)
+    assert found.verdict == "sensor_fault"
+    assert not found.effects
+    (fault,) = found.faults
+    near = pytest.approx(0.05 * jump, abs=0.3)
+    assert fault.channel == "theta"
+    assert (fault.from_s, fault.to_s) == ((0.0, near) if wrong_before else (near, pytest.approx(0.05 * (n - 1), abs=0.3)))

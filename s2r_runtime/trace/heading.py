@@ -4,6 +4,8 @@
     D_k = arg(sum d^2) / 2 over a window: course less heading, whichever way the robot drives, in (-pi/2, pi/2]
     C_k   running sum of the yaw residual, less what of it is constant or in proportion to the yaw that the model foresees
 
+Of a heading that is off from some time on, or up to it, the part is wrong in which it is not the course.
+
 A robot that slips sideways, drifts or is measured beside its axle has a course of its own, but turns as its heading says. A heading that is
 wrong by b has D lower by b, and got there by a yaw residual that sums to b: only both together are a fault. At high rates steps are taken
 over several rows, until they are long beside the noise.
@@ -33,6 +35,11 @@ AGREE = 0.4
 
 CLEAR = 6.0
 """Standard deviations of a position that a step must be long, at its upper quartile, for its course to be told."""
+
+RIGHT, LEAST_RIGHT, FEWEST_RIGHT = 0.35, 0.1, 150
+"""Of a jump: how near the course must be to the heading on one side of it, and to the jump beside it on the other, to say which side is
+right; and the share of a run, and rows, that must be left then.
+"""
 
 SHORTEST = 5
 """Rows that must be off."""
@@ -81,7 +88,41 @@ def departures(y: Array, turned: Array, foreseen: Array, noise: float) -> list[O
         edges = [(begin, int(there[0]))] * (begin > 0) + [(int(there[-1]), end)] * (end < len(off) - 1)
         if _agree(off, total, begin, end, half) or (edges and all(_agree(off, total, *edge, half) for edge in edges)):
             found.append(_bounds(off, left, begin, end, angle, half, every))
-    return _joined(found)
+    joined = _joined(found)
+    return [_wrong_side(joined[0], y)] if len(joined) == 1 else joined
+
+
+def wrong_before(y: Array, step: int, jump: float) -> bool | None:
+    """Whether a heading that jumps in a step was wrong before (True), or is after it (False), by the course; None where that does not say,
+    or would leave too little. y: (K+1, 3) x, y, theta.
+    """
+    before, after = _course(y[: step + 1]), _course(y[step + 1 :])
+    there = np.asarray(np.isfinite(y).all(axis=1))
+    near, least = RIGHT * abs(jump), max(LEAST_RIGHT * np.count_nonzero(there), FEWEST_RIGHT)
+    if abs(after) < near and abs(before - jump) < near and np.count_nonzero(there[step + 1 :]) > least:
+        return True
+    return False if abs(before) < near and abs(after + jump) < near and np.count_nonzero(there[: step + 1]) > least else None
+
+
+def _course(y: Array) -> float:
+    """Course less heading, all in all, in (-pi/2, pi/2]; NaN if it never moved. Squares of noise go anywhere."""
+    step, turned = np.diff(y[:, :2], axis=0), np.exp(-0.5j * (y[1:, 2] + y[:-1, 2]))
+    squared = ((step[:, 0] + 1j * step[:, 1]) * turned) ** 2
+    total = complex(np.nansum(squared))
+    return float(0.5 * np.angle(total)) if total else float("nan")
+
+
+def _wrong_side(off: Off, y: Array) -> Off:
+    """The other part of a run in two, if that is the wrong one."""
+    first, last = int(np.argmax(np.isfinite(y[:, 2]))), len(y) - 1
+    from_first = off.first <= first
+    if from_first == (off.last >= last):
+        return off
+    step, jump = (off.last, -off.angle) if from_first else (off.first, off.angle)
+    before = wrong_before(y, step, jump)
+    if before is None or before == from_first:
+        return off
+    return Off(first, step, -jump) if before else Off(step, last, jump)
 
 
 def _joined(found: list[Off]) -> list[Off]:

@@ -19,6 +19,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.fault import SIGMAS, Fault
+from s2r_runtime.trace.heading import wrong_before
 from s2r_runtime.trace.reach import ONE_IN, Reach, predicted
 from s2r_runtime.trace.residual import Acting
 
@@ -38,7 +39,7 @@ BEYOND = 2.2
 """Times the largest move in a step: a command that reverses and is late, or followed with a lag, leaves up to twice that."""
 
 RIGHT_AT_FIRST = 0.3
-"""Of a heading that jumped for good, what was before counts if it is at least this part of the run."""
+"""Of a heading that jumped for good, what was before counts if it is at least this part of the run, unless the course says otherwise."""
 
 BRIEF = 4
 """Rows that a spike lasts at most; a jump that comes back later is an offset."""
@@ -139,11 +140,21 @@ def _take_out(found: Jumps, model: ComposedModel, data: Dataset, i: int, j: int,
     """An offset from step k on, to the end or to the step `back`."""
     run = data.runs[i]
     end = len(run.y) - 1 if back is None else back
-    found.offsets.append(Fault(run.start_s + data.dt * (k + 1), run.start_s + data.dt * end, model.states[j], "offset_jump"))
+    told = _wrong_before(model, run.y, j, k) if back is None else False
+    first, last = (int(np.argmax(np.isfinite(run.y[:, j]))), k) if told else (k + 1, end)
+    found.offsets.append(Fault(run.start_s + data.dt * first, run.start_s + data.dt * last, model.states[j], "offset_jump"))
     found.cut.extend([(i, k)] if back is None else [(i, k), (i, back)])
-    if model.states[j] in model.nominal.angles:  # a heading that is off leaves the motion; it was right at first, if that is long enough
-        off = slice(k + 1, end + 1) if back is not None or k >= RIGHT_AT_FIRST * len(bad) else slice(0, k + 1)
-        bad[off, j] = True
+    if model.states[j] in model.nominal.angles:  # a heading that is off leaves the motion
+        before = told or (told is None and k < RIGHT_AT_FIRST * len(bad))
+        bad[slice(0, k + 1) if before else slice(k + 1, end + 1), j] = True
+
+
+def _wrong_before(model: ComposedModel, y: Array, j: int, k: int) -> bool | None:
+    """Whether a state that jumps in step k was wrong before; None where nothing tells."""
+    if model.states[j] != "theta" or not {"x", "y"} <= set(model.states):
+        return None
+    jump = float(model.difference(y[k + 1 : k + 2].copy(), y[k : k + 1])[0, j])
+    return wrong_before(y[:, [model.states.index("x"), model.states.index("y"), j]], k, jump)
 
 
 def tails_of(model: ComposedModel, data: Dataset, act: Acting, i: int, reach: Reach, sigmas: float = TAIL_SIGMAS) -> Mask:

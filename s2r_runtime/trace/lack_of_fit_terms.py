@@ -356,6 +356,8 @@ def _of_states(
         known |= set(VELOCITIES)
         yield "speed", speed, body
         yield "speed", [f for v in speed for f in (v, np.abs(v) * v, v**3, np.tanh(v / 0.05), np.abs(v))], body
+        if len(speed) > 1:
+            yield "speed", [v * w for i, v in enumerate(speed) for w in speed[: i + 1]], body
     for i, name in enumerate(model.states):
         if name not in known:
             v = _scaled(y[:, i])

@@ -39,7 +39,7 @@ def before_changes(data: Dataset) -> tuple[tuple[int, int], ...]:
     """(run, step) of transitions, measured at both ends, after which another command is held."""
     found = []
     for i, run in enumerate(data.runs):
-        held, there = run.u[:: data.substeps], np.isfinite(run.y).all(axis=1)
+        held, there = run.u[:: data.substeps], np.asarray(np.isfinite(run.y).all(axis=1))
         changes = np.any(held[1:] != held[:-1], axis=1) & there[:-2] & there[1:-1]
         found += [(i, int(k)) for k in np.flatnonzero(changes)]
     return tuple(found)
