@@ -54,7 +54,7 @@ def _told_by_stamps(given: Problem, fit: Fit, base: Fit) -> bool:
     one moment, whenever that was.
     """
     data = given.data
-    if not data.interpolated and not data.uneven and not data.way:
+    if not (data.interpolated or data.uneven or data.way or data.unplaced):
         return True
     there = names(base.model)
     values = values_of(fit.model, fit.free)

@@ -138,7 +138,7 @@ def _pushed_aside(model: ComposedModel, data: Dataset, starts: Index, ahead: int
     rates = [axis.velocity for axis in axes(model.nominal)]
     y = every[rows]
     y = y - np.where(np.isin(np.arange(y.shape[1]), rates), 0.0, y.mean(axis=0))
-    ways = np.cumsum(np.nan_to_num(np.sign(every[:, rates])), axis=0)
+    ways = np.cumsum(np.concatenate([np.zeros((1, len(rates))), np.nan_to_num(np.sign(every[:, rates]))]), axis=0)
     return np.column_stack([np.ones(len(y)), y, np.sign(y), (ways[rows + ahead] - ways[rows]) / ahead])
 
 

@@ -41,6 +41,9 @@ RIGHT, LEAST_RIGHT, FEWEST_RIGHT = 0.35, 0.1, 150
 right; and the share of a run, and rows, that must be left then.
 """
 
+KEPT = 0.3
+"""Of a run that the smaller part must be to be the right one, where a heading went off in more than a step."""
+
 SHORTEST = 5
 """Rows that must be off."""
 
@@ -113,14 +116,15 @@ def _course(y: Array) -> float:
 
 
 def _wrong_side(off: Off, y: Array) -> Off:
-    """The other part of a run in two, if that is the wrong one."""
+    """The other part of a run in two, if that is the wrong one, and leaves enough: some rows beside it are left out, too."""
     first, last = int(np.argmax(np.isfinite(y[:, 2]))), len(y) - 1
     from_first = off.first <= first
     if from_first == (off.last >= last):
         return off
     step, jump = (off.last, -off.angle) if from_first else (off.first, off.angle)
     before = wrong_before(y, step, jump)
-    if before is None or before == from_first:
+    kept = np.isfinite(y[:, 2])[: step + 1] if from_first else np.isfinite(y[:, 2])[step + 1 :]
+    if before is None or before == from_first or np.count_nonzero(kept) < KEPT * np.count_nonzero(np.isfinite(y[:, 2])):
         return off
     return Off(first, step, -jump) if before else Off(step, last, jump)
 

@@ -151,8 +151,8 @@ def _take_out(found: Jumps, model: ComposedModel, data: Dataset, i: int, j: int,
 
 def _wrong_before(model: ComposedModel, y: Array, j: int, k: int) -> bool | None:
     """Whether a state that jumps in step k was wrong before; None where nothing tells."""
-    if model.states[j] != "theta" or not {"x", "y"} <= set(model.states):
-        return None
+    if model.states[j] != "theta" or not {"x", "y"} <= set(model.states) or getattr(model.nominal, "integration", None) is None:
+        return None  # a robot that goes sideways at will has a course of its own
     jump = float(model.difference(y[k + 1 : k + 2].copy(), y[k : k + 1])[0, j])
     return wrong_before(y[:, [model.states.index("x"), model.states.index("y"), j]], k, jump)
 

@@ -22,6 +22,7 @@ from s2r_runtime.trace.fitting import insert
 from s2r_runtime.trace.found import Found, Limit
 from s2r_runtime.trace.power import Visible
 from s2r_runtime.trace.reconstruct import IN_PARTS, Reconstruction
+from s2r_runtime.trace.unplaced import before_changes
 from s2r_runtime.trace.verdict import Verdict
 from s2r_runtime.trace.views import views
 from s2r_runtime.trace.ways import Way
@@ -138,11 +139,16 @@ class TraceResult:
         for stretches, of in ((self.forgetting, ""), (of_test, f" of {self.held.data.source}")):
             each = ", ".join(f"{a:.4g} to {b:.4g} s" for a, b in stretches[:3]) + (", ..." if len(stretches) > 3 else "")
             lines += [f"left out: {each}{of}; what acts there may follow a command from before the recording"] if stretches else []
-        if self.unplaced:
-            lines.append(
-                f"left out: {self.unplaced} transitions in which a command changes; it changed between the rows, which do not say when "
-                "(record commands with stamps of their own)"
-            )
+        apart = self.held.data if self.held.data.source != self.source else None
+        for count, of in (
+            (self.unplaced, ""),
+            (len(before_changes(apart)) if apart and apart.unplaced else 0, f" of {apart.source}" if apart else ""),
+        ):
+            if count:
+                lines.append(
+                    f"left out: {count} transitions{of} in which a command changes: it changed between the rows, and nothing says when "
+                    "(record commands with stamps of their own)"
+                )
         lines += self._inputs_taken()
         if self.unconfirmed:
             names = ", ".join(f"{name} on {channel}" for name, channel in self.unconfirmed)

@@ -8,10 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.dataset import Dataset, in_finer_parts
 from s2r_runtime.trace.errors import Held, at_most_seen, judge, noise_floor
-from s2r_runtime.trace.faults import check
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, foretold, problem
 from s2r_runtime.trace.hidden_pairs import two_together
 from s2r_runtime.trace.lack_of_fit import Structure
@@ -20,6 +18,7 @@ from s2r_runtime.trace.residual_noise import Whitener
 from s2r_runtime.trace.retimed import dated
 from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, Scored, names
 from s2r_runtime.trace.selection import Selection, against_rivals, all_dated, called_for, crowded
+from s2r_runtime.trace.unplaced import checked_of
 from s2r_runtime.trace.verdict import confirmed, foretelling, takes_far
 from s2r_runtime.trace.whole import Whole
 
@@ -36,8 +35,8 @@ def finer(
     dataset: Dataset, model: ComposedModel, chosen: Selection, structure: Structure, ahead: int, under: ComposedModel | None = None
 ) -> int | None:
     """Parts of a step in which nothing is left by what was found, or by the model as given, if there are such: then it is what inputs do
-    within steps, or within the parts that they are in already. A step has the mean of what they do, and a position more. under: as `check`
-    has it.
+    within steps, or within the parts that they are in already. A step has the mean of what they do, and a position more. under: as
+    `checked_of` has it.
     """
     data = in_finer_parts(dataset, model)
     if data is None:
@@ -49,8 +48,7 @@ def finer(
         means = _with_means(data)
         if not all(_makes(replace(means, in_parts=False), means, fit) <= INTEGRATES * makes for fit in (chosen.nominal, chosen.fit)):
             return None
-    checked = check(model, with_history(model, data), under)
-    whole = Whole(checked, model, ahead)
+    whole = Whole(checked_of(model, data, under), model, ahead)
     nominal = whole.nominal
     fit = nominal if not chosen.fit.added else fitted(whole.given, nominal, chosen.fit.model)
     return None if whole.structure(replace(chosen, nominal=nominal, fit=fit)).matters else data.substeps

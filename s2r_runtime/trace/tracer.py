@@ -45,7 +45,7 @@ from s2r_runtime.trace.second_look import astray, finer, once_more
 from s2r_runtime.trace.selection import MOST, Selection, all_dated, select
 from s2r_runtime.trace.straight import acted, alike_laid, changed_within, commanded, noisy, sampled, samples_of, straight, way_of
 from s2r_runtime.trace.throttled import refuted, says_forces
-from s2r_runtime.trace.unplaced import before_changes, only_before_changes
+from s2r_runtime.trace.unplaced import checked_of, only_before_changes
 from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import confirmed, foretold_too
 from s2r_runtime.trace.ways import Way, moving
@@ -126,12 +126,14 @@ def _traced(
 
     def _less_changes() -> TraceResult | None:
         """Without the transitions in which commands change, if that leaves nothing."""
-        less = replace(as_recorded[0], unplaced=True), None if as_recorded[1] is None else replace(as_recorded[1], unplaced=True)
+        recorded, judged = as_recorded
+        if judged is not None and not judged.commanded and commanded(judged):
+            judged = replace(judged, unplaced=True)
         try:
-            result = _traced(less[0], asked, less[1], horizon, seed, _from(90.0, say), norm, parts, under)
+            less = _traced(replace(recorded, unplaced=True), asked, judged, horizon, seed, _from(90.0, say), norm, parts, under)
         except NotEnoughEvidence:
             return None
-        return None if _structure_of(result) else result
+        return None if less.verdict == "unexplained" or {*less.depends_on} - {"noise"} else less
 
     if not model.inputs:
         raise NotEnoughEvidence(f"{dataset.source}: the model has no inputs; nothing can be traced of a robot that is asked nothing")
@@ -144,8 +146,8 @@ def _traced(
     check_plausible(model, dataset)
     dataset, test = from_one_place(model, dataset), None if test is None else from_one_place(model, test)
     say(0.0, 100.0, "looking for faults of measurement")
-    checked = _checked(model, dataset, under)
-    tested = None if test is None else _checked(model, test, under)
+    checked = checked_of(model, dataset, under)
+    tested = None if test is None else checked_of(model, test, under)
     seen = fit_mask(checked.data, seed, everything=test is not None)
     cut = _cut(checked, seen, tested, model, horizon)
     ahead = max(1, min(round(horizon / dataset.dt), len(cut.fit_part.steps) // 4))
@@ -158,7 +160,8 @@ def _traced(
     lines = _straight(as_recorded, asked, parts, checked, seen, cut.given, chosen.fit)
     if lines is not None:
         placed = _traced(lines[0], asked, lines[1], horizon, seed, _from(60.0, say), norm, parts, under)
-        return (_less_changes() if lines[0].way.within and _structure_of(placed) else None) or placed
+        untold = placed.verdict == "unexplained" and lines[0].way.within and only_before_changes(cut.given, chosen.fit)
+        return (_less_changes() if untold else None) or placed
     for most in range(2, MOST + 1) if hidden else (MOST,):
         if not _told_otherwise(cut.given, chosen.fit):
             break
@@ -199,8 +202,9 @@ def _traced(
         and any(_more_faults(chosen.fit, model, one, there) for one, there in ((dataset, checked), (test, tested)))
     ):
         return _traced(as_recorded[0], asked, as_recorded[1], horizon, seed, _from(90.0, say), norm, parts, chosen.fit.model)
-    untimed = not (dataset.unplaced or dataset.commanded or dataset.way) and commanded(dataset)
-    if untimed and only_before_changes(whole.given, whole.everywhere(chosen.fit)):
+    untimed = result.verdict in {"none", "unexplained"} and not (dataset.unplaced or dataset.commanded or dataset.way)
+    on_rows = dataset.apart == 1 and not dataset.interpolated and commanded(dataset)
+    if untimed and on_rows and only_before_changes(whole.given, whole.everywhere(chosen.fit)):
         less = _less_changes()
         if less is not None:
             return less
@@ -240,17 +244,6 @@ def _more_faults(fit: Fit, model: ComposedModel, data: Dataset | None, checked: 
     if data is None or checked is None or data.reconstruction is not None or not fit.added:
         return False
     return check(model, with_history(model, data), fit.model).faults != checked.faults
-
-
-def _checked(model: ComposedModel, data: Dataset, under: ComposedModel | None) -> Checked:
-    """Without its faults, and without transitions in which a command changed that could not be placed."""
-    found = check(model, with_history(model, data), under)
-    return replace(found, left_out=(*found.left_out, *before_changes(found.data))) if data.unplaced else found
-
-
-def _structure_of(result: TraceResult) -> set[str]:
-    """Tokens of what is left."""
-    return {*result.depends_on} - {"noise"}
 
 
 def _nothing_remembers(chosen: Selection) -> bool:

@@ -58,8 +58,8 @@ TWICE = 2.0
 """Times what the best dictionary explains that several together must explain to be told in its place: it does not do most of it."""
 
 QUIET = 2.0
-"""Nats of the best dictionary at first look below which no shape is asked about: it must explain as much as an effect to count, and they
-say, term by term, whatever a shape does.
+"""Nats of the best dictionary at first look below which no shape is asked about: it must explain as much as an effect to count. Of 51 made
+recordings in which one did, the best dictionary had 4.8 or more.
 """
 
 HALF = 0.5
