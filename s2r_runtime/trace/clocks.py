@@ -119,7 +119,7 @@ def _least_causal(cost: Callable[[int], float], longest: int, apart: int) -> flo
 
 def _errors(model: ComposedModel, data: Dataset, lead: int, starts: Index, ahead: int) -> Array:
     """(n, nx) after `ahead` steps with the inputs earlier by `lead`."""
-    shifted = replace(data, runs=tuple(_earlier(run, lead * data.substeps) for run in data.runs))
+    shifted = replace(data, runs=tuple(earlier(run, lead * data.substeps) for run in data.runs))
     with np.errstate(all="ignore"):
         error = rollout(model, data, acting(model, shifted), starts, ahead).error
     return np.nan_to_num(error, nan=1e300, posinf=1e300, neginf=-1e300)
@@ -154,7 +154,8 @@ def _parts(z: Array) -> list[Array]:
     return np.array_split(np.minimum(np.abs(z), WILD) ** 2, PARTS)
 
 
-def _earlier(run: Run, rows: int) -> Run:
+def earlier(run: Run, rows: int) -> Run:
+    """With its inputs so many of their rows earlier (later, if negative); the last ones (the first ones) hold."""
     u = np.roll(run.u, -rows, axis=0)
     if rows > 0:
         u[-rows:] = run.u[-1]

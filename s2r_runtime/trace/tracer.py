@@ -124,16 +124,8 @@ def _traced(
     weights, kind = norm
     asked, as_recorded = model, (dataset, test)
 
-    def _less_changes() -> TraceResult | None:
-        """Without the transitions in which commands change, if that leaves nothing."""
-        recorded, judged = as_recorded
-        if judged is not None and not judged.commanded and commanded(judged):
-            judged = replace(judged, unplaced=True)
-        try:
-            less = _traced(replace(recorded, unplaced=True), asked, judged, horizon, seed, _from(90.0, say), norm, parts, under)
-        except NotEnoughEvidence:
-            return None
-        return None if less.verdict == "unexplained" or {*less.depends_on} - {"noise"} else less
+    def again(one: Dataset, other: Dataset | None, begun: float) -> TraceResult:
+        return _traced(one, asked, other, horizon, seed, _from(begun, say), norm, parts, under)
 
     if not model.inputs:
         raise NotEnoughEvidence(f"{dataset.source}: the model has no inputs; nothing can be traced of a robot that is asked nothing")
@@ -159,9 +151,9 @@ def _traced(
     chosen = select(cut.given, model, ahead, lambda share: say(5.0 + 55.0 * share, 100.0, "looking for effects"), 1 if hidden else MOST)
     lines = _straight(as_recorded, asked, parts, checked, seen, cut.given, chosen.fit)
     if lines is not None:
-        placed = _traced(lines[0], asked, lines[1], horizon, seed, _from(60.0, say), norm, parts, under)
+        placed = again(*lines, 60.0)
         untold = placed.verdict == "unexplained" and lines[0].way.within and only_before_changes(cut.given, chosen.fit)
-        return (_less_changes() if untold else None) or placed
+        return (_less_changes(as_recorded, again) if untold else None) or placed
     for most in range(2, MOST + 1) if hidden else (MOST,):
         if not _told_otherwise(cut.given, chosen.fit):
             break
@@ -182,7 +174,7 @@ def _traced(
     if left_out and not dataset.from_first and not structure.matters and dataset.reconstruction is None and _nothing_remembers(chosen):
         # structure may be a memory without a name, and what was reconstructed is as little known where it begins
         also = None if as_recorded[1] is None else replace(as_recorded[1], from_first=True)
-        return _traced(replace(as_recorded[0], from_first=True), asked, also, horizon, seed, _from(80.0, say), norm, parts, under)
+        return again(replace(as_recorded[0], from_first=True), also, 80.0)
     if structure.matters and parts is None:
         more = finer(dataset, model, chosen, structure, ahead, under)
         if more is not None:
@@ -205,7 +197,7 @@ def _traced(
     untimed = result.verdict in {"none", "unexplained"} and not (dataset.unplaced or dataset.commanded or dataset.way)
     on_rows = dataset.apart == 1 and not dataset.interpolated and commanded(dataset)
     if untimed and on_rows and only_before_changes(whole.given, whole.everywhere(chosen.fit)):
-        less = _less_changes()
+        less = _less_changes(as_recorded, again)
         if less is not None:
             return less
     if result.verdict == "unexplained" and chosen.fit.added and not {*result.depends_on} - {"noise"}:
@@ -244,6 +236,20 @@ def _more_faults(fit: Fit, model: ComposedModel, data: Dataset | None, checked: 
     if data is None or checked is None or data.reconstruction is not None or not fit.added:
         return False
     return check(model, with_history(model, data), fit.model).faults != checked.faults
+
+
+def _less_changes(
+    recorded: tuple[Dataset, Dataset | None], again: Callable[[Dataset, Dataset | None, float], TraceResult]
+) -> TraceResult | None:
+    """Without the transitions in which commands change, if that leaves nothing. again: traces recordings."""
+    data, test = recorded
+    if test is not None and not test.commanded and commanded(test):
+        test = replace(test, unplaced=True)
+    try:
+        less = again(replace(data, unplaced=True), test, 90.0)
+    except NotEnoughEvidence:
+        return None
+    return None if less.verdict == "unexplained" or {*less.depends_on} - {"noise"} else less
 
 
 def _nothing_remembers(chosen: Selection) -> bool:

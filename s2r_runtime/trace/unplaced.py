@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.beginning import with_history
+from s2r_runtime.trace.clocks import earlier
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.faults import Checked, check
 from s2r_runtime.trace.fitting import Fit, Problem
@@ -82,8 +83,8 @@ def only_before_changes(given: Problem, fit: Fit) -> bool:
 def _residual_and_change(given: Problem, fit: Fit) -> tuple[Array, Array]:
     """(n, nx) each, over the noise: the residual, and what the next step's inputs would do in its place."""
     model, data, parts = fit.model, given.data, given.data.substeps
-    later = tuple(replace(run, u=np.concatenate([run.u[parts:], run.u[-parts:]]), turned=None) for run in data.runs)
-    now, then = (predicted(model, given.steps, acting(model, one)) for one in (data, replace(data, runs=later)))
+    sooner = replace(data, runs=tuple(earlier(run, parts) for run in data.runs))
+    now, then = (predicted(model, given.steps, acting(model, one)) for one in (data, sooner))
     noise = fit.noise.one_step(given.jacobian(model))
     return model.difference(given.steps.y1.copy(), now) / noise, model.difference(then.copy(), now) / noise
 
