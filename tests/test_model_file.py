@@ -11,6 +11,7 @@ import pytest
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.plugins import registry
 
 HEAD = 'import sys\nimport numpy as np\nSTATES = ("x", "v")\nINPUTS = ("force",)\nPARAMS = {"mass": 2.0}\n'
 STEP = "def step(x, u, dt, params):\n    "
@@ -38,6 +39,9 @@ def test_a_file_is_a_model(tmp_path: Path) -> None:
         (HEAD + "step = 3\n", r"own\.py: step is 3, must be a function"),
         (HEAD + 'PARAMS = {"mass": "heavy"}\n' + STEP + GOOD, r"own\.py: PARAMS must be a dict of numbers"),
         (HEAD + "STATES = 2\n" + STEP + GOOD, r"own\.py: STATES is 2, must be a tuple of names"),
+        (HEAD + "UNITS = ('m',)\n" + STEP + GOOD, r"own\.py: UNITS is \('m',\), must be a dict"),
+        (HEAD + "UNITS = {'x': 1}\n" + STEP + GOOD, r"own\.py: UNITS is \{'x': 1\}, must be a dict .* as text"),
+        (HEAD + "UNITS = {'y': 'm'}\n" + STEP + GOOD, r"own\.py: UNITS names 'y', must name states and inputs: x, v, force"),
     ],
 )
 def test_a_file_that_is_no_model_is_refused_with_its_place(tmp_path: Path, text: str, words: str) -> None:
@@ -102,3 +106,11 @@ def test_a_step_in_place_changes_nothing_of_its_callers(tmp_path: Path) -> None:
     for _ in range(2):
         assert own.nominal.step(x, u, 0.1, own.nominal.parameters)[0] == pytest.approx([1.2, 2.2])
         assert (x.tolist(), u.tolist(), own.nominal.parameters) == ([[1.0, 2.0]], [[4.0]], {"mass": 2.0})
+
+
+def test_units_that_the_file_says_are_those_of_effects(tmp_path: Path) -> None:
+    own = model(tmp_path, HEAD + 'UNITS = {"x": "m", "force": "kN"}\n' + STEP + GOOD)
+    limit = registry().get("effects", "input_rate_limit")
+    assert own.nominal.units == {"x": "m", "force": "kN"}
+    assert limit.unit(own.nominal, "force", "rate") == "kN/s"
+    assert limit.unit(model(tmp_path, HEAD + STEP + GOOD).nominal, "force", "rate") == "input's unit/s"

@@ -18,7 +18,7 @@ from s2r_runtime.report import plots
 from s2r_runtime.report.page import Page
 from s2r_runtime.report.trace_page import trace_page
 from s2r_runtime.report.trace_section import add_trace
-from s2r_runtime.trace.account import loud
+from s2r_runtime.trace.account import _assumed, loud
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.excitation import suggest
 from s2r_runtime.trace.found import Found, each_once, interval_text
@@ -401,3 +401,13 @@ def test_a_gain_that_is_just_that_of_a_unit_is_asked_about(gain, unit):
     words = in_words("input_gain", "v", {"gain": gain})
     assert words.startswith(f"v does {100.0 * gain:.3g} % of what is commanded")
     assert words.endswith(f"(is it told in {unit}?)" if unit else "commanded")
+
+
+def test_the_account_says_which_numbers_of_the_model_nobody_said(results):
+    def of(**parameters):
+        return _assumed(replace(results["none"], nominal=compose(ModelSpec("differential_drive", 0.05, parameters))))
+
+    assert of() == ["taken as built in, since nobody said: wheel_radius = 0.1, track = 0.5 (--param wheel_radius=... if it is another)"]
+    assert of(wheel_radius=0.1) == ["taken as built in, since nobody said: track = 0.5 (--param track=... if it is another)"]
+    assert of(wheel_radius=0.1, track=0.5) == []
+    assert _assumed(results["none"]) == []  # a unicycle has none

@@ -1,4 +1,4 @@
-"""`s2r plugin list|check|new`: what is installed, whether it keeps its interface, and a new one to begin with."""
+"""`s2r plugin list|show|check|new`: what is installed, whether it keeps its interface, and a new one to begin with."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from s2r_runtime.cli import output, plugin_files
+from s2r_runtime.cli import output, plugin_files, plugin_show
 from s2r_runtime.errors import PluginError, UsageError, one_line
 
 TEST_FILE = """
@@ -30,6 +30,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     listing = what.add_parser("list", help="every plug-in found, what it offers, and why one could not be loaded")
     listing.add_argument("--json", action="store_true", help="print one JSON object")
     listing.set_defaults(run=plugin_list)
+
+    plugin_show.add(what)
 
     check = what.add_parser("check", help="run the kit of everything that a plug-in offers", description=_CHECK)
     check.add_argument("name", metavar="NAME", help="plug-in, as s2r plugin list names it")

@@ -33,7 +33,7 @@ class InputCoupling(InputEffect):
         mine = units.get(channel, "input's unit")
         if parameter == "from" or other == {mine}:
             return ""
-        return f"({mine})/({other.pop()})" if len(other) == 1 else f"({mine})/(unit of from)"
+        return f"{_whole(mine)}/{_whole(other.pop() if len(other) == 1 else 'unit of from')}"
 
     def input_sequence(self, u: Array, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
         """u (..., nu) -> the channel with its share of the other input."""
@@ -45,6 +45,11 @@ class InputCoupling(InputEffect):
         size = dict(zip(model.inputs, np.sqrt(np.mean(u**2, axis=0)).tolist() if len(u) else [0.0] * u.shape[1], strict=True))
         mine = size[channel] or 1.0
         return [{"from": name, "coefficient": SHARE * mine / size[name]} for name in self.reads(model, channel) if size[name]]
+
+
+def _whole(unit: str) -> str:
+    """As a part of a quotient."""
+    return f"({unit})" if "/" in unit or " " in unit else unit
 
 
 EFFECT = InputCoupling()

@@ -37,7 +37,7 @@ class InputEffect:
         """SI unit; `input` in a Parameter stands for the channel's own."""
         given = next(p.unit for p in self.parameters if p.name == parameter)
         units: dict[str, str] = getattr(model, "units", {})
-        return given.replace("input", units.get(channel, "input's unit"))
+        return given.replace("input", units.get(channel, "input's unit")).replace("/s/s", "/s²")
 
     def hidden(self, n: int, model: NominalModel, channel: str, dt: float, p: Values) -> Array:
         """None: (n, 0)."""

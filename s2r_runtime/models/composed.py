@@ -341,18 +341,23 @@ def _registered(kind: str, name: str, where: str) -> Any:
         raise ConfigError(f"{where}.name: {error}") from None
 
 
-def _words(effect: Effect, channel: str, nominal: NominalModel, parameter: str) -> tuple[str, ...] | None:
+def takes(effect: Effect, nominal: NominalModel, channel: str) -> tuple[str, ...]:
+    """Names of the parameters that an effect has on this channel."""
+    return effect.takes(nominal, channel) if hasattr(effect, "takes") else tuple(p.name for p in effect.parameters)
+
+
+def words(effect: Effect, channel: str, nominal: NominalModel, parameter: str) -> tuple[str, ...] | None:
     """What a parameter may say that is no number; None for one that is."""
     if parameter in getattr(effect, "named", ()):
         return tuple(name for name in nominal.inputs if name != channel)
-    words: tuple[str, ...] | None = getattr(effect, "choices", {}).get(parameter)
-    return words
+    said: tuple[str, ...] | None = getattr(effect, "choices", {}).get(parameter)
+    return said
 
 
 def _effect_parameters(effect: Effect, entry: EffectSpec, nominal: NominalModel, where: str) -> dict[str, Any]:
     given: dict[str, Any] = entry.parameters
-    takes = effect.takes(nominal, entry.channel) if hasattr(effect, "takes") else [p.name for p in effect.parameters]
-    known = {p.name: p for p in effect.parameters if p.name in takes}
+    there = takes(effect, nominal, entry.channel)
+    known = {p.name: p for p in effect.parameters if p.name in there}
     for name, value in given.items():
         if name not in known:
             raise ConfigError(f"{where}: has no parameter {name!r}; it has: {', '.join(known)}")
@@ -360,7 +365,7 @@ def _effect_parameters(effect: Effect, entry: EffectSpec, nominal: NominalModel,
         if bounds.shape or isinstance(value, list):
             _check_matrix(value, bounds, where)
             continue
-        allowed = _words(effect, entry.channel, nominal, name)
+        allowed = words(effect, entry.channel, nominal, name)
         if allowed is not None and value not in allowed:
             raise ConfigError(f"{where}: {name} is {value!r}, must be one of: {', '.join(allowed)}")
         if allowed is None and isinstance(value, str):

@@ -53,6 +53,7 @@ class FileModel:
     parameters: dict[str, float]
     function: Callable[..., Any]
     follows: dict[str, Follows] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
     _known: OrderedDict[Asked, tuple[Array, Array, Array, Array]] = field(
         default_factory=OrderedDict, init=False, repr=False, compare=False
     )
@@ -144,7 +145,9 @@ def load_file_model(spec: ModelSpec, where: str) -> NominalModel:
     _check_columns(path, states, inputs)
     if unknown := [name for name in angles if name not in states]:
         raise ConfigError(f"{path}: ANGLES names {unknown[0]!r}, must name states: {', '.join(states)}")
-    return FileModel(str(path), states, inputs, angles, parameters, module.step, _follows(path, module, states))
+    return FileModel(
+        str(path), states, inputs, angles, parameters, module.step, _follows(path, module, states), _units(path, module, (*states, *inputs))
+    )
 
 
 def _run(path: Path) -> ModuleType:
@@ -186,6 +189,16 @@ def _follows(path: Path, module: ModuleType, states: tuple[str, ...]) -> dict[st
     if not isinstance(given, dict) or not {*given, *given.values()} <= {*states} or {*given} & {*given.values()}:
         raise ConfigError(f"{path}: RATES is {given!r}, must be a dict of states and the states whose rates they are")
     return {name: Follows((of,), partial(_rate, of)) for name, of in given.items()}
+
+
+def _units(path: Path, module: ModuleType, columns: tuple[str, ...]) -> dict[str, str]:
+    """UNITS = {"x": "m", "force": "N"}: SI units of states and inputs, as far as they are said."""
+    given = getattr(module, "UNITS", {})
+    if not isinstance(given, dict) or not all(isinstance(unit, str) for unit in given.values()):
+        raise ConfigError(f"{path}: UNITS is {given!r}, must be a dict of states and inputs and their units as text")
+    if unknown := [name for name in given if name not in columns]:
+        raise ConfigError(f"{path}: UNITS names {unknown[0]!r}, must name states and inputs: {', '.join(columns)}")
+    return dict(given)
 
 
 def _rate(of: str, x: dict[str, Array], rates: dict[str, Array], parameters: dict[str, float]) -> Array:

@@ -281,12 +281,22 @@ def _unseen(r: TraceResult) -> list[str]:
 def _data(r: TraceResult) -> list[str]:
     runs = len({int(run) for run in r.held.steps.run}) if r.held.data.source != r.source else len(r.held.data.runs)
     grid = "interpolated to the model's step, they were not recorded on it" if r.interpolated else "on the model's step as recorded"
-    lines = [f"{r.n_rows} rows in {runs} run{'s' if runs > 1 else ''}, {grid}"]
+    lines = [f"{r.n_rows} rows in {runs} run{'s' if runs > 1 else ''}, {grid}", *_assumed(r)]
     lines += list(r.done_to_data)
     if r.outliers:
         lines.append(f"{r.outliers} outlying rows count for next to nothing")
     lines.append(f"fitted on {r.n_fit} transitions, judged on {len(r.held.steps)} that the fit never saw")
     return lines
+
+
+def _assumed(r: TraceResult) -> list[str]:
+    """Numbers of a built-in model that are what they are because nobody said: a wheel base that was forgotten is traced as a gain."""
+    spec = r.nominal.spec
+    unsaid = {} if spec.source_digest else {k: v for k, v in r.nominal.parameters.items() if k not in spec.parameters}
+    if not unsaid:
+        return []
+    numbers = ", ".join(f"{name} = {value:g}" for name, value in unsaid.items())
+    return [f"taken as built in, since nobody said: {numbers} (--param {next(iter(unsaid))}=... if it is another)"]
 
 
 def labelled(label: str, lines: Sequence[str]) -> list[str]:
