@@ -142,3 +142,101 @@ def test_names_of_speeds():
     speeds = ["velocity", "cmd_v", "wheel_speed", "yaw_rate", "omega", "linvel"]
     others = ["level", "roll", "drive", "v_bat", "flow_rate", "accelerate"]
     assert [name for name in (*speeds, *others) if is_speed(name)] == speeds
+
+
+LOSING = """
+import numpy as np
+STATES, INPUTS, PARAMS = ("omega",), ("volt",), {"gain": 40.0, "loss": 7.0}
+
+def step(x, u, dt, p):
+    end = p["gain"] / p["loss"] * u
+    return end + (x - end) * np.exp(-p["loss"] * dt)
+"""
+FOLLOWING = """
+import numpy as np
+STATES, INPUTS, PARAMS = ("y", "vy"), ("vy_cmd",), {"tau": 0.4}
+
+def step(x, u, dt, p):
+    keep = np.exp(-dt / p["tau"])
+    off = x[:, 1:] - u
+    return np.column_stack([x[:, :1] + u * dt + off * p["tau"] * (1.0 - keep), u + off * keep])
+"""
+DRAGGED = """
+import numpy as np
+STATES, INPUTS, PARAMS = ("omega",), ("torque",), {"drag": 0.8}
+
+def step(x, u, dt, p):
+    for _ in range(20):
+        x = x + dt / 20 * (u - p["drag"] * x * np.abs(x))
+    return x
+"""
+
+
+def finely(rates, x, dt, parts=4000):
+    """States (n, nx) after dt by small steps of rates(x)."""
+    for _ in range(parts):
+        x = x + dt / parts * rates(x)
+    return x
+
+
+@pytest.mark.parametrize("name", ["coulomb_friction", "stribeck_friction", "quadratic_drag"])
+def test_what_brakes_a_speed_that_the_model_slows_down_acts_all_the_while(tmp_path, name):
+    (tmp_path / "losing.py").write_text(LOSING)
+    p = {"coulomb_friction": {"force": 5.0}, "stribeck_friction": {"force": 3.0, "static_force": 9.0, "velocity": 4.0}}.get(
+        name, {"coefficient": 0.6}
+    )
+    model = compose(ModelSpec(str(tmp_path / "losing.py"), 0.05, {}, (EffectSpec(name, "omega", p),)))
+    effect = registry().get("effects", name)
+    v, u = np.array([[8.0], [-6.0], [3.0]]), np.array([[2.0], [-1.0], [2.5]])
+
+    def rates(v):
+        if name == "quadratic_drag":
+            brake = p["coefficient"] * v * np.abs(v)
+        elif name == "coulomb_friction":
+            brake = p["force"] * np.sign(v)
+        else:
+            brake = (p["force"] + (p["static_force"] - p["force"]) * np.exp(-((v / p["velocity"]) ** 2))) * np.sign(v)
+        return 40.0 * u - 7.0 * v - brake
+
+    want = finely(rates, v, 0.05)
+    bent = 1e-2 if effect.varies else 1e-4  # coefficients that bend are one number in each part of a step
+    alone = compose(ModelSpec(str(tmp_path / "losing.py"), 0.05)).advance(v, u, u)
+    assert np.all(np.abs(model.advance(v, u, u) - want) < bent * np.abs(want - alone) + 1e-3 * np.abs(want - alone))
+    assert "omega" not in registry().get("effects", "viscous_friction").channels(model.nominal)  # that is another `loss`
+
+
+def test_wind_on_a_robot_that_follows_its_commands_is_slowed_down_too(tmp_path):
+    (tmp_path / "following.py").write_text(FOLLOWING)
+    model = compose(ModelSpec(str(tmp_path / "following.py"), 0.1, {}, (EffectSpec("constant_disturbance", "world", {"x": -0.9}),)))
+    x, u = np.array([[0.0, 1.0], [2.0, -0.5]]), np.array([[0.7], [-1.0]])
+    want = finely(lambda x: np.column_stack([x[:, 1], (u[:, 0] - x[:, 1]) / 0.4 - 0.9]), x, 0.1)
+    assert np.allclose(model.advance(x, u, u), want, atol=5e-5)
+
+
+def test_a_model_that_loses_more_the_faster_it_is_is_asked_at_each_speed(tmp_path):
+    (tmp_path / "dragged.py").write_text(DRAGGED)
+    model = compose(ModelSpec(str(tmp_path / "dragged.py"), 0.2, {}, (EffectSpec("coulomb_friction", "omega", {"force": 1.5}),)))
+    v, u = np.array([[6.0], [-2.0], [1.0]]), np.array([[0.0], [3.0], [4.0]])
+    want = finely(lambda v: u - 0.8 * v * np.abs(v) - 1.5 * np.sign(v), v, 0.2)
+    without = compose(ModelSpec(str(tmp_path / "dragged.py"), 0.2)).advance(v, u, u)
+    off, lossless = np.abs(model.advance(v, u, u) - want), np.abs(1.5 * 0.2 - np.abs(want - without))
+    assert np.all(off < 0.25 * lossless)  # the first one falls to half its speed within the step
+    assert np.all(off[1:] < 0.02 * np.abs(want - without)[1:])
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_dry_friction_of_a_motor_with_losses_of_its_own_is_named(tmp_path, seed):
+    (tmp_path / "losing.py").write_text(LOSING)
+    model = compose(ModelSpec(str(tmp_path / "losing.py"), DT))
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-3.0, 3.0, (60, 1)), 15, axis=0)
+    v, rows = np.zeros((1, 1)), [0.0]
+    for k in range(len(u)):
+        for _ in range(200):  # friction holds what it can hold
+            pushed = 40.0 * u[k] - 7.0 * v
+            v = v + DT / 200 * np.where(np.abs(v) > 0.02, pushed - 9.0 * np.sign(v), pushed - np.clip(pushed, -9.0, 9.0))
+        rows.append(float(v[0, 0]))
+    measured = np.array(rows)[:, None] + rng.normal(scale=0.02, size=(len(u) + 1, 1))
+    found = trace(from_arrays(model, [(measured, u)]), model)
+    assert [(e.name, e.channel) for e in found.effects] == [("coulomb_friction", "omega")]
+    assert found.effects[0].values["force"] == pytest.approx(9.0, rel=0.02)

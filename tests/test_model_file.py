@@ -12,6 +12,7 @@ from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
+from s2r_runtime.trace.tracer import load_dataset
 
 HEAD = 'import sys\nimport numpy as np\nSTATES = ("x", "v")\nINPUTS = ("force",)\nPARAMS = {"mass": 2.0}\n'
 STEP = "def step(x, u, dt, params):\n    "
@@ -114,3 +115,25 @@ def test_units_that_the_file_says_are_those_of_effects(tmp_path: Path) -> None:
     assert own.nominal.units == {"x": "m", "force": "kN"}
     assert limit.unit(own.nominal, "force", "rate") == "kN/s"
     assert limit.unit(model(tmp_path, HEAD + STEP + GOOD).nominal, "force", "rate") == "input's unit/s"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        'return [float(x[0]) + dt * float(x[1]), float(x[1]) + dt * float(u[0]) / params["mass"]]\n',
+        'return np.array([x[0] + dt * x[1], x[1] + dt * u[0] / params["mass"]])[:2].ravel()[:2]\n',
+    ],
+)
+def test_a_step_that_takes_one_state_is_told_so_at_once(tmp_path: Path, body: str) -> None:
+    with pytest.raises(ConfigError, match=r"own\.py: step takes one state at a time, .* x is \(n, 2\), u is \(n, 1\)"):
+        model(tmp_path, HEAD + STEP + body)
+
+
+def test_a_step_that_always_fails_is_asked_a_few_times(tmp_path: Path) -> None:
+    own = model(tmp_path, HEAD + "CALLS = []\n" + STEP + 'CALLS.append(1)\n    return x + params["mas"]\n')
+    rows = [f"{0.1 * k:.1f},{0.01 * k},{0.1},{k % 5}" for k in range(300)]
+    (tmp_path / "run.csv").write_text("\n".join(["t,x,v,force", *rows]) + "\n")
+    before = len(own.nominal.shared.function.__globals__["CALLS"])  # type: ignore[attr-defined]
+    with pytest.raises(ConfigError, match=r"own\.py, line 9: step raised KeyError: 'mas'"):
+        load_dataset(tmp_path / "run.csv", own)
+    assert len(own.nominal.shared.function.__globals__["CALLS"]) - before < 20  # type: ignore[attr-defined]

@@ -496,3 +496,23 @@ def test_where_a_frozen_state_would_lead_to_no_numbers_the_trace_goes_on(tmp_pat
     y = np.array(y)[:, None] + rng.normal(size=(401, 1)) * 0.003
     y[210:290] = y[210]
     assert trace(from_arrays(model, [(y, u)]), model).verdict in {"none", "traced", "ambiguous", "unexplained", "sensor_fault"}
+
+
+def test_rows_of_which_a_model_makes_no_numbers_are_not_looked_for_one_by_one(tmp_path):
+    path = tmp_path / "runs_away.py"
+    path.write_text(
+        "import numpy as np\nSTATES, INPUTS, PARAMS, CALLS = ('x', 'v'), ('u',), {}, []\n\n\n"
+        "def step(x, u, dt, p):\n    CALLS.append(len(x))\n"
+        "    return np.column_stack([x[:, 0] + dt * x[:, 1], np.where(x[:, 0] > 0.9, np.inf, x[:, 1] + dt * u[:, 0])])\n"
+    )
+    model = compose(ModelSpec(str(path), 0.1))
+    calls = model.nominal.shared.function.__globals__["CALLS"]
+    rng = np.random.default_rng(0)
+    x, u = rng.uniform(-1.0, 1.0, (1000, 2)), rng.uniform(-1.0, 1.0, (1000, 1))
+    calls.clear()
+    there = wherever(model, x, Acting(u, u), slice(None))
+    gone = x[:, 0] > 0.9
+    assert 10 < np.count_nonzero(gone) < 200
+    assert np.array_equal(there[gone], x[gone])
+    assert np.allclose(there[~gone], np.column_stack([x[:, 0] + 0.1 * x[:, 1], x[:, 1] + 0.1 * u[:, 0]])[~gone], atol=1e-15)
+    assert calls == [1000, 1000 - np.count_nonzero(gone)]

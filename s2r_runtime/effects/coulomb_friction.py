@@ -20,6 +20,7 @@ class CoulombFriction(ForceEffect):
     name = "coulomb_friction"
     parameters = tuple(Parameter(name, "N", 0.0, 1e6, neutral=0.0) for name in ("force", "force_positive", "force_negative"))
     uneven = True
+    besides = True
     optional = ("force", "force_positive", "force_negative")
     additive = True
 

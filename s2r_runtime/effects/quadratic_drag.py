@@ -28,6 +28,7 @@ class QuadraticDrag(ForceEffect):
     stage = "input"
     parameters = (Parameter("coefficient", "s/m", 0.0, 1e6, neutral=0.0),)
     uneven = True
+    besides = True
     varies = True
     side_by_side = True
 

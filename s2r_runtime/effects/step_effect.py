@@ -56,17 +56,20 @@ class StepEffect:
 
 
 class ForceEffect(StepEffect):
-    """Acts on axes by a `push`. varies: whether the push depends on the state."""
+    """Acts on axes by a `push`. varies: whether the push depends on the state; besides: whether it also brakes a lone speed that the model
+    itself slows down. What is in proportion to speed, that model has in a number of its own.
+    """
 
     varies = False
+    besides = False
 
     def channels(self, model: NominalModel) -> tuple[str, ...]:
         """The velocities of all axes, and speeds without a position."""
-        return (*(model.states[axis.velocity] for axis in axes(model)), *lone_speeds(model))
+        return (*(model.states[axis.velocity] for axis in axes(model)), *lone_speeds(model, self.besides))
 
     def pushes(self, model: NominalModel, channel: str) -> bool:
         """Whether it acts by `push` there."""
-        return bool(axes(model)) or channel in lone_speeds(model)
+        return bool(axes(model)) or channel in lone_speeds(model, self.besides)
 
     def push(self, x: Array, axis: Axis, model: NominalModel, channel: str, p: Values) -> Push | None:
         """What it adds on this axis at x (n, nx), accelerations; None where it does not act."""
@@ -99,7 +102,7 @@ def has_pose(model: NominalModel) -> bool:
 def force_unit(model: NominalModel, channel: str = "") -> str:
     """Of what acts on an axis: the input's where it is divided by a mass, an acceleration otherwise, and on a speed without a position."""
     units: dict[str, str] = getattr(model, "units", {})
-    if channel in lone_speeds(model):
+    if channel in lone_speeds(model, slowed=True):
         return f"{length_unit(model, channel)}/s²"
     if coupled(model):
         return units.get(model.inputs[0], "input's unit")

@@ -29,6 +29,7 @@ class StribeckFriction(ForceEffect):
         Parameter("velocity", "m/s", 1e-9, 1e4),
     )
     uneven = True
+    besides = True
     varies = True
     homogeneous = True
 

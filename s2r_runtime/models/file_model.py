@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import io
 import math
 import sys
 import traceback
@@ -39,7 +40,18 @@ SAMPLED = 64
 as to step it; whether all are the same is then asked of the one that is kept.
 """
 
+PROBED, PROBED_S = 0.5, 0.01
+"""States and inputs, and a step in s, with which a file's `step` is called once to see whether it takes a table."""
+
 Asked = tuple[tuple[int, ...], bytes, bytes, bytes, tuple[tuple[str, float], ...]]
+
+
+class NoNumbers(ConfigError):
+    """A step gives none in some rows, (n,) of those that it was asked for: the others need not be asked one by one."""
+
+    def __init__(self, message: str, rows: NDArray[np.bool_]) -> None:
+        super().__init__(message)
+        self.rows = rows
 
 
 @dataclass
@@ -96,9 +108,10 @@ class FileModel:
         wrong = np.argwhere(~np.isfinite(result) & given)
         if len(wrong):
             row, column = map(int, wrong[0])
-            raise ConfigError(
+            raise NoNumbers(
                 f"{self.name}: step returned {result[row, column]} for state {self.states[column]!r} in row {row}"
-                f" (x = {x[row].tolist()}, u = {u[row].tolist()}), must be finite"
+                f" (x = {x[row].tolist()}, u = {u[row].tolist()}), must be finite",
+                ~np.isfinite(result).all(axis=1),
             )
 
 
@@ -145,6 +158,7 @@ def load_file_model(spec: ModelSpec, where: str) -> NominalModel:
     _check_columns(path, states, inputs)
     if unknown := [name for name in angles if name not in states]:
         raise ConfigError(f"{path}: ANGLES names {unknown[0]!r}, must name states: {', '.join(states)}")
+    _check_batched(path, module.step, len(states), len(inputs), parameters)
     return FileModel(
         str(path), states, inputs, angles, parameters, module.step, _follows(path, module, states), _units(path, module, (*states, *inputs))
     )
@@ -162,6 +176,24 @@ def _run(path: Path) -> ModuleType:
     except (Exception, SystemExit) as error:  # noqa: BLE001 - a user's file: whatever it raises is its report
         raise _failed(str(path), "loading it", error) from None
     return module
+
+
+def _check_batched(path: Path, step: Callable[..., Any], nx: int, nu: int, parameters: dict[str, float]) -> None:
+    """Raises ConfigError if `step` takes one state, and not a table of them: else that would show only after hours, row by row."""
+
+    def taken(x: Array, u: Array) -> bool:
+        try:
+            with contextlib.redirect_stdout(io.StringIO()), np.errstate(all="ignore"):
+                return bool(np.shape(step(x, u, PROBED_S, dict(parameters))) == x.shape)
+        except (Exception, SystemExit):  # noqa: BLE001 - it may want other values: what it raises is told where it is asked for some
+            return False
+
+    tables = np.full((2, nx), PROBED), np.full((2, nu), PROBED)
+    if not taken(*tables) and taken(*(table[0] for table in tables)):
+        raise ConfigError(
+            f"{path}: step takes one state at a time, must take a table of them: x is (n, {nx}), u is (n, {nu}), the result (n, {nx}), "
+            "so that column j of all rows is x[:, j]"
+        )
 
 
 def _names(path: Path, module: ModuleType, name: str) -> tuple[str, ...]:

@@ -118,6 +118,10 @@ def _axes(model: NominalModel) -> tuple[Axis, ...]:
     return tuple(Axis(model.states.index(rates[name]), j) for j, name in enumerate(model.states) if name in rates)
 
 
+SET = 0.01
+"""Of a speed, what a model must keep over that step for it to be one that something pushes, and not one that is set.
+"""
+
 LETTERS = {"v", "vx", "vy", "vz", "w"}
 """Words in names of speeds (cmd_v, w_ref)."""
 
@@ -125,18 +129,19 @@ TURNING = ("roll", "pitch", "yaw", "turn")
 
 POSE = {"x", "y", "theta"}
 
-_LONE: WeakKeyDictionary[BoundModel, tuple[str, ...]] = WeakKeyDictionary()
+_LONE: WeakKeyDictionary[BoundModel, dict[str, bool]] = WeakKeyDictionary()
 
 
-def lone_speeds(model: NominalModel) -> tuple[str, ...]:
-    """States of somebody's own model that are speeds by their names, without a position, and that the model itself does not slow down: a
-    loss that it knows has a parameter there. (A flying robot's, under tilt and thrust; a motor's.) Forces act on them as on an axis.
+def lone_speeds(model: NominalModel, slowed: bool = False) -> tuple[str, ...]:
+    """States of somebody's own model that are speeds by their names, without a position, and that the model itself does not slow down.
+    (A flying robot's, under tilt and thrust; a motor's.) Forces act on them as on an axis. slowed: with those that it does slow down: what
+    it knows of that in proportion to speed has a parameter there (a motor's back EMF), but not all that may brake it besides.
     """
     if not isinstance(model, BoundModel) or not isinstance(model.shared, FileModel):
         return ()
     if model not in _LONE:
-        _LONE[model] = () if {*model.states} >= POSE else _lone_speeds(model)
-    return _LONE[model]
+        _LONE[model] = {} if {*model.states} >= POSE else _lone_speeds(model)
+    return tuple(name for name, losing in _LONE[model].items() if slowed or not losing)
 
 
 def is_speed(name: str) -> bool:
@@ -159,22 +164,63 @@ def turns(name: str) -> bool:
     return "omega" in name.lower() or any(word in {"w", "qd"} or word.startswith(TURNING) for word in name.lower().split("_"))
 
 
-def _lone_speeds(model: BoundModel) -> tuple[str, ...]:
+def _lone_speeds(model: BoundModel) -> dict[str, bool]:
+    """Each with whether the model slows it down."""
     moving = {model.states[axis.velocity] for axis in axes(model)}
+    found = {}
+    for name in (s for s in model.states if s not in moving and (is_speed(s) or s in NAMED_RATES)):
+        kept = _kept_anywhere(model, model.states.index(name), PROBE_S)
+        if kept is not None and np.all(np.abs(kept - 1.0) < 1e-9):
+            found[name] = False
+        elif kept is not None and np.all((kept > SET) & (kept <= 1.0 + 1e-9)):
+            found[name] = True
+    return found
+
+
+def _kept_anywhere(model: BoundModel, column: int, dt: float) -> Array | None:
+    """(8,) what the model keeps of a bit more of a speed over a step, at random states; None where it gives no numbers there."""
     model = replace(model, finer=False, schemes={})  # in parts of a step, what a speed does to other states comes back to it
     rng = np.random.default_rng(0)
     x, u = rng.uniform(-1.0, 1.0, (8, len(model.states))), rng.uniform(-1.0, 1.0, (8, len(model.inputs)))
-    found = []
-    for name in (s for s in model.states if s not in moving and (is_speed(s) or s in NAMED_RATES)):
-        j, faster = model.states.index(name), x.copy()
-        faster[:, j] += 1.0
-        try:
-            kept = model.step(faster, u, PROBE_S, model.parameters)[:, j] - model.step(x, u, PROBE_S, model.parameters)[:, j]
-        except ConfigError:  # a user's model that cannot be stepped just anywhere
-            continue
-        if np.all(np.abs(kept - 1.0) < 1e-9):
-            found.append(name)
-    return tuple(found)
+    try:
+        return _kept(model, column, x, u, dt, 1.0)
+    except ConfigError:  # a user's model that cannot be stepped just anywhere
+        return None
+
+
+def _kept(model: BoundModel, column: int, x: Array, u: Array, dt: float | Array, more: float) -> Array:
+    """(n,) of `more` of a speed, how much is there after a step, as a share of it."""
+    faster = x.copy()
+    faster[:, column] += more
+    gained = model.step(faster, u, dt, model.parameters) - model.step(x, u, dt, model.parameters)  # type: ignore[arg-type]
+    return np.asarray(gained[:, column] / more)
+
+
+_SLOWED: WeakKeyDictionary[BoundModel, dict[tuple[int, float], float | None]] = WeakKeyDictionary()
+
+
+def own_rate(model: NominalModel, column: int, x: Array, u: Array, dt: float | Array) -> Value:
+    """1/s by which somebody's own model slows a speed down by itself, a number or (n,): what pushes it is slowed down, too. 0 where it does
+    not, and of a model that is not somebody's own: forces on those have their losses with them.
+    """
+    if not isinstance(model, BoundModel) or not isinstance(model.shared, FileModel):
+        return 0.0
+    lasts = float(np.median(dt))
+    known = _SLOWED.setdefault(model, {})
+    if (column, lasts) not in known:
+        kept = _kept_anywhere(model, column, lasts)
+        even = kept is None or bool(np.ptp(kept) <= 1e-6)
+        usual = 1.0 if kept is None else float(kept[0])
+        known[column, lasts] = None if not even else 0.0 if abs(usual - 1.0) < 1e-9 else _rate(usual, lasts)
+    steady = known[column, lasts]
+    if steady is not None:
+        return steady
+    more = PROBE * max(float(np.max(np.abs(x[:, column]), initial=0.0)), PROBE)
+    return np.asarray(_rate(_kept(model, column, x, u, dt, more), dt))
+
+
+def _rate(kept: Value, dt: float | Array) -> Any:
+    return -np.log(np.maximum(kept, math.exp(LEAST))) / dt
 
 
 def mass_name(model: NominalModel) -> str:
@@ -190,7 +236,7 @@ def mass(model: NominalModel) -> float:
 
 def mass_on(model: NominalModel, channel: str) -> float:
     """By which a force on a speed is divided. Whether a model's mass is that of a speed without a position, nobody says: 1."""
-    return 1.0 if channel in lone_speeds(model) else mass(model)
+    return 1.0 if channel in lone_speeds(model, slowed=True) else mass(model)
 
 
 def coupled(model: NominalModel) -> bool:
@@ -254,9 +300,9 @@ def _response(x: Array, u: Array, model: BoundModel, dt: float) -> Array:
 
 def pushed(x: Array, u: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushing], dt: float | Array) -> Array:
     """The result of the step under u without these effects, x_next (n, nx), with all of them. dt: also of each row, (n,)."""
-    alone = {*lone_speeds(model)}.intersection(channel for _, channel, _ in pushing)
+    alone = {*lone_speeds(model, slowed=True)}.intersection(channel for _, channel, _ in pushing)
     for name in sorted(alone):
-        x_next = _braked(x, x_next, model, [one for one in pushing if one[1] == name], dt)
+        x_next = _braked(x, u, x_next, model, [one for one in pushing if one[1] == name], dt)
     pushing = [one for one in pushing if one[1] not in alone]
     if not pushing:
         return x_next
@@ -264,43 +310,62 @@ def pushed(x: Array, u: Array, x_next: Array, model: NominalModel, pushing: Sequ
         return _pushed_together(x, u, x_next, model, pushing, dt)
     varies = any(effect.varies for effect, _, _ in pushing)
     moved = [k for k in axes(model) if any(effect.push(x[:1], k, model, channel, p) is not None for effect, channel, p in pushing)]
-    given = [(x_next[:, k.velocity] - x[:, k.velocity]) / dt for k in moved]
+    rates = [own_rate(model, k.velocity, x, u, dt) for k in moved]
+    given = [_given(x[:, k.velocity], x_next[:, k.velocity], rate, dt) for k, rate in zip(moved, rates, strict=True)]
     parts = max(1, math.ceil(float(np.max(dt, initial=0.0)) / PART_S - 1e-9)) if varies else 1
     h = dt / parts
     now, at = (x.copy(), x.copy()) if varies else (x, x)
     for _ in range(parts if varies else 0):
-        for k, g in zip(moved, given, strict=True):
-            half, _ = _glide(now[:, k.velocity], g, _together(now, k, model, pushing), 0.5 * h)
+        for k, g, rate in zip(moved, given, rates, strict=True):
+            half, _ = _glide(now[:, k.velocity], g, _losing(_together(now, k, model, pushing), rate), 0.5 * h)
             at[:, k.position] = now[:, k.position] + 0.5 * h * now[:, k.velocity]
             at[:, k.velocity] = half
-        for k, g in zip(moved, given, strict=True):
-            now[:, k.velocity], way = _glide(now[:, k.velocity], g, _together(at, k, model, pushing), h)
+        for k, g, rate in zip(moved, given, rates, strict=True):
+            now[:, k.velocity], way = _glide(now[:, k.velocity], g, _losing(_together(at, k, model, pushing), rate), h)
             now[:, k.position] += way
     after = x_next.copy()
-    for k, g in zip(moved, given, strict=True):
+    for k, g, rate in zip(moved, given, rates, strict=True):
         v = np.ascontiguousarray(x[:, k.velocity])
         if varies:
             end, way = now[:, k.velocity], now[:, k.position] - x[:, k.position]
         else:
-            end, way = _glide(v, g, _together(x, k, model, pushing), dt)
-        after[:, k.position] += way - (dt * v + 0.5 * dt * dt * g)
+            end, way = _glide(v, g, _losing(_together(x, k, model, pushing), rate), dt)
+        after[:, k.position] += way - (dt * v + 0.5 * dt * dt * g if _none(rate) else _moved(v, g, _flow(rate, dt))[1])
         after[:, k.velocity] = end
     return after
 
 
-def _braked(x: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushing], dt: float | Array) -> Array:
+def _none(rate: Value) -> bool:
+    return not isinstance(rate, np.ndarray) and rate == 0.0
+
+
+def _given(v: Array, v_next: Array, rate: Value, dt: float | Array) -> Array:
+    """(n,) the acceleration that the model itself gives, besides what it loses at this rate: with both, v becomes v_next."""
+    if _none(rate):
+        return (v_next - v) / dt
+    flow = _flow(rate, dt)
+    return np.asarray((v_next - flow.keep * v) / flow.first)
+
+
+def _losing(push: Push, rate: Value) -> Push:
+    """A push where the model itself slows down at this rate."""
+    return push if _none(rate) else replace(push, rate=_sum(push.rate, (rate, rate)))
+
+
+def _braked(x: Array, u: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushing], dt: float | Array) -> Array:
     """x_next (n, nx), under pushes on one speed that has no position."""
     j = model.states.index(pushing[0][1])
     axis = Axis(x.shape[1], j)  # a push that asks where it is fails
     varies = any(effect.varies for effect, _, _ in pushing)
     parts = max(1, math.ceil(float(np.max(dt, initial=0.0)) / PART_S - 1e-9)) if varies else 1
-    given, at = (x_next[:, j] - x[:, j]) / dt, x.copy()
+    rate = own_rate(model, j, x, u, dt)
+    given, at = _given(x[:, j], x_next[:, j], rate, dt), x.copy()
     v = np.ascontiguousarray(x[:, j])
     for _ in range(parts):
         at[:, j] = v
         if varies:
-            at[:, j] = _glide(v, given, _together(at, axis, model, pushing), 0.5 * dt / parts)[0]
-        v = _glide(v, given, _together(at, axis, model, pushing), dt / parts)[0]
+            at[:, j] = _glide(v, given, _losing(_together(at, axis, model, pushing), rate), 0.5 * dt / parts)[0]
+        v = _glide(v, given, _losing(_together(at, axis, model, pushing), rate), dt / parts)[0]
     after = x_next.copy()
     after[:, j] = v
     return after

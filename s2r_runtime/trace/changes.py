@@ -18,9 +18,9 @@ import numpy as np
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.fitting import Fit, Problem, fitted, foretold, gain, sought, under_noise
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, foretold, gain, sought, under_noise, without
 from s2r_runtime.trace.rivals import CLOSE, rivals_of
-from s2r_runtime.trace.scores import Bar, Scored, name_of
+from s2r_runtime.trace.scores import CONTENDS, ONWARD, Bar, Scored, name_of
 from s2r_runtime.trace.slots import Added, Slot, bounds_of, values_of, with_values
 
 EDGE = 0.02
@@ -69,13 +69,31 @@ def from_the_beginning(given: Problem, fit: Fit, bar: Bar) -> Fit:
         drifts, sine = name == "input_gain_drift", name == "periodic_disturbance"
         if not (drifts or sine or not happens(given, fit)):
             continue
+        behind = _behind(given, fit, place) if sine else math.inf
         for models in _of_the_drive(fit.model, place, 1 if given.bends else 2) if sine else [_of_each(fit.model, place)]:
-            others = [fitted(given, fit, model) for model in models if foretold(given, model) is not None]
-            better = [(gain(other, fit) - bar.price(other.k - fit.k, len(given.steps)), other) for other in others]
-            more, best = max(better, key=lambda pair: pair[0], default=(-math.inf, fit))
+            others = [_instead(given, fit, model, bar, behind) for model in models if foretold(given, model) is not None]
+            more, best = max(
+                ((_ahead(given, other, fit, bar), other) for other in others), key=lambda pair: pair[0], default=(-math.inf, fit)
+            )
             if more > (CLOSE if drifts else -CLOSE):
                 return best
     return fit
+
+
+def _behind(given: Problem, fit: Fit, place: int) -> float:
+    """Nats by which something else may be behind a sine after a round of parameters and noise and still come up to it in another."""
+    return (1.0 - ONWARD) * gain(fit, evaluate(given, without(fit.model, place), fit.noise))
+
+
+def _instead(given: Problem, fit: Fit, model: ComposedModel, bar: Bar, behind: float) -> Fit:
+    """A model in the place of what was found, fitted as far as it may come up to that. behind: nats, after a round."""
+    other = fitted(given, fit, model, 2, lambda other: gain(other, fit) < -behind)
+    return fitted(given, other, other.model) if _ahead(given, other, fit, bar) > -CONTENDS else other
+
+
+def _ahead(given: Problem, other: Fit, fit: Fit, bar: Bar) -> float:
+    """Nats of another model more than a fit has, numbers paid for."""
+    return gain(other, fit) - bar.price(other.k - fit.k, len(given.steps))
 
 
 def _of_the_drive(model: ComposedModel, place: int, most: int) -> list[list[ComposedModel]]:

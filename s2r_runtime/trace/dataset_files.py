@@ -23,6 +23,7 @@ from s2r_runtime.trace.dataset import Array, Dataset, Stream, columns_of, from_s
 from s2r_runtime.trace.hidden import told_through
 from s2r_runtime.trace.late_poses import earlier, late_pose
 from s2r_runtime.trace.reconstruct import late_speeds, reconstruct
+from s2r_runtime.trace.residual import check_steps
 from s2r_runtime.trace.unseen import unneeded, without
 
 MCAP_MAGIC = b"\x89MCAP"
@@ -62,6 +63,8 @@ def load_dataset(
         segments, missing, content = _robot_segments(paths[0], model, transport)
     else:
         segments, missing, content = _table_segments(paths[0], model, columns or {}, hidden=not bandwidth)
+    if not missing:
+        _check_steps(model, segments)
     if behind is None:
         behind = {} if bandwidth else late_pose(model, segments, missing)
     names = [s for s in model.states if s not in missing]
@@ -77,6 +80,16 @@ def load_dataset(
     if missing:
         segments, done = reconstruct(model, segments, missing, source, bandwidth, slow)
     return replace(from_streams(model, segments, source, (*digests, content), paths, done), behind=dict(behind))
+
+
+def _check_steps(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]]) -> None:
+    """Raises ConfigError, as the model does, if it steps from none of the first, middle and last states that were measured. One that never
+    does would say so only after it was asked of every row by itself.
+    """
+    x, u = (np.concatenate([pair[kind].values for pair in segments]) for kind in (0, 1))
+    x, u = x[np.isfinite(x).all(axis=1)], u[np.isfinite(u).all(axis=1)]
+    if len(x) and len(u):
+        check_steps(model, *(e[[0, len(e) // 2, -1]] for e in (x, u)))
 
 
 def _digest(path: Path) -> str:

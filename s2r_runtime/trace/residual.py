@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
+from s2r_runtime.models.file_model import NoNumbers
 from s2r_runtime.trace.dataset import Dataset
 
 Array = NDArray[np.float64]
@@ -206,11 +207,27 @@ def wherever(model: ComposedModel, x: Array, act: Acting, place: Index | slice) 
     """
     try:
         return advanced(model, x, act, place)
-    except ConfigError:
+    except ConfigError as error:
         if len(x) <= 1:
             return x
         place, half = np.arange(len(act.end))[place], len(x) // 2
+        if isinstance(error, NoNumbers) and len(error.rows) == len(x):
+            going, there = ~error.rows, x.copy()
+            there[going] = wherever(model, x[going], act, place[going])
+            return there
         return np.concatenate([wherever(model, x[part], act, place[part]) for part in (slice(half), slice(half, None))])
+
+
+def check_steps(model: ComposedModel, x: Array, u: Array) -> None:
+    """Raises ConfigError, as the model does, if it steps from none of these states (n, nx) under these inputs (n, nu), each alone."""
+    failed: list[ConfigError] = []
+    for state, given in zip(x, u, strict=True):
+        try:
+            model.advance(state[None], given[None], given[None])
+        except ConfigError as error:
+            failed.append(error)
+    if failed and len(failed) == len(x):
+        raise failed[0]
 
 
 def predicted(model: ComposedModel, steps: Steps, act: Acting) -> Array:

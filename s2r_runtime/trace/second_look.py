@@ -101,13 +101,14 @@ def once_more(
     if pair is not None:  # a change between the parts that are fitted is anywhere there: its time is told by all of the recording
         pair = replace(pair, fit=dated(given, whole.given, pair.fit))
     told = None if pair is None else _all_explained(whole, pair, structure, refused)
-    for bar, before, may_be_left in (
-        (STRICT, pair if told is not None and not told.tokens else None, set()),
-        (LENIENT if chosen.fit.added else ALONE, chosen, {"noise"}),
+    nameless = max([structure.nats, *structure.gains.values()])
+    for bar, before, may_be_left, lacks in (
+        (STRICT, pair if told is not None and not told.tokens else None, set(), 0.0),
+        (LENIENT if chosen.fit.added else ALONE, chosen, {"noise"}, nameless),
     ):
         if before is None:
             continue
-        alone = called_for(given, chosen.nominal.model, ahead, lambda share: None, bar, before)
+        alone = called_for(given, chosen.nominal.model, ahead, lambda share: None, bar, before, lacks=lacks)
         rest = _all_explained(whole, alone, structure, refused)
         if rest is None or not {*rest.tokens} <= may_be_left:  # as it mostly is: no need to ask for rivals
             continue

@@ -36,6 +36,11 @@ NEAR = 0.4
 drive. Among 265 recordings of ten families, none got another name for it.
 """
 
+A_PART = 0.2
+"""Of what something without a name explains: the least that an effect must do of it, where all of it is looked for. Five are looked for at
+most, and two that say little alone are looked for together (`hidden_pairs`).
+"""
+
 CLOSE_BY, SHORT = 3, 0.5
 """Effects that fall short which what was not fitted is asked about, and the share of what is needed that they must have."""
 
@@ -68,26 +73,31 @@ def called_for(
     bar: Bar = STRICT,
     before: Selection | None = None,
     most: int = MOST,
+    lacks: float = 0.0,
 ) -> Selection:
-    """The effects alone, by any bar, `most` at most. before: what was selected with another one, from which it goes on."""
+    """The effects alone, by any bar, `most` at most. before: what was selected with another one, from which it goes on. lacks: nats that
+    something without a name explains beyond that: an effect that makes next to nothing of it is not gone on from.
+    """
     nominal = evaluate(given, model) if before is None else before.nominal
     fit, tried = (nominal, 0) if before is None else (before.fit, before.tried)
+    begun = fit
     ranking = [] if before is None else list(before.ranking)
     for step in range(most - len(fit.added)):
+        short = A_PART * (lacks - gain(fit, begun))
         if ranking and not fit.added:
             found, columns = rescored(ranking, nominal, len(given.steps), bar), tried
         else:
             needed = bar.needed(tried, 1, len(given.steps)) if fit.added else 0.0  # of the model as given, all are told
-            found, columns = best_candidates(given, fit, bar=bar, against=needed)
+            found, columns = best_candidates(given, fit, bar=bar, against=max(needed, short))
         tried = max(tried, columns)
         ranking = ranking or found
         progress(0.1 + 0.6 * (step + 1) / (MOST + 1))
         chosen = _first_of(found, given, fit, tried, horizon, bar)
         if chosen is None:  # they may have hidden others, by how much they seemed to explain
-            others = overlooked(given, fit, found, bar, bar.needed(tried, 1, len(given.steps)))
+            others = overlooked(given, fit, found, bar, max(bar.needed(tried, 1, len(given.steps)), short))
             chosen = _first_of(others, given, fit, tried, horizon, bar)
         chosen = chosen if fit.added else _of_all_axes(given, nominal, chosen, tried, horizon, bar)
-        if chosen is None:
+        if chosen is None or gain(chosen, fit) < short:
             break
         chosen = parted(given, fitted(given, chosen, chosen.model), ranking, bar)
         fit = exchanged(given, chosen, bar) if 1 < len(chosen.added) <= EXCHANGED else chosen
