@@ -218,8 +218,11 @@ def test_a_silence_is_told_from_a_clock_that_jumped(kind):
     else:
         t[400:] += 20 * DT
     data = from_streams(declared(), [(Stream(t[keep], y[keep]), Stream(t[:-1], u[0]))], "here")
-    (fault,) = check(declared(), data).faults
+    checked = check(declared(), data)
+    (fault,) = checked.faults
     assert (fault.kind, fault.channel) == (kind, "*")
+    across = [step for _, step in checked.left_out]  # no rollout goes on in time that there was not
+    assert across == (list(range(399, 420)) if kind == "clock_step" else [])
     assert fault.from_s == pytest.approx(399 * DT, abs=1e-6)
 
 

@@ -121,7 +121,8 @@ def test_units_that_the_file_says_are_those_of_effects(tmp_path: Path) -> None:
     "body",
     [
         'return [float(x[0]) + dt * float(x[1]), float(x[1]) + dt * float(u[0]) / params["mass"]]\n',
-        'return np.array([x[0] + dt * x[1], x[1] + dt * u[0] / params["mass"]])[:2].ravel()[:2]\n',
+        'return np.array([x[0] + dt * x[1], x[1] + dt * (u[0] if np.ndim(u) == 1 else u[0, 0]) / params["mass"]])\n',
+        'return np.array([x[0] + dt * x[1], x[1] + dt * u[0] / params["mass"]])\n',
     ],
 )
 def test_a_step_that_takes_one_state_is_told_so_at_once(tmp_path: Path, body: str) -> None:
@@ -137,3 +138,11 @@ def test_a_step_that_always_fails_is_asked_a_few_times(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"own\.py, line 9: step raised KeyError: 'mas'"):
         load_dataset(tmp_path / "run.csv", own)
     assert len(own.nominal.shared.function.__globals__["CALLS"]) - before < 20  # type: ignore[attr-defined]
+
+
+def test_a_step_that_gives_no_numbers_at_rest_is_no_step_that_fails(tmp_path: Path) -> None:
+    own = model(tmp_path, HEAD + STEP + "return np.column_stack([x[:, 0] + dt * x[:, 1], x[:, 1] + dt * u[:, 0] / x[:, 1]])\n")
+    moving = [0.0 if k in (0, 150, 299) else 1.0 + 0.01 * k for k in range(300)]
+    rows = [f"{0.1 * k:.1f},{0.01 * k},{v},{k % 5}" for k, v in enumerate(moving)]
+    (tmp_path / "run.csv").write_text("\n".join(["t,x,v,force", *rows]) + "\n")
+    assert load_dataset(tmp_path / "run.csv", own).rows == 300

@@ -101,3 +101,22 @@ def test_what_it_cannot_tell_is_one_line(argv: list[str], code: int, words: str,
     assert words in shown.err
     assert len(shown.err.splitlines()) == 1
     assert not shown.out
+
+
+def test_what_one_effect_or_model_raises_is_told_and_not_the_end(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(*_: object) -> tuple[str, ...]:
+        raise RuntimeError("no channels today")
+
+    monkeypatch.setattr(registry().get("effects", "input_lag"), "channels", broken, raising=False)
+    assert main(["plugin", "show", "joint"]) == 0
+    shown = capsys.readouterr()
+    assert "input_delay" in shown.out
+    assert "input_lag" not in shown.out
+    assert shown.err == "s2r: effect 'input_lag' is left out on joint: RuntimeError: no channels today\n"
+    monkeypatch.setattr(registry().get("models", "unicycle"), "parameters", None)
+    assert main(["plugin", "show", "input_delay"]) == 0
+    shown = capsys.readouterr()
+    assert "bicycle" in shown.out
+    assert "s2r: model 'unicycle' is left out: " in shown.err

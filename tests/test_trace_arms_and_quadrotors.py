@@ -10,7 +10,8 @@ from s2r_runtime.models.forces import coupled
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.fitting import problem
-from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.lack_of_fit_terms import directions_of
+from s2r_runtime.trace.residual import acting, steps_of
 from s2r_runtime.trace.result import TraceResult
 from s2r_runtime.trace.selection import select
 from s2r_runtime.trace.tracer import trace
@@ -158,7 +159,8 @@ def test_friction_in_the_joints_of_an_arm_is_named(tmp_path):
     assert sizes == pytest.approx({"dq1": 1.0, "dq2": 0.3}, rel=0.05)
 
 
-def _flown(folder, sag, wind, lost=()) -> TraceResult:
+def _flown(folder, sag, wind, lost=(), lift=0.0) -> TraceResult:
+    """lift: m/s² upwards, at a height of 0, however the robot tilts, and less by e each 0.4 m."""
     model, rng = _model(folder, QUADROTOR), np.random.default_rng(2)
     goal = np.repeat(rng.uniform(-2.0, 2.0, (10, 3)), 100, axis=0)
     x, states, inputs = np.zeros((1, 6)), [], []
@@ -168,7 +170,8 @@ def _flown(folder, sag, wind, lost=()) -> TraceResult:
         states.append(x[0])
         inputs.append(u[0])
         x = model.nominal.step(x, u * [1.0, 1.0, 1.0 + sag], DT_S, model.parameters)
-        x[0] += np.concatenate([0.5 * DT_S * DT_S * np.array(wind), DT_S * np.array(wind)])
+        push = np.array([wind[0], wind[1], wind[2] + lift * np.exp(-x[0, 2] / 0.4)])
+        x[0] += np.concatenate([0.5 * DT_S * DT_S * push, DT_S * push])
     noise = rng.normal(size=(1000, 6)) * [0.002, 0.002, 0.002, 0.03, 0.03, 0.03]
     y = np.array(states) + noise
     for first in lost:
@@ -185,6 +188,60 @@ def test_wind_may_blow_downwards(tmp_path):
     (found,) = _flown(tmp_path, 0.0, (0.3, 0.0, -0.2)).effects
     assert (found.name, found.channel) == ("constant_disturbance", "world")
     assert [found.parameters[k][0] for k in "xyz"] == pytest.approx([0.3, 0.0, -0.2], abs=0.02)
+
+
+CART = """
+import numpy as np
+
+STATES, INPUTS, PARAMS, RATES = ("x", "y", "vx", "vy"), ("ax",), {}, {"vx": "x", "vy": "y"}
+
+
+def step(x, u, dt, params):
+    a = np.column_stack([u[:, 0], 0.0 * u[:, 0]])
+    return np.hstack([x[:, :2] + dt * x[:, 2:], x[:, 2:] + dt * a])
+"""
+
+
+def _directions(folder, source, dt):
+    path = folder / "robot.py"
+    path.write_text(source)
+    model, rng = compose(ModelSpec(str(path), dt)), np.random.default_rng(0)
+    nx, nu = len(model.states), len(model.inputs)
+    data = from_arrays(model, [(rng.uniform(-0.2, 0.2, (50, nx)), rng.uniform(0.05, 0.3, (49, nu)))])
+    given = problem(data, steps_of(data))
+    return directions_of(given, model, acting(model, data))
+
+
+@pytest.mark.parametrize("dt", [0.01, 0.1, 0.5])
+def test_an_axis_along_which_an_input_pushes_is_no_other_direction(tmp_path, dt):
+    body, world = _directions(tmp_path, CART, dt)  # Euler's rule: the input moves the speed alone
+    assert len(body) == 1
+    assert [np.flatnonzero(axis[0]).tolist() for axis in world] == [[1, 3]]
+    body, world = _directions(tmp_path, QUADROTOR, dt)
+    assert len(body) == 3
+    assert [np.flatnonzero(axis[0]).tolist() for axis in world][-1] == [2, 5]
+    assert _directions(tmp_path, ARM, dt)[1] == []  # links that move one another
+
+
+def test_what_depends_on_a_place_is_asked_about_where_inputs_push_as_well(tmp_path):
+    (tmp_path / "robot.py").write_text(CART)
+    model, rng = compose(ModelSpec(str(tmp_path / "robot.py"), DT_S)), np.random.default_rng(4)
+    u = np.repeat(rng.uniform(-1.0, 1.0, 40), 25)
+    x, rows = np.array([0.0, 0.0, 0.0, 0.2]), []
+    for a in u:
+        rows.append(x)
+        for _ in range(PARTS):
+            h = DT_S / PARTS
+            x = x + h * np.array([x[2], x[3], a - 6.0 * x[0], 0.0])  # a spring along the way that it is driven
+    y = np.array([*rows, x]) + rng.normal(size=(1001, 4)) * [1e-4, 1e-4, 1e-3, 1e-3]
+    found = trace(from_arrays(model, [(y, u[:, None])]), model)
+    assert "position" in found.depends_on or any(e.name in {"position_field", "cubic_stiffness"} for e in found.effects)
+
+
+def test_the_ground_lifts_what_flies_low_however_it_tilts(tmp_path):
+    found = _flown(tmp_path, 0.0, (0.0, 0.0, 0.0), lift=0.15)
+    assert found.verdict == "unexplained"
+    assert "position" in found.depends_on
 
 
 def test_a_message_that_repeats_is_frozen_in_all_that_it_says(tmp_path):

@@ -7,7 +7,7 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace import scores, selection
 from s2r_runtime.trace.dataset import from_arrays
-from s2r_runtime.trace.fitting import Problem, evaluate, problem
+from s2r_runtime.trace.fitting import Problem, evaluate, gain, problem
 from s2r_runtime.trace.residual import steps_of
 
 DT_S = 0.02
@@ -55,3 +55,14 @@ def test_nothing_is_asked_again_where_the_rest_says_too_little(monkeypatch):
     monkeypatch.setattr(scores, "fitted", lambda *_: pytest.fail("fitted again"))
     assert scores.overlooked(given, base, found, scores.STRICT, 1e5) == []
     assert scores.overlooked(given, base, [], scores.STRICT, 20.0) == []
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_what_makes_next_to_nothing_of_what_is_looked_for_is_not_gone_on_from(share):
+    """A drag that explains so many nats, where something without a name explains a little fewer, or more, than five times as many."""
+    given = _given(0.1)
+    usual = selection.called_for(given, MODEL, 50, lambda share: None)
+    before = selection.Selection(usual.nominal, usual.nominal, usual.tried, usual.ranking, ())
+    lacks = share * gain(usual.fit, usual.nominal) / selection.A_PART  # of both axes, which are looked for together
+    chosen = selection.called_for(given, MODEL, 50, lambda share: None, scores.LENIENT, before, lacks=lacks)
+    assert bool(chosen.fit.added) == (share < 1.0)

@@ -98,9 +98,9 @@ def test_the_account_opens_with_the_verdict_and_fits_a_terminal(results, verdict
 def test_the_account_says_what_was_left_over_and_what_it_followed(results):
     text = results["traced"].text()
     left = text[text.index("\nleft over") : text.index("error, rms")]
-    assert re.search(r"theta: [\d.]+ x the noise in one step; (9\d|100) % of that follows w", left)
-    assert re.search(r"along the heading: [\d.]+ x the noise in one step; \d+ % of that\s+follows how v changes", left)
-    assert re.search(r"ends [\d.]+ x the noise away\s+after 1 s", left)
+    assert re.search(r"theta: [\d.]+ times the noise in one step; (9\d|100) % of that follows w", left)
+    assert re.search(r"along the heading: [\d.]+ times the noise in one step; \d+ % of that\s+follows how v changes", left)
+    assert re.search(r"ends [\d.]+ times the noise away\s+after 1 s", left)
 
 
 def test_the_account_says_what_explains_it_with_numbers_units_and_intervals(results):
@@ -403,11 +403,17 @@ def test_a_gain_that_is_just_that_of_a_unit_is_asked_about(gain, unit):
     assert words.endswith(f"(is it told in {unit}?)" if unit else "commanded")
 
 
-def test_the_account_says_which_numbers_of_the_model_nobody_said(results):
+def test_the_account_says_which_numbers_of_the_model_nobody_said(results, tmp_path):
     def of(**parameters):
         return _assumed(replace(results["none"], nominal=compose(ModelSpec("differential_drive", 0.05, parameters))))
 
-    assert of() == ["taken as built in, since nobody said: wheel_radius = 0.1, track = 0.5 (--param wheel_radius=... if it is another)"]
-    assert of(wheel_radius=0.1) == ["taken as built in, since nobody said: track = 0.5 (--param track=... if it is another)"]
+    assert of() == [
+        "nobody said otherwise, so as the model has it: wheel_radius = 0.1, track = 0.5 (--param wheel_radius=... if it is another)"
+    ]
+    assert of(wheel_radius=0.1) == ["nobody said otherwise, so as the model has it: track = 0.5 (--param track=... if it is another)"]
     assert of(wheel_radius=0.1, track=0.5) == []
     assert _assumed(results["none"]) == []  # a unicycle has none
+    (tmp_path / "own.py").write_text(
+        "STATES, INPUTS, PARAMS = ('x',), ('u',), {'k': 2.0}\n\n\ndef step(x, u, dt, p):\n    return x + p['k'] * dt * u\n"
+    )
+    assert _assumed(replace(results["none"], nominal=compose(ModelSpec(str(tmp_path / "own.py"), 0.05)))) == []  # who wrote it has said

@@ -14,7 +14,7 @@ from s2r_runtime.hookspecs import Effect, Parameter
 from s2r_runtime.models.bound import BoundModel
 from s2r_runtime.models.composed import compose, resolve_source, takes, words
 from s2r_runtime.modelspec import ModelSpec, load_model
-from s2r_runtime.plugins import KINDS, registry
+from s2r_runtime.plugins import KINDS, registry, said
 
 ANY_STEP_S = 1.0
 """A model file's step, which nothing that is told of it depends on."""
@@ -94,7 +94,6 @@ def _of_model(name: str) -> dict[str, Any]:
     model = _bound(name)
     mine = name.endswith((".py", ".toml"))
     offered = None if mine else registry().offered("models", name)
-    on = [(one, registry().get("effects", one)) for one in registry().names("effects")]
     return {
         "kind": "model",
         "name": name,
@@ -104,13 +103,13 @@ def _of_model(name: str) -> dict[str, Any]:
         "inputs": [{"name": u, "unit": model.units.get(u, "")} for u in model.inputs],
         "angles": list(model.angles),
         "parameters": [{"name": key, "value": value} for key, value in model.parameters.items()],
-        "effects": [{"name": one, **entry} for one, effect in on for entry in _channels(effect, model)],
+        "effects": [{"name": one, **entry} for one in registry().names("effects") for entry in _acting(one, model)],
     }
 
 
 def _of_effect(name: str, model: str | None) -> dict[str, Any]:
     effect: Effect = registry().get("effects", name)
-    on = [{"model": one, **entry} for one in ([model] if model else registry().names("models")) for entry in _channels(effect, _bound(one))]
+    on = [{"model": one, **entry} for one in ([model] if model else _bindable()) for entry in _acting(name, _bound(one))]
     if model and not on:
         raise ConfigError(f"effect {name!r} acts on nothing that the model {model} has")
     return {"stage": effect.stage, "parameters": [_number(effect, p) for p in effect.parameters], "on": on}
@@ -123,6 +122,26 @@ def _number(effect: Effect, p: Parameter) -> dict[str, Any]:
     if choices or p.name in getattr(effect, "named", ()):
         return told | {"words": list(choices or ()), "input": not choices}
     return told | {"low": p.low, "high": p.high, "neutral": p.neutral, "shape": list(p.shape)}
+
+
+def _bindable() -> Iterator[str]:
+    """Models that can be used. What one of somebody else's raises is told, and is not the end."""
+    for name in registry().names("models"):
+        try:
+            _bound(name)
+        except Exception as error:  # noqa: BLE001 - as in `plugins`
+            output.err(f"s2r: model {name!r} is left out: {said(error)}")
+        else:
+            yield name
+
+
+def _acting(name: str, model: BoundModel) -> list[dict[str, Any]]:
+    """As `_channels`. What an effect of somebody else raises is told, and is not the end."""
+    try:
+        return _channels(registry().get("effects", name), model)
+    except Exception as error:  # noqa: BLE001 - as in `plugins`
+        output.err(f"s2r: effect {name!r} is left out on {model.name}: {said(error)}")
+        return []
 
 
 def _channels(effect: Effect, model: BoundModel) -> list[dict[str, Any]]:
@@ -148,7 +167,8 @@ def _lines(told: dict[str, Any]) -> Iterator[str]:
             yield "    parameters:"
             yield from _table([(p["name"], _range(p)) for p in told["parameters"]])
         yield "    acts on:"
-        yield from _table([(one["model"], ", ".join(one["channels"]), _units(one["units"])) for one in told["on"]])
+        rows = [(one["model"], ", ".join(one["channels"]), _units(one["units"])) for one in told["on"]]
+        yield from _table(rows) if rows else ["      none of these models; --model FILE.py says on what of yours"]
     elif "options" in told:
         yield "    options:"
         defaults = [f"default {o['default']}" if "default" in o else "" for o in told["options"]]
@@ -184,4 +204,4 @@ def _table(rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
     """In columns."""
     wide = [max(len(row[i]) for row in rows) for i in range(len(rows[0]) - 1)] if rows else []
     for row in rows:
-        yield "      " + "  ".join([*(f"{cell:{w}}" for cell, w in zip(row, wide, strict=False)), row[-1]]).rstrip()
+        yield "      " + "  ".join([*(f"{cell:{w}}" for cell, w in zip(row[:-1], wide, strict=True)), row[-1]]).rstrip()

@@ -116,7 +116,8 @@ def length_unit(model: NominalModel, channel: str) -> str:
     units: dict[str, str] = getattr(model, "units", {})
     axis = axis_of(model, channel)
     if axis is None:
-        return units.get(channel, "rad/s" if turns(channel) else "m/s").removesuffix("/s")
+        speed = units.get(channel, "rad/s" if turns(channel) else "m/s")
+        return speed.removesuffix("/s") if speed.endswith("/s") else f"{speed} s"
     name = model.states[axis.position]
     if coupled(model):
         return units.get(name, f"{name}'s unit")

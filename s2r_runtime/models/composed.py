@@ -221,7 +221,7 @@ class ComposedModel:
             as_it_is = given if rebound is None or changed is None else replace(given, parameters=changed, schemes={})
             x_next = a.effect.after_step(x, u, x_next, as_it_is, a.channel, dt, a.p)
             changed = changed if rebound is None else rebound(as_it_is, a.channel, a.p)
-        return pushed(x, u, x_next, given, self._forces, dt) if self._forces else x_next
+        return pushed(x, u, x_next, given, self._forces, dt, changed) if self._forces else x_next
 
     def true(self, x: Array) -> Array:
         """Measured states (n, nx) -> true ones."""

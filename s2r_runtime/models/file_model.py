@@ -41,7 +41,9 @@ as to step it; whether all are the same is then asked of the one that is kept.
 """
 
 PROBED, PROBED_S = 0.5, 0.01
-"""States and inputs, and a step in s, with which a file's `step` is called once to see whether it takes a table."""
+"""States and inputs, and a step in s, with which a file's `step` is asked once or twice whether it takes a table. What it prints then
+goes nowhere.
+"""
 
 Asked = tuple[tuple[int, ...], bytes, bytes, bytes, tuple[tuple[str, float], ...]]
 
@@ -111,7 +113,7 @@ class FileModel:
             raise NoNumbers(
                 f"{self.name}: step returned {result[row, column]} for state {self.states[column]!r} in row {row}"
                 f" (x = {x[row].tolist()}, u = {u[row].tolist()}), must be finite",
-                ~np.isfinite(result).all(axis=1),
+                np.asarray((~np.isfinite(result) & given).any(axis=1)),
             )
 
 
@@ -188,7 +190,8 @@ def _check_batched(path: Path, step: Callable[..., Any], nx: int, nu: int, param
         except (Exception, SystemExit):  # noqa: BLE001 - it may want other values: what it raises is told where it is asked for some
             return False
 
-    tables = np.full((2, nx), PROBED), np.full((2, nu), PROBED)
+    rows = nx + nu + 1  # one state at a time, taken for so many, makes no table of as many rows
+    tables = np.full((rows, nx), PROBED), np.full((rows, nu), PROBED)
     if not taken(*tables) and taken(*(table[0] for table in tables)):
         raise ConfigError(
             f"{path}: step takes one state at a time, must take a table of them: x is (n, {nx}), u is (n, {nu}), the result (n, {nx}), "
@@ -226,7 +229,7 @@ def _follows(path: Path, module: ModuleType, states: tuple[str, ...]) -> dict[st
 def _units(path: Path, module: ModuleType, columns: tuple[str, ...]) -> dict[str, str]:
     """UNITS = {"x": "m", "force": "N"}: SI units of states and inputs, as far as they are said."""
     given = getattr(module, "UNITS", {})
-    if not isinstance(given, dict) or not all(isinstance(unit, str) for unit in given.values()):
+    if not isinstance(given, dict) or not all(isinstance(unit, str) and unit and unit.isprintable() for unit in given.values()):
         raise ConfigError(f"{path}: UNITS is {given!r}, must be a dict of states and inputs and their units as text")
     if unknown := [name for name in given if name not in columns]:
         raise ConfigError(f"{path}: UNITS names {unknown[0]!r}, must name states and inputs: {', '.join(columns)}")

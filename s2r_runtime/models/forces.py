@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import NominalModel
-from s2r_runtime.models.bound import BoundModel
+from s2r_runtime.models.bound import PROBED, BoundModel
 from s2r_runtime.models.file_model import FileModel
 
 Array = NDArray[np.float64]
@@ -119,7 +119,11 @@ def _axes(model: NominalModel) -> tuple[Axis, ...]:
 
 
 SET = 0.01
-"""Of a speed, what a model must keep over that step for it to be one that something pushes, and not one that is set.
+"""Of a speed, what a model must keep over PROBE_S for it to be one that something pushes, and not one that is set at once."""
+
+EVEN, RATES_KEPT = 1e-3, 256
+"""Of what a model loses of a speed, by how much that may differ from state to state and still be in proportion; parameter values of which
+losses are known at a time.
 """
 
 LETTERS = {"v", "vx", "vy", "vz", "w"}
@@ -169,7 +173,7 @@ def _lone_speeds(model: BoundModel) -> dict[str, bool]:
     moving = {model.states[axis.velocity] for axis in axes(model)}
     found = {}
     for name in (s for s in model.states if s not in moving and (is_speed(s) or s in NAMED_RATES)):
-        kept = _kept_anywhere(model, model.states.index(name), PROBE_S)
+        kept = _kept(model, model.states.index(name), PROBE_S, model.parameters, 1.0)
         if kept is not None and np.all(np.abs(kept - 1.0) < 1e-9):
             found[name] = False
         elif kept is not None and np.all((kept > SET) & (kept <= 1.0 + 1e-9)):
@@ -177,50 +181,53 @@ def _lone_speeds(model: BoundModel) -> dict[str, bool]:
     return found
 
 
-def _kept_anywhere(model: BoundModel, column: int, dt: float) -> Array | None:
-    """(8,) what the model keeps of a bit more of a speed over a step, at random states; None where it gives no numbers there."""
+def _kept(model: BoundModel, column: int, dt: float, parameters: dict[str, float], size: float) -> Array | None:
+    """(8,) what the model keeps of a speed over a step, a share of it, at random states of this size; None if it gives no numbers there."""
     model = replace(model, finer=False, schemes={})  # in parts of a step, what a speed does to other states comes back to it
     rng = np.random.default_rng(0)
     x, u = rng.uniform(-1.0, 1.0, (8, len(model.states))), rng.uniform(-1.0, 1.0, (8, len(model.inputs)))
+    x, faster = size * x, size * x
+    faster[:, column] += size
     try:
-        return _kept(model, column, x, u, dt, 1.0)
+        more, usual = (model.step(start, u, dt, parameters)[:, column] for start in (faster, x))
     except ConfigError:  # a user's model that cannot be stepped just anywhere
         return None
+    return np.asarray((more - usual) / size)
 
 
-def _kept(model: BoundModel, column: int, x: Array, u: Array, dt: float | Array, more: float) -> Array:
-    """(n,) of `more` of a speed, how much is there after a step, as a share of it."""
-    faster = x.copy()
-    faster[:, column] += more
-    gained = model.step(faster, u, dt, model.parameters) - model.step(x, u, dt, model.parameters)  # type: ignore[arg-type]
-    return np.asarray(gained[:, column] / more)
+_SLOWED: WeakKeyDictionary[BoundModel, dict[tuple[object, ...], tuple[float, float]]] = WeakKeyDictionary()
 
 
-_SLOWED: WeakKeyDictionary[BoundModel, dict[tuple[int, float], float | None]] = WeakKeyDictionary()
-
-
-def own_rate(model: NominalModel, column: int, x: Array, u: Array, dt: float | Array) -> Value:
-    """1/s by which somebody's own model slows a speed down by itself, a number or (n,): what pushes it is slowed down, too. 0 where it does
-    not, and of a model that is not somebody's own: forces on those have their losses with them.
+def own_rate(model: NominalModel, column: int, dt: float | Array, parameters: dict[str, float] | None = None) -> Value:
+    """1/s by which somebody's own model slows a speed down in proportion to it, a number (or (n,), with dt): what pushes it is slowed down,
+    too. 0 where it loses nothing, or otherwise than in proportion, or is set at once; and of a model that is not somebody's own, which has
+    forces besides. parameters: others than the model's.
     """
     if not isinstance(model, BoundModel) or not isinstance(model.shared, FileModel):
         return 0.0
-    lasts = float(np.median(dt))
     known = _SLOWED.setdefault(model, {})
-    if (column, lasts) not in known:
-        kept = _kept_anywhere(model, column, lasts)
-        even = kept is None or bool(np.ptp(kept) <= 1e-6)
-        usual = 1.0 if kept is None else float(kept[0])
-        known[column, lasts] = None if not even else 0.0 if abs(usual - 1.0) < 1e-9 else _rate(usual, lasts)
-    steady = known[column, lasts]
-    if steady is not None:
-        return steady
-    more = PROBE * max(float(np.max(np.abs(x[:, column]), initial=0.0)), PROBE)
-    return np.asarray(_rate(_kept(model, column, x, u, dt, more), dt))
+    values = model.parameters if parameters is None else parameters
+    key = (column, *values.items())
+    if key not in known:
+        if len(known) >= RATES_KEPT:
+            known.clear()
+        known[key] = _rates(model, column, values)
+    rate, each = known[key]
+    return rate if each == 0.0 else each / dt
 
 
-def _rate(kept: Value, dt: float | Array) -> Any:
-    return -np.log(np.maximum(kept, math.exp(LEAST))) / dt
+def _rates(model: BoundModel, column: int, parameters: dict[str, float]) -> tuple[float, float]:
+    """(per s, per step): the second one of a model that was identified for one step, and does not ask how long it is."""
+    once = [_kept(model, column, PROBE_S, parameters, size) for size in PROBED]
+    twice = _kept(model, column, 2.0 * PROBE_S, parameters, 1.0)
+    if twice is None or any(kept is None for kept in once):
+        return 0.0, 0.0
+    kept = np.concatenate([one for one in once if one is not None])
+    if np.ptp(kept) > EVEN * abs(1.0 - kept[0]) or not SET < kept[0] < 1.0 - 1e-9:
+        return 0.0, 0.0
+    loss = -math.log(kept[0])
+    asks = abs(twice[0] - kept[0]) > EVEN * abs(1.0 - kept[0])
+    return (loss / PROBE_S, 0.0) if asks else (0.0, loss)
 
 
 def mass_name(model: NominalModel) -> str:
@@ -298,11 +305,22 @@ def _response(x: Array, u: Array, model: BoundModel, dt: float) -> Array:
     return found
 
 
-def pushed(x: Array, u: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushing], dt: float | Array) -> Array:
-    """The result of the step under u without these effects, x_next (n, nx), with all of them. dt: also of each row, (n,)."""
+def pushed(
+    x: Array,
+    u: Array,
+    x_next: Array,
+    model: NominalModel,
+    pushing: Sequence[Pushing],
+    dt: float | Array,
+    parameters: dict[str, float] | None = None,
+) -> Array:
+    """The result of the step under u without these effects, x_next (n, nx), with all of them. dt: also of each row, (n,). parameters: by
+    which the model slows down, if others than its own.
+    """
     alone = {*lone_speeds(model, slowed=True)}.intersection(channel for _, channel, _ in pushing)
     for name in sorted(alone):
-        x_next = _braked(x, u, x_next, model, [one for one in pushing if one[1] == name], dt)
+        rate = own_rate(model, model.states.index(name), dt, parameters)
+        x_next = _braked(x, x_next, model, [one for one in pushing if one[1] == name], dt, rate)
     pushing = [one for one in pushing if one[1] not in alone]
     if not pushing:
         return x_next
@@ -310,7 +328,7 @@ def pushed(x: Array, u: Array, x_next: Array, model: NominalModel, pushing: Sequ
         return _pushed_together(x, u, x_next, model, pushing, dt)
     varies = any(effect.varies for effect, _, _ in pushing)
     moved = [k for k in axes(model) if any(effect.push(x[:1], k, model, channel, p) is not None for effect, channel, p in pushing)]
-    rates = [own_rate(model, k.velocity, x, u, dt) for k in moved]
+    rates = [own_rate(model, k.velocity, dt, parameters) for k in moved]
     given = [_given(x[:, k.velocity], x_next[:, k.velocity], rate, dt) for k, rate in zip(moved, rates, strict=True)]
     parts = max(1, math.ceil(float(np.max(dt, initial=0.0)) / PART_S - 1e-9)) if varies else 1
     h = dt / parts
@@ -330,18 +348,18 @@ def pushed(x: Array, u: Array, x_next: Array, model: NominalModel, pushing: Sequ
             end, way = now[:, k.velocity], now[:, k.position] - x[:, k.position]
         else:
             end, way = _glide(v, g, _losing(_together(x, k, model, pushing), rate), dt)
-        after[:, k.position] += way - (dt * v + 0.5 * dt * dt * g if _none(rate) else _moved(v, g, _flow(rate, dt))[1])
+        after[:, k.position] += way - (dt * v + 0.5 * dt * dt * g if _lossless(rate) else _moved(v, g, _flow(rate, dt))[1])
         after[:, k.velocity] = end
     return after
 
 
-def _none(rate: Value) -> bool:
+def _lossless(rate: Value) -> bool:
     return not isinstance(rate, np.ndarray) and rate == 0.0
 
 
 def _given(v: Array, v_next: Array, rate: Value, dt: float | Array) -> Array:
     """(n,) the acceleration that the model itself gives, besides what it loses at this rate: with both, v becomes v_next."""
-    if _none(rate):
+    if _lossless(rate):
         return (v_next - v) / dt
     flow = _flow(rate, dt)
     return np.asarray((v_next - flow.keep * v) / flow.first)
@@ -349,16 +367,15 @@ def _given(v: Array, v_next: Array, rate: Value, dt: float | Array) -> Array:
 
 def _losing(push: Push, rate: Value) -> Push:
     """A push where the model itself slows down at this rate."""
-    return push if _none(rate) else replace(push, rate=_sum(push.rate, (rate, rate)))
+    return push if _lossless(rate) else replace(push, rate=_sum(push.rate, (rate, rate)))
 
 
-def _braked(x: Array, u: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushing], dt: float | Array) -> Array:
-    """x_next (n, nx), under pushes on one speed that has no position."""
+def _braked(x: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushing], dt: float | Array, rate: Value) -> Array:
+    """x_next (n, nx), under pushes on one speed that has no position, which the model itself slows down at this rate."""
     j = model.states.index(pushing[0][1])
     axis = Axis(x.shape[1], j)  # a push that asks where it is fails
     varies = any(effect.varies for effect, _, _ in pushing)
     parts = max(1, math.ceil(float(np.max(dt, initial=0.0)) / PART_S - 1e-9)) if varies else 1
-    rate = own_rate(model, j, x, u, dt)
     given, at = _given(x[:, j], x_next[:, j], rate, dt), x.copy()
     v = np.ascontiguousarray(x[:, j])
     for _ in range(parts):

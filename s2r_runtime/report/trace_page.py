@@ -246,4 +246,4 @@ def _data(page: Page, r: TraceResult) -> None:
     for line in r.done_to_data:
         page.text(line)
     if r.outliers:
-        page.text(f"{r.outliers} outlying rows count for next to nothing.")
+        page.text(f"{r.outliers} outlying {'row counts' if r.outliers == 1 else 'rows count'} for next to nothing.")

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from s2r_runtime.hookspecs import Effect, NominalModel
-from s2r_runtime.models.composed import compose
+from s2r_runtime.models.composed import compose, takes
 from s2r_runtime.modelspec import EffectSpec, ModelSpec, dump_model, load_model
 from s2r_runtime.plugins import registry
 from s2r_runtime.testing.effect_claims import additive_gap, first_of, linear_gap, shift_gap
@@ -304,7 +304,7 @@ class EffectKit:
 
     def _takes(self, model: NominalModel, channel: str) -> set[str]:
         """Names of the parameters that it has there."""
-        return {*(self.effect.takes(model, channel) if hasattr(self.effect, "takes") else (p.name for p in self.effect.parameters))}
+        return {*takes(self.effect, model, channel)}
 
     def _like(self, value: object, number: float | None) -> object:
         """The number, in every entry if the value is a matrix."""

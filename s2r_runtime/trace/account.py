@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.models.file_model import FileModel
 from s2r_runtime.trace.found import Found
 from s2r_runtime.trace.residual import rms
 from s2r_runtime.trace.shape import Component, Shape, components, derived, strongest, variables
@@ -168,7 +169,7 @@ def _told(shape: Shape) -> str:
 
 
 def _louder(part: Component) -> str:
-    return f"{part.said}: {float(rms(part.before)) / max(part.floor, 1e-300):.3g} x the noise in one step"
+    return f"{part.said}: {float(rms(part.before)) / max(part.floor, 1e-300):.3g} times the noise in one step"
 
 
 def _percent(share: float) -> str:
@@ -184,7 +185,7 @@ def _away(r: TraceResult, ends: Array, least: float) -> str:
     usual = np.sort(np.abs(ends[:, worst]))[: max(1, round(USUAL * len(ends)))]  # a few wild rows are outliers, and counted
     if min(ratio[worst], float(np.sqrt(np.mean(usual**2))) / max(float(r.floor[1][worst]), 1e-300)) <= least:
         return ""
-    return f"{r.nominal.states[worst]} ends {float(ratio[worst]):.3g} x the noise away after {r.horizon_s:.4g} s"
+    return f"{r.nominal.states[worst]} ends {float(ratio[worst]):.3g} times the noise away after {r.horizon_s:.4g} s"
 
 
 def _table(r: TraceResult) -> list[str]:
@@ -284,19 +285,19 @@ def _data(r: TraceResult) -> list[str]:
     lines = [f"{r.n_rows} rows in {runs} run{'s' if runs > 1 else ''}, {grid}", *_assumed(r)]
     lines += list(r.done_to_data)
     if r.outliers:
-        lines.append(f"{r.outliers} outlying rows count for next to nothing")
+        lines.append(f"{r.outliers} outlying {'row counts' if r.outliers == 1 else 'rows count'} for next to nothing")
     lines.append(f"fitted on {r.n_fit} transitions, judged on {len(r.held.steps)} that the fit never saw")
     return lines
 
 
 def _assumed(r: TraceResult) -> list[str]:
-    """Numbers of a built-in model that are what they are because nobody said: a wheel base that was forgotten is traced as a gain."""
-    spec = r.nominal.spec
-    unsaid = {} if spec.source_digest else {k: v for k, v in r.nominal.parameters.items() if k not in spec.parameters}
+    """Numbers of a model of others that are what they are because nobody said: a wheel base that was forgotten is traced as a gain."""
+    model, said = r.nominal.nominal, r.nominal.spec.parameters
+    unsaid = {} if isinstance(model.shared, FileModel) else {k: v for k, v in model.parameters.items() if k not in said}
     if not unsaid:
         return []
     numbers = ", ".join(f"{name} = {value:g}" for name, value in unsaid.items())
-    return [f"taken as built in, since nobody said: {numbers} (--param {next(iter(unsaid))}=... if it is another)"]
+    return [f"nobody said otherwise, so as the model has it: {numbers} (--param {next(iter(unsaid))}=... if it is another)"]
 
 
 def labelled(label: str, lines: Sequence[str]) -> list[str]:

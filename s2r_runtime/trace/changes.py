@@ -20,7 +20,7 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, foretold, gain, sought, under_noise, without
 from s2r_runtime.trace.rivals import CLOSE, rivals_of
-from s2r_runtime.trace.scores import CONTENDS, ONWARD, Bar, Scored, name_of
+from s2r_runtime.trace.scores import ONWARD, Bar, Scored, name_of
 from s2r_runtime.trace.slots import Added, Slot, bounds_of, values_of, with_values
 
 EDGE = 0.02
@@ -69,9 +69,9 @@ def from_the_beginning(given: Problem, fit: Fit, bar: Bar) -> Fit:
         drifts, sine = name == "input_gain_drift", name == "periodic_disturbance"
         if not (drifts or sine or not happens(given, fit)):
             continue
-        behind = _behind(given, fit, place) if sine else math.inf
+        behind = _behind(given, fit, place) if sine and not given.floor.axes else math.inf
         for models in _of_the_drive(fit.model, place, 1 if given.bends else 2) if sine else [_of_each(fit.model, place)]:
-            others = [_instead(given, fit, model, bar, behind) for model in models if foretold(given, model) is not None]
+            others = [_instead(given, fit, model, behind) for model in models if foretold(given, model) is not None]
             more, best = max(
                 ((_ahead(given, other, fit, bar), other) for other in others), key=lambda pair: pair[0], default=(-math.inf, fit)
             )
@@ -81,14 +81,15 @@ def from_the_beginning(given: Problem, fit: Fit, bar: Bar) -> Fit:
 
 
 def _behind(given: Problem, fit: Fit, place: int) -> float:
-    """Nats by which something else may be behind a sine after a round of parameters and noise and still come up to it in another."""
+    """Nats by which something else may be behind a sine after a round of parameters and noise and still come up to it in another: as much
+    as a candidate may be behind the best one (ONWARD). Where speeds were not measured, one round says little.
+    """
     return (1.0 - ONWARD) * gain(fit, evaluate(given, without(fit.model, place), fit.noise))
 
 
-def _instead(given: Problem, fit: Fit, model: ComposedModel, bar: Bar, behind: float) -> Fit:
+def _instead(given: Problem, fit: Fit, model: ComposedModel, behind: float) -> Fit:
     """A model in the place of what was found, fitted as far as it may come up to that. behind: nats, after a round."""
-    other = fitted(given, fit, model, 2, lambda other: gain(other, fit) < -behind)
-    return fitted(given, other, other.model) if _ahead(given, other, fit, bar) > -CONTENDS else other
+    return fitted(given, fit, model, hopeless=lambda other: gain(other, fit) < -behind)
 
 
 def _ahead(given: Problem, other: Fit, fit: Fit, bar: Bar) -> float:

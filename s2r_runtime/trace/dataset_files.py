@@ -50,8 +50,9 @@ def load_dataset(
     needs: unseen.py). transport: the profile's, for a log in a robot's own format. behind: s by which states of the pose come late, if that
     is known from another recording (None: as this one says, `late_poses`).
 
-    Raises RecordingError (unreadable, lacks a column that does not follow from others, too slow for the model's dt), NotEnoughEvidence
-    if states were measured at one moment only, or too seldom for what was not measured.
+    Raises RecordingError (unreadable, lacks a column that does not follow from others, too slow for the model's dt), ConfigError if
+    somebody's own model fails at the states of a table, NotEnoughEvidence if states were measured at one moment only, or too seldom for
+    what was not measured.
     """
     paths = tuple(Path(p) for p in ([path] if isinstance(path, str | Path) else path))
     digests = tuple(_digest(p) for p in paths)
@@ -83,7 +84,7 @@ def load_dataset(
 
 
 def _check_steps(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]]) -> None:
-    """Raises ConfigError, as the model does, if it steps from none of the first, middle and last states that were measured. One that never
+    """Raises ConfigError, as the model does, if its step fails from the first, middle and last states that were measured. One that always
     does would say so only after it was asked of every row by itself.
     """
     x, u = (np.concatenate([pair[kind].values for pair in segments]) for kind in (0, 1))

@@ -67,7 +67,9 @@ BESIDE = 0.15
 
 @dataclass(frozen=True)
 class Checked:
-    """data: with faulty rows taken out (NaN); left_out: (run, step) transitions across a jump; outliers: rows taken out as such."""
+    """data: with faulty rows taken out (NaN); left_out: (run, step) transitions across a jump, or in time that a clock made up; outliers:
+    rows taken out as such.
+    """
 
     data: Dataset
     faults: tuple[Fault, ...]
@@ -86,7 +88,7 @@ def check(model: ComposedModel, data: Dataset, under: ComposedModel | None = Non
     found = [*known, *silent]
     pose = _pose(model)
     bad = [np.zeros(run.y.shape, dtype=bool) for run in data.runs]
-    left_out: list[tuple[int, int]] = []
+    left_out = [at for fault, pause in zip(faults, data.pauses, strict=True) if fault in found for at in _within(data, fault, pause)]
     spikes: list[Fault] = []
     outliers = tails = 0
     sure: list[Fault] = []
@@ -105,7 +107,7 @@ def check(model: ComposedModel, data: Dataset, under: ComposedModel | None = Non
             found += _inconsistent(model, data, act, i, bad[i], reach, pose)
     rows = sum(len(run.y) for run in data.runs)
     for i, stray in strays if len(strays) <= max(STRAYS * rows, 1.0) else ():
-        first, last = (round((at - data.runs[i].start_s) / data.dt) for at in (stray.from_s, stray.to_s))
+        first, last = _rows(data, i, stray.from_s, stray.to_s)
         bad[i][first : last + 1, model.states.index(stray.channel)] = True
         outliers += 1
     for jumps in [] if under is None else _under(under, data, bad, found):
@@ -123,6 +125,18 @@ def check(model: ComposedModel, data: Dataset, under: ComposedModel | None = Non
         found = [f for f in found if f.kind != "offset_jump" or f in sure]
     faults_ = tuple(sorted([*found, *([] if many else spikes)], key=lambda f: (f.from_s, f.channel)))
     return Checked(bridged(replace(data, runs=runs)), faults_, tuple(sorted(set(left_out))), _untold(data, bad, faults_))
+
+
+def _within(data: Dataset, fault: Fault | None, pause: Pause) -> list[tuple[int, int]]:
+    """(run, step) of the time that a clock made up: a rollout across it would go on while the robot did not."""
+    if fault is None or fault.kind != "clock_step":
+        return []
+    return [(pause.run, step) for step in range(*_rows(data, pause.run, fault.from_s, fault.to_s))]
+
+
+def _rows(data: Dataset, run: int, *at: float) -> tuple[int, ...]:
+    """Of a run, those nearest to these times in s."""
+    return tuple(round((t - data.runs[run].start_s) / data.dt) for t in at)
 
 
 def _untold(data: Dataset, bad: list[Mask], faults_: Sequence[Fault]) -> int:
@@ -158,7 +172,7 @@ def _of_pause(model: ComposedModel, data: Dataset, act: Acting, pause: Pause, re
     did too.
     """
     run = data.runs[pause.run]
-    first, last = (round((at - run.start_s) / data.dt) for at in (pause.from_s, pause.to_s))
+    first, last = _rows(data, pause.run, pause.from_s, pause.to_s)
     before = model.difference(run.y[max(0, first - AROUND) + 1 : first + 1], run.y[max(0, first - AROUND) : first])
     after = model.difference(run.y[last + 1 : last + AROUND + 1], run.y[last : last + AROUND][: len(run.y[last + 1 : last + AROUND + 1])])
     steps, usual = (pause.to_s - pause.from_s) / data.dt, pause.usual_s / data.dt

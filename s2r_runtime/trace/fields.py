@@ -326,7 +326,7 @@ def _offered(left: Left) -> Iterator[_Offer]:
     moved = _apart([*_moved(left), *named] if set(model.states) >= BODY else [*own, *named])
     for place in _places(model.states, y):
         yield from _over("position", place, moved)  # floors have stripes and hills of all sizes
-        yield from _over("position", place, world or body)
+        yield from _over("position", place, world if {*model.states} >= BODY else [*body, *world])
     for name in ANGLES:
         if name in model.states:
             angle = y[:, model.states.index(name)]

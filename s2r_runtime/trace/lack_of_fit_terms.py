@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.models.forces import axes
+from s2r_runtime.models.forces import POSE, axes, coupled, lone_speeds
 from s2r_runtime.trace.fitting import Problem, slopes
 from s2r_runtime.trace.lack_of_fit_crossed import bent_product, over_time, overtones
 from s2r_runtime.trace.residual import Acting, Steps, acting, wherever
@@ -61,6 +61,9 @@ LINE = 25.0
 
 FEWEST_LEVELS, MOST_LEVELS = 4.0, 200.0
 """Steps between zero and the largest input, in which it may be carried out: fewer have dictionaries of their own."""
+
+PARALLEL = 0.999
+"""Share of a push along one axis, mean square, from which it is that axis': a tilt of two degrees is another direction."""
 
 WIDEST = 30
 """Steps to each side over which states are averaged at most."""
@@ -337,17 +340,19 @@ def _of_states(
         yield token, [c[:, None] * p for c in ripples for p in pushes], None
         yield from ((token, [c * v for c in ripples], body) for v in inputs)
     position = [_scaled(y[:, i]) for i, name in enumerate(model.states) if name in {"x", "y", "z", "q"}]
+    posed = {*model.states} >= POSE
+    anywhere = world if posed else [*body, *world]
     if position:
         known |= {"x", "y", "z", "q"}
         squares = [a * b for i, a in enumerate(position) for b in position[: i + 1]]
-        yield "position", [one, *position], world or body
+        yield "position", [one, *position], anywhere
         yield "position", [a * v for a in position for v in inputs], body
         yield "position", [c[:, None] * p for c in _patches(position) for p in pushes], None
-        for a in [] if world else position:
+        for a in [] if posed else position:
             yield "position", [*_push(_at_ends(a), body), *(c[:, None] * p for c in _there(a) for p in pushes)], None
         yield "position", [one, *position, *squares, *(a**3 for a in position)], [*body, *world]
         for a in position:
-            yield "position", [f(np.pi * k * a) for k in range(1, WAVES + 1) for f in (np.sin, np.cos)], world or body
+            yield "position", [f(np.pi * k * a) for k in range(1, WAVES + 1) for f in (np.sin, np.cos)], anywhere
         rubbed = [term for i in _speeds(model) for term in _rubbed(_patches(position), y[:, i], _pushing(body, i))]
         if rubbed:
             yield "position", rubbed, None
@@ -446,11 +451,11 @@ def _push(terms: Sequence[Array], directions: Sequence[Array]) -> Terms:
 
 def directions_of(given: Problem, model: ComposedModel, act: Acting) -> tuple[list[Array], list[Array]]:
     """((n, nx) each) in which something can push: along, across and about the body and each further state; and the world's axes. For a
-    model without a planar pose, where its inputs push; each state, if they push nowhere.
+    model without a planar pose, where its inputs push (each state, if they push nowhere); and its axes, along which none of them does.
     """
     n, nx = given.steps.y0.shape
     unit = np.eye(nx)
-    if {"x", "y", "theta"} <= set(model.states):
+    if {*model.states} >= POSE:
         x, y, theta = (model.states.index(name) for name in ("x", "y", "theta"))
         c, s = np.cos(given.steps.y0[:, theta]), np.sin(given.steps.y0[:, theta])
         along, across = np.zeros((n, nx)), np.zeros((n, nx))
@@ -458,7 +463,28 @@ def directions_of(given: Problem, model: ComposedModel, act: Acting) -> tuple[li
         others = [np.tile(unit[i], (n, 1)) for i in range(nx) if i not in {x, y}]
         return [along, across, *others], [np.tile(unit[x], (n, 1)), np.tile(unit[y], (n, 1))]
     own = own_pushes(given, model, act)
-    return own if any(np.any(d) for d in own) else [np.tile(axis, (n, 1)) for axis in unit], []
+    if not any(np.any(d) for d in own):
+        return [np.tile(axis, (n, 1)) for axis in unit], []
+    alone = [np.tile(axis, (n, 1)) for axis in _pushed_alone(model)]
+    return own, [axis for axis in alone if not any(_along(model, axis, push) for push in own)]
+
+
+def _pushed_alone(model: ComposedModel) -> Terms:
+    """(nx,) where a force along one axis pushes: the ground lifts what flies, however it tilts. Not of links that move one another."""
+    if coupled(model.nominal):
+        return []
+    unit = np.eye(len(model.states))
+    lone = [unit[model.states.index(name)] for name in lone_speeds(model.nominal, slowed=True)]
+    return [*(unit[axis.velocity] + 0.5 * model.dt * unit[axis.position] for axis in axes(model.nominal)), *lone]
+
+
+def _along(model: ComposedModel, axis: Array, push: Array) -> bool:
+    """Whether a push (n, nx) changes speeds only along one axis (n, nx), where it changes any."""
+    speeds = [*(one.velocity for one in axes(model.nominal)), *map(model.states.index, lone_speeds(model.nominal, slowed=True))]
+    there = push[:, speeds]
+    there = there[np.any(there, axis=1)]
+    own = np.argmax(axis[0, speeds])
+    return len(there) > 0 and float(np.mean(there[:, own] ** 2 / np.sum(there**2, axis=1))) > PARALLEL
 
 
 def own_pushes(given: Problem, model: ComposedModel, act: Acting) -> Terms:

@@ -213,17 +213,22 @@ def wherever(model: ComposedModel, x: Array, act: Acting, place: Index | slice) 
         place, half = np.arange(len(act.end))[place], len(x) // 2
         if isinstance(error, NoNumbers) and len(error.rows) == len(x):
             going, there = ~error.rows, x.copy()
-            there[going] = wherever(model, x[going], act, place[going])
+            if np.any(going):
+                there[going] = wherever(model, x[going], act, place[going])
             return there
         return np.concatenate([wherever(model, x[part], act, place[part]) for part in (slice(half), slice(half, None))])
 
 
 def check_steps(model: ComposedModel, x: Array, u: Array) -> None:
-    """Raises ConfigError, as the model does, if it steps from none of these states (n, nx) under these inputs (n, nu), each alone."""
+    """Raises ConfigError, as the model does, if its step fails from all of these states (n, nx) under these inputs (n, nu), each alone. One
+    that gives no numbers there may give some elsewhere.
+    """
     failed: list[ConfigError] = []
     for state, given in zip(x, u, strict=True):
         try:
             model.advance(state[None], given[None], given[None])
+        except NoNumbers:
+            return
         except ConfigError as error:
             failed.append(error)
     if failed and len(failed) == len(x):

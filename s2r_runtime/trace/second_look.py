@@ -101,7 +101,7 @@ def once_more(
     if pair is not None:  # a change between the parts that are fitted is anywhere there: its time is told by all of the recording
         pair = replace(pair, fit=dated(given, whole.given, pair.fit))
     told = None if pair is None else _all_explained(whole, pair, structure, refused)
-    nameless = max([structure.nats, *structure.gains.values()])
+    nameless = max([structure.nats, *structure.gains.values()]) if structure.matters else 0.0
     for bar, before, may_be_left, lacks in (
         (STRICT, pair if told is not None and not told.tokens else None, set(), 0.0),
         (LENIENT if chosen.fit.added else ALONE, chosen, {"noise"}, nameless),

