@@ -56,7 +56,7 @@ def matches(expected: str, got: str) -> bool:
 
 @pytest.mark.parametrize(("where", "block"), blocks("console"), ids=[w for w, _ in blocks("console")])
 def test_console_block_shows_what_happens(where: str, block: str, tmp_path: Path) -> None:
-    for folder in ("profiles", "controllers"):
+    for folder in ("profiles", "controllers", "examples"):
         shutil.copytree(ROOT / folder, tmp_path / folder)
     environment = {
         **os.environ,
