@@ -10,7 +10,7 @@ import numpy as np
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset, in_finer_parts
 from s2r_runtime.trace.errors import Held, at_most_seen, judge, noise_floor
-from s2r_runtime.trace.fitting import Fit, Problem, fitted, foretold, problem
+from s2r_runtime.trace.fitting import Fit, Problem, fitted, foretold, gain, problem
 from s2r_runtime.trace.hidden_pairs import two_together
 from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import steps_of
@@ -101,9 +101,13 @@ def once_more(
     if pair is not None:  # a change between the parts that are fitted is anywhere there: its time is told by all of the recording
         pair = replace(pair, fit=dated(given, whole.given, pair.fit))
     told = None if pair is None else _all_explained(whole, pair, structure, refused)
-    nameless = max([structure.nats, *structure.gains.values()]) if structure.matters else 0.0
+
+    def nameless() -> float:
+        seen = max([structure.nats, *structure.gains.values()]) if structure.matters else -math.inf
+        return max(seen, whole.nameless(len(given.steps)) - gain(chosen.fit, chosen.nominal))
+
     for bar, before, may_be_left, lacks in (
-        (STRICT, pair if told is not None and not told.tokens else None, set(), 0.0),
+        (STRICT, pair if told is not None and not told.tokens else None, set(), None),
         (LENIENT if chosen.fit.added else ALONE, chosen, {"noise"}, nameless),
     ):
         if before is None:

@@ -61,9 +61,18 @@ class Selection:
     risky: bool = False
 
 
-def select(given: Problem, model: ComposedModel, horizon: int, progress: Callable[[float], None], most: int = MOST) -> Selection:
-    """The effects that the transitions call for, `most` of them at most, and their rivals."""
-    return against_rivals(given, called_for(given, model, horizon, progress, most=most), STRICT)
+def select(
+    given: Problem,
+    model: ComposedModel,
+    horizon: int,
+    progress: Callable[[float], None],
+    most: int = MOST,
+    lacks: Callable[[], float] | None = None,
+) -> Selection:
+    """The effects that the transitions call for, `most` of them at most, and their rivals. lacks: as `called_for` has it; asked once two
+    effects were found.
+    """
+    return against_rivals(given, called_for(given, model, horizon, progress, most=most, lacks=lacks), STRICT)
 
 
 def called_for(
@@ -74,17 +83,18 @@ def called_for(
     bar: Bar = STRICT,
     before: Selection | None = None,
     most: int = MOST,
-    lacks: float = 0.0,
+    lacks: Callable[[], float] | None = None,
 ) -> Selection:
     """The effects alone, by any bar, `most` at most. before: what was selected with another one, from which it goes on. lacks: nats that
-    something without a name explains beyond that: an effect that makes next to nothing of it is not gone on from.
+    something without a name explains beyond what it begins with: an effect that makes next to nothing of it is not gone on from.
     """
     nominal = evaluate(given, model) if before is None else before.nominal
     fit, tried = (nominal, 0) if before is None else (before.fit, before.tried)
     begun = fit
     ranking = [] if before is None else list(before.ranking)
     for step in range(most - len(fit.added)):
-        short = A_PART * (lacks - gain(fit, begun)) if lacks else -math.inf
+        again = before is not None or len(fit.added) > 1
+        short = _least(lacks, fit, begun) if again else -math.inf
         if ranking and not fit.added:
             found, columns = rescored(ranking, nominal, len(given.steps), bar), tried
         else:
@@ -98,7 +108,7 @@ def called_for(
             others = overlooked(given, fit, found, bar, max(bar.needed(tried, 1, len(given.steps)), short))
             chosen = _first_of(others, given, fit, tried, horizon, bar)
         chosen = chosen if fit.added else _of_all_axes(given, nominal, chosen, tried, horizon, bar)
-        if chosen is None or gain(chosen, fit) < short:
+        if chosen is None or ((again or fit.added) and gain(chosen, fit) < _least(lacks, fit, begun)):
             break
         chosen = parted(given, fitted(given, chosen, chosen.model), ranking, bar)
         fit = exchanged(given, chosen, bar) if 1 < len(chosen.added) <= EXCHANGED else chosen
@@ -107,6 +117,11 @@ def called_for(
     fit = unbent(given, simplified(given, pruned(given, fit, tried, horizon, bar)), tried, bar)
     progress(0.8)
     return Selection(nominal, plainly(given, fit), tried, tuple(ranking), ())
+
+
+def _least(lacks: Callable[[], float] | None, fit: Fit, begun: Fit) -> float:
+    """Nats that an effect must explain beside those that were found since it began. lacks: as `called_for` has it."""
+    return -math.inf if lacks is None else A_PART * (lacks() - gain(fit, begun))
 
 
 def _first_of(found: Sequence[Scored], given: Problem, base: Fit, tried: int, horizon: int, bar: Bar) -> Fit | None:
@@ -138,11 +153,13 @@ def against_rivals(given: Problem, chosen: Selection, bar: Bar) -> Selection:
     return replace(chosen, fit=fit, rivals=tuple(found))
 
 
-def one_more(given: Problem, chosen: Selection, horizon: int, foretells: Callable[[Fit, Fit], float]) -> Selection:
+def one_more(
+    given: Problem, chosen: Selection, horizon: int, foretells: Callable[[Fit, Fit], float], lacks: Callable[[], float] | None = None
+) -> Selection:
     """With an effect besides that falls short of what is needed on what was fitted, but not on all of the recording. foretells: nats by
     which one model foretells what was not fitted better than another one does: the probability of both parts is that of one times that
     of the other, given the first, so they add. It counts for no more than the fit does, which is asked about where the robot was, but of
-    what changes an input: that is known without noise.
+    what changes an input: that is known without noise. lacks: as `called_for` has it.
     """
     fit = chosen.fit
     if len(fit.added) >= MOST or crowded(fit):
@@ -153,7 +170,7 @@ def one_more(given: Problem, chosen: Selection, horizon: int, foretells: Callabl
         needed, reached = STRICT.needed(chosen.tried, s.fit.k - fit.k, len(given.steps)), gain(s.fit, fit)
         if not _on_inputs(s, fit) and s.fit.white - fit.white >= SHORT * needed:
             reached += nearer(given, s.fit, fit)
-        if reached < SHORT * needed:
+        if reached < SHORT * needed or 2.0 * reached < _least(lacks, fit, chosen.nominal):
             continue
         told = foretells(s.fit, fit)
         ahead = reached - gain(s.fit, fit) + min(told, reached)

@@ -148,7 +148,13 @@ def _traced(
     _enough(dataset, model, cut.fit_part, cut.judged_on, ahead)
     say(5.0, 100.0, "looking for effects")
     hidden = cut.given.bends
-    chosen = select(cut.given, model, ahead, lambda share: say(5.0 + 55.0 * share, 100.0, "looking for effects"), 1 if hidden else MOST)
+    whole = Whole(checked, model, ahead)
+
+    def lacks() -> float:
+        return whole.nameless(len(cut.given.steps))
+
+    asked_of = 1 if hidden else MOST
+    chosen = select(cut.given, model, ahead, lambda share: say(5.0 + 55.0 * share, 100.0, "looking for effects"), asked_of, lacks)
     lines = _straight(as_recorded, asked, parts, checked, seen, cut.given, chosen.fit)
     if lines is not None:
         placed = again(*lines, 60.0)
@@ -163,8 +169,8 @@ def _traced(
         if names(chosen.fit.model) == before:
             break
     checked, judged_on, given = cut.checked, cut.judged_on, cut.given
-    whole = Whole(checked, model, ahead)
-    chosen = foretold_too(given, whole.given, chosen, judged_on, ahead)
+    whole = Whole(checked, model, ahead) if checked is not whole.checked else whole
+    chosen = foretold_too(given, whole.given, chosen, judged_on, ahead, lacks)
     chosen = confirmed(given, all_dated(given, whole.given, chosen), judged_on)
     say(80.0, 100.0, "testing what is left")
     structure = whole.structure(chosen)

@@ -14,7 +14,7 @@ traced         otherwise
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -162,8 +162,12 @@ def _in_its_place(fit: Fit, found: Sequence[Scored]) -> list[Scored]:
     return kept
 
 
-def foretold_too(given: Problem, everything: Problem, chosen: Selection, judged_on: Held, horizon: int) -> Selection:
-    """With an effect besides that only all of the recording shows. everything: transitions of all of it (as many as are fitted at most)."""
+def foretold_too(
+    given: Problem, everything: Problem, chosen: Selection, judged_on: Held, horizon: int, lacks: Callable[[], float] | None = None
+) -> Selection:
+    """With an effect besides that only all of the recording shows. everything: transitions of all of it (as many as are fitted at most).
+    lacks: as `called_for` has it.
+    """
 
     def ahead(fit: Fit, base: Fit) -> float:
         told = foretelling(judged_on, [base, fit])[1]
@@ -172,7 +176,7 @@ def foretold_too(given: Problem, everything: Problem, chosen: Selection, judged_
         dearer = STRICT.price(fit.k - base.k, len(everything.steps)) - STRICT.price(fit.k - base.k, len(given.steps))
         return max(told, _of_all(everything, fit, base) - gain(fit, base) - dearer)
 
-    return one_more(given, chosen, horizon, ahead)
+    return one_more(given, chosen, horizon, ahead, lacks)
 
 
 def _of_all(everything: Problem, fit: Fit, base: Fit) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cached_property
 
@@ -13,7 +14,7 @@ from s2r_runtime.trace.challenge import MORE as SHAPED
 from s2r_runtime.trace.challenge import Better, best_shape, better_shape
 from s2r_runtime.trace.faults import Checked
 from s2r_runtime.trace.fields import Field, beats, nats_of, nats_of_fit, wanders
-from s2r_runtime.trace.fitting import Fit, evaluate, fitted, gain, problem
+from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, problem
 from s2r_runtime.trace.holdout import part
 from s2r_runtime.trace.lack_of_fit import (
     ALIKE,
@@ -73,12 +74,27 @@ class Whole:
     """All of a recording, and what the nominal model leaves of it: a test for structure needs no data that the fit never saw."""
 
     def __init__(self, checked: Checked, nominal: ComposedModel, horizon: int) -> None:
-        everything = part(checked.data, checked.left_out, np.ones(first_steps(checked.data)[-1], dtype=bool), STRUCTURE_STEPS)
-        self.given = problem(everything.data, everything.steps)
-        self.nominal = evaluate(self.given, nominal)
-        self._horizon = horizon
+        self.checked, self._model, self._horizon = checked, nominal, horizon
         self._known: dict[int, tuple[Fit, Structure]] = {}
         self._fitted: dict[int, tuple[Fit, Fit]] = {}
+
+    @cached_property
+    def given(self) -> Problem:
+        """Its transitions, STRUCTURE_STEPS at most."""
+        checked = self.checked
+        everything = part(checked.data, checked.left_out, np.ones(first_steps(checked.data)[-1], dtype=bool), STRUCTURE_STEPS)
+        return problem(everything.data, everything.steps)
+
+    @cached_property
+    def nominal(self) -> Fit:
+        """The nominal model on it."""
+        return evaluate(self.given, self._model)
+
+    def nameless(self, steps: int) -> float:
+        """Nats that the best dictionary explains at first look of what the nominal model lacks, on so many of the transitions. None where
+        speeds were not measured: there, little looks like much.
+        """
+        return -math.inf if self.given.floor.axes else steps / len(self.given.steps) * self._looks.most
 
     @cached_property
     def _looks(self) -> Looks:
