@@ -12,6 +12,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.about import about_states
 from s2r_runtime.trace.challenge import MORE as SHAPED
 from s2r_runtime.trace.challenge import Better, best_shape, better_shape
+from s2r_runtime.trace.episodes import episodes, may_depend_on
 from s2r_runtime.trace.faults import Checked
 from s2r_runtime.trace.fields import Field, beats, nats_of, nats_of_fit, wanders
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, problem
@@ -158,7 +159,8 @@ class Whole:
             return found
         if not better.shows:  # the repair is as good, whatever its name
             return replace(found, beside=tuple(dict.fromkeys((better.token, *found.beside))))
-        return replace(found, tokens=(better.token,), matters=True, share=1.0, nameless=True)
+        tokens = self._for_a_while(max(better.nats, gain(fit, self.nominal))) or (better.token,)
+        return replace(found, tokens=tokens, matters=True, share=1.0, nameless=True)
 
     def _of_nominal(self) -> Structure:
         """What the model as given leaves."""
@@ -170,6 +172,8 @@ class Whole:
             tokens = self._looks_like  # it was seen by sliding only, which names what it tries
         else:
             tokens = () if self._shape is None else (self._shape.token,)
+        if (tokens or found.matters) and not found.for_a_while and self._comes_and_goes:
+            return replace(found, tokens=self._comes_and_goes, matters=True, share=1.0)
         more = (found.for_a_while or found.varies) and self._shape is not None and found.nats > self._shape.nats
         named = tuple(dict.fromkeys((*found.tokens, *tokens) if more else (*tokens, *found.tokens)))
         return replace(found, tokens=named, matters=True, share=1.0) if tokens else found
@@ -214,6 +218,8 @@ class Whole:
         price of their numbers. Where noise of some colour does nearly as well, or speeds were not measured, by what they foretell of
         other blocks of time.
         """
+        if self._comes_and_goes:
+            return self._comes_and_goes
         left, shape, field = self._looks.left, self._shape, self._field
         each = {} if self.given.floor.axes else self._looks.weighed
         nats = max(each.values(), default=0.0)
@@ -240,6 +246,26 @@ class Whole:
         """Dictionaries that explain far more together than the best one does; none, if it does most of it."""
         chosen = self._looks.chosen[0]
         return chosen if len(chosen) > 1 and chosen[-1].gain >= TWICE * self.unnamed.gain + CLEAR else []
+
+    @cached_property
+    def _windows(self) -> Judged | None:
+        """What happens for a while only, if rows are in order."""
+        return episodes(self._looks.left, each=False) if self.given.data.in_order else None
+
+    def _for_a_while(self, others: float) -> tuple[str, ...]:
+        """What it may depend on, if it happens for a while only by more nats than what holds all the time explains."""
+        windows = self._windows
+        if windows is None or windows.gain <= others + ALIKE:
+            return ()
+        return may_depend_on(self._looks.left, windows, self._looks.found)
+
+    @cached_property
+    def _comes_and_goes(self) -> tuple[str, ...]:
+        """The same, held against all that has no name: in closed loop, inputs answer a gust, and are told for it."""
+        if self._windows is None:
+            return ()
+        others = [self.unnamed.gain, *self._looks.weighed.values()]
+        return self._for_a_while(max(*others, *(one.nats for one in (self._shape, self._field) if one is not None)))
 
     @property
     def _field(self) -> Field | None:
