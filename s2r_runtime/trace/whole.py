@@ -92,10 +92,11 @@ class Whole:
         return evaluate(self.given, self._model)
 
     def nameless(self, steps: int) -> float:
-        """Nats that the best dictionary explains at first look of what the nominal model lacks, on so many of the transitions. None where
-        speeds were not measured: there, little looks like much.
+        """Nats that the best dictionary explains at first look of what the nominal model lacks, or what comes and goes, if that was asked
+        for, on so many of the transitions. No dictionary where speeds were not measured: there, little looks like much.
         """
-        return -math.inf if self.given.floor.axes else steps / len(self.given.steps) * self._looks.most
+        most = -math.inf if self.given.floor.axes else self._looks.most
+        return steps / len(self.given.steps) * max(most, self._for_now)
 
     @cached_property
     def _looks(self) -> Looks:
@@ -127,7 +128,8 @@ class Whole:
     def falls_short(self, other: Selection) -> bool:
         """Whether another selection explains clearly less than the best that has no name: then it leaves what that explains beyond it."""
         told = max(gain(self.everywhere(other.fit), self.nominal), 0.0)
-        return self._looks.most > told and self.unnamed.gain > SHORT * told + CLEAR
+        enough = SHORT * told + CLEAR
+        return self._for_now > enough or (self._looks.most > told and self.unnamed.gain > enough)
 
     def in_one_stretch(self, chosen: Selection) -> bool:
         """Whether a name comes from one stretch of the recording."""
@@ -251,6 +253,12 @@ class Whole:
     def _windows(self) -> Judged | None:
         """What happens for a while only, if rows are in order."""
         return episodes(self._looks.left, each=False) if self.given.data.in_order else None
+
+    @property
+    def _for_now(self) -> float:
+        """Nats of that, if it was asked for: it takes time."""
+        windows: Judged | None = self.__dict__.get("_windows")
+        return -math.inf if windows is None else windows.gain
 
     def _for_a_while(self, others: float) -> tuple[str, ...]:
         """What it may depend on, if it happens for a while only by more nats than what holds all the time explains."""
