@@ -26,16 +26,18 @@ def test_of_a_field_and_a_shape_the_one_that_explains_more_comes_first(nats, fir
     left = Structure(("time*v",), True, 1.0, {}, varies=True, nats=nats)
     monkeypatch.setattr(whole, "lack_of_fit", lambda *of: left)
     asked = whole.Whole.__new__(whole.Whole)
-    asked.__dict__.update(_looks=None, nominal=None, _horizon=1, _shape=Better("memory(v)", 17.0))
+    asked.__dict__.update(_looks=None, nominal=None, _horizon=1, _shape=Better("memory(v)", 17.0), _windows=None)
     assert asked._of_nominal().tokens[0] == first
 
 
-def _likened(weighed, unnamed, shape=None, field=None):
+def _likened(weighed, unnamed, shape=None, field=None, windows=None):
     """What is told of a dictionary that is likeliest, of one that foretells other blocks of time best, of a shape and a field."""
     asked = whole.Whole.__new__(whole.Whole)
-    looks = SimpleNamespace(weighed=dict(weighed), field=field, chosen=([], {}), left=None)
+    looks = SimpleNamespace(weighed=dict(weighed), field=field, chosen=([], {}), left=None, found=[])
     given = SimpleNamespace(floor=SimpleNamespace(axes=()))
-    asked.__dict__.update(_looks=looks, given=given, unnamed=SimpleNamespace(token=unnamed[0], gain=unnamed[1]), _shape=shape)
+    asked.__dict__.update(
+        _looks=looks, given=given, unnamed=SimpleNamespace(token=unnamed[0], gain=unnamed[1]), _shape=shape, _windows=windows
+    )
     return asked._looks_like
 
 
@@ -65,6 +67,26 @@ def test_what_foretells_best_is_told_beside_what_is_likeliest():
 def test_a_shape_is_told_where_it_is_clearly_likelier():
     assert _likened({"w": 30.0}, ("w", 9.0), shape=Better("memory(w)", 50.0)) == ("memory(w)",)
     assert _likened({"w": 48.0}, ("w", 9.0), shape=Better("memory(w)", 50.0)) == ("w",)
+
+
+def test_what_comes_and_goes_is_told_where_it_explains_more_than_all_that_holds_all_the_time(monkeypatch):
+    monkeypatch.setattr(whole, "may_depend_on", lambda left, windows, found: ("time",))
+    weighed, shape, field = {"ax*ay": 92.0}, Better("ax", 120.0), _field("position", nats=140.0)
+    for nats, told in ((144.0, "time"), (142.0, "position")):
+        assert _likened(weighed, ("ax*ay", 90.0), shape, field, SimpleNamespace(gain=nats))[0] == told
+    assert _likened(weighed, ("ax*ay", 150.0), windows=SimpleNamespace(gain=152.0)) == ("ax*ay",)
+
+
+@pytest.mark.parametrize(("seen", "told"), [("position", ("position", "time")), ("speed", ("time", "position"))])
+def test_a_place_where_the_robot_was_once_stays_first(seen, told, monkeypatch):
+    """As much as windows, a dictionary of places explains; fields told the place by what they have in common elsewhere."""
+    monkeypatch.setattr(whole, "may_depend_on", lambda left, windows, found: ("time", "position"))
+    monkeypatch.setattr(whole, "lack_of_fit", lambda *of: Structure((seen,), True, 1.0, {}, varies=True, nats=20.0))
+    asked = whole.Whole.__new__(whole.Whole)
+    looks = SimpleNamespace(weighed={}, field=None, left=None, found=[])
+    unnamed = SimpleNamespace(gain=3.0)
+    asked.__dict__.update(_looks=looks, nominal=None, _horizon=1, _shape=None, unnamed=unnamed, _windows=SimpleNamespace(gain=134.0))
+    assert asked._of_nominal().tokens == told
 
 
 @pytest.mark.parametrize("seed", first(1, range(4)))

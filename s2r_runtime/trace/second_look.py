@@ -16,7 +16,7 @@ from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.residual_noise import Whitener
 from s2r_runtime.trace.retimed import dated
-from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, Scored, names
+from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, Bar, Scored, names
 from s2r_runtime.trace.selection import Selection, against_rivals, all_dated, called_for, crowded
 from s2r_runtime.trace.unplaced import checked_of
 from s2r_runtime.trace.verdict import confirmed, foretelling, takes_far
@@ -90,41 +90,47 @@ def once_more(
     """Where structure is left, or a shape without a name is likelier than what was named, something is there: a rival that leaves nothing;
     or two effects together that do, coloured noise neither (two take up a part of anything, and the rest looks like that); or what is
     found with a lower bar, if that leaves nothing. What was not fitted must be foretold no worse. Each is challenged by shapes, too.
+    What explains clearly less than one more effect does leaves what that explains, and is not asked about.
     """
     refused = {names(chosen.fit.model)}
-    complete = [(s, rest) for s in chosen.rivals if (rest := _left_by(whole, chosen, s, structure, refused)) is not None]
-    for best, rest in sorted(complete, key=lambda pair: pair[0].score, reverse=True):  # what ties, and leaves nothing, is more than that
-        if best.fit is not None and foretelling(judged_on, [chosen.fit, best.fit])[1] >= 0.0:
-            fit = dated(given, whole.given, best.fit)
-            return replace(chosen, fit=fit, rivals=tuple(s for s, _ in complete if s is not best)), rest
-    pair = two_together(given, chosen, lambda fits: foretelling(judged_on, fits))
-    if pair is not None:  # a change between the parts that are fitted is anywhere there: its time is told by all of the recording
-        pair = replace(pair, fit=dated(given, whole.given, pair.fit))
-    told = None if pair is None else _all_explained(whole, pair, structure, refused)
 
     def nameless() -> float:
         seen = max([structure.nats, *structure.gains.values()]) if structure.matters else -math.inf
         return max(seen, whole.nameless(len(given.steps)) - gain(chosen.fit, chosen.nominal))
 
-    for bar, before, may_be_left, lacks in (
-        (STRICT, pair if told is not None and not told.tokens else None, set(), None),
-        (LENIENT if chosen.fit.added else ALONE, chosen, {"noise"}, nameless),
-    ):
-        if before is None:
-            continue
-        alone = called_for(given, chosen.nominal.model, ahead, lambda share: None, bar, before, lacks=lacks)
+    def found_by(bar: Bar, alone: Selection, may_be_left: set[str]) -> tuple[Selection, Structure] | None:
+        """What was called for by this bar, beside its rivals, if it leaves no more than that."""
         rest = _all_explained(whole, alone, structure, refused)
         if rest is None or not {*rest.tokens} <= may_be_left:  # as it mostly is: no need to ask for rivals
-            continue
+            return None
         other = against_rivals(given, alone, bar)
         other = confirmed(given, all_dated(given, whole.given, other), judged_on)
         if other.fit is not alone.fit:
             rest = _all_explained(whole, other, structure, refused)
         if rest is None or not {*rest.tokens} <= may_be_left:
-            continue
-        if foretelling(judged_on, [chosen.fit, other.fit])[1] >= 0.0:
-            return other, rest
-    return chosen, structure
+            return None
+        return (other, rest) if foretelling(judged_on, [chosen.fit, other.fit])[1] >= 0.0 else None
+
+    lower = LENIENT if chosen.fit.added else ALONE
+    besides = called_for(given, chosen.nominal.model, ahead, lambda share: None, lower, chosen, lacks=nameless)
+    clearly = gain(besides.fit, chosen.fit) - STRICT.needed(besides.tried, besides.fit.k - chosen.fit.k, len(given.steps))
+    rivals = [s for s in chosen.rivals if s.fit is not None and gain(s.fit, chosen.fit) >= clearly]
+    complete = [(s, rest) for s in rivals if (rest := _left_by(whole, chosen, s, structure, refused)) is not None]
+    for best, rest in sorted(complete, key=lambda pair: pair[0].score, reverse=True):  # what ties, and leaves nothing, is more than that
+        if best.fit is not None and foretelling(judged_on, [chosen.fit, best.fit])[1] >= 0.0:
+            fit = dated(given, whole.given, best.fit)
+            return replace(chosen, fit=fit, rivals=tuple(s for s, _ in complete if s is not best)), rest
+    pair = two_together(given, chosen, lambda fits: foretelling(judged_on, fits))
+    if pair is not None and gain(pair.fit, chosen.fit) >= clearly:
+        # a change between the parts that are fitted is anywhere there: its time is told by all of the recording
+        pair = replace(pair, fit=dated(given, whole.given, pair.fit))
+        told = _all_explained(whole, pair, structure, refused)
+        if told is not None and not told.tokens:
+            both = called_for(given, chosen.nominal.model, ahead, lambda share: None, STRICT, pair)
+            answer = found_by(STRICT, both, set())
+            if answer is not None:
+                return answer
+    return found_by(lower, besides, {"noise"}) or (chosen, structure)
 
 
 def _left_by(

@@ -175,7 +175,9 @@ class Whole:
         else:
             tokens = () if self._shape is None else (self._shape.token,)
         if (tokens or found.matters) and not found.for_a_while and self._comes_and_goes:
-            return replace(found, tokens=self._comes_and_goes, matters=True, share=1.0)
+            told = (*tokens, *found.tokens)  # a place where the robot was once cannot be told from the time when it was there
+            first = [token for token in told if token in self._comes_and_goes]
+            return replace(found, tokens=tuple(dict.fromkeys((*first, *self._comes_and_goes))), matters=True, share=1.0)
         more = (found.for_a_while or found.varies) and self._shape is not None and found.nats > self._shape.nats
         named = tuple(dict.fromkeys((*found.tokens, *tokens) if more else (*tokens, *found.tokens)))
         return replace(found, tokens=named, matters=True, share=1.0) if tokens else found
@@ -272,8 +274,8 @@ class Whole:
         """The same, held against all that has no name: in closed loop, inputs answer a gust, and are told for it."""
         if self._windows is None:
             return ()
-        others = [self.unnamed.gain, *self._looks.weighed.values()]
-        return self._for_a_while(max(*others, *(one.nats for one in (self._shape, self._field) if one is not None)))
+        others = [one.nats for one in (self._shape, self._field) if one is not None]
+        return self._for_a_while(max([self.unnamed.gain, *self._looks.weighed.values(), *others]))
 
     @property
     def _field(self) -> Field | None:
