@@ -67,26 +67,28 @@ def test_what_makes_next_to_nothing_of_what_is_looked_for_is_not_gone_on_from(sh
     usual = selection.called_for(given, MODEL, 50, lambda share: None)
     before = selection.Selection(usual.nominal, usual.nominal, usual.tried, usual.ranking, ())
     lacks = share * gain(usual.fit, usual.nominal) / selection.A_PART  # of both axes, which are looked for together
-    chosen = selection.called_for(given, MODEL, 50, lambda share: None, scores.LENIENT, before, lacks=lambda: lacks)
+    chosen = selection.called_for(
+        given, MODEL, 50, lambda share: None, scores.LENIENT, before, lacks=lambda fit: lacks - gain(fit, before.fit)
+    )
     assert bool(chosen.fit.added) == (share < 1.0)
 
 
 @pytest.mark.parametrize("share", [0.9, 1.1])
 def test_nor_is_a_second_effect_beside_a_first_one(share):
-    """A bias beside a gain: the first one is told whatever there is without a name, which is asked for once."""
+    """A bias beside a gain: the first one is told whatever there is without a name, which is not asked for before a second one is there."""
     given = _driven(EffectSpec("input_gain", "ax", {"gain": 0.6}), EffectSpec("input_bias", "ay", {"bias": 0.03}))
     both = selection.called_for(given, MODEL, 50, lambda share: None)
     assert [*scores.names(both.fit.model)] == [("input_bias", "ay"), ("input_gain", "ax")]
     first = selection.called_for(given, MODEL, 50, lambda share: None, most=1).fit
     asked = []
 
-    def lacks():
-        asked.append(first)
-        return gain(first, both.nominal) + share * gain(both.fit, first) / selection.A_PART
+    def lacks(fit):
+        asked.append(scores.names(fit.model))
+        return share * gain(both.fit, first) / selection.A_PART
 
     chosen = selection.called_for(given, MODEL, 50, lambda share: None, lacks=lacks)
     assert scores.names(chosen.fit.model) == scores.names((both.fit if share < 1.0 else first).model)
-    assert asked
+    assert asked[0] == scores.names(first.model)
     asked.clear()
     assert not selection.called_for(_driven(), MODEL, 50, lambda share: None, lacks=lacks).fit.added
     assert not asked  # nothing was found: what has no name is not asked for

@@ -30,15 +30,23 @@ def test_of_a_field_and_a_shape_the_one_that_explains_more_comes_first(nats, fir
     assert asked._of_nominal().tokens[0] == first
 
 
-def _likened(weighed, unnamed, shape=None, field=None, windows=None):
+WANDERS = 20.0
+"""Nats by which noise of the likeliest law is likelier than that which windows are held against."""
+
+
+def _likened(weighed, unnamed, shape=None, field=None, windows=None, together=()):
     """What is told of a dictionary that is likeliest, of one that foretells other blocks of time best, of a shape and a field."""
     asked = whole.Whole.__new__(whole.Whole)
-    looks = SimpleNamespace(weighed=dict(weighed), field=field, chosen=([], {}), left=None, found=[])
+    left = SimpleNamespace(fit=SimpleNamespace(coloured=-5.0, white=-9.0), known={"bare": WANDERS - 5.0})
+    looks = SimpleNamespace(weighed=dict(weighed), field=field, chosen=(list(together), {}), left=left, found=[])
     given = SimpleNamespace(floor=SimpleNamespace(axes=()))
-    asked.__dict__.update(
-        _looks=looks, given=given, unnamed=SimpleNamespace(token=unnamed[0], gain=unnamed[1]), _shape=shape, _windows=windows
-    )
+    best = SimpleNamespace(token=unnamed[0], gain=unnamed[1])
+    asked.__dict__.update(_looks=looks, nominal=None, _horizon=1, given=given, unnamed=best, _shape=shape, _windows=windows)
     return asked._looks_like
+
+
+def _windows_tell(*tokens):
+    return lambda looks, nominal, horizon, windows: Structure(tokens, True, 1.0, {}, for_a_while=True, nats=windows.gain)
 
 
 def _field(*tokens, nats):
@@ -70,22 +78,34 @@ def test_a_shape_is_told_where_it_is_clearly_likelier():
 
 
 def test_what_comes_and_goes_is_told_where_it_explains_more_than_all_that_holds_all_the_time(monkeypatch):
-    monkeypatch.setattr(whole, "may_depend_on", lambda left, windows, found: ("time",))
+    monkeypatch.setattr(whole, "comes_and_goes", _windows_tell("time"))
     weighed, shape, field = {"ax*ay": 92.0}, Better("ax", 120.0), _field("position", nats=140.0)
-    for nats, told in ((144.0, "time"), (142.0, "position")):
+    for nats, told in ((180.0, "time"), (178.0, "position")):  # 140 beyond noise that wanders, a tenth and 3 more
         assert _likened(weighed, ("ax*ay", 90.0), shape, field, SimpleNamespace(gain=nats))[0] == told
-    assert _likened(weighed, ("ax*ay", 150.0), windows=SimpleNamespace(gain=152.0)) == ("ax*ay",)
+    assert _likened(weighed, ("ax*ay", 150.0), windows=SimpleNamespace(gain=167.0)) == ("ax*ay",)
+    both = [SimpleNamespace(token="ax", gain=90.0), SimpleNamespace(token="ay", gain=300.0)]  # noqa: S106
+    for nats, told in ((334.0, "time"), (332.0, "ax*ay")):
+        assert (told == "time") == (_likened({}, ("ax*ay", 90.0), windows=SimpleNamespace(gain=nats), together=both)[0] == "time")
 
 
 @pytest.mark.parametrize(("seen", "told"), [("position", ("position", "time")), ("speed", ("time", "position"))])
 def test_a_place_where_the_robot_was_once_stays_first(seen, told, monkeypatch):
     """As much as windows, a dictionary of places explains; fields told the place by what they have in common elsewhere."""
-    monkeypatch.setattr(whole, "may_depend_on", lambda left, windows, found: ("time", "position"))
+    monkeypatch.setattr(whole, "comes_and_goes", _windows_tell("time", "position"))
     monkeypatch.setattr(whole, "lack_of_fit", lambda *of: Structure((seen,), True, 1.0, {}, varies=True, nats=20.0))
     asked = whole.Whole.__new__(whole.Whole)
-    looks = SimpleNamespace(weighed={}, field=None, left=None, found=[])
+    left = SimpleNamespace(fit=SimpleNamespace(coloured=0.0, white=0.0), known={"bare": 0.0})
+    looks = SimpleNamespace(weighed={}, field=None, left=left, found=[], chosen=([], {}))
     unnamed = SimpleNamespace(gain=3.0)
-    asked.__dict__.update(_looks=looks, nominal=None, _horizon=1, _shape=None, unnamed=unnamed, _windows=SimpleNamespace(gain=134.0))
+    asked.__dict__.update(
+        _looks=looks,
+        nominal=None,
+        _horizon=1,
+        _shape=None,
+        unnamed=unnamed,
+        _windows=SimpleNamespace(gain=134.0),
+        given=SimpleNamespace(floor=SimpleNamespace(axes=())),
+    )
     assert asked._of_nominal().tokens == told
 
 

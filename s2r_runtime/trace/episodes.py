@@ -65,13 +65,14 @@ LOOKS_LIKE = 0.9
 
 
 def episodes(left: Left, *, each: bool = True) -> Judged | None:
-    """The windows of what a model leaves; None if noise may have made them. each: also a share for each stretch that stays wild, of which
-    an actuator that sticks makes many: that is no matter of time.
+    """The windows of what a model leaves; None if noise may have made them. each: also a share for each stretch that stays wild, as an
+    actuator that sticks makes them: where it does is a matter of where it was, not of time.
     """
     fit = left.fit
     pushes = pushes_by_token(left.given, fit.model, acting(fit.model, left.given.data))
     bare = max(fit.coloured, fit.white)
-    price = _price(left, pushes)
+    n = len(left.given.steps)
+    price = math.log(0.5 * n**2 * max(len(pushes), 1)) + 0.5 * math.log(n)
     best: Judged | None = None
     wild = _staying_wild(left)
     lost, alone = _lost(wild, pushes), _each(left, wild, pushes) if each else []
@@ -79,11 +80,11 @@ def episodes(left: Left, *, each: bool = True) -> Judged | None:
         best, _, _ = _better(left, fit.whiten, lost, bare + price * max(len(wild), len(lost)), None)
     if lost and alone:
         best, _, _ = _better(left, fit.whiten, alone, bare + price * len(alone), best)
-    best, found = _one_by_one(left, pushes, best)
+    best, found = _one_by_one(left, pushes, price, best)
     plain = [(token, push) for token, push in pushes if token == PUSH]
-    if best is not None and plain and any(token != PUSH for token, _, _ in found):
+    if best is not None and plain and any(token != PUSH for token, _, nats in found if nats >= price):
         # in closed loop, inputs answer a push all the time: their windows are longer, and hide when it comes and goes
-        pushed, also = _one_by_one(left, plain, best)
+        pushed, also = _one_by_one(left, plain, price, best)
         if pushed is not None and pushed.gain > FAR * best.gain:
             best, found = pushed, also
     if best is None:
@@ -92,17 +93,11 @@ def episodes(left: Left, *, each: bool = True) -> Judged | None:
     return best if best.gain > max(_wandering(left, used), 0.0) + BEYOND else None
 
 
-def _price(left: Left, pushes: list[tuple[str, Array]]) -> float:
-    """Nats that a window costs: it was looked for everywhere, and in all directions."""
-    n = len(left.given.steps)
-    return math.log(0.5 * n**2 * max(len(pushes), 1)) + 0.5 * math.log(n)
-
-
-def _one_by_one(left: Left, pushes: list[tuple[str, Array]], best: Judged | None) -> tuple[Judged | None, list[Window]]:
+def _one_by_one(left: Left, pushes: list[tuple[str, Array]], price: float, best: Judged | None) -> tuple[Judged | None, list[Window]]:
     """Windows of these pushes, each the one that explains most of what those before leave, if they are better than the best so far; and
-    all that were found.
+    all that were found, the last of which may be worth less than its price in nats.
     """
-    bare, price = max(left.fit.coloured, left.fit.white), _price(left, pushes)
+    bare = max(left.fit.coloured, left.fit.white)
     found: list[Window] = []
     whiten, rest = left.fit.whiten, left.r
     while pushes and len(found) < MOST:

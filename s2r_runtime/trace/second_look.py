@@ -90,13 +90,14 @@ def once_more(
     """Where structure is left, or a shape without a name is likelier than what was named, something is there: a rival that leaves nothing;
     or two effects together that do, coloured noise neither (two take up a part of anything, and the rest looks like that); or what is
     found with a lower bar, if that leaves nothing. What was not fitted must be foretold no worse. Each is challenged by shapes, too.
-    What explains clearly less than one more effect does leaves what that explains, and is not asked about.
+    What explains clearly less than what is found with the lower bar leaves what that explains, and is not asked about.
     """
     refused = {names(chosen.fit.model)}
+    told = max([structure.nats, *structure.gains.values()]) if structure.matters else -math.inf
+    share = len(given.steps) / len(whole.given.steps)
 
-    def nameless() -> float:
-        seen = max([structure.nats, *structure.gains.values()]) if structure.matters else -math.inf
-        return max(seen, whole.nameless(len(given.steps)) - gain(chosen.fit, chosen.nominal))
+    def lacks(fit: Fit) -> float:
+        return max(share * told - gain(fit, chosen.fit), whole.explains_beyond(fit, given), whole.happens_beyond(fit, given))
 
     def found_by(bar: Bar, alone: Selection, may_be_left: set[str]) -> tuple[Selection, Structure] | None:
         """What was called for by this bar, beside its rivals, if it leaves no more than that."""
@@ -112,20 +113,25 @@ def once_more(
         return (other, rest) if foretelling(judged_on, [chosen.fit, other.fit])[1] >= 0.0 else None
 
     lower = LENIENT if chosen.fit.added else ALONE
-    besides = called_for(given, chosen.nominal.model, ahead, lambda share: None, lower, chosen, lacks=nameless)
-    clearly = gain(besides.fit, chosen.fit) - STRICT.needed(besides.tried, besides.fit.k - chosen.fit.k, len(given.steps))
-    rivals = [s for s in chosen.rivals if s.fit is not None and gain(s.fit, chosen.fit) >= clearly]
+    besides = called_for(given, chosen.nominal.model, ahead, lambda share: None, lower, chosen, lacks=lacks)
+    more = names(besides.fit.model) != names(chosen.fit.model) and not crowded(besides.fit)
+
+    def behind(fit: Fit) -> bool:
+        needed = STRICT.needed(besides.tried, besides.fit.k - fit.k, len(given.steps))
+        return more and gain(besides.fit, fit) > needed
+
+    rivals = [s for s in chosen.rivals if s.fit is not None and not behind(s.fit)]
     complete = [(s, rest) for s in rivals if (rest := _left_by(whole, chosen, s, structure, refused)) is not None]
     for best, rest in sorted(complete, key=lambda pair: pair[0].score, reverse=True):  # what ties, and leaves nothing, is more than that
         if best.fit is not None and foretelling(judged_on, [chosen.fit, best.fit])[1] >= 0.0:
             fit = dated(given, whole.given, best.fit)
             return replace(chosen, fit=fit, rivals=tuple(s for s, _ in complete if s is not best)), rest
     pair = two_together(given, chosen, lambda fits: foretelling(judged_on, fits))
-    if pair is not None and gain(pair.fit, chosen.fit) >= clearly:
+    if pair is not None and not behind(pair.fit):
         # a change between the parts that are fitted is anywhere there: its time is told by all of the recording
         pair = replace(pair, fit=dated(given, whole.given, pair.fit))
-        told = _all_explained(whole, pair, structure, refused)
-        if told is not None and not told.tokens:
+        rest_of_it = _all_explained(whole, pair, structure, refused)
+        if rest_of_it is not None and not rest_of_it.tokens:
             both = called_for(given, chosen.nominal.model, ahead, lambda share: None, STRICT, pair)
             answer = found_by(STRICT, both, set())
             if answer is not None:

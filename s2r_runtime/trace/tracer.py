@@ -150,11 +150,11 @@ def _traced(
     hidden = cut.given.bends
     whole = Whole(checked, model, ahead)
 
-    def lacks() -> float:
-        return whole.nameless(len(cut.given.steps))
+    def lacks(fit: Fit) -> float:
+        return whole.explains_beyond(fit, cut.given)
 
-    asked_of = 1 if hidden else MOST
-    chosen = select(cut.given, model, ahead, lambda share: say(5.0 + 55.0 * share, 100.0, "looking for effects"), asked_of, lacks)
+    at_first = 1 if hidden else MOST
+    chosen = select(cut.given, model, ahead, lambda share: say(5.0 + 55.0 * share, 100.0, "looking for effects"), at_first, lacks)
     lines = _straight(as_recorded, asked, parts, checked, seen, cut.given, chosen.fit)
     if lines is not None:
         placed = again(*lines, 60.0)

@@ -14,7 +14,7 @@ traced         otherwise
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -32,7 +32,7 @@ from s2r_runtime.trace.residual import Mask, acting, first_steps, predicted, rms
 from s2r_runtime.trace.residual_noise import OUTLIER
 from s2r_runtime.trace.rivals import only_in, representative, tied
 from s2r_runtime.trace.scores import STRICT, Scored, name_of, names
-from s2r_runtime.trace.selection import Selection, doing_something, one_more
+from s2r_runtime.trace.selection import Lacks, Selection, doing_something, one_more
 from s2r_runtime.trace.slots import Added, slots_of
 from s2r_runtime.trace.throttled import refuted
 
@@ -163,7 +163,7 @@ def _in_its_place(fit: Fit, found: Sequence[Scored]) -> list[Scored]:
 
 
 def foretold_too(
-    given: Problem, everything: Problem, chosen: Selection, judged_on: Held, horizon: int, lacks: Callable[[], float] | None = None
+    given: Problem, everything: Problem, chosen: Selection, judged_on: Held, horizon: int, lacks: Lacks | None = None
 ) -> Selection:
     """With an effect besides that only all of the recording shows. everything: transitions of all of it (as many as are fitted at most).
     lacks: as `called_for` has it.
