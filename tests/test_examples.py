@@ -21,6 +21,12 @@ def test_the_motors_recordings_are_what_its_maker_writes(tmp_path):
         np.testing.assert_allclose(made, kept, atol=0.0011)  # the last digit may be rounded otherwise by another machine
 
 
+def test_the_page_shows_the_model_that_is_there():
+    page = (MOTOR.parent.parent / "docs" / "first-trace.md").read_text(encoding="utf-8")
+    source = (MOTOR / "motor.py").read_text(encoding="utf-8")
+    assert source.split('"""', 2)[2].strip() in page
+
+
 def test_what_the_motors_data_sheet_does_not_tell_is_found():
     model = compose(ModelSpec(str(MOTOR / "motor.py"), 0.02))
     result = trace(load_dataset(MOTOR / "drive.csv", model), model)

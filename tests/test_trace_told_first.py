@@ -88,6 +88,19 @@ def test_what_comes_and_goes_is_told_where_it_explains_more_than_all_that_holds_
         assert (told == "time") == (_likened({}, ("ax*ay", 90.0), windows=SimpleNamespace(gain=nats), together=both)[0] == "time")
 
 
+@pytest.mark.parametrize(
+    ("windows", "unnamed", "short"), [(None, 130.0, True), (None, 90.0, False), (130.0, 0.0, True), (100.0, 0.0, False)]
+)
+def test_what_explains_clearly_less_than_what_has_no_name_falls_short(windows, unnamed, short, monkeypatch):
+    """100 nats against dictionaries, or what comes and goes."""
+    monkeypatch.setattr(whole, "gain", lambda fit, base: 100.0)
+    asked, fit = whole.Whole.__new__(whole.Whole), SimpleNamespace()
+    looks, best = SimpleNamespace(most=200.0), SimpleNamespace(gain=unnamed)
+    happens = None if windows is None else SimpleNamespace(gain=windows)
+    asked.__dict__.update(_looks=looks, nominal=None, unnamed=best, _windows=happens, _fitted={id(fit): (fit, fit)})
+    assert asked.falls_short(SimpleNamespace(fit=fit)) == short
+
+
 @pytest.mark.parametrize(("seen", "told"), [("position", ("position", "time")), ("speed", ("time", "position"))])
 def test_a_place_where_the_robot_was_once_stays_first(seen, told, monkeypatch):
     """As much as windows, a dictionary of places explains; fields told the place by what they have in common elsewhere."""

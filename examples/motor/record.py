@@ -1,4 +1,4 @@
-"""Makes the two recordings: the motor as it is, which its data sheet does not tell, in a hundred parts a step.
+"""Makes the two recordings: the motor as it is, which its data sheet does not tell, simulated in 100 substeps a sample.
 
 python record.py FOLDER
 """
