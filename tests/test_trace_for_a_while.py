@@ -259,25 +259,3 @@ def test_what_is_wild_at_the_end_of_a_run_and_at_the_start_of_the_next_one_is_no
     given = problem(data, steps_of(data))
     left = left_of(given, evaluate(given, model))
     assert not _staying_wild(left)
-
-
-@pytest.mark.parametrize("seed", first(1, [1, 0, 3]))
-def test_gusts_that_a_controller_answers_are_no_matter_of_its_inputs(seed):
-    """A robot that is held on a path leans against each gust: what it asks for goes with what is left, longer than the gust is there."""
-    rng, dt, parts, n = np.random.default_rng(seed), 0.05, 10, 1500
-    model = compose(ModelSpec("double_integrator", dt))
-    force = np.zeros((n, 2))
-    for begin in rng.choice(np.arange(50, n - 100, 120), 5, replace=False):
-        force[begin : begin + int(rng.integers(20, 90))] = rng.normal(size=2) * 1.2
-    noise = np.array([0.01, 0.01, 0.02, 0.02])
-    x, rows, u = np.zeros(4), [], np.zeros((n, 2))
-    for k in range(n):
-        measured = x + rng.normal(size=4) * noise
-        goal = 1.5 * np.array([np.sin(0.011 * k), np.cos(0.017 * k) - 1.0])
-        u[k] = 1.5 * (goal - measured[:2]) - 1.6 * measured[2:]
-        rows.append(measured)
-        for _ in range(parts):
-            x = x + dt / parts * np.concatenate([x[2:], u[k] + force[k]])
-    result = trace(from_arrays(model, [(np.array(rows), u[:-1])]), model)
-    assert result.verdict == "unexplained"
-    assert result.depends_on[0] == "time"

@@ -26,27 +26,17 @@ def test_of_a_field_and_a_shape_the_one_that_explains_more_comes_first(nats, fir
     left = Structure(("time*v",), True, 1.0, {}, varies=True, nats=nats)
     monkeypatch.setattr(whole, "lack_of_fit", lambda *of: left)
     asked = whole.Whole.__new__(whole.Whole)
-    asked.__dict__.update(_looks=None, nominal=None, _horizon=1, _shape=Better("memory(v)", 17.0), _windows=None)
+    asked.__dict__.update(_looks=None, nominal=None, _horizon=1, _shape=Better("memory(v)", 17.0))
     assert asked._of_nominal().tokens[0] == first
 
 
-WANDERS = 20.0
-"""Nats by which noise of the likeliest law is likelier than that which windows are held against."""
-
-
-def _likened(weighed, unnamed, shape=None, field=None, windows=None, together=()):
+def _likened(weighed, unnamed, shape=None, field=None):
     """What is told of a dictionary that is likeliest, of one that foretells other blocks of time best, of a shape and a field."""
     asked = whole.Whole.__new__(whole.Whole)
-    left = SimpleNamespace(fit=SimpleNamespace(coloured=-5.0, white=-9.0), known={"bare": WANDERS - 5.0})
-    looks = SimpleNamespace(weighed=dict(weighed), field=field, chosen=(list(together), {}), left=left, found=[])
+    looks = SimpleNamespace(weighed=dict(weighed), field=field, chosen=([], {}), left=None)
     given = SimpleNamespace(floor=SimpleNamespace(axes=()))
-    best = SimpleNamespace(token=unnamed[0], gain=unnamed[1])
-    asked.__dict__.update(_looks=looks, nominal=None, _horizon=1, given=given, unnamed=best, _shape=shape, _windows=windows)
+    asked.__dict__.update(_looks=looks, given=given, unnamed=SimpleNamespace(token=unnamed[0], gain=unnamed[1]), _shape=shape)
     return asked._looks_like
-
-
-def _windows_tell(*tokens):
-    return lambda looks, nominal, horizon, windows: Structure(tokens, True, 1.0, {}, for_a_while=True, nats=windows.gain)
 
 
 def _field(*tokens, nats):
@@ -75,51 +65,6 @@ def test_what_foretells_best_is_told_beside_what_is_likeliest():
 def test_a_shape_is_told_where_it_is_clearly_likelier():
     assert _likened({"w": 30.0}, ("w", 9.0), shape=Better("memory(w)", 50.0)) == ("memory(w)",)
     assert _likened({"w": 48.0}, ("w", 9.0), shape=Better("memory(w)", 50.0)) == ("w",)
-
-
-def test_what_comes_and_goes_is_told_where_it_explains_more_than_all_that_holds_all_the_time(monkeypatch):
-    monkeypatch.setattr(whole, "comes_and_goes", _windows_tell("time"))
-    weighed, shape, field = {"ax*ay": 92.0}, Better("ax", 120.0), _field("position", nats=140.0)
-    for nats, told in ((180.0, "time"), (178.0, "position")):  # 140 beyond noise that wanders, a tenth and 3 more
-        assert _likened(weighed, ("ax*ay", 90.0), shape, field, SimpleNamespace(gain=nats))[0] == told
-    assert _likened(weighed, ("ax*ay", 150.0), windows=SimpleNamespace(gain=167.0)) == ("ax*ay",)
-    both = [SimpleNamespace(token="ax", gain=90.0), SimpleNamespace(token="ay", gain=300.0)]  # noqa: S106
-    for nats, told in ((334.0, "time"), (332.0, "ax*ay")):
-        assert (told == "time") == (_likened({}, ("ax*ay", 90.0), windows=SimpleNamespace(gain=nats), together=both)[0] == "time")
-
-
-@pytest.mark.parametrize(
-    ("windows", "unnamed", "short"), [(None, 130.0, True), (None, 90.0, False), (130.0, 0.0, True), (100.0, 0.0, False)]
-)
-def test_what_explains_clearly_less_than_what_has_no_name_falls_short(windows, unnamed, short, monkeypatch):
-    """100 nats against dictionaries, or what comes and goes."""
-    monkeypatch.setattr(whole, "gain", lambda fit, base: 100.0)
-    asked, fit = whole.Whole.__new__(whole.Whole), SimpleNamespace()
-    looks, best = SimpleNamespace(most=200.0), SimpleNamespace(gain=unnamed)
-    happens = None if windows is None else SimpleNamespace(gain=windows)
-    asked.__dict__.update(_looks=looks, nominal=None, unnamed=best, _windows=happens, _fitted={id(fit): (fit, fit)})
-    assert asked.falls_short(SimpleNamespace(fit=fit)) == short
-
-
-@pytest.mark.parametrize(("seen", "told"), [("position", ("position", "time")), ("speed", ("time", "position"))])
-def test_a_place_where_the_robot_was_once_stays_first(seen, told, monkeypatch):
-    """As much as windows, a dictionary of places explains; fields told the place by what they have in common elsewhere."""
-    monkeypatch.setattr(whole, "comes_and_goes", _windows_tell("time", "position"))
-    monkeypatch.setattr(whole, "lack_of_fit", lambda *of: Structure((seen,), True, 1.0, {}, varies=True, nats=20.0))
-    asked = whole.Whole.__new__(whole.Whole)
-    left = SimpleNamespace(fit=SimpleNamespace(coloured=0.0, white=0.0), known={"bare": 0.0})
-    looks = SimpleNamespace(weighed={}, field=None, left=left, found=[], chosen=([], {}))
-    unnamed = SimpleNamespace(gain=3.0)
-    asked.__dict__.update(
-        _looks=looks,
-        nominal=None,
-        _horizon=1,
-        _shape=None,
-        unnamed=unnamed,
-        _windows=SimpleNamespace(gain=134.0),
-        given=SimpleNamespace(floor=SimpleNamespace(axes=())),
-    )
-    assert asked._of_nominal().tokens == told
 
 
 @pytest.mark.parametrize("seed", first(1, range(4)))

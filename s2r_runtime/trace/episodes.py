@@ -42,12 +42,6 @@ SHORTEST = 4
 MOST, MOST_WILD, LOOKED_AT = 6, 12, 48
 """Windows; and of those in which values stay wild, and which are looked at for that, the longest first."""
 
-PUSH = "time"
-"""The token of a push that comes and goes, whatever the inputs do."""
-
-FAR = 1.2
-"""Times what shares of inputs explain that pushes alone must explain, to be told in their place."""
-
 PASSES = 3
 """Of waves and noise in turn."""
 
@@ -64,48 +58,30 @@ LOOKS_LIKE = 0.9
 """Of what windows explain: a dictionary that has this share of it says what they may depend on, one that has more than all of it does."""
 
 
-def episodes(left: Left, *, each: bool = True) -> Judged | None:
-    """The windows of what a model leaves; None if noise may have made them. each: also a share for each stretch that stays wild, as an
-    actuator that sticks makes them: where it does is a matter of where it was, not of time.
-    """
+def episodes(left: Left) -> Judged | None:
+    """The windows of what a model leaves; None if noise may have made them."""
     fit = left.fit
     pushes = pushes_by_token(left.given, fit.model, acting(fit.model, left.given.data))
-    bare = max(fit.coloured, fit.white)
     n = len(left.given.steps)
     price = math.log(0.5 * n**2 * max(len(pushes), 1)) + 0.5 * math.log(n)
+    bare = max(fit.coloured, fit.white)
     best: Judged | None = None
     wild = _staying_wild(left)
-    lost, alone = _lost(wild, pushes), _each(left, wild, pushes) if each else []
+    lost, each = _lost(wild, pushes), _each(left, wild, pushes)
     if lost:
         best, _, _ = _better(left, fit.whiten, lost, bare + price * max(len(wild), len(lost)), None)
-    if lost and alone:
-        best, _, _ = _better(left, fit.whiten, alone, bare + price * len(alone), best)
-    best, found = _one_by_one(left, pushes, price, best)
-    plain = [(token, push) for token, push in pushes if token == PUSH]
-    if best is not None and plain and any(token != PUSH for token, _, nats in found if nats >= price):
-        # in closed loop, inputs answer a push all the time: their windows are longer, and hide when it comes and goes
-        pushed, also = _one_by_one(left, plain, price, best)
-        if pushed is not None and pushed.gain > FAR * best.gain:
-            best, found = pushed, also
-    if best is None:
-        return None
-    used = [push for token, push in pushes if token in {best.token, *(t for t, _, _ in found)}]
-    return best if best.gain > max(_wandering(left, used), 0.0) + BEYOND else None
-
-
-def _one_by_one(left: Left, pushes: list[tuple[str, Array]], price: float, best: Judged | None) -> tuple[Judged | None, list[Window]]:
-    """Windows of these pushes, each the one that explains most of what those before leave, if they are better than the best so far; and
-    all that were found, the last of which may be worth less than its price in nats.
-    """
-    bare = max(left.fit.coloured, left.fit.white)
+        best, _, _ = _better(left, fit.whiten, each, bare + price * len(each), best)
     found: list[Window] = []
-    whiten, rest = left.fit.whiten, left.r
+    whiten, rest = fit.whiten, left.r
     while pushes and len(found) < MOST:
         found.append(_window(whiten, rest, pushes))
         if found[-1][2] < price:
             break
         best, rest, whiten = _better(left, whiten, found, bare + price * len(found), best)
-    return best, found
+    if best is None:
+        return None
+    used = [push for token, push in pushes if token in {best.token, *(t for t, _, _ in found)}]
+    return best if best.gain > max(_wandering(left, used), 0.0) + BEYOND else None
 
 
 def _better(left: Left, whiten: Whitener, found: list[Window], least: float, best: Judged | None) -> tuple[Judged | None, Array, Whitener]:

@@ -143,7 +143,7 @@ class Structure:
 
 def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     """Structure left by a model; how much of what `nominal` leaves that is."""
-    left = looks.left
+    left, found = looks.left, looks.found
     chosen, gains = looks.chosen
     varying = uneven(left)
     if varying is not None and left.given.data.measured_forces and about_inputs(left.fit.model, varying.judged.token):
@@ -174,21 +174,13 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
         if matters and (not varies or varied is None or varied.beyond > 0.0):  # rollouts take less time than what it is beyond
             return Structure(tokens, True, share, gains, varies=varies, noise=_beside(left, judged), nats=nats)
     windows = None if chosen else windows or _for_a_while(left)
-    happens = None if windows is None else comes_and_goes(looks, nominal, horizon, windows)
-    if happens is None:  # a number that may vary is told with the name, if no rollout shows it
+    matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
+    if windows is None or not matters:  # a number that may vary is told with the name, if no rollout shows it
         seen = as_told(chosen) if chosen and left.fit.added and (shows or _share_of(left, chosen[-1]) > MUCH) else ()
         also = () if varying is None else (varying.judged.token,)
         return Structure(coloured, False, 0.0, gains, beside=tuple(dict.fromkeys((*also, *seen))))
-    return replace(happens, gains=gains)
-
-
-def comes_and_goes(looks: Looks, nominal: Fit, horizon: int, windows: Judged) -> Structure | None:
-    """What happens in these windows only, if rollouts show it clearly."""
-    matters, share = _weight_of(looks.left, nominal, windows, horizon, DOUBLED)
-    if not matters:
-        return None
-    tokens = tuple(dict.fromkeys(TOKENS.get(token, token) for token in may_depend_on(looks.left, windows, looks.found)))
-    return Structure(tokens, True, share, {}, for_a_while=True, noise=_beside(looks.left, windows), nats=windows.gain)
+    tokens = may_depend_on(left, windows, found)
+    return Structure(tokens, True, share, gains, for_a_while=True, noise=_beside(left, windows), nats=windows.gain)
 
 
 def still_left(left: Left, tokens: tuple[str, ...], nominal: Fit, horizon: int) -> bool:

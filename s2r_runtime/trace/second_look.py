@@ -97,7 +97,7 @@ def once_more(
     share = len(given.steps) / len(whole.given.steps)
 
     def lacks(fit: Fit) -> float:
-        return max(share * told - gain(fit, chosen.fit), whole.explains_beyond(fit, given), whole.happens_beyond(fit, given))
+        return max(share * told - gain(fit, chosen.fit), whole.explains_beyond(fit, given))
 
     def found_by(bar: Bar, alone: Selection, may_be_left: set[str]) -> tuple[Selection, Structure] | None:
         """What was called for by this bar, beside its rivals, if it leaves no more than that."""

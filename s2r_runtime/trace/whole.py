@@ -12,9 +12,8 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.about import about_states
 from s2r_runtime.trace.challenge import MORE as SHAPED
 from s2r_runtime.trace.challenge import Better, best_shape, better_shape
-from s2r_runtime.trace.episodes import episodes
 from s2r_runtime.trace.faults import Checked
-from s2r_runtime.trace.fields import Field, bare_nats, beats, nats_of, nats_of_fit, wanders
+from s2r_runtime.trace.fields import Field, beats, nats_of, nats_of_fit, wanders
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, problem
 from s2r_runtime.trace.holdout import part
 from s2r_runtime.trace.lack_of_fit import (
@@ -24,7 +23,6 @@ from s2r_runtime.trace.lack_of_fit import (
     Structure,
     as_told,
     best_unnamed,
-    comes_and_goes,
     explains_more,
     lack_of_fit,
     left_of,
@@ -102,11 +100,6 @@ class Whole:
         beyond = share * self._looks.most - told
         return beyond if beyond <= 0.0 else min(beyond, share * self.unnamed.gain - told)
 
-    def happens_beyond(self, fit: Fit, given: Problem) -> float:
-        """The same of what comes and goes."""
-        share = len(given.steps) / len(self.given.steps)
-        return -math.inf if self._windows is None else share * self._windows.gain - gain(fit, evaluate(given, self._model))
-
     @cached_property
     def _looks(self) -> Looks:
         return Looks(left_of(self.given, self.nominal))
@@ -137,10 +130,7 @@ class Whole:
     def falls_short(self, other: Selection) -> bool:
         """Whether another selection explains clearly less than the best that has no name: then it leaves what that explains beyond it."""
         told = max(gain(self.everywhere(other.fit), self.nominal), 0.0)
-        enough = SHORT * told + CLEAR
-        if self._windows is not None and self._windows.gain > enough:
-            return True
-        return self._looks.most > told and self.unnamed.gain > enough
+        return self._looks.most > told and self.unnamed.gain > SHORT * told + CLEAR
 
     def in_one_stretch(self, chosen: Selection) -> bool:
         """Whether a name comes from one stretch of the recording."""
@@ -172,10 +162,7 @@ class Whole:
             return found
         if not better.shows:  # the repair is as good, whatever its name
             return replace(found, beside=tuple(dict.fromkeys((better.token, *found.beside))))
-        told = better.nats + (gain(fit, self.nominal) if len(fit.added) > 1 else 0.0)  # beside what else was named, at most
-        happens = self._for_a_while(max(told, gain(fit, self.nominal)))
-        tokens = (better.token,) if happens is None else happens.tokens
-        return replace(found, tokens=tokens, matters=True, share=1.0, nameless=True)
+        return replace(found, tokens=(better.token,), matters=True, share=1.0, nameless=True)
 
     def _of_nominal(self) -> Structure:
         """What the model as given leaves."""
@@ -187,11 +174,6 @@ class Whole:
             tokens = self._looks_like  # it was seen by sliding only, which names what it tries
         else:
             tokens = () if self._shape is None else (self._shape.token,)
-        happens = self._comes_and_goes if (tokens or found.matters) and not found.for_a_while else None
-        if happens is not None:
-            # a place where the robot was once cannot be told from the time when it was there
-            first = [token for token in found.tokens if token in happens.tokens]
-            return replace(happens, tokens=tuple(dict.fromkeys((*first, *happens.tokens))), share=1.0, gains=found.gains)
         more = (found.for_a_while or found.varies) and self._shape is not None and found.nats > self._shape.nats
         named = tuple(dict.fromkeys((*found.tokens, *tokens) if more else (*tokens, *found.tokens)))
         return replace(found, tokens=named, matters=True, share=1.0) if tokens else found
@@ -236,8 +218,6 @@ class Whole:
         price of their numbers. Where noise of some colour does nearly as well, or speeds were not measured, by what they foretell of
         other blocks of time.
         """
-        if self._comes_and_goes is not None:
-            return self._comes_and_goes.tokens
         left, shape, field = self._looks.left, self._shape, self._field
         each = {} if self.given.floor.axes else self._looks.weighed
         nats = max(each.values(), default=0.0)
@@ -264,31 +244,6 @@ class Whole:
         """Dictionaries that explain far more together than the best one does; none, if it does most of it."""
         chosen = self._looks.chosen[0]
         return chosen if len(chosen) > 1 and chosen[-1].gain >= TWICE * self.unnamed.gain + CLEAR else []
-
-    @cached_property
-    def _windows(self) -> Judged | None:
-        """What happens for a while only, if rows are in order."""
-        return episodes(self._looks.left, each=False) if self.given.data.in_order else None
-
-    def _for_a_while(self, others: float) -> Structure | None:
-        """What happens for a while only, if rollouts show it, and if it explains clearly more than `others`, in nats, do all the time."""
-        if self._windows is None or self._windows.gain <= MORE * others + ALIKE:
-            return None
-        return comes_and_goes(self._looks, self.nominal, self._horizon, self._windows)
-
-    @cached_property
-    def _comes_and_goes(self) -> Structure | None:
-        """The same, held against all that has no name: in closed loop, inputs answer a gust, and are told for it."""
-        windows = self._windows
-        if windows is None or windows.gain <= self.unnamed.gain + ALIKE:
-            return None
-        left = self._looks.left
-        apart = bare_nats(left) - max(left.fit.coloured, left.fit.white)  # noise of any law is likelier than that which windows beat
-        weighed = [] if self.given.floor.axes else [apart + nats for nats in self._looks.weighed.values()]
-        field = [] if self._field is None else [apart + self._field.nats]
-        shape = [] if self._shape is None else [self._shape.nats]
-        together = [both.gain for both in self._together[-1:]]
-        return self._for_a_while(max([self.unnamed.gain, *weighed, *field, *shape, *together]))
 
     @property
     def _field(self) -> Field | None:
