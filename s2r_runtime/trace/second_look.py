@@ -93,11 +93,7 @@ def once_more(
     What explains clearly less than what is found with the lower bar leaves what that explains, and is not asked about.
     """
     refused = {names(chosen.fit.model)}
-    told = max([structure.nats, *structure.gains.values()]) if structure.matters else -math.inf
-    share = len(given.steps) / len(whole.given.steps)
-
-    def lacks(fit: Fit) -> float:
-        return max(share * told - gain(fit, chosen.fit), whole.explains_beyond(fit, given))
+    nameless = max([structure.nats, *structure.gains.values()]) if structure.matters else 0.0
 
     def found_by(bar: Bar, alone: Selection, may_be_left: set[str]) -> tuple[Selection, Structure] | None:
         """What was called for by this bar, beside its rivals, if it leaves no more than that."""
@@ -113,7 +109,7 @@ def once_more(
         return (other, rest) if foretelling(judged_on, [chosen.fit, other.fit])[1] >= 0.0 else None
 
     lower = LENIENT if chosen.fit.added else ALONE
-    besides = called_for(given, chosen.nominal.model, ahead, lambda share: None, lower, chosen, lacks=lacks)
+    besides = called_for(given, chosen.nominal.model, ahead, lambda share: None, lower, chosen, lacks=nameless)
     more = names(besides.fit.model) != names(chosen.fit.model) and not crowded(besides.fit)
 
     def behind(fit: Fit) -> bool:

@@ -38,17 +38,12 @@ drive. Among 265 recordings of ten families, none got another name for it.
 """
 
 A_PART = 0.2
-"""Of what something without a name still explains: the least that an effect besides must do of it, as five are looked for at most. Two that
-say little alone are looked for together (`hidden_pairs`). No answer changed by it on 204 made recordings of four families in the second
-look, nor on 137 others in both.
+"""Of what something without a name explains: the least that an effect must do of it, where all of it is looked for: five are looked for at
+most. Two that say little alone are looked for together (`hidden_pairs`). No answer changed by it on 204 made recordings of four families.
 """
 
 CLOSE_BY, SHORT = 3, 0.5
 """Effects that fall short which what was not fitted is asked about, and the share of what is needed that they must have."""
-
-
-Lacks = Callable[[Fit], float]
-"""Nats, on what is fitted, that something without a name explains beyond a fit."""
 
 
 @dataclass(frozen=True)
@@ -66,18 +61,9 @@ class Selection:
     risky: bool = False
 
 
-def select(
-    given: Problem,
-    model: ComposedModel,
-    horizon: int,
-    progress: Callable[[float], None],
-    most: int = MOST,
-    lacks: Lacks | None = None,
-) -> Selection:
-    """The effects that the transitions call for, `most` of them at most, and their rivals. lacks: as `called_for` has it; it is not asked
-    before a second effect was found.
-    """
-    return against_rivals(given, called_for(given, model, horizon, progress, most=most, lacks=lacks), STRICT)
+def select(given: Problem, model: ComposedModel, horizon: int, progress: Callable[[float], None], most: int = MOST) -> Selection:
+    """The effects that the transitions call for, `most` of them at most, and their rivals."""
+    return against_rivals(given, called_for(given, model, horizon, progress, most=most), STRICT)
 
 
 def called_for(
@@ -88,17 +74,17 @@ def called_for(
     bar: Bar = STRICT,
     before: Selection | None = None,
     most: int = MOST,
-    lacks: Lacks | None = None,
+    lacks: float = 0.0,
 ) -> Selection:
-    """The effects alone, by any bar, `most` at most. before: what was selected with another one, from which it goes on. lacks: an effect
-    that makes next to nothing of that is not gone on from; a first one is, unless there was a selection before.
+    """The effects alone, by any bar, `most` at most. before: what was selected with another one, from which it goes on. lacks: nats that
+    something without a name explains beyond that: an effect that makes next to nothing of it is not gone on from.
     """
     nominal = evaluate(given, model) if before is None else before.nominal
     fit, tried = (nominal, 0) if before is None else (before.fit, before.tried)
+    begun = fit
     ranking = [] if before is None else list(before.ranking)
     for step in range(most - len(fit.added)):
-        # beside one effect there is mostly no second: what has no name is asked for once there is
-        short = _least(lacks, fit) if before is not None or len(fit.added) > 1 else -math.inf
+        short = A_PART * (lacks - gain(fit, begun)) if lacks else -math.inf
         if ranking and not fit.added:
             found, columns = rescored(ranking, nominal, len(given.steps), bar), tried
         else:
@@ -112,7 +98,7 @@ def called_for(
             others = overlooked(given, fit, found, bar, max(bar.needed(tried, 1, len(given.steps)), short))
             chosen = _first_of(others, given, fit, tried, horizon, bar)
         chosen = chosen if fit.added else _of_all_axes(given, nominal, chosen, tried, horizon, bar)
-        if chosen is None or ((before is not None or fit.added) and gain(chosen, fit) < _least(lacks, fit)):
+        if chosen is None or gain(chosen, fit) < short:
             break
         chosen = parted(given, fitted(given, chosen, chosen.model), ranking, bar)
         fit = exchanged(given, chosen, bar) if 1 < len(chosen.added) <= EXCHANGED else chosen
@@ -121,11 +107,6 @@ def called_for(
     fit = unbent(given, simplified(given, pruned(given, fit, tried, horizon, bar)), tried, bar)
     progress(0.8)
     return Selection(nominal, plainly(given, fit), tried, tuple(ranking), ())
-
-
-def _least(lacks: Lacks | None, fit: Fit) -> float:
-    """Nats that an effect must explain beside those that were found."""
-    return -math.inf if lacks is None else A_PART * lacks(fit)
 
 
 def _first_of(found: Sequence[Scored], given: Problem, base: Fit, tried: int, horizon: int, bar: Bar) -> Fit | None:
@@ -157,13 +138,11 @@ def against_rivals(given: Problem, chosen: Selection, bar: Bar) -> Selection:
     return replace(chosen, fit=fit, rivals=tuple(found))
 
 
-def one_more(
-    given: Problem, chosen: Selection, horizon: int, foretells: Callable[[Fit, Fit], float], lacks: Lacks | None = None
-) -> Selection:
+def one_more(given: Problem, chosen: Selection, horizon: int, foretells: Callable[[Fit, Fit], float]) -> Selection:
     """With an effect besides that falls short of what is needed on what was fitted, but not on all of the recording. foretells: nats by
     which one model foretells what was not fitted better than another one does: the probability of both parts is that of one times that
     of the other, given the first, so they add. It counts for no more than the fit does, which is asked about where the robot was, but of
-    what changes an input: that is known without noise. lacks: as `called_for` has it.
+    what changes an input: that is known without noise.
     """
     fit = chosen.fit
     if len(fit.added) >= MOST or crowded(fit):
@@ -174,7 +153,7 @@ def one_more(
         needed, reached = STRICT.needed(chosen.tried, s.fit.k - fit.k, len(given.steps)), gain(s.fit, fit)
         if not _on_inputs(s, fit) and s.fit.white - fit.white >= SHORT * needed:
             reached += nearer(given, s.fit, fit)
-        if reached < SHORT * needed or (fit.added and 2.0 * reached < _least(lacks, fit)):  # what is foretold counts as much at most
+        if reached < SHORT * needed:
             continue
         told = foretells(s.fit, fit)
         ahead = reached - gain(s.fit, fit) + min(told, reached)

@@ -148,13 +148,7 @@ def _traced(
     _enough(dataset, model, cut.fit_part, cut.judged_on, ahead)
     say(5.0, 100.0, "looking for effects")
     hidden = cut.given.bends
-    whole = Whole(checked, model, ahead)
-
-    def lacks(fit: Fit) -> float:
-        return whole.explains_beyond(fit, cut.given)
-
-    at_first = 1 if hidden else MOST
-    chosen = select(cut.given, model, ahead, lambda share: say(5.0 + 55.0 * share, 100.0, "looking for effects"), at_first, lacks)
+    chosen = select(cut.given, model, ahead, lambda share: say(5.0 + 55.0 * share, 100.0, "looking for effects"), 1 if hidden else MOST)
     lines = _straight(as_recorded, asked, parts, checked, seen, cut.given, chosen.fit)
     if lines is not None:
         placed = again(*lines, 60.0)
@@ -169,8 +163,8 @@ def _traced(
         if names(chosen.fit.model) == before:
             break
     checked, judged_on, given = cut.checked, cut.judged_on, cut.given
-    whole = Whole(checked, model, ahead) if checked is not whole.checked else whole
-    chosen = foretold_too(given, whole.given, chosen, judged_on, ahead, lacks)
+    whole = Whole(checked, model, ahead)
+    chosen = foretold_too(given, whole.given, chosen, judged_on, ahead)
     chosen = confirmed(given, all_dated(given, whole.given, chosen), judged_on)
     say(80.0, 100.0, "testing what is left")
     structure = whole.structure(chosen)

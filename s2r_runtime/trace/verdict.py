@@ -32,7 +32,7 @@ from s2r_runtime.trace.residual import Mask, acting, first_steps, predicted, rms
 from s2r_runtime.trace.residual_noise import OUTLIER
 from s2r_runtime.trace.rivals import only_in, representative, tied
 from s2r_runtime.trace.scores import STRICT, Scored, name_of, names
-from s2r_runtime.trace.selection import Lacks, Selection, doing_something, one_more
+from s2r_runtime.trace.selection import Selection, doing_something, one_more
 from s2r_runtime.trace.slots import Added, slots_of
 from s2r_runtime.trace.throttled import refuted
 
@@ -162,12 +162,8 @@ def _in_its_place(fit: Fit, found: Sequence[Scored]) -> list[Scored]:
     return kept
 
 
-def foretold_too(
-    given: Problem, everything: Problem, chosen: Selection, judged_on: Held, horizon: int, lacks: Lacks | None = None
-) -> Selection:
-    """With an effect besides that only all of the recording shows. everything: transitions of all of it (as many as are fitted at most).
-    lacks: as `called_for` has it.
-    """
+def foretold_too(given: Problem, everything: Problem, chosen: Selection, judged_on: Held, horizon: int) -> Selection:
+    """With an effect besides that only all of the recording shows. everything: transitions of all of it (as many as are fitted at most)."""
 
     def ahead(fit: Fit, base: Fit) -> float:
         told = foretelling(judged_on, [base, fit])[1]
@@ -176,7 +172,7 @@ def foretold_too(
         dearer = STRICT.price(fit.k - base.k, len(everything.steps)) - STRICT.price(fit.k - base.k, len(given.steps))
         return max(told, _of_all(everything, fit, base) - gain(fit, base) - dearer)
 
-    return one_more(given, chosen, horizon, ahead, lacks)
+    return one_more(given, chosen, horizon, ahead)
 
 
 def _of_all(everything: Problem, fit: Fit, base: Fit) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from functools import cached_property
 
@@ -14,7 +13,7 @@ from s2r_runtime.trace.challenge import MORE as SHAPED
 from s2r_runtime.trace.challenge import Better, best_shape, better_shape
 from s2r_runtime.trace.faults import Checked
 from s2r_runtime.trace.fields import Field, beats, nats_of, nats_of_fit, wanders
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, problem
+from s2r_runtime.trace.fitting import Fit, evaluate, fitted, gain, problem
 from s2r_runtime.trace.holdout import part
 from s2r_runtime.trace.lack_of_fit import (
     ALIKE,
@@ -74,31 +73,12 @@ class Whole:
     """All of a recording, and what the nominal model leaves of it: a test for structure needs no data that the fit never saw."""
 
     def __init__(self, checked: Checked, nominal: ComposedModel, horizon: int) -> None:
-        self.checked, self._model, self._horizon = checked, nominal, horizon
+        everything = part(checked.data, checked.left_out, np.ones(first_steps(checked.data)[-1], dtype=bool), STRUCTURE_STEPS)
+        self.given = problem(everything.data, everything.steps)
+        self.nominal = evaluate(self.given, nominal)
+        self._horizon = horizon
         self._known: dict[int, tuple[Fit, Structure]] = {}
         self._fitted: dict[int, tuple[Fit, Fit]] = {}
-
-    @cached_property
-    def given(self) -> Problem:
-        """Its transitions, STRUCTURE_STEPS at most."""
-        checked = self.checked
-        everything = part(checked.data, checked.left_out, np.ones(first_steps(checked.data)[-1], dtype=bool), STRUCTURE_STEPS)
-        return problem(everything.data, everything.steps)
-
-    @cached_property
-    def nominal(self) -> Fit:
-        """The nominal model on it."""
-        return evaluate(self.given, self._model)
-
-    def explains_beyond(self, fit: Fit, given: Problem) -> float:
-        """Nats, on what is fitted, by which the best dictionary explains more of what the nominal model lacks than a fit does; at first
-        look, if that is less: there, wild values weigh more than in a fit. None where speeds were not measured: little looks like much.
-        """
-        if self.given.floor.axes:
-            return -math.inf
-        share, told = len(given.steps) / len(self.given.steps), gain(fit, evaluate(given, self._model))
-        beyond = share * self._looks.most - told
-        return beyond if beyond <= 0.0 else min(beyond, share * self.unnamed.gain - told)
 
     @cached_property
     def _looks(self) -> Looks:
