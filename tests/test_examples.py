@@ -21,6 +21,13 @@ def test_the_motors_recordings_are_what_its_maker_writes(tmp_path):
         np.testing.assert_allclose(made, kept, atol=0.0011)  # the last digit may be rounded otherwise by another machine
 
 
+def test_its_maker_says_in_a_line_what_it_needs(tmp_path):
+    for more in ([], [str(tmp_path / "none")]):
+        done = subprocess.run([sys.executable, str(MOTOR / "record.py"), *more], capture_output=True, text=True, timeout=60, check=False)
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
+        assert "python record.py FOLDER" in done.stderr
+
+
 def test_the_page_shows_the_model_that_is_there():
     page = (MOTOR.parent.parent / "docs" / "first-trace.md").read_text(encoding="utf-8")
     source = (MOTOR / "motor.py").read_text(encoding="utf-8")

@@ -40,6 +40,8 @@ def recorded(rng: np.random.Generator, volts: np.ndarray) -> str:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2 or not Path(sys.argv[1]).is_dir():
+        sys.exit("record.py: needs the folder to write to, which exists: python record.py FOLDER")
     folder = Path(sys.argv[1])
     for name, seed, seconds in (("drive.csv", 1, 30.0), ("another.csv", 2, 10.0)):
         rng = np.random.default_rng(seed)
