@@ -26,17 +26,21 @@ def test_whitened_residuals_have_unit_covariance_and_no_memory():
         assert np.all(np.abs(z[lag:].T @ z[:-lag] / n) < limit)
 
 
-def test_the_likelihood_of_whitening_is_that_of_the_full_covariance():
+@pytest.mark.parametrize("pushed", [False, True])
+def test_the_likelihood_of_whitening_is_that_of_the_full_covariance(pushed):
     rng, q, r = np.random.default_rng(2), np.array([0.5, 0.1]), np.array([1.0, 2.0])
     residual, f = _residuals(rng, 6, q, r, 0.3)
+    push = rng.normal(size=(6, 2)) if pushed else None
     joined = np.array([False, True, True, False, True, True])
     s = np.zeros((12, 12))
     for k in range(6):
         s[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = np.diag(q + r) + f[k] @ np.diag(r) @ f[k].T
+        if push is not None:
+            s[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += np.outer(push[k], push[k])
         if joined[k]:
             s[2 * k : 2 * k + 2, 2 * k - 2 : 2 * k] = -f[k] @ np.diag(r)
             s[2 * k - 2 : 2 * k, 2 * k : 2 * k + 2] = (-f[k] @ np.diag(r)).T
-    whiten = Whitener(Noise(q, r), f, joined)
+    whiten = Whitener(Noise(q, r), f, joined, push=push)
     z = whiten(residual)
     assert float(np.sum(z * z)) == pytest.approx(residual.ravel() @ np.linalg.solve(s, residual.ravel()))
     assert whiten.logdet == pytest.approx(0.5 * np.linalg.slogdet(s)[1])

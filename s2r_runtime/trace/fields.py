@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.body_noise import body_noise
 from s2r_runtime.trace.evidence import evidence
-from s2r_runtime.trace.fitting import Fit, slopes
+from s2r_runtime.trace.fitting import slopes
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
 from s2r_runtime.trace.lack_of_fit_terms import directions_of, own_pushes, quieter
 from s2r_runtime.trace.residual import acting
@@ -222,10 +223,10 @@ def _standing_out(left: Left, offered: Iterable[_Offer]) -> tuple[list[tuple[flo
 
 def _flipped(left: Left) -> Array:
     """(n, nx, 1 + FLIPS) S^-1 r, wild values weighted down; then the same with the sign of each step by chance."""
-    z = left.fit.z
+    whiten, z = body_noise(left).white
     push = np.clip(z, -CLIPPED, CLIPPED) * noises.weight(z)
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(z), 1, FLIPS))
-    return left.fit.whiten.back(np.concatenate([push[:, :, None], push[:, :, None] * signs], axis=2))
+    return whiten.back(np.concatenate([push[:, :, None], push[:, :, None] * signs], axis=2))
 
 
 def _stands_out(offer: _Offer, along: Array) -> float:
@@ -267,15 +268,16 @@ def nats_of(left: Left, x: Array) -> float:
     return _marginal(left, x, PASSES)[0] - bare_nats(left)
 
 
-def nats_of_fit(left: Left, fit: Fit, price: float) -> float:
-    """The same of another model, the numbers of which cost so much."""
-    return _under_any_law(fit.z, fit.whiten, left) - bare_nats(left) - price
+def nats_of_other(left: Left, other: Left, price: float) -> float:
+    """The same of another model, which leaves `other`, and the numbers of which cost so much."""
+    return bare_nats(other) - bare_nats(left) - price
 
 
 def bare_nats(left: Left) -> float:
     """Log likelihood of what a model leaves, under noise of whatever colour is likeliest."""
     if "bare" not in left.known:
-        left.known["bare"] = _under_any_law(left.fit.z, left.fit.whiten, left)
+        whiten, z = body_noise(left).white
+        left.known["bare"] = _under_any_law(z, whiten, left)
     bare: float = left.known["bare"]
     return bare
 
@@ -412,7 +414,8 @@ def _marginal(left: Left, x: Array, passes: int, first: Marginal | None = None) 
     """(log marginal likelihood, beta (m,)) of x (n, nx, m), the best of some passes of beta and noise in turn. What is left is judged, and
     its price is taken, under one noise. first: what the first pass said, if that was asked before.
     """
-    whiten, z, joined = left.fit.whiten, left.fit.z, left.given.steps.joined
+    own, joined = body_noise(left), left.given.steps.joined
+    whiten, z = own.white
     best, told, rest = -math.inf, np.asarray(np.zeros(x.shape[2])), left.r
     columns = np.asfortranarray(x.reshape(-1, x.shape[2]))  # as whitening takes them: they are copied once, not in every pass
     if first is not None:
@@ -420,8 +423,7 @@ def _marginal(left: Left, x: Array, passes: int, first: Marginal | None = None) 
         rest = left.r - (columns @ told).reshape(left.r.shape)
     for again in range(0 if first is None else 1, passes):
         if again:
-            whiten = Whitener(noises.estimate(rest, left.f, joined, left.given.floor), left.f, joined)
-            z = whiten(rest)
+            whiten, z = own.of(noises.estimate(rest, left.f, joined, left.given.floor), rest)
         before, root = best, np.sqrt(noises.weight(np.clip(z, -CLIPPED, CLIPPED)))
         weighted = whiten.columns(columns)
         weighted *= root.reshape(-1, 1)

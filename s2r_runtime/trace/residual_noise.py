@@ -99,9 +99,11 @@ class Noise:
 
 
 class Whitener:
-    """z = L^-1 r for r (n, nx) or (n, nx, m). `logdet`: of L. extra: (n, nx) variance added to the diagonal."""
+    """z = L^-1 r for r (n, nx) or (n, nx, m). `logdet`: of L. extra: (n, nx) variance added to the diagonal; push: (n, nx), what noise of
+    its own pushes along in each step, by how much.
+    """
 
-    def __init__(self, noise: Noise, f: Array, joined: Mask, extra: Array | None = None) -> None:
+    def __init__(self, noise: Noise, f: Array, joined: Mask, extra: Array | None = None, push: Array | None = None) -> None:
         from scipy.linalg import lapack
 
         n, nx = f.shape[:2]
@@ -114,6 +116,8 @@ class Whitener:
             for b in range(nx):
                 if a >= b:
                     band[a - b, :, b] += np.sum(rf[a] * ft[b], axis=0)
+                    if push is not None:
+                        band[a - b, :, b] += push[:, a] * push[:, b]
                 band[nx + a - b, :-1, b] = linked[a, b]
         for p, v in noise.axes:  # what pushes an axis all through a step moves it, too
             h = ft[p, v]
