@@ -55,7 +55,7 @@ def _commanded(seed: int, *effects: EffectSpec, noise: float = 2e-3, slowly: boo
     return from_arrays(JOINT, [(np.array(states) + rng.normal(size=(rows + 1, 2)) * [1e-5, noise], u)])
 
 
-@pytest.mark.parametrize("noise", [0.2, 0.5])
+@pytest.mark.parametrize("noise", first(1, [0.2, 0.5]))
 @pytest.mark.parametrize("seed", first(1, range(4)))
 def test_friction_that_takes_up_the_whole_torque_is_no_motor_that_does_nothing(seed, noise):
     """A torque of 3.5 to 6.5 N m, 0.2 of which moves the joint: as a command it would do a thirtieth of what it says."""

@@ -202,12 +202,11 @@ def test_runs_side_by_side_are_the_runs_one_by_one(name):
 @pytest.mark.parametrize(
     ("physics", "token"),
     [
-        (("uneven_lag", "w", {"out": 0.1, "back": 0.5}), "memory(w)"),
         (("ringing", "w", {"rate": 9.0, "damping": 0.2}), "memory(w)"),
         (("warming", "w", {"loss": 2.0, "time_constant": 2.0}), "memory(w)"),
         (("cubic", "w", {"share": -0.5}), "w"),
     ],
-    ids=["uneven lag", "ringing", "warming", "cubic"],
+    ids=["ringing", "warming", "cubic"],
 )
 def test_what_only_looks_like_an_effect_gets_no_name(physics, token, which):
     found = trace(recordings([physics], 2, steps=1200, seed=61)[which], declared())
@@ -233,20 +232,22 @@ def test_a_name_that_is_right_stands(physics, which):
     assert [(e.name.removeprefix("input_"), e.channel) for e in found.effects] == [(physics[0].removeprefix("input_"), "w")]
 
 
+@pytest.mark.parametrize("which", first(1, range(2)))
 @pytest.mark.parametrize(
     ("physics", "left"), [(("input_lag", "w", {"time_constant": 0.25}), False), (("uneven_lag", "w", {"out": 0.1, "back": 0.5}), True)]
 )
-def test_names_are_held_against_dictionaries_and_fields_where_they_leave_something_and_only_there(physics, left, monkeypatch):
+def test_names_are_held_against_dictionaries_and_fields_where_they_leave_something_and_only_there(physics, left, which, monkeypatch):
     """What explained more than a name would explain something beside it. A shape need not: it may do all that a name does."""
     asked = []
     for name in ("better_shape", "best_unnamed", "wanders"):
         challenge = getattr(whole, name)
         monkeypatch.setattr(whole, name, lambda *of, name=name, challenge=challenge: asked.append(name) or challenge(*of))
-    (data,) = recordings([physics], 1, steps=1200, seed=61)
+    data = recordings([physics], 2, steps=1200, seed=61)[which]
     found = trace(data, declared())
     assert bool({*asked} - {"better_shape"}) == left
     assert left or "better_shape" in asked
     assert (found.verdict == "unexplained") == left
+    assert not left or (found.depends_on[0], found.effects) == ("memory(w)", ())
 
 
 def _ramped(seed, name, p, loud):
@@ -272,7 +273,7 @@ def _wrong_way(v, s, h):
     return 2.0 * s["z"] - v
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", first(1, [1, 2]))
 def test_what_first_goes_the_other_way_is_no_lag_behind_a_delay(seed):
     rng = np.random.default_rng(seed)
     u = np.repeat(rng.uniform([0.1, -0.8], [0.5, 0.8], (60, 2)), 20, axis=0)
@@ -280,7 +281,7 @@ def test_what_first_goes_the_other_way_is_no_lag_behind_a_delay(seed):
     assert (result.verdict, result.effects, result.depends_on[:1]) == ("unexplained", (), ("memory(w)",))
 
 
-@pytest.mark.parametrize("loud", [1, 3])
+@pytest.mark.parametrize("loud", first(1, [1, 3]))
 def test_two_names_on_one_input_that_leave_nothing_are_held_against_one_that_has_no_name(loud):
     """Play and a gain by sign together come near to a loop."""
     result = trace(_ramped(1, "a loop", {"share": 0.2, "width": 0.4}, loud), UNICYCLE)

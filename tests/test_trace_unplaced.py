@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from seeds import first
 from trace_robots import GEOMETRY, drive
 
 from s2r_runtime.models.composed import compose
@@ -32,7 +33,7 @@ def _filled_up(name, seed=0, on_rows=False, effects=(), after=lambda u: u, every
     return Stream(t, y + rng.normal(size=y.shape) * NOISE[name]), Stream(t, fine[::PARTS])
 
 
-@pytest.mark.parametrize("name", ["differential_drive", "bicycle"])
+@pytest.mark.parametrize("name", first(1, ["bicycle", "differential_drive"]))
 def test_commands_of_another_clock_leave_out_the_transitions_in_which_they_change(name):
     model = _model(name)
     data = from_streams(model, [_filled_up(name)], "here.csv")
@@ -73,7 +74,7 @@ def test_a_lag_on_rows_is_a_lag():
     assert found.unplaced == 0
 
 
-@pytest.mark.parametrize("share", [0.15, 0.3, 0.6])
+@pytest.mark.parametrize("share", first(1, [0.3, 0.15, 0.6]))
 def test_a_delay_of_a_part_of_a_row_is_never_left_out(share):
     name = "differential_drive"
     model, slow = _model(name), [("input_delay", "*", {"delay": share * DT})]
@@ -103,7 +104,7 @@ def test_of_commands_that_change_in_every_third_row_none_is_left_out():
     assert trace(data, model).unplaced == 0
 
 
-@pytest.mark.parametrize("rows", [1, 3])
+@pytest.mark.parametrize("rows", first(1, [3, 1]))
 def test_what_shoots_over_after_a_change_is_not_left_out(rows):
     """It has no name, and comes after the change: leaving out the transitions before would explain nothing."""
 

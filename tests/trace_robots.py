@@ -151,36 +151,52 @@ def drive(rng, name, u, effects, dt, noise, outside=None):
     x = np.zeros((robots, WIDTH[name]))
     if name in POSES:
         x[:, :2], x[:, 2] = rng.uniform(-1.0, 1.0, (robots, 2)), rng.uniform(-3.0, 3.0, robots)
-    states = np.empty((robots, steps + 1, WIDTH[name]))
-    states[:, 0] = x
-    for i in range(steps * PARTS):
-        if name in POSES:
+    if outside is None:
+        states = _driven(name, x, a, part)[:, ::PARTS]
+    else:
+        states = np.empty((robots, steps + 1, WIDTH[name]))
+        states[:, 0] = x
+        for i in range(steps * PARTS):
             _move_pose(name, x, a[:, i], part, outside)
-        else:
-            n = a.shape[2]
-            acceleration = a[:, i] / GEOMETRY.get(name, {}).get("mass", 1.0)
-            x[:, :n] += part * x[:, n:] + part * part / 2 * acceleration
-            x[:, n:] += part * acceleration
-        if (i + 1) % PARTS == 0:
-            states[:, (i + 1) // PARTS] = x
+            if (i + 1) % PARTS == 0:
+                states[:, (i + 1) // PARTS] = x
     y = states + rng.normal(size=states.shape) * noise
     if name in POSES:
         y[..., 2] = (y[..., 2] + np.pi) % (2 * np.pi) - np.pi
     return y
 
 
-def _move_pose(name, x, c, part, outside):
+def _driven(name, x, a, part):
+    """x (robots, nx) at rest, (robots, parts, nu) what acts -> (robots, parts + 1, nx): all parts at once, where nothing depends on where
+    a robot is.
+    """
+
+    def summed(rate):
+        return np.concatenate([np.zeros_like(rate[:, :1]), np.cumsum(part * rate, axis=1)], axis=1)
+
+    if name not in POSES:
+        acceleration = a / GEOMETRY.get(name, {}).get("mass", 1.0)
+        speed = summed(acceleration)
+        return np.concatenate([summed(speed[:, :-1] + part / 2 * acceleration), speed], axis=2)
+    v, w, wheels = _speeds(name, a)
+    theta = x[:, 2:3] + summed(w)
+    middle = theta[:, :-1] + w * part / 2
+    pose = np.stack([x[:, :1] + summed(v * np.cos(middle)), x[:, 1:2] + summed(v * np.sin(middle)), theta], axis=2)
+    return np.concatenate([pose, np.concatenate([x[:, None, 3:], wheels], axis=1)], axis=2)
+
+
+def _speeds(name, c):
+    """Speed, yaw rate, and the further states (..., k), of what acts (..., nu)."""
     if name == "unicycle":
-        v, w = c[:, 0], c[:, 1]
-    elif name == "differential_drive":
-        v, w = 0.1 * (c[:, 0] + c[:, 1]) / 2, 0.1 * (c[:, 1] - c[:, 0]) / 0.5
-        x[:, 3:] = c
-    else:
-        v, w = c[:, 1], c[:, 1] * np.tan(c[:, 0]) / 0.33
-        x[:, 3] = c[:, 1]
-    dx = dy = 0.0
-    if outside is not None:
-        v, w, dx, dy = outside(x, v, w)
+        return c[..., 0], c[..., 1], c[..., :0]
+    if name == "differential_drive":
+        return 0.1 * (c[..., 0] + c[..., 1]) / 2, 0.1 * (c[..., 1] - c[..., 0]) / 0.5, c
+    return c[..., 1], c[..., 1] * np.tan(c[..., 0]) / 0.33, c[..., 1:]
+
+
+def _move_pose(name, x, c, part, outside):
+    v, w, x[:, 3:] = _speeds(name, c)
+    v, w, dx, dy = outside(x, v, w)
     middle = x[:, 2] + w * part / 2
     x[:, 0] += part * (v * np.cos(middle) + dx)
     x[:, 1] += part * (v * np.sin(middle) + dy)

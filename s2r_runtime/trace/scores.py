@@ -45,8 +45,10 @@ ONWARD = 0.4
 625 such, of 998, none that was needed came to three fifths of the best one in another.
 """
 
-KEPT = 6
-"""Searches that are known at a time: a selection goes back to the models less one effect, of which there are at most five."""
+KEPT = 12
+"""Searches that are known at a time: a selection goes back to the models less one effect, of which there are at most five, and a second
+look goes the way of the first one again.
+"""
 
 AS_MUCH = 3.0
 """Nats that a model may explain less than another one of the same effects (its noise was begun elsewhere) for a search beside it to do."""
