@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
@@ -37,6 +38,9 @@ FEW = 3
 
 BEYOND = 2.2
 """Times the largest move in a step: a command that reverses and is late, or followed with a lag, leaves up to twice that."""
+
+NEAR = 5
+"""Steps on either side of which the pace says by how much a row that was stamped late may be away."""
 
 RIGHT_AT_FIRST = 0.3
 """Of a heading that jumped for good, what was before counts if it is at least this part of the run, unless the course says otherwise."""
@@ -69,7 +73,8 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
     found = Jumps([], [], [], [], [], [])
     if len(run.y) < 3:
         return found
-    e = model.difference(run.y[1:], predicted(model, data, act, i))
+    foretold = predicted(model, data, act, i)
+    e, moves = model.difference(run.y[1:], foretold), model.difference(foretold, run.y[:-1])
     change = model.difference(run.y[1:].copy(), run.y[:-1])
     pose = {"x", "y", "theta"} if getattr(model.nominal, "integration", None) is not None else set()
     goes_on = pose | {model.states[axis.position] for axis in axes(model.nominal)}  # as its speed says, which is a state of its own
@@ -77,7 +82,7 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
         if of_positions and name not in goes_on:
             continue
         series = np.nan_to_num(change[:, j] if reach.instant[j] else e[:, j])
-        limit = SIGMAS * reach.noise[j] + BEYOND * reach.move[j]
+        limit = SIGMAS * reach.noise[j] + BEYOND * np.minimum(reach.move[j], _pace(moves[:, j], change[:, j]))
         for_one_step = SIGMAS * reach.noise[j] + BEYOND * (reach.turn if name in goes_on else reach.move)[j]
         tail = max(float(reach.tail[j]), _reached(series, float(reach.noise[j]), float(for_one_step)))
         lost = np.isnan(run.y[:, j])
@@ -86,7 +91,7 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
             if bad[k, j] or bad[k + 1, j]:  # the end of something that is taken out already
                 continue
             rows = _there_and_back(series, k)
-            if rows is not None and abs(float(series[k])) <= limit:  # a row that was stamped late is as far away, and back
+            if rows is not None and abs(float(series[k])) <= limit[k]:  # a row that was stamped late is as far away, and back
                 stray = Fault(run.start_s + data.dt * rows[0], run.start_s + data.dt * rows[1], name, "spike")
                 if stray not in found.strays:
                     found.strays.append(stray)
@@ -103,6 +108,13 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
                 if _stays(series, k, (bad[1:, j] | bad[:-1, j], single)):
                     found.sure.append(found.offsets[-1])
     return found
+
+
+def _pace(moves: Array, change: Array) -> Array:
+    """(K,) how far the state goes in a step hereabouts: by the model at most, whose inputs act at once, or as measured, in most steps."""
+    near = np.abs(np.nan_to_num(np.stack([moves, change])))
+    wide = sliding_window_view(np.pad(near, ((0, 0), (NEAR, NEAR)), mode="edge"), 2 * NEAR + 1, axis=1)
+    return np.asarray(np.maximum(wide[0].max(axis=1), np.median(wide[1], axis=1)))
 
 
 def _reached(series: Array, noise: float, least: float) -> float:
