@@ -211,9 +211,9 @@ def test_what_is_known_of_what_a_model_leaves_is_forgotten_with_another_fit():
     data, model = _recording(_driven(rng, u, lambda k, x, v, w: (v, w)), u)
     given = problem(data, steps_of(data))
     left = left_of(given, evaluate(given, model))
-    noisier = replace(left, r=2.0 * left.r, fit=replace(left.fit, z=2.0 * left.fit.z))
+    noisier = replace(left, fit=replace(left.fit, z=2.0 * left.fit.z))
     assert fields.bare_nats(left) > fields.bare_nats(noisier) + 1.0
-    assert fields.bare_nats(replace(left, r=noisier.r, fit=noisier.fit)) == fields.bare_nats(noisier)
+    assert fields.bare_nats(replace(left, fit=noisier.fit)) == fields.bare_nats(noisier)
 
 
 def test_only_fields_that_stand_out_are_looked_at(monkeypatch):
@@ -300,9 +300,9 @@ def test_a_model_and_a_dictionary_that_say_the_same_are_weighed_alike(seed):
     gain = insert(model, AppliedEffect(registry().get("effects", "input_gain"), "w", {"gain": 0.97}), 0)
     fit = fitted(given, nominal, gain)
     price = 0.5 * math.log(len(given.steps))
-    as_model = fields.nats_of_other(left, left_of(given, fit), price)
+    as_model = fields.nats_of_fit(left, fit, price)
     as_term = fields.nats_of(left, (given.predicted(model) - given.predicted(gain))[:, :, None])
-    assert fields.nats_of_other(left, left_of(given, nominal), 0.0) == pytest.approx(0.0)
-    assert as_model == pytest.approx(fields.nats_of_other(left, left_of(given, fit), 0.0) - price)
+    assert fields.nats_of_fit(left, nominal, 0.0) == pytest.approx(0.0)
+    assert as_model == pytest.approx(fields.nats_of_fit(left, fit, 0.0) - price)
     assert min(as_model, as_term) > 20.0
     assert as_model - 12.0 < as_term < as_model + 3.0  # a term may be of any size: that costs up to log(1e5) / 2 more

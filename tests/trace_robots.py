@@ -145,6 +145,8 @@ def drive(rng, name, u, effects, dt, noise, outside=None):
     outside(x, first, second) -> first, second, dx, dy for poses (speed, yaw rate, speeds along the world's axes): physics that no effect
     of the library has.
     """
+    if outside is not None and name not in POSES:
+        raise ValueError(f"{name}: has no pose that something outside could move")
     robots, steps, _ = u.shape
     part = dt / PARTS
     a = acted(np.repeat(u, PARTS, axis=1), effects, INPUTS[name], part)

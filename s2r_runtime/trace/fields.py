@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.body_noise import body_noise
+from s2r_runtime.trace.body_noise import BodyNoise, body_noise, whitener
 from s2r_runtime.trace.evidence import evidence
-from s2r_runtime.trace.fitting import slopes
+from s2r_runtime.trace.fitting import Fit, slopes
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
 from s2r_runtime.trace.lack_of_fit_terms import directions_of, own_pushes, quieter
 from s2r_runtime.trace.residual import acting
@@ -168,11 +168,19 @@ def field(left: Left) -> Field | None:
     fitted = sorted(((*_marginal(left, offer.x, PASSES, first), k) for k, (offer, first) in enumerate(kept)), key=lambda f: -f[0])
     nats, beta, best = fitted[0]
     price = math.log(tried / ALPHA)
-    if nats - bare < price:
+    told = kept[best][0]
+    if nats - bare < price or not _beyond_body_noise(left, told.x, price):
         return None
     also = tuple(kept[k][0].token for other, _, k in fitted[1:] if other > nats - ALIKE)
-    told = kept[best][0]
     return Field(told.token, also, told.x, beta, nats - bare, lambda: _beyond(left, nats - price, told.x, beta, price))
+
+
+def _beyond_body_noise(left: Left, x: Array, price: float) -> bool:
+    """Whether a field has its price beside noise along the body, too, where there is any: a field takes up some of what that does. It is
+    asked of one that has its price, before it is asked what wanders, which takes ten times as long.
+    """
+    body = body_noise(left)
+    return body is None or _marginal(left, x, PASSES, body=body)[0] - _under_any_law(body.z, body.whiten, left) >= price
 
 
 def _beyond(left: Left, nats: float, x: Array, beta: Array, price: float) -> float:
@@ -223,10 +231,10 @@ def _standing_out(left: Left, offered: Iterable[_Offer]) -> tuple[list[tuple[flo
 
 def _flipped(left: Left) -> Array:
     """(n, nx, 1 + FLIPS) S^-1 r, wild values weighted down; then the same with the sign of each step by chance."""
-    whiten, z = body_noise(left).white
+    z = left.fit.z
     push = np.clip(z, -CLIPPED, CLIPPED) * noises.weight(z)
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(z), 1, FLIPS))
-    return whiten.back(np.concatenate([push[:, :, None], push[:, :, None] * signs], axis=2))
+    return left.fit.whiten.back(np.concatenate([push[:, :, None], push[:, :, None] * signs], axis=2))
 
 
 def _stands_out(offer: _Offer, along: Array) -> float:
@@ -268,16 +276,15 @@ def nats_of(left: Left, x: Array) -> float:
     return _marginal(left, x, PASSES)[0] - bare_nats(left)
 
 
-def nats_of_other(left: Left, other: Left, price: float) -> float:
-    """The same of another model, which leaves `other`, and the numbers of which cost so much."""
-    return bare_nats(other) - bare_nats(left) - price
+def nats_of_fit(left: Left, fit: Fit, price: float) -> float:
+    """The same of another model, the numbers of which cost so much."""
+    return _under_any_law(fit.z, fit.whiten, left) - bare_nats(left) - price
 
 
 def bare_nats(left: Left) -> float:
     """Log likelihood of what a model leaves, under noise of whatever colour is likeliest."""
     if "bare" not in left.known:
-        whiten, z = body_noise(left).white
-        left.known["bare"] = _under_any_law(z, whiten, left)
+        left.known["bare"] = _under_any_law(left.fit.z, left.fit.whiten, left)
     bare: float = left.known["bare"]
     return bare
 
@@ -410,12 +417,12 @@ def _cells(place: Array, along: int) -> Array:
     return np.asarray(numbers[:, None] // sides % (along + 1), dtype=np.float64)
 
 
-def _marginal(left: Left, x: Array, passes: int, first: Marginal | None = None) -> Marginal:
+def _marginal(left: Left, x: Array, passes: int, first: Marginal | None = None, body: BodyNoise | None = None) -> Marginal:
     """(log marginal likelihood, beta (m,)) of x (n, nx, m), the best of some passes of beta and noise in turn. What is left is judged, and
-    its price is taken, under one noise. first: what the first pass said, if that was asked before.
+    its price is taken, under one noise. first: what the first pass said, if that was asked before. body: a share of the noise goes there.
     """
-    own, joined = body_noise(left), left.given.steps.joined
-    whiten, z = own.white
+    joined = left.given.steps.joined
+    whiten, z = (left.fit.whiten, left.fit.z) if body is None else (body.whiten, body.z)
     best, told, rest = -math.inf, np.asarray(np.zeros(x.shape[2])), left.r
     columns = np.asfortranarray(x.reshape(-1, x.shape[2]))  # as whitening takes them: they are copied once, not in every pass
     if first is not None:
@@ -423,7 +430,9 @@ def _marginal(left: Left, x: Array, passes: int, first: Marginal | None = None) 
         rest = left.r - (columns @ told).reshape(left.r.shape)
     for again in range(0 if first is None else 1, passes):
         if again:
-            whiten, z = own.of(noises.estimate(rest, left.f, joined, left.given.floor), rest)
+            noise = noises.estimate(rest, left.f, joined, left.given.floor)
+            whiten = Whitener(noise, left.f, joined) if body is None else whitener(left, noise, body.push, body.share)
+            z = whiten(rest)
         before, root = best, np.sqrt(noises.weight(np.clip(z, -CLIPPED, CLIPPED)))
         weighted = whiten.columns(columns)
         weighted *= root.reshape(-1, 1)

@@ -12,7 +12,7 @@ from s2r_runtime.trace.about import about_states
 from s2r_runtime.trace.challenge import MORE as SHAPED
 from s2r_runtime.trace.challenge import Better, best_shape, better_shape
 from s2r_runtime.trace.faults import Checked
-from s2r_runtime.trace.fields import Field, beats, nats_of, nats_of_other, wanders
+from s2r_runtime.trace.fields import Field, beats, nats_of, nats_of_fit, wanders
 from s2r_runtime.trace.fitting import Fit, evaluate, fitted, gain, problem
 from s2r_runtime.trace.holdout import part
 from s2r_runtime.trace.lack_of_fit import (
@@ -211,7 +211,7 @@ class Whole:
             more = nats_of(left, both.x) if weighed else both.gain
             tokens, nats = (as_told(self._together), more) if more > nats + ALIKE else (tokens, nats)
         if shape is not None:
-            more = nats_of_other(left, left_of(self.given, shape.fit), shape.price) if weighed and shape.fit is not None else shape.nats
+            more = nats_of_fit(left, shape.fit, shape.price) if weighed and shape.fit is not None else shape.nats
             tokens, nats = ((shape.token,), more) if more >= MORE * nats + ALIKE else (tokens, nats)
         if field is not None and field.nats > nats + (ALIKE if weighed else CLEAR):
             first = tokens[:1] if tokens[0] in field.tokens else ()
