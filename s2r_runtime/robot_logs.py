@@ -50,6 +50,11 @@ def is_robot_log(path: Path) -> bool:
     return bool(suffix) and any(name.partition(".")[2] == suffix[1:] for name in registry().names("recordings"))
 
 
+def is_table(path: Path) -> bool:
+    """Whether a recording is read as a table: it is no MCAP, and no log that a plug-in reads."""
+    return not path.name.lower().endswith(".mcap") and not is_robot_log(path)
+
+
 def read_robot_log(path: Path, model: ComposedModel, transport: Mapping[str, Any] | None) -> list[Stretch]:
     """Its stretches of driving. transport: the profile's table, or None. Raises RecordingError, ConfigError, UsageError."""
     suffix = suffix_of(path)

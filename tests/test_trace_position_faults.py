@@ -23,7 +23,11 @@ def _spiked(q):
 
 @pytest.mark.parametrize(
     ("wrong", "kind", "begins", "ends"),
-    [(_frozen, "frozen", 4.0, 4.3), (_jumped, "offset_jump", 5.0, 10.0), (_spiked, "spike", 6.0, 6.0)],
+    [
+        (_frozen, "frozen", 4.0, 4.3),
+        (_jumped, "offset_jump", 5.0, 10.0),
+        pytest.param(_spiked, "spike", 6.0, 6.0, marks=pytest.mark.long),
+    ],
 )
 def test_a_fault_of_a_position_alone_is_found_where_it_is_and_takes_no_name_away(tmp_path, wrong, kind, begins, ends):
     rows = _recorded(np.random.default_rng(0), 10.0)

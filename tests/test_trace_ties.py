@@ -215,6 +215,7 @@ def _traced(folder, family, seed):
     return trace(load_dataset(path, model), model)
 
 
+@pytest.mark.long
 def test_what_is_named_is_asked_again_where_rollouts_go_astray(tmp_path):
     """A drift of all inputs, and a change that undoes it on one, leave what looks like noise; a drift and a gain leave nothing."""
     found = _traced_pair(tmp_path, 68110)

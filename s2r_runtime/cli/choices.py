@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def add_model_options(verb: argparse.ArgumentParser) -> None:
-    """--profile, --model, --dt, --param."""
+    """--profile, --model, --dt, --param, --column."""
     verb.add_argument("--profile", type=Path, metavar="P", help="the robot's profile (TOML): model, columns, weights")
     verb.add_argument(
         "--model",
@@ -32,6 +32,44 @@ def add_model_options(verb: argparse.ArgumentParser) -> None:
         "--dt", type=positive, metavar="DT", help="the model's step in s (needed with a name or a Python file; else instead of the file's)"
     )
     verb.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the model; may be repeated")
+    verb.add_argument(
+        "--column",
+        action="append",
+        default=[],
+        metavar="NAME=COLUMN",
+        help="the table's column of a state or an input that has another name there (else as a profile says); may be repeated",
+    )
+
+
+def columns_of(args: argparse.Namespace, model: ComposedModel, profile: Profile | None, *recordings: Path | None) -> dict[str, str]:
+    """Name in the model -> column of the table, where they differ: the profile's, and those of --column instead. recordings: what is read.
+    Raises UsageError for a name that the model does not have, or two on one column; and if there is no table for --column.
+    """
+    columns = dict(profile.columns) if profile else {}
+    if not args.column:
+        return columns
+    from s2r_runtime.robot_logs import is_table
+
+    for path in recordings:
+        if path is not None and not is_table(path):
+            raise UsageError(f"--column: belongs to a table; {path} is a log, whose states and inputs have their names")
+    names = (*model.states, *model.inputs)
+    asked: dict[str, str] = {}
+    for item in args.column:
+        name, sign, column = (part.strip() for part in item.partition("="))
+        if not name or not sign or not column:
+            raise UsageError(f"--column {item}: must be NAME=COLUMN, a state or an input of the model and the table's name for it")
+        if name not in names:
+            raise UsageError(f"--column {item}: the model has no state or input {name!r}; it has: {', '.join(names)}")
+        if name in asked:
+            raise UsageError(f"--column {item}: {name} is in {asked[name]!r} already")
+        asked[name] = column
+    columns |= asked
+    for name in asked:
+        other = next((n for n in names if n != name and columns.get(n, n) == columns[name]), None)
+        if other is not None:
+            raise UsageError(f"--column {name}={columns[name]}: is the column of {other}, too; say where that is: --column {other}=COLUMN")
+    return columns
 
 
 def chosen_model(args: argparse.Namespace) -> tuple[ComposedModel, Profile | None]:

@@ -181,7 +181,7 @@ def run_adopt(args: argparse.Namespace) -> int:
 
 def run_live_trace(args: argparse.Namespace) -> int:
     """Exit 0 with any verdict, 1 if there is none, 3 if there is nothing to trace."""
-    fixed = ("profile", "model", "dt", "param", "test", "horizon", "seed", "bandwidth", "suggest", "suggest_duration", "report")
+    fixed = ("profile", "model", "dt", "param", "column", "test", "horizon", "seed", "bandwidth", "suggest", "suggest_duration", "report")
     if given := [name for name in fixed if getattr(args, name, None)]:
         raise UsageError(
             f"--{given[0].replace('_', '-')}: the daemon traces as its profile says; leave it out, or name its log as RECORDING"

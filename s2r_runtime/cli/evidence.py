@@ -13,6 +13,7 @@ from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import (
     add_model_options,
     chosen_model,
+    columns_of,
     controller_at,
     count,
     load_checked,
@@ -92,9 +93,8 @@ def run_gap(args: argparse.Namespace) -> int:
     from s2r_runtime.transitions import load_transitions
 
     model, profile = chosen_model(args)
-    found = load_transitions(
-        args.recording, model, dict(profile.columns) if profile else {}, transport=profile.transport if profile else None
-    )
+    columns = columns_of(args, model, profile, args.recording)
+    found = load_transitions(args.recording, model, columns, transport=profile.transport if profile else None)
     if args.blocking:
         found = gaps.blocked(found, args.blocking, model.dt)
     result = gaps.estimate_gap(

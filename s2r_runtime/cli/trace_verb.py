@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import add_model_options, apart, chosen_model, count, own_file, positive, weights_of, writable
+from s2r_runtime.cli.choices import add_model_options, apart, chosen_model, columns_of, count, own_file, positive, weights_of, writable
 from s2r_runtime.cli.daemon_verbs import add_daemon_options, run_live_trace
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
 
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--suggest-duration {args.suggest_duration:g}: must be at most {most:g} s, {MOST_SUGGESTED} steps of the model")
     if args.horizon and args.horizon < model.dt:
         raise UsageError(f"--horizon {args.horizon:g}: must be at least the model's step, {model.dt:g} s")
-    columns, transport = (dict(profile.columns), profile.transport) if profile else ({}, None)
+    columns, transport = columns_of(args, model, profile, args.recording, args.test), profile.transport if profile else None
     data = load_dataset(args.recording, model, columns, bandwidth=args.bandwidth, transport=transport)
     used = data.reconstruction.bandwidth if data.reconstruction and not data.reconstruction.axes else args.bandwidth
     test = load_dataset(args.test, model, columns, bandwidth=used, transport=transport, behind=data.behind) if args.test else None
