@@ -38,7 +38,7 @@ check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
-	@$(BIN)/mypy & $(BIN)/pytest tests/test_docs.py; docs=$$?; wait $$! && exit $$docs  # a minute in turn, half side by side
+	$(BIN)/mypy & $(BIN)/pytest tests/test_docs.py; docs=$$?; wait $$! || { echo "mypy failed, see above" >&2; exit 1; }; exit $$docs
 
 mutation: $(STAMP)
 	PYTHONHASHSEED=0 nice -n 19 $(BIN)/python tools/mutation.py

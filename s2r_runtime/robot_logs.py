@@ -51,8 +51,12 @@ def is_robot_log(path: Path) -> bool:
 
 
 def is_table(path: Path) -> bool:
-    """Whether a recording is read as a table: it is no MCAP, and no log that a plug-in reads."""
-    return not path.name.lower().endswith(".mcap") and not is_robot_log(path)
+    """Whether a recording is read as a table: it is no MCAP, and no log that a plug-in reads. One that cannot be read says so itself."""
+    try:
+        with path.open("rb") as file:
+            return file.read(5) != b"\x89MCAP" and not is_robot_log(path)
+    except OSError:
+        return True
 
 
 def read_robot_log(path: Path, model: ComposedModel, transport: Mapping[str, Any] | None) -> list[Stretch]:

@@ -54,23 +54,23 @@ class Table:
         return digest(np.ascontiguousarray(numbers, dtype="<f8").tobytes())
 
 
-def read_csv(path: Path | str, wanted: Sequence[str] | None = None, optional: Sequence[str] = ()) -> Table:
-    """Reads the columns `wanted` (None: all), and those of `optional` that are there.
+def read_csv(path: Path | str, wanted: Sequence[str] | None = None, optional: Sequence[str] = (), time: str = TIME) -> Table:
+    """Reads the columns `wanted` (None: all), and those of `optional` that are there. time: the column of the stamps.
 
     Raises RecordingError, one line: file, line, column, value, what would be right.
     """
     path = Path(path)
     header, rows = _opened(path)
-    names = _checked_names(path, header, wanted, optional)
+    names = _checked_names(path, header, wanted, optional, time)
     for name in optional:
         if name not in header and (near := [h for h in header if h.lower() == name.lower()]):
             raise RecordingError(f"{path}: lacks the column {name!r}, and has {near[0]!r}; column names must match exactly")
-    names += [name for name in dict.fromkeys(optional) if name in header and name not in {TIME, SEGMENT, *names}]
+    names += [name for name in dict.fromkeys(optional) if name in header and name not in names]
     cells, lines = _cells(path, rows, len(header))
-    numbers = {name: _numbers(path, name, cells[header.index(name)], lines) for name in (TIME, *names)}
-    t = numbers.pop(TIME)
+    numbers = {name: _numbers(path, name, cells[header.index(name)], lines) for name in (time, *names)}
+    t = numbers.pop(time)
     if blank := np.flatnonzero(np.isnan(t)).tolist():
-        raise RecordingError(f"{path}: line {lines[blank[0]]}: column {TIME!r} is blank, every row needs its stamp")
+        raise RecordingError(f"{path}: line {lines[blank[0]]}: column {time!r} is blank, every row needs its stamp")
     segment = _segments(path, cells[header.index(SEGMENT)], lines) if SEGMENT in header else None
     _check_time(path, t, segment, lines)
     return Table(t, numbers, segment)
@@ -112,17 +112,20 @@ def _text(path: Path) -> str:
     return text
 
 
-def _checked_names(path: Path, header: list[str], wanted: Sequence[str] | None, optional: Sequence[str]) -> list[str]:
-    """The columns to read, without `t` and `segment`."""
+def _checked_names(path: Path, header: list[str], wanted: Sequence[str] | None, optional: Sequence[str], time: str) -> list[str]:
+    """The columns to read, without the stamps and `segment`."""
     if not any(header):
         raise RecordingError(f"{path}: is empty, must start with a header row")
-    for name in (name for name in header if name) if wanted is None else (TIME, SEGMENT, *wanted, *optional):
+    for name in (*(wanted or ()), *optional):
+        if name in {time, SEGMENT}:
+            raise RecordingError(f"{path}: column {name!r} has the {'stamps' if name == time else 'runs'}, can be no state or input")
+    for name in (name for name in header if name) if wanted is None else (time, SEGMENT, *wanted, *optional):
         if header.count(name) > 1:
             raise RecordingError(f"{path}: column {name!r} is there {header.count(name)} times, must be there once")
-    needed = [TIME, *(name for name in wanted or () if name != TIME)]
+    needed = [time, *(wanted or ())]
     if missing := [name for name in needed if name not in header]:
         raise RecordingError(f"{path}: {_missing(missing, header)}")
-    return [name for name in (header if wanted is None else needed) if name not in {TIME, SEGMENT, ""}]
+    return [name for name in (header if wanted is None else needed) if name not in {time, SEGMENT, ""}]
 
 
 def _missing(missing: list[str], header: list[str]) -> str:

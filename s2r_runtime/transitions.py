@@ -33,7 +33,7 @@ from s2r_runtime.models.bound import wrap
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.robot_logs import content_digest, is_robot_log, merged_rows, read_robot_log
 from s2r_runtime.sensor_noise import FEWEST, NORMAL_MAD
-from s2r_runtime.tables import read_csv
+from s2r_runtime.tables import TIME, read_csv
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ def load_transitions(
     epoch: int | None = None,
     transport: Mapping[str, Any] | None = None,
 ) -> Transitions:
-    """The transitions of a recording, whichever form it has. columns: model name -> column name, where they differ. transport: the
+    """The transitions of a recording, whichever form it has. columns: model name, or `t` -> column name, where they differ. transport: the
     profile's, for a log in a robot's own format.
 
     Raises RecordingError (not readable, columns missing, of another robot).
@@ -77,7 +77,7 @@ def from_csv(path: Path, model: ComposedModel, columns: Mapping[str, str], dt: f
     if dt != model.dt:
         raise UsageError(f"dt is {dt} s, the model's step is {model.dt} s")
     names = [columns.get(name, name) for name in (*model.states, *model.inputs)]
-    table = read_csv(path, names)
+    table = read_csv(path, names, time=columns.get(TIME, TIME))
     values = np.column_stack([table.columns[name] for name in names])
     nx = len(model.states)
     whole = Streams(table.t, values[:, :nx], values[:, nx:])

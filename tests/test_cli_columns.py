@@ -73,6 +73,8 @@ def test_it_is_asked_instead_of_what_a_profile_says(renamed, table, tmp_path, ca
         (["x=a", "x=b"], ("--column x=b", "x is in 'a' already")),
         (["x=y"], ("--column x=y", "the column of y, too", "--column y=COLUMN")),
         (["v=speed", "w=speed"], ("--column v=speed", "the column of w, too")),
+        (["x=t"], ("--column x=t", "the column of t, too")),
+        (["x=segment"], ("column 'segment' has the runs, can be no state or input",)),
         (["x=pose.x"], ("lacks the column 'pose.x'",)),
     ],
 )
@@ -86,15 +88,40 @@ def test_what_is_no_mapping_gets_a_line(table, verb, columns, words, capsys):
 
 
 def test_two_columns_may_be_exchanged(table, capsys):
-    assert _answer(capsys, "gap", table, *MODEL, "--column", "x=y", "--column", "y=x", "--json")["n"] == 299
+    crossed = table.with_name("crossed.csv")
+    crossed.write_text(table.read_text().replace(",x,y,", ",y,x,", 1))
+    plain, wrong = (_answer(capsys, "gap", path, *MODEL, "--json")["radius"] for path in (table, crossed))
+    right = _answer(capsys, "gap", crossed, *MODEL, "--column", "x=y", "--column", "y=x", "--json")["radius"]
+    assert right == plain < wrong
+
+
+@pytest.mark.parametrize("verb", ["gap", "trace"])
+def test_the_stamps_may_have_another_name_too(table, verb, capsys):
+    stamped = table.with_name("stamped.csv")
+    stamped.write_text(table.read_text().replace("segment,t,", "segment,time,", 1))
+    assert main([verb, str(stamped), *MODEL]) == 2
+    assert "lacks the column 't'" in capsys.readouterr().err
+    plain = _answer(capsys, verb, table, *MODEL, "--json")
+    named = _answer(capsys, verb, stamped, *MODEL, "--column", "t=time", "--json")
+    assert (
+        (named["gap"], named.get("radius")) == (plain["gap"], plain.get("radius"))
+        if verb == "trace"
+        else named["radius"] == plain["radius"]
+    )
 
 
 @pytest.mark.parametrize("verb", ["gap", "trace"])
 def test_a_log_has_its_names(tmp_path, verb, capsys):
-    log = tmp_path / "drive.mcap"
+    log = tmp_path / "drive.of.today"
     log.write_bytes(b"\x89MCAP0\r\n")
     assert main([verb, str(log), *MODEL, "--column", "x=a"]) == 2
     assert "is a log, whose states and inputs have their names" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", ["gap", "trace"])
+def test_a_file_that_is_not_there_says_so(tmp_path, verb, capsys):
+    assert main([verb, str(tmp_path / "none.mcap"), *MODEL, "--column", "x=a"]) == 2
+    assert "No such file" in capsys.readouterr().err
 
 
 def test_the_daemon_knows_its_own(capsys):

@@ -37,30 +37,33 @@ def add_model_options(verb: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=COLUMN",
-        help="the table's column of a state or an input that has another name there (else as a profile says); may be repeated",
+        help="the table's column of a state, an input, or t (the stamps), of another name (else as a profile says); may be repeated",
     )
 
 
 def columns_of(args: argparse.Namespace, model: ComposedModel, profile: Profile | None, *recordings: Path | None) -> dict[str, str]:
-    """Name in the model -> column of the table, where they differ: the profile's, and those of --column instead. recordings: what is read.
-    Raises UsageError for a name that the model does not have, or two on one column; and if there is no table for --column.
+    """Name in the model, or `t` -> column of the table, where they differ: the profile's, and those of --column instead. recordings: what
+    is read. Raises UsageError for a name that the model does not have, or two on one column; and if there is no table for --column.
     """
     columns = dict(profile.columns) if profile else {}
     if not args.column:
         return columns
     from s2r_runtime.robot_logs import is_table
+    from s2r_runtime.tables import TIME
 
     for path in recordings:
         if path is not None and not is_table(path):
             raise UsageError(f"--column: belongs to a table; {path} is a log, whose states and inputs have their names")
-    names = (*model.states, *model.inputs)
+    names = (*model.states, *model.inputs, TIME)
     asked: dict[str, str] = {}
     for item in args.column:
         name, sign, column = (part.strip() for part in item.partition("="))
         if not name or not sign or not column:
-            raise UsageError(f"--column {item}: must be NAME=COLUMN, a state or an input of the model and the table's name for it")
+            raise UsageError(f"--column {item}: must be NAME=COLUMN, a state or an input of the model (or t, the stamps) and its column")
         if name not in names:
-            raise UsageError(f"--column {item}: the model has no state or input {name!r}; it has: {', '.join(names)}")
+            raise UsageError(
+                f"--column {item}: the model has no state or input {name!r}; it has: {', '.join(names[:-1])} (and t for the stamps)"
+            )
         if name in asked:
             raise UsageError(f"--column {item}: {name} is in {asked[name]!r} already")
         asked[name] = column
@@ -68,7 +71,9 @@ def columns_of(args: argparse.Namespace, model: ComposedModel, profile: Profile 
     for name in asked:
         other = next((n for n in names if n != name and columns.get(n, n) == columns[name]), None)
         if other is not None:
-            raise UsageError(f"--column {name}={columns[name]}: is the column of {other}, too; say where that is: --column {other}=COLUMN")
+            raise UsageError(
+                f"--column {name}={columns[name]}: is the column of {other}, too; say where that is (--column {other}=COLUMN), or rename it"
+            )
     return columns
 
 

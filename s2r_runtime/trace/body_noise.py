@@ -28,7 +28,7 @@ SHARES = (0.5, 0.8, 0.95)
 """That are tried: what little is left of a variance keeps the other direction from being known exactly."""
 
 CLEARLY = 10.0
-"""Nats that one must bring, of the six that are offered: a chance of one in thousands. Less hides no field, nor makes one."""
+"""Nats that one must bring, of the six that are offered: a chance of one in thousands."""
 
 WIDTHS, FLIPS, GOES_ON = (3, 10, 30, 100), 24, 3.0
 """Steps over which sums of what pushes are taken, to see whether it goes on; draws of the signs of steps, for what chance makes of such
@@ -51,16 +51,16 @@ def body_noise(left: Left) -> BodyNoise | None:
     model = left.fit.model
     if not {*model.states} >= POSE or left.given.floor.axes:
         return None
-    plain = Whitener(left.fit.noise, left.f, left.given.steps.joined)
+    plain = Whitener(left.fit.noise, left.f, left.given.steps.joined)  # the fit's own may be of steps from other states (`bends`)
     most, best = _log_likelihood(plain, plain(left.r)) + CLEARLY, None
     body, _ = directions_of(left.given, model, acting(model, left.given.data))
     for push in body[:2]:
-        for share in SHARES:
-            whiten = whitener(left, left.fit.noise, push, share)
-            z = whiten(left.r)
-            if (nats := _log_likelihood(whiten, z)) > most:
-                most, best = nats, BodyNoise(push, share, whiten, z)
-    return None if best is None or _goes_on(best) else best
+        shared = [(share, whiten := whitener(left, left.fit.noise, push, share), whiten(left.r)) for share in SHARES]
+        share, whiten, z = max(shared, key=lambda of: _log_likelihood(*of[1:]))
+        found = BodyNoise(push, share, whiten, z)
+        if (nats := _log_likelihood(whiten, z)) > most and not _goes_on(found):
+            most, best = nats, found
+    return best
 
 
 def whitener(left: Left, noise: Noise, push: Array, share: float) -> Whitener:

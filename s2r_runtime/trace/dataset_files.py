@@ -44,7 +44,7 @@ def load_dataset(
     transport: Mapping[str, Any] | None = None,
     behind: Mapping[str, float] | None = None,
 ) -> Dataset:
-    """Reads a recording on the model's grid. columns: name in the model -> column of the table. Several paths: parts of one log.
+    """Reads a recording on the model's grid. columns: name in the model, or `t` -> column of the table. Several paths: parts of one log.
     epoch: of a log, only what was recorded while that campaign was under way. bandwidth: Hz within which states that the table does not
     have are reconstructed from those that it has (None: what the data bear, and only those that the motion
     needs: unseen.py). transport: the profile's, for a log in a robot's own format. behind: s by which states of the pose come late, if that
@@ -113,12 +113,13 @@ def _table_segments(
     """The segments, the states that the table does not have although they may be left out, and the digest of what it says, however it is
     written. A column that the caller named must be there. hidden: whether states may be left out that others tell by the model alone.
     """
-    from s2r_runtime.tables import read_csv
+    from s2r_runtime.tables import TIME, read_csv
 
     names = columns_of(model, columns)
     free = {name for name in getattr(model.nominal, "follows", {}) if name not in columns}
     free |= _hidden(path, model, free, columns) if hidden else set()
-    table = read_csv(path, [names[n] for n in names if n not in free], optional=[names[n] for n in names if n in free])
+    needed, spare = ([names[n] for n in names if (n in free) == may] for may in (False, True))
+    table = read_csv(path, needed, spare, columns.get(TIME, TIME))
     unsaid = {s for s in model.states if s not in columns and np.isnan(table.columns.get(s, np.array(np.nan))).all()}
     if not unsaid <= free and not (hidden and told_through(model.nominal, [s for s in model.states if s in unsaid])):
         unsaid &= free

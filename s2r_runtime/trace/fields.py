@@ -165,13 +165,14 @@ def field(left: Left) -> Field | None:
     kept = [(offer, first) for nats, offer, first in looked if nats > LOOKS][:FITTED]
     if not kept:
         return None
-    fitted = sorted(((*_marginal(left, offer.x, PASSES, first), k) for k, (offer, first) in enumerate(kept)), key=lambda f: -f[0])
-    nats, beta, best = fitted[0]
+    fitted = sorted(((*_marginal(left, offer.x, PASSES, first), offer) for offer, first in kept), key=lambda f: -f[0])
     price = math.log(tried / ALPHA)
-    told = kept[best][0]
-    if nats - bare < price or not _beyond_body_noise(left, told.x, price):
+    paid = [f for f in fitted if f[0] - bare >= price]
+    best = next((f for f in paid if _beyond_body_noise(left, f[2].x, price)), None)
+    if best is None:
         return None
-    also = tuple(kept[k][0].token for other, _, k in fitted[1:] if other > nats - ALIKE)
+    nats, beta, told = best
+    also = tuple(offer.token for other, _, offer in fitted if offer is not told and nats >= other > nats - ALIKE)
     return Field(told.token, also, told.x, beta, nats - bare, lambda: _beyond(left, nats - price, told.x, beta, price))
 
 

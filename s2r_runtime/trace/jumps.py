@@ -10,6 +10,7 @@ does a joint at 6 rad/s jump by 0.05 rad in 4 ms.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,7 +38,9 @@ FEW = 3
 """Rows beyond TAIL_SIGMAS that are no spikes from which on they have a law."""
 
 BEYOND = 2.2
-"""Times the largest move in a step: a command that reverses and is late, or followed with a lag, leaves up to twice that."""
+"""Times the largest move in a step: a command that reverses and is late, or followed with a lag, leaves up to twice that. A row that was
+stamped late by two rows is as far away.
+"""
 
 NEAR = 5
 """Steps on either side of which the pace says by how much a row that was stamped late may be away."""
@@ -112,9 +115,11 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
 
 def _pace(moves: Array, change: Array) -> Array:
     """(K,) how far the state goes in a step hereabouts: by the model at most, whose inputs act at once, or as measured, in most steps."""
-    near = np.abs(np.nan_to_num(np.stack([moves, change])))
-    wide = sliding_window_view(np.pad(near, ((0, 0), (NEAR, NEAR)), mode="edge"), 2 * NEAR + 1, axis=1)
-    return np.asarray(np.maximum(wide[0].max(axis=1), np.median(wide[1], axis=1)))
+    wide = (np.pad(np.abs(e), NEAR, constant_values=np.nan) for e in (moves, change))
+    foretold, measured = (sliding_window_view(np.where(np.isfinite(e), e, np.nan), 2 * NEAR + 1) for e in wide)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # where nothing hereabouts was received
+        return np.asarray(np.nan_to_num(np.fmax(np.nanmax(foretold, axis=1), np.nanmedian(measured, axis=1))))
 
 
 def _reached(series: Array, noise: float, least: float) -> float:
