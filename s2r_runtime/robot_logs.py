@@ -21,6 +21,8 @@ from s2r_runtime.tables import LARGEST, Table
 
 Array = NDArray[np.float64]
 
+MCAP_MAGIC = b"\x89MCAP"
+
 
 class Rows(NamedTuple):
     """t: (N,) s, ascending; values: (N, c), NaN where a column was not received."""
@@ -50,11 +52,16 @@ def is_robot_log(path: Path) -> bool:
     return bool(suffix) and any(name.partition(".")[2] == suffix[1:] for name in registry().names("recordings"))
 
 
+def is_mcap(path: Path) -> bool:
+    """Whether it begins as an MCAP does, whatever its name. Raises OSError."""
+    with path.open("rb") as file:
+        return file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
+
+
 def is_table(path: Path) -> bool:
     """Whether a recording is read as a table: it is no MCAP, and no log that a plug-in reads. One that cannot be read says so itself."""
     try:
-        with path.open("rb") as file:
-            return file.read(5) != b"\x89MCAP" and not is_robot_log(path)
+        return not is_mcap(path) and not is_robot_log(path)
     except OSError:
         return True
 

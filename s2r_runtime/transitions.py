@@ -31,7 +31,7 @@ from s2r_runtime.gap import Transitions
 from s2r_runtime.messages import CampaignFinished, Observed, SampleTaken, Send, Started
 from s2r_runtime.models.bound import wrap
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.robot_logs import content_digest, is_robot_log, merged_rows, read_robot_log
+from s2r_runtime.robot_logs import content_digest, is_mcap, is_robot_log, merged_rows, read_robot_log
 from s2r_runtime.sensor_noise import FEWEST, NORMAL_MAD
 from s2r_runtime.tables import TIME, read_csv
 
@@ -55,8 +55,7 @@ def load_transitions(
     """
     path = Path(path)
     try:
-        with path.open("rb") as file:
-            log = file.read(5) == b"\x89MCAP"
+        log = is_mcap(path)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
     robots = is_robot_log(path)

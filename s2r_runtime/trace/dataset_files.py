@@ -18,15 +18,13 @@ import numpy as np
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.messages import CampaignFinished, Observed, Send, StartCampaign, Started
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.robot_logs import content_digest, is_robot_log, read_robot_log
+from s2r_runtime.robot_logs import content_digest, is_mcap, is_robot_log, read_robot_log
 from s2r_runtime.trace.dataset import Array, Dataset, Stream, columns_of, from_streams
 from s2r_runtime.trace.hidden import told_through
 from s2r_runtime.trace.late_poses import earlier, late_pose
 from s2r_runtime.trace.reconstruct import late_speeds, reconstruct
 from s2r_runtime.trace.residual import check_steps
 from s2r_runtime.trace.unseen import unneeded, without
-
-MCAP_MAGIC = b"\x89MCAP"
 
 Row = tuple[float, ...]
 
@@ -58,7 +56,7 @@ def load_dataset(
     digests = tuple(_digest(p) for p in paths)
     source = ", ".join(str(p) for p in paths)
     robots = is_robot_log(paths[0])
-    if _is_log(paths[0]) and not robots:
+    if is_mcap(paths[0]) and not robots:
         return replace(from_streams(model, _log_segments(paths, model, epoch), source, digests, paths), commanded=True)
     if robots:
         segments, missing, content = _robot_segments(paths[0], model, transport)
@@ -100,11 +98,6 @@ def _digest(path: Path) -> str:
             return "sha256:" + hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
-
-
-def _is_log(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
 
 
 def _table_segments(

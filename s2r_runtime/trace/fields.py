@@ -168,7 +168,8 @@ def field(left: Left) -> Field | None:
     fitted = sorted(((*_marginal(left, offer.x, PASSES, first), offer) for offer, first in kept), key=lambda f: -f[0])
     price = math.log(tried / ALPHA)
     paid = [f for f in fitted if f[0] - bare >= price]
-    best = next((f for f in paid if _beyond_body_noise(left, f[2].x, price)), None)
+    body = body_noise(left) if paid else None
+    best = next((f for f in paid if body is None or _beside(left, body, f[2].x) >= price), None)
     if best is None:
         return None
     nats, beta, told = best
@@ -176,12 +177,11 @@ def field(left: Left) -> Field | None:
     return Field(told.token, also, told.x, beta, nats - bare, lambda: _beyond(left, nats - price, told.x, beta, price))
 
 
-def _beyond_body_noise(left: Left, x: Array, price: float) -> bool:
-    """Whether a field has its price beside noise along the body, too, where there is any: a field takes up some of what that does. It is
-    asked of one that has its price, before it is asked what wanders, which takes ten times as long.
+def _beside(left: Left, body: BodyNoise, x: Array) -> float:
+    """Nats of a field beside noise along the body, some of which a field takes up. It is asked of one that has its price, before it is
+    asked what wanders, which takes ten times as long.
     """
-    body = body_noise(left)
-    return body is None or _marginal(left, x, PASSES, body=body)[0] - _under_any_law(body.z, body.whiten, left) >= price
+    return _marginal(left, x, PASSES, body=body)[0] - _under_any_law(body.z, body.whiten, left)
 
 
 def _beyond(left: Left, nats: float, x: Array, beta: Array, price: float) -> float:
