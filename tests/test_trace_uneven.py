@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 from numpy.typing import NDArray
+from test_trace_arms_and_quadrotors import ARM
 
 from s2r_runtime.models.composed import ComposedModel, compose
+from s2r_runtime.models.forces import coupled
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.chains import Inputs
@@ -201,3 +206,61 @@ def test_a_robot_that_slides_to_either_side_does_so_whenever_its_rows_come(slip:
     streams = Stream(t, x + rng.normal(size=x.shape) * 0.0005), Stream(t[:-1], u)
     found = trace(from_streams(model, [streams], "rows"), model)
     assert [(e.name, e.channel) for e in found.effects] == [("lateral_slip", "*")]
+
+
+TANK = """
+import numpy as np
+
+STATES = ("level", "flow")
+INPUTS = ("pump",)
+PARAMS = {"outflow": 0.4}
+
+
+def step(x, u, dt, params):
+    LASTS
+"""
+AS_WRITTEN = {
+    "by column": "return np.column_stack([x[:, 0] + dt * (u[:, 0] - params['outflow'] * np.sqrt(x[:, 0])), u[:, 0] + dt])",
+    "by table": "return x + dt * np.hstack([u - params['outflow'] * np.sqrt(x[:, :1]), x[:, :1] - x[:, 1:]])",
+    "of one length": "return x + float(dt) * np.hstack([u, -x[:, 1:]])",
+    "of a mean": "return x + np.mean(dt) * np.hstack([u, -x[:, 1:]])",
+    "in parts of the longest": "return x + np.max(dt) * np.hstack([u, -x[:, 1:]])",
+    "not at all": "return 0.9 * x + 0.1 * u",
+    "out of bounds": "raise ValueError('no such tank')",
+}
+
+
+@pytest.mark.parametrize("written", AS_WRITTEN)
+def test_a_model_of_ones_own_is_given_each_rows_length_if_its_step_takes_that(tmp_path: Path, written: str) -> None:
+    (tmp_path / "tank.py").write_text(TANK.replace("LASTS", AS_WRITTEN[written]))
+    model = compose(ModelSpec(str(tmp_path / "tank.py"), DT)).nominal
+    takes = written in {"by column", "by table", "not at all"}
+    assert getattr(model.shared, "uneven", None) is takes
+    if takes:
+        rng = np.random.default_rng(1)
+        x, u, lasts = rng.uniform(0.5, 2.0, (40, 2)), rng.uniform(0.0, 1.0, (40, 1)), rng.uniform(0.02, 0.08, 40)
+        alone = np.concatenate([model.step(x[[k]], u[[k]], float(lasts[k]), model.parameters) for k in range(40)])
+        given: Any = lasts
+        assert model.step(x, u, given, model.parameters) == pytest.approx(alone, rel=1e-12)
+
+
+@pytest.mark.parametrize("stuck", [False, True])
+def test_friction_between_links_acts_for_as_long_as_each_row_lasts(tmp_path: Path, stuck: bool) -> None:
+    """Rows of four lengths at once are what they are length by length; stuck: most rows hold, and are settled before the others."""
+    (tmp_path / "arm.py").write_text(ARM)
+    effects = (
+        EffectSpec("coulomb_friction", "dq1", {"force": 0.5}),
+        EffectSpec("coulomb_friction", "dq2", {"force": 2.0 if stuck else 0.05}),
+        EffectSpec("viscous_friction", "dq2", {"coefficient": 0.2}),
+    )
+    model, rng = _model(str(tmp_path / "arm.py"), *effects, dt=0.02), np.random.default_rng(2)
+    assert coupled(model.nominal)
+    assert model.uneven
+    x, u = rng.uniform(-1.0, 1.0, (200, 4)), rng.uniform(-1.5, 1.5, (200, 2))
+    lasts = rng.choice([0.008, 0.02, 0.021, 0.04], 200)
+    act = Acting(u, u, lasts)
+    together = advanced(model, x, act, slice(None))
+    for length in np.unique(lasts):
+        rows = np.flatnonzero(lasts == length)
+        alone = advanced(replace(model, spec=structs.replace(model.spec, dt=float(length))), x[rows], Acting(u[rows], u[rows]), slice(None))
+        assert together[rows] == pytest.approx(alone, rel=0.0, abs=1e-7)  # rounds end where forces hardly change

@@ -14,7 +14,7 @@ import traceback
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -45,6 +45,9 @@ PROBED, PROBED_S = 0.5, 0.01
 goes nowhere.
 """
 
+EACH_S = (1e-3, 1.0)
+"""Steps between which those of a table's rows are spread, s, when a file's `step` is asked whether it takes one for each row."""
+
 Asked = tuple[tuple[int, ...], bytes, bytes, bytes, tuple[tuple[str, float], ...]]
 
 
@@ -72,14 +75,42 @@ class FileModel:
         default_factory=OrderedDict, init=False, repr=False, compare=False
     )
 
-    def step(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
-        """Calls the file's `step`: x (n, nx), u (n, nu) -> (n, nx).
+    @cached_property
+    def uneven(self) -> bool:
+        """Whether `step` also takes dt as (n,), one a row."""
+        return self._column is not None
+
+    @cached_property
+    def _column(self) -> bool | None:
+        """Whether the file's `step` takes dt of each row as a column, (n, 1); False: as (n,); None: neither. Most that are written for
+        one dt take one of the two, by how they are written: it is asked, and counts if all rows are as they are alone, each with its own.
+        """
+        nx, nu = len(self.states), len(self.inputs)
+        n = nx + nu + 3  # a table that is wrongly laid out, (n, n) or (nx, n), is not taken for one of states
+        x, u = (np.random.default_rng(0).uniform(PROBED / 2.0, PROBED, (n, columns)) for columns in (nx, nu))
+        lasts = np.geomspace(*EACH_S, n)
+        try:
+            with contextlib.redirect_stderr(io.StringIO()):  # where what it prints would go
+                alone = np.concatenate([self._called(x[k : k + 1], u[k : k + 1], float(lasts[k]), self.parameters) for k in range(n)])
+        except ConfigError:
+            return None
+        for column in (False, True):
+            with contextlib.suppress(ConfigError), contextlib.redirect_stderr(io.StringIO()):
+                together = self._called(x, u, lasts[:, None] if column else lasts, self.parameters)
+                if np.allclose(together, alone, rtol=1e-12, atol=1e-15):
+                    return column
+        return None
+
+    def step(self, x: Array, u: Array, dt: float | Array, parameters: dict[str, float]) -> Array:
+        """Calls the file's `step`: x (n, nx), u (n, nu) -> (n, nx). dt: s; also (n,), where `uneven`.
 
         Raises ConfigError if it raises or exits, or if its result has the wrong shape, or is not finite where x and u are.
         """
+        lasts = np.asarray(dt)
+        if lasts.ndim:
+            dt = lasts[:, None] if self._column else lasts
         if x.size > LARGE:
             return self._called(x, u, dt, parameters)
-        lasts = np.asarray(dt)
         asked = (x.shape, _sampled(x), _sampled(u), _sampled(lasts), tuple(parameters.items()))
         known = self._known.pop(asked, None)
         if known is None or not all(map(_same, known, (x, u, lasts))):
@@ -89,11 +120,11 @@ class FileModel:
             self._known.popitem(last=False)
         return known[3].copy()
 
-    def _called(self, x: Array, u: Array, dt: float, parameters: dict[str, float]) -> Array:
+    def _called(self, x: Array, u: Array, dt: float | Array, parameters: dict[str, float]) -> Array:
         try:
             # a division by zero shows in the result, which is checked; a step in place may change what it is given
             with contextlib.redirect_stdout(sys.stderr), np.errstate(all="ignore"):
-                given = np.asarray(self.function(x.copy(), u.copy(), dt, dict(parameters)))
+                given = np.asarray(self.function(x.copy(), u.copy(), dt.copy() if isinstance(dt, np.ndarray) else dt, dict(parameters)))
                 result = np.array(given.real if np.iscomplexobj(given) else given, dtype=np.float64)
         except (Exception, SystemExit) as error:  # noqa: BLE001 - a user's file: whatever it raises is its report
             raise _failed(self.name, "step", error) from None

@@ -280,7 +280,7 @@ def _coupled(model: BoundModel) -> bool:
     return bool(np.any(np.abs(w) * (1.0 - np.eye(len(axes(model)))) > COUPLED * size))
 
 
-def response(x: Array, u: Array, model: NominalModel, dt: float, size: float = 1.0) -> Array:
+def response(x: Array, u: Array, model: NominalModel, dt: Any, size: float = 1.0) -> Array:
     """(n, nx, nu) what a unit more of each input makes of x (n, nx) over a step under u (n, nu); size: of the probe, over the inputs'."""
     probe = size * PROBE * max(float(np.max(np.abs(u), initial=0.0)), PROBE)
     usual = model.step(x, u, dt, model.parameters)
@@ -292,16 +292,16 @@ def response(x: Array, u: Array, model: NominalModel, dt: float, size: float = 1
     return np.stack(made, axis=2)
 
 
-_LAST: WeakKeyDictionary[BoundModel, tuple[float, Array, Array, Array]] = WeakKeyDictionary()
+_LAST: WeakKeyDictionary[BoundModel, tuple[float | Array, Array, Array, Array]] = WeakKeyDictionary()
 
 
-def _response(x: Array, u: Array, model: BoundModel, dt: float) -> Array:
+def _response(x: Array, u: Array, model: BoundModel, dt: float | Array) -> Array:
     """`response`, kept for the last rows asked for, as a fit asks of the same ones again. What another thread keeps is not returned."""
     known = _LAST.get(model)
-    if known is not None and known[0] == dt and np.array_equal(known[1], x) and np.array_equal(known[2], u):
+    if known is not None and np.array_equal(known[0], dt) and np.array_equal(known[1], x) and np.array_equal(known[2], u):
         return known[3]
     found = response(x, u, model, dt)
-    _LAST[model] = (dt, x.copy(), u.copy(), found)
+    _LAST[model] = (np.copy(dt), x.copy(), u.copy(), found)
     return found
 
 
@@ -324,7 +324,7 @@ def pushed(
     pushing = [one for one in pushing if one[1] not in alone]
     if not pushing:
         return x_next
-    if isinstance(model, BoundModel) and not isinstance(dt, np.ndarray) and coupled(model):
+    if isinstance(model, BoundModel) and coupled(model):
         return _pushed_together(x, u, x_next, model, pushing, dt)
     varies = any(effect.varies for effect, _, _ in pushing)
     moved = [k for k in axes(model) if any(effect.push(x[:1], k, model, channel, p) is not None for effect, channel, p in pushing)]
@@ -388,14 +388,14 @@ def _braked(x: Array, x_next: Array, model: NominalModel, pushing: Sequence[Push
     return after
 
 
-def _pushed_together(x: Array, u: Array, x_next: Array, model: BoundModel, pushing: Sequence[Pushing], dt: float) -> Array:
+def _pushed_together(x: Array, u: Array, x_next: Array, model: BoundModel, pushing: Sequence[Pushing], dt: float | Array) -> Array:
     """The same where axes move one another: forces act as the inputs u do, so that what they change turns what else depends on speeds."""
     among = axes(model)
     does = mass(model) * _response(x, u, model, dt)
-    w = does[:, [k.velocity for k in among]] / dt
+    w = does[:, [k.velocity for k in among]] / (dt[:, None, None] if isinstance(dt, np.ndarray) else dt)
     given = [(x_next[:, k.velocity] - x[:, k.velocity]) / dt for k in among]
     varies = any(effect.varies for effect, _, _ in pushing)
-    parts = max(1, math.ceil(dt / PART_S - 1e-9)) if varies else 1
+    parts = max(1, math.ceil(float(np.max(dt, initial=0.0)) / PART_S - 1e-9)) if varies else 1
     h = dt / parts
     now, mean = x.copy(), np.zeros((len(among), len(x)))
     for _ in range(parts):
@@ -416,7 +416,9 @@ def _pushed_together(x: Array, u: Array, x_next: Array, model: BoundModel, pushi
     return after
 
 
-def _swept(speeds: list[Array], given: list[Array], pushes: list[Push], w: Array, h: float) -> tuple[Array, list[tuple[Array, Array]]]:
+def _swept(
+    speeds: list[Array], given: list[Array], pushes: list[Push], w: Array, h: float | Array
+) -> tuple[Array, list[tuple[Array, Array]]]:
     """Mean force of the pushes on each axis over h seconds, (axes, n), and each axis' speed then with the way made, all at once. Rows that
     are done are swept no more: most are after two or three. In others, where friction holds links against each other, each sweep leaves
     the same share of what the last one changed: every second one of the first half goes on to where that ends (A. Aitken, Proc. R. Soc.
@@ -445,6 +447,7 @@ def _swept(speeds: list[Array], given: list[Array], pushes: list[Push], w: Array
         if len(changing) < FEWER * w.shape[0]:
             rows = changing if isinstance(rows, slice) else rows[changing]
             w, pushes = w[changing], [_rows(push, changing) for push in pushes]
+            h = h[changing] if isinstance(h, np.ndarray) else h
             flows = [(_flow_at(ahead, changing), _flow_at(back, changing)) for ahead, back in flows]
             speeds, given = [v[changing] for v in speeds], [g[changing] for g in given]
             now, changed, last = now[:, changing], changed[:, changing], last[:, changing]

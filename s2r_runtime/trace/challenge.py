@@ -30,7 +30,7 @@ from s2r_runtime.trace.begun import begun, measured
 from s2r_runtime.trace.candidates import Candidate
 from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, without
 from s2r_runtime.trace.lack_of_fit_terms import token_of
-from s2r_runtime.trace.residual import acting, covered, first_steps, rms, rollout, rollout_starts
+from s2r_runtime.trace.residual import acting, covered, first_steps, rms, rollout, rollout_starts, some_of
 from s2r_runtime.trace.scores import at_first_look
 from s2r_runtime.trace.screening import screen
 from s2r_runtime.trace.shapes import SHAPES, Shape
@@ -252,8 +252,7 @@ def _lower(given: Problem, named: Fit, shape: Fit, horizon: int) -> bool:
     _, there = covered(given.steps, int(first_steps(given.data)[-1]))
     pair = [(fit.model, acting(fit.model, given.data), begun(given, fit)) for fit in (named, shape)]
     for ahead in sorted({1, max(1, horizon // 4), horizon}):
-        starts = rollout_starts(given.data, ahead, within=there)
-        starts = starts[:: max(1, len(starts) // STARTS)]
+        starts = some_of(rollout_starts(given.data, ahead, within=there), ahead, STARTS)
         if len(starts) < 10:
             continue
         errors = [rollout(m, given.data, act, starts, ahead, begun=begin).error for m, act, begin in pair]

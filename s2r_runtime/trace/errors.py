@@ -33,6 +33,7 @@ from s2r_runtime.trace.residual import (
     rms,
     rollout,
     rollout_starts,
+    some_of,
     state_jacobian,
     wherever,
 )
@@ -124,8 +125,7 @@ def better(given: Held, model: ComposedModel, other: ComposedModel, share: float
             return True
     pair = [(m, acting(m, given.data), _begun(given, m)) for m in (model, other)]
     for ahead in sorted({1, max(1, given.horizon // 4), given.horizon}):
-        starts = rollout_starts(given.data, ahead, given.left_out, given.within)
-        starts = starts[:: max(1, len(starts) // FLOOR_STARTS)]
+        starts = some_of(rollout_starts(given.data, ahead, given.left_out, given.within), ahead, FLOOR_STARTS)
         errors = [rms(measured(given.data, rollout(m, given.data, act, starts, ahead, begun=begin).error)) for m, act, begin in pair]
         if len(starts) and np.any(errors[1] > (1.0 + share) * errors[0]):
             return True

@@ -35,10 +35,13 @@ from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, SLOWLY, Judged, Left, f
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
 from s2r_runtime.trace.lack_of_fit_together import pairs
 from s2r_runtime.trace.measured_forces import about_inputs
-from s2r_runtime.trace.residual import Mask, acting, covered, rms, rollout, rollout_starts
+from s2r_runtime.trace.residual import Mask, acting, covered, rms, rollout, rollout_starts, some_of
 from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
 
 Array = NDArray[np.float64]
+
+STARTS = 1200
+"""Rollouts at most."""
 
 ALPHA = 1e-3
 """Chance that clean data show structure, as far as the likelihood is right."""
@@ -492,8 +495,7 @@ def _rollouts(left: Left, other: Fit, judged: Judged, horizon: int) -> Iterator[
     extra = more[last]
     begins = _begins(left, other, more)
     for ahead in sorted({1, max(1, horizon // 4), horizon}):
-        starts = rollout_starts(data, ahead, within=there)
-        starts = starts[:: max(1, len(starts) // 1200)]
+        starts = some_of(rollout_starts(data, ahead, within=there), ahead, STARTS)
         if len(starts) < 10:
             continue
         yield (

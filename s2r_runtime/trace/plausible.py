@@ -32,7 +32,7 @@ from s2r_runtime.trace.never_measured import check_measured
 from s2r_runtime.trace.residual import acting, advanced, predicted, steps_of
 from s2r_runtime.trace.scales import SCALES, Scale, axis_pairs, groups
 from s2r_runtime.trace.streams import Stream
-from s2r_runtime.trace.unforetold import each_unforetold, some_starts, steps_ahead, trimmed, unforetold, ways_of
+from s2r_runtime.trace.unforetold import STARTS, each_unforetold, some_starts, steps_ahead, trimmed, unforetold, ways_of
 
 Array = NDArray[np.float64]
 Change = Callable[[Array], Array]
@@ -68,6 +68,9 @@ ROWS = 6000
 
 AT_ONCE = 100_000
 """Rows of recordings that are rolled out at once: some megabytes."""
+
+ROUGHLY, FAR_FROM = 60, 2.0
+"""Rollouts of a first look at many mistakes, and times an E that counts from which on that look suffices: so few tell E to a sixth."""
 
 SEGMENTS = 40
 """Segments that are looked at, evenly spread."""
@@ -105,7 +108,7 @@ def _check_columns(model: ComposedModel, data: Dataset) -> None:
         return
     few = _few(model, data)
     mistakes = list(_mistakes(model))
-    known = zip(_if_each_taken_back(model, few, mistakes), mistakes, strict=True)
+    known = zip(_if_near(model, few, mistakes, WELL), mistakes, strict=True)
     tried = [(e, m) for e, m in known if e is not None and _moves_as_well(model, few, m)]
     for measure, nothing in ((np.mean, NOTHING), (np.max, NOTHING_ALONE)):
         as_it_is = float(measure(every))
@@ -141,7 +144,7 @@ def _check_scales(model: ComposedModel, data: Dataset) -> None:
     limit = min(WELL, BETTER * float(np.mean(every)), still)
     offered = [(group, scale) for group in groups(model) for scale in SCALES]
     changes = [_Mistake("", partial(_rescaled, list(group), 1.0 / scale.times, scale.zero), None, WELL) for group, scale in offered]
-    for e, (group, scale) in sorted(zip(_errs(model, few, changes), offered, strict=True), key=lambda one: one[0]):
+    for e, (group, scale) in sorted(zip(_means(_if_near(model, few, changes, limit)), offered, strict=True), key=lambda one: one[0]):
         if not e < (limit if scale.times >= FAR else min(limit, SURELY)):
             return
         if _heading_off(model, few, np.mean) < DEAD * e:
@@ -165,7 +168,19 @@ def _exactly(model: ComposedModel, data: Dataset, group: tuple[int, ...], scale:
 
 def _errs(model: ComposedModel, data: Dataset, changes: Sequence[_Mistake]) -> list[float]:
     """Mean E with columns changed; infinite where nothing goes anywhere then."""
-    return [math.inf if e is None else float(np.mean(e)) for e in _if_each_taken_back(model, data, changes)]
+    return _means(_if_each_taken_back(model, data, changes))
+
+
+def _means(each: Sequence[Array | None]) -> list[float]:
+    return [math.inf if e is None else float(np.mean(e)) for e in each]
+
+
+def _if_near(model: ComposedModel, data: Dataset, mistakes: Sequence[_Mistake], limit: float) -> list[Array | None]:
+    """`_if_each_taken_back`; None, too, where a first look says that E is far above a limit."""
+    roughly = _means(_if_each_taken_back(model, data, mistakes, ROUGHLY))
+    near = [i for i, e in enumerate(roughly) if e < FAR_FROM * limit]
+    closely = dict(zip(near, _if_each_taken_back(model, data, [mistakes[i] for i in near]), strict=True))
+    return [closely.get(i) for i in range(len(mistakes))]
 
 
 def _err(model: ComposedModel, data: Dataset, states: Change | None = None, inputs: Change | None = None) -> float:
@@ -243,11 +258,12 @@ def _if_taken_back(model: ComposedModel, data: Dataset, mistake: _Mistake) -> Ar
         return None
 
 
-def _if_each_taken_back(model: ComposedModel, data: Dataset, mistakes: Sequence[_Mistake]) -> list[Array | None]:
+def _if_each_taken_back(model: ComposedModel, data: Dataset, mistakes: Sequence[_Mistake], most: int = STARTS) -> list[Array | None]:
     """The same of each of some by itself, many rolled out at once: what a step costs hardly depends on how many take it. None, too, where
-    fewer states go anywhere than as it is: a heading 57 times as large is wrapped to chance, and what is not asked is not foretold.
+    fewer states go anywhere than as it is: a heading 57 times as large is wrapped to chance, and what is not asked is not foretold. most:
+    rollouts of each, or so.
     """
-    as_it_is = unforetold(model, data)
+    as_it_is = each_unforetold(model, [data], most=most)[0]
     asked = 0 if as_it_is is None else len(as_it_is)
     count = max(1, AT_ONCE // max(1, sum(len(run.y) for run in data.runs)))
     found: list[Array | None] = []
@@ -255,7 +271,7 @@ def _if_each_taken_back(model: ComposedModel, data: Dataset, mistakes: Sequence[
         try:
             changed = [_taken_back(model, data, mistake) for mistake in some]
             alike = len({one.substeps for one in changed}) == 1  # inputs that never change have no parts of a step
-            found += each_unforetold(model, changed) if alike else [unforetold(model, one) for one in changed]
+            found += each_unforetold(model, changed, most=most) if alike else [unforetold(model, one) for one in changed]
         except ConfigError:
             found += [_if_taken_back(model, data, mistake) for mistake in some]
     return [None if e is None or len(e) < asked else e for e in found]

@@ -14,7 +14,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.begun import begun, uncertain
 from s2r_runtime.trace.fitting import Fit, Problem, objective, sensitivities, under_noise
-from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts
+from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts, some_of
 from s2r_runtime.trace.scores import STRICT, Bar, name_of, names
 from s2r_runtime.trace.slots import values_of, with_values
 
@@ -82,8 +82,7 @@ def _held_out_errors(
     blocks. known: where axes were whose speed was not measured (rows, nx), and its variances; else by what was measured.
     """
     starts = rollout_starts(given.data, horizon)
-    starts = starts[np.isin(starts, given.steps.place)]
-    starts = starts[:: max(1, len(starts) // STARTS)]
+    starts = some_of(starts[np.isin(starts, given.steps.place)], horizon, STARTS)
     if not len(starts):
         return np.full(given.steps.y0.shape[1], np.nan)
     errors = []

@@ -42,10 +42,10 @@ def unforetold(model: ComposedModel, data: Dataset, among: list[int] | None = No
 
 
 def each_unforetold(
-    model: ComposedModel, each: Sequence[Dataset], among: list[int] | None = None, *, pushed: bool = False
+    model: ComposedModel, each: Sequence[Dataset], among: list[int] | None = None, *, pushed: bool = False, most: int = STARTS
 ) -> list[Array | None]:
-    """`unforetold` of recordings with one step."""
-    starts = [some_starts(data) for data in each]
+    """`unforetold` of recordings with one step. most: rollouts, or so."""
+    starts = [some_starts(data, most) for data in each]
     if not any(map(len, starts)):  # a user's own model need not take a table without rows
         return [None] * len(starts)
     begin = np.cumsum([0] + [int(first_steps(data)[-1]) for data in each])
@@ -57,10 +57,10 @@ def each_unforetold(
     return [shares(model, data, s, e, among, pushed) for data, s, e in zip(each, starts, parts, strict=True)]
 
 
-def some_starts(data: Dataset) -> Index:
+def some_starts(data: Dataset, most: int = STARTS) -> Index:
     """Of rollouts; none if there are too few."""
     starts = rollout_starts(data, steps_ahead(data))
-    starts = starts[:: max(1, len(starts) // STARTS)]
+    starts = starts[:: max(1, len(starts) // most)]
     return starts if len(starts) >= FEWEST_STARTS else starts[:0]
 
 
