@@ -80,6 +80,8 @@ def fit_mask(data: Dataset, seed: int, *, everything: bool = False) -> Mask:
         ways = [
             (set(), stretches) for stretches in [HELD_OUT, *sorted(chosen, key=lambda way: (_pieces(way) < 2, _hides(way), _pieces(way)))]
         ]
+    span = np.ptp(u, axis=0) if len(u) else np.ones(u.shape[1])
+    u = u / np.where(span > 0.0, span, 1.0)
     shorter = np.array([_shorter(u, _without(data, spans, *way)[rows]) for way in ways])
     enough = np.flatnonzero(shorter <= shorter.min() + (SHORTER if shorter[0] <= shorter.min() + SHORTER else 0.5 * SHORTER))
     return _without(data, spans, *ways[int(enough[0])])
@@ -124,16 +126,15 @@ def _rows(data: Dataset, measured: Mask) -> tuple[Array, NDArray[np.int64]]:
 
 
 def _shorter(u: Array, seen: Mask) -> float:
-    """By which share of its range an input falls short on one side of what it reaches on the other; the worst input and direction. What the
-    fit does not reach counts in full, as it can't be found then; what the judge does not reach, LESS.
+    """By how much an input (n, nu), over its range, falls short on one side of what it reaches on the other; the worst input and direction.
+    What the fit does not reach counts in full, as it can't be found then; what the judge does not reach, LESS.
     """
     sides = [u[seen], u[~seen]]
     if not all(map(len, sides)):
         return 0.0
     ends = [np.sort(side, axis=0)[[int(REACH * len(side)), -1 - int(REACH * len(side))]] for side in sides]
     beyond = np.stack([ends[0][0] - ends[1][0], ends[1][1] - ends[0][1]])  # what is held out reaches farther: low, high
-    span = np.ptp(u, axis=0)
-    return float(np.max(np.maximum(beyond, -LESS * beyond) / np.where(span > 0.0, span, 1.0)))
+    return float(np.max(np.maximum(beyond, -LESS * beyond)))
 
 
 def part(data: Dataset, left_out: tuple[tuple[int, int], ...], seen: Mask, most: int) -> Part:
