@@ -9,6 +9,7 @@ from seeds import first
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
+from s2r_runtime.trace import lack_of_fit
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.episodes import _staying_wild, episodes
 from s2r_runtime.trace.fitting import evaluate, insert, problem
@@ -46,14 +47,29 @@ def _traced(y, u, scheme="euler"):
     return trace(from_arrays(model, [(y, u)]), model)
 
 
-def test_a_stretch_of_wet_floor_is_no_noise():
+def _on_a_wet_floor():
     """Two stretches of time on which the wheels slip, in places where it never comes back to."""
     rng = np.random.default_rng(3)
     u = np.column_stack([rng.uniform(0.2, 0.4, 800), 0.15 * np.sin(0.02 * np.arange(800))])
-    y = _unicycle(rng, u, lambda k, x: 0.55 if 300 <= k < 340 or 610 <= k < 640 else 1.0, "euler")
-    result = _traced(y, u)
+    return _unicycle(rng, u, lambda k, x: 0.55 if 300 <= k < 340 or 610 <= k < 640 else 1.0, "euler"), u
+
+
+def test_a_stretch_of_wet_floor_is_no_noise():
+    result = _traced(*_on_a_wet_floor())
     assert result.verdict == "unexplained"
     assert {"time", "time*v", "position"} & set(result.depends_on)
+
+
+def test_what_comes_and_goes_is_told_by_words_that_users_know(monkeypatch):
+    """A dictionary of waves is one of time."""
+    monkeypatch.setattr(lack_of_fit, "may_depend_on", lambda left, found, dictionaries: ("wave", "time", "v"))
+    model = compose(ModelSpec("unicycle", DT, {}, ()))
+    data = from_arrays(model, [_on_a_wet_floor()])
+    given = problem(data, steps_of(data))
+    nominal = evaluate(given, model)
+    found = lack_of_fit.lack_of_fit(lack_of_fit.Looks(left_of(given, nominal)), nominal, 20)
+    assert found.for_a_while
+    assert found.tokens == ("time", "v")
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -93,6 +93,7 @@ BEYOND = 8.0
 """Nats by which the evidence must exceed that of every slide."""
 
 TOKENS = {"wave": "time"}
+"""As which dictionaries are told that are none of a user's words."""
 
 MOST_GROUPS = 3
 """Groups that are named at most."""
@@ -141,7 +142,7 @@ class Structure:
     def likeliest(self) -> tuple[str, ...]:
         """The group that gains most, though not beyond doubt; nothing where chance would do as well."""
         best = max(self.gains, key=lambda token: self.gains[token], default="")
-        return (TOKENS.get(best, best),) if best and self.gains[best] > math.log(len(self.gains) / ALPHA) else ()
+        return (_told(best),) if best and self.gains[best] > math.log(len(self.gains) / ALPHA) else ()
 
 
 def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
@@ -182,8 +183,12 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
         seen = as_told(chosen) if chosen and left.fit.added and (shows or _share_of(left, chosen[-1]) > MUCH) else ()
         also = () if varying is None else (varying.judged.token,)
         return Structure(coloured, False, 0.0, gains, beside=tuple(dict.fromkeys((*also, *seen))))
-    tokens = may_depend_on(left, windows, found)
+    tokens = tuple(dict.fromkeys(map(_told, may_depend_on(left, windows, found))))
     return Structure(tokens, True, share, gains, for_a_while=True, noise=_beside(left, windows), nats=windows.gain)
+
+
+def _told(token: str) -> str:
+    return TOKENS.get(token, token)
 
 
 def still_left(left: Left, tokens: tuple[str, ...], nominal: Fit, horizon: int) -> bool:
@@ -241,7 +246,7 @@ class Looks:
     @cached_property
     def looked(self) -> list[tuple[float, int]]:
         """(nats, place in `found`), the best first."""
-        asked = [i for i, (token, _) in enumerate(self.found) if self.only is None or TOKENS.get(token, token) in self.only]
+        asked = [i for i, (token, _) in enumerate(self.found) if self.only is None or _told(token) in self.only]
         return sorted(((first_look(self.left, self.found[i][1]), i) for i in asked), reverse=True)
 
     @property
@@ -268,7 +273,7 @@ class Looks:
         for first, i in self.looked[:WEIGHED]:
             if first > NOTHING:
                 token, x = self.found[i]
-                token = TOKENS.get(token, token)
+                token = _told(token)
                 nats[token] = max(nats.get(token, -math.inf), nats_of(self.left, leading(self.left, x)))
         return dict(sorted(nats.items(), key=lambda pair: -pair[1]))
 
@@ -282,14 +287,14 @@ class Looks:
 
 def as_told(chosen: Sequence[Judged]) -> tuple[str, ...]:
     """Their tokens, as they are told."""
-    return tuple(dict.fromkeys(TOKENS.get(judged.token, judged.token) for judged in chosen))
+    return tuple(dict.fromkeys(_told(judged.token) for judged in chosen))
 
 
 def best_unnamed(looks: Looks) -> Judged:
     """The dictionary that explains most without any effect's name, under the token that is told."""
     most = max(j.gain for j in looks.judged)
     best = min((j for j in looks.judged if j.gain >= most - ALIKE), key=lambda j: (j.x.shape[2], -j.gain))
-    return replace(best, token=TOKENS.get(best.token, best.token), gain=most)
+    return replace(best, token=_told(best.token), gain=most)
 
 
 def explains_more(looks: Looks, unnamed: Judged, fit: Fit, horizon: int, *, left: bool) -> bool:
