@@ -8,7 +8,7 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.dataset import from_streams, thinned
 from s2r_runtime.trace.faults import check
-from s2r_runtime.trace.streams import Stream, complete, fresh, turned
+from s2r_runtime.trace.streams import Stream, complete, fresh, nearest, turned
 
 
 def _pose(t):
@@ -116,3 +116,25 @@ def test_a_change_anywhere_in_the_last_part_of_a_step_but_on_its_end_is_over_by_
     inputs = Stream(np.array([0.0, at[3] - before_s]), np.array([[1.0], [2.0]]))
     found = turned(inputs, at, 10, on_edge=0.001)
     assert (found is not None and found[:, 0].tolist() == [False, False, True, False, False]) == over
+
+
+@pytest.mark.parametrize("pause", [7.0, 7.25, 7.5, 7.75])
+def test_no_row_is_lost_behind_a_pause_that_ends_within_a_step(pause):
+    """Rows jitter by a tenth of a step, and have a point each, in their order, with the stamp that they have."""
+    place = np.arange(300.0) + np.random.default_rng(8).uniform(-0.1, 0.1, 300)
+    place[0] = 0.0
+    place[100:] += pause
+    t = 0.05 * place
+    y, at = nearest(Stream(t, t[:, None]), 0.05, [])
+    there = np.isfinite(y[:, 0])
+    assert np.array_equal(y[there, 0], t)
+    assert np.array_equal(at[there], t)
+    assert (np.diff(at) > 0.0).all()
+    assert np.abs(at / 0.05 - np.arange(len(at))).max() < 0.8  # where a row is follows from its stamp, to within a step
+
+
+def test_of_rows_that_come_twice_a_step_the_nearest_counts():
+    t = 0.025 * np.arange(200)
+    y, at = nearest(Stream(t, t[:, None]), 0.05, [])
+    assert y[:, 0] == pytest.approx(at)
+    assert at[:-1] == pytest.approx(0.05 * np.arange(len(at) - 1))
