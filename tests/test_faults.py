@@ -471,3 +471,36 @@ def test_outliers_by_themselves_are_no_jump(law):
             y += law(np.random.default_rng([seed, 1]), y.shape)
 
         assert [f for f in _checked(spoil, seed=100 + seed).faults if f.kind == "offset_jump"] == []
+
+
+def _turning_joint(seed):
+    """Led to and fro by a force that is known; its encoder is good to 0.1 mm. Rows of q and qd, and the force."""
+    rng, dt, steps = np.random.default_rng(seed), 0.01, 1200
+    u = 16.0 * np.sin(3.1 * dt * np.arange(steps)) + 6.0 * np.sin(7.3 * dt * np.arange(steps) + seed)
+    x, rows = np.zeros(2), [np.zeros(2)]
+    for now in u:
+        x = x + dt * np.array([x[1] + 0.5 * dt * now, now])
+        rows.append(x)
+    return np.array(rows) + rng.normal(size=(steps + 1, 2)) * [1e-4, 5e-3], u
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_row_that_stands_where_the_one_before_did_is_late_if_all_of_it_does(seed):
+    """An encoder that is off for one row by what the joint goes in a step: its speed tells that the row is in time."""
+    model = compose(ModelSpec("joint", 0.01, {"mass": 1.0}))
+    y, u = _turning_joint(seed)
+    k = int(np.argmax(np.abs(y[1:-1, 1]) * (np.abs(u[1:]) > 10.0))) + 1  # where it goes, and changes how fast
+    t = 0.01 * np.arange(len(y))
+
+    def faults(rows):
+        return [
+            (f.kind, f.channel, round(f.from_s, 3))
+            for f in check(model, from_streams(model, [(Stream(t, rows), Stream(t[:-1], u[:, None]))], "here")).faults
+        ]
+
+    off = y.copy()
+    off[k, 0] = y[k - 1, 0]
+    assert faults(off) == [("spike", "q", round(0.01 * k, 3))]
+    late = y.copy()
+    late[k] = y[k - 1] + np.random.default_rng(seed).normal(size=2) * [1e-4, 5e-3]
+    assert faults(late) == []

@@ -94,7 +94,8 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
             if bad[k, j] or bad[k + 1, j]:  # the end of something that is taken out already
                 continue
             rows = _there_and_back(series, k)
-            if rows is not None and abs(float(series[k])) <= limit[k]:  # a row that was stamped late is as far away, and back
+            late = rows is not None and abs(float(series[k])) <= limit[k]  # a row that was stamped late is as far away, and back
+            if rows is not None and late and not (rows[0] == rows[1] and _others_in_time(change, j, rows[0])):
                 stray = Fault(run.start_s + data.dt * rows[0], run.start_s + data.dt * rows[1], name, "spike")
                 if stray not in found.strays:
                     found.strays.append(stray)
@@ -111,6 +112,21 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
                 if _stays(series, k, (bad[1:, j] | bad[:-1, j], single)):
                     found.sure.append(found.offsets[-1])
     return found
+
+
+def _others_in_time(change: Array, j: int, row: int) -> bool:
+    """Whether another state of a row says clearly that its stamp is right. change: (K, nx) how far states went in each step; j: the state
+    that is off. Had the row come late, the others would be off by as many steps of what they go hereabouts.
+    """
+    if not 0 < row < len(change):
+        return False
+    off, pace = 0.5 * (change[:-1] - change[1:]), 0.5 * (change[row - 1] + change[row])  # from the rows before and after, and of these
+    usual = np.array([np.median(np.abs(one[np.isfinite(one)])) for one in off.T]) / 0.6745
+    if not abs(pace[j]) > usual[j]:
+        return False
+    expected = float(off[row - 1, j] / pace[j]) * pace
+    others = np.arange(len(pace)) != j
+    return bool(np.any(others & (np.abs(expected) > SIGMAS * usual) & (np.abs(off[row - 1]) < 0.5 * np.abs(expected))))
 
 
 def _pace(moves: Array, change: Array) -> Array:
