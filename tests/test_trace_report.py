@@ -348,10 +348,10 @@ def test_a_page_fits_narrow_and_wide_windows(pages, verdict, width, tmp_path):
     assert figures >= 25
 
 
-SLOW = [pytest.param(name, marks=pytest.mark.long) for name in ("bicycle", "double_integrator")]
+SLOW = [pytest.param(name, marks=pytest.mark.long) for name in ("differential_drive", "bicycle", "double_integrator")]
 
 
-@pytest.mark.parametrize("name", ["differential_drive", "joint", *SLOW])
+@pytest.mark.parametrize("name", ["joint", *SLOW])
 def test_other_models_have_their_page_too(name):
     dt, bounds, noise = {
         "differential_drive": (0.05, [(-6.0, 6.0), (-6.0, 6.0)], [0.002, 0.002, 0.004, 0.03, 0.03]),

@@ -242,7 +242,7 @@ def test_names_are_held_against_dictionaries_and_fields_where_they_leave_somethi
     for name in ("better_shape", "best_unnamed", "wanders"):
         challenge = getattr(whole, name)
         monkeypatch.setattr(whole, name, lambda *of, name=name, challenge=challenge: asked.append(name) or challenge(*of))
-    data = recordings([physics], 2, steps=1200, seed=61)[which]
+    data = recordings([physics], 2, steps=900, seed=61)[which]
     found = trace(data, declared())
     assert bool({*asked} - {"better_shape"}) == left
     assert left or "better_shape" in asked
