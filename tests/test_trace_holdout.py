@@ -3,7 +3,6 @@
 import tracemalloc
 
 import numpy as np
-import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
@@ -107,33 +106,3 @@ def test_the_fit_sees_the_beginning_and_the_end():
         assert fitted == held == -10.0
         assert seen[:200].any()
         assert seen[800:].any()
-
-
-@pytest.mark.parametrize("begin", [0, 30, 240, 430, 640, 880, 960])
-def test_what_an_input_does_once_is_seen_by_the_half_on_either_side(begin):
-    """No tenths part it, or hardly."""
-    u = 0.1 * np.random.default_rng(7).normal(size=STEPS)
-    u[begin : begin + 40] = -10.0
-    seen = fit_mask(_data([u]), 0)
-    fitted, held = _reach(u, seen)
-    assert fitted == held == -10.0
-    assert 0.3 < np.mean(~seen) < 0.5
-    assert 10 <= np.count_nonzero(seen[begin : begin + 40]) <= 30
-
-
-def test_a_limit_that_is_met_once_is_named():
-    """The drive's current is limited; one hard push of a third of a second asks for more, either way."""
-    rng, dt, mass = np.random.default_rng(9), 0.01, 0.7
-    u = 3.0 * np.sin(0.9 * dt * np.arange(1500)) + np.repeat(rng.normal(size=75), 20)
-    u[640:660], u[660:680] = 9.0, -8.0
-    x, rows = np.zeros(2), [np.zeros(2)]
-    for now in np.clip(u, -6.0, 6.0) / mass:
-        x = x + dt * np.array([x[1] + 0.5 * dt * now, now])
-        rows.append(x)
-    model = compose(ModelSpec("joint", dt, {"mass": mass}))
-    y = np.array(rows) + rng.normal(size=(1501, 2)) * [1e-4, 5e-3]
-    found = trace(from_arrays(model, [(y, u[:, None])]), model)
-    assert found.verdict == "traced"
-    (limit,) = found.effects
-    assert (limit.name, limit.channel) == ("input_saturation", "force")
-    assert [limit.parameters[side][0] for side in ("low", "high")] == pytest.approx([-6.0, 6.0], rel=0.01)

@@ -240,6 +240,28 @@ def test_what_only_the_fit_has_seen_is_said_to_be_unconfirmed():
         assert trace(data, declared()).unconfirmed == ()
 
 
+@pytest.mark.parametrize(("pushes", "once"), [([280], True), ([300], True), ([100, 500], False), ([0], True), ([580], True)])
+def test_what_is_done_at_one_time_only_may_lie_anywhere(pushes, once):
+    """Also across the edge of two parts of the time. A cart that is pushed now and then does half of what it is asked."""
+    u = np.zeros((600, 1))
+    for k in pushes:
+        u[k : k + 20] = 1.0
+    model = compose(ModelSpec("joint", DT, {}, ()))
+    data = from_arrays(model, [(np.zeros((601, 2)), u)])
+    weak = insert(model, AppliedEffect(registry().get("effects", "input_gain"), "force", {"gain": 0.5}), 0)
+    assert verdict._once(problem(data, steps_of(data)), weak, model) == once
+
+
+def test_what_was_met_at_one_time_only_and_is_not_asked_for_elsewhere_gets_no_name(monkeypatch):
+    """Numbers that were fitted without it foretell a little better or worse by chance, which confirms nothing."""
+    data = recordings(GAIN, 1, steps=STEPS, seed=45)[0]
+    assert trace(data, declared()).effects
+    monkeypatch.setattr(verdict, "asked", lambda *of: False)
+    assert trace(data, declared()).effects
+    monkeypatch.setattr(verdict, "_once", lambda *of: True)
+    assert trace(data, declared()).effects == ()
+
+
 def test_measurements_without_noise_are_no_effect():
     for data in recordings([], 3, steps=STEPS, seed=44, noise=0.0 * NOISE):
         assert trace(data, declared()).verdict == "none"

@@ -2,17 +2,15 @@
 
 Of one run two stretches are held out, one of them the end (HELD_OUT); of several runs, whole runs drawn by the seed (TEST_SHARE). Where
 the inputs of one side do not reach as far as those of the other, other stretches, or runs, are held out on which they do (TENTHS,
-DRAWS): an end stop that only one side meets would be found and not confirmed, or not found. Where no tenths do, as an input goes
-there once only, what is held out begins or ends amid that. What the robot did then is not looked at.
+DRAWS): an end stop that only one side meets would be found and not confirmed, or not found. What the robot did then is not looked at.
 The inputs of a run are kept from its beginning: a wide play never forgets, and a slow process hardly. Long recordings are thinned for the
 fit: blocks of contiguous steps, evenly spread, each with the inputs before it from which hidden states settle.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-from itertools import combinations, pairwise, product
+from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,10 +83,6 @@ def fit_mask(data: Dataset, seed: int, *, everything: bool = False) -> Mask:
     span = np.ptp(u, axis=0) if len(u) else np.ones(u.shape[1])
     u = u / np.where(span > 0.0, span, 1.0)
     shorter = np.array([_shorter(u, _without(data, spans, *way)[rows]) for way in ways])
-    if len(data.runs) < FEWEST_RUNS and shorter.min() > SHORTER:
-        through = [(set[int](), stretches) for stretches in _through(u, rows, spans)]
-        ways += through
-        shorter = np.append(shorter, [_shorter(u, _without(data, spans, *way)[rows]) for way in through])
     enough = np.flatnonzero(shorter <= shorter.min() + (SHORTER if shorter[0] <= shorter.min() + SHORTER else 0.5 * SHORTER))
     return _without(data, spans, *ways[int(enough[0])])
 
@@ -101,20 +95,6 @@ def _pieces(stretches: Stretches) -> int:
 def _hides(way: Stretches) -> bool:
     """Whether the first fifth of the time is held out, or the last: what changed since then, or only then, the fit would never see."""
     return any(all(any(a <= at < b for a, b in way) for at in ends) for ends in ENDS)
-
-
-def _through(u: Array, rows: NDArray[np.int64], spans: list[tuple[int, int]]) -> list[Stretches]:
-    """Stretches that begin or end amid what an input reaches farthest: what happens once only, the fit then sees the half of."""
-    few = math.ceil(2.0 * REACH * len(u))
-    ends = np.sort(u, axis=0)[[few - 1, -few]]
-    mids = [int(np.median(rows[there])) for there in (*(u <= ends[0]).T, *(u >= ends[1]).T)]
-    times = sorted({(row - a) / length for row in mids for a, length in spans if a <= row < a + length})
-    half = (HELD_OUT[0][1] - HELD_OUT[0][0], HELD_OUT[1][1] - HELD_OUT[1][0])
-    alone = [(a, a + sum(half)) for at in times for a in (at - sum(half), at)]
-    one, last = ([(a, a + h) for at in times for a in (at - h, at)] for h in half)
-    two = (*product(one, HELD_OUT[1:]), *product(HELD_OUT[:1], last), *product(one, last))
-    each = [*(tuple(sorted(way)) for way in two), *((single,) for single in alone)]
-    return [way for way in each if way[0][0] >= 0.0 and way[-1][1] <= 1.0 and all(a[1] < b[0] for a, b in pairwise(way))]
 
 
 def _spans(data: Dataset) -> list[tuple[int, int]]:

@@ -100,8 +100,11 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
         again = False
         for place in fit.added:
             less = fitted(given, fit, without(fit.model, place), 2)
-            refutable = asked(given, judged_on, fit.model, less.model) or _once(given, fit.model, less.model)
-            if refutable and not _holds(judged_on, fit, less, place):
+            if asked(given, judged_on, fit.model, less.model):
+                stays = _holds(judged_on, fit, less, place)
+            else:  # numbers fitted without it foretell a little better or worse by chance
+                stays = not _once(given, fit.model, less.model)
+            if not stays:
                 fit, again = less, True
                 break
     gone = fit is not chosen.fit  # rivals of a model with more effects are none of this one
@@ -214,8 +217,9 @@ def asked(given: Problem, judged_on: Held, model: ComposedModel, less: ComposedM
 def _once(given: Problem, model: ComposedModel, less: ComposedModel) -> bool:
     """Whether an effect does what it does at one time only: somebody may have held the robot there."""
     apart = model.difference(*(given.predicted(m) for m in (model, less)))
-    done = np.array([np.sum((part / np.maximum(rms(apart), 1e-300)) ** 2) for part in np.array_split(apart, TIMES)])
-    return bool(np.max(done) > MOSTLY * np.sum(done))
+    done = np.append(0.0, np.cumsum(np.sum((apart / np.maximum(rms(apart), 1e-300)) ** 2, axis=1)))
+    long = math.ceil(len(apart) / TIMES)
+    return bool(np.max(done[long:] - done[:-long], initial=0.0) > MOSTLY * done[-1])
 
 
 def verdict_of(
