@@ -6,7 +6,7 @@ from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recor
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace.dataset import Stream, from_streams
+from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
 from s2r_runtime.trace.faults import check
 
 STEPS = 900
@@ -504,3 +504,17 @@ def test_a_row_that_stands_where_the_one_before_did_is_late_if_all_of_it_does(se
     late = y.copy()
     late[k] = y[k - 1] + np.random.default_rng(seed).normal(size=2) * [1e-4, 5e-3]
     assert faults(late) == []
+
+
+def test_a_run_in_which_a_state_was_not_measured_says_nothing_of_its_rows():
+    """Nor does one whose position is stale now and then, for ever: that is how its rows come."""
+    model = compose(ModelSpec("joint", 0.01, {"mass": 1.0}))
+    y, u = _turning_joint(0)
+    off = y.copy()
+    off[300, 0] = off[299, 0]
+    off[:, 1] = np.nan
+    assert check(model, from_arrays(model, [(y, u[:, None]), (off, u[:, None])])).faults == ()
+    stale = y.copy()
+    for k in np.flatnonzero(np.abs(np.diff(y[:, 0])) > 0.05)[::60]:
+        stale[k + 1, 0] = y[k, 0]
+    assert check(model, from_arrays(model, [(stale, u[:, None])])).faults == ()

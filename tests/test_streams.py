@@ -138,3 +138,23 @@ def test_of_rows_that_come_twice_a_step_the_nearest_counts():
     y, at = nearest(Stream(t, t[:, None]), 0.05, [])
     assert y[:, 0] == pytest.approx(at)
     assert at[:-1] == pytest.approx(0.05 * np.arange(len(at) - 1))
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("late", [0.4, 0.6, 1.0])
+def test_stamps_of_arrival_stay_in_their_order(late, seed):
+    """Rows come late by a part of a step, or by several: two may have one point, of which the nearer counts."""
+    rng = np.random.default_rng(seed)
+    place = np.sort(np.arange(1000.0) + rng.exponential(late, 1000))
+    t = 0.05 * (place - place[0])
+    y, at = nearest(Stream(t, t[:, None]), 0.05, [])
+    assert (np.diff(at) > 0.0).all()
+    there = np.isfinite(y[:, 0])
+    assert np.array_equal(y[there, 0], at[there])
+    assert np.count_nonzero(there) >= len(np.unique(np.rint(place - place[0])))  # as the nearest points would have
+
+
+def test_one_row_far_from_the_point_after_that_of_the_row_before_is_not_before_it():
+    t = np.array([0, 1, 2, 3, 4, 5, 6, 7, 7.6, 8.45, 9.25, 9.4, 11.6, 12.6, 13.6, 14.6])
+    _, at = nearest(Stream(t, t[:, None]), 1.0, [])
+    assert (np.diff(at) > 0.0).all()

@@ -252,6 +252,25 @@ def test_what_is_done_at_one_time_only_may_lie_anywhere(pushes, once):
     assert verdict._once(problem(data, steps_of(data)), weak, model) == once
 
 
+def test_what_is_done_at_two_times_is_not_done_at_one_because_nothing_between_them_was_fitted():
+    """What was held out lies between them, or the end of a run."""
+
+    def pushed(*begins):
+        u = np.zeros((600, 1))
+        for k in begins:
+            u[k : k + 15] = 1.0
+        return u
+
+    model = compose(ModelSpec("joint", DT, {}, ()))
+    weak = insert(model, AppliedEffect(registry().get("effects", "input_gain"), "force", {"gain": 0.5}), 0)
+    one = from_arrays(model, [(np.zeros((601, 2)), pushed(165, 300))])
+    steps = steps_of(one)
+    seen = (steps.place < 180) | ((steps.place >= 300) & (steps.place < 480))
+    assert not verdict._once(problem(one, steps.take(seen)), weak, model)
+    two = from_arrays(model, [(np.zeros((601, 2)), pushed(585)), (np.zeros((601, 2)), pushed(0))])
+    assert not verdict._once(problem(two, steps_of(two)), weak, model)
+
+
 def test_what_was_met_at_one_time_only_and_is_not_asked_for_elsewhere_gets_no_name(monkeypatch):
     """Numbers that were fitted without it foretell a little better or worse by chance, which confirms nothing."""
     data = recordings(GAIN, 1, steps=STEPS, seed=45)[0]

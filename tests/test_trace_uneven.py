@@ -225,6 +225,7 @@ AS_WRITTEN = {
     "of one length": "return x + float(dt) * np.hstack([u, -x[:, 1:]])",
     "of a mean": "return x + np.mean(dt) * np.hstack([u, -x[:, 1:]])",
     "in parts of the longest": "return x + np.max(dt) * np.hstack([u, -x[:, 1:]])",
+    "by a mask": "y = x + dt * u; hit = y[:, 0] > 1.0; y[hit, 1] = y[hit, 1] + dt * u[hit, 0]; return y",
     "not at all": "return 0.9 * x + 0.1 * u",
     "out of bounds": "raise ValueError('no such tank')",
 }
@@ -242,6 +243,17 @@ def test_a_model_of_ones_own_is_given_each_rows_length_if_its_step_takes_that(tm
         alone = np.concatenate([model.step(x[[k]], u[[k]], float(lasts[k]), model.parameters) for k in range(40)])
         given: Any = lasts
         assert model.step(x, u, given, model.parameters) == pytest.approx(alone, rel=1e-12)
+
+
+def test_a_model_that_does_not_take_each_rows_length_everywhere_is_interpolated_there(tmp_path: Path) -> None:
+    """Its step is asked at some states only, and in others picks rows."""
+    source = "y = x + dt * u; far = y[:, 0] > 1e9; y[far] += dt * u[far] if far.any() else 0.0; return y"
+    (tmp_path / "tank.py").write_text(TANK.replace("LASTS", source))
+    model, rng = compose(ModelSpec(str(tmp_path / "tank.py"), DT)), np.random.default_rng(4)
+    assert model.uneven
+    x, u, lasts = rng.choice([1e6, 3e9], (60, 2)), rng.uniform(0.0, 1e9, (60, 1)), rng.uniform(0.04, 0.06, 60)
+    alone = [model.nominal.step(x[[k]], u[[k]], float(lasts[k]), model.parameters)[0] for k in range(60)]
+    assert advanced(model, x, Acting(u, u, lasts), slice(None)) == pytest.approx(np.array(alone), rel=1e-9)
 
 
 @pytest.mark.parametrize("stuck", [False, True])

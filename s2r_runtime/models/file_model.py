@@ -45,8 +45,10 @@ PROBED, PROBED_S = 0.5, 0.01
 goes nowhere.
 """
 
-EACH_S = (1e-3, 1.0)
-"""Steps between which those of a table's rows are spread, s, when a file's `step` is asked whether it takes one for each row."""
+EACH, FAR, EACH_S = 24, (0.0, 1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0), (1e-3, 100.0)
+"""Rows near to PROBED, and as many of these sizes, by which a file's `step` is asked whether it takes a dt for each; and what these are
+spread between, s.
+"""
 
 Asked = tuple[tuple[int, ...], bytes, bytes, bytes, tuple[tuple[str, float], ...]]
 
@@ -86,18 +88,22 @@ class FileModel:
         one dt take one of the two, by how they are written: it is asked, and counts if all rows are as they are alone, each with its own.
         """
         nx, nu = len(self.states), len(self.inputs)
-        n = nx + nu + 3  # a table that is wrongly laid out, (n, n) or (nx, n), is not taken for one of states
-        x, u = (np.random.default_rng(0).uniform(PROBED / 2.0, PROBED, (n, columns)) for columns in (nx, nu))
-        lasts = np.geomspace(*EACH_S, n)
-        try:
-            with contextlib.redirect_stderr(io.StringIO()):  # where what it prints would go
-                alone = np.concatenate([self._called(x[k : k + 1], u[k : k + 1], float(lasts[k]), self.parameters) for k in range(n)])
-        except ConfigError:
+        rng = np.random.default_rng(0)
+        near = (rng.uniform(PROBED / 2.0, PROBED, (EACH, columns)) for columns in (nx, nu))
+        far = (rng.choice(FAR, (EACH, columns)) * rng.uniform(-1.0, 1.0, (EACH, columns)) for columns in (nx, nu))
+        x, u = (np.concatenate(tables) for tables in zip(near, far, strict=True))
+        lasts = rng.permutation(np.geomspace(*EACH_S, len(x)))
+        there, alone = [], []
+        for k in range(len(x)):  # not everywhere does it give numbers
+            with contextlib.suppress(ConfigError), contextlib.redirect_stderr(io.StringIO()):  # where what it prints would go
+                alone.append(self._called(x[k : k + 1], u[k : k + 1], float(lasts[k]), self.parameters))
+                there.append(k)
+        if len(there) <= nx + nu + 2:  # a table that is wrongly laid out, (n, n) or (nx, n), is not taken for one of states
             return None
         for column in (False, True):
             with contextlib.suppress(ConfigError), contextlib.redirect_stderr(io.StringIO()):
-                together = self._called(x, u, lasts[:, None] if column else lasts, self.parameters)
-                if np.allclose(together, alone, rtol=1e-9, atol=1e-12):
+                together = self._called(x[there], u[there], lasts[there, None] if column else lasts[there], self.parameters)
+                if np.allclose(together, np.concatenate(alone), rtol=1e-9, atol=1e-12):
                     return column
         return None
 

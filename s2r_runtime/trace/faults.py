@@ -92,7 +92,7 @@ def check(model: ComposedModel, data: Dataset, under: ComposedModel | None = Non
     spikes: list[Fault] = []
     outliers = tails = 0
     sure: list[Fault] = []
-    strays: list[tuple[int, Fault]] = []
+    strays: list[tuple[int, Fault, bool]] = []
     for i in range(len(data.runs)):
         tails += int(np.count_nonzero(tails_of(model, data, act, i, reach).any(axis=1)))
         found += frozen(model, data, act, i, bad[i], reach)
@@ -102,14 +102,17 @@ def check(model: ComposedModel, data: Dataset, under: ComposedModel | None = Non
         left_out += jumps.cut
         sure += jumps.sure
         outliers += len(jumps.tails)
-        strays += [(i, stray) for stray in jumps.strays]
+        strays += [(i, stray, in_time) for stray, in_time in zip(jumps.strays, jumps.in_time, strict=True)]
         if pose is not None:
             found += _inconsistent(model, data, act, i, bad[i], reach, pose)
     rows = sum(len(run.y) for run in data.runs)
-    for i, stray in strays if len(strays) <= max(STRAYS * rows, 1.0) else ():
+    for i, stray, in_time in strays if len(strays) <= max(STRAYS * rows, 1.0) else ():
         first, last = _rows(data, i, stray.from_s, stray.to_s)
         bad[i][first : last + 1, model.states.index(stray.channel)] = True
-        outliers += 1
+        if in_time:
+            spikes.append(stray)
+        else:
+            outliers += 1
     for jumps in [] if under is None else _under(under, data, bad, found):
         spikes += jumps.spikes
         found += jumps.offsets

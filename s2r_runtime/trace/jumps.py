@@ -59,7 +59,7 @@ STAYS, FARTHER = 10, 2.0
 class Jumps:
     """Of one run: spikes; rows that the noise's own tail took away (`tails`, as spikes); offsets that stay; (run, step) transitions across
     them; of the offsets, those that are none of the noise's tail either; rows that are away by no more than a late stamp could do
-    (`strays`, as spikes), which are not marked.
+    (`strays`, as spikes), which are not marked, and whether another state says that such a row is in time.
     """
 
     spikes: list[Fault]
@@ -68,17 +68,19 @@ class Jumps:
     cut: list[tuple[int, int]]
     sure: list[Fault]
     strays: list[Fault]
+    in_time: list[bool]
 
 
 def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: Reach, *, of_positions: bool = False) -> Jumps:
     """Of run i; marks in `bad` what of it is wrong. of_positions: no other states are looked at."""
     run = data.runs[i]
-    found = Jumps([], [], [], [], [], [])
+    found = Jumps([], [], [], [], [], [], [])
     if len(run.y) < 3:
         return found
     foretold = predicted(model, data, act, i)
     e, moves = model.difference(run.y[1:], foretold), model.difference(foretold, run.y[:-1])
     change = model.difference(run.y[1:].copy(), run.y[:-1])
+    between = _between(change)
     pose = {"x", "y", "theta"} if getattr(model.nominal, "integration", None) is not None else set()
     goes_on = pose | {model.states[axis.position] for axis in axes(model.nominal)}  # as its speed says, which is a state of its own
     for j, name in enumerate(model.states):
@@ -94,11 +96,11 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
             if bad[k, j] or bad[k + 1, j]:  # the end of something that is taken out already
                 continue
             rows = _there_and_back(series, k)
-            late = rows is not None and abs(float(series[k])) <= limit[k]  # a row that was stamped late is as far away, and back
-            if rows is not None and late and not (rows[0] == rows[1] and _others_in_time(change, j, rows[0])):
+            if rows is not None and abs(float(series[k])) <= limit[k]:  # a row that was stamped late is as far away, and back
                 stray = Fault(run.start_s + data.dt * rows[0], run.start_s + data.dt * rows[1], name, "spike")
                 if stray not in found.strays:
                     found.strays.append(stray)
+                    found.in_time.append(rows[0] == rows[1] and between.in_time(j, rows[0]))
                 continue
             if rows is not None:
                 bad[rows[0] : rows[1] + 1, j] = True
@@ -114,19 +116,35 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
     return found
 
 
-def _others_in_time(change: Array, j: int, row: int) -> bool:
-    """Whether another state of a row says clearly that its stamp is right. change: (K, nx) how far states went in each step; j: the state
-    that is off. Had the row come late, the others would be off by as many steps of what they go hereabouts.
+@dataclass(frozen=True)
+class _Rows:
+    """How rows lie between the two around them: change (K, nx) in each step; off (K - 1, nx) from the mean of the two; usual (nx,) of that,
+    by its median; not a number where a state was not measured.
     """
-    if not 0 < row < len(change):
-        return False
-    off, pace = 0.5 * (change[:-1] - change[1:]), 0.5 * (change[row - 1] + change[row])  # from the rows before and after, and of these
-    usual = np.array([np.median(np.abs(one[np.isfinite(one)])) for one in off.T]) / 0.6745
-    if not abs(pace[j]) > usual[j]:
-        return False
-    expected = float(off[row - 1, j] / pace[j]) * pace
-    others = np.arange(len(pace)) != j
-    return bool(np.any(others & (np.abs(expected) > SIGMAS * usual) & (np.abs(off[row - 1]) < 0.5 * np.abs(expected))))
+
+    change: Array
+    off: Array
+    usual: Array
+
+    def in_time(self, j: int, row: int) -> bool:
+        """Whether another state of a row says clearly that its stamp is right, of which the state j is off. Had it come late, the others
+        would be off by as many steps of what they go hereabouts, and stand where they did a row or two before.
+        """
+        if not 1 < row < len(self.change):
+            return False
+        pace = 0.5 * (self.change[row - 1] + self.change[row])  # from the row before to the one after
+        if not abs(pace[j]) > self.usual[j]:
+            return False
+        expected, least = float(self.off[row - 1, j] / pace[j]) * pace, SIGMAS * self.usual
+        gone = np.abs([self.change[row - 1], self.change[row - 1] + self.change[row - 2]])
+        says = (np.abs(expected) > least) & (np.abs(self.off[row - 1]) < 0.5 * np.abs(expected)) & np.all(gone > least, axis=0)
+        return bool(np.any(says & (np.arange(len(pace)) != j)))
+
+
+def _between(change: Array) -> _Rows:
+    off = 0.5 * (change[:-1] - change[1:])
+    finite = [one[np.isfinite(one)] for one in np.abs(off).T]
+    return _Rows(change, off, np.array([np.median(one) / 0.6745 if len(one) else np.nan for one in finite]))
 
 
 def _pace(moves: Array, change: Array) -> Array:

@@ -293,8 +293,7 @@ def _points(place: Array) -> NDArray[np.int64]:
     following = point.tolist()
     for k, at in enumerate(place.tolist()[1:], start=1):
         after = following[k - 1] + 1
-        if abs(at - after) <= FARTHEST:
-            following[k] = after
+        following[k] = after if abs(at - after) <= FARTHEST else max(following[k], following[k - 1])
     return np.array(following)
 
 

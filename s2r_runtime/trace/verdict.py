@@ -219,7 +219,9 @@ def _once(given: Problem, model: ComposedModel, less: ComposedModel) -> bool:
     apart = model.difference(*(given.predicted(m) for m in (model, less)))
     done = np.append(0.0, np.cumsum(np.sum((apart / np.maximum(rms(apart), 1e-300)) ** 2, axis=1)))
     long = math.ceil(len(apart) / TIMES)
-    return bool(np.max(done[long:] - done[:-long], initial=0.0) > MOSTLY * done[-1])
+    at = given.steps.place + long * given.steps.run  # what was held out lies between, and so does the time between runs
+    ends = np.searchsorted(at, at + long)
+    return bool(np.max(done[ends] - done[:-1], initial=0.0) > MOSTLY * done[-1])
 
 
 def verdict_of(
