@@ -65,6 +65,16 @@ def test_stripes_that_slip_are_no_slip_of_the_wheels(seed):
     assert "position" in result.depends_on
 
 
+def test_a_floor_may_go_with_one_axis_of_the_place_alone():
+    """Of which far fewer cells say it: a robot comes back to an x wherever it is in y."""
+    y = np.random.default_rng(0).uniform(size=(50, 3))
+    for states in (("x", "y", "theta"), ("y", "theta", "x")):
+        both, *alone = fields._places(states, y)
+        assert both.shape == (50, 2)
+        assert sorted(one[0, 0] for one in alone) == sorted(both[0])
+    assert [one.shape for one in fields._places(("q", "qd"), y[:, :2])] == [(50, 1)]
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_wide_stripes_are_a_field_although_noise_of_some_colour_follows_them(seed):
     """Ten steps in each: what is left is one long autoregression, until the noise beside the field is seen."""
