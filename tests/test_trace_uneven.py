@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from test_trace_arms_and_quadrotors import ARM
 
 from s2r_runtime.models.composed import ComposedModel, compose
+from s2r_runtime.models.file_model import FileModel
 from s2r_runtime.models.forces import coupled
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.beginning import with_history
@@ -243,6 +244,17 @@ def test_a_model_of_ones_own_is_given_each_rows_length_if_its_step_takes_that(tm
         alone = np.concatenate([model.step(x[[k]], u[[k]], float(lasts[k]), model.parameters) for k in range(40)])
         given: Any = lasts
         assert model.step(x, u, given, model.parameters) == pytest.approx(alone, rel=1e-12)
+
+
+def test_a_step_that_counts_its_own_parts_is_not_asked_of_rows_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes as long as there are parts in ten seconds."""
+    source = "h = 0.0\n    while h < dt:\n        x, h = x + 1e-3 * u, h + 1e-3\n    return x"
+    (tmp_path / "tank.py").write_text(TANK.replace("LASTS", source))
+    model = compose(ModelSpec(str(tmp_path / "tank.py"), DT)).nominal
+    called, asked = FileModel._called, []
+    monkeypatch.setattr(FileModel, "_called", lambda self, *given: (asked.append(given), called(self, *given))[1])
+    assert not getattr(model.shared, "uneven", None)
+    assert len(asked) == 2
 
 
 def test_a_model_that_does_not_take_each_rows_length_everywhere_is_interpolated_there(tmp_path: Path) -> None:
