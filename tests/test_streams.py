@@ -118,21 +118,6 @@ def test_a_change_anywhere_in_the_last_part_of_a_step_but_on_its_end_is_over_by_
     assert (found is not None and found[:, 0].tolist() == [False, False, True, False, False]) == over
 
 
-@pytest.mark.parametrize("pause", [7.0, 7.25, 7.5, 7.75])
-def test_no_row_is_lost_behind_a_pause_that_ends_within_a_step(pause):
-    """Rows jitter by a tenth of a step, and have a point each, in their order, with the stamp that they have."""
-    place = np.arange(300.0) + np.random.default_rng(8).uniform(-0.1, 0.1, 300)
-    place[0] = 0.0
-    place[100:] += pause
-    t = 0.05 * place
-    y, at = nearest(Stream(t, t[:, None]), 0.05, [])
-    there = np.isfinite(y[:, 0])
-    assert np.array_equal(y[there, 0], t)
-    assert np.array_equal(at[there], t)
-    assert (np.diff(at) > 0.0).all()
-    assert np.abs(at / 0.05 - np.arange(len(at))).max() < 0.8  # where a row is follows from its stamp, to within a step
-
-
 def test_of_rows_that_come_twice_a_step_the_nearest_counts():
     t = 0.025 * np.arange(200)
     y, at = nearest(Stream(t, t[:, None]), 0.05, [])
@@ -152,9 +137,3 @@ def test_stamps_of_arrival_stay_in_their_order(late, seed):
     there = np.isfinite(y[:, 0])
     assert np.array_equal(y[there, 0], at[there])
     assert np.count_nonzero(there) >= len(np.unique(np.rint(place - place[0])))  # as the nearest points would have
-
-
-def test_one_row_far_from_the_point_after_that_of_the_row_before_is_not_before_it():
-    t = np.array([0, 1, 2, 3, 4, 5, 6, 7, 7.6, 8.45, 9.25, 9.4, 11.6, 12.6, 13.6, 14.6])
-    _, at = nearest(Stream(t, t[:, None]), 1.0, [])
-    assert (np.diff(at) > 0.0).all()

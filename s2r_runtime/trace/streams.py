@@ -24,9 +24,6 @@ ALIGNED = 0.02
 ROUNDING = 1e-3
 """Of a part's length: a change this near to an edge, or nearer than stamps can tell, is on it: stamps are printed with some digits."""
 
-APART, FARTHEST = 0.9, 0.8
-"""Steps that rows are apart where each has a point of its own, and by which it may be away from that."""
-
 TOGETHER = 0.8
 """If this part of the rows with the rarest state has all states, they come on the same stamps, and the rest is left."""
 
@@ -272,29 +269,15 @@ def at_grid(states: Stream, dt: float, angles: list[int]) -> Array:
 
 
 def nearest(states: Stream, dt: float, angles: list[int]) -> tuple[Array, Array]:
-    """(K + 1, nx) the row of each point of the grid, and (K + 1,) its stamp (of a point without a row: where the grid has it)."""
+    """(K + 1, nx) the row nearest to each point of the grid, and (K + 1,) its stamp (of a point without a row: where the grid has it)."""
     place = (states.t - states.t[0]) / dt
-    point = _points(place)
+    point = np.rint(place).astype(np.int64)
     order = np.argsort(-np.abs(place - point), kind="stable")  # the nearest one is written last
     y = np.full((int(point.max()) + 1, states.values.shape[1]), np.nan)
     at = states.t[0] + dt * np.arange(len(y))
     y[point[order]] = states.values[order]
     at[point[order]] = states.t[order]
     return unwrapped(y, angles), at
-
-
-def _points(place: Array) -> NDArray[np.int64]:
-    """(N,) the point of each row, whose place is in steps: the nearest one. Where rows come about a step apart and two have the same one,
-    the next after that of the row before, up to FARTHEST away: after a pause that ends within a step, every second row would be lost else.
-    """
-    point = np.rint(place).astype(np.int64)
-    if np.all(np.diff(point) > 0) or np.median(np.diff(place)) < APART:
-        return point
-    following = point.tolist()
-    for k, at in enumerate(place.tolist()[1:], start=1):
-        after = following[k - 1] + 1
-        following[k] = after if abs(at - after) <= FARTHEST else max(following[k], following[k - 1])
-    return np.array(following)
 
 
 def held_between(inputs: Stream, at: Array, parts: int) -> Array:
