@@ -206,9 +206,8 @@ def test_outliers_that_an_input_could_have_made_are_left_out_where_tails_are_hea
     assert np.mean(np.isnan(checked.data.runs[0].y[~(off != 0.0).any(axis=1)]).any(axis=1)) < 0.02
 
 
-@pytest.mark.parametrize("steps", [20])
 @pytest.mark.parametrize("kind", ["dropout", "clock_step"])
-def test_a_silence_is_told_from_a_clock_that_jumped(kind, steps):
+def test_a_silence_is_told_from_a_clock_that_jumped(kind):
     rng = np.random.default_rng(9)
     u = commands(rng, 1, STEPS, DT, [(0.1, 0.2), (-1.0, 1.0)], rest=0.0)
     y = drive(rng, "unicycle", u, ROBOTARIUM, DT, NOISE)[0]
@@ -216,16 +215,15 @@ def test_a_silence_is_told_from_a_clock_that_jumped(kind, steps):
     keep = np.ones(STEPS + 1, dtype=bool)
     if kind == "dropout":
         keep[400:420] = False
-        t[420:] += (steps - 20) * DT
     else:
-        t[400:] += steps * DT
+        t[400:] += 20 * DT
     data = from_streams(declared(), [(Stream(t[keep], y[keep]), Stream(t[:-1], u[0]))], "here")
     assert np.count_nonzero(np.isfinite(data.runs[0].y).all(axis=1)) == np.count_nonzero(keep)
     checked = check(declared(), data)
     (fault,) = checked.faults
     assert (fault.kind, fault.channel) == (kind, "*")
     across = [step for _, step in checked.left_out]  # no rollout goes on in time that there was not
-    assert across == (list(range(399, 399 + int(1 + steps))) if kind == "clock_step" else [])
+    assert across == (list(range(399, 420)) if kind == "clock_step" else [])
     assert fault.from_s == pytest.approx(399 * DT, abs=1e-6)
 
 

@@ -267,6 +267,9 @@ def test_what_is_done_at_two_times_is_not_done_at_one_because_nothing_between_th
     steps = steps_of(one)
     seen = (steps.place < 180) | ((steps.place >= 300) & (steps.place < 480))
     assert not verdict._once(problem(one, steps.take(seen)), weak, model)
+    sparse = steps.take(steps.place % 10 == 0)  # as of a long recording, of which a part is fitted
+    long = from_arrays(model, [(np.zeros((601, 2)), pushed(280, 295, 310))])
+    assert verdict._once(problem(long, sparse), weak, model)
     two = from_arrays(model, [(np.zeros((601, 2)), pushed(585)), (np.zeros((601, 2)), pushed(0))])
     assert not verdict._once(problem(two, steps_of(two)), weak, model)
 

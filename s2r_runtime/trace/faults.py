@@ -102,7 +102,7 @@ def check(model: ComposedModel, data: Dataset, under: ComposedModel | None = Non
         left_out += jumps.cut
         sure += jumps.sure
         outliers += len(jumps.tails)
-        strays += [(i, stray, in_time) for stray, in_time in zip(jumps.strays, jumps.in_time, strict=True)]
+        strays += [(i, stray, in_time) for stray, in_time in jumps.strays.items()]
         if pose is not None:
             found += _inconsistent(model, data, act, i, bad[i], reach, pose)
     rows = sum(len(run.y) for run in data.runs)

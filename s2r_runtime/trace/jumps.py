@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -67,20 +68,19 @@ class Jumps:
     offsets: list[Fault]
     cut: list[tuple[int, int]]
     sure: list[Fault]
-    strays: list[Fault]
-    in_time: list[bool]
+    strays: dict[Fault, bool]
 
 
 def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: Reach, *, of_positions: bool = False) -> Jumps:
     """Of run i; marks in `bad` what of it is wrong. of_positions: no other states are looked at."""
     run = data.runs[i]
-    found = Jumps([], [], [], [], [], [], [])
+    found = Jumps([], [], [], [], [], {})
     if len(run.y) < 3:
         return found
     foretold = predicted(model, data, act, i)
     e, moves = model.difference(run.y[1:], foretold), model.difference(foretold, run.y[:-1])
     change = model.difference(run.y[1:].copy(), run.y[:-1])
-    between = _between(change)
+    between = _Rows(change)
     pose = {"x", "y", "theta"} if getattr(model.nominal, "integration", None) is not None else set()
     goes_on = pose | {model.states[axis.position] for axis in axes(model.nominal)}  # as its speed says, which is a state of its own
     for j, name in enumerate(model.states):
@@ -99,8 +99,7 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
             if rows is not None and abs(float(series[k])) <= limit[k]:  # a row that was stamped late is as far away, and back
                 stray = Fault(run.start_s + data.dt * rows[0], run.start_s + data.dt * rows[1], name, "spike")
                 if stray not in found.strays:
-                    found.strays.append(stray)
-                    found.in_time.append(rows[0] == rows[1] and between.in_time(j, rows[0]))
+                    found.strays[stray] = rows[0] == rows[1] and between.in_time(j, rows[0])
                 continue
             if rows is not None:
                 bad[rows[0] : rows[1] + 1, j] = True
@@ -118,13 +117,20 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
 
 @dataclass(frozen=True)
 class _Rows:
-    """How rows lie between the two around them: change (K, nx) in each step; off (K - 1, nx) from the mean of the two; usual (nx,) of that,
-    by its median; not a number where a state was not measured.
-    """
+    """How rows lie between the two around them. change: (K, nx) how far states went in each step."""
 
     change: Array
-    off: Array
-    usual: Array
+
+    @cached_property
+    def off(self) -> Array:
+        """(K - 1, nx) from the mean of the two."""
+        return 0.5 * (self.change[:-1] - self.change[1:])
+
+    @cached_property
+    def usual(self) -> Array:
+        """(nx,) of that, by its median; not a number where a state was not measured."""
+        finite = [one[np.isfinite(one)] for one in np.abs(self.off).T]
+        return np.array([np.median(one) / 0.6745 if len(one) else np.nan for one in finite])
 
     def in_time(self, j: int, row: int) -> bool:
         """Whether another state of a row says clearly that its stamp is right, of which the state j is off. Had it come late, the others
@@ -139,12 +145,6 @@ class _Rows:
         gone = np.abs([self.change[row - 1], self.change[row - 1] + self.change[row - 2]])
         says = (np.abs(expected) > least) & (np.abs(self.off[row - 1]) < 0.5 * np.abs(expected)) & np.all(gone > least, axis=0)
         return bool(np.any(says & (np.arange(len(pace)) != j)))
-
-
-def _between(change: Array) -> _Rows:
-    off = 0.5 * (change[:-1] - change[1:])
-    finite = [one[np.isfinite(one)] for one in np.abs(off).T]
-    return _Rows(change, off, np.array([np.median(one) / 0.6745 if len(one) else np.nan for one in finite]))
 
 
 def _pace(moves: Array, change: Array) -> Array:

@@ -218,9 +218,10 @@ def _once(given: Problem, model: ComposedModel, less: ComposedModel) -> bool:
     """Whether an effect does what it does at one time only: somebody may have held the robot there."""
     apart = model.difference(*(given.predicted(m) for m in (model, less)))
     done = np.append(0.0, np.cumsum(np.sum((apart / np.maximum(rms(apart), 1e-300)) ** 2, axis=1)))
-    long = math.ceil(len(apart) / TIMES)
-    at = given.steps.place + long * given.steps.run  # what was held out lies between, and so does the time between runs
-    ends = np.searchsorted(at, at + long)
+    place = given.steps.place
+    rows, reach = math.ceil(len(place) / TIMES), math.ceil((np.ptp(place) + 1) / TIMES) if len(place) else 0
+    at = place + reach * given.steps.run  # what was held out, or thinned away, lies between, and so does the time between runs
+    ends = np.minimum(np.searchsorted(at, at + reach), np.arange(len(place)) + rows)
     return bool(np.max(done[ends] - done[:-1], initial=0.0) > MOSTLY * done[-1])
 
 
