@@ -38,11 +38,14 @@ LARGEST = 1e30
 
 @dataclass(frozen=True)
 class Table:
-    """t: (N,) s. columns: name -> (N,), NaN where nothing was received. segment: (N,) number of the run, 0, 1, ..., or None."""
+    """t: (N,) s. columns: name -> (N,), NaN where nothing was received. segment: (N,) number of the run, 0, 1, ..., or None; segments: what
+    the file calls them.
+    """
 
     t: Array
     columns: dict[str, Array]
     segment: NDArray[np.int64] | None
+    segments: tuple[str, ...] = ()
 
     def content_digest(self, names: Sequence[str]) -> str:
         """Digest of the numbers in `t`, since the first stamp and to the microsecond, and in these columns: the same for every
@@ -71,9 +74,9 @@ def read_csv(path: Path | str, wanted: Sequence[str] | None = None, optional: Se
     t = numbers.pop(time)
     if blank := np.flatnonzero(np.isnan(t)).tolist():
         raise RecordingError(f"{path}: line {lines[blank[0]]}: column {time!r} is blank, every row needs its stamp")
-    segment = _segments(path, cells[header.index(SEGMENT)], lines) if SEGMENT in header else None
+    segment, called = _segments(path, cells[header.index(SEGMENT)], lines) if SEGMENT in header else (None, ())
     _check_time(path, t, segment, lines)
-    return Table(t, numbers, segment)
+    return Table(t, numbers, segment, called)
 
 
 def header_of(path: Path | str) -> list[str]:
@@ -186,8 +189,8 @@ def _number(path: Path, name: str, cell: str, line: int) -> float:
         raise RecordingError(f"{path}: line {line}: column {name!r} is {cell!r}, must {must}") from None
 
 
-def _segments(path: Path, cells: tuple[str, ...], lines: list[int]) -> NDArray[np.int64]:
-    """(N,) 0, 1, ... in order of appearance."""
+def _segments(path: Path, cells: tuple[str, ...], lines: list[int]) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+    """(N,) 0, 1, ... in order of appearance, and what each is called."""
     numbers: list[int] = []
     seen: dict[str, int] = {}
     for label, rows in groupby(cell.strip() for cell in cells):
@@ -198,7 +201,7 @@ def _segments(path: Path, cells: tuple[str, ...], lines: list[int]) -> NDArray[n
             raise RecordingError(f"{path}: line {line}: segment {label!r} goes on after another one began; its rows must stand together")
         seen[label] = len(seen)
         numbers += [seen[label]] * sum(1 for _ in rows)
-    return np.array(numbers, dtype=np.int64)
+    return np.array(numbers, dtype=np.int64), tuple(seen)
 
 
 def _check_time(path: Path, t: Array, segment: NDArray[np.int64] | None, lines: list[int]) -> None:

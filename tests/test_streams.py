@@ -118,6 +118,28 @@ def test_a_change_anywhere_in_the_last_part_of_a_step_but_on_its_end_is_over_by_
     assert (found is not None and found[:, 0].tolist() == [False, False, True, False, False]) == over
 
 
+@pytest.mark.parametrize("pause", [7.0, 7.25, 7.4, 7.5, 7.6, 7.75])
+def test_no_row_is_lost_behind_a_pause_that_ends_within_a_step(pause):
+    """Rows jitter by a tenth of a step, and have a point each, in their order, with the stamp that they have."""
+    place = np.arange(300.0) + np.random.default_rng(8).uniform(-0.1, 0.1, 300)
+    place[0] = 0.0
+    place[100:] += pause
+    t = 0.05 * place
+    y, at = nearest(Stream(t, t[:, None]), 0.05, [])
+    there = np.isfinite(y[:, 0])
+    assert np.array_equal(y[there, 0], t)
+    assert np.array_equal(at[there], t)
+    assert (np.diff(at) > 0.0).all()
+    assert np.abs(at / 0.05 - np.arange(len(at))).max() < 0.7
+
+
+def test_rows_that_come_a_little_faster_than_the_grid_are_where_they_are():
+    """None of the points between two pauses is half a step away for all of them: only the nearest rows are taken."""
+    place = np.concatenate([0.97 * np.arange(200.0), 220.5 + 0.97 * np.arange(200.0)])
+    _, at = nearest(Stream(place, place[:, None]), 1.0, [])
+    assert np.abs(at - np.arange(len(at))).max() <= 0.5
+
+
 def test_of_rows_that_come_twice_a_step_the_nearest_counts():
     t = 0.025 * np.arange(200)
     y, at = nearest(Stream(t, t[:, None]), 0.05, [])

@@ -18,6 +18,7 @@ from s2r_runtime.trace.residual import rms
 from s2r_runtime.trace.shape import Component, Shape, components, derived, strongest, variables
 
 if TYPE_CHECKING:
+    from s2r_runtime.trace.fault import Fault
     from s2r_runtime.trace.result import TraceResult
 
 Array = NDArray[np.float64]
@@ -29,6 +30,9 @@ LABEL = 12
 
 LISTED = 6
 """Faults, and effects that could not have been seen, that are listed one by one."""
+
+SEGMENTS = 8
+"""Names of segments that are listed."""
 
 TOLD, FOLLOWED, SEEN = 1.05, 0.3, 0.1
 """A part of the residual is spoken of from this many times the noise on; what it follows, from this share (of all of it) on."""
@@ -255,19 +259,46 @@ def _beyond_doubt(r: TraceResult) -> list[str]:
 
 
 def _faults(r: TraceResult) -> Iterator[str]:
-    """What stands at one time on several channels is one line."""
-    loud = sorted((f for f in r.faults if f.kind != "dropout"), key=lambda f: (f.from_s, f.to_s, f.kind))
+    """What stands at one time on several channels is one line; so is what several segments have."""
+    loud = sorted((f for f in r.faults if f.kind != "dropout" and not f.segment), key=lambda f: (f.from_s, f.to_s, f.kind))
     grouped = [(key, [f.channel for f in found]) for key, found in groupby(loud, key=lambda f: (f.from_s, f.to_s, f.kind))]
-    for (begin, end, kind), channels in grouped[:LISTED]:
-        where = ", ".join("all" if c == "*" else c for c in channels)
-        yield f"{kind} of {where} at {begin:.3f} s" if end == begin else f"{kind} of {where} from {begin:.3f} to {end:.3f} s"
-    if len(grouped) > LISTED:
-        yield f"and {len(grouped) - LISTED} more (all of them: --json)"
+    told = [f"{kind} of {_channels(channels)} {_when(begin, end)}" for (begin, end, kind), channels in grouped]
+    told += _in_segments([f for f in r.faults if f.kind != "dropout" and f.segment])
+    yield from told[:LISTED]
+    if len(told) > LISTED:
+        yield f"and {len(told) - LISTED} more (all of them: --json)"
     silent = [f for f in r.faults if f.kind == "dropout"]
     if silent:
         yield f"{len(silent)} dropout{'s' if len(silent) > 1 else ''}, the longest {max(f.to_s - f.from_s for f in silent):.3g} s"
     if any(f.kind != "late" for f in r.faults):
         yield "what they spoil is left out"
+
+
+def _in_segments(faults: Sequence[Fault]) -> list[str]:
+    """Those of recordings whose runs have names."""
+    at: dict[tuple[str, float, float, str], list[str]] = {}
+    for f in faults:
+        at.setdefault((f.segment, f.from_s, f.to_s, f.kind), []).append(f.channel)
+    alike: dict[str, list[tuple[str, float, float]]] = {}
+    for (segment, begin, end, kind), channels in at.items():
+        alike.setdefault(f"{kind} of {_channels(channels)}", []).append((segment, begin, end))
+    told = []
+    for what, places in alike.items():
+        names = list(dict.fromkeys(segment for segment, _, _ in places))
+        if len(names) == 1:
+            told += [f"{what} in segment {segment} {_when(begin, end)}" for segment, begin, end in places]
+            continue
+        more = f" and {len(names) - SEGMENTS} more (all of them: --json)" if len(names) > SEGMENTS else ""
+        told.append(f"{what} in segments {', '.join(names[:SEGMENTS])}{more}")
+    return told
+
+
+def _channels(channels: Sequence[str]) -> str:
+    return ", ".join("all" if c == "*" else c for c in channels)
+
+
+def _when(begin: float, end: float) -> str:
+    return f"at {begin:.3f} s" if end == begin else f"from {begin:.3f} to {end:.3f} s"
 
 
 def _unseen(r: TraceResult) -> list[str]:

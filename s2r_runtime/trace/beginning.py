@@ -155,4 +155,4 @@ def _preceded(data: Dataset, run: Run, steps: int, before: Array) -> Run:
     first = np.tile(before, (steps * data.substeps, 1))
     lasts = None if run.lasts is None else np.concatenate([np.full(steps, data.dt), run.lasts])
     turned = None if run.turned is None else np.concatenate([np.zeros((steps, run.u.shape[1]), dtype=bool), run.turned])
-    return Run(run.start_s - steps * data.dt, y, np.concatenate([first, run.u]), lasts, turned)
+    return Run(run.start_s - steps * data.dt, y, np.concatenate([first, run.u]), lasts, turned, run.segment)

@@ -85,13 +85,16 @@ FINER_PARTS = 8
 LONG_S = 0.04
 """Steps longer than this are taken in parts where speeds were not measured: a position says when within a step a force acted."""
 
+SILENT = 0.8
+"""Of a pause of the states that no input comes in, for nothing to have been received."""
+
 BEFORE = 600
 """Steps before the first state for which inputs are kept at most: hidden states have settled then."""
 
 
 @dataclass(frozen=True)
 class Pause:
-    """No states between two stamps of a run, seconds; states before and after, (nx,). silent: nor anything else."""
+    """No states between two stamps of a run, seconds; states before and after, (nx,). silent: nor anything else, or nearly."""
 
     from_s: float
     to_s: float
@@ -105,7 +108,7 @@ class Pause:
 @dataclass(frozen=True)
 class Run:
     """One contiguous stretch. start_s: of its first row; y: (K+1, nx); u: (K S, nu); lasts: (K,) s, of each step (None: dt).
-    turned: (K, nu) steps in whose last part an input changes (`streams.turned`; None: in none).
+    turned: (K, nu) steps in whose last part an input changes (`streams.turned`; None: in none). segment: which of the recording's it is of.
     """
 
     start_s: float
@@ -113,6 +116,7 @@ class Run:
     u: Array
     lasts: Array | None = None
     turned: Mask | None = None
+    segment: int = 0
 
     def durations(self, dt: float) -> Array:
         """(K,) s, of each step."""
@@ -164,6 +168,8 @@ class Dataset:
     """The first rows of runs count, whatever the model makes of them: the tracer found nothing that remembers what was before."""
     unplaced: bool = False
     """Commands changed between rows, nobody knows when: transitions in which one does are left out (`unplaced`)."""
+    called: tuple[str, ...] = ()
+    """Names of its segments; empty if it has one, or none has a name."""
     forgetting: tuple[tuple[float, float], ...] = ()
     """From and to, s: first rows of runs that are left out, in which something may act on that nobody recorded (`beginning`)."""
 
@@ -173,6 +179,10 @@ class Dataset:
         lasts = [np.repeat(run.durations(self.dt) / self.substeps, self.substeps) for run in self.runs] if self.uneven else None
         starts, turned = [run.start_s for run in self.runs], [run.turned for run in self.runs]
         return Inputs([run.u for run in self.runs], self.dt / self.substeps, starts, lasts, self.substeps, turned)
+
+    def segment_of(self, run: int) -> str:
+        """What the recording calls the segment that a run is of, or nothing."""
+        return self.called[self.runs[run].segment] if self.called else ""
 
     @property
     def uneven(self) -> bool:
@@ -247,7 +257,8 @@ def from_streams(
     were measured at one moment only.
     """
     dt = model.dt
-    stretches = _stretches(model, segments, source)
+    pieces = _stretches(model, segments, source)
+    stretches = [part for _, part in pieces]
     spacing = _spacing(stretches, dt, source)
     apart = math.ceil(spacing / dt - ALIGNED) if spacing > SLOWEST * dt else 1
     if reconstruction is not None:
@@ -265,7 +276,7 @@ def from_streams(
         inputs=model.inputs,
         dt=dt,
         substeps=parts,
-        runs=tuple(runs),
+        runs=tuple(replace(run, segment=k) for run, (k, _) in zip(runs, pieces, strict=True)),
         interpolated=not exact and not as_they_are,
         rows=sum(len(states.t) for states, _ in stretches),
         source=source,
@@ -281,15 +292,15 @@ def from_streams(
     )
 
 
-def _stretches(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], source: str) -> list[tuple[Stream, Stream]]:
-    """What is in one piece, and long enough for a step. Raises NotEnoughEvidence if there is one moment only, RecordingError if nothing is
-    long enough, or clocks or units of time differ.
+def _stretches(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], source: str) -> list[tuple[int, tuple[Stream, Stream]]]:
+    """What is in one piece, and long enough for a step, each with the segment that it is of. Raises NotEnoughEvidence if there is one
+    moment only, RecordingError if nothing is long enough, or clocks or units of time differ.
     """
     for states, inputs in segments:
         _check_same_clock(states, inputs, source)
     _check_seconds(segments, model.dt, source)
-    pieces = [part for states, inputs in segments for part in _split(states, inputs, model)]
-    pieces = [part for part in pieces if len(part[0].t) >= 2 and part[0].t[-1] - part[0].t[0] > 0.5 * model.dt]
+    pieces = [(k, part) for k, (states, inputs) in enumerate(segments) for part in _split(states, inputs, model)]
+    pieces = [(k, part) for k, part in pieces if len(part[0].t) >= 2 and part[0].t[-1] - part[0].t[0] > 0.5 * model.dt]
     if not pieces:
         longest = max((float(states.t[-1] - states.t[0]) for states, _ in segments if len(states.t)), default=-1.0)
         if longest < 0.0:
@@ -350,7 +361,7 @@ def _after(early: int, y: Array) -> Array:
 def regridded(data: Dataset, model: ComposedModel, in_parts: int = 0, substeps: int = 0) -> Dataset:
     """The same recording on the grid of a model with another step. in_parts, substeps: as `from_streams`."""
     again = from_streams(model, data.segments, data.source, data.digests, data.paths, data.reconstruction, in_parts, substeps)
-    again = replace(again, commanded=data.commanded, measured_forces=data.measured_forces)
+    again = replace(again, commanded=data.commanded, measured_forces=data.measured_forces, called=data.called)
     return replace(again, way=data.way, noisy=data.noisy, behind=data.behind, from_first=data.from_first, unplaced=data.unplaced)
 
 
@@ -500,6 +511,9 @@ def _pauses(states: Stream, stamps: Array, run: int, usual: float, origin: float
     """Intervals between states clearly longer than usual, and than a step. stamps: of the inputs."""
     t, v, found = states.t, states.values, []
     for i in np.flatnonzero(np.diff(t) > max(1.7 * usual, 1.5 * dt)).tolist():
-        between = np.count_nonzero((stamps > t[i] + 0.1 * usual) & (stamps < t[i + 1] - 0.1 * usual))
-        found.append(Pause(float(t[i] - origin), float(t[i + 1] - origin), run, usual, v[i], v[i + 1], between == 0))
+        near = 0.1 * usual
+        between = stamps[(stamps > t[i] + near) & (stamps < t[i + 1] - near)]  # a few may come before all is silent, or after
+        longest = float(np.max(np.diff(np.concatenate([t[i : i + 1], between, t[i + 1 : i + 2]]))))
+        silent = longest >= SILENT * float(t[i + 1] - t[i])
+        found.append(Pause(float(t[i] - origin), float(t[i + 1] - origin), run, usual, v[i], v[i + 1], silent))
     return found

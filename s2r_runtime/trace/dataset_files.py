@@ -58,10 +58,11 @@ def load_dataset(
     robots = is_robot_log(paths[0])
     if is_mcap(paths[0]) and not robots:
         return replace(from_streams(model, _log_segments(paths, model, epoch), source, digests, paths), commanded=True)
+    called: tuple[str, ...] = ()
     if robots:
         segments, missing, content = _robot_segments(paths[0], model, transport)
     else:
-        segments, missing, content = _table_segments(paths[0], model, columns or {}, hidden=not bandwidth)
+        segments, missing, content, called = _table_segments(paths[0], model, columns or {}, hidden=not bandwidth)
     if not missing:
         _check_steps(model, segments)
     if behind is None:
@@ -78,7 +79,8 @@ def load_dataset(
     done = None
     if missing:
         segments, done = reconstruct(model, segments, missing, source, bandwidth, slow)
-    return replace(from_streams(model, segments, source, (*digests, content), paths, done), behind=dict(behind))
+    named = called if len(called) == len(segments) > 1 else ()  # what was reconstructed may be in more parts
+    return replace(from_streams(model, segments, source, (*digests, content), paths, done), behind=dict(behind), called=named)
 
 
 def _check_steps(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]]) -> None:
@@ -102,9 +104,10 @@ def _digest(path: Path) -> str:
 
 def _table_segments(
     path: Path, model: ComposedModel, columns: Mapping[str, str], hidden: bool
-) -> tuple[list[tuple[Stream, Stream]], tuple[str, ...], str]:
-    """The segments, the states that the table does not have although they may be left out, and the digest of what it says, however it is
-    written. A column that the caller named must be there. hidden: whether states may be left out that others tell by the model alone.
+) -> tuple[list[tuple[Stream, Stream]], tuple[str, ...], str, tuple[str, ...]]:
+    """The segments, the states that the table does not have although they may be left out, the digest of what it says, however it is
+    written, and what the segments are called. A column that the caller named must be there. hidden: whether states may be left out that
+    others tell by the model alone.
     """
     from s2r_runtime.tables import TIME, read_csv
 
@@ -126,7 +129,7 @@ def _table_segments(
         t, y, u = table.t[rows], states[rows], inputs[rows]
         measured, commanded = ~np.isnan(y).all(axis=1), ~np.isnan(u).all(axis=1)
         given.append((Stream(t[measured], y[measured]), Stream(t[commanded], u[commanded])))
-    return given, missing, table.content_digest([names[n] for n in names if n not in missing])
+    return given, missing, table.content_digest([names[n] for n in names if n not in missing]), table.segments
 
 
 def _hidden(path: Path, model: ComposedModel, free: set[str], columns: Mapping[str, str]) -> set[str]:
@@ -148,7 +151,7 @@ def _hidden(path: Path, model: ComposedModel, free: set[str], columns: Mapping[s
 def _robot_segments(
     path: Path, model: ComposedModel, transport: Mapping[str, Any] | None
 ) -> tuple[list[tuple[Stream, Stream]], tuple[str, ...], str]:
-    """As `_table_segments`, from a log in a robot's own format."""
+    """The same of a log in a robot's own format, whose segments have no names."""
     stretches = read_robot_log(path, model, transport)
     seen = ~np.isnan(np.concatenate([stretch.states.values for stretch in stretches])).all(axis=0)
     free = getattr(model.nominal, "follows", {})

@@ -172,14 +172,14 @@ def noise_floor(fit: Fit, given: Held, seed: int) -> tuple[Array, Array]:
     rng = np.random.default_rng(seed)
     begin = np.cumsum([0] + [len(run.y) - 1 for run in given.data.runs])
     rows = starts + np.searchsorted(begin, starts, side="right") - 1
-    clean = np.concatenate([run.y for run in given.data.runs])[rows]
+    y = np.concatenate([run.y for run in given.data.runs])
+    clean, far = y[rows], farthest(y)  # of all: where rollouts begin may be the origin of each run
     if not given.data.axes_without_speed and (np.any(fit.colour.strength > COLOURED) or fit.colour.slow.size):
-        ends = _coloured_ends(fit, given, act, starts[::FEWER], clean[::FEWER], rng)
+        ends = _coloured_ends(fit, given, act, starts[::FEWER], clean[::FEWER], far, rng)
         if ends is not None:
             return one, rms(ends)
     known = uncertain(fit, slope) if fit.noise.axes else noise.r
     noisy = clean + rng.normal(size=clean.shape) * np.sqrt(known)
-    far = farthest(clean)
     for h in range(given.horizon):
         clean, noisy = (no_farther(x, far) for x in _each_on(model, (clean, noisy), act, starts + h))
         noisy = noisy + rng.normal(size=clean.shape) * np.sqrt(noise.q)
@@ -201,19 +201,18 @@ def at_most_seen(floor: tuple[Array, Array], model: ComposedModel, given: Held, 
     return one, np.minimum(rolled, np.maximum(mostly, rms(ends)))
 
 
-def _coloured_ends(fit: Fit, given: Held, act: Acting, starts: Index, y: Array, rng: np.random.Generator) -> Array | None:
+def _coloured_ends(fit: Fit, given: Held, act: Acting, starts: Index, y: Array, far: Array, rng: np.random.Generator) -> Array | None:
     """(m, nx) measured less foretold at the ends of rollouts from y (m, nx), where every step's residual is drawn by the noise's law:
 
         r_k = scale (w_k + e_{k+1} - F e_k) + what of r the past foretells        (the colour of z taken for that of r)
 
-    None if that law has no end: then it says nothing of so long a time.
+    None if that law has no end: then it says nothing of so long a time. far: (nx,) sizes that nothing exceeds.
     """
     model, (q, s) = fit.model, (np.sqrt(fit.noise.q), np.sqrt(fit.noise.r))
     law, e, x = Past(fit.colour, y.shape), s * rng.normal(size=y.shape), y
     measured = [np.flatnonzero(~np.isnan(run.y).any(axis=1)) for run in given.data.runs]  # rows before the first one are inputs alone
     longest = max((int(rows[-1] - rows[0]) for rows in measured if len(rows)), default=0)
     before = longest - given.horizon  # what lasts longer than a run was not seen, nor its law
-    far = farthest(y)
     settle = min(SETTLE if fit.colour.slow.size else SETTLE // 10, max(before, 0))
     for k in range(settle + given.horizon):
         late = s * rng.normal(size=y.shape)

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from s2r_runtime.trace.dataset import Dataset
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -30,12 +34,21 @@ QUANTA = 6.0
 
 @dataclass(frozen=True)
 class Fault:
-    """An interval of the recording, s since its first stamp. channel: a state, or `*`. kind: as docs/json.md."""
+    """An interval of the recording, s since its first stamp. channel: a state, or `*`. kind: as docs/json.md. segment: what the recording
+    calls the run that it is in, if it has several.
+    """
 
     from_s: float
     to_s: float
     channel: str
     kind: str
+    segment: str = ""
+
+
+def fault_of(data: Dataset, run: int, rows: tuple[int, int], channel: str, kind: str) -> Fault:
+    """One of a run, from its first row to its last."""
+    begin, (first, last) = data.runs[run].start_s, rows
+    return Fault(begin + data.dt * first, begin + data.dt * last, channel, kind, data.segment_of(run))
 
 
 def stretches(yes: Mask) -> list[tuple[int, int]]:

@@ -19,7 +19,7 @@ makes them jump.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.dataset import Dataset, Pause
-from s2r_runtime.trace.fault import Fault
+from s2r_runtime.trace.fault import Fault, fault_of
 from s2r_runtime.trace.frozen import frozen
-from s2r_runtime.trace.heading import departures
+from s2r_runtime.trace.heading import carried, departures
 from s2r_runtime.trace.holes import bridged
 from s2r_runtime.trace.jumps import WILD_SIGMAS, Jumps, jumps_of, tails_of
 from s2r_runtime.trace.reach import Reach, predicted, reach_of
@@ -93,18 +93,23 @@ def check(model: ComposedModel, data: Dataset, under: ComposedModel | None = Non
     outliers = tails = 0
     sure: list[Fault] = []
     strays: list[tuple[int, Fault, bool]] = []
+    jumped: dict[int, Fault] = {}
     for i in range(len(data.runs)):
         tails += int(np.count_nonzero(tails_of(model, data, act, i, reach).any(axis=1)))
         found += frozen(model, data, act, i, bad[i], reach)
         jumps = jumps_of(model, data, act, i, bad[i], reach)
         spikes += jumps.spikes
         found += jumps.offsets
+        for f in jumps.offsets:
+            if pose is not None and f.channel == model.states[pose[2]] and bad[i][-1, pose[2]]:
+                jumped[i] = f
         left_out += jumps.cut
         sure += jumps.sure
         outliers += len(jumps.tails)
         strays += [(i, stray, in_time) for stray, in_time in jumps.strays.items()]
         if pose is not None:
             found += _inconsistent(model, data, act, i, bad[i], reach, pose)
+    found += _carried(data, bad, pose, jumped) if pose is not None else []
     rows = sum(len(run.y) for run in data.runs)
     for i, stray, in_time in strays if len(strays) <= max(STRAYS * rows, 1.0) else ():
         first, last = _rows(data, i, stray.from_s, stray.to_s)
@@ -126,7 +131,8 @@ def check(model: ComposedModel, data: Dataset, under: ComposedModel | None = Non
     runs = tuple(replace(run, y=np.where(b.any(axis=1, keepdims=True), np.nan, run.y)) for run, b in zip(data.runs, bad, strict=True))
     if many:  # two of them in a row look like a jump
         found = [f for f in found if f.kind != "offset_jump" or f in sure]
-    faults_ = tuple(sorted([*found, *([] if many else spikes)], key=lambda f: (f.from_s, f.channel)))
+    order = {name: k for k, name in enumerate(data.called)}
+    faults_ = tuple(sorted([*found, *([] if many else spikes)], key=lambda f: (order.get(f.segment, 0), f.from_s, f.channel)))
     return Checked(bridged(replace(data, runs=runs)), faults_, tuple(sorted(set(left_out))), _untold(data, bad, faults_))
 
 
@@ -145,11 +151,13 @@ def _rows(data: Dataset, run: int, *at: float) -> tuple[int, ...]:
 def _untold(data: Dataset, bad: list[Mask], faults_: Sequence[Fault]) -> int:
     """Rows that are taken out and lie in no fault that is told."""
     count = 0
-    for run, mask in zip(data.runs, bad, strict=True):
-        t, there = run.start_s + data.dt * np.arange(len(mask)), mask.any(axis=1)
-        for f in (f for f in faults_ if f.kind != "offset_jump"):
-            there &= (t < f.from_s - 0.5 * data.dt) | (t > f.to_s + 0.5 * data.dt)
-        count += int(np.count_nonzero(there))
+    for i, (run, mask) in enumerate(zip(data.runs, bad, strict=True)):
+        t, segment, there = run.start_s + data.dt * np.arange(len(mask)), data.segment_of(i), mask.copy()
+        for f in (f for f in faults_ if f.segment == segment):
+            columns = [j for j, name in enumerate(data.states) if f.channel in {name, "*"}]
+            within = (t > f.from_s - 0.5 * data.dt) & (t < f.to_s + 0.5 * data.dt)
+            there[within[:, None] & np.isin(np.arange(there.shape[1]), columns)] = False
+        count += int(np.count_nonzero(there.any(axis=1)))
     return count
 
 
@@ -187,8 +195,10 @@ def _of_pause(model: ComposedModel, data: Dataset, act: Acting, pause: Pause, re
         steady = np.abs(np.nanmean(before, axis=0) - np.nanmean(after, axis=0)) < 0.5 * np.abs(pace)
         by_pace = np.any(stood & steady & (apart > 2.0 * noise)) and np.all(stood | reach.instant)
         if by_pace or _one_step_on(model, data, act, pause, first, reach):
-            return Fault(pause.from_s, pause.to_s, "*", "clock_step")
-    return Fault(pause.from_s, pause.to_s, "*", "dropout") if pause.to_s - pause.from_s > LONG * pause.usual_s else None
+            return Fault(pause.from_s, pause.to_s, "*", "clock_step", data.segment_of(pause.run))
+    if pause.to_s - pause.from_s <= LONG * pause.usual_s:
+        return None
+    return Fault(pause.from_s, pause.to_s, "*", "dropout", data.segment_of(pause.run))
 
 
 def _one_step_on(model: ComposedModel, data: Dataset, act: Acting, pause: Pause, first: int, reach: Reach) -> bool:
@@ -210,6 +220,22 @@ def _pose(model: ComposedModel) -> list[int] | None:
     return [model.states.index(name) for name in ("x", "y", "theta")]
 
 
+def _carried(data: Dataset, bad: list[Mask], pose: list[int], jumped: Mapping[int, Fault]) -> list[Fault]:
+    """A heading that is off in whole runs. jumped: where it jumped for good, by run."""
+    if len(data.runs) < 2:
+        return []
+    jumps = {}
+    for i, fault in jumped.items():
+        (step,) = _rows(data, i, fault.from_s)
+        jumps[i] = float(data.runs[i].y[step, pose[2]] - data.runs[i].y[step - 1, pose[2]])
+    found = []
+    for i in carried([np.where(mask, np.nan, run.y)[:, pose] for run, mask in zip(data.runs, bad, strict=True)], jumps):
+        there = np.flatnonzero(np.isfinite(data.runs[i].y[:, pose[2]]))
+        bad[i][there, pose[2]] = True
+        found.append(fault_of(data, i, (int(there[0]), int(there[-1])), data.states[pose[2]], "offset_jump"))
+    return found
+
+
 def _inconsistent(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: Reach, pose: list[int]) -> list[Fault]:
     """A heading that leaves the motion, by more than a spike or a jump."""
     run = data.runs[i]
@@ -224,5 +250,5 @@ def _inconsistent(model: ComposedModel, data: Dataset, act: Acting, i: int, bad:
     for off in departures(y, turned, foretold - run.y[:-1, pose[2]], noise):
         beside = round(BESIDE * (off.last - off.first))
         bad[max(0, off.first - beside) : off.last + beside + 1, pose[2]] = True
-        found.append(Fault(run.start_s + data.dt * off.first, run.start_s + data.dt * off.last, model.states[pose[2]], "inconsistent"))
+        found.append(fault_of(data, i, (off.first, off.last), model.states[pose[2]], "inconsistent"))
     return found

@@ -5,6 +5,7 @@ its readings, stands still.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,8 @@ from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes, lone_speeds
 from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.fault import FROZEN_ROWS, QUANTA, REPEATS, RESTLESS, RESTS, SIGMAS, Fault, stretches
+from s2r_runtime.trace.fault import FROZEN_ROWS, QUANTA, REPEATS, RESTLESS, RESTS, SIGMAS, Fault, fault_of, stretches
+from s2r_runtime.trace.holes import filled
 from s2r_runtime.trace.reach import Reach, predicted
 from s2r_runtime.trace.residual import Acting, advanced, first_steps
 
@@ -43,22 +45,29 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
     """Exact repeats through which the model moves the state by more than noise and quantisation, and after which it catches up.
 
     Without catching up the robot itself may have stood still; only a long silence of a state that jitters otherwise is then a fault; or one
-    of a state that jitters on other rows on which the robot stands, or nearly; or of a speed that jitters, and is not zero.
+    of a state that jitters on other rows on which the robot stands, or nearly; or of a speed that jitters, and is not zero. A silence in
+    which a run begins or ends catches up with nothing: one of a state that repeats nowhere else, while others move, is a fault.
     """
     run = data.runs[i]
     if len(run.y) < FROZEN_ROWS + 1:
         return []
     foretold = predicted(model, data, act, i)
-    moves, e = model.difference(foretold, run.y[:-1]), model.difference(run.y[1:], foretold)
+    e = model.difference(run.y[1:], foretold)
+    run = replace(run, y=filled(run.y))
+    if run.y is not data.runs[i].y:  # a row that is lost amid a silence does not end it
+        data = replace(data, runs=(*data.runs[:i], run, *data.runs[i + 1 :]))
+        foretold = predicted(model, data, act, i)
+    moves = model.difference(foretold, run.y[:-1])
     speeds = {model.states.index(name) for name in lone_speeds(model.nominal)} | {axis.velocity for axis in axes(model.nominal)}
     speeds |= {*np.flatnonzero(reach.instant).tolist()}
     asked = run.u.reshape(len(run.y) - 1, -1, run.u.shape[1]).mean(axis=1)
     found = []
     for j, name in enumerate(model.states):
         change = np.abs(np.diff(run.y[:, j]))
-        if not np.isfinite(reach.noise[j]) or not np.any(change > 0.0):
+        there = change > 0.0
+        quantum = float(np.min(change[there])) if np.any(there) else float(reach.quantum[j])
+        if not np.isfinite(reach.noise[j]) or not np.isfinite(quantum):
             continue
-        quantum = float(np.min(change[change > 0.0]))
         least = SIGMAS * reach.noise[j] + QUANTA * quantum
         for a, b in stretches(change == 0.0):
             if b - a < FROZEN_ROWS:
@@ -82,9 +91,30 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
             off = math.remainder(off, math.tau) if name in model.nominal.angles else off
             caught_up = b < len(e) and abs(expected) > least and abs(off) < 0.5 * abs(expected)
             jitters = reach.noise[j] > QUANTA * quantum  # even where the robot stands
-            if caught_up or (b - a > LONG_FROZEN and jitters and far > 10.0 * reach.move[j]):
+            ends = (a == 0 or b == len(e)) and not caught_up and _alone(data, reach, i, j, (a, b))
+            if caught_up or ends or (b - a > LONG_FROZEN and jitters and far > 10.0 * reach.move[j]):
                 found.append(_taken_out(data, i, j, name, (a, b), bad))
     return found + _with_them(model, data, i, bad)
+
+
+def _alone(data: Dataset, reach: Reach, i: int, j: int, within: tuple[int, int]) -> bool:
+    """Whether state j repeats over the steps [a, b) of run i, for long, although it hardly ever does on other rows of any run on which the
+    model moves it the same way, by no more. Not before others move, either: a robot may answer late. Nor at an end of where it ever is: a
+    wall may hold it there.
+    """
+    a, b = within
+    y, moves = data.runs[i].y, reach.moves[i][a:b, j]
+    others_move = float(np.max(np.mean(np.diff(y[a : b + 1], axis=0) != 0.0, axis=0))) > FOLLOWED
+    if b - a < RESTLESS or not (others_move or b == len(y) - 1):
+        return False
+    way, most = math.copysign(1.0, float(np.nansum(moves))), float(np.nanmax(np.abs(moves)))
+    still = []
+    for run, move in zip(data.runs, reach.moves, strict=True):
+        asked = (way * move[:, j] > 0.0) & (way * move[:, j] <= most) & (run.y[:-1, j] != y[a, j])
+        change = np.diff(run.y[:, j])[asked]
+        still.append(change[np.isfinite(change)] == 0.0)
+    others, every = np.concatenate(still), np.concatenate([run.y[:, j] for run in data.runs])
+    return len(others) >= RESTS and bool(np.mean(others) < REPEATS and np.nanmin(every) < y[a, j] < np.nanmax(every))
 
 
 def _led(model: ComposedModel, data: Dataset, act: Acting, i: int, within: tuple[int, int]) -> Array:
@@ -129,8 +159,7 @@ def _taken_out(data: Dataset, i: int, j: int, name: str, within: tuple[int, int]
     """State j of run i, which repeats over the steps [a, b), marked in `bad` (K+1, nx) on the rows that repeat the first one."""
     a, b = within
     bad[a + 1 : b + 1, j] = True
-    begun = data.runs[i].start_s
-    return Fault(begun + data.dt * a, begun + data.dt * b, name, "frozen")
+    return fault_of(data, i, within, name, "frozen")
 
 
 def _ignored(foretold: Array, y: Array, within: tuple[int, int], least: float) -> bool:

@@ -151,7 +151,8 @@ def part(data: Dataset, left_out: tuple[tuple[int, int], ...], seen: Mask, most:
         out += [(len(runs), a - 1 - early) for (_, before), (a, _) in pairwise(kept) if a == before + 1]
         lasts = None if given.lasts is None else given.lasts[early:end]
         turned = None if given.turned is None else given.turned[early:end] & (np.arange(early, end) < end - 1)[:, None]
-        runs.append(Run(float(given.begins(data.dt)[early]), y, given.u[early * data.substeps : end * data.substeps], lasts, turned))
+        u = given.u[early * data.substeps : end * data.substeps]
+        runs.append(Run(float(given.begins(data.dt)[early]), y, u, lasts, turned, given.segment))
     made = replace(data, runs=tuple(runs))
     return Part(made, steps_of(made, out), tuple(out))
 

@@ -13,11 +13,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.trace.dataset import Dataset, Run
+from s2r_runtime.trace.fault import stretches
 
 Array = NDArray[np.float64]
 
 BRIEF = 4
 """Rows that are bridged at most."""
+
+FEW = 3
+"""Rows that a line is put through."""
+
+
+def filled(y: Array) -> Array:
+    """y (K+1, nx) with a line through gaps of FEW rows or less, for what may be rough: between two values that are the same, that value."""
+    lost = np.asarray(np.isnan(y).any(axis=1))
+    gaps = [(a, b) for a, b in stretches(lost) if a > 0 and b < len(y) and b - a <= FEW]
+    if not gaps:
+        return y
+    y = y.copy()
+    for a, b in gaps:
+        share = np.arange(1, b - a + 1)[:, None] / (b - a + 1)
+        y[a:b] = y[a - 1] + share * (y[b] - y[a - 1])
+    return y
 
 
 def bridged(data: Dataset) -> Dataset:

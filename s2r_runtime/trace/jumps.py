@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.fault import SIGMAS, Fault
+from s2r_runtime.trace.fault import SIGMAS, Fault, fault_of
 from s2r_runtime.trace.heading import wrong_before
 from s2r_runtime.trace.reach import ONE_IN, Reach, predicted
 from s2r_runtime.trace.residual import Acting
@@ -97,18 +97,24 @@ def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask
                 continue
             rows = _there_and_back(series, k)
             if rows is not None and abs(float(series[k])) <= limit[k]:  # a row that was stamped late is as far away, and back
-                stray = Fault(run.start_s + data.dt * rows[0], run.start_s + data.dt * rows[1], name, "spike")
+                stray = fault_of(data, i, rows, name, "spike")
                 if stray not in found.strays:
                     found.strays[stray] = rows[0] == rows[1] and between.in_time(j, rows[0])
                 continue
             if rows is not None:
                 bad[rows[0] : rows[1] + 1, j] = True
                 kind = found.spikes if abs(float(series[k])) > tail else found.tails
-                kind.append(Fault(run.start_s + data.dt * rows[0], run.start_s + data.dt * rows[1], name, "spike"))
+                kind.append(fault_of(data, i, rows, name, "spike"))
             elif _alone(series, k) and not np.any((lost | bad[:, j])[max(k - 1, 0) : k + 3]):  # where rows lack, the way back is not seen
                 single.append(k)
         if not reach.instant[j]:
             for k, back in _offsets(series, single):
+                rows = _at_an_end(lost, k) if back is None else None
+                if rows is not None:
+                    bad[rows[0] : rows[1] + 1, j] = True
+                    kind = found.spikes if abs(float(series[k])) > tail else found.tails
+                    kind.append(fault_of(data, i, rows, name, "spike"))
+                    continue
                 _take_out(found, model, data, i, j, k, back, bad)
                 if _stays(series, k, (bad[1:, j] | bad[:-1, j], single)):
                     found.sure.append(found.offsets[-1])
@@ -193,7 +199,7 @@ def _take_out(found: Jumps, model: ComposedModel, data: Dataset, i: int, j: int,
     end = len(run.y) - 1 if back is None else back
     told = _wrong_before(model, run.y, j, k) if back is None else False
     first, last = (int(np.argmax(np.isfinite(run.y[:, j]))), k) if told else (k + 1, end)
-    found.offsets.append(Fault(run.start_s + data.dt * first, run.start_s + data.dt * last, model.states[j], "offset_jump"))
+    found.offsets.append(fault_of(data, i, (first, last), model.states[j], "offset_jump"))
     found.cut.extend([(i, k)] if back is None else [(i, k), (i, back)])
     if model.states[j] in model.nominal.angles:  # a heading that is off leaves the motion
         before = told or (told is None and k < RIGHT_AT_FIRST * len(bad))
@@ -228,6 +234,16 @@ def _there_and_back(series: Array, k: int) -> tuple[int, int] | None:
             if len(legs) == length + 1 and abs(float(np.sum(legs))) < 0.35 * abs(float(series[k])):
                 return begin + 1, begin + length
     return None
+
+
+def _at_an_end(lost: Mask, k: int) -> tuple[int, int] | None:
+    """The rows before a jump at step k if they are the first few that there are, or those after it, if they are the last: of these, nobody
+    knows whether they would have gone back. lost: (K+1,).
+    """
+    first, last = int(np.argmin(lost)), len(lost) - 1 - int(np.argmin(lost[::-1]))
+    if k - first < BRIEF:
+        return first, k
+    return (k + 1, last) if last - k <= BRIEF else None
 
 
 def _offsets(series: Array, single: list[int]) -> list[tuple[int, int | None]]:

@@ -28,6 +28,7 @@ from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.accelerations import check_accelerations
 from s2r_runtime.trace.clocks import check_clocks
 from s2r_runtime.trace.dataset import Dataset, regridded
+from s2r_runtime.trace.loosely import heading_off, loosely_unforetold, sizes
 from s2r_runtime.trace.never_measured import check_measured
 from s2r_runtime.trace.residual import acting, advanced, predicted, steps_of
 from s2r_runtime.trace.scales import SCALES, Scale, axis_pairs, groups
@@ -35,6 +36,7 @@ from s2r_runtime.trace.streams import Stream
 from s2r_runtime.trace.unforetold import STARTS, each_unforetold, some_starts, steps_ahead, trimmed, unforetold, ways_of
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Change = Callable[[Array], Array]
 
 NOTHING, WELL, BETTER = 0.35, 0.35, 0.4
@@ -48,6 +50,11 @@ NOTHING_ALONE = 0.6
 SURELY = 0.1
 """As WELL, for factors that an actuator's limits could have, too."""
 
+CHANGED, NEITHER, WORSE = 0.1, 0.8, 0.1
+"""By how much E' of one state must change to count; what it must be below, with a mistake or without; and by how much it may be above what
+E may be, of a model that lacks much.
+"""
+
 DEAD = 0.7
 """Of E with an input that does nothing, which E must be below: a motor that hardly turns is in no other unit."""
 
@@ -56,6 +63,9 @@ BEYOND = 0.01
 
 EXACTLY, FEWEST_STEPS = 0.02, 60
 """How near to a unit's factor a speed must be to its command's multiple, and on how many steps at least."""
+
+NEARLY = 0.08
+"""The same of what states are foretold, less what friction does: that is not known as well."""
 
 ALIKE = 1.5
 """Times E with states in another unit, below which E with inputs as many times larger says the same."""
@@ -78,12 +88,15 @@ SEGMENTS = 40
 
 @dataclass(frozen=True)
 class _Mistake:
-    """What it is, and how it is taken back: of states (N, nx) and inputs (N, nu). well: E below which it is believed."""
+    """What it is, and how it is taken back: of states (N, nx) and inputs (N, nu). well: E below which it is believed. by_number: if states
+    then go just as far as they should, too.
+    """
 
     said: str
     states: Change | None
     inputs: Change | None
     well: float
+    by_number: bool = False
 
 
 def check_plausible(model: ComposedModel, data: Dataset) -> None:
@@ -92,6 +105,7 @@ def check_plausible(model: ComposedModel, data: Dataset) -> None:
     """
     check_measured(model, data)
     _check_columns(model, data)
+    _check_loosely(model, data)
     check_accelerations(model, data)
     _check_angles(model, data)
     _check_scales(model, data)
@@ -119,6 +133,79 @@ def _check_columns(model: ComposedModel, data: Dataset) -> None:
             continue
         if best < DEAD * min((float(measure(e)) for e in _otherwise(model, few)), default=math.inf):
             raise RecordingError(f"{data.source}: {said}: so read, the model errs by {best:.0%} of the motion; as it is, by {as_it_is:.0%}")
+
+
+def _check_loosely(model: ComposedModel, data: Dataset) -> None:
+    """The same of a model that lacks so much that it foretells little whatever is taken back: by the states that a mistake changes, each by
+    itself, in whatever size (`loosely`). It must do none of them harm.
+    """
+    few = _few(model, data) if data.segments else data
+    as_it_is = loosely_unforetold(model, few) if data.segments else None
+    if as_it_is is None or not np.nanmax(as_it_is, initial=0.0) > NOTHING_ALONE:
+        return
+    found: list[tuple[float, int, float, float, Mask, _Mistake]] = []
+    for mistake in (*_mistakes(model), *_other_scales(model)):
+        e = _loosely_if(model, few, mistake) if _moves_as_well(model, few, mistake) else None
+        if e is None:
+            continue
+        changed = (np.abs(e - as_it_is) > CHANGED) & (np.minimum(e, as_it_is) < NEITHER)
+        before, after = (float(np.mean(one[changed])) if changed.any() else math.inf for one in (as_it_is, e))
+        better = (
+            before > NOTHING_ALONE and after < min(mistake.well + WORSE, BETTER * before) and not np.any(e[changed] > as_it_is[changed])
+        )
+        if better and _by_number(model, few, mistake, changed):
+            found.append((float(np.sum((as_it_is - e)[changed])), _columns(model, few, mistake), before, after, changed, mistake))
+    if not found:
+        return
+    _, _, before, after, changed, mistake = max(found, key=lambda one: (round(one[0], 2), one[1]))
+    others = [loosely_unforetold(model, few, pushed=True), *(_loosely_if(model, few, one) for one in _no_mistakes(model, few))]
+    if after < DEAD * min((float(np.mean(np.where(np.isnan(e), 2.0, e)[changed])) for e in others if e is not None), default=math.inf):
+        names = ", ".join(name for name, there in zip(model.states, changed, strict=True) if there)
+        raise RecordingError(
+            f"{data.source}: {mistake.said}: so read, the model errs by {after:.0%} of how {names} moved; as it is, by {before:.0%}, even "
+            "if it may be off in size"
+        )
+
+
+def _other_scales(model: ComposedModel) -> Iterator[_Mistake]:
+    """Of positions with their rates, or of all states, those that are told by their number: a light load may be about as far off."""
+    for group in groups(model):
+        for scale in SCALES if len(group) > 1 else ():
+            if scale.by_number and not scale.zero:
+                said = scale.said([model.states[j] for j in group])
+                yield _Mistake(said, partial(_rescaled, list(group), 1.0 / scale.times, 0.0), None, WELL, by_number=True)
+
+
+def _by_number(model: ComposedModel, data: Dataset, mistake: _Mistake, changed: Mask) -> bool:
+    """Whether states go just as far as they are foretold to with a mistake taken back, friction aside, if that is what tells it."""
+    return not mistake.by_number or bool(np.all(np.abs(sizes(model, _taken_back(model, data, mistake))[changed] - 1.0) < NEARLY))
+
+
+def _loosely_if(model: ComposedModel, data: Dataset, mistake: _Mistake) -> Array | None:
+    """How little is foretold then, and somehow; None where somebody's own model cannot go there."""
+    try:
+        return loosely_unforetold(model, _taken_back(model, data, mistake))
+    except ConfigError:
+        return None
+
+
+def _columns(model: ComposedModel, data: Dataset, mistake: _Mistake) -> int:
+    """How many columns that the recording has a mistake is in."""
+    made_up = [model.states.index(s) for s in (data.reconstruction.states if data.reconstruction else ()) if s in model.states]
+    count = 0
+    for change, names, skipped in ((mistake.states, model.states, made_up), (mistake.inputs, model.inputs, [])):
+        values = np.arange(1.0, len(names) + 1.0)[None, :]
+        count += 0 if change is None else int(np.count_nonzero(np.delete(change(values.copy()) != values, skipped)))
+    return count
+
+
+def _no_mistakes(model: ComposedModel, data: Dataset) -> Iterator[_Mistake]:
+    """What else it may be: an input that does nothing, a heading that is off all the time."""
+    for j in range(len(model.inputs)):
+        yield _mistake("inputs", "", partial(_scaled, [j], 0.0))
+    by = heading_off(model, data) if {"x", "y", "theta"} <= set(model.states) else None
+    if by is not None:
+        yield _mistake("states", "", partial(_rescaled, [model.states.index("theta")], 1.0, -by))
 
 
 def _check_angles(model: ComposedModel, data: Dataset) -> None:

@@ -29,7 +29,7 @@ ONE_IN = 100.0
 class Reach:
     """noise: (nx,) robust standard deviation of a residual; move: (nx,) largest move in a step that the model foresees; turn: (nx,)
     largest change of it from one step to the next; tail: (nx,) leg of a spike that noise with tails such as these has in one recording
-    of a hundred.
+    of a hundred. quantum: (nx,) least change; moves: of each run, (K, nx) what the model foresees.
     """
 
     noise: Array
@@ -37,6 +37,8 @@ class Reach:
     turn: Array
     tail: Array
     instant: Mask
+    quantum: Array
+    moves: tuple[Array, ...]
 
 
 def reach_of(model: ComposedModel, data: Dataset, act: Acting) -> Reach:
@@ -52,7 +54,7 @@ def reach_of(model: ComposedModel, data: Dataset, act: Acting) -> Reach:
     unseen = [v for _, v in data.axes_without_speed]
     if not len(good):
         one = np.ones(len(model.states))
-        return Reach(one, one, one, one, instant)
+        return Reach(one, one, one, one, instant, one, tuple(moves))
     noise = np.median(np.abs(residuals[good]), axis=0) / 0.6745
     largest = np.quantile(np.abs(move[good]), 0.999, axis=0)
     turns = np.concatenate([np.abs(np.diff(part, axis=0)) for part in moves])
@@ -61,9 +63,11 @@ def reach_of(model: ComposedModel, data: Dataset, act: Acting) -> Reach:
     y = [run.y[np.isfinite(run.y).all(axis=1)] for run in data.runs]
     starts, ends = np.concatenate([rows[:-1] for rows in y]), np.concatenate([rows[1:] for rows in y])
     rounded = [quantum(starts[:, j], ends[:, j]) for j in range(len(model.states))]
+    change = np.abs(ends - starts)
+    least = np.min(np.where(change > 0.0, change, np.inf), axis=0)
     noise = np.maximum(noise, ROUNDING * np.array(rounded) + 1e-12)
     noise[unseen] = np.inf  # what was not measured has no fault
-    return Reach(noise, largest, turn, _tail(residuals), instant)
+    return Reach(noise, largest, turn, _tail(residuals), instant, least, tuple(moves))
 
 
 def _tail(residuals: Array) -> Array:

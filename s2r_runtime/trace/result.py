@@ -237,7 +237,10 @@ class TraceResult:
             },
             "gap": {"before": self.gap[0], "after": self.gap[1], "independent": self.gap[2]},
             "states_late": self.behind,
-            "faults": [{"from_s": f.from_s, "to_s": f.to_s, "channel": f.channel, "kind": f.kind} for f in self.faults],
+            "faults": [
+                {"from_s": f.from_s, "to_s": f.to_s, "channel": f.channel, "kind": f.kind, "segment": f.segment or None}
+                for f in self.faults
+            ],
             "outliers": self.outliers,
             "first_left_out": [{"from_s": a, "to_s": b} for a, b in self.forgetting],
             "could_see": [

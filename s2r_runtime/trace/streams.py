@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,11 @@ ALIGNED = 0.02
 
 ROUNDING = 1e-3
 """Of a part's length: a change this near to an edge, or nearer than stamps can tell, is on it: stamps are printed with some digits."""
+
+PAUSE, LONG, APART, FARTHEST = 1.5, 8, 0.1, 0.7
+"""Steps between two rows from which on it is a pause; rows behind one that tell where they lie between the points of the grid, if they come
+a step apart to within so many steps; and steps from its point to where any of them may be.
+"""
 
 TOGETHER = 0.8
 """If this part of the rows with the rarest state has all states, they come on the same stamps, and the rest is left."""
@@ -271,13 +277,29 @@ def at_grid(states: Stream, dt: float, angles: list[int]) -> Array:
 def nearest(states: Stream, dt: float, angles: list[int]) -> tuple[Array, Array]:
     """(K + 1, nx) the row nearest to each point of the grid, and (K + 1,) its stamp (of a point without a row: where the grid has it)."""
     place = (states.t - states.t[0]) / dt
-    point = np.rint(place).astype(np.int64)
+    point = _points(place)
     order = np.argsort(-np.abs(place - point), kind="stable")  # the nearest one is written last
     y = np.full((int(point.max()) + 1, states.values.shape[1]), np.nan)
     at = states.t[0] + dt * np.arange(len(y))
     y[point[order]] = states.values[order]
     at[point[order]] = states.t[order]
     return unwrapped(y, angles), at
+
+
+def _points(place: Array) -> NDArray[np.int64]:
+    """(N,) the point of each row, whose place is in steps: the nearest one. Behind a pause that ends midway between two, the nearest one
+    is a matter of rounding, and every second row would be lost: those rows all go to the one before or behind, whichever is nearer to most.
+    """
+    point = np.rint(place).astype(np.int64)
+    edges = [0, *(np.flatnonzero(np.diff(place) > PAUSE) + 1).tolist(), len(place)]
+    for a, b in pairwise(edges[1:]):
+        if b - a < LONG or abs(float(np.median(np.diff(place[a:b]))) - 1.0) > APART or np.all(np.diff(point[a:b])):
+            continue
+        aside = float(np.angle(np.mean(np.exp(2j * np.pi * place[a:b]))) / (2.0 * np.pi))
+        own = np.rint(place[a:b] - aside).astype(np.int64)
+        if np.max(np.abs(own - place[a:b])) <= FARTHEST and len(np.unique(own)) > len(np.unique(point[a:b])):
+            point[a:b] = own
+    return point
 
 
 def held_between(inputs: Stream, at: Array, parts: int) -> Array:

@@ -83,13 +83,17 @@ def shares(model: ComposedModel, data: Dataset, starts: Index, error: Array, amo
     y = np.concatenate([run.y for run in data.runs])
     error = trimmed(error - np.median(error, axis=0) if pushed else error)
     gone = trimmed(model.difference(y[rows + steps_ahead(data)].copy(), y[rows]))
-    bent = np.concatenate([np.diff(run.y, 2, axis=0) for run in data.runs])
-    # nanmedian of a table goes row by row, and this is asked of dozens of them
-    noise = np.array([np.median(b[np.isfinite(b)]) for b in np.abs(bent.T)]) / 0.6745 / math.sqrt(6.0)
-    goes = gone > GOES * noise + 1e-12
+    goes = gone > GOES * bend_noise(data) + 1e-12
     if among is not None:
         goes &= np.isin(np.arange(len(goes)), among)
     return np.minimum(error[goes] / gone[goes], 2.0) if goes.any() else None
+
+
+def bend_noise(data: Dataset) -> Array:
+    """(nx,) standard deviation of the noise of each state, by how it bends from row to row."""
+    bent = np.concatenate([np.diff(run.y, 2, axis=0) for run in data.runs])
+    # nanmedian of a table goes row by row, and this is asked of dozens of them
+    return np.array([np.median(b[np.isfinite(b)]) for b in np.abs(bent.T)]) / 0.6745 / math.sqrt(6.0)
 
 
 def steps_ahead(data: Dataset) -> int:
