@@ -135,3 +135,21 @@ def test_a_position_that_froze_at_rest_and_springs_to_where_the_robot_went_meanw
     p = 0.2 * np.exp(-t / 0.05) + 0.1 * np.clip((t - 2.05) / 0.1, 0.0, 1.0) + 1e-6 * np.random.default_rng(seed).normal(size=1500)
     p[1000:1100] = p[1000]
     assert [(f.kind, round(f.from_s, 3), round(f.to_s, 3)) for f in _checked(p, 0.002).faults] == [("frozen", 2.0, 2.198)]
+
+
+@pytest.mark.parametrize("share", [0.02, 0.05])
+def test_many_wild_positions_are_outliers_that_are_left_out_and_counted_and_cut_nothing(share):
+    """Of more than a hundredth of the rows none is a fault: it is how this sensor is. Next to one another they leave no hole."""
+    rng = np.random.default_rng(4)
+    t = 1e-3 * np.arange(8000)
+    clean = 0.1 * np.sin(2.0 * t)
+    p = clean + 1e-6 * rng.normal(size=len(t))
+    wild = np.flatnonzero(rng.uniform(size=len(t)) < share)
+    p[wild] += rng.choice([-1.0, 1.0], len(wild)) * rng.uniform(1e-3, 1e-2, len(wild))
+    done = mended(Stream(t, p[:, None]), [(0, "q")], np.zeros((len(t) - 1, 1)), 0.0)
+    assert done.faults == ()
+    assert len(done.parts) == 1
+    assert 0.9 * len(wild) < done.outliers < 1.1 * len(wild) + 5
+    kept = np.searchsorted(t, done.parts[0].t)
+    assert np.mean(np.abs(done.parts[0].values[:, 0] - clean[kept]) > 1e-4) < 0.1 * share
+    assert np.max(np.diff(done.parts[0].t)) < 2.5e-3 or share > 0.03

@@ -124,6 +124,7 @@ def _recorded(
     model, final, verdict, structure = chosen.nominal.model, decided.final, decided.verdict, decided.structure
     gap_before, gap_after, independent = gaps((model, decided.before), (final.model, decided.after), judged_on, weights, kind)
     effects = tuple(_found(model, final, place, ranges) for place in final.added)
+    early = dataset.reconstruction.outliers if dataset.reconstruction else 0
     idle = [place for place in final.added if not asked(given, judged_on, final.model, without(final.model, place))]
     rivals = [s.fit for s in chosen.rivals if s.fit is not None] if verdict == "ambiguous" else []
     left = _in_order(structure, verdict)
@@ -149,7 +150,7 @@ def _recorded(
         share_left=float(structure.share),
         suggested_excitation=advice(model, [(f.name, f.channel) for f in (*effects, *ties)]) if ties else None,
         faults=decided.faults,
-        outliers=checked.outliers + int(np.count_nonzero(np.abs(final.z).max(axis=1) > WILD)),
+        outliers=early + checked.outliers + int(np.count_nonzero(np.abs(final.z).max(axis=1) > WILD)),
         spec=_spec(model, adopted, dataset),
         model=final.model,
         nominal=model,

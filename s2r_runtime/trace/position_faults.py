@@ -45,6 +45,9 @@ MADE_UP = 0.5
 BRIEF = 3
 """Rows that a spike lasts at most."""
 
+TAIL_SIGMAS = 4.0
+"""Robust standard deviations from which rows of a sensor with many wild ones are left out, if they are away and back."""
+
 FEWEST = 60
 """Rows from which noise is told."""
 
@@ -54,10 +57,13 @@ RARE = 0.01
 
 @dataclass(frozen=True)
 class Mended:
-    """parts: the rows that are right, cut where a position jumped; faults: s since `begin`."""
+    """parts: the rows that are right, cut where a position jumped; faults: s since `begin`; outliers: rows that are away, and back, of more
+    than RARE, and no faults.
+    """
 
     parts: tuple[Stream, ...]
     faults: tuple[Fault, ...]
+    outliers: int
 
 
 def mended(states: Stream, columns: Sequence[tuple[int, str]], pushed: Array, begin: float) -> Mended:
@@ -65,22 +71,36 @@ def mended(states: Stream, columns: Sequence[tuple[int, str]], pushed: Array, be
     cause, of each of them; begin: s, of the recording.
     """
     lost, cuts, faults = np.zeros(len(states.t), dtype=bool), set[int](), []
+    astray = lost.copy()
     for (j, name), push in zip(columns, pushed.T, strict=True):
-        wrong, jumps, told = _of_one(states.t, states.values[:, j], push)
+        wrong, jumps, told, away = _of_one(states.t, states.values[:, j], push)
         lost |= wrong
+        astray |= away
         cuts |= set(jumps)
         faults += [Fault(float(states.t[a]) - begin, float(states.t[b]) - begin, name, kind) for a, b, kind in told]
     edges = [0, *(k + 1 for k in sorted(cuts)), len(states.t)]
+    values = _but_holes(states, astray & ~lost)
+    lost |= astray & (values == states.values).all(axis=1)
     kept = [np.arange(a, b)[~lost[a:b]] for a, b in pairwise(edges)]
-    parts = tuple(Stream(states.t[rows], states.values[rows]) for rows in kept if len(rows))
-    return Mended(parts, tuple(faults))
+    parts = tuple(Stream(states.t[rows], values[rows]) for rows in kept if len(rows))
+    return Mended(parts, tuple(faults), int(np.count_nonzero(astray)))
 
 
-def _of_one(t: Array, p: Array, pushed: Array) -> tuple[Mask, list[int], list[tuple[int, int, str]]]:
-    """Rows that are wrong (n,), steps that jump, and (from, to, kind) in rows."""
+def _but_holes(states: Stream, astray: Mask) -> Array:
+    """The values with a line through rows that are astray next to one another, a few at most: a recording is not cut for them."""
+    values = states.values.copy()
+    for a, b in stretches(astray):
+        if 1 < b - a <= AROUND and a > 0 and b < len(astray):
+            for column in values.T:
+                column[a:b] = np.interp(states.t[a:b], states.t[[a - 1, b]], column[[a - 1, b]])
+    return values
+
+
+def _of_one(t: Array, p: Array, pushed: Array) -> tuple[Mask, list[int], list[tuple[int, int, str]], Mask]:
+    """Rows that are wrong (n,), steps that jump, (from, to, kind) in rows, and rows (n,) that a sensor of many wild ones took away."""
     lost = np.zeros(len(p), dtype=bool)
     if len(p) < FEWEST:
-        return lost, [], []
+        return lost, [], [], lost
     h, d = np.diff(t), np.diff(p)
     pace, blow = _pace(d / h)
     pauses = np.convolve(h > APART * np.median(h), np.ones(2 * AROUND + 1), mode="same") > 0.5
@@ -88,7 +108,8 @@ def _of_one(t: Array, p: Array, pushed: Array) -> tuple[Mask, list[int], list[tu
     changed = np.abs(d[d != 0.0])
     quantum = float(changed.min()) if len(changed) else 0.0
     noise = max(1.4826 * float(np.median(np.abs(off - np.median(off)))), quantum / 2.0)
-    least = SIGMAS * noise + BEYOND * float(np.max(np.abs(pushed), initial=0.0)) * float(np.median(h)) ** 2
+    by_force = BEYOND * float(np.max(np.abs(pushed), initial=0.0)) * float(np.median(h)) ** 2
+    least = SIGMAS * noise + by_force
     told: list[tuple[int, int, str]] = []
     changed_by = np.where(h > APART * np.median(h), np.nan, np.abs(d))
     for a, b in (one for one in stretches(d == 0.0) if one[1] - one[0] >= FROZEN_ROWS):
@@ -104,20 +125,39 @@ def _of_one(t: Array, p: Array, pushed: Array) -> tuple[Mask, list[int], list[tu
             lost[a + 1 : b + 1] = True
             off[max(a - AROUND, 0) : b + 1 + AROUND] = 0.0  # the pace there is told from rows that stand still
             told.append((a, b, "frozen"))
-    jumps, wild = [], np.flatnonzero(np.abs(off) > least + blow * h).tolist()
-    if len(wild) > max(RARE * len(p), 3.0):
-        return lost, [], told
-    while wild:
-        k = wild.pop(0)
-        back = next((m for m in wild if m <= k + BRIEF and abs(off[m] + off[k]) < ALIKE * abs(off[k])), None)
-        if back is not None:
-            wild.remove(back)
-            lost[k + 1 : back + 1] = True
-            told.append((k + 1, back, "spike"))
-        elif _alone(off, k):
-            jumps.append(k)
+    wild = np.flatnonzero(np.abs(off) > least + blow * h).tolist()
+    many = len(wild) > max(RARE * len(p), 3.0)
+    if many:  # the tail of what is found goes on below
+        wild = np.flatnonzero(np.abs(off) > TAIL_SIGMAS * noise + by_force + blow * h).tolist()
+    away = np.zeros(len(p), dtype=bool)
+    if many:  # two of them in a row look like a jump
+        for k in wild:
+            path = np.cumsum(off[k : k + BRIEF + 2])
+            back = np.flatnonzero(np.abs(path[1:]) < ALIKE * np.max(np.abs(path)))
+            if len(back) and not np.any(away[k : k + 2]):
+                away[k + 1 : k + 2 + int(back[0])] = True
+        return lost, [], told, away
+    spikes = _there_and_back(off, wild)
+    for first, last in spikes:
+        lost[first : last + 1] = True
+    told += [(first, last, "spike") for first, last in spikes]
+    jumps = [k for k in wild if _alone(off, k)]
     told += [(k + 1, _until(off, k, jumps, len(p)), "offset_jump") for k in _first_of_pairs(off, jumps)]
-    return lost, jumps, told
+    return lost, jumps, told, away
+
+
+def _there_and_back(off: Array, wild: list[int]) -> list[tuple[int, int]]:
+    """First and last rows that are away for a few rows at most; both steps of each are taken out of `wild`."""
+    found, left = [], [*wild]
+    while left:
+        k = left.pop(0)
+        back = next((m for m in left if m <= k + BRIEF and abs(off[m] + off[k]) < ALIKE * abs(off[k])), None)
+        if back is not None:
+            left.remove(back)
+            wild.remove(k)
+            wild.remove(back)
+            found.append((k + 1, back))
+    return found
 
 
 def _pace(v: Array) -> tuple[Array, Array]:

@@ -55,6 +55,9 @@ INSIDE = 0.4
 FINER = 0.6
 """Of a step: rows that come more often than this are filtered, so that those between the steps say something, too."""
 
+SILENT = 20.0
+"""Times the longest but a few intervals of the inputs, from which on it is a silence."""
+
 SNAPPED = 0.01
 """A usual interval this near to a whole fraction of the model's step is that fraction: stamps are printed with a few digits."""
 
@@ -85,6 +88,8 @@ class Reconstruction:
     """s by which speeds were late that the recording has (`late_speeds`)."""
     faults: tuple[Fault, ...] = ()
     """Of positions, found before anything was done to them (`position_faults`)."""
+    outliers: int = 0
+    """Rows of positions that were left out before that, of more than are faults."""
     hidden: bool = False
     """Whether `axes` are no axes, but what tells a hidden state of somebody's own model, and that state."""
     in_parts: bool = False
@@ -220,7 +225,7 @@ def _with_speeds(
             f"{source}: {', '.join(missing)} cannot be told: fewer than {FEWEST} rows on which {', '.join(measured)} were measured"
         )
     interval = snapped(float(np.median(np.concatenate([np.diff(s.t) for s, _ in given]))), model.dt)
-    given, faults = _mended(model, given, measured, pairs)
+    given, faults, outliers = _mended(model, given, measured, pairs)
     made, known = [], []
     for states, inputs in given:
         whole, found = _speeds(model, states, inputs, measured, pairs)
@@ -240,7 +245,7 @@ def _with_speeds(
         made = [both for s, u in made for both in _filtered(s, u, interval, band)]
         if not made:
             raise NotEnoughEvidence(f"{source}: {', '.join(missing)} cannot be told: no stretch without a gap is long enough")
-    return made, Reconstruction(missing, shown, interval, needed, pairs, errors, apart, tuple(cleaned), faults=faults)
+    return made, Reconstruction(missing, shown, interval, needed, pairs, errors, apart, tuple(cleaned), faults=faults, outliers=outliers)
 
 
 def _with_hidden(
@@ -278,21 +283,23 @@ def _with_hidden(
 
 def _mended(
     model: ComposedModel, given: list[tuple[Stream, Stream]], measured: list[str], pairs: tuple[tuple[str, str], ...]
-) -> tuple[list[tuple[Stream, Stream]], tuple[Fault, ...]]:
-    """Segments without what is wrong with their positions, cut where these jumped, and what that was."""
+) -> tuple[list[tuple[Stream, Stream]], tuple[Fault, ...], int]:
+    """Segments without what is wrong with their positions, cut where these jumped, what that was, and how many rows were mere outliers."""
     begin = min(float(states.t[0]) for states, _ in given)
     columns = [(measured.index(position), position) for position, _ in pairs]
     made: list[tuple[Stream, Stream]] = []
     faults: list[Fault] = []
+    outliers = 0
     for states, inputs in given:
         rates = _pushed(model, states, inputs, measured)[1]
         done = mended(states, columns, rates[:, [model.states.index(speed) for _, speed in pairs]], begin)
         faults += done.faults
-        for part in done.parts if done.faults else (states,):
+        outliers += done.outliers
+        for part in done.parts if done.faults or done.outliers else (states,):
             if len(part.t) >= FEWEST:
                 until = np.searchsorted(inputs.t, part.t[-1], side="right")
                 made.append((part, inputs if part is states else Stream(inputs.t[:until], inputs.values[:until])))
-    return made, tuple(faults)
+    return made, tuple(faults), outliers
 
 
 def _pushed(model: ComposedModel, states: Stream, inputs: Stream, measured: list[str]) -> tuple[Array, Array]:
@@ -387,9 +394,16 @@ def _with_rates(model: ComposedModel, part: Stream, measured: list[str], missing
 
 
 def _inputs(inputs: Stream, first: float, last: float, interval: float, band: float) -> Stream:
-    """Means over intervals, filtered as the states are; from before the first state, if inputs were there before."""
+    """Means over intervals, filtered as the states are; from before the first state, if inputs were there before. Where nothing came
+    for far longer than usual, nothing is made up: a clock may have jumped there.
+    """
     early = max(0, math.ceil((first - inputs.t[0]) / interval - 1e-6)) if len(inputs.t) else 0
     begin = first - early * interval
     means = held_means(inputs, begin, max(2, round((last - begin) / interval)), interval, 1)
     t = np.asarray(begin + interval * np.arange(len(means)), dtype=np.float64)
-    return Stream(t, differentiation.low_pass(means, interval, band))
+    smooth, apart = differentiation.low_pass(means, interval, band), np.diff(inputs.t)
+    silent = np.flatnonzero(apart > SILENT * np.quantile(apart, 0.99)) if len(apart) else np.zeros(0, dtype=np.int64)
+    received = np.ones(len(t), dtype=bool)
+    for k in silent.tolist():
+        received &= (t <= inputs.t[k] + interval) | (t >= inputs.t[k + 1] - interval)
+    return Stream(t[received], smooth[received])
