@@ -217,6 +217,26 @@ def test_short_runs_side_by_side_act_as_one_after_the_other():
     assert np.allclose(together, alone, rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.parametrize("unequal", [0, 3])
+@pytest.mark.parametrize("count", [2, 9])
+def test_what_acts_over_steps_is_the_mean_of_what_acts_in_their_parts(count, unequal):
+    """Worked out input by input, once for all chains that share what acts on it; side by side (nine runs), or one after the other."""
+    effects = [
+        EffectSpec("input_lag", "speed_cmd", {"time_constant": 0.2}),
+        EffectSpec("input_delay", "steer_cmd", {"delay": 0.13}),
+        EffectSpec("input_coupling", "speed_cmd", {"from": "steer_cmd", "coefficient": 0.3}),
+    ]
+    model = compose(ModelSpec("bicycle", 0.1, {"wheel_base": 0.3}, tuple(effects)))
+    rng, parts = np.random.default_rng(5), 4
+    runs = [rng.normal(size=(parts * (12 + k % (unequal + 1)), 2)) for k in range(count)]
+    inputs = Inputs(runs, 0.1 / parts, [0.0] * count, parts=parts)
+    for chain in (model.effects, model.effects[:1], (), model.effects[1:], model.effects):
+        mean, end = inputs.over_steps(model, chain)
+        each = [Inputs([u], 0.1 / parts, [0.0], parts=parts).with_ends(model, chain) for u in runs]
+        assert np.allclose(mean, np.concatenate([m.reshape(-1, parts, 2).mean(axis=1) for m, _ in each]), rtol=1e-12, atol=1e-13)
+        assert np.allclose(end, np.concatenate([e[parts - 1 :: parts] for _, e in each]), rtol=1e-12, atol=1e-13)
+
+
 def test_what_was_before_a_run_is_told_from_its_first_steps():
     model = _model(0.1)
     u = np.tile([[0.5, 0.3]], (40, 1))

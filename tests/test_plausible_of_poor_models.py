@@ -84,6 +84,43 @@ def test_a_poor_model_is_no_mistake(name):
         check_plausible(model, data)
 
 
+OTHERWISE = {  # what a mistake of the columns would look like
+    "a compass that is off by a quarter turn": ([("heading_offset", "theta", {"angle": 1.57})], (0.1, 0.5)),
+    "the other way": ([("heading_offset", "theta", {"angle": -1.57}), ("input_lag", "w", {"time_constant": 0.5})], (0.1, 0.5)),
+    "in the wind": ([("heading_offset", "theta", {"angle": 1.57}), ("constant_disturbance", "world", {"x": 0.1, "y": 0.1})], (0.1, 0.5)),
+    "a motor that hardly turns": ([("input_saturation", "v", {"low": -0.02, "high": 0.02})], (0.1, 0.5)),
+    "many turns in so long a time": ([("input_lag", "v", {"time_constant": 0.9})], (0.1, 0.5)),
+}
+
+
+@pytest.mark.parametrize("case", OTHERWISE)
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_what_looks_like_exchanged_columns_and_is_an_effect_is_not_refused(case, seed):
+    effects, speeds = OTHERWISE[case]
+    turns = (-14.0, 14.0) if case.startswith("many") else (-1.0, 1.0)
+    model, robot = (compose(ModelSpec("unicycle", DT, {}, tuple(EffectSpec(*e) for e in some))) for some in ((), effects))
+    rng = np.random.default_rng(seed)
+    u = commands(rng, 1, STEPS, DT, [speeds, turns])[0]
+    x, hidden, rows = np.array([[0.0, 0.0, rng.uniform(-3.0, 3.0)]]), robot.at_rest(1), []
+    for k in range(STEPS):
+        rows.append(x[0])
+        x, hidden = robot.step(x, u[k : k + 1], hidden)
+    check_plausible(model, _data(model, np.array(rows) + 1e-3 * rng.normal(size=(STEPS, 3)), u))
+
+
+def test_a_weak_motor_is_not_in_another_unit():
+    """A car's measured speed says how far it goes: it is what it says, however little of its command that is."""
+    model = compose(ModelSpec("bicycle", DT, GEOMETRY["bicycle"]))
+    robot = compose(ModelSpec("bicycle", DT, GEOMETRY["bicycle"], (EffectSpec("input_gain", "speed_cmd", {"gain": 0.12}),)))
+    rng = np.random.default_rng(1)
+    u = commands(rng, 1, STEPS, DT, [(-0.4, 0.4), (0.2, 2.0)])[0]
+    x, hidden, rows = np.zeros((1, 4)), robot.at_rest(1), []
+    for k in range(STEPS):
+        rows.append(x[0])
+        x, hidden = robot.step(x, u[k : k + 1], hidden)
+    check_plausible(model, _data(model, np.array(rows) + 1e-3 * rng.normal(size=(STEPS, 4)), u))
+
+
 @pytest.mark.parametrize("gain", [-1.0, 0.25, 0.6, 1.6])
 def test_how_far_a_state_goes_of_what_was_foretold_is_told_beside_friction(gain):
     model, y, u = _recorded("joint")

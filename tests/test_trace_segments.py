@@ -66,24 +66,24 @@ def test_a_robot_whose_runs_begin_at_rest_and_late_is_not_frozen(tmp_path, until
     assert not [f for f in _found(tmp_path, runs).faults if f.kind == "frozen"]
 
 
-@pytest.mark.parametrize("row", [0, 30])
-def test_a_compass_that_is_set_anew_is_off_in_all_runs_that_follow(tmp_path, row):
-    """Between two runs, or within one; where it was right before, those that follow are left out."""
+@pytest.mark.parametrize(("first", "jump"), [(15, 0.4), (15, -0.9), (5, 0.4), (11, 1.57)])
+def test_a_compass_that_jumps_in_one_run_is_off_in_all_that_follow(tmp_path, first, jump):
+    """Where it was right before, those that follow are left out; it is right before, as the course says, also if that leaves less."""
     runs = _drives()
-    for k in range(15, RUNS):
-        runs[k][0][(row if k == 15 else 0) :, 2] += 0.4
+    for k in range(first, RUNS):
+        runs[k][0][(30 if k == first else 0) :, 2] += jump
     found = _found(tmp_path, runs)
     jumps = [f for f in found.faults if f.kind == "offset_jump"]
-    assert {(f.channel, f.segment) for f in jumps} == {("theta", NAMES[k]) for k in range(15, RUNS)}
+    assert {(f.channel, f.segment) for f in jumps} == {("theta", NAMES[k]) for k in range(first, RUNS)}
     assert found.outliers == 0  # what a fault takes out is told as one
-    assert jumps[0].from_s == pytest.approx(DT * row, abs=1.01 * DT)
-    assert all(np.isnan(run.y).any(axis=1).all() for run in found.data.runs[16:])
+    assert jumps[0].from_s == pytest.approx(DT * 30, abs=1.01 * DT)
+    assert all(np.isnan(run.y).any(axis=1).all() for run in found.data.runs[first + 1 :])
 
 
 def test_what_is_found_beside_it_is_what_the_robot_does(tmp_path):
     runs = _drives(effects=[("input_gain", "w", {"gain": 0.8})])
     for k in range(15, RUNS):
-        runs[k][0][:, 2] += 0.4
+        runs[k][0][(30 if k == 15 else 0) :, 2] += 0.4
     model = compose(ModelSpec("unicycle", DT))
     found = trace(load_dataset(_written(tmp_path / "d.csv", runs), model), model)
     assert [(e.name, e.channel) for e in found.effects] in ([("input_gain", "w")], [("track_scale", "theta")])
@@ -95,30 +95,30 @@ def test_what_is_found_beside_it_is_what_the_robot_does(tmp_path):
     assert [f["segment"] for f in found.to_json()["faults"]] == NAMES[15:]
 
 
-OTHERWISE = {
-    "wind, and the heading changes with the runs": ([("constant_disturbance", "world", {"x": 0.1, "y": 0.0})], "heading"),
-    "sliding in curves, to one side and then to the other": ([("lateral_slip", "*", {"coefficient": 0.4})], "turn"),
-    "nothing": ([], ""),
-}
-
-
-@pytest.mark.parametrize("case", OTHERWISE)
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_what_else_makes_a_course_is_no_compass(case, seed):
-    """The second half of the runs is driven the other way, in the wind, or round the other way."""
-    effects, what = OTHERWISE[case]
-    robot = compose(ModelSpec("unicycle", DT, {}, tuple(EffectSpec(*e) for e in effects)))
-    rng, runs = np.random.default_rng(seed), []
+def test_a_jump_that_the_course_of_other_runs_does_not_show_is_of_its_own_run():
+    """And one that all of them show is theirs: by as much, and the other way."""
+    rng, runs = np.random.default_rng(6), []
     for k in range(RUNS):
-        late = k >= RUNS // 2
-        heading = rng.normal(scale=0.3) + (1.3 if late else -1.3) * (what == "heading")
-        turn = rng.uniform(0.3, 0.9) * (-1.0 if late and what == "turn" else 1.0)
-        x, hidden, rows = np.array([[0.0, 0.0, heading]]), robot.at_rest(1), []
-        for _ in range(ROWS):
-            rows.append(x[0])
-            x, hidden = robot.step(x, np.array([[0.3, turn]]), hidden)
-        runs.append(np.array(rows) + 1e-3 * rng.normal(size=(ROWS, 3)))
-    assert carried(runs, {}) == []
+        heading = np.cumsum(np.full(ROWS, 0.02)) + rng.uniform(-3.0, 3.0)
+        steps = 0.02 * np.column_stack([np.cos(heading), np.sin(heading)])
+        runs.append(np.column_stack([np.cumsum(steps, axis=0), heading + (0.5 if k > 10 else 0.0)]))
+    assert carried(runs, {10: 0.5}) == [*range(11, RUNS)]
+    for jumps in ({10: -0.5}, {10: 1.2}, {4: 0.2}, {}):
+        assert carried(runs, jumps) == []
+
+
+@pytest.mark.parametrize("rounded", [None, 1e-5])
+@pytest.mark.parametrize("case", ["all of it", "its place"])
+def test_what_holds_a_robot_while_it_is_asked_to_move_is_no_frozen_sensor(tmp_path, case, rounded):
+    """To the end of a run, without noise, as encoders say it: by an emergency stop, or at a wall where it turns on."""
+    for seed in range(3):
+        runs = [(y[:45], u[:45]) for y, u in _drives(noise=(0.0, 0.0, 0.0), seed=10 + seed)]  # of longer ones, exact repeats alone say it
+        for y, _ in runs[4:8]:
+            columns = [0, 1] if case == "its place" else [0, 1, 2]
+            y[20:, columns] = y[20, columns]
+        if rounded:
+            runs = [(np.round(y / rounded) * rounded, u) for y, u in runs]
+        assert not [f for f in _found(tmp_path, runs).faults if f.kind == "frozen"]
 
 
 def test_runs_that_all_begin_at_the_origin_have_a_noise_floor(tmp_path):

@@ -22,7 +22,8 @@ from s2r_runtime.models.composed import AppliedEffect, ComposedModel, delays_fir
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Key = tuple[object, ...]
-Tables = tuple[list[Array], list[Array], list[Array]]
+Columns = list[list[Array]]
+"""Of each input, of each table: (T,) or (T, runs)."""
 
 KEPT = 24_000_000
 """Bytes of results that are kept; the longest unused go first."""
@@ -70,6 +71,8 @@ class Inputs:
             self._tables, self._starts = [table], [np.array(starts, dtype=np.float64)]
             run, row = np.nonzero(np.arange(len(table)) < lengths[:, None])
             self._rows = row * len(inputs) + run  # of the table laid flat, in the order of runs laid end to end
+            run, step = np.nonzero(np.arange(len(table) // parts) < (lengths // parts)[:, None])
+            self._step_rows = step * len(inputs) + run
         self._each: list[float | Array] = [dt for _ in self._tables]
         """How long rows of each table last, s: all alike, or (T, 1), (T, runs, 1)."""
         if lasts is not None:
@@ -83,11 +86,33 @@ class Inputs:
 
     def with_ends(self, model: ComposedModel, chain: Sequence[AppliedEffect]) -> tuple[Array, Array]:
         """The same, and what acts at the end of each row. One and the same array, if no effect says anything of the ends."""
-        asked = self._asked_at_ends(model, chain)
-        ends = any(a.says_ends and asked.intersection(self._touched(a, model)) for a in chain)
-        now, last, links = self._follow(model, chain, asked if ends else set())
+        now, last, links = self._followed(model, chain)
         mean = self._laid(("laid", *links), now)
-        return mean, (self._laid(("laid at the ends", *links), last) if ends else mean)
+        return mean, (mean if last is now else self._laid(("laid at the ends", *links), last))
+
+    def over_steps(self, model: ComposedModel, chain: Sequence[AppliedEffect]) -> tuple[Array, Array]:
+        """The same over the model's steps: on average over each, and at its end; the runs laid end to end, (sum T_i / parts, nu)."""
+        if self._rows is None or self._parts == 1:
+            mean, ends = self.with_ends(model, chain)
+            if self._parts == 1:
+                return mean, ends
+            width = mean.shape[1]
+            each = np.tile(np.eye(width) / self._parts, (self._parts, 1))
+            return mean.reshape(-1, self._parts * width) @ each, ends[self._parts - 1 :: self._parts].copy()
+        now, last, links = self._followed(model, chain)
+        means = [self._step_means(("over steps", c, link), columns[0]) for c, (link, columns) in enumerate(zip(links, now, strict=True))]
+        at_ends = [_in_order(columns[0][self._parts - 1 :: self._parts], self._step_rows) for columns in last]
+        return np.stack(means, axis=1), np.stack(at_ends, axis=1)
+
+    def _step_means(self, key: Key, column: Array) -> Array:
+        """(sum T_i / parts,) of a column (T, runs)."""
+        found = self._kept.get(key)
+        if found is None:
+            found = [_in_order(column.reshape(-1, self._parts, column.shape[1]).mean(axis=1), self._step_rows)]
+            self._keep(key, found)
+        else:
+            self._kept.move_to_end(key)
+        return found[0]
 
     def _asked_at_ends(self, model: ComposedModel, chain: Sequence[AppliedEffect]) -> set[int]:
         """Columns of which somebody asks what acts at the ends of rows: those that states are set to, and what these come from. A steering
@@ -106,27 +131,32 @@ class Inputs:
                     found.update(touched)
         return found
 
-    def _follow(self, model: ComposedModel, chain: Sequence[AppliedEffect], ends: set[int]) -> tuple[list[Array], list[Array], list[Key]]:
-        """Tables on average and at the ends of rows (of those columns only, the same ones if there are none), and the last link on each
+    def _followed(self, model: ComposedModel, chain: Sequence[AppliedEffect]) -> tuple[Columns, Columns, list[Key]]:
+        """`_follow`, with what acts at the ends if some effect says something of them."""
+        asked = self._asked_at_ends(model, chain)
+        ends = any(a.says_ends and asked.intersection(self._touched(a, model)) for a in chain)
+        return self._follow(model, chain, asked if ends else set())
+
+    def _follow(self, model: ComposedModel, chain: Sequence[AppliedEffect], ends: set[int]) -> tuple[Columns, Columns, list[Key]]:
+        """Columns on average and at the ends of rows (of those inputs only, the same ones if there are none), and the last link on each
         input.
         """
         nominal = model.nominal
         who: Key = (self._number(nominal.shared), *sorted(nominal.parameters.items()))
         links: list[Key] = [(who, name) for name in nominal.inputs]
-        now = self._tables
-        last = self._given_at_ends if ends else now
+        now = self._given
+        last = now if not ends or self._given_at_ends is self._tables else _apart(self._given_at_ends)
         for a in delays_first(nominal, chain, lambda link: link):
             touched = self._touched(a, model)
             key: Key = (self._number(a.effect), a.channel, values_key(a), *(links[c] for c in touched))
             found = self._kept.get(key)
             if found is None:
-                found = [table[..., touched] for table in self._apply(a, now, model)]
-                self._keep(key, found)
+                found = self._keep_columns(key, self._apply(a, _whole(now), model), touched)
             else:
                 self._kept.move_to_end(key)
-            acted = [_with(table, touched, columns) for table, columns in zip(now, found, strict=True)]
+            acted = self._with(now, touched, found)
             if ends.intersection(touched):
-                last = self._ends(key, a, (now, acted, last), touched, model)
+                last = self._ends(key, a, now, acted, last, touched, model)
             elif last is now:
                 last = acted
             now = acted
@@ -134,23 +164,45 @@ class Inputs:
                 links[c] = key
         return now, last, links
 
-    def _ends(self, key: Key, a: AppliedEffect, tables: Tables, touched: list[int], model: ComposedModel) -> list[Array]:
-        """At the ends of rows after one more link, from tables of what it was given, what acted, and what it was given at the ends."""
-        given, acted, last = tables
+    def _ends(
+        self, key: Key, a: AppliedEffect, given: Columns, acted: Columns, last: Columns, touched: list[int], model: ComposedModel
+    ) -> Columns:
+        """At the ends of rows after one more link, from what it was given, what acted, and what it was given at the ends."""
         if last is given and not a.says_ends:
             return acted
         known = ("ends", *key)
         found = self._kept.get(known)
         if found is None:
-            again = cache(lambda: self._apply(a, last, model))
-            found = []
-            when = self._when if getattr(a.effect, "timed", False) else [None for _ in given]
-            for i, (u, acting, end, dt, t) in enumerate(zip(given, acted, last, self._each, when, strict=True)):
-                found.append(a.ends((u, acting, end), t, partial(_one, again, i), model.nominal, dt, mixed=self._mixed)[..., touched])
-            self._keep(known, found)
+            whole = _whole(given)
+            at_ends = whole if last is given else _whole(last)
+            again = cache(lambda: self._apply(a, at_ends, model))
+            when = self._when if getattr(a.effect, "timed", False) else [None for _ in whole]
+            after = [
+                a.ends((u, acting, end), t, partial(_one, again, i), model.nominal, dt, mixed=self._mixed)
+                for i, (u, acting, end, dt, t) in enumerate(zip(whole, _whole(acted), at_ends, self._each, when, strict=True))
+            ]
+            found = self._keep_columns(known, after, touched)
         else:
             self._kept.move_to_end(known)
-        return [_with(table, touched, columns) for table, columns in zip(last, found, strict=True)]
+        return self._with(last, touched, found)
+
+    def _with(self, columns: Columns, touched: list[int], found: list[Array]) -> Columns:
+        """Some of the columns changed. found: of each of them, of each table."""
+        changed, count = [*columns], len(self._tables)
+        for i, c in enumerate(touched):
+            changed[c] = found[i * count : (i + 1) * count]
+        return changed
+
+    def _keep_columns(self, key: Key, tables: list[Array], touched: list[int]) -> list[Array]:
+        """Those of tables, kept: of each of them, of each table."""
+        found = [np.array(table[..., c]) for c in touched for table in tables]
+        self._keep(key, found)
+        return found
+
+    @cached_property
+    def _given(self) -> Columns:
+        """What is commanded."""
+        return _apart(self._tables)
 
     @cached_property
     def _given_at_ends(self) -> list[Array]:
@@ -175,17 +227,13 @@ class Inputs:
             found.append(np.cumsum(lasts, axis=0) - lasts + (start[:, None] if isinstance(start, np.ndarray) else start))
         return found
 
-    def _laid(self, key: Key, tables: list[Array]) -> Array:
+    def _laid(self, key: Key, columns: Columns) -> Array:
         """The runs laid end to end."""
         found = self._kept.get(key)
         if found is None:
-            table = tables[0]
-            if self._rows is None:
-                laid = table if len(tables) == 1 else np.concatenate(tables)
-            elif len(self._rows) == table.shape[0] * table.shape[1]:  # all of one length
-                laid = table.transpose(1, 0, 2).reshape(-1, table.shape[2])
-            else:
-                laid = table.reshape(-1, table.shape[2])[self._rows]
+            tables = _whole(columns)
+            one_by_one = tables[0] if len(tables) == 1 else np.concatenate(tables)
+            laid = one_by_one if self._rows is None else _in_order(tables[0], self._rows)
             found = [laid.view()]
             found[0].flags.writeable = False  # it is handed out again
             self._keep(key, found)
@@ -265,6 +313,13 @@ def _side_by_side(runs: Sequence[Array]) -> Array:
     return table
 
 
+def _in_order(table: Array, rows: NDArray[np.int64]) -> Array:
+    """(T, runs, ...) -> the runs laid end to end. rows: of the table laid flat."""
+    if len(rows) == table.shape[0] * table.shape[1]:  # all of one length
+        return np.swapaxes(table, 0, 1).reshape(-1, *table.shape[2:])
+    return np.asarray(table.reshape(-1, *table.shape[2:])[rows])
+
+
 def _end_to_end(runs: Sequence[Array], between: float) -> Array:
     """(T_i, c) each -> one after the other, with a row of this between two."""
     rest = np.full((1, runs[0].shape[1]), between)
@@ -275,12 +330,13 @@ def _one(tables: Callable[[], list[Array]], i: int) -> Array:
     return tables()[i]
 
 
-def _with(table: Array, columns: list[int], values: Array) -> Array:
-    if values.shape == table.shape:
-        return values
-    changed = table.copy()
-    changed[..., columns] = values
-    return changed
+def _apart(tables: list[Array]) -> Columns:
+    return [[np.array(table[..., c]) for table in tables] for c in range(tables[0].shape[-1])]
+
+
+def _whole(columns: Columns) -> list[Array]:
+    """Tables (T, nu) or (T, runs, nu), in which every input lies by itself."""
+    return [np.moveaxis(np.stack(table), 0, -1) for table in zip(*columns, strict=True)]
 
 
 def values_key(a: AppliedEffect) -> Key:

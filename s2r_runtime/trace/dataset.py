@@ -85,8 +85,10 @@ FINER_PARTS = 8
 LONG_S = 0.04
 """Steps longer than this are taken in parts where speeds were not measured: a position says when within a step a force acted."""
 
-SILENT = 0.8
-"""Of a pause of the states that no input comes in, for nothing to have been received."""
+SILENT, OFTEN = 0.8, 3.0
+"""Of a pause of the states that no input comes in, for nothing to have been received; and times as long as inputs usually are apart, if
+some came in the rest of it.
+"""
 
 BEFORE = 600
 """Steps before the first state for which inputs are kept at most: hidden states have settled then."""
@@ -510,10 +512,11 @@ def _parts(model: ComposedModel, stretches: Sequence[tuple[Stream, Stream]], exa
 def _pauses(states: Stream, stamps: Array, run: int, usual: float, origin: float, dt: float) -> list[Pause]:
     """Intervals between states clearly longer than usual, and than a step. stamps: of the inputs."""
     t, v, found = states.t, states.values, []
+    rate = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     for i in np.flatnonzero(np.diff(t) > max(1.7 * usual, 1.5 * dt)).tolist():
         near = 0.1 * usual
         between = stamps[(stamps > t[i] + near) & (stamps < t[i + 1] - near)]  # a few may come before all is silent, or after
         longest = float(np.max(np.diff(np.concatenate([t[i : i + 1], between, t[i + 1 : i + 2]]))))
-        silent = longest >= SILENT * float(t[i + 1] - t[i])
+        silent = longest >= SILENT * float(t[i + 1] - t[i]) and (not len(between) or longest > OFTEN * rate)
         found.append(Pause(float(t[i] - origin), float(t[i + 1] - origin), run, usual, v[i], v[i + 1], silent))
     return found

@@ -79,7 +79,7 @@ def load_dataset(
     done = None
     if missing:
         segments, done = reconstruct(model, segments, missing, source, bandwidth, slow)
-    named = called if len(called) == len(segments) > 1 else ()  # what was reconstructed may be in more parts
+    named = called if len(called) > 1 and done is None else ()  # what was reconstructed may be in more parts
     return replace(from_streams(model, segments, source, (*digests, content), paths, done), behind=dict(behind), called=named)
 
 

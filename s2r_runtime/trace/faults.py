@@ -93,16 +93,14 @@ def check(model: ComposedModel, data: Dataset, under: ComposedModel | None = Non
     outliers = tails = 0
     sure: list[Fault] = []
     strays: list[tuple[int, Fault, bool]] = []
-    jumped: dict[int, Fault] = {}
+    jumped: dict[int, float] = {}
     for i in range(len(data.runs)):
         tails += int(np.count_nonzero(tails_of(model, data, act, i, reach).any(axis=1)))
         found += frozen(model, data, act, i, bad[i], reach)
         jumps = jumps_of(model, data, act, i, bad[i], reach)
         spikes += jumps.spikes
         found += jumps.offsets
-        for f in jumps.offsets:
-            if pose is not None and f.channel == model.states[pose[2]] and bad[i][-1, pose[2]]:
-                jumped[i] = f
+        jumped.update((i, jump) for jump in jumps.lasting[:1])
         left_out += jumps.cut
         sure += jumps.sure
         outliers += len(jumps.tails)
@@ -124,7 +122,7 @@ def check(model: ComposedModel, data: Dataset, under: ComposedModel | None = Non
         left_out += jumps.cut
         sure += jumps.offsets
         outliers += len(jumps.tails)
-    many = max(tails, len({f.from_s for f in spikes}) + outliers) > max(RARE * rows, 3.0)
+    many = max(tails, len({(f.segment, f.from_s) for f in spikes}) + outliers) > max(RARE * rows, 3.0)
     for i, mask in enumerate(bad) if many else ():
         wild = tails_of(model, data, act, i, reach, WILD_SIGMAS) & ~mask
         mask |= wild
@@ -220,16 +218,11 @@ def _pose(model: ComposedModel) -> list[int] | None:
     return [model.states.index(name) for name in ("x", "y", "theta")]
 
 
-def _carried(data: Dataset, bad: list[Mask], pose: list[int], jumped: Mapping[int, Fault]) -> list[Fault]:
-    """A heading that is off in whole runs. jumped: where it jumped for good, by run."""
-    if len(data.runs) < 2:
-        return []
-    jumps = {}
-    for i, fault in jumped.items():
-        (step,) = _rows(data, i, fault.from_s)
-        jumps[i] = float(data.runs[i].y[step, pose[2]] - data.runs[i].y[step - 1, pose[2]])
+def _carried(data: Dataset, bad: list[Mask], pose: list[int], jumps: Mapping[int, float]) -> list[Fault]:
+    """A heading that is off in whole runs. jumps: rad, by run, where it jumped for good."""
     found = []
-    for i in carried([np.where(mask, np.nan, run.y)[:, pose] for run, mask in zip(data.runs, bad, strict=True)], jumps):
+    seen = [np.where(mask, np.nan, run.y)[:, pose] for run, mask in zip(data.runs, bad, strict=True)] if jumps else []
+    for i in carried(seen, jumps):
         there = np.flatnonzero(np.isfinite(data.runs[i].y[:, pose[2]]))
         bad[i][there, pose[2]] = True
         found.append(fault_of(data, i, (int(there[0]), int(there[-1])), data.states[pose[2]], "offset_jump"))

@@ -37,6 +37,9 @@ BENDS = 5
 MOVING = 1.5
 """Times that a speed bends from row to row by noise, for white noise 1.65 standard deviations, from which on no robot stands."""
 
+PLACE = {"x", "y", "z"}
+"""States that stand together where something holds a robot."""
+
 FOLLOWS, FOLLOWED = 0.25, 0.9
 """Of what a frozen speed is off at most, how near to its command it is on other rows, and on which share of them at least."""
 
@@ -91,30 +94,57 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
             off = math.remainder(off, math.tau) if name in model.nominal.angles else off
             caught_up = b < len(e) and abs(expected) > least and abs(off) < 0.5 * abs(expected)
             jitters = reach.noise[j] > QUANTA * quantum  # even where the robot stands
-            ends = (a == 0 or b == len(e)) and not caught_up and _alone(data, reach, i, j, (a, b))
+            ends = (a == 0 or b == len(e)) and not caught_up and _alone(data, reach, i, j, (a, b), j in speeds)
             if caught_up or ends or (b - a > LONG_FROZEN and jitters and far > 10.0 * reach.move[j]):
                 found.append(_taken_out(data, i, j, name, (a, b), bad))
     return found + _with_them(model, data, i, bad)
 
 
-def _alone(data: Dataset, reach: Reach, i: int, j: int, within: tuple[int, int]) -> bool:
-    """Whether state j repeats over the steps [a, b) of run i, for long, although it hardly ever does on other rows of any run on which the
-    model moves it the same way, by no more. Not before others move, either: a robot may answer late. Nor at an end of where it ever is: a
-    wall may hold it there.
+def _alone(data: Dataset, reach: Reach, i: int, j: int, within: tuple[int, int], speed: bool) -> bool:
+    """Whether state j repeats over the steps [a, b) of run i, for long, while another moves on, although it hardly ever does on other rows
+    of any run on which the model moves it the same way, by no more. Not where all stands, nor all of a place: something may hold the
+    robot, at an end of where it ever is, too. Nor a speed of next to nothing: dry friction holds that.
     """
     a, b = within
     y, moves = data.runs[i].y, reach.moves[i][a:b, j]
-    others_move = float(np.max(np.mean(np.diff(y[a : b + 1], axis=0) != 0.0, axis=0))) > FOLLOWED
-    if b - a < RESTLESS or not (others_move or b == len(y) - 1):
+    place = {k for k, name in enumerate(data.states) if name in PLACE}
+    among = place if j in place and len(place) > 1 else {*range(len(data.states))}
+    change = np.diff(y[a : b + 1], axis=0)[:, sorted(among - {j})]
+    goes_on = np.mean(np.isfinite(change) & (change != 0.0), axis=0)
+    if b - a < RESTLESS or np.max(goes_on, initial=0.0) <= FOLLOWED or (speed and abs(y[a, j]) < SIGMAS * reach.noise[j]):
         return False
     way, most = math.copysign(1.0, float(np.nansum(moves))), float(np.nanmax(np.abs(moves)))
-    still = []
-    for run, move in zip(data.runs, reach.moves, strict=True):
-        asked = (way * move[:, j] > 0.0) & (way * move[:, j] <= most) & (run.y[:-1, j] != y[a, j])
-        change = np.diff(run.y[:, j])[asked]
-        still.append(change[np.isfinite(change)] == 0.0)
+    silent, still = _same_silence(data, i, j, within), []
+    for k, (run, move) in enumerate(zip(data.runs, reach.moves, strict=True)):
+        asked = (way * move[:, j] > 0.0) & (way * move[:, j] <= most)
+        if k in silent:
+            first, last = silent[k]
+            asked[first:last] = False
+        gone = np.diff(run.y[:, j])[asked]
+        still.append(gone[np.isfinite(gone)] == 0.0)
     others, every = np.concatenate(still), np.concatenate([run.y[:, j] for run in data.runs])
     return len(others) >= RESTS and bool(np.mean(others) < REPEATS and np.nanmin(every) < y[a, j] < np.nanmax(every))
+
+
+def _same_silence(data: Dataset, i: int, j: int, within: tuple[int, int]) -> dict[int, tuple[int, int]]:
+    """The steps of a silence by run: it may go on at the same value in the runs before and after, up to where it ends."""
+    value, silent = data.runs[i].y[within[0], j], {i: within}
+    for way in (-1, 1):
+        k, (first, last) = i, within
+        while True:
+            y = data.runs[k].y[:, j]
+            beyond = y[:first] if way < 0 else y[last + 1 :]
+            k += way
+            if np.isfinite(beyond).any() or not 0 <= k < len(data.runs):
+                break
+            y = data.runs[k].y[:, j]
+            others = np.flatnonzero(np.isfinite(y) & (y != value))
+            first = 0 if way > 0 or not len(others) else int(others[-1]) + 1
+            last = len(y) - 1 if way < 0 or not len(others) else int(others[0]) - 1
+            if last < first:
+                break
+            silent[k] = first, last
+    return silent
 
 
 def _led(model: ComposedModel, data: Dataset, act: Acting, i: int, within: tuple[int, int]) -> Array:

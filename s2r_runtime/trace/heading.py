@@ -13,7 +13,6 @@ over several rows, until they are long beside the noise.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -46,9 +45,6 @@ right; and the share of a run, and rows, that must be left then.
 
 KEPT = 0.3
 """Of a run that the smaller part must be to be the right one, where a heading went off in more than a step."""
-
-FEWEST_RUNS, MANY_RUNS = 3, 16
-"""Before and after a heading is off in whole runs, and in all, at least, where no run has the jump in it."""
 
 SHORTEST = 5
 """Rows that must be off."""
@@ -114,61 +110,31 @@ def wrong_before(y: Array, step: int, jump: float) -> bool | None:
 
 
 def carried(runs: Sequence[Array], jumps: Mapping[int, float]) -> list[int]:
-    """Runs in which a heading is off, each as a whole: a compass that is set anew is off from one run on to the last, or was up to one from
-    the first, and no run by itself shows it. runs: (K+1, 3) each, x, y, theta, in their order; jumps: rad, by run, of those in which a
-    heading jumped for good.
+    """Runs in which a heading is off, each as a whole: a compass that jumped in one run is off in all that follow, or was in all before.
+    runs: (K+1, 3) each, x, y, theta, in their order; jumps: rad, by run, of those in which a heading jumped for good.
 
-    The course less the heading jumps there, by as much. Where no run has the jump in it, it must be clear beside what else makes a course:
-    with d of a run the course, h the heading, w the turn, by least squares over the runs, wild ones weighted down,
-
-        d = a + b after(k) + c cos h + s sin h + e w,    |b| > LEAST and SPREADS of its standard errors
-
-    (wind, sliding in curves). That side is right on which the heading is the course; if both or neither are, the longer one. What acts on a
-    robot does not begin where a recording is cut.
+    The course less the heading changes there by as much, on all that follow, the other way. That side is right on which the heading is the
+    course; if both or neither are, the longer one. Where no run has the jump in it, nothing is said: other floors, winds and ways to drive
+    change courses, too.
     """
     there = [k for k, y in enumerate(runs) if np.count_nonzero(np.isfinite(y).all(axis=1)) >= SHORTEST and np.isfinite(_course(y))]
     course = np.array([_course(runs[k]) for k in there])
     rows = np.array([np.count_nonzero(np.isfinite(runs[k]).all(axis=1)) for k in there])
-    split = _split(course, there, jumps) or _split_by_course(course, [runs[k] for k in there])
-    if split is None:
-        return []
-    at, jump = split
-    near = [abs(_middle(part)) < RIGHT * abs(jump) for part in (course[:at], course[at:])]
-    before = near[1] if near[0] != near[1] else bool(np.sum(rows[:at]) < np.sum(rows[at:]))  # whether the first ones are the wrong ones
-    right = rows[at:] if before else rows[:at]
-    if np.sum(right) < max(LEAST_RIGHT * np.sum(rows), FEWEST_RIGHT):
-        return []
-    return there[:at] if before else there[at:]
-
-
-def _split(course: Array, there: Sequence[int], jumps: Mapping[int, float]) -> tuple[int, float] | None:
-    """(first of the runs behind it, rad) of a known jump that all that follows has, and nothing before."""
     for run, jump in jumps.items():
         first, at = (int(np.searchsorted(there, k)) for k in (run, run + 1))
-        if first and at < len(there) and abs(_turned(_middle(course[at:]) - _middle(course[:first]), -jump)) < RIGHT * abs(jump):
-            return at, -jump
-    return None
-
-
-def _split_by_course(course: Array, runs: Sequence[Array]) -> tuple[int, float] | None:
-    """The same of one that nobody saw; None if it is not clear."""
-    if len(runs) < MANY_RUNS:
-        return None
-    heading = [float(np.angle(np.nansum(np.exp(1j * y[:, 2])))) for y in runs]
-    turn = [float(np.nansum(np.diff(y[:, 2]))) / len(y) for y in runs]
-    else_ = np.column_stack([np.ones(len(runs)), np.cos(heading), np.sin(heading), turn])
-    splits = range(FEWEST_RUNS, len(runs) - FEWEST_RUNS + 1)
-    off = _turned(course, _middle(course))
-    at = min(splits, key=lambda k: sum(float(np.sum(np.abs(part - np.median(part)))) for part in (off[:k], off[k:])))
-    table = np.column_stack([else_, np.arange(len(runs)) >= at])
-    weight, slopes, left = np.ones(len(runs)), np.zeros(table.shape[1]), off
-    for _ in range(10):
-        slopes = np.linalg.lstsq(weight[:, None] * table, weight * off, rcond=1e-6)[0]
-        left = off - table @ slopes
-        size = 1.4826 * float(np.median(np.abs(left))) + 1e-9
-        weight = 1.0 / np.sqrt(np.maximum(1.0, np.abs(left) / size))
-    error = size * math.sqrt(float(np.linalg.pinv((weight[:, None] * table).T @ (weight[:, None] * table), rcond=1e-9)[-1, -1]))
-    return (at, float(slopes[-1])) if abs(slopes[-1]) > max(LEAST, SPREADS * error) else None
+        if not first or at == len(there):
+            continue
+        middles = _middle(course[:first]), _middle(course[at:])
+        if abs(_turned(middles[1] - middles[0], -jump)) >= RIGHT * abs(jump):
+            continue
+        near = [abs(m) < RIGHT * abs(jump) for m in middles]
+        before = (
+            near[1] if near[0] != near[1] else bool(np.sum(rows[:first]) < np.sum(rows[at:]))
+        )  # whether the first ones are the wrong ones
+        right = rows[at:] if before else rows[:first]
+        if np.sum(right) >= max(LEAST_RIGHT * np.sum(rows), FEWEST_RIGHT):
+            return there[:first] if before else there[at:]
+    return []
 
 
 def _middle(angles: Array) -> float:

@@ -60,7 +60,8 @@ STAYS, FARTHER = 10, 2.0
 class Jumps:
     """Of one run: spikes; rows that the noise's own tail took away (`tails`, as spikes); offsets that stay; (run, step) transitions across
     them; of the offsets, those that are none of the noise's tail either; rows that are away by no more than a late stamp could do
-    (`strays`, as spikes), which are not marked, and whether another state says that such a row is in time.
+    (`strays`, as spikes), which are not marked, and whether another state says that such a row is in time; by how much headings jumped for
+    good, rad (`lasting`).
     """
 
     spikes: list[Fault]
@@ -69,12 +70,13 @@ class Jumps:
     cut: list[tuple[int, int]]
     sure: list[Fault]
     strays: dict[Fault, bool]
+    lasting: list[float]
 
 
 def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: Reach, *, of_positions: bool = False) -> Jumps:
     """Of run i; marks in `bad` what of it is wrong. of_positions: no other states are looked at."""
     run = data.runs[i]
-    found = Jumps([], [], [], [], [], {})
+    found = Jumps([], [], [], [], [], {}, [])
     if len(run.y) < 3:
         return found
     foretold = predicted(model, data, act, i)
@@ -204,6 +206,8 @@ def _take_out(found: Jumps, model: ComposedModel, data: Dataset, i: int, j: int,
     if model.states[j] in model.nominal.angles:  # a heading that is off leaves the motion
         before = told or (told is None and k < RIGHT_AT_FIRST * len(bad))
         bad[slice(0, k + 1) if before else slice(k + 1, end + 1), j] = True
+        if back is None:
+            found.lasting.append(float(model.difference(run.y[k + 1 : k + 2].copy(), run.y[k : k + 1])[0, j]))
 
 
 def _wrong_before(model: ComposedModel, y: Array, j: int, k: int) -> bool | None:

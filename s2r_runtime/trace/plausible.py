@@ -51,8 +51,8 @@ SURELY = 0.1
 """As WELL, for factors that an actuator's limits could have, too."""
 
 CHANGED, NEITHER, WORSE = 0.1, 0.8, 0.1
-"""By how much E' of one state must change to count; what it must be below, with a mistake or without; and by how much it may be above what
-E may be, of a model that lacks much.
+"""By how much E' of a state must change to count; what it must be below with a mistake taken back; and by how much it may be above what E
+may be, of a model that lacks much.
 """
 
 DEAD = 0.7
@@ -63,6 +63,9 @@ BEYOND = 0.01
 
 EXACTLY, FEWEST_STEPS = 0.02, 60
 """How near to a unit's factor a speed must be to its command's multiple, and on how many steps at least."""
+
+TOLD = 0.15
+"""E' below which all is said: that another explanation leaves more than one does is noise then."""
 
 NEARLY = 0.08
 """The same of what states are foretold, less what friction does: that is not known as well."""
@@ -137,29 +140,32 @@ def _check_columns(model: ComposedModel, data: Dataset) -> None:
 
 def _check_loosely(model: ComposedModel, data: Dataset) -> None:
     """The same of a model that lacks so much that it foretells little whatever is taken back: by the states that a mistake changes, each by
-    itself, in whatever size (`loosely`). It must do none of them harm.
+    itself, in whatever size (`loosely`). All that it is in must be foretold then, and nothing worse than it was.
     """
     few = _few(model, data) if data.segments else data
     as_it_is = loosely_unforetold(model, few) if data.segments else None
     if as_it_is is None or not np.nanmax(as_it_is, initial=0.0) > NOTHING_ALONE:
         return
+    every = unforetold(model, data)
+    if every is None or (np.mean(every) <= NOTHING and np.max(every) <= NOTHING_ALONE):
+        return
     found: list[tuple[float, int, float, float, Mask, _Mistake]] = []
-    for mistake in (*_mistakes(model), *_other_scales(model)):
+    for mistake in (*(m for m in _mistakes(model) if m.well == WELL), *_other_scales(model)):  # a few times as far is no mistake here
         e = _loosely_if(model, few, mistake) if _moves_as_well(model, few, mistake) else None
-        if e is None:
+        if e is None or np.any(e > as_it_is + CHANGED) or np.any(e[_spoilt(model, mistake)] > NEITHER):
             continue
-        changed = (np.abs(e - as_it_is) > CHANGED) & (np.minimum(e, as_it_is) < NEITHER)
+        changed = (np.abs(e - as_it_is) > CHANGED) & (e < NEITHER)
         before, after = (float(np.mean(one[changed])) if changed.any() else math.inf for one in (as_it_is, e))
-        better = (
-            before > NOTHING_ALONE and after < min(mistake.well + WORSE, BETTER * before) and not np.any(e[changed] > as_it_is[changed])
-        )
-        if better and _by_number(model, few, mistake, changed):
+        better = before > NOTHING_ALONE and after < min(WELL + WORSE, BETTER * before)
+        if better and _by_number(model, few, mistake):
             found.append((float(np.sum((as_it_is - e)[changed])), _columns(model, few, mistake), before, after, changed, mistake))
     if not found:
         return
     _, _, before, after, changed, mistake = max(found, key=lambda one: (round(one[0], 2), one[1]))
-    others = [loosely_unforetold(model, few, pushed=True), *(_loosely_if(model, few, one) for one in _no_mistakes(model, few))]
-    if after < DEAD * min((float(np.mean(np.where(np.isnan(e), 2.0, e)[changed])) for e in others if e is not None), default=math.inf):
+    nothing = _Mistake("", None, None, WELL)
+    others = [_loosely_if(model, few, one, pushed=pushed) for one in (nothing, *_no_mistakes(model, few)) for pushed in (False, True)]
+    otherwise = min((float(np.mean(np.where(np.isnan(e), 2.0, e)[changed])) for e in others if e is not None), default=math.inf)
+    if after < DEAD * otherwise and otherwise > TOLD:
         names = ", ".join(name for name, there in zip(model.states, changed, strict=True) if there)
         raise RecordingError(
             f"{data.source}: {mistake.said}: so read, the model errs by {after:.0%} of how {names} moved; as it is, by {before:.0%}, even "
@@ -176,15 +182,23 @@ def _other_scales(model: ComposedModel) -> Iterator[_Mistake]:
                 yield _Mistake(said, partial(_rescaled, list(group), 1.0 / scale.times, 0.0), None, WELL, by_number=True)
 
 
-def _by_number(model: ComposedModel, data: Dataset, mistake: _Mistake, changed: Mask) -> bool:
-    """Whether states go just as far as they are foretold to with a mistake taken back, friction aside, if that is what tells it."""
-    return not mistake.by_number or bool(np.all(np.abs(sizes(model, _taken_back(model, data, mistake))[changed] - 1.0) < NEARLY))
+def _by_number(model: ComposedModel, data: Dataset, mistake: _Mistake) -> bool:
+    """Whether all states of a mistake go just as far as they are foretold to with it taken back, friction aside, if that tells it."""
+    if not mistake.by_number:
+        return True
+    return bool(np.all(np.abs(sizes(model, _taken_back(model, data, mistake))[_spoilt(model, mistake)] - 1.0) < NEARLY))
 
 
-def _loosely_if(model: ComposedModel, data: Dataset, mistake: _Mistake) -> Array | None:
-    """How little is foretold then, and somehow; None where somebody's own model cannot go there."""
+def _spoilt(model: ComposedModel, mistake: _Mistake) -> Mask:
+    """(nx,) the states that a mistake is in."""
+    values = np.arange(1.0, len(model.states) + 1.0)[None, :]
+    return np.zeros(len(model.states), dtype=np.bool_) if mistake.states is None else (mistake.states(values.copy()) != values)[0]
+
+
+def _loosely_if(model: ComposedModel, data: Dataset, mistake: _Mistake, *, pushed: bool = False) -> Array | None:
+    """E' with a mistake taken back; None where somebody's own model cannot go there. pushed: less a steady push."""
     try:
-        return loosely_unforetold(model, _taken_back(model, data, mistake))
+        return loosely_unforetold(model, _taken_back(model, data, mistake), pushed=pushed)
     except ConfigError:
         return None
 

@@ -132,8 +132,10 @@ def times(data: Dataset) -> Array:
 def acting(model: ComposedModel, data: Dataset, effects: Sequence[AppliedEffect] | None = None) -> Acting:
     """The input as it acts after the effects of stage `input` (None: the model's)."""
     chain = [a for a in (model.effects if effects is None else effects) if a.effect.stage == "input"]
-    u, ends = data.chains.with_ends(model, chain)
     lasts = np.concatenate([run.durations(data.dt) for run in data.runs]) if data.uneven else None
+    if data.turned is None and not data.in_parts:
+        return Acting(*data.chains.over_steps(model, chain), lasts)
+    u, ends = data.chains.with_ends(model, chain)
     if data.substeps == 1:
         return Acting(u, ends, lasts)
     table = u.reshape(-1, data.substeps * u.shape[1])
