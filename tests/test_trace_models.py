@@ -49,7 +49,7 @@ def _undeclared(name):
     }
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.long) if n == "differential_drive" else n for n in ROBOTS])
 def test_effects_get_their_names_on_every_model_and_clean_data_give_none(name):
     dt, bounds, noise = ROBOTS[name]
     model, rng = _model(name), np.random.default_rng(17)
