@@ -108,10 +108,14 @@ def test_what_looks_like_exchanged_columns_and_is_an_effect_is_not_refused(case,
     check_plausible(model, _data(model, np.array(rows) + 1e-3 * rng.normal(size=(STEPS, 3)), u))
 
 
-def test_a_weak_motor_is_not_in_another_unit():
-    """A car's measured speed says how far it goes: it is what it says, however little of its command that is."""
+@pytest.mark.parametrize(("drive", "steer"), [(0.12, 1.0), (0.12, 0.5), (0.3, 0.2), (0.12, 0.3)])
+def test_weak_motors_are_in_no_other_unit(drive, steer):
+    """A car's measured speed says how far it goes: it is what it says, however little of its command that is. Two weak gains together make
+    it turn by nearly as little as degrees do.
+    """
     model = compose(ModelSpec("bicycle", DT, GEOMETRY["bicycle"]))
-    robot = compose(ModelSpec("bicycle", DT, GEOMETRY["bicycle"], (EffectSpec("input_gain", "speed_cmd", {"gain": 0.12}),)))
+    gains = tuple(EffectSpec("input_gain", *e) for e in (("speed_cmd", {"gain": drive}), ("steer_cmd", {"gain": steer})))
+    robot = compose(ModelSpec("bicycle", DT, GEOMETRY["bicycle"], gains))
     rng = np.random.default_rng(1)
     u = commands(rng, 1, STEPS, DT, [(-0.4, 0.4), (0.2, 2.0)])[0]
     x, hidden, rows = np.zeros((1, 4)), robot.at_rest(1), []

@@ -14,7 +14,9 @@ from s2r_runtime.trace.dataset import from_arrays, thinned
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.differentiation import bandwidth, low_pass, reach
 from s2r_runtime.trace.inverse import input_relative, inverse
+from s2r_runtime.trace.reconstruct import reconstruct
 from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.streams import Stream
 from s2r_runtime.trace.tracer import trace
 
 DT = 0.01
@@ -175,3 +177,22 @@ def test_inputs_that_are_no_forces_have_no_inverse_model(tmp_path):
     model, _, path = _driven(tmp_path / "run.csv", "bicycle", 8, steps=300)
     data = load_dataset(path, model)
     assert inverse(model, data, steps_of(data)) is None
+
+
+def test_what_was_commanded_last_holds_through_a_silence_of_commands():
+    """A last command of zero, and states that go on: what a low-pass makes of that command at its edge is not what holds on."""
+    model = compose(ModelSpec("joint", 0.02, {"mass": 1.0}))
+    t = 0.002 * np.arange(6000)
+    held = 0.01 * np.arange(1200)
+    rng = np.random.default_rng(3)
+    u = 5.0 * np.repeat(rng.choice([-1.0, 1.0], 60), 20)
+    silent = (held > 6.0) & (held < 8.5)
+    u[np.flatnonzero(silent)[0] - 1] = 0.0
+    acts = u.copy()
+    acts[silent] = 0.0
+    v = 0.002 * np.cumsum(np.repeat(acts, 5))
+    q = 0.002 * np.cumsum(v) + 1e-6 * rng.normal(size=len(t))
+    inputs = Stream(held[~silent], u[~silent, None])
+    (made,), _ = reconstruct(model, [(Stream(t, q[:, None]), inputs)], ("qd",), "here", None)
+    at = np.searchsorted(made[1].t, [6.3, 7.0, 8.0], side="right") - 1
+    assert np.abs(made[1].values[at, 0]).max() < 1e-6

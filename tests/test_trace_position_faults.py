@@ -153,3 +153,31 @@ def test_many_wild_positions_are_outliers_that_are_left_out_and_counted_and_cut_
     kept = np.searchsorted(t, done.parts[0].t)
     assert np.mean(np.abs(done.parts[0].values[:, 0] - clean[kept]) > 1e-4) < 0.1 * share
     assert np.max(np.diff(done.parts[0].t)) < 2.5e-3 or share > 0.03
+
+
+def test_wild_rows_of_one_position_leave_another_one_as_it_is():
+    """Next to one another they are bridged in their own column, between rows that are right: not over a spike or a jump of another one."""
+    rng = np.random.default_rng(5)
+    t = 1e-3 * np.arange(8000)
+    clean = np.column_stack([0.1 * np.sin(2.0 * t), 0.1 * np.cos(2.0 * t)])
+    p = clean + 1e-6 * rng.normal(size=clean.shape)
+    wild = np.flatnonzero(rng.uniform(size=len(t)) < 0.03)
+    p[wild, 0] += rng.choice([-1.0, 1.0], len(wild)) * rng.uniform(1e-3, 1e-2, len(wild))
+    for k in wild[np.flatnonzero(np.diff(wild) == 1)][:6]:  # beside rows that are bridged
+        p[k - 1, 1] += 0.05
+    p[5000:, 1] += 0.02
+    done = mended(Stream(t, p), [(0, "a"), (1, "b")], np.zeros((len(t) - 1, 2)), 0.0)
+    for part in done.parts:
+        rows = np.searchsorted(t, part.t)
+        assert np.max(np.abs(part.values[:, 1] - p[rows, 1])) < 1e-3
+
+
+@pytest.mark.parametrize(("rate", "dt"), [(6.0, 0.02), (10.0, 0.01), (150.0, 0.001)])
+def test_what_rings_for_a_while_is_no_outlier(rate, dt):
+    """It is away and back within a few rows, too, again and again."""
+    t = dt * np.arange(4000)
+    ringing = np.where((np.arange(4000) // 250) % 8 == 0, 0.01 * np.sin(2.0 * np.pi * rate * t), 0.0)
+    p = 0.1 * np.sin(0.5 * t) + ringing + 1e-6 * np.random.default_rng(2).normal(size=len(t))
+    done = mended(Stream(t, p[:, None]), [(0, "q")], np.zeros((len(t) - 1, 1)), 0.0)
+    assert done.outliers == 0
+    assert sum(len(part.t) for part in done.parts) > 3980

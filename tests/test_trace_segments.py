@@ -80,6 +80,19 @@ def test_a_compass_that_jumps_in_one_run_is_off_in_all_that_follow(tmp_path, fir
     assert all(np.isnan(run.y).any(axis=1).all() for run in found.data.runs[first + 1 :])
 
 
+def test_wild_positions_hide_no_compass_that_jumped(tmp_path):
+    """Of so many wild rows, jumps count only if they stay: then the runs that follow are told, too, and are no outliers."""
+    runs, rng = _drives(), np.random.default_rng(9)
+    for k in range(15, RUNS):
+        runs[k][0][(30 if k == 15 else 0) :, 2] += 0.4
+    for y, _ in runs:
+        wild = rng.uniform(size=ROWS) < 0.03
+        y[wild, 0] += rng.choice([-0.4, 0.4], np.count_nonzero(wild))
+    found = _found(tmp_path, runs)
+    assert {(f.channel, f.segment) for f in found.faults} == {("theta", NAMES[k]) for k in range(15, RUNS)}
+    assert 15 < found.outliers < 70  # three of a hundred of 1440
+
+
 def test_what_is_found_beside_it_is_what_the_robot_does(tmp_path):
     runs = _drives(effects=[("input_gain", "w", {"gain": 0.8})])
     for k in range(15, RUNS):
@@ -108,14 +121,19 @@ def test_a_jump_that_the_course_of_other_runs_does_not_show_is_of_its_own_run():
 
 
 @pytest.mark.parametrize("rounded", [None, 1e-5])
-@pytest.mark.parametrize("case", ["all of it", "its place"])
+@pytest.mark.parametrize("case", ["all of it", "its place", "its heading"])
 def test_what_holds_a_robot_while_it_is_asked_to_move_is_no_frozen_sensor(tmp_path, case, rounded):
-    """To the end of a run, without noise, as encoders say it: by an emergency stop, or at a wall where it turns on."""
+    """To the end of a run, without noise, as encoders say it: by an emergency stop, at a wall where it turns on, by a rail along which it
+    goes on.
+    """
     for seed in range(3):
         runs = [(y[:45], u[:45]) for y, u in _drives(noise=(0.0, 0.0, 0.0), seed=10 + seed)]  # of longer ones, exact repeats alone say it
-        for y, _ in runs[4:8]:
-            columns = [0, 1] if case == "its place" else [0, 1, 2]
+        for y, u in runs[4:8]:
+            columns = {"its place": [0, 1], "its heading": [2]}.get(case, [0, 1, 2])
             y[20:, columns] = y[20, columns]
+            if case == "its heading":
+                way = DT * np.cumsum(u[20:-1, 0])[:, None]
+                y[21:, :2] = y[20, :2] + way * [np.cos(y[20, 2]), np.sin(y[20, 2])]
         if rounded:
             runs = [(np.round(y / rounded) * rounded, u) for y, u in runs]
         assert not [f for f in _found(tmp_path, runs).faults if f.kind == "frozen"]

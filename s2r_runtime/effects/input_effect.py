@@ -67,6 +67,6 @@ def columns(model: NominalModel, channel: str) -> list[int]:
 
 def replaced(u: Array, model: NominalModel, channel: str, acting: Array) -> Array:
     """u (..., nu) with the channel's columns set to acting (..., c)."""
-    after = u.copy(order="K")
+    after = u.copy()
     after[..., columns(model, channel)] = acting
     return after

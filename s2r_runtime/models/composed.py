@@ -95,7 +95,7 @@ class AppliedEffect:
         else:
             found = again()
         changed = slice(None) if self.channel not in nominal.inputs else [nominal.inputs.index(self.channel)]
-        after = end.copy(order="K")
+        after = end.copy()
         after[..., changed] = found[..., changed]
         return after
 

@@ -335,8 +335,8 @@ def _apart(tables: list[Array]) -> Columns:
 
 
 def _whole(columns: Columns) -> list[Array]:
-    """Tables (T, nu) or (T, runs, nu), in which every input lies by itself."""
-    return [np.moveaxis(np.stack(table), 0, -1) for table in zip(*columns, strict=True)]
+    """Tables (T, nu) or (T, runs, nu)."""
+    return [np.stack(table, axis=-1) for table in zip(*columns, strict=True)]
 
 
 def values_key(a: AppliedEffect) -> Key:

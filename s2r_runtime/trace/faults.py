@@ -93,7 +93,7 @@ def check(model: ComposedModel, data: Dataset, under: ComposedModel | None = Non
     outliers = tails = 0
     sure: list[Fault] = []
     strays: list[tuple[int, Fault, bool]] = []
-    jumped: dict[int, float] = {}
+    jumped: dict[int, tuple[Fault, float]] = {}
     for i in range(len(data.runs)):
         tails += int(np.count_nonzero(tails_of(model, data, act, i, reach).any(axis=1)))
         found += frozen(model, data, act, i, bad[i], reach)
@@ -107,7 +107,6 @@ def check(model: ComposedModel, data: Dataset, under: ComposedModel | None = Non
         strays += [(i, stray, in_time) for stray, in_time in jumps.strays.items()]
         if pose is not None:
             found += _inconsistent(model, data, act, i, bad[i], reach, pose)
-    found += _carried(data, bad, pose, jumped) if pose is not None else []
     rows = sum(len(run.y) for run in data.runs)
     for i, stray, in_time in strays if len(strays) <= max(STRAYS * rows, 1.0) else ():
         first, last = _rows(data, i, stray.from_s, stray.to_s)
@@ -123,6 +122,9 @@ def check(model: ComposedModel, data: Dataset, under: ComposedModel | None = Non
         sure += jumps.offsets
         outliers += len(jumps.tails)
     many = max(tails, len({(f.segment, f.from_s) for f in spikes}) + outliers) > max(RARE * rows, 3.0)
+    jumps_kept = {i: jump for i, (fault, jump) in jumped.items() if not many or fault in sure}
+    carried_on = _carried(data, bad, pose, jumps_kept) if pose is not None else []
+    found, sure = [*found, *carried_on], [*sure, *carried_on]
     for i, mask in enumerate(bad) if many else ():
         wild = tails_of(model, data, act, i, reach, WILD_SIGMAS) & ~mask
         mask |= wild

@@ -15,6 +15,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes, lone_speeds
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.fault import FROZEN_ROWS, QUANTA, REPEATS, RESTLESS, RESTS, SIGMAS, Fault, fault_of, stretches
+from s2r_runtime.trace.heading import course_of
 from s2r_runtime.trace.holes import filled
 from s2r_runtime.trace.reach import Reach, predicted
 from s2r_runtime.trace.residual import Acting, advanced, first_steps
@@ -36,6 +37,9 @@ BENDS = 5
 
 MOVING = 1.5
 """Times that a speed bends from row to row by noise, for white noise 1.65 standard deviations, from which on no robot stands."""
+
+ASIDE = 0.2
+"""Of a turn that a heading seems to have missed, by which its course must leave it: of an even one it is half of that on average."""
 
 PLACE = {"x", "y", "z"}
 """States that stand together where something holds a robot."""
@@ -113,6 +117,10 @@ def _alone(data: Dataset, reach: Reach, i: int, j: int, within: tuple[int, int],
     goes_on = np.mean(np.isfinite(change) & (change != 0.0), axis=0)
     if b - a < RESTLESS or np.max(goes_on, initial=0.0) <= FOLLOWED or (speed and abs(y[a, j]) < SIGMAS * reach.noise[j]):
         return False
+    if data.states[j] == "theta" and {"x", "y"} <= {*data.states}:  # held by a rail, a robot goes where its heading says
+        pose = [data.states.index(name) for name in ("x", "y", "theta")]
+        if abs(course_of(y[a : b + 1, pose])) < ASIDE * abs(float(np.nansum(moves))):
+            return False
     way, most = math.copysign(1.0, float(np.nansum(moves))), float(np.nanmax(np.abs(moves)))
     silent, still = _same_silence(data, i, j, within), []
     for k, (run, move) in enumerate(zip(data.runs, reach.moves, strict=True)):

@@ -101,7 +101,7 @@ def wrong_before(y: Array, step: int, jump: float) -> bool | None:
     """Whether a heading that jumps in a step was wrong before (True), or is after it (False), by the course; None where that does not say,
     or would leave too little. y: (K+1, 3) x, y, theta.
     """
-    before, after = _course(y[: step + 1]), _course(y[step + 1 :])
+    before, after = course_of(y[: step + 1]), course_of(y[step + 1 :])
     there = np.asarray(np.isfinite(y).all(axis=1))
     near, least = RIGHT * abs(jump), max(LEAST_RIGHT * np.count_nonzero(there), FEWEST_RIGHT)
     if abs(after) < near and abs(before - jump) < near and np.count_nonzero(there[step + 1 :]) > least:
@@ -117,8 +117,8 @@ def carried(runs: Sequence[Array], jumps: Mapping[int, float]) -> list[int]:
     course; if both or neither are, the longer one. Where no run has the jump in it, nothing is said: other floors, winds and ways to drive
     change courses, too.
     """
-    there = [k for k, y in enumerate(runs) if np.count_nonzero(np.isfinite(y).all(axis=1)) >= SHORTEST and np.isfinite(_course(y))]
-    course = np.array([_course(runs[k]) for k in there])
+    there = [k for k, y in enumerate(runs) if np.count_nonzero(np.isfinite(y).all(axis=1)) >= SHORTEST and np.isfinite(course_of(y))]
+    course = np.array([course_of(runs[k]) for k in there])
     rows = np.array([np.count_nonzero(np.isfinite(runs[k]).all(axis=1)) for k in there])
     for run, jump in jumps.items():
         first, at = (int(np.searchsorted(there, k)) for k in (run, run + 1))
@@ -148,7 +148,7 @@ def _turned(angles: Any, by: float) -> Any:
     return 0.5 * np.angle(np.exp(2j * (angles - by)))
 
 
-def _course(y: Array) -> float:
+def course_of(y: Array) -> float:
     """Course less heading, all in all, in (-pi/2, pi/2]; NaN if it never moved. Squares of noise go anywhere."""
     step, turned = np.diff(y[:, :2], axis=0), np.exp(-0.5j * (y[1:, 2] + y[:-1, 2]))
     squared = ((step[:, 0] + 1j * step[:, 1]) * turned) ** 2

@@ -70,7 +70,7 @@ class Jumps:
     cut: list[tuple[int, int]]
     sure: list[Fault]
     strays: dict[Fault, bool]
-    lasting: list[float]
+    lasting: list[tuple[Fault, float]]
 
 
 def jumps_of(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, reach: Reach, *, of_positions: bool = False) -> Jumps:
@@ -207,7 +207,7 @@ def _take_out(found: Jumps, model: ComposedModel, data: Dataset, i: int, j: int,
         before = told or (told is None and k < RIGHT_AT_FIRST * len(bad))
         bad[slice(0, k + 1) if before else slice(k + 1, end + 1), j] = True
         if back is None:
-            found.lasting.append(float(model.difference(run.y[k + 1 : k + 2].copy(), run.y[k : k + 1])[0, j]))
+            found.lasting.append((found.offsets[-1], float(model.difference(run.y[k + 1 : k + 2].copy(), run.y[k : k + 1])[0, j])))
 
 
 def _wrong_before(model: ComposedModel, y: Array, j: int, k: int) -> bool | None:

@@ -64,6 +64,9 @@ BEYOND = 0.01
 EXACTLY, FEWEST_STEPS = 0.02, 60
 """How near to a unit's factor a speed must be to its command's multiple, and on how many steps at least."""
 
+ONWARD = 1.3
+"""Times as far as it is foretold that a robot goes at most, of which a mistake is believed."""
+
 TOLD = 0.15
 """E' below which all is said: that another explanation leaves more than one does is noise then."""
 
@@ -157,7 +160,7 @@ def _check_loosely(model: ComposedModel, data: Dataset) -> None:
         changed = (np.abs(e - as_it_is) > CHANGED) & (e < NEITHER)
         before, after = (float(np.mean(one[changed])) if changed.any() else math.inf for one in (as_it_is, e))
         better = before > NOTHING_ALONE and after < min(WELL + WORSE, BETTER * before)
-        if better and _by_number(model, few, mistake):
+        if better and _by_number(model, few, mistake, changed):
             found.append((float(np.sum((as_it_is - e)[changed])), _columns(model, few, mistake), before, after, changed, mistake))
     if not found:
         return
@@ -182,11 +185,14 @@ def _other_scales(model: ComposedModel) -> Iterator[_Mistake]:
                 yield _Mistake(said, partial(_rescaled, list(group), 1.0 / scale.times, 0.0), None, WELL, by_number=True)
 
 
-def _by_number(model: ComposedModel, data: Dataset, mistake: _Mistake) -> bool:
-    """Whether all states of a mistake go just as far as they are foretold to with it taken back, friction aside, if that tells it."""
-    if not mistake.by_number:
-        return True
-    return bool(np.all(np.abs(sizes(model, _taken_back(model, data, mistake))[_spoilt(model, mistake)] - 1.0) < NEARLY))
+def _by_number(model: ComposedModel, data: Dataset, mistake: _Mistake, changed: Mask) -> bool:
+    """Whether all states of a mistake go just as far as they are foretold to with it taken back, friction aside, if that tells it; else
+    whether none goes clearly farther: robots fall short, and two weak gains together are as far from one as degrees are.
+    """
+    found = sizes(model, _taken_back(model, data, mistake))
+    if mistake.by_number:
+        return bool(np.all(np.abs(found[_spoilt(model, mistake)] - 1.0) < NEARLY))
+    return not np.any(found[changed] > ONWARD)
 
 
 def _spoilt(model: ComposedModel, mistake: _Mistake) -> Mask:

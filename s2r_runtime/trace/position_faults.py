@@ -48,6 +48,11 @@ BRIEF = 3
 TAIL_SIGMAS = 4.0
 """Robust standard deviations from which rows of a sensor with many wild ones are left out, if they are away and back."""
 
+MOST_WILD, BLOCK, BURSTS = 0.25, 40, 5.0
+"""Share of steps that are wild at most, of a sensor with outliers; steps in which they are counted, and variance of these counts over their
+mean from which on they come in bursts.
+"""
+
 FEWEST = 60
 """Rows from which noise is told."""
 
@@ -71,29 +76,35 @@ def mended(states: Stream, columns: Sequence[tuple[int, str]], pushed: Array, be
     cause, of each of them; begin: s, of the recording.
     """
     lost, cuts, faults = np.zeros(len(states.t), dtype=bool), set[int](), []
-    astray = lost.copy()
+    astray: list[tuple[int, Mask]] = []
     for (j, name), push in zip(columns, pushed.T, strict=True):
         wrong, jumps, told, away = _of_one(states.t, states.values[:, j], push)
         lost |= wrong
-        astray |= away
+        astray.append((j, away))
         cuts |= set(jumps)
         faults += [Fault(float(states.t[a]) - begin, float(states.t[b]) - begin, name, kind) for a, b, kind in told]
+    values = states.values.copy()
+    gone = np.any([away for _, away in astray], axis=0)
+    rests = ~(lost | gone)
+    for j, away in astray:
+        lost |= away & ~_bridged(states.t, values[:, j], away, rests, cuts)
     edges = [0, *(k + 1 for k in sorted(cuts)), len(states.t)]
-    values = _but_holes(states, astray & ~lost)
-    lost |= astray & (values == states.values).all(axis=1)
     kept = [np.arange(a, b)[~lost[a:b]] for a, b in pairwise(edges)]
     parts = tuple(Stream(states.t[rows], values[rows]) for rows in kept if len(rows))
-    return Mended(parts, tuple(faults), int(np.count_nonzero(astray)))
+    return Mended(parts, tuple(faults), int(np.count_nonzero(gone)))
 
 
-def _but_holes(states: Stream, astray: Mask) -> Array:
-    """The values with a line through rows that are astray next to one another, a few at most: a recording is not cut for them."""
-    values = states.values.copy()
-    for a, b in stretches(astray):
-        if 1 < b - a <= AROUND and a > 0 and b < len(astray):
-            for column in values.T:
-                column[a:b] = np.interp(states.t[a:b], states.t[[a - 1, b]], column[[a - 1, b]])
-    return values
+def _bridged(t: Array, column: Array, away: Mask, rests: Mask, cuts: set[int]) -> Mask:
+    """(n,) rows that are astray next to one another, a few at most, through which a line is put here, in `column`, between rows that are
+    right (`rests`) and belong together: a recording is not cut for them.
+    """
+    done = np.zeros(len(t), dtype=bool)
+    for a, b in stretches(away):
+        whole = 1 < b - a <= AROUND and a > 0 and b < len(t) and rests[a - 1] and rests[b]
+        if whole and not any(k in cuts for k in range(a - 1, b)):
+            column[a:b] = np.interp(t[a:b], t[[a - 1, b]], column[[a - 1, b]])
+            done[a:b] = True
+    return done
 
 
 def _of_one(t: Array, p: Array, pushed: Array) -> tuple[Mask, list[int], list[tuple[int, int, str]], Mask]:
@@ -131,7 +142,7 @@ def _of_one(t: Array, p: Array, pushed: Array) -> tuple[Mask, list[int], list[tu
         wild = np.flatnonzero(np.abs(off) > TAIL_SIGMAS * noise + by_force + blow * h).tolist()
     away = np.zeros(len(p), dtype=bool)
     if many:  # two of them in a row look like a jump
-        for k in wild:
+        for k in wild if _scattered(wild, len(off)) else ():
             path = np.cumsum(off[k : k + BRIEF + 2])
             back = np.flatnonzero(np.abs(path[1:]) < ALIKE * np.max(np.abs(path)))
             if len(back) and not np.any(away[k : k + 2]):
@@ -144,6 +155,14 @@ def _of_one(t: Array, p: Array, pushed: Array) -> tuple[Mask, list[int], list[tu
     jumps = [k for k in wild if _alone(off, k)]
     told += [(k + 1, _until(off, k, jumps, len(p)), "offset_jump") for k in _first_of_pairs(off, jumps)]
     return lost, jumps, told, away
+
+
+def _scattered(wild: list[int], steps: int) -> bool:
+    """Whether they come as by chance, and not in bursts: what rings is away and back, too. Of pairs that come by chance, counts in blocks
+    have twice their mean for variance.
+    """
+    counts = np.bincount(np.array(wild, dtype=np.int64) // BLOCK, minlength=-(-steps // BLOCK))
+    return len(wild) < MOST_WILD * steps and bool(np.var(counts) < BURSTS * np.mean(counts))
 
 
 def _there_and_back(off: Array, wild: list[int]) -> list[tuple[int, int]]:

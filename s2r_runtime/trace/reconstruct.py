@@ -157,7 +157,7 @@ def reconstruct(
         whole = [_with_rates(model, part, measured, missing, interval, band) for part in parts]
         states = Stream(np.concatenate([w.t for w in whole]), np.concatenate([w.values for w in whole])) if whole else None
         if states is not None and len(states.t):
-            made.append((states, _inputs(inputs, parts[0].t[0], parts[-1].t[-1], interval, band)))
+            made.append((states, _inputs(inputs, parts, interval, band)))
     if not made:
         raise RecordingError(
             f"{source}: {', '.join(missing)} cannot be reconstructed within {band:g} Hz, which takes more than "
@@ -333,7 +333,7 @@ def _filtered(states: Stream, inputs: Stream, interval: float, band: float) -> l
         return []
     smooth = [Stream(p.t[edge:-edge], differentiation.low_pass(p.values, interval, band)[edge:-edge]) for p in parts]
     whole = Stream(np.concatenate([p.t for p in smooth]), np.concatenate([p.values for p in smooth]))
-    return [(whole, _inputs(inputs, parts[0].t[0], parts[-1].t[-1], interval, band))]
+    return [(whole, _inputs(inputs, parts, interval, band))]
 
 
 def at_step(model: ComposedModel, dt: float) -> ComposedModel:
@@ -393,17 +393,23 @@ def _with_rates(model: ComposedModel, part: Stream, measured: list[str], missing
     return Stream(part.t[edge:-edge], values[edge:-edge])
 
 
-def _inputs(inputs: Stream, first: float, last: float, interval: float, band: float) -> Stream:
-    """Means over intervals, filtered as the states are; from before the first state, if inputs were there before. Where nothing came
-    for far longer than usual, nothing is made up: a clock may have jumped there.
+def _inputs(inputs: Stream, parts: Sequence[Stream], interval: float, band: float) -> Stream:
+    """Means over intervals, filtered as the states' stretches are; from before the first state, if inputs were there before. Where nothing
+    came for far longer than usual, states neither, nothing is made up, and what came last holds: a clock may have jumped there.
     """
+    first, last = float(parts[0].t[0]), float(parts[-1].t[-1])
     early = max(0, math.ceil((first - inputs.t[0]) / interval - 1e-6)) if len(inputs.t) else 0
     begin = first - early * interval
     means = held_means(inputs, begin, max(2, round((last - begin) / interval)), interval, 1)
     t = np.asarray(begin + interval * np.arange(len(means)), dtype=np.float64)
     smooth, apart = differentiation.low_pass(means, interval, band), np.diff(inputs.t)
-    silent = np.flatnonzero(apart > SILENT * np.quantile(apart, 0.99)) if len(apart) else np.zeros(0, dtype=np.int64)
+    longest = SILENT * float(np.quantile(apart, 0.99)) if len(apart) else math.inf
     received = np.ones(len(t), dtype=bool)
-    for k in silent.tolist():
-        received &= (t <= inputs.t[k] + interval) | (t >= inputs.t[k + 1] - interval)
+    for before, after in pairwise(parts):
+        k = int(np.searchsorted(inputs.t, before.t[-1] + interval, side="right")) - 1
+        if 0 <= k < len(apart) and apart[k] > longest and inputs.t[k + 1] > after.t[0] - interval:
+            silent = (t > inputs.t[k] + interval) & (t < inputs.t[k + 1] - interval)
+            received &= ~silent
+            kept = np.flatnonzero(received & (t <= inputs.t[k] + interval))
+            smooth[kept[-1:]] = means[kept[-1:]]
     return Stream(t[received], smooth[received])
