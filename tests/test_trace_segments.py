@@ -6,6 +6,7 @@ from trace_robots import GEOMETRY, commands
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.report.trace_page import trace_page
 from s2r_runtime.trace.faults import check
 from s2r_runtime.trace.heading import carried
 from s2r_runtime.trace.tracer import load_dataset, trace
@@ -106,6 +107,7 @@ def test_what_is_found_beside_it_is_what_the_robot_does(tmp_path):
         text.split()
     )
     assert [f["segment"] for f in found.to_json()["faults"]] == NAMES[15:]
+    assert '<td class="n">d20</td>' in trace_page(found)
 
 
 def test_a_jump_that_the_course_of_other_runs_does_not_show_is_of_its_own_run():

@@ -85,8 +85,9 @@ def _faults(page: Page, faults: Sequence[dict[str, Any]]) -> None:
         return
     spoilt = any(f["kind"] != "late" for f in faults)  # what is late is taken earlier
     page.heading("Faults of measurement" + ("; what they spoil is left out" if spoilt else ""), 3)
-    rows = [(f["kind"], f["channel"], f"{f['from_s']:.3f}", f"{f['to_s']:.3f}") for f in faults[:FAULTS]]
-    page.table(("kind", "of", "from (s)", "to (s)"), rows)
+    rows = [(f["kind"], f["channel"], f"{f['from_s']:.3f}", f"{f['to_s']:.3f}", f.get("segment") or "") for f in faults[:FAULTS]]
+    several = any(row[-1] for row in rows)  # logs of before say nothing of it
+    page.table(("kind", "of", "from (s)", "to (s)", "in segment")[: 4 + several], [row[: 4 + several] for row in rows])
     if len(faults) > FAULTS:
         page.text(f"and {len(faults) - FAULTS} more", "soft")
 

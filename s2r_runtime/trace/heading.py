@@ -128,9 +128,8 @@ def carried(runs: Sequence[Array], jumps: Mapping[int, float]) -> list[int]:
         if abs(_turned(middles[1] - middles[0], -jump)) >= RIGHT * abs(jump):
             continue
         near = [abs(m) < RIGHT * abs(jump) for m in middles]
-        before = (
-            near[1] if near[0] != near[1] else bool(np.sum(rows[:first]) < np.sum(rows[at:]))
-        )  # whether the first ones are the wrong ones
+        fewer = bool(np.sum(rows[:first]) < np.sum(rows[at:]))
+        before = near[1] if near[0] != near[1] else fewer  # whether the first ones are the wrong ones
         right = rows[at:] if before else rows[:first]
         if np.sum(right) >= max(LEAST_RIGHT * np.sum(rows), FEWEST_RIGHT):
             return there[:first] if before else there[at:]

@@ -64,14 +64,14 @@ BEYOND = 0.01
 EXACTLY, FEWEST_STEPS = 0.02, 60
 """How near to a unit's factor a speed must be to its command's multiple, and on how many steps at least."""
 
+NEARLY = 0.08
+"""As EXACTLY, of how far states went, friction aside: that is not known as well."""
+
 ONWARD = 1.3
 """Times as far as it is foretold that a robot goes at most, of which a mistake is believed."""
 
 TOLD = 0.15
 """E' below which all is said: that another explanation leaves more than one does is noise then."""
-
-NEARLY = 0.08
-"""The same of what states are foretold, less what friction does: that is not known as well."""
 
 ALIKE = 1.5
 """Times E with states in another unit, below which E with inputs as many times larger says the same."""
@@ -211,12 +211,10 @@ def _loosely_if(model: ComposedModel, data: Dataset, mistake: _Mistake, *, pushe
 
 def _columns(model: ComposedModel, data: Dataset, mistake: _Mistake) -> int:
     """How many columns that the recording has a mistake is in."""
-    made_up = [model.states.index(s) for s in (data.reconstruction.states if data.reconstruction else ()) if s in model.states]
-    count = 0
-    for change, names, skipped in ((mistake.states, model.states, made_up), (mistake.inputs, model.inputs, [])):
-        values = np.arange(1.0, len(names) + 1.0)[None, :]
-        count += 0 if change is None else int(np.count_nonzero(np.delete(change(values.copy()) != values, skipped)))
-    return count
+    made_up = np.isin(model.states, data.reconstruction.states if data.reconstruction else ())
+    values = np.arange(1.0, len(model.inputs) + 1.0)[None, :]
+    inputs = 0 if mistake.inputs is None else int(np.count_nonzero(mistake.inputs(values.copy()) != values))
+    return inputs + int(np.count_nonzero(_spoilt(model, mistake) & ~made_up))
 
 
 def _no_mistakes(model: ComposedModel, data: Dataset) -> Iterator[_Mistake]:
