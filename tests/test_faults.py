@@ -227,6 +227,18 @@ def test_a_silence_is_told_from_a_clock_that_jumped(kind):
     assert fault.from_s == pytest.approx(399 * DT, abs=1e-6)
 
 
+def test_a_lost_row_is_no_clock_that_jumped_where_the_model_turns_too_fast():
+    """One step of the model leads nearly as far then as the robot goes in two."""
+    rng = np.random.default_rng(21)
+    slow, fast = rng.uniform([-0.05, -0.2], [0.05, 0.2], (40, 2)), rng.uniform([-0.05, 1.8], [0.05, 2.2], (40, 2))
+    u = np.repeat(np.where((np.arange(40) % 4 == 1)[:, None], fast, slow), 50, axis=0)
+    y = drive(rng, "unicycle", u[None] * [1.0, 0.6], (), 0.05, [0.003, 0.003, 0.004])[0][:-1]
+    t, kept = 0.05 * np.arange(len(u)), np.arange(len(u)) % 200 != 75
+    model = compose(ModelSpec("unicycle", 0.05))
+    found = check(model, from_streams(model, [(Stream(t[kept], y[kept]), Stream(t[kept], u[kept]))], "here")).faults
+    assert [f for f in found if f.kind == "clock_step"] == []
+
+
 def test_a_clock_that_jumped_while_the_robot_turned_is_told_by_where_the_model_leads():
     """It is told to turn the other way then, so that what it did before and after are two things; but it is where one step leads."""
     rng = np.random.default_rng(9)

@@ -336,7 +336,11 @@ def _apart(tables: list[Array]) -> Columns:
 
 def _whole(columns: Columns) -> list[Array]:
     """Tables (T, nu) or (T, runs, nu)."""
-    return [np.stack(table, axis=-1) for table in zip(*columns, strict=True)]
+    tables = [np.empty((*first.shape, len(columns))) for first in columns[0]]
+    for c, column in enumerate(columns):
+        for table, values in zip(tables, column, strict=True):
+            table[..., c] = values
+    return tables
 
 
 def values_key(a: AppliedEffect) -> Key:

@@ -52,6 +52,9 @@ LONG = 3.5
 ONE_STEP, MOVED = 0.3, 6.0
 """Of a step, by which a usual interval may differ from it to be one; standard deviations that the state must move in it to be seen to."""
 
+SEEN = 3.0
+"""Standard deviations that the robot must go in the time in question for its pace to say whether there was such a time."""
+
 STRAYS = 0.001
 """Share of rows that are away by what a late stamp could do, up to which they are left out; one always is."""
 
@@ -194,11 +197,29 @@ def _of_pause(model: ComposedModel, data: Dataset, act: Acting, pause: Pause, re
         stood = np.abs(went - pace * usual) <= np.maximum(0.3 * apart, noise)
         steady = np.abs(np.nanmean(before, axis=0) - np.nanmean(after, axis=0)) < 0.5 * np.abs(pace)
         by_pace = np.any(stood & steady & (apart > 2.0 * noise)) and np.all(stood | reach.instant)
-        if by_pace or _one_step_on(model, data, act, pause, first, reach):
+        if (by_pace or _one_step_on(model, data, act, pause, first, reach)) and not _went_on(
+            model, run.y, (first, last), pace, usual, reach
+        ):
             return Fault(pause.from_s, pause.to_s, "*", "clock_step", data.segment_of(pause.run))
     if pause.to_s - pause.from_s <= LONG * pause.usual_s:
         return None
     return Fault(pause.from_s, pause.to_s, "*", "dropout", data.segment_of(pause.run))
+
+
+def _went_on(model: ComposedModel, y: Array, pause: tuple[int, int], pace: Array, usual: float, reach: Reach) -> bool:
+    """Whether the robot went as far as the stamps of a pause (its first and last row) say, by the rows beside these two, at this pace (nx,)
+    a step: a row that is off by itself, just before one that was lost, looks like a clock that stepped.
+    """
+    first, last = pause
+    if first < 1 or last + 1 >= len(y):
+        return False
+    steps, went = last - first, model.difference(y[[last + 1]], y[[first - 1]])[0]
+    told = ~reach.instant & np.isfinite(went) & np.isfinite(pace)
+    size = float(np.sum((pace[told] / reach.noise[told]) ** 2))
+    if size * (steps - usual) ** 2 < SEEN**2:
+        return False
+    gone = float(np.sum(went[told] * pace[told] / reach.noise[told] ** 2)) / size - 2.0
+    return gone > 0.5 * (usual + steps)
 
 
 def _one_step_on(model: ComposedModel, data: Dataset, act: Acting, pause: Pause, first: int, reach: Reach) -> bool:

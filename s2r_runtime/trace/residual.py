@@ -203,7 +203,7 @@ def near(x: Array, ends_at: Array) -> bool:
     """Whether all of x (..., nx) is nearer than the nearest of these (nx,), as it mostly is by far: that is seen at once, and column by
     column it takes as long as a step.
     """
-    return bool(np.max(np.abs(x), initial=0.0) <= np.min(ends_at))
+    return bool(max(x.max(initial=0.0), -x.min(initial=0.0)) <= ends_at.min())
 
 
 def no_farther(x: Array, ends_at: Array) -> Array:

@@ -356,14 +356,20 @@ def colour(z: Array, joined: Mask) -> Colour:
         best, own = n * math.log(spread), max(math.sqrt(spread), NARROWEST)
         scale[i] = own
         product, slope = lagged[i] @ lagged[i].T, lagged[i] @ clipped[:, i]
-        for order in range(1, ORDERS + 1) if spread > 0.25 * NARROWEST**2 else ():
-            c = np.linalg.solve(product[:order, :order] + 1e-9 * n * spread * np.eye(order), slope[:order])
-            left = max(spread - float(c @ (2.0 * slope[:order] - product[:order, :order] @ c)) / n, 1e-12)
+        if spread <= 0.25 * NARROWEST**2:
+            continue
+        factor = np.linalg.cholesky(
+            product + 1e-9 * n * spread * np.eye(ORDERS)
+        )  # its first rows and columns are those of each lower order
+        brought = np.cumsum(np.linalg.solve(factor, slope) ** 2) / n
+        chosen = 0
+        for order, less in enumerate(brought.tolist(), 1):
+            left = max(spread - less, 1e-12)
             score = n * math.log(left) + (order + 1.0) * math.log(n)
             if score < best - 1e-9:
-                best, scale[i] = score, own * math.sqrt(left / spread)
-                coefficients[i] = 0.0
-                coefficients[i, :order] = c
+                best, scale[i], chosen = score, own * math.sqrt(left / spread), order
+        part = factor[:chosen, :chosen]
+        coefficients[i, :chosen] = np.linalg.solve(part @ part.T, slope[:chosen])
     return Colour(coefficients, scale)
 
 
