@@ -356,11 +356,10 @@ def colour(z: Array, joined: Mask) -> Colour:
         best, own = n * math.log(spread), max(math.sqrt(spread), NARROWEST)
         scale[i] = own
         product, slope = lagged[i] @ lagged[i].T, lagged[i] @ clipped[:, i]
-        if spread <= 0.25 * NARROWEST**2:
+        if not spread > 0.25 * NARROWEST**2:  # nor where it is no number
             continue
-        factor = np.linalg.cholesky(
-            product + 1e-9 * n * spread * np.eye(ORDERS)
-        )  # its first rows and columns are those of each lower order
+        # Its first rows and columns are the factor of each lower order.
+        factor = np.linalg.cholesky(product + 1e-9 * n * spread * np.eye(ORDERS))
         brought = np.cumsum(np.linalg.solve(factor, slope) ** 2) / n
         chosen = 0
         for order, less in enumerate(brought.tolist(), 1):
