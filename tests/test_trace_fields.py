@@ -45,7 +45,7 @@ def _recording(y, u):
     return from_arrays(model, [(y, u)]), model
 
 
-@pytest.mark.parametrize("seed", [0, 1, 108, 117])
+@pytest.mark.parametrize("seed", first(1, [108, 0, 1, 117]))
 def test_a_floor_on_which_it_turns_now_more_now_less_is_no_noise(seed):
     """Hills of half a metre: step by step what is left looks like noise of some colour."""
     rng = np.random.default_rng(seed)
@@ -55,7 +55,8 @@ def test_a_floor_on_which_it_turns_now_more_now_less_is_no_noise(seed):
     assert trace(*_recording(y, u)).verdict == "unexplained"
 
 
-@pytest.mark.parametrize("seed", first(1, range(3)))
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.long
 def test_stripes_that_slip_are_no_slip_of_the_wheels(seed):
     rng = np.random.default_rng(seed)
     u = _held(rng, 600, [-0.5, -1.5], [0.5, 1.5])
@@ -106,7 +107,7 @@ def test_one_input_that_weakens_another_is_told_although_the_residual_is_loud():
     assert (result.verdict, result.depends_on[:1]) == ("unexplained", ("cmd_left*cmd_right",))
 
 
-@pytest.mark.parametrize("seed", [200, 201, 203])
+@pytest.mark.parametrize("seed", first(1, [200, 201, 203]))
 def test_a_floor_is_seen_beside_a_wind(seed):
     """Both are there: a push that is free to follow time closely follows the hills, too, but not as well as both together do. (It is seen
     on 8 of the 10 seeds from 200 on.)
@@ -141,7 +142,7 @@ def test_a_wind_is_no_change_of_a_gain():
     assert result.effects == ()
 
 
-@pytest.mark.parametrize("seed", [0, 13, 26])
+@pytest.mark.parametrize("seed", first(1, [26, 0, 13]))
 def test_winds_on_every_state_are_no_field(seed):
     """Each state is pushed by a wind of its own, half a second long: at first look, under a noise that has all of them in it, none
     stands out.
@@ -161,7 +162,7 @@ def test_winds_on_every_state_are_no_field(seed):
     assert (result.verdict, result.depends_on) == ("none", ("noise",))
 
 
-@pytest.mark.parametrize("memory", first(2, [0.5, 8.0, 0.1, 2.0]))
+@pytest.mark.parametrize("memory", first(1, [0.5, 8.0, 0.1, 2.0]))
 def test_a_push_that_wanders_is_no_field(memory):
     """Within some steps, or within a good part of the recording; whatever the robot does meanwhile, and wherever it is."""
     rng = np.random.default_rng(round(10 * memory))

@@ -93,7 +93,7 @@ def test_a_hidden_state_is_told_as_well_as_it_says_itself(model, what):
     ("what", "name", "channel", "values"),
     [
         ({"gain": 0.8}, "input_gain", "pump", {"gain": 0.8}),
-        ({"k3": 1.15 * 0.055}, "parameter_change", "k3", {"ratio": 1.15}),
+        pytest.param({"k3": 1.15 * 0.055}, "parameter_change", "k3", {"ratio": 1.15}, marks=pytest.mark.long),
         ({"k1": 0.85 * 0.054}, "parameter_change", "k1", {"ratio": 0.85}),
         ({"delay": 3}, "input_delay", "pump", {"delay": 12.0}),
     ],

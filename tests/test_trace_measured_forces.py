@@ -104,7 +104,8 @@ def test_what_throttles_a_command_keeps_its_name(name, values, noise):
     assert result.effects[0].values == {k: pytest.approx(v, rel=0.05) for k, v in values.items()}
 
 
-@pytest.mark.parametrize("noise", first(1, [0.05, 0.01]))
+@pytest.mark.parametrize("noise", [0.05, 0.01])
+@pytest.mark.long
 def test_a_weak_motor_with_friction_is_told_from_a_strong_one_with_more(noise, monkeypatch):
     """As a measurement the command would be friction of 6.7 N m s/rad, but for what moves the joint, which is small where it sways.
 

@@ -24,7 +24,7 @@ def _spiked(q):
 @pytest.mark.parametrize(
     ("wrong", "kind", "begins", "ends"),
     [
-        (_frozen, "frozen", 4.0, 4.3),
+        pytest.param(_frozen, "frozen", 4.0, 4.3, marks=pytest.mark.long),
         (_jumped, "offset_jump", 5.0, 10.0),
         pytest.param(_spiked, "spike", 6.0, 6.0, marks=pytest.mark.long),
     ],

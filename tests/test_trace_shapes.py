@@ -204,7 +204,7 @@ def test_runs_side_by_side_are_the_runs_one_by_one(name):
     [
         (("ringing", "w", {"rate": 9.0, "damping": 0.2}), "memory(w)"),
         (("warming", "w", {"loss": 2.0, "time_constant": 2.0}), "memory(w)"),
-        (("cubic", "w", {"share": -0.5}), "w"),
+        pytest.param(("cubic", "w", {"share": -0.5}), "w", marks=pytest.mark.long),
     ],
     ids=["ringing", "warming", "cubic"],
 )

@@ -216,6 +216,14 @@ def test_an_input_that_is_held_beside_one_that_moves_on_stays_where_it_is():
     assert "some inputs" in result.text()
 
 
+def test_what_an_input_that_moves_on_leaves_is_no_memory_although_it_shows_only_just():
+    """By some 20 nats, less than two inputs, each on a way of its own, are asked for at first."""
+    model, data = _unicycle(3, held=(1,), pose=(0.012, 0.024))
+    result = trace(data, model)
+    assert (result.verdict, result.depends_on) == ("none", ())
+    assert result.way.on == (pytest.approx(1.0, abs=0.1), 0.0)
+
+
 def test_commands_that_jump_in_every_row_are_not_smoothed():
     rng = np.random.default_rng(4)
     model = compose(ModelSpec("unicycle", 0.05))

@@ -54,6 +54,7 @@ def test_where_the_motion_says_when_they_came_none_is_left_out():
     assert (found.verdict, found.depends_on, found.unplaced, found.way.within) == ("none", (), 0, True)
 
 
+@pytest.mark.long
 def test_an_effect_beside_them_is_named_and_the_other_recording_loses_its_changes_too():
     name = "differential_drive"
     model, slow = _model(name), [("input_gain", "cmd_left", {"gain": 0.9})]
@@ -95,6 +96,7 @@ def test_a_push_that_is_answered_by_a_command_is_not_left_out():
     assert found.unplaced == 0
 
 
+@pytest.mark.long
 def test_of_commands_that_change_in_every_third_row_none_is_left_out():
     """Rollouts would end after two steps, and say nothing of what a model does in the long run."""
     name = "differential_drive"

@@ -56,6 +56,9 @@ PROBE_S, PROBE = 1e-3, 1e-3
 over the inputs.
 """
 
+SHORT_S = 1e-4
+"""The same where axes move one another, s: a light link at the end of an arm loses a few per cent of its speed within PROBE_S."""
+
 COUPLED, SYMMETRIC = 1e-3, 0.02
 """Of the geometric mean of two axes' own mobilities: from where on one moves the other, and how far a mass matrix may be off symmetry by
 what changes within two probes.
@@ -268,7 +271,7 @@ def _coupled(model: BoundModel) -> bool:
     try:
         w, later, back = (
             response(x, rest, model, dt, sign / PROBE)[:, rates] / dt
-            for dt, sign in ((PROBE_S, 1.0), (2.0 * PROBE_S, 1.0), (PROBE_S, -1.0))
+            for dt, sign in ((SHORT_S, 1.0), (2.0 * SHORT_S, 1.0), (SHORT_S, -1.0))
         )
     except ConfigError:  # a user's model that cannot be stepped just anywhere
         return False

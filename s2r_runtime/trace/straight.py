@@ -173,25 +173,25 @@ class _Share:
         return replace(way, clean=then) if self.noise else replace(way, on=then)
 
 
-def way_of(lay: Lay, fit: Fit, moves: Mask) -> Way:
+def way_of(lay: Lay, fit: Fit, moves: Mask, price: float = NATS) -> Way:
     """How inputs went by a fit and its effects, their numbers fitted again. lay: the fit's problem with inputs that went some way; moves:
-    (nu,) those that change in most rows.
+    (nu,) those that change in most rows; price: by which each number of a way must explain more than inputs that are held.
     """
     nu = len(moves)
     held = Way((0.0,) * nu, (0.0,) * nu)
     instead = _instead(lay, fit, moves) if fit.added else None
     if instead is not None:
         return instead
-    return _found(lay, fit, fit, held, moves)
+    return _found(lay, fit, fit, held, moves, price)
 
 
-def _found(lay: Lay, fit: Fit, under: Fit, held: Way, moves: Mask) -> Way:
+def _found(lay: Lay, fit: Fit, under: Fit, held: Way, moves: Mask, price: float = NATS) -> Way:
     """The way that explains most by a fit, looked for again under the noise that is left by what was found first. under: whose noise it is
     at first.
     """
     way = held
     for _ in range(LOOKS):
-        further = _likeliest(_Look(lay, fit, under, way), moves)
+        further = _likeliest(_Look(lay, fit, under, way), moves, price)
         if further.late or further == way:
             return further
         way = _settled(lay, fit, further)
@@ -202,20 +202,26 @@ def _found(lay: Lay, fit: Fit, under: Fit, held: Way, moves: Mask) -> Way:
     return way
 
 
-def _likeliest(look: _Look, moves: Mask) -> Way:
+def _likeliest(look: _Look, moves: Mask, price: float) -> Way:
     """Of the ways that inputs may have gone at a look, each further number paid for."""
     held, nu = look.held, len(moves)
     each = [tuple(i == j for i in range(nu)) for j in np.flatnonzero(moves).tolist()]
     together, noisy = [_Share((True,) * nu, noise=False)], [_Share(one, noise=True) for one in each]
     apart = [_Share(one, noise=False) for one in each] if nu > 1 else []
-    ways = [(together, NATS), (noisy, NATS), (together + noisy, NATS + CLOSE), (apart, 2.0 * NATS), (apart + noisy, 2.0 * NATS + CLOSE)]
+    ways = [
+        (together, price),
+        (noisy, price),
+        (together + noisy, price + CLOSE),
+        (apart, 2.0 * price),
+        (apart + noisy, 2.0 * price + CLOSE),
+    ]
     if held:
-        ways = [(noisy, CLOSE)] if not any(held.clean) else [(together, CLOSE), (apart, NATS)] if not any(held.on) else []
+        ways = [(noisy, CLOSE)] if not any(held.clean) else [(together, CLOSE), (apart, price)] if not any(held.on) else []
     best, most = held, 0.0
-    for shares, price in ways:
+    for shares, asked in ways:
         way, gained = look.best(shares)
-        if gained - price > most:
-            best, most = way, gained - price
+        if gained - asked > most:
+            best, most = way, gained - asked
     if held:
         return best
     beta, gained = look.late()

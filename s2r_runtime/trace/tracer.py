@@ -15,7 +15,7 @@ Deterministic: the same recording, model and seed give the same result.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -40,10 +40,11 @@ from s2r_runtime.trace.one_place import from_one_place
 from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.residual import Mask, acting, first_steps, rms, steps_of
 from s2r_runtime.trace.result import TraceResult
+from s2r_runtime.trace.rivals import CLOSE
 from s2r_runtime.trace.scores import names
 from s2r_runtime.trace.second_look import astray, finer, once_more
 from s2r_runtime.trace.selection import MOST, Selection, all_dated, select
-from s2r_runtime.trace.straight import acted, alike_laid, changed_within, commanded, noisy, sampled, samples_of, straight, way_of
+from s2r_runtime.trace.straight import NATS, acted, alike_laid, changed_within, commanded, noisy, sampled, samples_of, straight, way_of
 from s2r_runtime.trace.throttled import refuted, says_forces
 from s2r_runtime.trace.unplaced import checked_of, only_before_changes
 from s2r_runtime.trace.unseen import alike
@@ -194,6 +195,11 @@ def _traced(
         and any(_more_faults(chosen.fit, model, one, there) for one, there in ((dataset, checked), (test, tested)))
     ):
         return _traced(as_recorded[0], asked, as_recorded[1], horizon, seed, _from(90.0, say), norm, parts, chosen.fit.model)
+    if result.verdict == "unexplained" and _of_inputs_alone(result.depends_on):
+        lines = _straight(as_recorded, asked, parts, checked, seen, given, chosen.fit, CLOSE)
+        moved = None if lines is None else again(*lines, 90.0)
+        if moved is not None and not {*moved.depends_on} - {"noise"} and moved.verdict in {"none", "traced", "ambiguous"}:
+            return moved
     untimed = result.verdict in {"none", "unexplained"} and not (dataset.unplaced or dataset.commanded or dataset.way)
     on_rows = dataset.apart == 1 and not dataset.interpolated and commanded(dataset)
     if untimed and on_rows and only_before_changes(whole.given, whole.everywhere(chosen.fit)):
@@ -252,6 +258,12 @@ def _less_changes(
     return None if less.verdict == "unexplained" or {*less.depends_on} - {"noise"} else less
 
 
+def _of_inputs_alone(depends_on: Sequence[str]) -> bool:
+    """Whether what is left is a memory of inputs and nothing else: so looks, too, what went on between the rows that tell it."""
+    left = {*depends_on} - {"noise"}
+    return bool(left) and all(one.startswith("memory(") for one in left)
+
+
 def _nothing_remembers(chosen: Selection) -> bool:
     """Whether by nothing that was found, nor by what ties with it, an input acts on that was asked before."""
     models = [chosen.fit.model, *(s.fit.model for s in chosen.rivals if s.fit is not None)]
@@ -280,8 +292,9 @@ def _straight(
     seen: Mask,
     given: Problem,
     fit: Fit,
+    price: float = NATS,
 ) -> tuple[Dataset, Dataset | None] | None:
-    """The recordings with inputs that moved on between the rows, if the motion says that they did."""
+    """The recordings with inputs that moved on between the rows, if the motion says that they did, at a price."""
     if recorded[0].way or recorded[0].unplaced or recorded[0].measured_forces or not (sampled(recorded[0]) or commanded(recorded[0])):
         return None
     less, data, test = alike(asked, *recorded)  # a recording without a state is laid for the model without it
@@ -301,7 +314,7 @@ def _straight(
         return None
     try:
         if sampled(data):
-            way = way_of(laid, fit, moving([inputs for _, inputs in data.segments]))
+            way = way_of(laid, fit, moving([inputs for _, inputs in data.segments]), price)
         else:
             way = changed_within(laid, everywhere, fit, samples, len(less.inputs))
     except ConfigError:  # a user's own model may give no numbers for inputs that went so
