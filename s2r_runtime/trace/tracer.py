@@ -8,6 +8,8 @@
        if all is explained by what remembers nothing, first rows that were left out    beginning
        count, and all is asked again
     6  a verdict; errors and gap before and after on what was held out                 verdict, errors, answer
+    7  if the answer says that the recording is to be read otherwise, all is asked      straight, throttled,
+       again: inputs moved on, forces were measured, faults show under what was found   unplaced
 
 Deterministic: the same recording, model and seed give the same result.
 """
@@ -18,6 +20,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -36,6 +39,7 @@ from s2r_runtime.trace.errors import Held, Kind, displacement, held, judge
 from s2r_runtime.trace.faults import Checked, check
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, problem
 from s2r_runtime.trace.holdout import Part, fit_mask, part
+from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.one_place import from_one_place
 from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.residual import Mask, acting, first_steps, rms, steps_of
@@ -107,112 +111,70 @@ def trace(
 
     with threadpool_limits(limits=1):
         horizon = usual_horizon(model.dt) if horizon is None else horizon
-        return _traced(dataset, model, test, horizon, seed, progress or (lambda done, total, detail: None), (weights, kind))
+        return _traced(_Asked(dataset, test, model, horizon, seed, progress or (lambda done, total, detail: None), weights, kind))
 
 
-def _traced(
-    dataset: Dataset,
-    model: ComposedModel,
-    test: Dataset | None,
-    horizon: float,
-    seed: int,
-    say: Progress,
-    norm: tuple[tuple[float, ...] | None, Kind],
-    parts: int | None = None,
-    under: ComposedModel | None = None,
-) -> TraceResult:
-    """parts: S, of each step, where they were asked for (`finer`). under: what was found before, under which more faults show."""
-    weights, kind = norm
-    asked, as_recorded = model, (dataset, test)
+@dataclass(frozen=True)
+class _Asked:
+    """What is asked, of a recording and maybe of another one to judge on. parts: S, of each step, where they were asked for (`finer`).
+    under: what was found before, under which more faults show.
+    """
 
-    def again(one: Dataset, other: Dataset | None, begun: float) -> TraceResult:
-        return _traced(one, asked, other, horizon, seed, _from(begun, say), norm, parts, under)
+    dataset: Dataset
+    test: Dataset | None
+    model: ComposedModel
+    horizon: float
+    seed: int
+    say: Progress
+    weights: tuple[float, ...] | None
+    kind: Kind
+    parts: int | None = None
+    under: ComposedModel | None = None
 
-    if not model.inputs:
-        raise NotEnoughEvidence(f"{dataset.source}: the model has no inputs; nothing can be traced of a robot that is asked nothing")
-    model, dataset, test = alike(_in_parts(model, dataset), dataset, test)
-    _belongs(dataset, model)
-    if test is not None:
-        _belongs(test, model)
-    model, dataset, test = thinned(model, dataset, test, parts)
-    _measured(dataset)
-    check_plausible(model, dataset)
-    dataset, test = from_one_place(model, dataset), None if test is None else from_one_place(model, test)
-    say(0.0, 100.0, "looking for faults of measurement")
-    checked = checked_of(model, dataset, under)
-    tested = None if test is None else checked_of(model, test, under)
-    seen = fit_mask(checked.data, seed, everything=test is not None)
-    cut = _cut(checked, seen, tested, model, horizon)
-    ahead = max(1, min(round(horizon / dataset.dt), len(cut.fit_part.steps) // 4))
-    if test is not None and len(cut.judged_on.steps) < JUDGED:
-        raise _too_few(test, len(cut.judged_on.steps), JUDGED)
-    _enough(dataset, model, cut.fit_part, cut.judged_on, ahead)
-    say(5.0, 100.0, "looking for effects")
-    hidden = cut.given.bends
-    chosen = select(cut.given, model, ahead, lambda share: say(5.0 + 55.0 * share, 100.0, "looking for effects"), 1 if hidden else MOST)
-    lines = _straight(as_recorded, asked, parts, checked, seen, cut.given, chosen.fit)
-    if lines is not None:
-        placed = again(*lines, 60.0)
-        untold = placed.verdict == "unexplained" and lines[0].way.within and only_before_changes(cut.given, chosen.fit)
-        return (_less_changes(as_recorded, again) if untold else None) or placed
+    def again(self, begun: float, **otherwise: Any) -> TraceResult:
+        """The answer to the same with something else in it, when so much of 100 is done."""
+        return _traced(replace(self, say=_from(begun, self.say), **otherwise))
+
+    def looking(self, begin: float, span: float) -> Callable[[float], None]:
+        """To be told the share of the search that is done, which begins at so much of 100."""
+        return lambda share: self.say(begin + span * share, 100.0, "looking for effects")
+
+
+def _traced(asked: _Asked) -> TraceResult:
+    ready = _ready(asked)
+    hidden = ready.cut.given.bends
+    asked.say(5.0, 100.0, "looking for effects")
+    chosen = select(ready.cut.given, ready.model, ready.ahead, asked.looking(5.0, 55.0), 1 if hidden else MOST)
+    otherwise = _on_their_way(asked, ready, chosen.fit)
+    if otherwise is not None:
+        return otherwise
     for most in range(2, MOST + 1) if hidden else (MOST,):
-        if not _told_otherwise(cut.given, chosen.fit):
+        if not _told_otherwise(ready.cut.given, chosen.fit):
             break
-        cut = _cut(replace(cut.checked, data=_restated(cut.checked, chosen.fit)), seen, tested, model, horizon)
-        before = names(chosen.fit.model)
-        chosen = select(cut.given, model, ahead, lambda share: say(60.0 + 20.0 * share, 100.0, "looking for effects"), most)
+        ready, before = ready.restated(asked, chosen.fit), names(chosen.fit.model)
+        chosen = select(ready.cut.given, ready.model, ready.ahead, asked.looking(60.0, 20.0), most)
         if names(chosen.fit.model) == before:
             break
-    checked, judged_on, given = cut.checked, cut.judged_on, cut.given
-    whole = Whole(checked, model, ahead)
-    chosen = foretold_too(given, whole.given, chosen, judged_on, ahead)
-    chosen = confirmed(given, all_dated(given, whole.given, chosen), judged_on)
-    say(80.0, 100.0, "testing what is left")
+    cut, ahead = ready.cut, ready.ahead
+    whole = Whole(cut.checked, ready.model, ahead)
+    chosen = foretold_too(cut.given, whole.given, chosen, cut.judged_on, ahead)
+    chosen = confirmed(cut.given, all_dated(cut.given, whole.given, chosen), cut.judged_on)
+    asked.say(80.0, 100.0, "testing what is left")
     structure = whole.structure(chosen)
-    if structure.matters or astray(chosen, structure, judged_on, seed):
-        chosen, structure = once_more(given, whole, chosen, structure, judged_on, ahead)
-    left_out = checked.data.forgetting or (tested is not None and tested.data.forgetting)
-    if left_out and not dataset.from_first and not structure.matters and dataset.reconstruction is None and _nothing_remembers(chosen):
-        # structure may be a memory without a name, and what was reconstructed is as little known where it begins
-        also = None if as_recorded[1] is None else replace(as_recorded[1], from_first=True)
-        return again(replace(as_recorded[0], from_first=True), also, 80.0)
-    if structure.matters and parts is None:
-        more = finer(dataset, model, chosen, structure, ahead, under)
-        if more is not None:
-            return _traced(as_recorded[0], asked, as_recorded[1], horizon, seed, _from(80.0, say), norm, more, under)
-    say(90.0, 100.0, "judging on held-out data")
-    w = np.ones(len(model.states)) if weights is None else np.array([weights[asked.states.index(s)] for s in model.states])
-    result = answered(dataset, checked, given, chosen, structure, judged_on, seed, w, kind)
-    asked_once = under is None and not (dataset.commanded or dataset.measured_forces)
-    if asked_once and result.verdict == "unexplained" and refuted(chosen.fit, judged_on):
-        taken = replace(as_recorded[0], measured_forces=True)
-        other = _traced(taken, asked, as_recorded[1], horizon, seed, _from(90.0, say), norm, parts)
-        if says_forces(other.explaining, judged_on):
-            return other
-    if (
-        under is None
-        and result.effects
-        and any(_more_faults(chosen.fit, model, one, there) for one, there in ((dataset, checked), (test, tested)))
-    ):
-        return _traced(as_recorded[0], asked, as_recorded[1], horizon, seed, _from(90.0, say), norm, parts, chosen.fit.model)
-    if result.verdict == "unexplained" and _of_inputs_alone(result.depends_on):
-        lines = _straight(as_recorded, asked, parts, checked, seen, given, chosen.fit, CLOSE)
-        moved = None if lines is None else again(*lines, 90.0)
-        if moved is not None and not {*moved.depends_on} - {"noise"} and moved.verdict in {"none", "traced", "ambiguous"}:
-            return moved
-    untimed = result.verdict in {"none", "unexplained"} and not (dataset.unplaced or dataset.commanded or dataset.way)
-    on_rows = dataset.apart == 1 and not dataset.interpolated and commanded(dataset)
-    if untimed and on_rows and only_before_changes(whole.given, whole.everywhere(chosen.fit)):
-        less = _less_changes(as_recorded, again)
-        if less is not None:
-            return less
-    if result.verdict == "unexplained" and chosen.fit.added and not {*result.depends_on} - {"noise"}:
-        result = replace(result, depends_on=whole.likeliest or result.depends_on)
-    if result.verdict in {"traced", "ambiguous"} and whole.in_one_stretch(chosen):
-        result = with_time(result)
-    unseen = tuple(s for s in asked.states if s not in model.states)
-    result = replace(result, spec=msgspec.structs.replace(result.spec, dt=asked.dt), unseen=unseen)
-    say(100.0, 100.0, result.verdict)
+    if structure.matters or astray(chosen, structure, cut.judged_on, asked.seed):
+        chosen, structure = once_more(cut.given, whole, chosen, structure, cut.judged_on, ahead)
+    otherwise = _from_first(asked, ready, chosen, structure) or _in_more_parts(asked, ready, chosen, structure)
+    if otherwise is not None:
+        return otherwise
+    asked.say(90.0, 100.0, "judging on held-out data")
+    states = ready.model.states
+    w = np.ones(len(states)) if asked.weights is None else np.array([asked.weights[asked.model.states.index(s)] for s in states])
+    result = answered(ready.dataset, cut.checked, cut.given, chosen, structure, cut.judged_on, asked.seed, w, asked.kind)
+    otherwise = _second_thoughts(asked, ready, whole, chosen, result)
+    if otherwise is not None:
+        return otherwise
+    result = _told(asked, ready, whole, chosen, result)
+    asked.say(100.0, 100.0, result.verdict)
     return result
 
 
@@ -235,6 +197,115 @@ def _cut(checked: Checked, seen: Mask, tested: Checked | None, model: ComposedMo
     return _Cut(checked, fit_part, _held_out(checked, seen, tested, model, horizon))
 
 
+@dataclass(frozen=True)
+class _Ready:
+    """The recordings, and the model, as they are fitted: without what was not measured and is not needed, on steps that states are often
+    enough for, without what is wrong with them. ahead: steps of a rollout.
+    """
+
+    model: ComposedModel
+    dataset: Dataset
+    test: Dataset | None
+    checked: Checked
+    tested: Checked | None
+    seen: Mask
+    cut: _Cut
+    ahead: int
+
+    def restated(self, asked: _Asked, fit: Fit) -> _Ready:
+        """With hidden states told anew, under a fit."""
+        checked = replace(self.cut.checked, data=_restated(self.cut.checked, fit))
+        return replace(self, cut=_cut(checked, self.seen, self.tested, self.model, asked.horizon))
+
+
+def _ready(asked: _Asked) -> _Ready:
+    if not asked.model.inputs:
+        raise NotEnoughEvidence(f"{asked.dataset.source}: the model has no inputs; nothing can be traced of a robot that is asked nothing")
+    model, dataset, test = alike(_in_parts(asked.model, asked.dataset), asked.dataset, asked.test)
+    _belongs(dataset, model)
+    if test is not None:
+        _belongs(test, model)
+    model, dataset, test = thinned(model, dataset, test, asked.parts)
+    _measured(dataset)
+    check_plausible(model, dataset)
+    dataset, test = from_one_place(model, dataset), None if test is None else from_one_place(model, test)
+    asked.say(0.0, 100.0, "looking for faults of measurement")
+    checked = checked_of(model, dataset, asked.under)
+    tested = None if test is None else checked_of(model, test, asked.under)
+    seen = fit_mask(checked.data, asked.seed, everything=test is not None)
+    cut = _cut(checked, seen, tested, model, asked.horizon)
+    ahead = max(1, min(round(asked.horizon / dataset.dt), len(cut.fit_part.steps) // 4))
+    if test is not None and len(cut.judged_on.steps) < JUDGED:
+        raise _too_few(test, len(cut.judged_on.steps), JUDGED)
+    _enough(dataset, model, cut.fit_part, cut.judged_on, ahead)
+    return _Ready(model, dataset, test, checked, tested, seen, cut, ahead)
+
+
+def _on_their_way(asked: _Asked, ready: _Ready, fit: Fit) -> TraceResult | None:
+    """The answer with inputs that moved on between the rows, if the motion says that they did."""
+    lines = _straight(asked, ready, fit)
+    if lines is None:
+        return None
+    placed = asked.again(60.0, dataset=lines[0], test=lines[1])
+    if placed.verdict == "unexplained" and lines[0].way.within and only_before_changes(ready.cut.given, fit):
+        return _less_changes(asked) or placed
+    return placed
+
+
+def _from_first(asked: _Asked, ready: _Ready, chosen: Selection, structure: Structure) -> TraceResult | None:
+    """The answer with runs from their first rows on, if nothing remembers what was commanded before: rows were left out for that. Structure
+    may be a memory without a name, and what was reconstructed is as little known where it begins.
+    """
+    left_out = ready.cut.checked.data.forgetting or (ready.tested is not None and ready.tested.data.forgetting)
+    if not left_out or ready.dataset.from_first or ready.dataset.reconstruction is not None:
+        return None
+    if structure.matters or not _nothing_remembers(chosen):
+        return None
+    test = None if asked.test is None else replace(asked.test, from_first=True)
+    return asked.again(80.0, dataset=replace(asked.dataset, from_first=True), test=test)
+
+
+def _in_more_parts(asked: _Asked, ready: _Ready, chosen: Selection, structure: Structure) -> TraceResult | None:
+    """The answer with steps in parts, if that explains structure that is left."""
+    if not structure.matters or asked.parts is not None:
+        return None
+    parts = finer(ready.dataset, ready.model, chosen, structure, ready.ahead, asked.under)
+    return None if parts is None else asked.again(80.0, parts=parts)
+
+
+def _second_thoughts(asked: _Asked, ready: _Ready, whole: Whole, chosen: Selection, result: TraceResult) -> TraceResult | None:
+    """The answer to a recording that is read otherwise, as this answer suggests, if it explains what this one does not."""
+    fit, dataset = chosen.fit, ready.dataset
+    unexplained = result.verdict == "unexplained"
+    if unexplained and asked.under is None and not (dataset.commanded or dataset.measured_forces) and refuted(fit, ready.cut.judged_on):
+        other = asked.again(90.0, dataset=replace(asked.dataset, measured_forces=True))
+        if says_forces(other.explaining, ready.cut.judged_on):
+            return other
+    recorded = ((dataset, ready.cut.checked), (ready.test, ready.tested))
+    if asked.under is None and result.effects and any(_more_faults(fit, ready.model, one, there) for one, there in recorded):
+        return asked.again(90.0, under=fit.model)
+    if unexplained and _of_inputs_alone(result.depends_on):
+        lines = _straight(asked, ready, fit, CLOSE)
+        moved = None if lines is None else asked.again(90.0, dataset=lines[0], test=lines[1])
+        if moved is not None and _leaves_nothing(moved):
+            return moved
+    untimed = result.verdict in {"none", "unexplained"} and not (dataset.unplaced or dataset.commanded or dataset.way)
+    on_rows = dataset.apart == 1 and not dataset.interpolated and commanded(dataset)
+    if untimed and on_rows and only_before_changes(whole.given, whole.everywhere(fit)):
+        return _less_changes(asked)
+    return None
+
+
+def _told(asked: _Asked, ready: _Ready, whole: Whole, chosen: Selection, result: TraceResult) -> TraceResult:
+    """The answer, with what is said of it once it is the last one."""
+    if result.verdict == "unexplained" and chosen.fit.added and not {*result.depends_on} - {"noise"}:
+        result = replace(result, depends_on=whole.likeliest or result.depends_on)
+    if result.verdict in {"traced", "ambiguous"} and whole.in_one_stretch(chosen):
+        result = with_time(result)
+    unseen = tuple(s for s in asked.model.states if s not in ready.model.states)
+    return replace(result, spec=msgspec.structs.replace(result.spec, dt=asked.model.dt), unseen=unseen)
+
+
 def _more_faults(fit: Fit, model: ComposedModel, data: Dataset | None, checked: Checked | None) -> bool:
     """Whether rows are clearly off by what was found that might have been the robot by the model as given: commands that it seemed to carry
     out at once could have taken it there.
@@ -244,18 +315,20 @@ def _more_faults(fit: Fit, model: ComposedModel, data: Dataset | None, checked: 
     return check(model, with_history(model, data), fit.model).faults != checked.faults
 
 
-def _less_changes(
-    recorded: tuple[Dataset, Dataset | None], again: Callable[[Dataset, Dataset | None, float], TraceResult]
-) -> TraceResult | None:
-    """Without the transitions in which commands change, if that leaves nothing. again: traces recordings."""
-    data, test = recorded
+def _less_changes(asked: _Asked) -> TraceResult | None:
+    """Without the transitions in which commands change, if that leaves nothing."""
+    test = asked.test
     if test is not None and not test.commanded and commanded(test):
         test = replace(test, unplaced=True)
     try:
-        less = again(replace(data, unplaced=True), test, 90.0)
+        less = asked.again(90.0, dataset=replace(asked.dataset, unplaced=True), test=test)
     except NotEnoughEvidence:
         return None
-    return None if less.verdict == "unexplained" or {*less.depends_on} - {"noise"} else less
+    return less if _leaves_nothing(less) else None
+
+
+def _leaves_nothing(result: TraceResult) -> bool:
+    return result.verdict != "unexplained" and not {*result.depends_on} - {"noise"}
 
 
 def _of_inputs_alone(depends_on: Sequence[str]) -> bool:
@@ -284,27 +357,21 @@ def _from(begun: float, say: Progress) -> Progress:
     return lambda done, total, detail: say(begun + (1.0 - begun / 100.0) * done, total, detail)
 
 
-def _straight(
-    recorded: tuple[Dataset, Dataset | None],
-    asked: ComposedModel,
-    parts: int | None,
-    checked: Checked,
-    seen: Mask,
-    given: Problem,
-    fit: Fit,
-    price: float = NATS,
-) -> tuple[Dataset, Dataset | None] | None:
+def _straight(asked: _Asked, ready: _Ready, fit: Fit, price: float = NATS) -> tuple[Dataset, Dataset | None] | None:
     """The recordings with inputs that moved on between the rows, if the motion says that they did, at a price."""
-    if recorded[0].way or recorded[0].unplaced or recorded[0].measured_forces or not (sampled(recorded[0]) or commanded(recorded[0])):
+    if asked.dataset.way or asked.dataset.unplaced or asked.dataset.measured_forces:
         return None
-    less, data, test = alike(asked, *recorded)  # a recording without a state is laid for the model without it
+    if not (sampled(asked.dataset) or commanded(asked.dataset)):
+        return None
+    checked, given, parts = ready.cut.checked, ready.cut.given, asked.parts
+    less, data, test = alike(asked.model, asked.dataset, asked.test)  # a recording without a state is laid for the model without it
     samples = samples_of(data)
 
     def so_far(way: Way) -> Dataset:
         return acted(checked.data, thinned(less, straight(data, less, way, samples), test, parts)[1])
 
     def laid(way: Way) -> Problem:
-        return replace(given, data=part(so_far(way), checked.left_out, seen, FIT_STEPS).data, searches={}) if way else given
+        return replace(given, data=part(so_far(way), checked.left_out, ready.seen, FIT_STEPS).data, searches={}) if way else given
 
     def everywhere(way: Way) -> Problem:
         there = so_far(way) if way else checked.data
