@@ -347,11 +347,35 @@ def fitted(
     """Parameters and noise in turn, until neither gains. start: whose noise to begin with. hopeless: what is not gone on with."""
     fit = replace(start, colour=noises.no_colour(start.z.shape[1]))  # what looks like colour may be what the effect explains
     for turn in range(rounds):
-        model = refine(given, fit, model)
+        model = _on_the_highest_step(given, fit, refine(given, fit, model))
         before, fit = fit, evaluate(given, model, fit.noise)
         if (turn and fit.white - before.white < SETTLED) or hopeless(fit):
             break
     return fit
+
+
+def _on_the_highest_step(given: Problem, fit: Fit, model: ComposedModel) -> ComposedModel:
+    """The model with its delays where the likelihood is highest, row by row of the inputs. A state that is set to its input at once (the
+    speed of a wheel) is the same for all delays between two such rows: the likelihood has steps, and no slope says where to go.
+    """
+    row = given.data.dt / given.data.substeps
+    began = best = float(np.sum(noises.log_density(objective(given, fit, model))))
+    for slot in (slot for slot in free_of(model) if _shifts_what_is_set(model, slot)):
+        for way in (row, -row):
+            while (other := with_values(model, (slot,), inside(model, (slot,), values_of(model, (slot,)) + way))) is not None:
+                there = foretold(given, other)
+                z = None if there is None else _whitened(given, fit, other.difference(given.steps.y1, there))
+                reached = best if z is None else float(np.sum(noises.log_density(z)))
+                if reached < best + NEXT:
+                    break
+                model, best = other, reached
+    return model if best == began else refine(given, fit, model)
+
+
+def _shifts_what_is_set(model: ComposedModel, slot: Slot) -> bool:
+    """Whether a number is the delay of an input that states are set to at once."""
+    a, there = model.effects[slot.place], {*getattr(model.nominal, "reached", {}).values()}
+    return getattr(a.effect, "shift", False) and (a.channel in there or (a.channel == "*" and bool(there)))
 
 
 def settled(given: Problem, fit: Fit) -> Fit:
