@@ -320,3 +320,18 @@ def test_friction_that_is_a_fortieth_more_one_way_has_two_numbers(back, told):
     data = from_arrays(model, [(np.concatenate(rows), u)])
     given = problem(data, steps_of(data))
     assert set(simplified(given, evaluate(given, robot)).model.effects[0].p) == told
+
+
+@pytest.mark.parametrize(("linear", "cubic", "shape"), [(-3.0, -2.0, ("position",)), (3.0, 2.0, ("position",)), (-3.0, 2.0, ())])
+def test_springs_that_pull_against_each_other_are_how_many_a_force_begins(linear, cubic, shape):
+    """A sine is x less a sixth of its cube near zero, and something else far from there. A spring that stiffens is one."""
+    rng = np.random.default_rng(12)
+    y = np.column_stack([rng.uniform(-0.5, 0.5, (201, 2)), rng.normal(size=(201, 2))])
+    model = compose(ModelSpec("double_integrator", 0.05))
+    data = from_arrays(model, [(y, rng.normal(size=(200, 2)))])
+    given = problem(data, steps_of(data))
+    field = _more(model, "position_field", "*", matrix=[[linear, 0.0], [0.0, 0.0]])
+    both = evaluate(given, _more(field, "cubic_stiffness", "x", coefficient=cubic))
+    elsewhere = evaluate(given, _more(field, "cubic_stiffness", "y", coefficient=cubic))
+    assert any_shape_of(both, [], data, given.steps) == shape
+    assert any_shape_of(elsewhere, [], data, given.steps) == ()

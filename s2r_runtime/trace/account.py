@@ -94,6 +94,8 @@ def _explained(r: TraceResult) -> list[str]:
         lines += ["cannot be told from:", *(line for e in r.rivals for line in [*_known(r, e), *_in_place_of(r, e)])]
         lines += labelled("or", _nameless(r))
         lines += labelled("try next", [r.suggested_excitation or "", "(--suggest FILE.csv writes such a drive)"])
+    elif r.any_shape_of:
+        lines += labelled("or", _nameless(r))
     if r.partial:
         lines += ["explains a part only, so no name is lent to it:", *(line for e in r.partial for line in _effect(e))]
     return lines
@@ -109,6 +111,8 @@ def _in_place_of(r: TraceResult, e: Found) -> list[str]:
 def _nameless(r: TraceResult) -> list[str]:
     """What else it may be where many explanations tie."""
     shared = " and ".join(r.any_shape_of)
+    if shared and not r.rivals:
+        return [f"anything else that depends on {shared} and begins so: together they turn over beyond where the robot was"]
     return [f"by anything else that depends on {shared}: where so many do alike, one without a name may, too"] if shared else []
 
 

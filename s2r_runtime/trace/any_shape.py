@@ -2,6 +2,9 @@
 
 Where a bias, a gain, a deadband and a limit of one input explain the same, the data have a single number to say about that input: whatever
 depends on it and comes out as that number would do, with a name in the library or without one. Of these only what they share is known.
+
+So it is of a spring and a cubic one that pull against each other on one position: the first terms of a sine (gravity, cogging) are that,
+and of whatever else turns over not far from where the robot was. What it does beyond, these terms do not say.
 """
 
 from __future__ import annotations
@@ -33,7 +36,17 @@ def any_shape_of(fit: Fit, rivals: Sequence[Fit], data: Dataset, steps: Steps) -
             count = Counter(token for one in explained for token in _about(*one, data, steps))
             most = max(count.values(), default=0)
             shared |= {token for token in count if count[token] == most >= SEVERAL}
+    if _turns_over(fit):
+        shared.add("position")
     return tuple(sorted(token for token in shared if f"memory({token})" not in shared))
+
+
+def _turns_over(fit: Fit) -> bool:
+    """Whether a linear and a cubic spring that were found pull against each other."""
+    found = [fit.model.effects[place] for place in fit.added]
+    fields = [a.p["matrix"] for a in found if a.effect.name == "position_field"]
+    cubes = [(a.channel, float(a.p["coefficient"])) for a in found if a.effect.name == "cubic_stiffness"]
+    return any(c in ("x", "y") and field["xy".index(c)]["xy".index(c)] * cube > 0.0 for field in fields for c, cube in cubes)
 
 
 def _each_once(explained: list[tuple[Fit, int]]) -> list[tuple[Fit, int]]:

@@ -110,7 +110,7 @@ _WORDS: dict[str, Callable[[str, Values], str]] = {
     "coulomb_friction": _friction("dry friction of a constant size"),
     "stribeck_friction": _friction("dry friction that is larger at standstill"),
     "quadratic_drag": lambda what, p: f"drag that grows with the square of {what}",
-    "cubic_stiffness": lambda what, p: f"a spring on {what} that stiffens with the cube",
+    "cubic_stiffness": lambda what, p: f"a spring on {what} that {'stiffens' if p['coefficient'] > 0.0 else 'gives way'} with the cube",
     "constant_disturbance": _disturbance,
     "gravity_slope": lambda what, p: "the ground slopes: what it does turns with the heading",
     "lateral_slip": lambda what, p: "the robot slides sideways in curves",

@@ -76,7 +76,7 @@ class TraceResult:
     may_depend_on: tuple[str, ...] = ()
     """Of `depends_on`, beside a name: what no rollout shows, or what is less sure."""
     any_shape_of: tuple[str, ...] = ()
-    """Of `depends_on`: what several explanations that tie have in common, one without a name may, too (`any_shape`)."""
+    """Of `depends_on`: what several explanations have in common that tie, or add up to it; one without a name may, too (`any_shape`)."""
     way: Way = field(default_factory=Way)
     """As the dataset's: how inputs went that the recording has samples of."""
     noisy: dict[str, float] = field(default_factory=dict)
