@@ -340,3 +340,30 @@ def test_another_thread_that_asks_of_the_same_arm_changes_no_answer(tmp_path, mo
 
     monkeypatch.setattr(forces, "_LAST", Shared())
     assert np.array_equal(forces._response(one, u, model, DT_S), alone)
+
+
+PROPELLERS = """
+import numpy as np
+
+STATES = ("z", "vz", "qw", "qx")
+INPUTS = ("{first}", "second")
+PARAMS = {{"mass": 0.5, "pull": 2e-6}}
+RATES = {{"vz": "z"}}
+UNITS = {{"z": "m", "vz": "m/s", "{first}": "{unit}"}}
+
+
+def step(x, u, dt, params):
+    q = x[:, 2:] / np.linalg.norm(x[:, 2:], axis=1, keepdims=True)
+    a = {force} * (1 - 2 * q[:, 1] ** 2) / params["mass"] - 9.81
+    return np.column_stack([x[:, 0] + dt * x[:, 1], x[:, 1] + dt * a, q])
+"""
+
+
+@pytest.mark.parametrize(
+    ("first", "unit", "force", "said"),
+    [("rotor", "rad/s", "params['pull'] * u[:, 0] ** 2", "N"), ("thrust", "lbf", "u[:, 0]", "lbf"), ("tilt", "rad", "u[:, 1]", "N")],
+)
+def test_what_brakes_is_told_in_units_of_an_input_only_if_that_is_a_force(tmp_path, first, unit, force, said):
+    """The speed of a rotor is none, although a mass divides what it does; no attitude is a quaternion of zeros."""
+    model = _model(tmp_path, PROPELLERS.format(first=first, unit=unit, force=force))
+    assert ViscousFriction().unit(model.nominal, "vz", "coefficient") == f"{said} s/m"

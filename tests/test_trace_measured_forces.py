@@ -202,3 +202,36 @@ def test_what_the_daemon_cuts_out_of_its_stream_was_commanded():
     stamps = [100_000_000 * k for k in range(6)]  # ns
     one = SimpleNamespace(states=[(t, (1e-9 * t, 0.0)) for t in stamps], inputs=[(t, (1.0,)) for t in stamps])
     assert trace_job.dataset(compose(ModelSpec("joint", 0.1)), SimpleNamespace(segments=[one]), "stream", ()).commanded
+
+
+def _led(seed: int, rows: int = 2500) -> Dataset:
+    """A joint with dry friction of 0.6 N m that a loop takes along sines. Its torque is measured by a sensor that filters its noise."""
+    rng, dt, mass, parts = np.random.default_rng(seed), 0.002, 0.5, 4
+    h = dt / parts
+    f, phase = 0.25 * np.arange(1, 6)[:, None], rng.uniform(0.0, 6.3, (5, 1))
+    turned = 2.0 * np.pi * f * h * np.arange(rows * parts) + phase
+    size = 0.25 / np.arange(1, 6)[:, None]
+    waves = (np.sin(turned), np.cos(turned), -np.sin(turned))
+    way = [np.sum(size * wave * (2.0 * np.pi * f) ** k, axis=0) for k, wave in enumerate(waves)]
+    q, v, torque, states, torques = float(way[0][0]), float(way[1][0]), 0.0, [], []
+    for k, (r, rate, acceleration) in enumerate(zip(*(one.tolist() for one in way), strict=True)):
+        if k % parts == 0:
+            torque = 400.0 * (r - q) + 30.0 * (rate - v) + mass * acceleration
+            states.append((q, v))
+            torques.append(torque)
+        free = v + h * torque / mass
+        then = free - np.sign(free) * min(abs(free), h * 0.6 / mass)
+        q, v = q + 0.5 * h * (v + then), then
+    noise, keep = np.zeros(rows), np.exp(-dt / 0.004)
+    for k, one in enumerate(rng.normal(size=rows).tolist()):
+        noise[k] = keep * noise[k - 1] + np.sqrt(1.0 - keep**2) * one
+    y = np.array(states) + rng.normal(size=(rows, 2)) * [1e-6, 4e-3]
+    return from_arrays(compose(ModelSpec("joint", dt, {"mass": mass})), [(y, (np.array(torques) + 0.2 * noise)[:-1, None])])
+
+
+def test_noise_that_a_torque_sensor_filters_is_no_memory_of_the_motor():
+    """As a command, the torque seems to have a play of 0.6 N m beside the friction, and memory that may be something else."""
+    result = trace(_led(1), compose(ModelSpec("joint", 0.002, {"mass": 0.5})))
+    assert [(e.name, e.channel) for e in result.effects] == [("coulomb_friction", "qd")]
+    assert result.effects[0].values == {"force": pytest.approx(0.6, rel=0.03)}
+    assert (result.verdict, result.depends_on, result.measured_forces) == ("traced", ("noise",), True)

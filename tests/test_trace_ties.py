@@ -335,3 +335,23 @@ def test_springs_that_pull_against_each_other_are_how_many_a_force_begins(linear
     elsewhere = evaluate(given, _more(field, "cubic_stiffness", "y", coefficient=cubic))
     assert any_shape_of(both, [], data, given.steps) == shape
     assert any_shape_of(elsewhere, [], data, given.steps) == ()
+
+
+def test_a_rival_that_is_gone_on_with_has_no_numbers_that_it_does_not_need(monkeypatch):
+    """Dry friction by direction, likelier by chance, gives way to one that is larger at rest by next to nothing: that is dry friction."""
+    rng, model = np.random.default_rng(13), compose(ModelSpec("joint", 0.05))
+    robot, x, rows = _more(model, "coulomb_friction", "qd", force=0.4), np.zeros((1, 2)), [np.zeros(2)]
+    u = np.repeat(rng.uniform(-2.0, 2.0, (60, 1)), 10, axis=0)
+    for one in u:
+        x = robot.step(x, one[None], robot.at_rest(1))[0]
+        rows.append(x[0])
+    data = from_arrays(model, [(np.array(rows) + rng.normal(size=(601, 2)) * [1e-3, 0.01], u)])
+    given = problem(data, steps_of(data))
+    by_direction = _with(given, model, "coulomb_friction", "qd", force_positive=0.42, force_negative=0.38)
+    at_rest = evaluate(given, _more(model, "stribeck_friction", "qd", force=0.4, static_force=0.4003, velocity=1.0))
+    chosen = Selection(evaluate(given, model), by_direction, 100, (), (Scored("stribeck_friction", "qd", 1.0, at_rest),))
+    monkeypatch.setattr(verdict, "_likeliest", lambda given, fit, found, judged_on: (at_rest, []))
+    left = confirmed(given, chosen, held(model, data, given.steps, (), np.ones(len(given.steps), dtype=bool), 1.0))
+    assert names(left.fit.model) == (("coulomb_friction", "qd"),)
+    (slot,) = left.fit.free
+    assert slot.name == "force"

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.hookspecs import NominalModel, Parameter
+from s2r_runtime.models.force_inputs import force_input
 from s2r_runtime.models.forces import POSE, Axis, Push, axes, coupled, lone_speeds, mass, mass_name, pushed, turns
 
 Array = NDArray[np.float64]
@@ -100,7 +101,9 @@ def has_pose(model: NominalModel) -> bool:
 
 
 def force_unit(model: NominalModel, channel: str = "") -> str:
-    """Of what acts on an axis: the input's where it is divided by a mass, an acceleration otherwise, and on a speed without a position."""
+    """Of what acts on an axis: the input's that the mass divides, where there is a mass; else an acceleration, as on a speed without a
+    position.
+    """
     units: dict[str, str] = getattr(model, "units", {})
     if channel in lone_speeds(model, slowed=True):
         return f"{length_unit(model, channel)}/s²"
@@ -108,7 +111,9 @@ def force_unit(model: NominalModel, channel: str = "") -> str:
         return units.get(model.inputs[0], "input's unit")
     if not mass_name(model):
         return "m/s²"
-    return units.get(model.inputs[0], "N m" if mass_name(model) == "inertia" else "N")
+    usual = "N m" if mass_name(model) == "inertia" else "N"
+    force = force_input(model)
+    return usual if force is None else units.get(force, usual)
 
 
 def length_unit(model: NominalModel, channel: str) -> str:

@@ -277,9 +277,9 @@ def _second_thoughts(asked: _Asked, ready: _Ready, whole: Whole, chosen: Selecti
     """The answer to a recording that is read otherwise, as this answer suggests, if it explains what this one does not."""
     fit, dataset = chosen.fit, ready.dataset
     unexplained = result.verdict == "unexplained"
-    if unexplained and asked.under is None and not (dataset.commanded or dataset.measured_forces) and refuted(fit, ready.cut.judged_on):
-        other = asked.again(90.0, dataset=replace(asked.dataset, measured_forces=True))
-        if says_forces(other.explaining, ready.cut.judged_on):
+    if unexplained and _may_be_measured(asked, ready) and refuted(fit, ready.cut.judged_on):
+        other = _with_measured_forces(asked, ready)
+        if other is not None:
             return other
     recorded = ((dataset, ready.cut.checked), (ready.test, ready.tested))
     if asked.under is None and result.effects and any(_more_faults(fit, ready.model, one, there) for one, there in recorded):
@@ -289,11 +289,41 @@ def _second_thoughts(asked: _Asked, ready: _Ready, whole: Whole, chosen: Selecti
         moved = None if lines is None else asked.again(90.0, dataset=lines[0], test=lines[1])
         if moved is not None and _leaves_nothing(moved):
             return moved
+    if _may_be_measured(asked, ready) and (_of_inputs_alone(result.depends_on) if unexplained else _doubted_memory(fit, result)):
+        other = _with_measured_forces(asked, ready)
+        if other is not None and _leaves_nothing(other) and (unexplained or _foretells_better(other, result)):
+            return other
     untimed = result.verdict in {"none", "unexplained"} and not (dataset.unplaced or dataset.commanded or dataset.way)
     on_rows = dataset.apart == 1 and not dataset.interpolated and commanded(dataset)
     if untimed and on_rows and only_before_changes(whole.given, whole.everywhere(fit)):
         return _less_changes(asked)
     return None
+
+
+def _may_be_measured(asked: _Asked, ready: _Ready) -> bool:
+    """Whether it has not been asked yet if inputs are forces that were measured."""
+    data, force = ready.dataset, ready.cut.judged_on.inverse
+    return asked.under is None and force is not None and not (data.commanded or data.measured_forces)
+
+
+def _with_measured_forces(asked: _Asked, ready: _Ready) -> TraceResult | None:
+    """The answer with inputs that are forces with noise of their own, if its inverse model says them."""
+    other = asked.again(90.0, dataset=replace(asked.dataset, measured_forces=True))
+    return other if says_forces(other.explaining, ready.cut.judged_on) else None
+
+
+def _doubted_memory(fit: Fit, result: TraceResult) -> bool:
+    """Whether an input was found to remember, and something may depend on that memory all the same: noise that a sensor filters looks so,
+    where the motion follows none of it.
+    """
+    found = [fit.model.effects[place] for place in fit.added]
+    return any(f"memory({a.channel})" in result.may_depend_on for a in found if remembers(fit.model, a))
+
+
+def _foretells_better(one: TraceResult, other: TraceResult) -> bool:
+    """Whether rollouts on held-out data end nearer, all states together."""
+    ends = [rms(r.after.ends) for r in (one, other)]
+    return bool(np.sum(np.log(np.maximum(ends[0], 1e-300))) < np.sum(np.log(np.maximum(ends[1], 1e-300))))
 
 
 def _told(asked: _Asked, ready: _Ready, whole: Whole, chosen: Selection, result: TraceResult) -> TraceResult:

@@ -30,7 +30,7 @@ from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, foretold, 
 from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import Mask, acting, first_steps, predicted, rms
 from s2r_runtime.trace.residual_noise import OUTLIER
-from s2r_runtime.trace.rivals import only_in, representative, tied
+from s2r_runtime.trace.rivals import only_in, representative, simplified, tied
 from s2r_runtime.trace.scores import STRICT, Scored, name_of, names
 from s2r_runtime.trace.selection import Selection, doing_something, one_more
 from s2r_runtime.trace.slots import Added, slots_of
@@ -113,7 +113,8 @@ def confirmed(given: Problem, chosen: Selection, judged_on: Held) -> Selection:
     fit, found = doing_something(given, fit), [s if s.fit is None else replace(s, fit=doing_something(given, s.fit)) for s in found]
     found = _in_its_place(fit, found)
     if found:
-        fit, found, risky = representative(given, *_likeliest(given, fit, found, judged_on))
+        best, found, risky = representative(given, *_likeliest(given, fit, found, judged_on))
+        fit = best if best is fit else simplified(given, best)  # a rival need not need all of its numbers either
         found = _in_its_place(fit, found)
     fit = fit if fit is chosen.fit else plainly(given, fit)
     return replace(chosen, fit=fit, rivals=tuple(found), risky=risky)
