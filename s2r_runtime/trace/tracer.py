@@ -53,7 +53,7 @@ from s2r_runtime.trace.throttled import refuted, says_forces
 from s2r_runtime.trace.unplaced import checked_of, only_before_changes
 from s2r_runtime.trace.unseen import alike
 from s2r_runtime.trace.verdict import confirmed, foretold_too
-from s2r_runtime.trace.ways import Way, moving
+from s2r_runtime.trace.ways import MOVING, Way, moving
 from s2r_runtime.trace.whole import Whole
 
 __all__ = ["Dataset", "TraceResult", "load_dataset", "trace", "usual_horizon"]
@@ -289,7 +289,11 @@ def _second_thoughts(asked: _Asked, ready: _Ready, whole: Whole, chosen: Selecti
         moved = None if lines is None else asked.again(90.0, dataset=lines[0], test=lines[1])
         if moved is not None and _leaves_nothing(moved):
             return moved
-    if _may_be_measured(asked, ready) and (_of_inputs_alone(result.depends_on) if unexplained else _doubted_memory(fit, result)):
+    if (
+        _may_be_measured(asked, ready)
+        and _ever_another(dataset)
+        and (_of_inputs_alone(result.depends_on) if unexplained else _doubted_memory(fit, result))
+    ):
         other = _with_measured_forces(asked, ready)
         if other is not None and _leaves_nothing(other) and (unexplained or _foretells_better(other, result)):
             return other
@@ -310,6 +314,12 @@ def _with_measured_forces(asked: _Asked, ready: _Ready) -> TraceResult | None:
     """The answer with inputs that are forces with noise of their own, if its inverse model says them."""
     other = asked.again(90.0, dataset=replace(asked.dataset, measured_forces=True))
     return other if says_forces(other.explaining, ready.cut.judged_on) else None
+
+
+def _ever_another(data: Dataset) -> bool:
+    """Whether inputs are others in most rows than in the row before, as a sensor's noise makes them; what is held was commanded."""
+    changed = [np.any(np.diff(run.u[:: data.substeps], axis=0) != 0.0, axis=1) for run in data.runs]
+    return bool(np.mean(np.concatenate(changed)) > MOVING)
 
 
 def _doubted_memory(fit: Fit, result: TraceResult) -> bool:
