@@ -366,7 +366,7 @@ def _on_the_highest_step(given: Problem, fit: Fit, model: ComposedModel) -> Comp
                 there = foretold(given, other)
                 z = None if there is None else _whitened(given, fit, other.difference(given.steps.y1, there))
                 reached = best if z is None else float(np.sum(noises.log_density(z)))
-                if reached < best + NEXT:
+                if not reached > best + NEXT:  # nor where it is no number
                     break
                 model, best = other, reached
     return model if best == began else refine(given, fit, model)
