@@ -235,3 +235,26 @@ def test_noise_that_a_torque_sensor_filters_is_no_memory_of_the_motor():
     assert [(e.name, e.channel) for e in result.effects] == [("coulomb_friction", "qd")]
     assert result.effects[0].values == {"force": pytest.approx(0.6, rel=0.03)}
     assert (result.verdict, result.depends_on, result.measured_forces) == ("traced", ("noise",), True)
+
+
+def test_a_motor_that_rings_under_commands_of_every_row_is_no_noise_of_a_sensor():
+    """Nothing in the library does so: that its force was measured would hide it."""
+    rng, dt, rows, parts = np.random.default_rng(1), 0.01, 1500, 10
+    u = np.zeros(rows)
+    for k in range(1, rows):
+        u[k] = 0.95 * u[k - 1] + rng.normal() * np.sqrt(1.0 - 0.95**2)
+    q = v = force = rate = 0.0
+    states = [(q, v)]
+    for asked in u.tolist():
+        for _ in range(parts):
+            rate += dt / parts * (40.0**2 * (asked - force) - 2.0 * 0.2 * 40.0 * rate)
+            force += dt / parts * rate
+            v += dt / parts * force / 0.5
+            q += dt / parts * v
+        states.append((q, v))
+    y = np.array(states) + rng.normal(size=(rows + 1, 2)) * [1e-4, 5e-3]
+    result = trace(
+        from_arrays(compose(ModelSpec("joint", dt, {"mass": 0.5})), [(y, u[:, None])]), compose(ModelSpec("joint", dt, {"mass": 0.5}))
+    )
+    assert (result.verdict, result.measured_forces) == ("unexplained", False)
+    assert "memory(force)" in result.depends_on

@@ -289,13 +289,10 @@ def _second_thoughts(asked: _Asked, ready: _Ready, whole: Whole, chosen: Selecti
         moved = None if lines is None else asked.again(90.0, dataset=lines[0], test=lines[1])
         if moved is not None and _leaves_nothing(moved):
             return moved
-    if (
-        _may_be_measured(asked, ready)
-        and _ever_another(dataset)
-        and (_of_inputs_alone(result.depends_on) if unexplained else _doubted_memory(fit, result))
-    ):
+    if not unexplained and _may_be_measured(asked, ready) and _ever_another(dataset) and _doubted_memory(fit, result):
+        # of a memory without a name that is not asked: a motor that rings would be noise of its sensor
         other = _with_measured_forces(asked, ready)
-        if other is not None and _leaves_nothing(other) and (unexplained or _foretells_better(other, result)):
+        if other is not None and other.effects and _leaves_nothing(other) and _foretells_better(other, result):
             return other
     untimed = result.verdict in {"none", "unexplained"} and not (dataset.unplaced or dataset.commanded or dataset.way)
     on_rows = dataset.apart == 1 and not dataset.interpolated and commanded(dataset)
