@@ -358,9 +358,12 @@ def _on_the_highest_step(given: Problem, fit: Fit, model: ComposedModel) -> Comp
     """The model with its delays where the likelihood is highest, row by row of the inputs. A state that is set to its input at once (the
     speed of a wheel) is the same for all delays between two such rows: the likelihood has steps, and no slope says where to go.
     """
-    row = given.data.dt / given.data.substeps
-    began = best = float(np.sum(noises.log_density(objective(given, fit, model))))
-    for slot in (slot for slot in free_of(model) if _shifts_what_is_set(model, slot)):
+    slots = [slot for slot in free_of(model) if _shifts_what_is_set(model, slot)]
+    if not slots:
+        return model
+    row, began = given.data.dt / given.data.substeps, model
+    best = float(np.sum(noises.log_density(objective(given, fit, model))))
+    for slot in slots:
         for way in (row, -row):
             while (other := with_values(model, (slot,), inside(model, (slot,), values_of(model, (slot,)) + way))) is not None:
                 there = foretold(given, other)
@@ -369,7 +372,7 @@ def _on_the_highest_step(given: Problem, fit: Fit, model: ComposedModel) -> Comp
                 if not reached > best + NEXT:  # nor where it is no number
                     break
                 model, best = other, reached
-    return model if best == began else refine(given, fit, model)
+    return model if model is began else refine(given, fit, model)
 
 
 def _shifts_what_is_set(model: ComposedModel, slot: Slot) -> bool:

@@ -284,9 +284,9 @@ def _second_thoughts(asked: _Asked, ready: _Ready, whole: Whole, chosen: Selecti
     recorded = ((dataset, ready.cut.checked), (ready.test, ready.tested))
     if asked.under is None and result.effects and any(_more_faults(fit, ready.model, one, there) for one, there in recorded):
         return asked.again(90.0, under=fit.model)
-    if unexplained and _of_inputs_alone(result.depends_on):
-        lines = _straight(asked, ready, fit, CLOSE)
-        moved = None if lines is None else asked.again(90.0, dataset=lines[0], test=lines[1])
+    if unexplained and _of_inputs_alone(result.depends_on) and sampled(asked.dataset):
+        lines = _straight(asked, ready, fit, CLOSE)  # less noise is no way on: it would smooth an input as a motor does that has no name
+        moved = None if lines is None or any(lines[0].way.clean) else asked.again(90.0, dataset=lines[0], test=lines[1])
         if moved is not None and _leaves_nothing(moved):
             return moved
     if not unexplained and _may_be_measured(asked, ready) and _ever_another(dataset) and _doubted_memory(fit, result):
@@ -316,7 +316,8 @@ def _with_measured_forces(asked: _Asked, ready: _Ready) -> TraceResult | None:
 def _ever_another(data: Dataset) -> bool:
     """Whether inputs are others in most rows than in the row before, as a sensor's noise makes them; what is held was commanded."""
     changed = [np.any(np.diff(run.u[:: data.substeps], axis=0) != 0.0, axis=1) for run in data.runs]
-    return bool(np.mean(np.concatenate(changed)) > MOVING)
+    every = np.concatenate(changed)
+    return bool(len(every) and np.mean(every) > MOVING)
 
 
 def _doubted_memory(fit: Fit, result: TraceResult) -> bool:
