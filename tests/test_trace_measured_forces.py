@@ -11,7 +11,7 @@ from s2r_runtime.daemon import trace_job
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import second_look
+from s2r_runtime.trace import second_look, tracer
 from s2r_runtime.trace.dataset import Dataset, from_arrays
 from s2r_runtime.trace.errors import held
 from s2r_runtime.trace.fitting import evaluate, insert, problem
@@ -258,3 +258,31 @@ def test_a_motor_that_rings_under_commands_of_every_row_is_no_noise_of_a_sensor(
     )
     assert (result.verdict, result.measured_forces) == ("unexplained", False)
     assert "memory(force)" in result.depends_on
+
+
+def test_only_what_is_another_in_most_rows_may_have_a_sensors_noise():
+    """A force that is held for ten rows was commanded."""
+    kept = _commanded(0)
+    (run,) = kept.runs
+    loud = replace(kept, runs=(replace(run, u=run.u + 0.01 * np.random.default_rng(1).normal(size=run.u.shape)),))
+    assert not tracer._ever_another(kept)
+    assert tracer._ever_another(loud)
+
+
+def test_what_foretells_better_ends_nearer_whatever_the_units_of_a_state():
+    """Half as far in one state outweighs a tenth farther in the other; what both foretell to rounding does not count."""
+
+    def ending(*far):
+        apart = [np.full((8, 2), e) * [1.0, 1e-3] for e in ([4.0, 4.0], far)]
+        return SimpleNamespace(before=SimpleNamespace(ends=apart[0]), after=SimpleNamespace(ends=apart[1]))
+
+    assert tracer._foretells_better(ending(0.5, 1.1), ending(1.0, 1.0))
+    assert not tracer._foretells_better(ending(1.1, 0.5), ending(0.5, 1.0))
+    assert not tracer._foretells_better(ending(1.1, 1e-15), ending(1.0, 1e-12))
+
+
+def test_a_memory_of_every_input_is_doubted_where_that_of_one_may_be_something_else():
+    lag = insert(JOINT, AppliedEffect(registry().get("effects", "input_lag"), "*", {"time_constant": 0.05}), 0)
+    fit = SimpleNamespace(model=lag, added=(0,))
+    assert tracer._doubted_memory(fit, SimpleNamespace(may_depend_on=("memory(force)",)))
+    assert not tracer._doubted_memory(fit, SimpleNamespace(may_depend_on=("speed",)))

@@ -13,7 +13,7 @@ import numpy as np
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import NominalModel
 from s2r_runtime.models.bound import BoundModel
-from s2r_runtime.models.forces import PROBE_S, axes, mass, response
+from s2r_runtime.models.forces import SHORT_S, axes, mass, response
 
 NEAR = 0.02
 """Of 1/mass: what a model loses to its own friction within the probe is less."""
@@ -36,8 +36,8 @@ def _found(model: BoundModel) -> str | None:
     asked = found = None
     for x in (np.zeros((1, n)), *np.eye(n)[:, None]):
         with contextlib.suppress(ConfigError):  # a user's model cannot be stepped just anywhere
-            asked = response(x, rest, model, PROBE_S, 1.0 / PROBE_S)[0, [axis.velocity for axis in axes(model)]]
-            size = mass(model) / PROBE_S * np.sqrt(np.sum(asked**2, axis=0))
+            asked = response(x, rest, model, SHORT_S, 1.0 / SHORT_S)[0, [axis.velocity for axis in axes(model)]]
+            size = mass(model) / SHORT_S * np.sqrt(np.sum(asked**2, axis=0))
             found = next((name for name, one in zip(model.inputs, size, strict=True) if abs(one - 1.0) < NEAR), None)
         if found is not None:
             return found

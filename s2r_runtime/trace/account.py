@@ -111,9 +111,7 @@ def _in_place_of(r: TraceResult, e: Found) -> list[str]:
 def _nameless(r: TraceResult) -> list[str]:
     """What else it may be where many explanations tie."""
     shared = " and ".join(r.any_shape_of)
-    if shared and not r.rivals:
-        return [f"anything else that depends on {shared} and begins so: together they turn over beyond where the robot was"]
-    return [f"by anything else that depends on {shared}: where so many do alike, one without a name may, too"] if shared else []
+    return [f"by anything else that depends on {shared}: where several do alike, or add up, one without a name may, too"] if shared else []
 
 
 def _known(r: TraceResult, e: Found) -> list[str]:

@@ -52,8 +52,9 @@ LONG = 3.5
 ONE_STEP, MOVED = 0.3, 6.0
 """Of a step, by which a usual interval may differ from it to be one; standard deviations that the state must move in it to be seen to."""
 
-SEEN = 3.0
-"""Standard deviations that the robot must go in the time in question for its pace to say whether there was such a time."""
+SEEN = 6.0
+"""Standard deviations that the robot must go in the time in question for its pace to say whether there was such a time: half way between
+the two answers is three from either."""
 
 STRAYS = 0.001
 """Share of rows that are away by what a late stamp could do, up to which they are left out; one always is."""

@@ -83,6 +83,9 @@ MOVED, ASKED = 1.5, 5.0
 """A robot whose measurements lie apart after the horizon as they do after one step has stood still; it was asked to move if the
 model would have it that much farther away."""
 
+EXACT = 1e-6
+"""Of where the model as given ends: what ends nearer is rounding, and nearer is no better."""
+
 
 def usual_horizon(dt: float) -> float:
     """Of rollouts, s: a second, and ten steps of what is slow."""
@@ -324,14 +327,16 @@ def _doubted_memory(fit: Fit, result: TraceResult) -> bool:
     """Whether an input was found to remember, and something may depend on that memory all the same: noise that a sensor filters looks so,
     where the motion follows none of it.
     """
-    found = [fit.model.effects[place] for place in fit.added]
-    return any(f"memory({a.channel})" in result.may_depend_on for a in found if remembers(fit.model, a))
+    found = [a for a in (fit.model.effects[place] for place in fit.added) if remembers(fit.model, a)]
+    asked = {name for a in found for name in (fit.model.inputs if a.channel == "*" else (a.channel,))}
+    return any(f"memory({name})" in result.may_depend_on for name in asked)
 
 
 def _foretells_better(one: TraceResult, other: TraceResult) -> bool:
-    """Whether rollouts on held-out data end nearer, all states together."""
-    ends = [rms(r.after.ends) for r in (one, other)]
-    return bool(np.sum(np.log(np.maximum(ends[0], 1e-300))) < np.sum(np.log(np.maximum(ends[1], 1e-300))))
+    """Whether rollouts on held-out data end nearer, all states together, each against where the model as given ends."""
+    given = np.maximum(rms(other.before.ends), 1e-300)
+    ends = [np.maximum(rms(r.after.ends) / given, EXACT) for r in (one, other)]
+    return bool(np.sum(np.log(ends[0])) < np.sum(np.log(ends[1])))
 
 
 def _told(asked: _Asked, ready: _Ready, whole: Whole, chosen: Selection, result: TraceResult) -> TraceResult:
