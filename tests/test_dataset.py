@@ -1,4 +1,4 @@
-"""A recording lands on the model's grid as it was measured: exactly where it can, by interpolation where it must."""
+"""A recording lands on the model's grid as it was measured: exactly where it can, else on the nearest row."""
 
 import gzip
 import hashlib
@@ -13,7 +13,7 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.recording.writer import Writer
 from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.chains import Inputs
-from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
+from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams, thinned
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.residual import acting, first_steps, rollout_starts, steps_of
 
@@ -31,7 +31,6 @@ def _streams(n=50, dt=0.1, seed=1):
 def test_rows_a_step_apart_are_taken_as_they_are():
     states, inputs = _streams()
     data = from_streams(_model(), [(states, inputs)], "here")
-    assert not data.interpolated
     assert data.substeps == 1
     assert np.array_equal(data.runs[0].y[:, :2], states.values[:, :2])
     assert np.array_equal(data.runs[0].u, inputs.values[:-1])
@@ -40,7 +39,6 @@ def test_rows_a_step_apart_are_taken_as_they_are():
 def test_rows_a_fraction_of_a_step_apart_are_picked_and_inputs_averaged():
     states, inputs = _streams(n=41, dt=0.025)
     data = from_streams(_model(), [(states, inputs)], "here")
-    assert not data.interpolated
     assert np.array_equal(data.runs[0].y[:, 0], states.values[::4, 0])
     mean = data.runs[0].u.reshape(10, data.substeps, 2).mean(axis=1)
     assert np.allclose(mean, inputs.values[:40].reshape(10, 4, 2).mean(axis=1))
@@ -73,7 +71,6 @@ def test_irregular_rows_are_taken_as_they_are_and_a_gap_is_a_gap():
     run = data.runs[0]
     at = np.concatenate([[0.0], np.cumsum(run.lasts)])
     good = ~np.isnan(run.y[:, 0])
-    assert not data.interpolated
     assert np.isin(np.round(run.y[good, 0], 9), np.round(2.0 * t, 9)).all()
     assert np.allclose(run.y[good, 0], 2.0 * at[good])
     assert np.all(np.abs(at - 0.1 * np.arange(len(at))) <= 0.05 + 1e-9)
@@ -85,13 +82,17 @@ def test_irregular_rows_are_taken_as_they_are_and_a_gap_is_a_gap():
     assert np.allclose(run.u[step].mean(axis=0), held.mean(axis=0), atol=1e-3)
 
 
-def test_rows_rarer_than_the_step_are_interpolated():
-    t = np.arange(0.0, 9.0, 0.13)
-    states = Stream(t, np.stack([2.0 * t, -t, 0.5 * t], axis=1))
-    data = from_streams(_model(), [(states, Stream(t, np.zeros((len(t), 2))))], "here")
-    y = data.runs[0].y
-    assert data.interpolated
-    assert np.allclose(y[:, 0], 0.2 * np.arange(len(y)))
+@pytest.mark.parametrize(("spacing", "step"), [(0.13, 0.13), (0.16, 0.2), (0.11, 0.1), (0.1, 0.1)])
+def test_where_rows_are_rarer_than_the_step_steps_are_longer_and_nothing_is_made_up_between_rows(spacing, step):
+    t = np.arange(0.0, 9.0, spacing)
+    states = Stream(t, np.stack([t**2, -t, 0.5 * t], axis=1))
+    given = from_streams(_model(), [(states, Stream(t, np.zeros((len(t), 2))))], "here")
+    model, data, _ = thinned(_model(), given)
+    assert model.dt == pytest.approx(step)
+    (run,) = data.runs
+    there = ~np.isnan(run.y[:, 0])
+    assert np.count_nonzero(there) >= 0.79 * len(run.y)
+    assert np.isin(np.round(run.y[there, 1], 9), np.round(-t, 9)).all()
 
 
 def test_angles_are_unwrapped_over_the_turn():

@@ -11,7 +11,7 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import coarse, grid_errors
-from s2r_runtime.trace.acceptance import WITHIN, _beyond_rounding
+from s2r_runtime.trace.acceptance import _beyond_rounding
 from s2r_runtime.trace.dataset import Run, from_arrays, from_streams
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem, sensitivities, told
 from s2r_runtime.trace.grid_errors import widened
@@ -272,16 +272,6 @@ def test_what_a_grid_adds_stays_within_what_a_number_may_be(monkeypatch):
     lag, gain = (widened(given, fit, dict(found))[slot] for slot in fit.free)
     assert lag == (bounds_of(fit.model, fit.free[0]).low, found[fit.free[0]][1])
     assert gain == (found[fit.free[1]][0], bounds_of(fit.model, fit.free[1]).high)
-
-
-def test_no_time_is_known_better_than_rows_that_were_interpolated_say():
-    given, fit = _two((("input_lag", {"time_constant": 0.2}), ("input_gain", {"gain": 0.7})))
-    found = intervals(given, fit)
-    assert widened(given, fit, dict(found)) == found
-    between = replace(given, data=replace(given.data, interpolated=True))
-    (low, high), gain = (widened(between, fit, dict(found))[slot] for slot in fit.free)
-    assert (found[fit.free[0]][0] - low, high - found[fit.free[0]][1]) == pytest.approx((WITHIN * 0.05, WITHIN * 0.05))
-    assert gain == found[fit.free[1]]
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.chains import Inputs
 from s2r_runtime.trace.dataset import from_streams
 from s2r_runtime.trace.holdout import part
+from s2r_runtime.trace.reconstruct import at_step
 from s2r_runtime.trace.residual import Acting, acting, advanced, residual, steps_of
 from s2r_runtime.trace.shapes import SHAPES, Shape
 from s2r_runtime.trace.streams import Stream
@@ -288,3 +289,25 @@ def test_friction_between_links_acts_for_as_long_as_each_row_lasts(tmp_path: Pat
         rows = np.flatnonzero(lasts == length)
         alone = advanced(replace(model, spec=structs.replace(model.spec, dt=float(length))), x[rows], Acting(u[rows], u[rows]), slice(None))
         assert together[rows] == pytest.approx(alone, rel=0.0, abs=1e-7)  # rounds end where forces hardly change
+
+
+@pytest.mark.parametrize("apart", [1.1, 1.3, 1.45])
+def test_wheels_that_turn_at_once_are_not_slow_where_rows_are_a_little_farther_apart_than_the_models_steps(apart):
+    """Halfway between two rows a wheel has one speed or the other, and no mean of both."""
+    dt, rows = 0.05, 500
+    model = compose(ModelSpec("differential_drive", dt))
+    robot = at_step(compose(ModelSpec("differential_drive", dt, {}, (EffectSpec("input_gain", "cmd_left", {"gain": 0.9}),))), apart * dt)
+    rng = np.random.default_rng(4)
+    u = np.repeat(rng.uniform(-6.0, 6.0, (rows // 4, 2)), 4, axis=0)
+    x, y = np.zeros((1, 5)), [np.zeros(5)]
+    for k in range(rows):
+        x, _ = robot.step(x, u[k : k + 1], robot.at_rest(1))
+        y.append(x[0])
+    t = apart * dt * np.arange(rows + 1)
+    measured = np.array(y) + rng.normal(size=(rows + 1, 5)) * [1e-3, 1e-3, 1e-3, 0.02, 0.02]
+    found = trace(from_streams(model, [(Stream(t, measured), Stream(t[:-1], u))], "made"), model)
+    assert [(e.name, e.channel) for e in found.effects] == [("input_gain", "cmd_left")]
+    assert found.effects[0].values == {"gain": pytest.approx(0.9, abs=0.005)}
+    assert (found.verdict, found.depends_on) == ("traced", ())
+    if apart > 1.1:
+        assert f"on steps of {apart * dt:.5g} s" in " ".join(found.done_to_data)

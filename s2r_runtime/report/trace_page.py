@@ -241,8 +241,7 @@ def _suggested(page: Page, r: TraceResult, suggested: Any) -> None:
 
 def _data(page: Page, r: TraceResult) -> None:
     page.heading("Data")
-    grid = "States were interpolated to the model's step: they were not recorded on it." if r.interpolated else "States are as recorded."
-    page.text(f"{r.n_rows} rows. {grid} Fitted on {r.n_fit} transitions, judged on {len(r.held.steps)} that the fit never saw.")
+    page.text(f"{r.n_rows} rows. Fitted on {r.n_fit} transitions, judged on {len(r.held.steps)} that the fit never saw.")
     for line in r.done_to_data:
         page.text(line)
     if r.outliers:

@@ -39,7 +39,9 @@ def add_trace(page: Page, trace: dict[str, Any]) -> None:
     if trace["suggested_excitation"]:
         page.text(f"What would tell them apart: {trace['suggested_excitation']}")
     if shared:
-        page.text(f"Or anything else that depends on {' and '.join(shared)}: where several do alike, or add up, one without a name may, too.")
+        page.text(
+            f"Or anything else that depends on {' and '.join(shared)}: where several do alike, or add up, one without a name may, too."
+        )
     if left:
         page.text("What is left depends on: " + ", ".join(left), "warn")
     if beside:

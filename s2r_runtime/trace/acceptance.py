@@ -50,19 +50,17 @@ def accepted(given: Problem, fit: Fit, base: Fit, tried: int, horizon: int, bar:
 
 def _told_by_stamps(given: Problem, fit: Fit, base: Fit) -> bool:
     """False for a time within a step where rows do not lie on the step, or inputs moved on between them: stamps, averages and reality
-    differ by that much. Of a robot that slides sideways that is so only where rows were interpolated: else its position and heading are of
-    one moment, whenever that was.
+    differ by that much. Of a robot that slides sideways that is not so: its position and heading are of one moment, whenever that was.
     """
     data = given.data
-    if not (data.interpolated or data.uneven or data.way or data.unplaced):
+    if not (data.uneven or data.way or data.unplaced):
         return True
     there = names(base.model)
     values = values_of(fit.model, fit.free)
     new = [
         (bounds_of(fit.model, slot), value)
         for slot, value in zip(fit.free, values.tolist(), strict=True)
-        if name_of(fit.model.effects[slot.place]) not in there
-        and (data.interpolated or fit.model.effects[slot.place].effect.stage == "input")
+        if name_of(fit.model.effects[slot.place]) not in there and fit.model.effects[slot.place].effect.stage == "input"
     ]
     return all(p.unit != "s" or p.neutral != 0.0 or abs(value) > WITHIN * data.dt for p, value in new)
 

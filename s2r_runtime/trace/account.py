@@ -314,8 +314,8 @@ def _unseen(r: TraceResult) -> list[str]:
 
 def _data(r: TraceResult) -> list[str]:
     runs = len({int(run) for run in r.held.steps.run}) if r.held.data.source != r.source else len(r.held.data.runs)
-    grid = "interpolated to the model's step, they were not recorded on it" if r.interpolated else "on the model's step as recorded"
-    lines = [f"{r.n_rows} rows in {runs} run{'s' if runs > 1 else ''}, {grid}", *_assumed(r)]
+    on = "on the model's step " if r.nominal.dt == r.spec.dt else ""
+    lines = [f"{r.n_rows} rows in {runs} run{'s' if runs > 1 else ''}, {on}as recorded", *_assumed(r)]
     lines += list(r.done_to_data)
     if r.outliers:
         lines.append(f"{r.outliers} outlying {'row counts' if r.outliers == 1 else 'rows count'} for next to nothing")

@@ -162,7 +162,6 @@ def _recorded(
         n_fit=len(given.steps),
         n_rows=dataset.rows,
         source=dataset.source,
-        interpolated=dataset.interpolated,
         reconstruction=dataset.reconstruction,
         way=dataset.way,
         noisy=dataset.noisy,

@@ -4,12 +4,12 @@
     u   = the commanded input, constant over parts of dt/S, (K S, nu); each is the mean of the held commands over its part
 
 States and inputs may come on stamps of their own. Where states were recorded dt apart (or a whole fraction of it) the grid lies on the
-recorded rows. Where they were recorded about as often or more often, each point of the grid takes the nearest row, and a step lasts as
-long as its two rows are apart. Only where rows are rarer are they interpolated linearly between neighbours that are close enough. Where
-inputs change on the grid only, S = 1. A run begins with the inputs that were there before its first state, if any were.
+recorded rows. Where they were not, each point of the grid takes the nearest row, and a step lasts as long as its two rows are apart.
+Where inputs change on the grid only, S = 1. A run begins with the inputs that were there before its first state, if any were.
 
 Steps are independent of each other if states are measured that often, and are not made of their neighbours by a filter. Where they
-are not, `thinned` gives the steps, some times longer, that are.
+are not, `thinned` gives the steps, some times longer, that are. Nothing is interpolated between two rows of all states: a wheel that
+changes its speed at once would look slow.
 """
 
 from __future__ import annotations
@@ -40,7 +40,6 @@ from s2r_runtime.trace.streams import (
     held,
     held_between,
     held_means,
-    interpolated,
     nearest,
     on_grid,
     turned,
@@ -68,11 +67,11 @@ PAUSE_S = 20.0
 """A recording that is silent for longer than this (or 200 steps) is two runs: what the robot did meanwhile is not known."""
 
 NEAREST = 1.1
-"""Rows at most this many steps apart are taken as they are, each step as long as its rows are apart. Interpolating would make a wheel that
-changes its speed at once look slow."""
+"""Rows at most this many steps apart nearly all have a point of the grid; where they are farther apart, the step is as long as they are."""
 
 SLOWEST, THINNED = 1.5, 3.2
-"""Rows farther apart than this many steps do not give every step; farther apart than so many, the step was meant for another recording."""
+"""Rows farther apart than this many steps do not give every step, and several are taken as one; farther apart than so many, the step was
+meant for another recording."""
 
 MOST_PARTS = 2
 """Parts of a step that is many of the model's at most: what an input does within it is then placed to a quarter of it, and more would cost
@@ -142,7 +141,6 @@ class Dataset:
     dt: float
     substeps: int
     runs: tuple[Run, ...]
-    interpolated: bool
     rows: int
     source: str
     digests: tuple[str, ...] = ()
@@ -150,7 +148,7 @@ class Dataset:
     paths: tuple[Path, ...] = field(default=(), repr=False)
     origin_s: float = 0.0
     reconstruction: Reconstruction | None = None
-    apart: int = 1
+    apart: float = 1
     interval: float = 0.0
     segments: tuple[tuple[Stream, Stream], ...] = field(default=(), repr=False)
     in_parts: bool = False
@@ -228,7 +226,7 @@ def from_arrays(model: ComposedModel, runs: Sequence[tuple[Array, Array]], sourc
         _fits(model, np.asarray(y), np.asarray(u), f"{source}: run {place}")
         made.append(Run(start, unwrapped(np.array(y, dtype=np.float64), model.angle_columns), np.repeat(u, parts, axis=0)))
         start += (len(y) + 1) * model.dt
-    return Dataset(model.states, model.inputs, model.dt, parts, tuple(made), False, sum(len(r.y) for r in made), source)
+    return Dataset(model.states, model.inputs, model.dt, parts, tuple(made), sum(len(r.y) for r in made), source)
 
 
 def _fits(model: ComposedModel, y: Array, u: Array, where: str) -> None:
@@ -262,24 +260,20 @@ def from_streams(
     pieces = _stretches(model, segments, source)
     stretches = [part for _, part in pieces]
     spacing = _spacing(stretches, dt, source)
-    apart = math.ceil(spacing / dt - ALIGNED) if spacing > SLOWEST * dt else 1
+    apart = _apart(spacing / dt)
     if reconstruction is not None:
         apart = max(apart, independent_step(reconstruction, dt))
     exact = all(on_grid(states.t, dt) for states, _ in stretches)
-    as_they_are = not exact and spacing <= NEAREST * dt
-    parts = in_parts or substeps or _parts(model, stretches, exact, as_they_are)
+    parts = in_parts or substeps or _parts(model, stretches, exact)
     origin = min(_first(states) for states, _ in segments)
-    if as_they_are:
-        runs = [_as_recorded(model, states, inputs, parts, origin) for states, inputs in stretches]
-    else:
-        runs = [_on_the_grid(model, states, inputs, parts, origin, None if exact else spacing) for states, inputs in stretches]
+    laid = _on_the_grid if exact else _as_recorded
+    runs = [laid(model, states, inputs, parts, origin) for states, inputs in stretches]
     return Dataset(
         states=model.states,
         inputs=model.inputs,
         dt=dt,
         substeps=parts,
         runs=tuple(replace(run, segment=k) for run, (k, _) in zip(runs, pieces, strict=True)),
-        interpolated=not exact and not as_they_are,
         rows=sum(len(states.t) for states, _ in stretches),
         source=source,
         digests=digests,
@@ -292,6 +286,13 @@ def from_streams(
         segments=tuple(segments),
         in_parts=in_parts > 0,
     )
+
+
+def _apart(steps: float) -> float:
+    """Steps of the model that are taken as one, where rows are so many of them apart."""
+    if steps > SLOWEST:
+        return math.ceil(steps - ALIGNED)
+    return steps if steps > NEAREST + ALIGNED else 1
 
 
 def _stretches(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], source: str) -> list[tuple[int, tuple[Stream, Stream]]]:
@@ -337,7 +338,7 @@ def _early(states: Stream, inputs: Stream, dt: float) -> int:
 
 
 def _as_recorded(model: ComposedModel, states: Stream, inputs: Stream, parts: int, origin: float) -> Run:
-    """A run on rows that are near the model's step, each step as long as its rows are apart."""
+    """A run on the rows nearest to the model's steps, each step as long as its rows are apart."""
     t0, early = float(states.t[0]), _early(states, inputs, model.dt)
     y, at = nearest(states, model.dt, model.angle_columns)
     at = np.concatenate([t0 - model.dt * np.arange(early, 0, -1), at])
@@ -345,13 +346,13 @@ def _as_recorded(model: ComposedModel, states: Stream, inputs: Stream, parts: in
     return Run(t0 - early * model.dt - origin, _after(early, y), u, lasts, late)
 
 
-def _on_the_grid(model: ComposedModel, states: Stream, inputs: Stream, parts: int, origin: float, spacing: float | None) -> Run:
-    """A run on the model's step. spacing: of the rows, s, if they have to be interpolated."""
+def _on_the_grid(model: ComposedModel, states: Stream, inputs: Stream, parts: int, origin: float) -> Run:
+    """A run on rows that lie on the model's steps."""
     dt, t0, early = model.dt, float(states.t[0]), _early(states, inputs, model.dt)
-    y = at_grid(states, dt, model.angle_columns) if spacing is None else interpolated(states, dt, model.angle_columns, spacing)
+    y = at_grid(states, dt, model.angle_columns)
     u = held_means(inputs, t0 - early * dt, len(y) - 1 + early, dt, parts)
     at = np.asarray(t0 + dt * np.arange(-early, len(y)), dtype=np.float64)
-    late = turned(inputs, at, parts, ALIGNED * dt) if spacing is None and parts > 1 else None
+    late = turned(inputs, at, parts, ALIGNED * dt) if parts > 1 else None
     return Run(t0 - early * dt - origin, _after(early, y), u, None, late)
 
 
@@ -382,7 +383,7 @@ def thinned(
 
     def again(one: Dataset) -> Dataset:
         if apart > 1:
-            return regridded(one, longer, parts or MOST_PARTS)
+            return regridded(one, longer, parts or (MOST_PARTS if apart > SLOWEST else 0))
         if not one.segments:  # arrays: inputs change with their rows
             return one
         return replace(regridded(one, longer, parts or MOST_PARTS), campaign=one.campaign)  # the step is the same, and so are its samples
@@ -486,15 +487,15 @@ def _received(inputs: Stream, t: Array) -> Stream:
     return Stream(np.append(t[0], inputs.t[inside]), np.concatenate([held(inputs.values[:before])[-1:], inputs.values[inside]]))
 
 
-def _parts(model: ComposedModel, stretches: Sequence[tuple[Stream, Stream]], exact: bool, as_they_are: bool) -> int:
+def _parts(model: ComposedModel, stretches: Sequence[tuple[Stream, Stream]], exact: bool) -> int:
     """S: into how many parts a step is cut."""
     least = least_parts(model)
     spacing = []
-    aligned: bool = exact or as_they_are
+    aligned = True
     for states, inputs in stretches:
         at = changes(inputs)
         place = (at - states.t[0]) / model.dt
-        if as_they_are:  # a step ends where its row is
+        if not exact:  # a step ends where its row is
             _, ends = nearest(states, model.dt, model.angle_columns)
             place = np.interp(at, ends, np.arange(len(ends)))
         off = np.abs(place - np.rint(place)) > ALIGNED

@@ -1,4 +1,4 @@
-"""What the grid adds to the intervals of numbers: commands that come within steps, and rows that were interpolated.
+"""What the grid adds to the intervals of numbers where commands come within steps.
 
 A command that changes within a part of a step counts as its mean over that part. What an effect makes of it is then off by c h or c h^2, h
 the part's length, and so are numbers: a rate limit that begins its ramp too early looks slow. With parts of 2 h a number p comes out by
@@ -6,8 +6,6 @@ c h (3 c h^2) farther off, so what is left is within  p(h) - p(2 h),  and lies t
 inputs push masses, a step takes their mean over all of it; what steps in parts say instead is added in the same way. Both to first order:
 
     p(other) - p = -(J^T W J)^-1 J^T W (z_other - z)        z: whitened residuals on the other grid and on this one
-
-Between rows that were interpolated nothing is known of when within WITHIN of a step something acted: no time is known better.
 """
 
 from __future__ import annotations
@@ -19,7 +17,6 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.forces import axes
 from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.acceptance import WITHIN
 from s2r_runtime.trace.coarse import coarser
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.fitting import Fit, Problem, foretold, objective, sensitivities
@@ -35,10 +32,6 @@ def widened(given: Problem, fit: Fit, found: Ranges) -> Ranges:
         for slot, by in zip(fit.free, shift.tolist(), strict=True):
             bounds, (low, high) = bounds_of(fit.model, slot), found[slot]
             found[slot] = max(min(low, low + by), bounds.low), min(max(high, high + by), bounds.high)
-    for slot in fit.free if given.data.interpolated else ():
-        bounds, (low, high) = bounds_of(fit.model, slot), found[slot]
-        if bounds.unit == "s":
-            found[slot] = max(low - WITHIN * given.data.dt, bounds.low), min(high + WITHIN * given.data.dt, bounds.high)
     return found
 
 

@@ -66,7 +66,6 @@ class TraceResult:
     n_fit: int
     n_rows: int
     source: str
-    interpolated: bool
     reconstruction: Reconstruction | None = None
     could_see: tuple[Visible, ...] = ()
     unseen: tuple[str, ...] = ()

@@ -243,5 +243,5 @@ def _rich(given: Problem, model: ComposedModel, reach: float = 1.0) -> _Rich:
         u = np.repeat(rng.uniform(least, most, (PROBE_STEPS, len(most))), hold, axis=0)[:PROBE_STEPS]
         y = rng.uniform(low, high, (PROBE_STEPS + 1, len(low)))
         runs.append(Run(float(start), y, np.repeat(u, source.substeps, axis=0)))
-    made = Dataset(source.states, source.inputs, source.dt, source.substeps, tuple(runs), False, 0, "rich inputs")
+    made = Dataset(source.states, source.inputs, source.dt, source.substeps, tuple(runs), 0, "rich inputs")
     return _Rich(made, np.sqrt(np.mean((steps.y1 - steps.y0) ** 2, axis=0)) + 1e-12)

@@ -47,7 +47,7 @@ def trajectories(model: ComposedModel, noise: Noise | None, start: Array, u: Arr
 def as_data(like: Dataset, y: Array, u: Array) -> Dataset:
     """One run on the same grid as a recording."""
     run = Run(0.0, y, np.repeat(u, like.substeps, axis=0))
-    return Dataset(like.states, like.inputs, like.dt, like.substeps, (run,), False, len(y), "suggested")
+    return Dataset(like.states, like.inputs, like.dt, like.substeps, (run,), len(y), "suggested")
 
 
 def expected(fits: Sequence[Fit], truth: int, data: Dataset) -> Array:

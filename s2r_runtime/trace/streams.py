@@ -6,7 +6,6 @@ An input holds until the next one and is zero before the first. A value that is 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -309,22 +308,6 @@ def held_between(inputs: Stream, at: Array, parts: int) -> Array:
         return np.zeros(((len(at) - 1) * parts, values.shape[1]))
     edges = np.interp(np.arange((len(at) - 1) * parts + 1) / parts, np.arange(len(at)), at)
     return _held_or_mean(np.diff(_area(inputs, edges), axis=0) / np.diff(edges)[:, None], values, inputs.t, edges)
-
-
-def interpolated(states: Stream, dt: float, angles: list[int], spacing: float) -> Array:
-    """(K + 1, nx) on the grid from the first stamp on: linear between neighbours at most a few usual spacings apart."""
-    values = unwrapped(states.values, angles)
-    near = max(1.6 * spacing, min(3.0 * spacing, dt))
-    grid = states.t[0] + dt * np.arange(math.floor((states.t[-1] - states.t[0]) / dt + ALIGNED) + 1)
-    right = np.clip(np.searchsorted(states.t, grid), 1, len(states.t) - 1)
-    share = ((grid - states.t[right - 1]) / (states.t[right] - states.t[right - 1]))[:, None]
-    y = (1.0 - share) * values[right - 1] + share * values[right]
-    far = states.t[right] - states.t[right - 1] > near
-    on_left, on_right = np.abs(grid - states.t[right - 1]) < ALIGNED * dt, np.abs(states.t[right] - grid) < ALIGNED * dt
-    y[far] = np.nan
-    y[far & on_left] = values[right - 1][far & on_left]
-    y[far & on_right] = values[right][far & on_right]
-    return np.asarray(y)
 
 
 def unwrapped(y: Array, angles: list[int]) -> Array:

@@ -298,7 +298,7 @@ def _second_thoughts(asked: _Asked, ready: _Ready, whole: Whole, chosen: Selecti
         if other is not None and other.effects and _leaves_nothing(other) and _foretells_better(other, result):
             return other
     untimed = result.verdict in {"none", "unexplained"} and not (dataset.unplaced or dataset.commanded or dataset.way)
-    on_rows = dataset.apart == 1 and not dataset.interpolated and commanded(dataset)
+    on_rows = dataset.apart == 1 and commanded(dataset)
     if untimed and on_rows and only_before_changes(whole.given, whole.everywhere(fit)):
         return _less_changes(asked)
     return None
