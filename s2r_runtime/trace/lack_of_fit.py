@@ -35,6 +35,7 @@ from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, SLOWLY, Judged, Left, f
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
 from s2r_runtime.trace.lack_of_fit_together import pairs
 from s2r_runtime.trace.measured_forces import about_inputs
+from s2r_runtime.trace.now_and_then import now_and_then
 from s2r_runtime.trace.residual import Mask, acting, covered, rms, rollout, rollout_starts, some_of
 from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
 
@@ -177,6 +178,11 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
         matters, share = _weight_of(left, nominal, judged, horizon)
         if matters and (not varies or varied is None or varied.beyond > 0.0):  # rollouts take less time than what it is beyond
             return Structure(tokens, True, share, gains, varies=varies, noise=_beside(left, judged), nats=nats)
+    lost = now_and_then(left)
+    if lost is not None:
+        matters, share = _weight_of(left, nominal, lost[0], horizon)
+        if matters:
+            return Structure(lost[1], True, share, gains, for_a_while=True, noise=_beside(left, lost[0]), nats=lost[0].gain)
     windows = None if chosen else windows or _for_a_while(left)
     matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
     if windows is None or not matters:  # a number that may vary is told with the name, if no rollout shows it
@@ -218,9 +224,17 @@ def _for_a_while(left: Left) -> Judged | None:
 
 def _wanders(left: Left, judged: Judged, enough: float) -> bool:
     """Whether what foretells fewer than `enough` nats elsewhere (none, if only sliding shows it) is rather a push that wanders: in a short
-    drive places and headings are as slow as time is, and slides know nothing of what wanders.
+    drive places and headings are as slow as time is, and slides know nothing of what wanders. Not what sliding shows by far of wild values
+    without the colour of the noise, for which what wanders has no use: commands that are lost now and then.
     """
-    return judged.gain <= enough and not left.given.floor.axes and as_noise(left, judged)
+    if judged.gain > enough or left.given.floor.axes or not as_noise(left, judged):
+        return False
+    if judged.token in SLIDING or left.clipped is None:
+        return True
+    joined, white = left.given.steps.joined, left.fit.whiten(judged.x)
+    laws = [left.fit.colour, *([] if left.law is None else [left.law])]
+    equal = np.ones_like(left.clipped)
+    return any(margin(law(white, joined), law(left.clipped, joined), equal, BEYOND) <= SLOW * BEYOND for law in laws)
 
 
 def _beside(left: Left, judged: Judged) -> tuple[Noise, Colour]:
