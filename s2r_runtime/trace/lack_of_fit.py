@@ -180,9 +180,10 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
             return Structure(tokens, True, share, gains, varies=varies, noise=_beside(left, judged), nats=nats)
     lost = now_and_then(left)
     if lost is not None:
-        matters, share = _weight_of(left, nominal, lost[0], horizon)
+        matters, share = _weight_of(left, nominal, lost.judged, horizon)
         if matters:
-            return Structure(lost[1], True, share, gains, for_a_while=True, noise=_beside(left, lost[0]), nats=lost[0].gain)
+            noise = _beside(left, lost.judged)
+            return Structure(lost.tokens, True, share, gains, for_a_while=True, noise=noise, nats=lost.judged.gain)
     windows = None if chosen else windows or _for_a_while(left)
     matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
     if windows is None or not matters:  # a number that may vary is told with the name, if no rollout shows it

@@ -9,14 +9,15 @@ asked one by one,
 c_k is 1 where that is likelier than not, the share of such steps known (a mixture of two, by turns of c and of share and noise). It counts
 if the log likelihood, noise and colour re-estimated, is beyond what a model without it leaves by the price of saying which steps these are,
 n H(share) with H the entropy of a coin of that share (J. Rissanen, Automatica 14, 1978), by BEYOND, and by far more than the same with d
-slid along the recording: outliers of a sensor know nothing of commands. A command that came late within its step is another thing: then r is
-a part of d, of any size.
+slid along the recording: outliers of a sensor know nothing of commands. A command that came late within its step is something else: r is a
+part of d then, of any size.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,16 +40,31 @@ FEWEST = 8
 PASSES = 5
 """Of which steps, and share and noise, in turn."""
 
-WHOLE = 0.15
+WHOLE = 0.07
 """Of d, by which r may differ from it over all such steps."""
 
 SLIDES, TWICE = 8, 2.0
 """Times that d is slid along the recording, and how many times what a slide explains there must be."""
 
 
-def now_and_then(left: Left) -> tuple[Judged, tuple[str, ...]] | None:
-    """The steps in which commands were lost, and what these are told as; None if noise may have made them."""
-    if left.clipped is None or left.given.floor.axes or left.given.data.measured_forces:
+@dataclass(frozen=True)
+class Lost:
+    """What commands do that are lost, and the tokens as which that is told."""
+
+    judged: Judged
+    tokens: tuple[str, ...]
+
+
+def now_and_then(left: Left) -> Lost | None:
+    """The steps in which commands were lost; None if noise may have made them."""
+    if "lost" not in left.known:
+        left.known["lost"] = _found(left)
+    lost: Lost | None = left.known["lost"]
+    return lost
+
+
+def _found(left: Left) -> Lost | None:
+    if left.given.floor.axes or left.given.data.measured_forces:
         return None
     offers = list(_offers(left))
     found = [(*_explained(left, d), d, tokens) for d, tokens in offers]
@@ -59,7 +75,7 @@ def now_and_then(left: Left) -> tuple[Judged, tuple[str, ...]] | None:
     shifts = np.linspace(0.0, len(d), SLIDES + 2).astype(int)[1:-1]
     if gain <= TWICE * max(_explained(left, np.roll(d, int(shift), axis=0))[0] for shift in shifts):
         return None
-    return Judged(tokens[0], np.where(lost[:, None], d, 0.0)[:, :, None], gain, 1.0, np.ones((BLOCKS, 1))), tokens
+    return Lost(Judged(tokens[0], np.where(lost[:, None], d, 0.0)[:, :, None], gain, 1.0, np.ones((BLOCKS, 1))), tokens)
 
 
 def _offers(left: Left) -> Iterator[tuple[Array, tuple[str, ...]]]:

@@ -31,6 +31,11 @@ Mask = NDArray[np.bool_]
 TAIL, WIDE = 0.01, 8.0
 """Share and size of wild errors in the density above. One such error then costs about log(WIDE / TAIL) = 7 nats."""
 
+LONGER, SHOCKS = 1.5, (0.003, 0.01, 0.03, 0.1, 0.3)
+"""Times as many steps that are wild as are outlying from which on shocks are asked about; and noise of the process that is tried then, as a
+share of all noise in a step.
+"""
+
 OUTLIER = 4.5
 """|z| above which a step is given a variance of its own when Q and R are estimated; white noise has one such in 150 000."""
 
@@ -196,6 +201,31 @@ def estimate(r: Array, f: Array, joined: Mask, floor: Noise, near: Noise | None 
         own = noise.q + seen + f**2 @ seen
         extra += np.where(wild, (z**2 / 4.0) * (own + extra), 0.0)
         noise = together(r, f, joined, extra, (noise,), floor) if hidden else _by_state(r, f, joined, extra, noise, floor)
+    return _after_shocks(r, f, joined, noise, np.any(extra > 0.0, axis=1)) if np.any(extra) and not noise.axes else noise
+
+
+def _after_shocks(r: Array, f: Array, joined: Mask, noise: Noise, outlying: Mask) -> Noise:
+    """With as much noise of the process as is likeliest where outlying steps are given no variance of their own, if many steps after them
+    are wild then: what a shock has moved stays there, and a filter that knows of no noise of the process does not believe it.
+    """
+    whiten = Whitener(noise, f, joined)
+    z = whiten(r)
+    wild = np.mean(np.abs(z) > OUTLIER, axis=0)
+    if not np.any(wild > LONGER * np.mean(outlying) + 1.0 / len(z)):
+        return noise
+
+    def told(level: Noise) -> float:
+        whiten = Whitener(level, f, joined)
+        return float(np.sum(log_density(whiten(r)))) - whiten.logdet
+
+    best = told(noise)
+    for i in np.argsort(-wild)[: np.count_nonzero(wild)].tolist():
+        for times in SHOCKS:
+            more = noise.q.copy()
+            more[i] = max(more[i], times * (more[i] + noise.r[i]))
+            reached = told(other := Noise(more, noise.r))
+            if reached > best:
+                best, noise = reached, other
     return noise
 
 

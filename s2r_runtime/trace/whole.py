@@ -28,6 +28,7 @@ from s2r_runtime.trace.lack_of_fit import (
     still_left,
 )
 from s2r_runtime.trace.lack_of_fit_judged import Judged, Left
+from s2r_runtime.trace.now_and_then import Lost, now_and_then
 from s2r_runtime.trace.one_stretch import in_one_stretch
 from s2r_runtime.trace.opposed import opposed
 from s2r_runtime.trace.patchwork import patchwork
@@ -131,6 +132,8 @@ class Whole:
         found = lack_of_fit(looks, self.nominal, self._horizon)
         if crowded(fit) or self._patchwork(fit):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
+        if (lost := now_and_then(self._looks.left)) is not None and self._lost_alone(lost, fit, looks):
+            return replace(found, tokens=lost.tokens, matters=True, share=1.0, for_a_while=True, nats=lost.judged.gain)
         if against := opposed(self.given, fit):
             return replace(found, tokens=tuple(dict.fromkeys((*against, *found.tokens))), matters=True, share=1.0)
         if (looks.most > ALIKE or found.matters) and self._explained_without(fit, looks, found):
@@ -185,6 +188,14 @@ class Whole:
         least = SHAPED * max(gain(best, self.nominal), 0.0)
         left = {token for token, nats in found.gains.items() if token in found.tokens and nats > least}
         return bool(left) and bool(left & about_states(best.model, best.added, self.given.data, self.given.steps))
+
+    def _lost_alone(self, lost: Lost, fit: Fit, looks: Looks) -> bool:
+        """Whether commands that are lost explain by themselves what names do, whatever is lost beside these: a mean of what comes and what
+        does not is a weaker input, or a later one. looks: at what the names leave.
+        """
+        beside = now_and_then(looks.left)
+        both = gain(fit, self.nominal) + (0.0 if beside is None else beside.judged.gain)
+        return lost.judged.gain + CLEAR > both
 
     @property
     def likeliest(self) -> tuple[str, ...]:
