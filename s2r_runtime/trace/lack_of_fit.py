@@ -163,6 +163,12 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
             others.append(looks.field.nats)
         if others and max(others) > nats_of(left, chosen[-1].x):
             chosen = []
+    lost = now_and_then(left)
+    if lost is not None and lost.judged.gain > max((judged.gain for judged in chosen), default=0.0):
+        matters, share = _weight_of(left, nominal, lost.judged, horizon)
+        if matters:
+            noise = _beside(left, lost.judged)
+            return Structure(lost.tokens, True, share, gains, for_a_while=True, noise=noise, nats=lost.judged.gain)
     shows = False
     if chosen:
         shows, share = _weight_of(left, nominal, chosen[-1], horizon)
@@ -178,12 +184,6 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
         matters, share = _weight_of(left, nominal, judged, horizon)
         if matters and (not varies or varied is None or varied.beyond > 0.0):  # rollouts take less time than what it is beyond
             return Structure(tokens, True, share, gains, varies=varies, noise=_beside(left, judged), nats=nats)
-    lost = now_and_then(left)
-    if lost is not None:
-        matters, share = _weight_of(left, nominal, lost.judged, horizon)
-        if matters:
-            noise = _beside(left, lost.judged)
-            return Structure(lost.tokens, True, share, gains, for_a_while=True, noise=noise, nats=lost.judged.gain)
     windows = None if chosen else windows or _for_a_while(left)
     matters, share = (False, 0.0) if windows is None else _weight_of(left, nominal, windows, horizon, DOUBLED)
     if windows is None or not matters:  # a number that may vary is told with the name, if no rollout shows it

@@ -115,6 +115,8 @@ def _explained(left: Left, d: Array) -> tuple[float, Mask]:
     joined = left.given.steps.joined
     whiten = Whitener(noises.estimate(rest, left.f, joined, left.given.floor), left.f, joined)
     z = whiten(rest)
-    told = noises.log_likelihood(z, whiten, noises.colour(z, joined), joined)
+    colour = noises.colour(z, joined)
+    told = noises.log_likelihood(z, whiten, colour, joined)
+    bare = max(left.fit.coloured, left.fit.white, noises.log_likelihood(whiten(r), whiten, colour, joined))  # a better noise is no loss
     which = -n * (share * math.log(share) + (1.0 - share) * math.log(1.0 - share))
-    return told - max(left.fit.coloured, left.fit.white) - which, lost
+    return told - bare - which, lost

@@ -31,9 +31,9 @@ Mask = NDArray[np.bool_]
 TAIL, WIDE = 0.01, 8.0
 """Share and size of wild errors in the density above. One such error then costs about log(WIDE / TAIL) = 7 nats."""
 
-LONGER, SHOCKS = 1.5, (0.003, 0.01, 0.03, 0.1, 0.3)
-"""Times as many steps that are wild as are outlying from which on shocks are asked about; and noise of the process that is tried then, as a
-share of all noise in a step.
+OFTEN, SHOCKED, STRIDES = 0.01, 0.3, (3.0, 1.4)
+"""Share of steps that are wild, of some state, from which on shocks are asked about; the least noise of the process that is tried
+first, of what was thought to be all noise of a step; and factors by which variances are tried larger and smaller.
 """
 
 OUTLIER = 4.5
@@ -201,32 +201,49 @@ def estimate(r: Array, f: Array, joined: Mask, floor: Noise, near: Noise | None 
         own = noise.q + seen + f**2 @ seen
         extra += np.where(wild, (z**2 / 4.0) * (own + extra), 0.0)
         noise = together(r, f, joined, extra, (noise,), floor) if hidden else _by_state(r, f, joined, extra, noise, floor)
-    return _after_shocks(r, f, joined, noise, np.any(extra > 0.0, axis=1)) if np.any(extra) and not noise.axes else noise
+    return _after_shocks(r, f, joined, noise, floor) if np.any(extra) and not noise.axes else noise
 
 
-def _after_shocks(r: Array, f: Array, joined: Mask, noise: Noise, outlying: Mask) -> Noise:
+def _after_shocks(r: Array, f: Array, joined: Mask, noise: Noise, floor: Noise) -> Noise:
     """With as much noise of the process as is likeliest where outlying steps are given no variance of their own, if many steps after them
     are wild then: what a shock has moved stays there, and a filter that knows of no noise of the process does not believe it.
     """
-    whiten = Whitener(noise, f, joined)
-    z = whiten(r)
-    wild = np.mean(np.abs(z) > OUTLIER, axis=0)
-    if not np.any(wild > LONGER * np.mean(outlying) + 1.0 / len(z)):
-        return noise
 
-    def told(level: Noise) -> float:
+    def told(level: Noise) -> tuple[float, Array]:
         whiten = Whitener(level, f, joined)
-        return float(np.sum(log_density(whiten(r)))) - whiten.logdet
+        z = whiten(r)
+        return float(np.sum(log_density(z))) - whiten.logdet, np.mean(np.abs(z) > OUTLIER, axis=0)
 
-    best = told(noise)
-    for i in np.argsort(-wild)[: np.count_nonzero(wild)].tolist():
-        for times in SHOCKS:
-            more = noise.q.copy()
-            more[i] = max(more[i], times * (more[i] + noise.r[i]))
-            reached = told(other := Noise(more, noise.r))
-            if reached > best:
-                best, noise = reached, other
+    best, wild = told(noise)
+    asked = np.zeros(len(wild), dtype=bool)
+    while np.any(wild[~asked] > OFTEN):  # states that follow from the one that is hit are wild, too, and no more once it is known
+        firsts = [(told(shocked), shocked, i) for i, shocked in _shocked(noise) if wild[i] > OFTEN and not asked[i]]
+        (reached, then), there, i = max(firsts, key=lambda one: one[0][0])
+        if reached <= best:
+            break
+        asked[i], best, noise, wild = True, reached, there, then
+        for factor in STRIDES:
+            moved = True
+            while moved:
+                moved = False
+                for more_q, more_r in ((factor, 1.0), (1.0 / factor, 1.0), (1.0, factor), (1.0, 1.0 / factor)):
+                    q, seen = max(more_q * noise.q[i], floor.q[i]), max(more_r * noise.r[i], floor.r[i])
+                    reached, then = told(there := _with(noise, i, q, seen))
+                    if reached > best + NEAR_ENOUGH:
+                        best, noise, wild, moved = reached, there, then, True
     return noise
+
+
+def _shocked(noise: Noise) -> list[tuple[int, Noise]]:
+    """With each state's process as noisy as is tried first."""
+    return [(i, _with(noise, i, max(q, SHOCKED * (q + r)), r)) for i, (q, r) in enumerate(zip(noise.q, noise.r, strict=True))]
+
+
+def _with(noise: Noise, i: int, q: float, r: float) -> Noise:
+    """With other variances of one state."""
+    variances = noise.q.copy(), noise.r.copy()
+    variances[0][i], variances[1][i] = q, r
+    return Noise(*variances, noise.axes)
 
 
 def hidden_by_others(f: Array, noise: Noise) -> bool:
