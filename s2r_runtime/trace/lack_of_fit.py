@@ -164,9 +164,12 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
         if others and max(others) > nats_of(left, chosen[-1].x):
             chosen = []
     lost = now_and_then(left)
+    dropped: tuple[str, ...] = ()
     if lost is not None and lost.judged.gain > max((judged.gain for judged in chosen), default=0.0):
         matters, share = _weight_of(left, nominal, lost.judged, horizon)
-        if matters:
+        if matters and left.fit.added:  # a delay is one, whatever comes later still now and then
+            dropped = lost.tokens
+        elif matters:
             noise = _beside(left, lost.judged)
             return Structure(lost.tokens, True, share, gains, for_a_while=True, noise=noise, nats=lost.judged.gain)
     shows = False
@@ -189,7 +192,7 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     if windows is None or not matters:  # a number that may vary is told with the name, if no rollout shows it
         seen = as_told(chosen) if chosen and left.fit.added and (shows or _share_of(left, chosen[-1]) > MUCH) else ()
         also = () if varying is None else (varying.judged.token,)
-        return Structure(coloured, False, 0.0, gains, beside=tuple(dict.fromkeys((*also, *seen))))
+        return Structure(coloured, False, 0.0, gains, beside=tuple(dict.fromkeys((*dropped, *also, *seen))))
     tokens = tuple(dict.fromkeys(map(_told, may_depend_on(left, windows, found))))
     return Structure(tokens, True, share, gains, for_a_while=True, noise=_beside(left, windows), nats=windows.gain)
 

@@ -31,8 +31,10 @@ from s2r_runtime.trace.residual_noise import Whitener
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-BEGIN, MOST = 0.05, 0.5
-"""Share of steps that is begun with, and from which on it is not now and then."""
+BEGIN, MOST, CLEAR = 0.05, 0.5, 5.0
+"""Share of steps that is begun with, and from which on it is not now and then; also of those in which d is so many standard deviations, and
+could be told: where most commands that change seem lost, they are late.
+"""
 
 FEWEST = 8
 """Steps below which a few outliers may lie so by chance."""
@@ -42,6 +44,10 @@ PASSES = 5
 
 WHOLE = 0.07
 """Of d, by which r may differ from it over all such steps."""
+
+ON_END = 0.3
+"""Share of such steps, beyond what chance makes, that may follow one another: what goes on is no packet that was lost (an end stop).
+"""
 
 SLIDES, TWICE = 8, 2.0
 """Times that d is slid along the recording, and how many times what a slide explains there must be."""
@@ -109,6 +115,10 @@ def _explained(left: Left, d: Array) -> tuple[float, Mask]:
         if not FEWEST <= count <= MOST * n:
             return 0.0, lost
         share, rest = count / n, r - np.where(lost[:, None], d, 0.0)
+    on_end = float(np.mean(lost[1:] & lost[:-1])) / share
+    told = np.sum((d / usual) ** 2, axis=1) > CLEAR**2
+    if on_end > ON_END + (1.0 - ON_END) * share or np.count_nonzero(lost & told) > MOST * np.count_nonzero(told):
+        return 0.0, lost
     there, size = np.sum((r * d / usual**2)[lost]), np.sum((d * d / usual**2)[lost])
     if not abs(there / size - 1.0) <= WHOLE:
         return 0.0, lost
@@ -116,7 +126,7 @@ def _explained(left: Left, d: Array) -> tuple[float, Mask]:
     whiten = Whitener(noises.estimate(rest, left.f, joined, left.given.floor), left.f, joined)
     z = whiten(rest)
     colour = noises.colour(z, joined)
-    told = noises.log_likelihood(z, whiten, colour, joined)
+    reached = noises.log_likelihood(z, whiten, colour, joined)
     bare = max(left.fit.coloured, left.fit.white, noises.log_likelihood(whiten(r), whiten, colour, joined))  # a better noise is no loss
     which = -n * (share * math.log(share) + (1.0 - share) * math.log(1.0 - share))
-    return told - bare - which, lost
+    return reached - bare - which, lost
