@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -96,6 +97,31 @@ def test_commands_that_come_late_within_their_steps_are_a_delay_on_average() -> 
     found = trace(data, CART)
     assert [(e.name, e.channel) for e in found.effects] == [("input_delay", "*")]
     assert found.effects[0].values == {"delay": pytest.approx(0.5 * DT, rel=0.1)}
+
+
+def test_an_input_that_never_changes_may_be_lost_too() -> None:
+    """There is no command before that would be another one."""
+    rng, x, rows = np.random.default_rng(3), np.zeros(3), [np.zeros(3)]
+    w, lost = rng.uniform(-1.0, 1.0, ROWS), rng.random(ROWS) < 0.05
+    robot = CART
+    for k in range(ROWS):
+        x = robot.step(x[None], np.array([[0.0 if lost[k] else 0.6, w[k]]]), robot.at_rest(1))[0][0]
+        rows.append(x)
+    u = np.column_stack([np.full(ROWS, 0.6), w])
+    data = from_arrays(CART, [(np.array(rows) + rng.normal(size=(ROWS + 1, 3)) * [8e-4, 8e-4, 2e-3], u)])
+    assert _lost(data, CART) == ("v",)
+
+
+def test_a_model_of_ones_own_that_knows_no_zero_command_is_not_asked_about_it(tmp_path: Path) -> None:
+    (tmp_path / "pump.py").write_text(
+        'STATES = ("level",)\nINPUTS = ("flow",)\nPARAMS = {}\n\n\ndef step(x, u, dt, params):\n'
+        '    if (u <= 0.0).any():\n        raise ValueError("no flow")\n    return x + 0.1 * dt * u\n'
+    )
+    model = compose(ModelSpec(str(tmp_path / "pump.py"), 0.5))
+    rng = np.random.default_rng(5)
+    u = rng.uniform(1.0, 2.0, (400, 1))
+    level = np.concatenate([[[0.0]], np.cumsum(0.05 * u, axis=0)]) + rng.normal(size=(401, 1)) * 1e-3
+    assert _lost(from_arrays(model, [(level, u)]), model) == ()
 
 
 @pytest.mark.parametrize("seed", first(2, range(20)))

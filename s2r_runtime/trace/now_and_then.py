@@ -22,10 +22,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.errors import ConfigError
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.episodes import BEYOND
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
-from s2r_runtime.trace.residual import acting, advanced
+from s2r_runtime.trace.residual import acting, advanced, rms
 from s2r_runtime.trace.residual_noise import Whitener
 
 Array = NDArray[np.float64]
@@ -95,9 +96,12 @@ def _offers(left: Left) -> Iterator[tuple[Array, tuple[str, ...]]]:
         for other, token in ((before, "memory({})"), (0.0 * before, "{}")):
             shift = np.zeros_like(act.mean)
             shift[:, which] = (other - act.mean)[:, which]
-            d = model.difference(advanced(model, steps.y0, act.moved(shift), steps.place), to)
+            try:
+                d = model.difference(advanced(model, steps.y0, act.moved(shift), steps.place), to)
+            except ConfigError:  # a user's own model may give no numbers for a command that is none
+                continue
             if np.all(np.isfinite(d)) and np.any(d):
-                size = np.std(shift, axis=0)
+                size = rms(shift)
                 yield d, tuple(token.format(model.inputs[j]) for j in sorted(which, key=lambda j: -size[j]) if size[j] > 0.0)
 
 
