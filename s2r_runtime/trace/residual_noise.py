@@ -32,8 +32,8 @@ TAIL, WIDE = 0.01, 8.0
 """Share and size of wild errors in the density above. One such error then costs about log(WIDE / TAIL) = 7 nats."""
 
 OFTEN, SHOCKED, STRIDES = 0.01, 0.3, (3.0, 1.4)
-"""Share of steps that are wild, of some state, from which on shocks are asked about; the least noise of the process that is tried
-first, of what was thought to be all noise of a step; and factors by which variances are tried larger and smaller.
+"""Share of steps that are outlying, and wild in some state, from which on shocks are asked about; the least noise of the process that is
+tried first, of what was thought to be all noise of a step; and factors by which variances are tried larger and smaller.
 """
 
 OUTLIER = 4.5
@@ -201,7 +201,8 @@ def estimate(r: Array, f: Array, joined: Mask, floor: Noise, near: Noise | None 
         own = noise.q + seen + f**2 @ seen
         extra += np.where(wild, (z**2 / 4.0) * (own + extra), 0.0)
         noise = together(r, f, joined, extra, (noise,), floor) if hidden else _by_state(r, f, joined, extra, noise, floor)
-    return _after_shocks(r, f, joined, noise, floor) if np.any(extra) and not noise.axes else noise
+    seldom = np.mean(np.any(rough > 0.0, axis=1)) <= OFTEN  # one that is off is left to itself
+    return noise if seldom or noise.axes else _after_shocks(r, f, joined, noise, floor)
 
 
 def _after_shocks(r: Array, f: Array, joined: Mask, noise: Noise, floor: Noise) -> Noise:
