@@ -134,6 +134,22 @@ def test_outliers_of_a_sensor_know_nothing_of_commands(seed: int) -> None:
     assert _lost(data, CART) == ()
 
 
+@pytest.mark.parametrize("share", [0.06, 0.1, 0.15])
+@pytest.mark.parametrize("seed", first(2, range(6)))
+def test_rows_that_are_one_sample_old_are_no_commands_that_are_lost(seed: int, share: float) -> None:
+    """Where they are, the robot seems not to have moved: just what no command does, but in the next row it is where it should be."""
+    data = _driven(seed, np.zeros(ROWS))
+    (run,) = data.runs
+    old = np.append(False, np.random.default_rng(200 + seed).random(ROWS) < share)
+    run.y[old] = run.y[np.flatnonzero(old) - 1] + np.random.default_rng(300 + seed).normal(size=(np.count_nonzero(old), 3)) * [
+        8e-4,
+        8e-4,
+        2e-3,
+    ]
+    found = trace(data, CART)
+    assert (found.verdict in {"none", "sensor_fault"}, {*found.depends_on} - {"noise"}) == (True, set())
+
+
 @pytest.mark.parametrize("seed", first(2, range(20)))
 def test_shocks_that_stay_make_no_other_drag_likelier(seed: int) -> None:
     """A joint that is hit in every fiftieth step goes on at another speed. A filter that does not believe it is off for long, by the right

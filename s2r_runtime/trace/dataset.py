@@ -262,7 +262,8 @@ def from_streams(
     spacing = _spacing(stretches, dt, source)
     apart = _apart(spacing / dt)
     if reconstruction is not None:
-        apart = max(apart, independent_step(reconstruction, dt))
+        each = apart if apart <= SLOWEST else 1  # a grid between the rows would take some twice as far apart as others
+        apart = max(apart, each * math.ceil(independent_step(reconstruction, dt) / each))
     exact = all(on_grid(states.t, dt) for states, _ in stretches)
     parts = in_parts or substeps or _parts(model, stretches, exact)
     origin = min(_first(states) for states, _ in segments)
@@ -322,8 +323,8 @@ def _stretches(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], 
 
 
 def _spacing(stretches: Sequence[tuple[Stream, Stream]], dt: float, source: str) -> float:
-    """Usual interval of the states, s. Raises RecordingError if they come too seldom for the model's step."""
-    spacing = float(np.median([float(np.median(np.diff(states.t))) for states, _ in stretches]))
+    """Usual interval of the states, s, of some run if they differ. Raises RecordingError if they come too seldom for the model's step."""
+    spacing = float(np.quantile([float(np.median(np.diff(states.t))) for states, _ in stretches], 0.5, method="higher"))
     if spacing > THINNED * dt:
         raise RecordingError(
             f"{source}: states are {spacing:.4g} s apart, the model's step is {dt:g} s; give a step of at least {spacing:.4g} s"

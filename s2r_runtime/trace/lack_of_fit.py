@@ -35,7 +35,7 @@ from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, SLOWLY, Judged, Left, f
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
 from s2r_runtime.trace.lack_of_fit_together import pairs
 from s2r_runtime.trace.measured_forces import about_inputs
-from s2r_runtime.trace.now_and_then import now_and_then
+from s2r_runtime.trace.now_and_then import Lost, now_and_then
 from s2r_runtime.trace.residual import Mask, acting, covered, rms, rollout, rollout_starts, some_of
 from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
 
@@ -163,13 +163,12 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
             others.append(looks.field.nats)
         if others and max(others) > nats_of(left, chosen[-1].x):
             chosen = []
-    lost = now_and_then(left)
+    lost, share = lost_commands(left, nominal, horizon)
     dropped: tuple[str, ...] = ()
     if lost is not None and lost.judged.gain > max((judged.gain for judged in chosen), default=0.0):
-        matters, share = _weight_of(left, nominal, lost.judged, horizon)
-        if matters and left.fit.added:  # a delay is one, whatever comes later still now and then
+        if left.fit.added:  # a delay is one, whatever comes later still now and then
             dropped = lost.tokens
-        elif matters:
+        else:
             noise = _beside(left, lost.judged)
             return Structure(lost.tokens, True, share, gains, for_a_while=True, noise=noise, nats=lost.judged.gain)
     shows = False
@@ -195,6 +194,13 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
         return Structure(coloured, False, 0.0, gains, beside=tuple(dict.fromkeys((*dropped, *also, *seen))))
     tokens = tuple(dict.fromkeys(map(_told, may_depend_on(left, windows, found))))
     return Structure(tokens, True, share, gains, for_a_while=True, noise=_beside(left, windows), nats=windows.gain)
+
+
+def lost_commands(left: Left, nominal: Fit, horizon: int) -> tuple[Lost | None, float]:
+    """Commands that are lost, if some rollout shows it, and what share of all that the nominal model lacks that is."""
+    lost = now_and_then(left)
+    matters, share = (False, 0.0) if lost is None else _weight_of(left, nominal, lost.judged, horizon)
+    return (lost, share) if matters else (None, 0.0)
 
 
 def _told(token: str) -> str:

@@ -6,11 +6,14 @@ asked one by one,
 
     r_k = c_k d_k + noise,      c_k in {0, 1},      d_k: where the other command leads, less where the one that was given does
 
-c_k is 1 where that is likelier than not, the share of such steps known (a mixture of two, by turns of c and of share and noise). It counts
-if the log likelihood, noise and colour re-estimated, is beyond what a model without it leaves by the price of saying which steps these are,
-n H(share) with H the entropy of a coin of that share (J. Rissanen, Automatica 14, 1978), by BEYOND, and by far more than the same with d
-slid along the recording: outliers of a sensor know nothing of commands. A command that came late within its step is something else: r is a
-part of d then, of any size.
+c_k is 1 where that is likelier than not, the share of such steps known (a mixture of two, by turns of c and of share and noise), of the n
+steps in which d is clearly beyond noise. It counts if the log likelihood, noise and colour re-estimated, is beyond what a model without it
+leaves by the price of saying which steps these are, n H(share) with H the entropy of a coin of that share (J. Rissanen, Automatica 14,
+1978), by BEYOND, and by far more than the same with d slid along the recording. A command that came late within its step is something
+else: r is a part of d then, of any size.
+
+A row that is one sample old leaves what no command at all leaves, and knows as much of commands. But the next one is right again, while a
+robot that lost a command is somewhere else for good: rollouts over such steps must end where d has taken it.
 """
 
 from __future__ import annotations
@@ -26,15 +29,18 @@ from s2r_runtime.errors import ConfigError
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.episodes import BEYOND
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
-from s2r_runtime.trace.residual import acting, advanced, rms
+from s2r_runtime.trace.residual import acting, advanced, rms, rollout, rollout_starts
 from s2r_runtime.trace.residual_noise import Whitener
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-BEGIN, MOST, CLEAR = 0.05, 0.5, 5.0
-"""Share of steps that is begun with, and from which on it is not now and then; also of those in which d is so many standard deviations, and
-could be told: where most commands that change seem lost, they are late.
+CLEAR = 5.0
+"""Standard deviations that d must be for it to be told whether a command was lost."""
+
+BEGIN, MOST = 0.05, 0.5
+"""Share of such steps that is begun with, and from which on it is not now and then: where most commands that change seem lost, they are
+late.
 """
 
 FEWEST = 8
@@ -50,8 +56,30 @@ ON_END = 0.3
 """Share of such steps, beyond what chance makes, that may follow one another: what goes on is no packet that was lost (an end stop).
 """
 
+AHEAD, HALF = (3, 4, 5, 6, 7), 0.5
+"""Steps later at which the robot must still be where d took it, and how much of it must be left.
+"""
+
 SLIDES, TWICE = 8, 2.0
 """Times that d is slid along the recording, and how many times what a slide explains there must be."""
+
+
+@dataclass(frozen=True)
+class _Offer:
+    """d (n, nx), the tokens as which it is told, the nats that it explains where it acts, and in which steps (n,) that is. whole: whether
+    r is all of d there, now and then.
+    """
+
+    d: Array
+    tokens: tuple[str, ...]
+    nats: float
+    lost: Mask
+    whole: bool
+
+    @property
+    def acted(self) -> Array:
+        """(n, nx), what it does."""
+        return np.where(self.lost[:, None], self.d, 0.0)
 
 
 @dataclass(frozen=True)
@@ -71,18 +99,53 @@ def now_and_then(left: Left) -> Lost | None:
 
 
 def _found(left: Left) -> Lost | None:
-    if left.given.floor.axes or left.given.data.measured_forces:
-        return None
-    offers = list(_offers(left))
-    found = [(*_explained(left, d), d, tokens) for d, tokens in offers]
-    nats, lost, d, tokens = max(found, key=lambda one: one[0], default=(0.0, np.zeros(0, bool), np.zeros(0), ()))
-    gain = nats - math.log(max(len(offers), 1))
-    if gain <= BEYOND:
-        return None
-    shifts = np.linspace(0.0, len(d), SLIDES + 2).astype(int)[1:-1]
-    if gain <= TWICE * max(_explained(left, np.roll(d, int(shift), axis=0))[0] for shift in shifts):
-        return None
-    return Lost(Judged(tokens[0], np.where(lost[:, None], d, 0.0)[:, :, None], gain, 1.0, np.ones((BLOCKS, 1))), tokens)
+    offers = _offered(left)
+    price = math.log(max(len(offers), 1))
+    for one in sorted((one for one in offers if one.whole), key=lambda one: -one.nats):
+        gain = one.nats - price
+        if gain <= BEYOND:
+            break
+        if not _stays(left, one):
+            continue
+        shifts = np.linspace(0.0, len(one.d), SLIDES + 2).astype(int)[1:-1]
+        slid = (_explained(left, np.roll(one.d, int(shift), axis=0), ()) for shift in shifts)
+        if gain > TWICE * max(other.nats if other.whole else 0.0 for other in slid):
+            return Lost(Judged(one.tokens[0], one.acted[:, :, None], gain, 1.0, np.ones((BLOCKS, 1))), one.tokens)
+    return None
+
+
+def nats_of_lost(left: Left) -> float:
+    """What the best offer explains, whether it is enough to be told or not."""
+    return max((one.nats for one in _offered(left)), default=0.0)
+
+
+def _offered(left: Left) -> list[_Offer]:
+    """All offers, as far as they explain anything."""
+    if "offered" not in left.known:
+        none = left.given.floor.axes or left.given.data.measured_forces
+        left.known["offered"] = [] if none else [_explained(left, d, tokens) for d, tokens in _offers(left)]
+    offered: list[_Offer] = left.known["offered"]
+    return offered
+
+
+def _stays(left: Left, one: _Offer) -> bool:
+    """Whether robots are where d took them some steps later, as far as that is clear: half of it, in the middle."""
+    given, model = left.given, left.fit.model
+    act, usual = acting(model, given.data), left.fit.noise.one_step(left.f)
+    at, extra = given.steps.place[one.lost], np.zeros((len(act.mean), len(model.states)))
+    extra[given.steps.place] = one.acted
+    shares, told = [], set()
+    for ahead in AHEAD:
+        starts = np.intersect1d(rollout_starts(given.data, ahead), at)
+        if not len(starts):
+            continue
+        off = rollout(model, given.data, act, starts, ahead).error
+        moved = model.difference(off, rollout(model, given.data, act, starts, ahead, extra).error)
+        size = np.sum((moved / usual) ** 2, axis=1)
+        clear = size > CLEAR**2
+        shares += (np.sum(off * moved / usual**2, axis=1)[clear] / size[clear]).tolist()
+        told |= {*starts[clear].tolist()}
+    return len(told) >= FEWEST and float(np.median(shares)) > HALF
 
 
 def _offers(left: Left) -> Iterator[tuple[Array, tuple[str, ...]]]:
@@ -105,32 +168,27 @@ def _offers(left: Left) -> Iterator[tuple[Array, tuple[str, ...]]]:
                 yield d, tuple(token.format(model.inputs[j]) for j in sorted(which, key=lambda j: -size[j]) if size[j] > 0.0)
 
 
-def _explained(left: Left, d: Array) -> tuple[float, Mask]:
-    """Nats of the steps in which d acts, and which (n,) these are."""
-    r, n = left.r, len(left.r)
-    least = left.given.floor.one_step(left.f)
+def _explained(left: Left, d: Array, tokens: tuple[str, ...]) -> _Offer:
+    """In which steps d acts, and the nats of that."""
+    r, least = left.r, left.given.floor.one_step(left.f)
     share, rest = BEGIN, r
-    lost = np.zeros(n, dtype=bool)
+    lost = told = np.zeros(len(r), dtype=bool)
     for _ in range(PASSES):
         usual = np.maximum(np.median(np.abs(rest), axis=0) / 0.6745, least)
+        told = np.sum((d / usual) ** 2, axis=1) > CLEAR**2
         nats = np.sum(noises.log_density((r - d) / usual) - noises.log_density(r / usual), axis=1)
-        lost = np.asarray(nats > math.log((1.0 - share) / share))
-        count = int(np.count_nonzero(lost))
-        if not FEWEST <= count <= MOST * n:
-            return 0.0, lost
-        share, rest = count / n, r - np.where(lost[:, None], d, 0.0)
-    on_end = float(np.mean(lost[1:] & lost[:-1])) / share
-    told = np.sum((d / usual) ** 2, axis=1) > CLEAR**2
-    if on_end > ON_END + (1.0 - ON_END) * share or np.count_nonzero(lost & told) > MOST * np.count_nonzero(told):
-        return 0.0, lost
+        lost = np.asarray(told & (nats > math.log((1.0 - share) / share)))
+        if not FEWEST <= np.count_nonzero(lost) <= MOST * np.count_nonzero(told):
+            return _Offer(d, tokens, 0.0, lost, whole=False)
+        share, rest = float(np.mean(lost[told])), r - np.where(lost[:, None], d, 0.0)
+    on_end = float(np.mean(lost[1:][lost[:-1]]))
     there, size = np.sum((r * d / usual**2)[lost]), np.sum((d * d / usual**2)[lost])
-    if not abs(there / size - 1.0) <= WHOLE:
-        return 0.0, lost
+    whole = on_end <= ON_END + (1.0 - ON_END) * share and abs(there / size - 1.0) <= WHOLE
     joined = left.given.steps.joined
     whiten = Whitener(noises.estimate(rest, left.f, joined, left.given.floor), left.f, joined)
     z = whiten(rest)
     colour = noises.colour(z, joined)
     reached = noises.log_likelihood(z, whiten, colour, joined)
     bare = max(left.fit.coloured, left.fit.white, noises.log_likelihood(whiten(r), whiten, colour, joined))  # a better noise is no loss
-    which = -n * (share * math.log(share) + (1.0 - share) * math.log(1.0 - share))
-    return reached - bare - which, lost
+    which = -np.count_nonzero(told) * (share * math.log(share) + (1.0 - share) * math.log(1.0 - share))
+    return _Offer(d, tokens, reached - bare - which, lost, bool(whole))

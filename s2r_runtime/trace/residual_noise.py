@@ -31,9 +31,12 @@ Mask = NDArray[np.bool_]
 TAIL, WIDE = 0.01, 8.0
 """Share and size of wild errors in the density above. One such error then costs about log(WIDE / TAIL) = 7 nats."""
 
-OFTEN, SHOCKED, STRIDES = 0.01, 0.3, (3.0, 1.4)
-"""Share of steps that are outlying, and wild in some state, from which on shocks are asked about; the least noise of the process that is
-tried first, of what was thought to be all noise of a step; and factors by which variances are tried larger and smaller.
+FEWEST_SHOCKS, OFTEN = 5, 0.01
+"""Outlying steps with none beside them, and share of steps that are wild in some state, from which on shocks are asked about."""
+
+SHOCKED, STRIDES = 0.3, (3.0, 1.4)
+"""Least noise of the process that is tried first, of what was thought to be all noise of a step; and factors by which variances are tried
+larger and smaller.
 """
 
 OUTLIER = 4.5
@@ -201,8 +204,16 @@ def estimate(r: Array, f: Array, joined: Mask, floor: Noise, near: Noise | None 
         own = noise.q + seen + f**2 @ seen
         extra += np.where(wild, (z**2 / 4.0) * (own + extra), 0.0)
         noise = together(r, f, joined, extra, (noise,), floor) if hidden else _by_state(r, f, joined, extra, noise, floor)
-    seldom = np.mean(np.any(rough > 0.0, axis=1)) <= OFTEN  # one that is off is left to itself
-    return noise if seldom or noise.axes else _after_shocks(r, f, joined, noise, floor)
+    shocks = np.count_nonzero(np.any(_alone(rough > 0.0), axis=1)) >= FEWEST_SHOCKS
+    return _after_shocks(r, f, joined, noise, floor) if shocks and not noise.axes else noise
+
+
+def _alone(outlying: Mask) -> Mask:
+    """(n, nx) which outlying steps have none beside them. A measurement that is off makes two, and so does what goes on."""
+    beside = np.zeros_like(outlying)
+    beside[1:] |= outlying[:-1]
+    beside[:-1] |= outlying[1:]
+    return np.asarray(outlying & ~beside)
 
 
 def _after_shocks(r: Array, f: Array, joined: Mask, noise: Noise, floor: Noise) -> Noise:

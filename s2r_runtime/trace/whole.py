@@ -25,10 +25,11 @@ from s2r_runtime.trace.lack_of_fit import (
     explains_more,
     lack_of_fit,
     left_of,
+    lost_commands,
     still_left,
 )
 from s2r_runtime.trace.lack_of_fit_judged import Judged, Left
-from s2r_runtime.trace.now_and_then import Lost, now_and_then
+from s2r_runtime.trace.now_and_then import Lost, nats_of_lost
 from s2r_runtime.trace.one_stretch import in_one_stretch
 from s2r_runtime.trace.opposed import opposed
 from s2r_runtime.trace.patchwork import patchwork
@@ -132,7 +133,7 @@ class Whole:
         found = lack_of_fit(looks, self.nominal, self._horizon)
         if crowded(fit) or self._patchwork(fit):
             return replace(found, tokens=self._looks_like, matters=True, share=1.0)
-        if (lost := now_and_then(self._looks.left)) is not None and self._lost_alone(lost, fit, looks):
+        if (lost := self._lost) is not None and self._lost_alone(lost, fit, looks):
             return replace(found, tokens=lost.tokens, matters=True, share=1.0, for_a_while=True, nats=lost.judged.gain)
         if against := opposed(self.given, fit):
             return replace(found, tokens=tuple(dict.fromkeys((*against, *found.tokens))), matters=True, share=1.0)
@@ -189,13 +190,17 @@ class Whole:
         left = {token for token, nats in found.gains.items() if token in found.tokens and nats > least}
         return bool(left) and bool(left & about_states(best.model, best.added, self.given.data, self.given.steps))
 
+    @cached_property
+    def _lost(self) -> Lost | None:
+        """Commands that are lost, of what the nominal model leaves."""
+        return lost_commands(self._looks.left, self.nominal, self._horizon)[0]
+
     def _lost_alone(self, lost: Lost, fit: Fit, looks: Looks) -> bool:
         """Whether commands that are lost explain by themselves what names do, whatever is lost beside these: a mean of what comes and what
         does not is a weaker input, or a later one. looks: at what the names leave.
         """
-        beside = now_and_then(looks.left)
-        both = gain(fit, self.nominal) + (0.0 if beside is None else beside.judged.gain)
-        return lost.judged.gain + CLEAR > both
+        named = max(fit.coloured, fit.white) - max(self.nominal.coloured, self.nominal.white)
+        return lost.judged.gain + CLEAR > named + max(nats_of_lost(looks.left), 0.0)
 
     @property
     def likeliest(self) -> tuple[str, ...]:
