@@ -78,14 +78,43 @@ def test_the_noise_of_a_state_is_the_most_likely_one(near):
         assert reached < min(given.at((a, b)).cost for a in grid for b in grid) + 0.02
 
 
-def test_a_few_wild_rows_do_not_change_the_noise():
-    rng, n = np.random.default_rng(4), 3000
-    residual, f = _residuals(rng, n, np.array([0.01, 0.01]), np.array([1.0, 1.0]), 0.0)
+def _still_noisy(seed, n=3000):
+    """Residuals of a state that hardly moves and is measured with noise of variance 1, which rows follow on which, and the noise found."""
+    residual, f = _residuals(np.random.default_rng(seed), n, np.array([0.01, 0.01]), np.array([1.0, 1.0]), 0.0)
     joined = np.append(False, np.ones(n - 1, dtype=bool))
-    clean = estimate(residual, f, joined, Noise(np.full(2, 1e-12), np.full(2, 1e-12)))
-    residual[rng.choice(n, 60, replace=False)] += rng.normal(size=(60, 2)) * 40.0
-    wild = estimate(residual, f, joined, Noise(np.full(2, 1e-12), np.full(2, 1e-12)))
+    floor = Noise(np.full(2, 1e-12), np.full(2, 1e-12))
+    return residual, f, joined, floor, estimate(residual, f, joined, floor)
+
+
+def test_wild_measurements_do_not_change_the_noise():
+    """2 % of rows measured 40 deviations off: what came a step before leaves again a step later."""
+    residual, f, joined, floor, clean = _still_noisy(4)
+    rng = np.random.default_rng(5)
+    k = rng.choice(len(residual) - 1, 60, replace=False)
+    off = rng.normal(size=(60, 2)) * 40.0
+    np.add.at(residual, k, off)
+    np.add.at(residual, k + 1, -off)
+    wild = estimate(residual, f, joined, floor)
     assert np.allclose(wild.q + wild.r, clean.q + clean.r, rtol=0.2)
+
+
+def test_few_shocks_do_not_change_the_noise_and_many_are_the_process_s():
+    """A shock stays where it took the state, and a filter must follow: at 2 % of rows more noise of the process is likelier by far."""
+    residual, f, joined, floor, clean = _still_noisy(4)
+    rng = np.random.default_rng(5)
+    few, many = residual.copy(), residual.copy()
+    few[rng.choice(len(few), 3, replace=False)] += rng.normal(size=(3, 2)) * 40.0
+    many[rng.choice(len(many), 60, replace=False)] += rng.normal(size=(60, 2)) * 40.0
+    unchanged = estimate(few, f, joined, floor)
+    assert np.allclose(unchanged.q + unchanged.r, clean.q + clean.r, rtol=0.2)
+
+    def likelihood(noise):
+        whiten = Whitener(noise, f, joined)
+        return np.sum(log_density(whiten(many))) - whiten.logdet
+
+    followed = estimate(many, f, joined, floor)
+    assert np.all(followed.q > 10.0 * clean.q)
+    assert likelihood(followed) > likelihood(clean) + 1000.0
 
 
 def test_the_weight_is_the_slope_of_the_density_over_the_value():
