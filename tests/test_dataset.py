@@ -130,6 +130,25 @@ def test_rows_too_far_apart_for_the_step_are_refused_with_the_step_that_would_do
         from_streams(_model(0.03), [_streams()], "here.csv")
 
 
+@pytest.mark.parametrize(("rows", "spacing"), [(3, 0.2), (5, 0.5), (20, 0.3)])
+def test_a_few_rows_that_come_seldom_decide_nothing_for_all(rows, spacing):
+    """A fragment after a silence, of a logger that was starting or dying."""
+    states, inputs = _streams(n=300)
+    t = np.concatenate([states.t, 100.0 + spacing * np.arange(rows)])
+    rng = np.random.default_rng(9)
+    values = [np.concatenate([stream.values, rng.normal(size=(rows, stream.values.shape[1]))]) for stream in (states, inputs)]
+    data = from_streams(_model(), [(Stream(t, values[0]), Stream(t, values[1]))], "here")
+    assert (data.dt, data.apart) == (0.1, 1)
+    assert np.array_equal(data.runs[0].y[:, :2], states.values[:, :2])
+
+
+def test_of_two_rates_of_equal_time_the_slower_one_is_taken_so_that_all_rows_count():
+    fast, slow = _streams(n=400), _streams(n=201, dt=0.2)
+    data = from_streams(_model(), [fast, slow], "here")
+    assert data.apart == 2
+    assert [np.count_nonzero(np.isfinite(run.y).all(axis=1)) for run in data.runs] == [400, 201]
+
+
 def test_a_long_silence_makes_two_runs():
     states, inputs = _streams(n=60)
     t = states.t + np.where(np.arange(60) >= 30, 100.0, 0.0)

@@ -166,7 +166,7 @@ def lack_of_fit(looks: Looks, nominal: Fit, horizon: int) -> Structure:
     lost, share = lost_commands(left, nominal, horizon)
     dropped: tuple[str, ...] = ()
     if lost is not None and lost.judged.gain > max((judged.gain for judged in chosen), default=0.0):
-        if left.fit.added:  # a delay is one, whatever comes later still now and then
+        if left.fit.added or not lost.sure:  # a delay is one, whatever comes later still now and then
             dropped = lost.tokens
         else:
             noise = _beside(left, lost.judged)

@@ -13,7 +13,8 @@ leaves by the price of saying which steps these are, n H(share) with H the entro
 else: r is a part of d then, of any size.
 
 A row that is one sample old leaves what no command at all leaves, and knows as much of commands. But the next one is right again, while a
-robot that lost a command is somewhere else for good: rollouts over such steps must end where d has taken it.
+robot that lost a command is somewhere else for good: rollouts over such steps must end where d has taken it. Where every command sets all
+that is measured well enough (the speed of a wheel), the two cannot be told apart; then it is no more than a doubt of what else was found.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.episodes import BEYOND
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
 from s2r_runtime.trace.residual import acting, advanced, rms, rollout, rollout_starts
-from s2r_runtime.trace.residual_noise import Whitener
+from s2r_runtime.trace.residual_noise import OUTLIER, Whitener
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -56,8 +57,9 @@ ON_END = 0.3
 """Share of such steps, beyond what chance makes, that may follow one another: what goes on is no packet that was lost (an end stop).
 """
 
-AHEAD, HALF = (3, 4, 5, 6, 7), 0.5
-"""Steps later at which the robot must still be where d took it, and how much of it must be left.
+AHEAD, HALF, SURE = (3, 4, 5, 6, 7), 0.5, 3.0
+"""Steps later at which the robot must still be where d took it, how much of it must be left, and by how many standard deviations, from one
+such step to the others.
 """
 
 SLIDES, TWICE = 8, 2.0
@@ -84,10 +86,11 @@ class _Offer:
 
 @dataclass(frozen=True)
 class Lost:
-    """What commands do that are lost, and the tokens as which that is told."""
+    """What commands do that are lost, and the tokens as which that is told. sure: it is not rows that are old."""
 
     judged: Judged
     tokens: tuple[str, ...]
+    sure: bool
 
 
 def now_and_then(left: Left) -> Lost | None:
@@ -99,19 +102,23 @@ def now_and_then(left: Left) -> Lost | None:
 
 
 def _found(left: Left) -> Lost | None:
-    offers = _offered(left)
+    offers, doubtful = _offered(left), None
     price = math.log(max(len(offers), 1))
     for one in sorted((one for one in offers if one.whole), key=lambda one: -one.nats):
         gain = one.nats - price
         if gain <= BEYOND:
             break
-        if not _stays(left, one):
+        stays = _stays(left, one)
+        if stays is False or (stays is None and doubtful is not None):
             continue
         shifts = np.linspace(0.0, len(one.d), SLIDES + 2).astype(int)[1:-1]
         slid = (_explained(left, np.roll(one.d, int(shift), axis=0), ()) for shift in shifts)
         if gain > TWICE * max(other.nats if other.whole else 0.0 for other in slid):
-            return Lost(Judged(one.tokens[0], one.acted[:, :, None], gain, 1.0, np.ones((BLOCKS, 1))), one.tokens)
-    return None
+            lost = Lost(Judged(one.tokens[0], one.acted[:, :, None], gain, 1.0, np.ones((BLOCKS, 1))), one.tokens, sure=bool(stays))
+            if lost.sure:
+                return lost
+            doubtful = lost
+    return doubtful
 
 
 def nats_of_lost(left: Left) -> float:
@@ -128,24 +135,29 @@ def _offered(left: Left) -> list[_Offer]:
     return offered
 
 
-def _stays(left: Left, one: _Offer) -> bool:
-    """Whether robots are where d took them some steps later, as far as that is clear: half of it, in the middle."""
+def _stays(left: Left, one: _Offer) -> bool | None:
+    """Whether robots are where d took them some steps later: half of it, and what is sure of that. None where it cannot be told."""
     given, model = left.given, left.fit.model
-    act, usual = acting(model, given.data), left.fit.noise.one_step(left.f)
+    act = acting(model, given.data)
+    usual = np.maximum(np.median(np.abs(left.r - one.acted), axis=0) / 0.6745, given.floor.one_step(left.f))
     at, extra = given.steps.place[one.lost], np.zeros((len(act.mean), len(model.states)))
     extra[given.steps.place] = one.acted
-    shares, told = [], set()
+    along, size = np.zeros((2, len(act.mean)))
     for ahead in AHEAD:
         starts = np.intersect1d(rollout_starts(given.data, ahead), at)
+        starts = np.setdiff1d(starts, at - (ahead - 1))  # a rollout that ends on another such step shows that one
         if not len(starts):
             continue
-        off = rollout(model, given.data, act, starts, ahead).error
-        moved = model.difference(off, rollout(model, given.data, act, starts, ahead, extra).error)
-        size = np.sum((moved / usual) ** 2, axis=1)
-        clear = size > CLEAR**2
-        shares += (np.sum(off * moved / usual**2, axis=1)[clear] / size[clear]).tolist()
-        told |= {*starts[clear].tolist()}
-    return len(told) >= FEWEST and float(np.median(shares)) > HALF
+        off = rollout(model, given.data, act, starts, ahead).error / usual
+        moved = off - rollout(model, given.data, act, starts, ahead, extra).error / usual
+        plain = np.all(np.minimum(np.abs(off), np.abs(off - moved)) < OUTLIER, axis=1)  # not where a row is off besides
+        along[starts] += np.sum(off * moved, axis=1) * plain
+        size[starts] += np.sum(moved * moved, axis=1) * plain
+    if np.count_nonzero(size) < FEWEST:
+        return None
+    there = float(np.sum(along) / np.sum(size))
+    scatter = SURE * float(np.linalg.norm(along - there * size) / np.sum(size))
+    return None if abs(there - HALF) < scatter else there > HALF
 
 
 def _offers(left: Left) -> Iterator[tuple[Array, tuple[str, ...]]]:

@@ -32,7 +32,7 @@ TAIL, WIDE = 0.01, 8.0
 """Share and size of wild errors in the density above. One such error then costs about log(WIDE / TAIL) = 7 nats."""
 
 FEWEST_SHOCKS, OFTEN = 5, 0.01
-"""Outlying steps with none beside them, and share of steps that are wild in some state, from which on shocks are asked about."""
+"""Outlying steps that the next one does not take back, and share of steps that are wild in some state, from which on shocks are asked about."""
 
 SHOCKED, STRIDES = 0.3, (3.0, 1.4)
 """Least noise of the process that is tried first, of what was thought to be all noise of a step; and factors by which variances are tried
@@ -204,16 +204,17 @@ def estimate(r: Array, f: Array, joined: Mask, floor: Noise, near: Noise | None 
         own = noise.q + seen + f**2 @ seen
         extra += np.where(wild, (z**2 / 4.0) * (own + extra), 0.0)
         noise = together(r, f, joined, extra, (noise,), floor) if hidden else _by_state(r, f, joined, extra, noise, floor)
-    shocks = np.count_nonzero(np.any(_alone(rough > 0.0), axis=1)) >= FEWEST_SHOCKS
+    shocks = np.count_nonzero(np.any(_staying(rough > 0.0, r), axis=1)) >= FEWEST_SHOCKS
     return _after_shocks(r, f, joined, noise, floor) if shocks and not noise.axes else noise
 
 
-def _alone(outlying: Mask) -> Mask:
-    """(n, nx) which outlying steps have none beside them. A measurement that is off makes two, and so does what goes on."""
-    beside = np.zeros_like(outlying)
-    beside[1:] |= outlying[:-1]
-    beside[:-1] |= outlying[1:]
-    return np.asarray(outlying & ~beside)
+def _staying(outlying: Mask, r: Array) -> Mask:
+    """(n, nx) which outlying steps are not taken back by the one before or after, as those of a measurement that is off are."""
+    back = np.zeros_like(outlying)
+    pair = outlying[1:] & outlying[:-1] & (r[1:] * r[:-1] < 0.0)
+    back[1:] |= pair
+    back[:-1] |= pair
+    return np.asarray(outlying & ~back)
 
 
 def _after_shocks(r: Array, f: Array, joined: Mask, noise: Noise, floor: Noise) -> Noise:
