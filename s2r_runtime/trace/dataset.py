@@ -323,8 +323,8 @@ def _stretches(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], 
 
 
 def _spacing(stretches: Sequence[tuple[Stream, Stream]], dt: float, source: str) -> float:
-    """Usual interval of the states, s: that of half of the time, or longer; a run's own where they differ. Raises RecordingError if they come
-    too seldom for the model's step.
+    """Usual interval of the states, s: that of half of the time, or longer; a run's own where they differ. Raises RecordingError if they
+    come too seldom for the model's step.
     """
     each = np.array([np.median(np.diff(states.t)) for states, _ in stretches])
     slower = np.argsort(-each)

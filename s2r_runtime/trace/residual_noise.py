@@ -32,7 +32,9 @@ TAIL, WIDE = 0.01, 8.0
 """Share and size of wild errors in the density above. One such error then costs about log(WIDE / TAIL) = 7 nats."""
 
 FEWEST_SHOCKS, OFTEN = 5, 0.01
-"""Outlying steps that the next one does not take back, and share of steps that are wild in some state, from which on shocks are asked about."""
+"""Outlying steps that none beside them takes back, and share of steps that are wild in some state, from which on shocks are asked
+about.
+"""
 
 SHOCKED, STRIDES = 0.3, (3.0, 1.4)
 """Least noise of the process that is tried first, of what was thought to be all noise of a step; and factors by which variances are tried
