@@ -148,10 +148,10 @@ def _stays(left: Left, one: _Offer) -> bool | None:
         starts = np.setdiff1d(starts, at - (ahead - 1))  # a rollout that ends on another such step shows that one
         if not len(starts):
             continue
-        off = rollout(model, given.data, act, starts, ahead).error / usual
-        moved = off - rollout(model, given.data, act, starts, ahead, extra).error / usual
-        plain = np.all(np.minimum(np.abs(off), np.abs(off - moved)) < OUTLIER, axis=1)  # not where a row is off besides
-        along[starts] += np.sum(off * moved, axis=1) * plain
+        off, then = (rollout(model, given.data, act, starts, ahead, more).error for more in (None, extra))
+        moved = model.difference(off, then) / usual
+        plain = np.all(np.minimum(np.abs(off), np.abs(then)) < OUTLIER * usual, axis=1)  # not where a row is off besides
+        along[starts] += np.sum(off / usual * moved, axis=1) * plain
         size[starts] += np.sum(moved * moved, axis=1) * plain
     if np.count_nonzero(size) < FEWEST:
         return None
