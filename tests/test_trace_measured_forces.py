@@ -229,7 +229,6 @@ def _led(seed: int, rows: int = 2500) -> Dataset:
     return from_arrays(compose(ModelSpec("joint", dt, {"mass": mass})), [(y, (np.array(torques) + 0.2 * noise)[:-1, None])])
 
 
-@pytest.mark.long
 def test_noise_that_a_torque_sensor_filters_is_no_memory_of_the_motor():
     """As a command, the torque seems to have a play of 0.6 N m beside the friction, and memory that may be something else."""
     result = trace(_led(1), compose(ModelSpec("joint", 0.002, {"mass": 0.5})))

@@ -127,7 +127,6 @@ def test_a_jump_that_was_seen_hides_no_other_one():
     assert [(f.kind, f.channel, round(f.from_s)) for f in result.faults] == [("offset_jump", "theta", 30), ("offset_jump", "theta", 60)]
 
 
-@pytest.mark.long
 def test_a_jump_of_the_recording_that_is_judged_on_is_left_out_of_it():
     """It would be taken for what the repaired model does not foretell."""
     sound, jumped = _cart(0.0), _cart(0.15, seed=2)

@@ -74,8 +74,8 @@ def _hit(seed: int, share: float, size: float, lasting: int) -> Dataset:
 
 def _wheeled(seed: int, model: ComposedModel, mean: float, lost: float = 0.0, old: float = 0.0, place: float = 3e-3) -> Dataset:
     """A vehicle whose commands set its speeds anew in every step. lost: share of steps in which the command before acts; old: share of
-    rows that are one sample old; place: of the noise of its position, m,
-    and of a bicycle's heading, rad.
+    rows that are one sample old; place: of the noise of its position, m, and of
+    a bicycle's heading, rad.
     """
     rng = np.random.default_rng(seed)
     u, x, rows = np.full((ROWS, 2), mean), np.zeros((1, len(model.states))), [np.zeros(len(model.states))]
@@ -90,7 +90,7 @@ def _wheeled(seed: int, model: ComposedModel, mean: float, lost: float = 0.0, ol
         x, _ = model.step(x, acts[None], model.at_rest(1))
         rows.append(x[0])
     y, late = np.array(rows), 1 + np.flatnonzero(rng.random(ROWS) < old)
-    y[late] = y[late - 1].copy()
+    y[late] = y[late - 1]
     noise = [place, place, place, 0.01] if model is BICYCLE else [place, place, 0.005, 0.02, 0.02]
     return from_arrays(model, [(y + rng.normal(size=y.shape) * noise, u)])
 
@@ -172,8 +172,12 @@ def test_outliers_of_a_sensor_know_nothing_of_commands(seed: int) -> None:
 
 @pytest.mark.parametrize("share", first(1, [0.1, 0.06, 0.15]))
 @pytest.mark.parametrize("seed", first(2, range(6)))
-def test_rows_that_are_one_sample_old_are_no_commands_that_are_lost(seed: int, share: float) -> None:
+def test_rows_that_are_one_sample_old_are_no_commands_that_are_lost(seed: int, share: float, request: pytest.FixtureRequest) -> None:
     """Where they are, the robot seems not to have moved: just what no command does, but in the next row it is where it should be."""
+    if (seed, share) == (3, 0.06):
+        request.applymarker(
+            pytest.mark.xfail(strict=True, reason="`none`, and not lost commands, but v may matter: what tells that is open")
+        )
     data = _driven(seed, np.zeros(ROWS))
     (run,) = data.runs
     old = np.append(False, np.random.default_rng(200 + seed).random(ROWS) < share)
@@ -184,7 +188,7 @@ def test_rows_that_are_one_sample_old_are_no_commands_that_are_lost(seed: int, s
     ]
     found = trace(data, CART)
     assert _lost(data, CART) == ()
-    assert (found.verdict in {"none", "sensor_fault"}, {*found.depends_on} - {"noise", *found.may_depend_on}) == (True, set())
+    assert (found.verdict in {"none", "sensor_fault"}, {*found.depends_on} - {"noise"}) == (True, set())
 
 
 @pytest.mark.parametrize("seed", first(1, range(6)))
