@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.trace.shocks import are_shocks
 from s2r_runtime.trace.speed_noise import of_axis
 from s2r_runtime.trace.state_noise import of_state
 
@@ -31,10 +32,8 @@ Mask = NDArray[np.bool_]
 TAIL, WIDE = 0.01, 8.0
 """Share and size of wild errors in the density above. One such error then costs about log(WIDE / TAIL) = 7 nats."""
 
-FEWEST_SHOCKS, A_PART, SHORT, OFTEN = 5, 0.25, 3, 0.01
-"""Outlying steps that none beside them takes back, what part of all of them these are, of at most how many on end, and share of steps that
-are wild in some state, from which on shocks are asked about.
-"""
+OFTEN = 0.01
+"""Share of steps that are wild in some state, from which on shocks are asked about."""
 
 SHOCKED, STRIDES = 0.3, (3.0, 1.4)
 """Least noise of the process that is tried first, of what was thought to be all noise of a step; and factors by which variances are tried
@@ -206,29 +205,9 @@ def estimate(r: Array, f: Array, joined: Mask, floor: Noise, near: Noise | None 
         own = noise.q + seen + f**2 @ seen
         extra += np.where(wild, (z**2 / 4.0) * (own + extra), 0.0)
         noise = together(r, f, joined, extra, (noise,), floor) if hidden else _by_state(r, f, joined, extra, noise, floor)
-    return _after_shocks(r, f, joined, noise, floor) if _shocks(rough > 0.0, r) and not noise.axes else noise
-
-
-def _shocks(outlying: Mask, r: Array) -> bool:
-    """Whether shocks are a good part of the outlying steps."""
-    shocks, all_of_them = (np.count_nonzero(np.any(steps, axis=1)) for steps in (_staying(outlying, r), outlying))
-    return bool(shocks >= max(FEWEST_SHOCKS, A_PART * all_of_them))
-
-
-def _staying(outlying: Mask, r: Array) -> Mask:
-    """(n, nx) which outlying steps are a shock's: not taken back by the one before or after, as those of a measurement that is off are, and
-    no more than SHORT on end, as those of what goes on are (an end stop).
-    """
-    back = np.zeros_like(outlying)
-    pair = outlying[1:] & outlying[:-1] & (r[1:] * r[:-1] < 0.0)
-    back[1:] |= pair
-    back[:-1] |= pair
-    longer = np.zeros_like(outlying)
-    if len(r) > SHORT:
-        begins = np.all(np.lib.stride_tricks.sliding_window_view(outlying, SHORT + 1, axis=0), axis=-1)
-        for later in range(SHORT + 1):
-            longer[later : later + len(begins)] |= begins
-    return np.asarray(outlying & ~back & ~longer)
+    if not noise.axes and are_shocks(r, f, joined, OUTLIER * np.sqrt(robust)):
+        return _after_shocks(r, f, joined, noise, floor)
+    return noise
 
 
 def _after_shocks(r: Array, f: Array, joined: Mask, noise: Noise, floor: Noise) -> Noise:
