@@ -14,14 +14,15 @@ else: r is a part of d then, of any size.
 
 A row that is one sample old leaves what no command at all leaves, and knows as much of commands. But the next one is right again, while a
 robot that lost a command is somewhere else for good: rollouts over such steps must end where d has taken it. Where every command sets all
-that is measured well enough (the speed of a wheel), the two cannot be told apart; then it is no more than a doubt of what else was found.
+that is measured well enough (the speed of a wheel), the two cannot be told apart: alone that is no finding, but it takes away a name that
+explains no more, which is neither of the two.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,23 +103,36 @@ def now_and_then(left: Left) -> Lost | None:
 
 
 def _found(left: Left) -> Lost | None:
-    offers, doubtful = _offered(left), None
+    """The best offer that is sure; or a better one that is not, of the same steps: that commands were lost there, the sure one says. What
+    is told of steps that were refuted is no doubt.
+    """
+    offers, refuted = _offered(left), np.zeros(len(left.r), dtype=bool)
+    doubtful: tuple[Lost, Mask] | None = None
     price = math.log(max(len(offers), 1))
     for one in sorted((one for one in offers if one.whole), key=lambda one: -one.nats):
         gain = one.nats - price
         if gain <= BEYOND:
             break
         stays = _stays(left, one)
-        if stays is False or (stays is None and doubtful is not None):
+        if stays is False:
+            refuted |= one.lost
+        if stays is False or (stays is None and (doubtful is not None or _mostly(one.lost, refuted))):
             continue
         shifts = np.linspace(0.0, len(one.d), SLIDES + 2).astype(int)[1:-1]
         slid = (_explained(left, np.roll(one.d, int(shift), axis=0), ()) for shift in shifts)
         if gain > TWICE * max(other.nats if other.whole else 0.0 for other in slid):
             lost = Lost(Judged(one.tokens[0], one.acted[:, :, None], gain, 1.0, np.ones((BLOCKS, 1))), one.tokens, sure=bool(stays))
-            if lost.sure:
-                return lost
-            doubtful = lost
-    return doubtful
+            if doubtful is None and not lost.sure:
+                doubtful = lost, one.lost
+            elif lost.sure:
+                better = doubtful is not None and _mostly(one.lost, doubtful[1]) and doubtful[0].judged.gain > gain + BEYOND
+                return replace(doubtful[0], sure=True) if better and doubtful is not None else lost
+    return None if doubtful is None else doubtful[0]
+
+
+def _mostly(steps: Mask, of: Mask) -> bool:
+    """Whether most of the steps (n,) are of others."""
+    return bool(np.count_nonzero(steps & of) > 0.5 * np.count_nonzero(steps))
 
 
 def nats_of_lost(left: Left) -> float:
