@@ -323,13 +323,13 @@ def _stretches(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], 
 
 
 def _spacing(stretches: Sequence[tuple[Stream, Stream]], dt: float, source: str) -> float:
-    """Usual interval of the states, s: that of half of the time, or longer; a run's own where they differ. Raises RecordingError if they
+    """Usual interval of the states, s: that of half of the rows, or longer; a run's own where they differ. Raises RecordingError if they
     come too seldom for the model's step.
     """
     each = np.array([np.median(np.diff(states.t)) for states, _ in stretches])
     slower = np.argsort(-each)
-    lasts = np.cumsum([stretches[i][0].t[-1] - stretches[i][0].t[0] for i in slower])
-    spacing = float(each[slower[np.searchsorted(lasts, 0.5 * lasts[-1] * (1.0 - 1e-9))]])
+    rows = np.cumsum([len(stretches[i][0].t) - 1 for i in slower])
+    spacing = float(each[slower[np.searchsorted(rows, 0.5 * rows[-1])]])
     if spacing > THINNED * dt:
         raise RecordingError(
             f"{source}: states are {spacing:.4g} s apart, the model's step is {dt:g} s; give a step of at least {spacing:.4g} s"
