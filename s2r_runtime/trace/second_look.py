@@ -126,12 +126,10 @@ def once_more(
     if pair is not None and not behind(pair.fit):
         # a change between the parts that are fitted is anywhere there: its time is told by all of the recording
         pair = replace(pair, fit=dated(given, whole.given, pair.fit))
-        rest_of_it = _all_explained(whole, pair, structure, refused)
-        if rest_of_it is not None and not rest_of_it.tokens:
-            both = called_for(given, chosen.nominal.model, ahead, lambda share: None, STRICT, pair)
-            answer = found_by(STRICT, both, set())
-            if answer is not None:
-                return answer
+        both = called_for(given, chosen.nominal.model, ahead, lambda share: None, STRICT, pair)
+        answer = found_by(STRICT, both, set())
+        if answer is not None:
+            return answer
     return found_by(lower, besides, {"noise"}) or (chosen, structure)
 
 
