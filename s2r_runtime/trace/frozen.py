@@ -84,6 +84,9 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
                 told = _ignored(foretold[:, j], run.y[:, j], (a, b), least)
             elif b - a >= RESTLESS and not told:
                 told = _restless(change, e[:, j], np.abs(moves[:, j]) < reach.noise[j], (a, b))
+            if not told and not reach.instant[j] and _outermost(data, j, float(run.y[a, j])):
+                told = _pegged(run.y[:, j], e[:, j], asked, a, QUANTA * quantum)
+                bad[told & (run.y[:, j] == run.y[a, j]), j] = True  # single rows, too
             if told:
                 found.append(_taken_out(data, i, j, name, (a, b), bad))
             if told or reach.instant[j]:
@@ -218,6 +221,37 @@ def _ignored(foretold: Array, y: Array, within: tuple[int, int], least: float) -
     return bool(np.count_nonzero(followed) > FOLLOWED * others and np.any(back))
 
 
+def _outermost(data: Dataset, j: int, value: float) -> bool:
+    """Whether state j never goes beyond a value, in any run."""
+    every = np.concatenate([run.y[:, j] for run in data.runs])
+    return bool(np.nanmax(every) <= value or np.nanmin(every) >= value)
+
+
+def _pegged(y: Array, e: Array, u: Array, first: int, least: float) -> bool:
+    """Whether a state y (K+1,) that jitters elsewhere repeats a value that is not next to zero, from its row `first` on. At an end of what
+    it ever is that is the end of a sensor's range: what holds a robot there (a full tank, an end stop) does not stop its sensor's noise.
+    As in `_stuck`.
+    """
+    others = _elsewhere(y, e) & (y[1:] != y[first])
+    bend = _unasked(_bends(e[:, None])[:, 0], u, others)
+    others &= np.isfinite(bend)
+    jitter = float(np.median(np.abs(bend[others]))) if np.any(others) else 0.0
+    if jitter <= least or abs(float(y[first])) <= MOVING * jitter or np.count_nonzero(others) < RESTS:
+        return False
+    return float(np.mean(np.diff(y)[others] == 0.0)) < REPEATS and _alternates(bend, others)
+
+
+def _elsewhere(y: Array, e: Array) -> Mask:
+    """(K,) steps of y (K+1,) that are measured, away from where it repeats and from the beginning. e: (K,) its residuals."""
+    change = np.diff(y)
+    others = np.isfinite(change) & np.isfinite(e)
+    for a, b in stretches(change == 0.0):
+        if b - a >= FROZEN_ROWS:
+            others[a : b + 3] = False
+    others[:BENDS] = False
+    return others
+
+
 def _stuck(y: Array, e: Array, u: Array, first: int, least: float) -> bool:
     """Whether a speed y (K+1,) that jitters wherever it is not next to zero is not from its row `first` on, which it repeats. Not one that
     hardly any exceeds: there a sensor may be at its end. e: (K,) its residuals; u: (K, nu) what was asked; least: of jitter that is no
@@ -226,12 +260,7 @@ def _stuck(y: Array, e: Array, u: Array, first: int, least: float) -> bool:
     From row to row, noise of a measurement bends to and fro, whatever the inputs do; what moves evenly, or follows its commands in any
     way, and is read without noise, does not. Where it repeats for as long elsewhere is not asked.
     """
-    value, change = float(y[first]), np.diff(y)
-    others = np.isfinite(change) & np.isfinite(e)
-    for a, b in stretches(change == 0.0):
-        if b - a >= FROZEN_ROWS:
-            others[a : b + 3] = False
-    others[:BENDS] = False
+    value, change, others = float(y[first]), np.diff(y), _elsewhere(y, e)
     if np.count_nonzero(others) < RESTS or np.count_nonzero(np.abs(y) > abs(value)) < FROZEN_ROWS:
         return False
     bend = _unasked(_bends(e[:, None])[:, 0], u, others)
