@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from trace_sets.families import make
 
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import compose
@@ -9,6 +10,7 @@ from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace import plausible
 from s2r_runtime.trace.dataset import Stream, from_streams
 from s2r_runtime.trace.plausible import check_plausible
+from s2r_runtime.trace.tracer import load_dataset
 
 HEADER = "import numpy as np\n\n"
 TANKS = (
@@ -135,6 +137,14 @@ def test_a_light_joint_is_not_in_degrees(gain):
     _check(model, np.array(rows), np.array(forces))
     with pytest.raises(RecordingError, match=r"q and qd seem to be 57.3 times what the model takes them for"):
         _check(model, np.degrees(rows), gain * np.array(forces))
+
+
+def test_no_position_and_no_speed_is_a_temperature(tmp_path):
+    """Little more than half the mass moves nearly as far as nine fifths of the motion."""
+    given = make("one", 1000694)
+    path, _ = given.write(tmp_path)
+    model = compose(ModelSpec(given.model["name"], given.model["dt"], given.model["parameters"]))
+    check_plausible(model, load_dataset(path, model))
 
 
 def test_a_model_that_needs_some_input_is_not_asked_what_none_does(tmp_path):

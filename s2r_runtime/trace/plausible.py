@@ -247,7 +247,8 @@ def _check_scales(model: ComposedModel, data: Dataset) -> None:
     still = DEAD * min(_errs(model, few, dead))
     pushed = DEAD * min((float(np.mean(e)) for e in _otherwise(model, few)[-1:]), default=math.inf)
     limit = min(WELL, BETTER * float(np.mean(every)), still)
-    offered = [(group, scale) for group in groups(model) for scale in SCALES]
+    moving = {j for pair in axis_pairs(model) for j in pair}  # no temperature
+    offered = [(group, scale) for group in groups(model) for scale in SCALES if not (scale.zero and moving & {*group})]
     changes = [_Mistake("", partial(_rescaled, list(group), 1.0 / scale.times, scale.zero), None, WELL) for group, scale in offered]
     for e, (group, scale) in sorted(zip(_means(_if_near(model, few, changes, limit)), offered, strict=True), key=lambda one: one[0]):
         if not e < (limit if scale.times >= FAR else min(limit, SURELY)):
