@@ -55,6 +55,9 @@ USUAL = 0.97
 FAR_OFF = 2.0
 """Times the noise at the end of rollouts from which on what was found did not explain all."""
 
+SOME_LEFT = 1.5
+"""The same, from which on it is not said that nothing is left. Rollouts are few, and not independent: less may be chance."""
+
 ARROW = "->"
 
 
@@ -241,7 +244,8 @@ def _shown(r: TraceResult) -> tuple[str, ...]:
 
 def _still_there(r: TraceResult) -> list[str]:
     """What is left for sure, and what may be."""
-    beside = [f"less sure, but something may depend on {', '.join(r.may_depend_on)}: look at the name again"]
+    look = ": look at the name again" if r.effects else ""
+    beside = [f"less sure, but something may depend on {', '.join(r.may_depend_on)}{look}"]
     return [*_beyond_doubt(r), *(beside if r.may_depend_on else [])]
 
 
@@ -250,7 +254,9 @@ def _beyond_doubt(r: TraceResult) -> list[str]:
     if not _shown(r):
         if r.verdict == "unexplained":
             return ["structure; what it depends on cannot be told"]
-        return [f"what no input and no state foretells: {away}"] if away else ["nothing beyond noise"]
+        some = _away(r, r.after.ends, SOME_LEFT)
+        nothing = f"nothing beyond noise in one step; {some}" if some else "nothing beyond noise"
+        return [f"what no input and no state foretells: {away}" if away else nothing]
     if _shown(r) == ("noise",):
         whatever = "" if r.may_depend_on else ", whatever the inputs do"
         return [f"coloured noise: correlated in time{whatever}", *([away] if away else [])]
