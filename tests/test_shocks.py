@@ -68,3 +68,16 @@ def test_where_a_run_ends_the_two_cannot_be_told_apart_and_another_run_says_noth
 
 def test_where_a_state_is_set_anew_in_every_step_nobody_can_tell() -> None:
     assert not are_shocks(*_residual(hits=_put(N, AT, 40.0), f=np.zeros((2, 2))), FAR)
+
+
+@pytest.mark.parametrize("wild", [0.1, 0.2])
+def test_a_heading_that_is_off_for_a_row_is_none_although_the_way_bends_with_it(wild: float) -> None:
+    """The place is known to a millimetre, and seems to be off by as much as the heading leads aside."""
+    rng, v, dt, joined = np.random.default_rng(2), 1.0, 0.1, np.append(False, np.ones(N - 1, dtype=bool))
+    y = rng.normal(size=(N + 1, 3)) * [1e-3, 1e-3, 2e-3]
+    y[:, 0] += v * dt * np.arange(N + 1)
+    y[AT, 2] += wild
+    r = y[1:] - y[:-1] - v * dt * np.column_stack([np.cos(y[:-1, 2]), np.sin(y[:-1, 2]), np.zeros(N)])
+    f = np.tile(np.eye(3), (N, 1, 1))
+    f[:, 0, 2], f[:, 1, 2] = -v * dt * np.sin(y[:-1, 2]), v * dt * np.cos(y[:-1, 2])
+    assert not are_shocks(r, f, joined, np.array([7e-3, 7e-3, 0.013]))

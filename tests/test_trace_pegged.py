@@ -10,6 +10,7 @@ from seeds import first
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.dataset import Dataset, from_arrays
+from s2r_runtime.trace.faults import check
 from s2r_runtime.trace.tracer import trace
 
 Array = NDArray[np.float64]
@@ -100,3 +101,48 @@ def test_a_motor_at_its_limit_that_is_read_without_noise_is_none(seed):
     speed = np.quantile(y[:, 1], 0.8)
     y[:, 1] = np.minimum(y[:, 1], speed)
     assert "qd" not in _frozen(from_arrays(MOTOR, [(np.round(y, 4), u)]), MOTOR)
+
+
+@pytest.mark.parametrize("seed", first(1, range(6)))
+def test_a_full_tank_of_which_nothing_is_known_but_a_level_without_noise_costs_no_name(tmp_path, seed):
+    """What flows in wavers, and at the brim nothing does: that looks like the end of a range. The pump is still what it is."""
+    model, _, u = _pumped(tmp_path, seed)
+    rng, x, rows = np.random.default_rng(9 + seed), np.array([[4.0]]), [4.0]
+    for k in range(ROWS):
+        x = np.minimum(model.nominal.step(x, u[k : k + 1], 0.5, {**model.parameters, "fills": 0.6}) + 0.02 * rng.normal(), 5.0)
+        rows.append(float(x[0, 0]))
+    y = np.array(rows)[:, None]
+    assert np.count_nonzero(y == 5.0) > 50
+    found = trace(from_arrays(model, [(np.round(y, 5), u)]), model)
+    assert {e.name for e in (*found.effects, *found.ambiguous_with)} & {"input_gain", "parameter_change"}
+
+
+@pytest.mark.parametrize("seed", first(2, range(6)))
+def test_a_robot_that_is_parked_where_it_never_went_beyond_is_none(seed):
+    """A localiser that is noisy on the way, and holds its last pose where the robot rests."""
+    model = compose(ModelSpec("unicycle", 0.05, {}, (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),)))
+    rng, goes = np.random.default_rng(seed), (np.arange(900) % 300) < 220
+    u = np.column_stack([np.repeat(rng.uniform(low, high, 30), 30) for low, high in ((0.2, 0.8), (-0.8, 0.8))]) * goes[:, None]
+    x, rows = np.zeros((1, 3)), [np.zeros(3)]
+    for k in range(900):
+        x, _ = model.step(x, u[k][None], model.at_rest(1))
+        rows.append(x[0])
+    y = np.array(rows) + 5e-3 * rng.normal(size=(901, 3))
+    for k in np.flatnonzero(~goes):
+        y[k + 1] = y[k]
+    assert _frozen(from_arrays(model, [(y, u)]), model) == []
+
+
+@pytest.mark.parametrize("seed", first(2, range(12)))
+def test_beside_single_rows_at_the_end_of_range_another_sensor_is_right(seed):
+    """A speed that is rounded repeats now and then by chance, also where the angle is at its end for a row."""
+    rng = np.random.default_rng(seed)
+    x, rows, u = np.zeros((1, 2)), [np.zeros(2)], np.zeros((2000, 1))
+    for k in range(2000):
+        u[k] = 6.0 * np.sin(0.005 * k) + 0.8 * rng.normal() - 4.0 * x[0, 0] - 2.0 * x[0, 1]
+        x, _ = JOINT.step(x, u[k][None], JOINT.at_rest(1))
+        rows.append(x[0])
+    y = np.array(rows) + rng.normal(size=(2001, 2)) * [0.3, 1e-2]
+    y[:, 1] = np.round(y[:, 1] / 3e-4) * 3e-4
+    y[:, 0] = np.minimum(y[:, 0], np.quantile(y[:, 0], 0.8))
+    assert {fault.channel for fault in check(JOINT, from_arrays(JOINT, [(y, u)])).faults} <= {"q"}

@@ -1,5 +1,5 @@
 """A state that repeats exactly while the model says that it moves, or a speed that jitters at all other times: the sensor, or what carries
-its readings, stands still.
+its readings, stands still, or is at the end of its range.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
 
     Without catching up the robot itself may have stood still; only a long silence of a state that jitters otherwise is then a fault; or one
     of a state that jitters on other rows on which the robot stands, or nearly; or of a speed that jitters, and is not zero. A silence in
-    which a run begins or ends catches up with nothing: one of a state that repeats nowhere else, while others move, is a fault.
+    which a run begins or ends catches up with nothing: one of a state that repeats nowhere else, while others move, is a fault. So is one
+    at the end of a sensor's range, with the single rows there.
     """
     run = data.runs[i]
     if len(run.y) < FROZEN_ROWS + 1:
@@ -68,7 +69,7 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
     speeds = {model.states.index(name) for name in lone_speeds(model.nominal)} | {axis.velocity for axis in axes(model.nominal)}
     speeds |= {*np.flatnonzero(reach.instant).tolist()}
     asked = run.u.reshape(len(run.y) - 1, -1, run.u.shape[1]).mean(axis=1)
-    found = []
+    found, single = [], np.zeros_like(bad)
     for j, name in enumerate(model.states):
         change = np.abs(np.diff(run.y[:, j]))
         there = change > 0.0
@@ -84,9 +85,10 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
                 told = _ignored(foretold[:, j], run.y[:, j], (a, b), least)
             elif b - a >= RESTLESS and not told:
                 told = _restless(change, e[:, j], np.abs(moves[:, j]) < reach.noise[j], (a, b))
-            if not told and not reach.instant[j] and _outermost(data, j, float(run.y[a, j])):
+            goes = np.nansum(np.abs(moves[a:b, j])) > reach.noise[j]  # a robot that rests where it never went beyond is not
+            if not told and goes and not reach.instant[j] and _outermost(data, j, float(run.y[a, j])):
                 told = _pegged(run.y[:, j], e[:, j], asked, a, QUANTA * quantum)
-                bad[told & (run.y[:, j] == run.y[a, j]), j] = True  # single rows, too
+                single[:, j] |= told & (run.y[:, j] == run.y[a, j])
             if told:
                 found.append(_taken_out(data, i, j, name, (a, b), bad))
             if told or reach.instant[j]:
@@ -104,7 +106,9 @@ def frozen(model: ComposedModel, data: Dataset, act: Acting, i: int, bad: Mask, 
             ends = (a == 0 or b == len(e)) and not caught_up and _alone(data, reach, i, j, (a, b), j in speeds)
             if caught_up or ends or (b - a > LONG_FROZEN and jitters and far > 10.0 * reach.move[j]):
                 found.append(_taken_out(data, i, j, name, (a, b), bad))
-    return found + _with_them(model, data, i, bad)
+    found += _with_them(model, data, i, bad)
+    bad |= single
+    return found
 
 
 def _alone(data: Dataset, reach: Reach, i: int, j: int, within: tuple[int, int], speed: bool) -> bool:
@@ -230,7 +234,7 @@ def _outermost(data: Dataset, j: int, value: float) -> bool:
 def _pegged(y: Array, e: Array, u: Array, first: int, least: float) -> bool:
     """Whether a state y (K+1,) that jitters elsewhere repeats a value that is not next to zero, from its row `first` on. At an end of what
     it ever is that is the end of a sensor's range: what holds a robot there (a full tank, an end stop) does not stop its sensor's noise.
-    As in `_stuck`.
+    As in `_stuck`. A state that is read without any noise, of a process that has some, looks alike where something holds it.
     """
     others = _elsewhere(y, e) & (y[1:] != y[first])
     bend = _unasked(_bends(e[:, None])[:, 0], u, others)

@@ -88,9 +88,10 @@ def once_more(
     given: Problem, whole: Whole, chosen: Selection, structure: Structure, judged_on: Held, ahead: int
 ) -> tuple[Selection, Structure]:
     """Where structure is left, or a shape without a name is likelier than what was named, something is there: a rival that leaves nothing;
-    or two effects together that do, coloured noise neither (two take up a part of anything, and the rest looks like that); or what is
-    found with a lower bar, if that leaves nothing. What was not fitted must be foretold no worse. Each is challenged by shapes, too.
-    What explains clearly less than what is found with the lower bar leaves what that explains, and is not asked about.
+    or two effects together, with what is called for beside them, that do, coloured noise neither (two take up a part of anything, and the
+    rest looks like that); or what is found with a lower bar, if that leaves nothing. What was not fitted must be foretold no worse. Each is
+    challenged by shapes, too. What explains clearly less than what is found with the lower bar leaves what that explains, and is not asked
+    about.
     """
     refused = {names(chosen.fit.model)}
     nameless = max([structure.nats, *structure.gains.values()]) if structure.matters else 0.0

@@ -5,8 +5,9 @@ A measurement that is off by e leaves r = e in the step that ends there and -F e
     s_k = r_k,      s_{k+j} = r_{k+j} + F_{k+j} s_{k+j-1}
 
 s, where the measurements are less where the model goes on to from before step k, is back within the noise as soon as the measurements are.
-What hits the robot itself stays: s goes on as F lets it. Some wild rows on end come back together. Where F forgets all within a step (a
-speed that is set anew), and where a run ends, the two cannot be told apart.
+What hits the robot itself stays: s goes on as F lets it. Some wild rows on end come back together. (So far as F is the same there: a
+heading that is off by half a radian leaves more of the way than F says. Rows so wild are taken out before, as faults.) Where F forgets all
+within a step (a speed that is set anew), and where a run ends, the two cannot be told apart.
 """
 
 from __future__ import annotations
