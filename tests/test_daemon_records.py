@@ -6,6 +6,7 @@ import json
 import resource
 import signal
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,8 @@ from typing import Any
 import pytest
 from daemon_rig import Rig
 
+from s2r_runtime.daemon.persistence import StateFolder
+from s2r_runtime.daemon.sampler import Keeper, Kept
 from s2r_runtime.messages import (
     CampaignFinished,
     EpochChanged,
@@ -98,7 +101,8 @@ def test_campaign_that_was_killed_goes_on_without_a_new_epoch_and_its_log_is_com
         rig.until(lambda: kept_in.exists() and b'"x0"' in kept_in.read_bytes())  # it is kept beside the loop, a little later
     rig.kill()
     rig.start()
-    assert rig.sample()["exit_code"] == 0
+    answer = rig.sample()
+    assert answer["exit_code"] == 0, answer
     status = rig.status()
     assert (status["epoch"], status["unfinished_epoch"]) == (1, None)
     rig.stop()
@@ -114,6 +118,24 @@ def test_campaign_that_was_killed_goes_on_without_a_new_epoch_and_its_log_is_com
     kept = [s.x0 in again for s in [e.message for e in read(first, ["event/sample_taken"])] if isinstance(s, SampleTaken)]
     assert kept[0]
     assert kept == sorted(kept, reverse=True), "but for the last ones, which the kill took back"
+
+
+def test_a_campaign_is_kept_only_as_far_as_the_log_has_it(tmp_path: Path) -> None:
+    """Samples that no log has look made up: a campaign with them would not be gone on with after a kill."""
+    said: list[str] = []
+    in_log = threading.Event()
+    with StateFolder(tmp_path / "state", "robot") as folder:
+        keeper = Keeper(folder, in_log.is_set, said.append)
+        kept = Kept(1, 4, {"index": 0}, (), ())
+        for _ in range(2):
+            keeper.keep(kept)
+            time.sleep(0.2)
+        assert said == ["the campaign cannot be kept, so an interruption would lose it: the log does not take its samples"]
+        assert folder.campaign() is None
+        in_log.set()
+        keeper.keep(kept)
+        keeper.close()
+        assert folder.campaign() is not None
 
 
 def test_robot_that_freezes_is_a_lost_link_and_the_campaign_goes_on_when_it_is_back(rig: Rig) -> None:

@@ -154,6 +154,11 @@ class Logbook:
         noted = self._retention is None or self._retention.save(self.anchor())
         return noted and self._recorder is not None and self._recorder.durable()
 
+    def written(self) -> bool:
+        """Whether all that was put is on the disk now. For any thread; what it is evidence of is not noted."""
+        recorder = self._recorder
+        return recorder is not None and recorder.durable()
+
     def health(self) -> Health:
         """How it is."""
         return (

@@ -30,7 +30,7 @@ from s2r_runtime.messages import (
 from s2r_runtime.profile import Sampling
 
 AHEAD = 1
-"""Samples that may be kept and not logged: a kill may come between the file and the log, which is written every 50 ms."""
+"""Samples that may be kept and not logged: the newest one may be kept before the log is given it; all before it are in the log first."""
 
 
 class Kept(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -44,10 +44,14 @@ class Kept(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Keeper:
-    """Writes the newest of what it is given, from a thread of its own. A write that fails is told once, and tried with the next."""
+    """Writes the newest of what it is given, from a thread of its own. A write that fails is told once, and tried with the next.
 
-    def __init__(self, folder: StateFolder, complain: Callable[[str], None]) -> None:
-        self._folder, self._complain = folder, complain
+    logged: waits until the log has what it was given, and says whether it has. It goes first: a kept sample that no log has is one that
+    somebody may have made up, and the campaign would not be gone on with.
+    """
+
+    def __init__(self, folder: StateFolder, logged: Callable[[], bool], complain: Callable[[str], None]) -> None:
+        self._folder, self._logged, self._complain = folder, logged, complain
         self._newest: Kept | None = None
         self._wake = threading.Condition()
         self._ending = False
@@ -77,6 +81,8 @@ class Keeper:
             if kept is None:
                 return
             try:
+                if not self._logged():
+                    raise OSError("the log does not take its samples")
                 self._folder.save_campaign(kept)
                 failed = ""
             except OSError as error:
