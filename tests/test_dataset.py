@@ -149,11 +149,16 @@ def test_a_long_run_with_few_rows_decides_nothing_either(slow):
     assert (data.dt, data.apart) == (0.1, 1)
 
 
-def test_of_two_rates_with_as_many_rows_the_slower_one_is_taken_so_that_all_rows_count():
-    fast, slow = _streams(n=201), _streams(n=201, dt=0.2)
+def test_a_few_rows_that_come_often_decide_nothing_for_all():
+    with pytest.raises(RecordingError, match=r"states are 1 s apart"):
+        from_streams(_model(), [_streams(n=300, dt=1.0), _streams(n=200)], "here.csv")
+
+
+def test_of_two_rates_of_equal_time_the_slower_one_is_taken_so_that_all_rows_count():
+    fast, slow = _streams(n=400), _streams(n=201, dt=0.2)
     data = from_streams(_model(), [fast, slow], "here")
     assert data.apart == 2
-    assert [np.count_nonzero(np.isfinite(run.y).all(axis=1)) for run in data.runs] == [201, 201]
+    assert [np.count_nonzero(np.isfinite(run.y).all(axis=1)) for run in data.runs] == [400, 201]
 
 
 def test_a_long_silence_makes_two_runs():

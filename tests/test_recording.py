@@ -490,6 +490,37 @@ def test_a_log_whose_beginning_a_power_cut_left_as_zeros_can_be_read_and_holds_n
     assert (reading.ending.kind, reading.ending.index) == (kind, 0)
 
 
+def test_what_was_put_settles_by_itself_and_is_on_the_disk_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody asked for a sync, so the thread that writes waits for none; what does not come within the time has not settled."""
+    asked: list[int] = []
+    writer = Writer(tmp_path / "a.mcap", run="test", signer=KEY, timed=False)
+    monkeypatch.setattr(writer, "durable", lambda: asked.append(1))
+    recorder = Recorder(writer, sync_s=0.01)
+    for i in range(20):
+        assert recorder.put(Ticked(i), i)
+        assert recorder.settled(60.0)
+        assert recorder.anchor.records > i, "a power cut can take no more of it"
+    assert asked == []
+    recorder.close()
+    assert not recorder.settled(1.0)
+
+    idle = Recorder(Writer(tmp_path / "b.mcap", run="test", signer=KEY, timed=False), sync_s=60.0)
+    assert idle.put(Ticked(1), 1)
+    assert not idle.settled(0.5), "it is written, and no sync came"
+    idle.close()
+
+
+def test_nothing_settles_on_a_disk_that_cannot_sync(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(fd: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    recorder = Recorder(Writer(tmp_path / "a.mcap", run="test", signer=KEY, timed=False), sync_s=0.01)
+    monkeypatch.setattr(os, "fdatasync", fails)
+    assert recorder.put(Ticked(1), 1)
+    assert not recorder.settled(2.0)
+    recorder.close()
+
+
 def test_nothing_is_durable_while_another_sync_may_be_about_to_say_that_it_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The system tells one sync of a file that it failed; one that comes just after it succeeds, before the first could say so."""
     told, honest = threading.Event(), os.fdatasync

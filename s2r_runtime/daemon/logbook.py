@@ -26,7 +26,7 @@ Attachment = tuple[str, str, bytes]
 
 
 class Logbook:
-    """Call `begin` before anything else. Nothing waits for the disk but `durable`, `begin` and `close`."""
+    """Call `begin` before anything else. Nothing waits for the disk but `durable`, `settled`, `begin` and `close`."""
 
     def __init__(
         self,
@@ -154,10 +154,10 @@ class Logbook:
         noted = self._retention is None or self._retention.save(self.anchor())
         return noted and self._recorder is not None and self._recorder.durable()
 
-    def written(self) -> bool:
-        """Whether all that was put is on the disk now. For any thread; what it is evidence of is not noted."""
+    def settled(self) -> bool:
+        """Whether all that was put so far came to the disk, by itself and within a few seconds. For a thread that has time."""
         recorder = self._recorder
-        return recorder is not None and recorder.durable()
+        return recorder is not None and recorder.settled()
 
     def health(self) -> Health:
         """How it is."""

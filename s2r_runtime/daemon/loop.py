@@ -215,7 +215,7 @@ class Daemon:
 
     def _set_up_sources(self, stack: ExitStack, taken: list[SampleTaken]) -> None:
         """Who may be asked what to do: the sampler, given inputs, a controller. taken: samples of an unfinished campaign."""
-        self.keeper = Keeper(self.folder, self.logbook.written, self.say)
+        self.keeper = Keeper(self.folder, self.logbook.settled, self.say)
         stack.callback(self.keeper.close)
         sampling, logs = self.profile.sampling, lambda: tuple(map(str, self.logbook.paths))
         self.sampler = Sampler(self.folder, self.keeper, sampling, logs, self.next_seq, taken)

@@ -55,7 +55,7 @@ class Recorder:
         self._unrecorded = 0
         self._last_ns = 0
         self._flushed_s = time.monotonic()
-        self._requested = self._granted = 0
+        self._requested = self._granted = self._writes = 0
         self._ending = self._over = False
         self._head = ""
         self._stop_syncing = threading.Event()
@@ -63,7 +63,7 @@ class Recorder:
         self._thread.start()
         threading.Thread(target=self._keep_synced, name="log-sync", daemon=True).start()
 
-    # ---- the gate's thread: nothing here waits for the disk, but `durable` and `close`
+    # ---- the gate's thread: nothing here waits for the disk, but `durable`, `settled` and `close`
 
     def put(self, message: Struct, t_ns: int) -> bool:
         """Records a message, in the order of the calls. False: it is not recorded, and the log ends before it."""
@@ -86,6 +86,20 @@ class Recorder:
             self._wake.set()
             self._room.wait_for(lambda: self._granted >= ticket or self._over, timeout_s)
             return self._granted >= ticket and not self._fault
+
+    def settled(self, timeout_s: float = 5.0) -> bool:
+        """Waits until all that was put so far is on the disk by the writes and syncs that come anyway: as `durable`, but nothing is done
+        for it, so that nothing is held up by it. False: it is not, or not within the time.
+        """
+        until = time.monotonic() + timeout_s
+        with self._room:
+            second = self._writes + 2  # the next one may have begun before
+            self._room.wait_for(lambda: self._writes >= second or self._over, timeout_s)
+            written = self._writes >= second
+        there = self._writer.recorded
+        while written and not self._over and self._writer.anchor.records < there and time.monotonic() < until:
+            time.sleep(min(self._sync_s, SYNC_S))
+        return written and self._writer.anchor.records >= there and not self._fault
 
     def health(self) -> Health:
         """How it is; never waits."""
@@ -187,7 +201,7 @@ class Recorder:
         self._trouble = ""
         self._flushed_s = time.monotonic()
         with self._room:
-            self._granted = ticket
+            self._granted, self._writes = ticket, self._writes + 1
             self._room.notify_all()
 
     def _doubt(self) -> None:

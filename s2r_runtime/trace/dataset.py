@@ -323,13 +323,17 @@ def _stretches(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], 
 
 
 def _spacing(stretches: Sequence[tuple[Stream, Stream]], dt: float, source: str) -> float:
-    """Usual interval of the states, s: that of half of the rows, or longer; a run's own where they differ. Raises RecordingError if they
-    come too seldom for the model's step.
+    """Usual interval of the states, s: that of half of the time, or longer, so that all rows count; a run's own where they differ. Runs in
+    which rows are too rare for the model's step decide nothing, unless most rows are in these: then RecordingError.
     """
     each = np.array([np.median(np.diff(states.t)) for states, _ in stretches])
-    slower = np.argsort(-each)
-    rows = np.cumsum([len(stretches[i][0].t) - 1 for i in slower])
-    spacing = float(each[slower[np.searchsorted(rows, 0.5 * rows[-1])]])
+    lasts = np.array([states.t[-1] - states.t[0] for states, _ in stretches])
+    rows = np.array([len(states.t) for states, _ in stretches])
+    often = each <= THINNED * dt
+    asked = often if 2 * rows[often].sum() >= rows.sum() else ~often
+    slower = np.flatnonzero(asked)[np.argsort(-each[asked])]
+    sofar = np.cumsum(lasts[slower])
+    spacing = float(each[slower[np.searchsorted(sofar, 0.5 * sofar[-1] * (1.0 - 1e-9))]])
     if spacing > THINNED * dt:
         raise RecordingError(
             f"{source}: states are {spacing:.4g} s apart, the model's step is {dt:g} s; give a step of at least {spacing:.4g} s"

@@ -125,8 +125,9 @@ def _found(left: Left) -> Lost | None:
             if doubtful is None and not lost.sure:
                 doubtful = lost, one.lost
             elif lost.sure:
-                better = doubtful is not None and _mostly(one.lost, doubtful[1]) and doubtful[0].judged.gain > gain + BEYOND
-                return replace(doubtful[0], sure=True) if better and doubtful is not None else lost
+                if doubtful is not None and doubtful[0].judged.gain > gain + BEYOND and _mostly(one.lost, doubtful[1]):
+                    return replace(doubtful[0], sure=True)
+                return lost
     return None if doubtful is None else doubtful[0]
 
 
