@@ -67,6 +67,8 @@ class Transitions:
     content_digest: str = ""
     noise: Array | None = None
     drive: Drive | None = field(default=None, repr=False)
+    notes: tuple[str, ...] = ()
+    """What a person should know of how the recording was read, one line each."""
 
 
 def residuals(model: ComposedModel, transitions: Transitions) -> Array:

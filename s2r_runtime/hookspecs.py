@@ -49,12 +49,28 @@ class Offer(NamedTuple):
 
     `files`: of a transport, the options that name a file (relative to the profile) whose content says what frames mean. Where a profile
     is read, such an option becomes `{"file": as written, "text": content}`: bound into the profile's digest, and attached to the log.
+
+    `recognises`: of a recording, `module:function`: function(head) -> bool, whether a file that begins with these bytes (unpacked, up to
+    `HEAD_BYTES`) is of this kind, whatever its name.
     """
 
     name: str
     target: str
     summary: str = ""
     files: tuple[str, ...] = ()
+    recognises: str = ""
+
+
+class ReadLog(NamedTuple):
+    """What a reader of recordings may return instead of the plain list. notes: one line each, for the person who reads the result: rows
+    that could not be used, with their number, and what was assumed.
+    """
+
+    stretches: list[Any]
+    notes: tuple[str, ...] = ()
+
+
+HEAD_BYTES = 65536
 
 
 # ---------------------------------------------------------------- transports
@@ -332,9 +348,10 @@ def s2r_tasks() -> list[Offer]:
 @hookspec
 def s2r_recordings() -> list[Offer]:
     """Readers of recordings in robots' own formats. An offer's name is `TRANSPORT.SUFFIX` (`can.blf`): the transport whose options
-    the reader understands, and the files that it reads (`.gz` behind the suffix is the reader's to unpack). The attribute is a function
+    the reader understands, and the files that it reads (`.gz` behind the suffix is the reader's to unpack). A file belongs to the offers
+    that recognise its content; only if there are none, its suffix decides (never `.csv`, which is a table's). The attribute is a function
 
-        read(path, states, inputs, options) -> [((t_states, x), (t_inputs, u)), ...]
+        read(path, states, inputs, options) -> [((t_states, x), (t_inputs, u)), ...], or a `ReadLog` of that list and notes
 
     states, inputs: the model's names. options: the profile's `[transport]` table without `name`, as a transport gets it; empty where the
     profile is of another transport. A list of contiguous stretches; t (N,) s, ascending, of one clock; x (N, nx), u (M, nu) in SI units,

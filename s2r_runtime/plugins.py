@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import re
+from collections.abc import Callable
 from functools import cache
 from importlib import metadata
 from typing import Any, NamedTuple
@@ -109,6 +110,9 @@ class Registry:
         if not isinstance(offer.target, str) or not TARGET.fullmatch(offer.target):
             errors.append(one_line(f"s2r_{kind}: {offer.name} has the target {offer.target!r}, must be module:attribute"))
             return ""
+        if not isinstance(offer.recognises, str) or (offer.recognises and not TARGET.fullmatch(offer.recognises)):
+            errors.append(one_line(f"s2r_{kind}: {offer.name} recognises by {offer.recognises!r}, must be module:attribute"))
+            return ""
         known = self._offers[kind].get(offer.name)
         if known is not None:
             errors.append(f"{kind[:-1]} {offer.name!r} of {distribution} is refused: {known.distribution} has that name")
@@ -129,13 +133,25 @@ class Registry:
 
     def get(self, kind: str, name: str) -> Any:
         """Imports and returns what is offered. Raises PluginError if it is unknown or its import fails."""
-        offer, distribution = self.offered(kind, name)
-        module, _, attribute = offer.target.partition(":")
+        return self._load(kind, name, self.offered(kind, name).offer.target)
+
+    def recogniser(self, name: str) -> Callable[[bytes], bool]:
+        """The function by which a recording's reader recognises a file by its first bytes. Without one, it recognises none.
+
+        Raises PluginError if its import fails.
+        """
+        target = self.offered("recordings", name).offer.recognises
+        found: Callable[[bytes], bool] = self._load("recordings", name, target) if target else _recognises_nothing
+        return found
+
+    def _load(self, kind: str, name: str, target: str) -> Any:
+        module, _, attribute = target.partition(":")
         try:
             return getattr(importlib.import_module(module), attribute)
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # noqa: BLE001 - as in `add`
+            distribution = self.offered(kind, name).distribution
             raise PluginError(f"{kind[:-1]} {name!r} of {distribution} cannot be loaded: {said(error)}") from None
 
     def _hint(self, kind: str, name: str) -> str:
@@ -164,6 +180,10 @@ def registry() -> Registry:
             continue
         found.add(point.name, distribution, version, module)
     return found
+
+
+def _recognises_nothing(_head: bytes) -> bool:
+    return False
 
 
 def said(error: BaseException) -> str:

@@ -1,11 +1,12 @@
 """Recordings in robots' own formats (candump, tlog, ...), read by plug-ins: the hook `s2r_recordings`.
 
-Which reader: the one that the profile's transport offers for the file's suffix, else the only one that there is for it (it then gets no
-options). A log in one of them is ordinary driving: rows of states and rows of inputs, each on stamps of its own.
+Which reader: of those that recognise the file's content (else of those for its suffix), the one that the profile's transport offers, or
+the only one (it then gets no options). A log in one of them is ordinary driving: rows of states and rows of inputs, each on its own stamps.
 """
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.errors import ConfigError, RecordingError, UsageError
+from s2r_runtime.hookspecs import HEAD_BYTES, ReadLog
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.recording.origin import other_writer
@@ -22,6 +24,8 @@ from s2r_runtime.tables import LARGEST, Table
 Array = NDArray[np.float64]
 
 MCAP_MAGIC = b"\x89MCAP"
+GZIP_MAGIC = b"\x1f\x8b"
+TABLE_SUFFIXES = (".csv",)
 
 
 class Rows(NamedTuple):
@@ -38,18 +42,59 @@ class Stretch(NamedTuple):
     inputs: Rows
 
 
+class RobotLog(NamedTuple):
+    """Its stretches of driving, and what a person should know of how they were read, one line each."""
+
+    stretches: list[Stretch]
+    notes: tuple[str, ...]
+
+
 def suffix_of(path: Path) -> str:
     """`.log` of `a.log` and of `a.log.gz`, in small letters."""
     name = path.name.lower()
     return Path(name.removesuffix(".gz")).suffix
 
 
-def is_robot_log(path: Path) -> bool:
-    """Whether an installed plug-in reads files with this suffix. An MCAP file is one if somebody else wrote it."""
+def head_of(path: Path) -> bytes:
+    """The first bytes of a regular file, unpacked if it is gzipped; empty for anything else. Raises OSError."""
+    if not path.is_file():
+        return b""
+    with path.open("rb") as file:
+        data = file.read(HEAD_BYTES)
+    if not data.startswith(GZIP_MAGIC):
+        return data
+    try:
+        return zlib.decompressobj(31).decompress(data, HEAD_BYTES)
+    except zlib.error:
+        return b""
+
+
+def readers_of(path: Path) -> list[str]:
+    """Names of the offers that may read this file: those that recognise its content, else those for its suffix. Raises OSError."""
+    offers, head = registry(), head_of(path)
+    named = offers.names("recordings")
+    if head and not head.startswith(MCAP_MAGIC):
+        known = [name for name in named if offers.recogniser(name)(head)]
+        if known:
+            return known
+    return _readers_by_suffix(path)
+
+
+def _readers_by_suffix(path: Path) -> list[str]:
     suffix = suffix_of(path)
-    if path.name.lower().endswith(".mcap") and not other_writer(path):
-        return False
-    return bool(suffix) and any(name.partition(".")[2] == suffix[1:] for name in registry().names("recordings"))
+    return [
+        name for name in registry().names("recordings") if suffix and suffix not in TABLE_SUFFIXES and name.partition(".")[2] == suffix[1:]
+    ]
+
+
+def is_robot_log(path: Path) -> bool:
+    """Whether an installed plug-in reads this file. An MCAP file is one if somebody else wrote it."""
+    try:
+        if (is_mcap(path) or path.suffix.lower() == ".mcap") and not other_writer(path):
+            return False
+        return bool(readers_of(path))
+    except OSError:  # who reads it says what is wrong
+        return bool(_readers_by_suffix(path))
 
 
 def is_mcap(path: Path) -> bool:
@@ -66,12 +111,14 @@ def is_table(path: Path) -> bool:
         return True
 
 
-def read_robot_log(path: Path, model: ComposedModel, transport: Mapping[str, Any] | None) -> list[Stretch]:
+def read_robot_log(path: Path, model: ComposedModel, transport: Mapping[str, Any] | None) -> RobotLog:
     """Its stretches of driving. transport: the profile's table, or None. Raises RecordingError, ConfigError, UsageError."""
-    suffix = suffix_of(path)
-    offered = [name for name in registry().names("recordings") if name.partition(".")[2] == suffix[1:]]
-    own = f"{(transport or {}).get('name', '')}{suffix}"
-    if own in offered:
+    try:
+        offered = readers_of(path)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+    own = next((name for name in offered if name.partition(".")[0] == (transport or {}).get("name")), "")
+    if own:
         options = {name: value for name, value in (transport or {}).items() if name != "name"}
     elif len(offered) == 1:
         own, options = offered[0], {}
@@ -84,10 +131,11 @@ def read_robot_log(path: Path, model: ComposedModel, transport: Mapping[str, Any
         if options:
             raise
         raise UsageError(f"{path}: is read with a profile that says what is in it (--profile P): {error}") from None
-    stretches = [Stretch(_rows(x, len(model.states), path, own), _rows(u, len(model.inputs), path, own)) for x, u in found]
+    given, notes = found if isinstance(found, ReadLog) else ReadLog(list(found))
+    stretches = [Stretch(_rows(x, len(model.states), path, own), _rows(u, len(model.inputs), path, own)) for x, u in given]
     if not any(len(stretch.states.t) for stretch in stretches):
         raise RecordingError(f"{path}: holds no state of this model")
-    return stretches
+    return RobotLog(stretches, tuple(notes))
 
 
 def _rows(given: tuple[Any, Any], width: int, path: Path, reader: str) -> Rows:

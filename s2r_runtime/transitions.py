@@ -197,9 +197,10 @@ def _rows(rows: Sequence[Array], width: int) -> Array:
 
 def from_robot_log(path: Path, model: ComposedModel, transport: Mapping[str, Any] | None) -> Transitions:
     """Transitions of ordinary driving from a log in a robot's own format."""
-    stretches, nx = read_robot_log(path, model, transport), len(model.states)
+    (stretches, notes), nx = read_robot_log(path, model, transport), len(model.states)
     drives = [Streams(t, values[:, :nx], values[:, nx:]) for t, values in map(merged_rows, stretches)]
-    return replace(drive_transitions(model, drives, digest(path.read_bytes()), str(path)), content_digest=content_digest(stretches, model))
+    found = drive_transitions(model, drives, digest(path.read_bytes()), str(path))
+    return replace(found, content_digest=content_digest(stretches, model), notes=notes)
 
 
 # ---------------------------------------------------------------- MCAP

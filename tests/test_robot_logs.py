@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,21 +11,23 @@ import numpy as np
 import pytest
 
 from s2r_runtime import robot_logs
+from s2r_runtime.cli.main import main
 from s2r_runtime.errors import ConfigError, RecordingError, UsageError
-from s2r_runtime.hookspecs import Offer, hookimpl
+from s2r_runtime.hookspecs import Offer, ReadLog, hookimpl
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import Registry
-from s2r_runtime.robot_logs import content_digest, is_robot_log, read_robot_log
+from s2r_runtime.robot_logs import content_digest, is_robot_log, is_table, read_robot_log, readers_of
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.transitions import load_transitions
 
 MODEL = compose(ModelSpec("unicycle", 0.1))
 GIVEN: list[Any] = []
 ASKED: list[dict[str, Any]] = []
+NOTES: list[str] = []
 
 
-def read(path: Path, states: tuple[str, ...], inputs: tuple[str, ...], options: dict[str, Any]) -> list[Any]:
+def read(path: Path, states: tuple[str, ...], inputs: tuple[str, ...], options: dict[str, Any]) -> list[Any] | ReadLog:
     """A reader that gives what the test wants."""
     assert (states, inputs) == (MODEL.states, MODEL.inputs)
     ASKED.append(options)
@@ -32,12 +35,18 @@ def read(path: Path, states: tuple[str, ...], inputs: tuple[str, ...], options: 
         raise ConfigError("transport.bad: is bad")
     if not options and GIVEN == ["needs options"]:
         raise ConfigError("transport.map is missing")
-    return GIVEN
+    return ReadLog(GIVEN, tuple(NOTES)) if NOTES else GIVEN
+
+
+def recognises(head: bytes) -> bool:
+    """Its files begin so, whatever they are called."""
+    return head.startswith(b"#own log")
 
 
 @hookimpl
 def s2r_recordings() -> list[Offer]:
-    return [Offer(name, f"{__name__}:read") for name in ("one.rec", "two.rec", "one.own")]
+    plain = [Offer(name, f"{__name__}:read") for name in ("one.rec", "two.rec", "one.own", "one.csv")]
+    return [*plain, Offer("two.known", f"{__name__}:read", recognises=f"{__name__}:recognises")]
 
 
 @pytest.fixture(autouse=True)
@@ -48,6 +57,7 @@ def registered(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setattr(robot_logs, "registry", lambda: found)
     GIVEN.clear()
     ASKED.clear()
+    NOTES.clear()
     path = tmp_path / "a.own.gz"
     path.write_bytes(b"anything")
     return path
@@ -113,10 +123,38 @@ def test_rows_that_are_none_are_refused(registered: Path, what: str) -> None:
 
 def test_digest_is_of_what_the_log_says(registered: Path) -> None:
     GIVEN.append(drive())
-    first = content_digest(read_robot_log(registered, MODEL, None), MODEL)
+    first = content_digest(read_robot_log(registered, MODEL, None).stretches, MODEL)
     GIVEN[0] = drive()
-    assert content_digest(read_robot_log(registered, MODEL, None), MODEL) == first
+    assert content_digest(read_robot_log(registered, MODEL, None).stretches, MODEL) == first
     (t, x), inputs = drive()
     x[3, 0] += 1e-3
     GIVEN[0] = (t, x), inputs
-    assert content_digest(read_robot_log(registered, MODEL, None), MODEL) != first
+    assert content_digest(read_robot_log(registered, MODEL, None).stretches, MODEL) != first
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.csv.gz", "a.rec", "a"])
+def test_content_decides_whatever_the_name(tmp_path: Path, name: str) -> None:
+    data = b"#own log" + bytes(range(256)) * 300
+    path = tmp_path / name
+    path.write_bytes(gzip.compress(data) if name.endswith(".gz") else data)
+    assert readers_of(path) == ["two.known"]
+    assert not is_table(path)
+    GIVEN.append(drive())
+    assert len(read_robot_log(path, MODEL, {"name": "zenoh", "map": 1}).stretches) == 1
+    assert ASKED == [{}], "it is of another transport than the profile's"
+
+
+def test_table_is_no_log_whatever_a_plug_in_offers(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("t,x,y,theta,v,w\n0,0,0,0,0,0\n")
+    assert is_table(path)
+    assert not is_robot_log(path)
+
+
+def test_notes_of_a_reader_reach_the_person(registered: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    GIVEN.append(drive())
+    NOTES.extend(["3 frames cannot be read", "stamps are relative"])
+    assert load_dataset(registered, MODEL).notes == load_transitions(registered, MODEL).notes == tuple(NOTES)
+    assert main(["gap", str(registered), "--model", "unicycle", "--dt", "0.1"]) == 3
+    said = capsys.readouterr().err.splitlines()
+    assert [f"s2r: {registered}: {note}" for note in NOTES] == [line for line in said if str(registered) in line][:2]

@@ -95,6 +95,7 @@ def run_gap(args: argparse.Namespace) -> int:
     model, profile = chosen_model(args)
     columns = columns_of(args, model, profile, args.recording)
     found = load_transitions(args.recording, model, columns, transport=profile.transport if profile else None)
+    output.notes(found.source, found.notes)
     if args.blocking:
         found = gaps.blocked(found, args.blocking, model.dt)
     result = gaps.estimate_gap(
@@ -195,6 +196,7 @@ def gap_of(recording: Path, model: ComposedModel, profile: Profile, *, beta: flo
     from s2r_runtime.transitions import load_transitions
 
     found = load_transitions(recording, model, dict(profile.columns), transport=profile.transport)
+    output.notes(found.source, found.notes)
     share = beta or profile.guarantee.beta
     if found.drive is not None and profile.driving.block > 0.0:
         from s2r_runtime import blocked

@@ -8,7 +8,7 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TextIO
@@ -42,6 +42,12 @@ def err(text: str = "") -> None:
     with contextlib.suppress(OSError):
         sys.stderr.write(text + "\n")
         sys.stderr.flush()
+
+
+def notes(source: str, lines: Sequence[str]) -> None:
+    """What a person should know of how a recording was read, a line each."""
+    for line in lines:
+        err(f"s2r: {source}: {line}")
 
 
 def _to_stdout(text: str) -> None:

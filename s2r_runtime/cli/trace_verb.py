@@ -99,6 +99,8 @@ def run(args: argparse.Namespace) -> int:
     data = load_dataset(args.recording, model, columns, bandwidth=args.bandwidth, transport=transport)
     used = data.reconstruction.bandwidth if data.reconstruction and not data.reconstruction.axes else args.bandwidth
     test = load_dataset(args.test, model, columns, bandwidth=used, transport=transport, behind=data.behind) if args.test else None
+    for one in (data, test):
+        output.notes(one.source if one else "", one.notes if one else ())
     if test and set(test.digests) & set(data.digests):
         raise UsageError(f"--test {args.test}: is the recording that the fit is made on; take one that the fit never sees")
     bar = output.Progress("tracing")

@@ -170,6 +170,8 @@ class Dataset:
     """Commands changed between rows, nobody knows when: transitions in which one does are left out (`unplaced`)."""
     called: tuple[str, ...] = ()
     """Names of its segments; empty if it has one, or none has a name."""
+    notes: tuple[str, ...] = ()
+    """What a person should know of how the recording was read, one line each."""
     forgetting: tuple[tuple[float, float], ...] = ()
     """From and to, s: first rows of runs that are left out, in which something may act on that nobody recorded (`beginning`)."""
 

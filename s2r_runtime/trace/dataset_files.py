@@ -59,8 +59,9 @@ def load_dataset(
     if is_mcap(paths[0]) and not robots:
         return replace(from_streams(model, _log_segments(paths, model, epoch), source, digests, paths), commanded=True)
     called: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     if robots:
-        segments, missing, content = _robot_segments(paths[0], model, transport)
+        segments, missing, content, notes = _robot_segments(paths[0], model, transport)
     else:
         segments, missing, content, called = _table_segments(paths[0], model, columns or {}, hidden=not bandwidth)
     if not missing:
@@ -80,7 +81,8 @@ def load_dataset(
     if missing:
         segments, done = reconstruct(model, segments, missing, source, bandwidth, slow)
     named = called if len(called) > 1 and done is None else ()  # what was reconstructed may be in more parts
-    return replace(from_streams(model, segments, source, (*digests, content), paths, done), behind=dict(behind), called=named)
+    data = from_streams(model, segments, source, (*digests, content), paths, done)
+    return replace(data, behind=dict(behind), called=named, notes=notes)
 
 
 def _check_steps(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]]) -> None:
@@ -150,15 +152,15 @@ def _hidden(path: Path, model: ComposedModel, free: set[str], columns: Mapping[s
 
 def _robot_segments(
     path: Path, model: ComposedModel, transport: Mapping[str, Any] | None
-) -> tuple[list[tuple[Stream, Stream]], tuple[str, ...], str]:
-    """The same of a log in a robot's own format, whose segments have no names."""
-    stretches = read_robot_log(path, model, transport)
+) -> tuple[list[tuple[Stream, Stream]], tuple[str, ...], str, tuple[str, ...]]:
+    """The same of a log in a robot's own format, whose segments have no names; and the notes of its reader."""
+    stretches, notes = read_robot_log(path, model, transport)
     seen = ~np.isnan(np.concatenate([stretch.states.values for stretch in stretches])).all(axis=0)
     free = getattr(model.nominal, "follows", {})
     missing = tuple(name for name, there in zip(model.states, seen, strict=True) if not there and name in free)
     kept = [i for i, name in enumerate(model.states) if name not in missing]
     given = [(Stream(s.states.t, s.states.values[:, kept]), Stream(*s.inputs)) for s in stretches]
-    return given, missing, content_digest(stretches, model)
+    return given, missing, content_digest(stretches, model), notes
 
 
 def _log_segments(paths: tuple[Path, ...], model: ComposedModel, epoch: int | None) -> list[tuple[Stream, Stream]]:
