@@ -25,6 +25,8 @@ REASONS: tuple[str, ...] = (
     "stopping",
     "emergency_stop",
     "manual_override",
+    "robot_twin",
+    "observation_faults",
     "clock_backwards",
     "recorder_down",
     "link_down",
@@ -61,8 +63,8 @@ REASONS: tuple[str, ...] = (
 )
 """Every reason why the gate can be closed."""
 
-ALWAYS_LATCHING = ("emergency_stop", "manual_override")
-"""These latch whatever the profile says (docs/gate.md)."""
+ALWAYS_LATCHING = ("emergency_stop", "manual_override", "robot_twin", "observation_faults")
+"""These latch whatever the profile says, hold back every source, and leave nothing but zero input (docs/gate.md)."""
 
 LATCH_HOLDS_ALL = (*ALWAYS_LATCHING, "recorder_down", "link_down", "clock_backwards", "measurement_faults", "outside_geofence")
 """Latched, these hold back the sampler too. The others are about the controller; sampling anew may be their remedy."""

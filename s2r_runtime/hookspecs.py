@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import pluggy
 
-from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
+from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, ObservationRefused, OverrideChanged
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -101,10 +101,15 @@ class Transport(Protocol):
     def receive(self) -> list[Frame]:
         """What came since the last call, oldest first; never blocks. Queues behind it are bounded; drops are counted in `counters`."""
 
-    def decode(self, frame: Frame) -> list[Observation | Command | LinkChanged | OverrideChanged]:
+    def decode(self, frame: Frame) -> list[Observation | ObservationRefused | Command | LinkChanged | OverrideChanged]:
         """What an inbound frame means. Depends on this and earlier frames only, not on the link. Never raises for bad bytes:
         gives an Observation with a `fault`, or nothing for a frame that is not for us. A Command is somebody else's
-        (source `external`): it is logged and refused. A non-finite number is a fault."""
+        (source `external`): it is logged and refused. A non-finite number is a fault.
+
+        What comes in the robot's name and is dropped, because it is an echo, late or another's, is an ObservationRefused: more of
+        them than the profile allows close the gate. A second robot under the robot's name is an OverrideChanged of kind `robot_twin`,
+        before any observation in the same list (`s2r_runtime.twins` helps to notice one).
+        """
 
     def poll(self, now_ns: int) -> list[LinkChanged]:
         """Called at least every 20 ms with the host's monotonic clock: link lost or back, by the transport's own time-outs."""

@@ -152,7 +152,13 @@ class Gate(_Table, frozen=True):
         "command_invalid",
         "measurement_faults",
     )
-    """Reasons that stay until a person clears them (`s2r clear`)."""
+    """Reasons that stay until a person clears them (`s2r clear`); besides `emergency_stop`, `manual_override`, `robot_twin` and
+    `observation_faults`, which always do."""
+    fault_share: float = 0.1
+    """Of the observations, so many may be malformed, echoed, late or another's; more latch the gate with `observation_faults`. 0: no such
+    bound. A sound link stays below 0.01; a copy of the stream, or a second robot, makes 0.5."""
+    fault_burst: int = 10
+    """So many of them at once are no reason yet: a network that stalls for a moment brings some."""
 
 
 class Recovery(_Table, frozen=True):
@@ -218,6 +224,21 @@ class Repair(_Table, frozen=True):
     """`ask`: a person adopts it (`s2r adopt`); `always`: it is in force as soon as nothing drives."""
 
 
+AS_BEFORE: dict[str, dict[str, Any]] = {"gate": {"fault_share": 0.0, "fault_burst": 0}}
+"""Settings that were added later: table -> setting -> the value by which everything was done before it was there. A log is audited, and a
+digest computed, as if a profile with that value did not have the setting.
+"""
+
+
+def plain_table(name: str, table: _Table) -> Any:
+    """A table as plain data for a digest; without the settings that have the value of before they were there."""
+    plain = msgspec.to_builtins(table)
+    for setting, before in AS_BEFORE.get(name, {}).items():
+        if plain[setting] == before:
+            del plain[setting]
+    return plain
+
+
 class Profile(_Table, frozen=True):
     """A robot."""
 
@@ -258,7 +279,7 @@ class Profile(_Table, frozen=True):
         """Digest of everything but the model (it has a digest of its own) and where logs go."""
         plain = msgspec.to_builtins(self)
         del plain["model"], plain["recording"]
-        return digest_of(plain)
+        return digest_of({**plain, **{name: plain_table(name, getattr(self, name)) for name in AS_BEFORE if name in plain}})
 
     def task_digest(self) -> str:
         """Digest of the task: its name, parameters, threshold and the model step it runs on."""
@@ -286,12 +307,17 @@ def load_profile(path: Path) -> Profile:
     return parse_profile(text, str(path), path.parent)
 
 
-def parse_profile(text: str, where: str, base: Path, files: Mapping[str, str] | None = None) -> Profile:
-    """As `load_profile`, from text; relative files are looked up from `base`. files: the transport's, by name, instead of the disk's."""
+def parse_profile(text: str, where: str, base: Path, files: Mapping[str, str] | None = None, *, as_before: bool = False) -> Profile:
+    """As `load_profile`, from text; relative files are looked up from `base`. files: the transport's, by name, instead of the disk's.
+    as_before: what the text lacks is as it was before the setting was there (`AS_BEFORE`), not today's default.
+    """
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{where}: not TOML: {error}") from None
+    for name, settings in AS_BEFORE.items() if as_before else ():
+        if isinstance(given := table.get(name, {}), dict):
+            table[name] = {**settings, **given}
     try:
         profile = msgspec.convert(table, Profile)
     except msgspec.ValidationError as error:

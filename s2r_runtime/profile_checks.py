@@ -126,6 +126,8 @@ def _gate(g: Gate) -> Iterator[Check]:
         yield _lasting(value), f"gate.{field}", value, "> 0 s and at most 1e9 s"
     yield 0.0 <= g.hysteresis <= LONGEST_S, "gate.hysteresis", g.hysteresis, ">= 0 s and at most 1e9 s"
     yield g.settle_periods >= 0, "gate.settle_periods", g.settle_periods, ">= 0"
+    yield 0.0 <= g.fault_share <= 1.0, "gate.fault_share", g.fault_share, "between 0 (no such bound) and 1"
+    yield 0 <= g.fault_burst <= 1_000_000, "gate.fault_burst", g.fault_burst, "0 to 1e6"
     for reason in g.latching:  # a misspelt one would never latch
         near = difflib.get_close_matches(reason, REASONS, 1, 0.6)
         must = "one of the gate's reasons" + (f"; did you mean {near[0]!r}?" if near else "")

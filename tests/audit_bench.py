@@ -26,6 +26,7 @@ from s2r_runtime.comparison import Campaign
 from s2r_runtime.controllers.file import load
 from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
+from s2r_runtime.core.status import against_sampler
 from s2r_runtime.core.stream import stood
 from s2r_runtime.daemon import jobs, trace_job
 from s2r_runtime.daemon.excitation import Excitation
@@ -310,6 +311,7 @@ class Bench:
             event = msgspec.structs.replace(self.queue.popleft(), t_ns=self.t_ns)
             self.items.append(event)
             self.state, outputs = core.handle(self.state, event)
+            self.reason = against_sampler(self.state, outputs)
             outputs = self._decided(outputs)
             self.items += outputs
             for output in in_effect_order(tuple(outputs)):
@@ -344,8 +346,6 @@ class Bench:
                     self.stream.sent(output)
                 if output.source == "recovery" and self.campaign is not None:
                     self.campaign.refused(output.obs_seq, self.reason)
-            case m.Decided():
-                self.reason = output.reason
             case m.Ask(source="sampler") if self.excitation.running:
                 self.numbers += 1
                 self.feed(*self._excited(output))

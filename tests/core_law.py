@@ -29,6 +29,7 @@ WALK = msgspec.structs.replace(
     recovery_input=(0.05, 5.0),
     required_laws=("uniform",),
 )
+STOPS = {"emergency_stop", "manual_override", "robot_twin", "observation_faults"}
 FAULTS = ("raised", "died", "deadline", "malformed")
 
 
@@ -276,7 +277,7 @@ class Law:
         x = self.good.x if self.good else ()
         wrong = {
             "down": not {"link", "recorder"} <= self.up,
-            "stopped": bool(self.latched & {"emergency_stop", "manual_override"}),
+            "stopped": bool(self.latched & STOPS),
             "no permit": self.permit is None or self.now >= self.permit,
             "no campaign": not self.sampling,
             "not seen": not self.usable or not 0 <= self.now - self.good_ns <= self.settings.observation_timeout_ns,
@@ -348,7 +349,7 @@ class Law:
             and self.asked is None
         )
         if send.source == "recovery":
-            if self.latched & {"emergency_stop", "manual_override"} or isinstance(event, m.Stopping):
+            if self.latched & STOPS or isinstance(event, m.Stopping):
                 assert send.u == (0.0, 0.0)
         elif again:
             assert self.last is not None

@@ -164,6 +164,8 @@ BOTH: dict[str, Callable[[Settings, Situation, Command, int], bool]] = {
     "stopping": lambda s, w, c, now: w.stopping,
     "emergency_stop": lambda s, w, c, now: "emergency_stop" in w.latched,
     "manual_override": lambda s, w, c, now: "manual_override" in w.latched,
+    "robot_twin": lambda s, w, c, now: "robot_twin" in w.latched,
+    "observation_faults": lambda s, w, c, now: "observation_faults" in w.latched,
     "clock_backwards": lambda s, w, c, now: now < w.clock_ns,
     "recorder_down": lambda s, w, c, now: not w.recorder_ok,
     "link_down": lambda s, w, c, now: not w.link_up,
@@ -225,7 +227,7 @@ def reason(settings: Settings, situation: Situation, command: Command, now: int)
 # ---------------------------------------------------------------- cases
 
 LATCHES = ("emergency_stop", "manual_override", "recorder_down", "link_down", "clock_backwards", "measurement_faults", "outside_geofence")
-LATCHES += ("controller_fault", "watch_alarm", "command_invalid", "observation_stale")
+LATCHES += ("robot_twin", "observation_faults", "controller_fault", "watch_alarm", "command_invalid", "observation_stale")
 NOTHING = ("permit_until_ns", "controller_digest", "certificate", "observation", "asked_seq", "clear_since_ns")
 
 

@@ -39,6 +39,8 @@ BOTH = [
     Case("stopping", {"stopping": True}),
     Case("emergency_stop", {"latched": ("emergency_stop",)}),
     Case("manual_override", {"latched": ("watch_alarm", "manual_override")}),
+    Case("robot_twin", {"latched": ("watch_alarm", "robot_twin")}),
+    Case("observation_faults", {"latched": ("watch_alarm", "observation_faults")}),
     Case("latched:link_down", {"latched": ("link_down",)}),
     Case("latched:measurement_faults", {"latched": ("measurement_faults",)}),
     Case("clock_backwards", now=NOW - 1),

@@ -23,6 +23,7 @@ from s2r_runtime.messages import (
     Event,
     LinkChanged,
     Measured,
+    ObservationRefused,
     Observed,
     OverrideChanged,
     Proposed,
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 
 CALLS = 1000
 """Told at once: fewer cost more turns, more only memory."""
-_TOLD = frozenset((Observed, Measured, LinkChanged, OverrideChanged, AnalyticsChanged, SourceStopped))
+_TOLD = frozenset((Observed, ObservationRefused, Measured, LinkChanged, OverrideChanged, AnalyticsChanged, SourceStopped))
 """Events that matter there; of `Proposed` those by others."""
 _ENCODE = msgspec.json.Encoder().encode
 _SEND = msgspec.json.Decoder(Send)
@@ -57,11 +58,13 @@ class Beside:
         self._file = ""
         self._quiet = True
 
-    def run(self, transport: str, options: dict[str, Any], states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
-        """A run begins, with this transport."""
+    def run(
+        self, transport: str, options: dict[str, Any], states: tuple[str, ...], inputs: tuple[str, ...], *, counts_faults: bool = True
+    ) -> None:
+        """A run begins, with this transport. counts_faults: as in `Frames`."""
         if self._pipe is None:
             self._start()
-        self._tell("run", transport, options, states, inputs)
+        self._tell("run", transport, options, states, inputs, counts_faults)
 
     def frame(self, entry: Entry) -> None:
         """A frame is recorded."""
@@ -156,8 +159,9 @@ class _Server:
     def file(self, name: str) -> None:
         self.findings.file = name
 
-    def run(self, transport: str, options: dict[str, Any], states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
-        self._frames = Frames(registry().get("transports", transport)(options, states, inputs), len(states), self.findings)
+    def run(self, transport: str, options: dict[str, Any], states: tuple[str, ...], inputs: tuple[str, ...], counts_faults: bool) -> None:
+        made = registry().get("transports", transport)(options, states, inputs)
+        self._frames = Frames(made, len(states), self.findings, counts_faults=counts_faults)
         self._watch = WatchReplay(self.findings)
 
     def frame(self, index: int, channel: str, raw: bytes) -> None:

@@ -129,7 +129,7 @@ class CampaignReplay:
                 self._due.append(Proposed(0, Command(0, ask.t_ns, "sampler", step.u, observation.seq, ttl_ns)))
 
     def decided(self, reason: str) -> None:
-        """The gate's last word."""
+        """Why the command that is sent next, if it is the recovery's, is not the campaign's."""
         self._reason = reason
 
     def sent(self, send: Send) -> None:

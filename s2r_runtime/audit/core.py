@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import msgspec
 
 from s2r_runtime.audit.findings import Findings, close
+from s2r_runtime.audit.older import as_recorded
 from s2r_runtime.core import reducer as core
 from s2r_runtime.core.state import State
 from s2r_runtime.messages import Event, GateChanged, Output, Send
@@ -55,7 +56,7 @@ class CoreReplay:
 
     def _same(self, due: bytes, entry: Entry) -> bool:
         """On another platform up to rounding; but no other text that some reader would take for it."""
-        if due == entry.raw:
+        if as_recorded(due, entry.raw):
             return True
         if self._findings.same_platform or _ENCODE(entry.message) != entry.raw:
             return False

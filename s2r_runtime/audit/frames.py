@@ -10,7 +10,18 @@ from s2r_runtime.audit.findings import Findings
 from s2r_runtime.daemon import transport_values
 from s2r_runtime.daemon.transport_values import Inbound
 from s2r_runtime.hookspecs import Transport
-from s2r_runtime.messages import Command, Event, Frame, LinkChanged, Observation, Observed, OverrideChanged, Proposed, Send
+from s2r_runtime.messages import (
+    Command,
+    Event,
+    Frame,
+    LinkChanged,
+    Observation,
+    ObservationRefused,
+    Observed,
+    OverrideChanged,
+    Proposed,
+    Send,
+)
 from s2r_runtime.recording.reading import Entry
 
 DECODE_FAILED = "transport: decode "
@@ -20,8 +31,11 @@ DECODE_FAILED = "transport: decode "
 class Frames:
     """One run's frames, through a transport of the log's own profile that is never opened."""
 
-    def __init__(self, transport: Transport, nx: int, findings: Findings) -> None:
-        """nx: components of a state."""
+    def __init__(self, transport: Transport, nx: int, findings: Findings, *, counts_faults: bool = True) -> None:
+        """nx: components of a state. counts_faults: whether the run's version counted refused observations, and noticed twins. One that
+        did not took nothing else from the same frames.
+        """
+        self._counts_faults = counts_faults
         self._transport, self._nx, self._findings = transport, nx, findings
         self._due: deque[Inbound] = deque()
         self._source = 0
@@ -34,7 +48,8 @@ class Frames:
         self._events_are_there(entry)
         self._source = entry.index
         try:
-            self._due.extend(transport_values.decoded(self._transport, frame, self._nx).messages)
+            said = transport_values.decoded(self._transport, frame, self._nx).messages
+            self._due.extend(one for one in said if self._counts_faults or not _came_later(one))
         except Exception:  # noqa: BLE001 - a plug-in's defect; the daemon took it for a lost link and went on, and so does this
             self._due.clear()
         self._findings.count("frames")
@@ -52,7 +67,7 @@ class Frames:
         told = _message(event)
         if told is None:
             return
-        if isinstance(due, OverrideChanged):
+        if isinstance(due, OverrideChanged | ObservationRefused):
             due = msgspec.structs.replace(due, t_ns=0)
         elif isinstance(due, Command):
             due = msgspec.structs.replace(due, source="external")
@@ -127,6 +142,11 @@ class Frames:
             return None
 
 
+def _came_later(message: Inbound) -> bool:
+    """Whether an earlier version's transports never said this."""
+    return isinstance(message, ObservationRefused) or (isinstance(message, OverrideChanged) and message.kind == "robot_twin")
+
+
 def _message(event: Event) -> Inbound | None:
     """What a frame must have said for this event; None for events that do not come from frames."""
     if isinstance(event, Observed):
@@ -134,6 +154,6 @@ def _message(event: Event) -> Inbound | None:
         return observation
     if isinstance(event, Proposed) and event.command.source == "external":
         return event.command
-    if isinstance(event, OverrideChanged):
+    if isinstance(event, OverrideChanged | ObservationRefused):
         return msgspec.structs.replace(event, t_ns=0)
     return None

@@ -14,9 +14,11 @@ from s2r_runtime.audit.core import CoreReplay, in_effect_order
 from s2r_runtime.audit.evidence import Evidence
 from s2r_runtime.audit.findings import Findings
 from s2r_runtime.audit.inputs import InputsReplay
+from s2r_runtime.audit.older import as_recorded
 from s2r_runtime.audit.traces import RELEVANT, Traces
 from s2r_runtime.canonical import digest
 from s2r_runtime.core.state import unix_now
+from s2r_runtime.core.status import against_sampler
 from s2r_runtime.daemon.model_store import parse_model
 from s2r_runtime.daemon.settings import ModelFacts, settings_of
 from s2r_runtime.errors import ConfigError
@@ -125,7 +127,7 @@ class RunAudit:
             if (type(event) is Started) == (self._now_ns is not None):
                 self._findings.differ(entry.index, entry.channel, "a run begins with its Started, and has no other", event, None)
             self._now_ns = event.t_ns
-            if _ENCODE(event) != entry.raw:
+            if not as_recorded(_ENCODE(event), entry.raw):
                 self._findings.differ(entry.index, entry.channel, "this is not how a recorder writes it", entry.raw, event)
             if relevant:
                 self._traces.take(entry, event)
@@ -164,6 +166,9 @@ class RunAudit:
         if type(event) is not Ticked:  # the most frequent one
             self._before(entry, event)
         outputs = self._core.event(entry, event)
+        state = self._core.state
+        if state.settings is not None and state.settings.fault_share and any(isinstance(one, Send) for one in outputs):
+            self._campaigns.decided(against_sampler(state, outputs))
         for output in in_effect_order(outputs):
             self._output(entry, output)
         if isinstance(event, JobFinished) and self._profile is not None:
@@ -210,7 +215,7 @@ class RunAudit:
         for name in ("profile.toml", "model.toml"):
             if name not in attached:
                 raise ConfigError(f"{self._where()}: {name} is not attached, so nothing can be recomputed")
-        profile = self._profile_of(attached)
+        profile = self._profile_of(attached, as_before=not event.settings.fault_share)
         self._profile = self._with_model(profile, event.settings.model_digest)
         settings = event.settings
         facts = ModelFacts(settings.states, settings.inputs, settings.angles)
@@ -229,15 +234,17 @@ class RunAudit:
         options = {name: value for name, value in profile.transport.items() if name != "name"}
         name = str(profile.transport.get("name"))
         registry().get("transports", name)(options, facts.states, facts.inputs)  # a transport that is not here is said here
-        self._beside.run(name, options, facts.states, facts.inputs)
+        self._beside.run(name, options, facts.states, facts.inputs, counts_faults=bool(settings.fault_share))
+        if not settings.fault_share:
+            self._findings.count("runs by an earlier version's rule: it let any number of faulty observations pass")
         self._begun = True
 
-    def _profile_of(self, attached: Mapping[str, Attached]) -> Profile:
+    def _profile_of(self, attached: Mapping[str, Attached], *, as_before: bool) -> Profile:
         """The attached profile. Raises ConfigError; not by the log's fault: a version that checked less may have written it."""
         text = self._text(attached["profile.toml"])
         files = {name.removeprefix("profile/"): self._text(one) for name, one in attached.items() if name.startswith("profile/")}
         try:
-            return parse_profile(text, f"{self._where()}: profile.toml", Path(), files)
+            return parse_profile(text, f"{self._where()}: profile.toml", Path(), files, as_before=as_before)
         except ConfigError as error:
             raise ConfigError(f"{error}; this version takes no such profile, so nothing can be recomputed") from None
 
@@ -267,8 +274,8 @@ class RunAudit:
                 self._sent_seq = output.seq
                 self._campaigns.sent(output)
                 self._beside.sent(output)
-            case Decided():
-                self._campaigns.decided(output.reason)
+            case Decided() if not settings.fault_share:
+                self._campaigns.decided(output.reason)  # an earlier version took the gate's last word, whatever it was about
             case Ask(source="controller"):
                 pass
             case Ask(source="sampler") if self._inputs.driving:

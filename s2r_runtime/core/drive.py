@@ -32,7 +32,8 @@ def regate(turn: Turn) -> None:
     refusal = gate.standing(turn.settings, situation(turn.state), "controller", turn.now)
     if refusal is not None:
         reason = refusal.reason
-        close(turn, turn.state.ended if reason == "no_controller" and turn.state.ended else reason)
+        said = turn.state.fault if reason == "observation_invalid" and turn.settings.fault_share else ""
+        close(turn, turn.state.ended if reason == "no_controller" and turn.state.ended else reason, said)
         return
     since = turn.state.clear_since_ns
     if since is None:

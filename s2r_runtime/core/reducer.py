@@ -11,16 +11,17 @@ before they matter, while closing acts first and is logged next. Every `Ask` is 
 `SourceStopped` of that source. A `Send` of the recovery command while a campaign runs means that another input than the
 campaign's acted: the campaign must be told. Everything that happens comes as an event, in the order in which it is logged.
 
-The parts: `state`, `drive` (instants, sends, the gate opening and closing), `sources` (who may command), `gaps` (campaigns, gap, watch),
-`excitation` (given inputs), `repair` (traces, proposed models), `certificates` (attempts, certificates), `requests` (what a person asks
-for), `gate` (the verdict on a command), `ledger` (what is spent), `stream` (what is kept of the discrepancies), `status`.
+The parts: `state`, `drive` (instants, sends, the gate opening and closing), `faults` (of observations, counted), `sources` (who may
+command), `gaps` (campaigns, gap, watch), `excitation` (given inputs), `repair` (traces, proposed models), `certificates` (attempts,
+certificates), `requests` (what a person asks for), `gate` (the verdict on a command), `ledger` (what is spent), `stream` (what is kept of
+the discrepancies), `status`.
 """
 
 from __future__ import annotations
 
 import msgspec
 
-from s2r_runtime.core import certificates, drive, excitation, gaps, repair, sources
+from s2r_runtime.core import certificates, drive, excitation, faults, gaps, repair, sources
 from s2r_runtime.core.requests import requested
 from s2r_runtime.core.state import State, Turn
 from s2r_runtime.core.status import status
@@ -38,6 +39,7 @@ from s2r_runtime.messages import (
     JobFinished,
     LinkChanged,
     Measured,
+    ObservationRefused,
     Observed,
     Output,
     OverrideChanged,
@@ -119,7 +121,10 @@ def _started(state: State, event: Started) -> tuple[State, tuple[Output, ...]]:
 def _dispatch(turn: Turn, event: Event) -> None:
     match event:
         case Observed():
+            before = turn.state.observation
+            faults.note(turn, event.observation)
             drive.observed(turn, event.observation)
+            faults.judge(turn, event.observation, before)
         case Proposed():
             drive.proposed(turn, event.command)
         case Ticked():
@@ -134,6 +139,8 @@ def _dispatch(turn: Turn, event: Event) -> None:
             sources.source_stopped(turn, event)
         case OverrideChanged():
             sources.override(turn, event)
+        case ObservationRefused():
+            faults.refused(turn, event.detail)
         case LinkChanged():
             sources.link_changed(turn, event)
         case Stopping():

@@ -11,6 +11,7 @@ import math
 import msgspec
 
 from s2r_runtime import gate
+from s2r_runtime.core import faults
 from s2r_runtime.core.certificates import begin_verification, refusal_to_verify, revoke, start_controller, valid_certificate
 from s2r_runtime.core.drive import recover_now, regate
 from s2r_runtime.core.excitation import begin_inputs
@@ -28,6 +29,8 @@ HINTS = {
     "permit_expired": "give another: s2r permit DURATION",
     "emergency_stop": "s2r clear emergency_stop, when it is safe",
     "manual_override": "s2r clear manual_override, when it is safe",
+    "robot_twin": "two robots answer to one name; switch one off, then s2r clear robot_twin",
+    "observation_faults": "too many observations are faulty (s2r status); mend it, then s2r clear observation_faults",
     "link_down": "the robot is not there",
     "recorder_down": "nothing can be recorded; is the disk full?",
     "observation_missing": "nothing was observed yet",
@@ -77,7 +80,7 @@ def _deploy(turn: Turn, request: Requested) -> None:
     elif state.deployment is not None:
         turn.answer(request.request_id, 2, "another deployment is in force or under way; first: s2r deploy --undeploy")
     elif stopped:
-        turn.answer(request.request_id, 1, f"refused: {stopped}: {HINTS[stopped]}")
+        turn.answer(request.request_id, 1, f"refused: {_hinted(turn, stopped)}")
     elif state.campaign is not None or job(state, "gap") is not None:
         turn.answer(request.request_id, 1, "refused: a campaign is under way")
     elif (facts := valid_certificate(turn, digest)) is not None:
@@ -130,6 +133,8 @@ def _clear(turn: Turn, request: Requested) -> None:
     turn.persist()
     if reason == "measurement_faults":
         turn.set(faults=0)
+    if reason == faults.REASON:
+        faults.forgive(turn)
     if reason == turn.state.ended:
         turn.set(ended="")
     regate(turn)
@@ -172,11 +177,17 @@ def _sampler_may_drive(turn: Turn, request: Requested) -> bool:
     elif state.deployment is not None:
         turn.answer(request.request_id, 1, "refused: a controller is deployed; undeploy it first")
     elif refusal is not None:
-        hint = HINTS.get(refusal.reason.removeprefix("latched:"), "")
-        turn.answer(request.request_id, 1, f"refused: {refusal.reason}" + (f": {hint}" if hint else ""))
+        turn.answer(request.request_id, 1, f"refused: {_hinted(turn, refusal.reason)}")
     else:
         return True
     return False
+
+
+def _hinted(turn: Turn, reason: str) -> str:
+    """A reason of the gate with what is known of it, and what helps."""
+    hint, fault = HINTS.get(reason.removeprefix("latched:"), ""), turn.state.fault if turn.settings.fault_share else ""
+    said = fault if reason in ("observation_invalid", "robot_twin", "observation_faults") else ""
+    return ": ".join(part for part in (reason, said, hint) if part)
 
 
 def _cancel(turn: Turn, request: Requested) -> None:

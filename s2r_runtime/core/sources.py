@@ -22,7 +22,7 @@ from s2r_runtime.messages import (
     StopController,
 )
 
-INTERRUPTS = ("stopping", "emergency_stop", "manual_override", "recorder_down", "no_permit", "permit_expired")
+INTERRUPTS = ("stopping", *gate.ALWAYS_LATCHING, "recorder_down", "no_permit", "permit_expired")
 """What ends a campaign for the moment; anything else only refuses its commands one by one."""
 FAULTS = ("raised", "died", "deadline", "malformed")
 
@@ -56,8 +56,11 @@ def fail_controller(turn: Turn, reason: str, detail: str, *, tell: bool) -> None
     end_deployment(turn, "controller_fault", f"refused: the controller failed ({said})", tell=False)
 
 
-def interrupt_campaign(turn: Turn, reason: str, *, tell: bool = True, exit_code: int = 1) -> None:
-    """The campaign stops sampling; its epoch stays begun, so that it can go on at no cost. Given inputs stop for good."""
+def interrupt_campaign(turn: Turn, reason: str, *, tell: bool = True, exit_code: int = 1, said: str = "") -> None:
+    """The campaign stops sampling; its epoch stays begun, so that it can go on at no cost. Given inputs stop for good.
+
+    said: the reason, for whoever waits for its end.
+    """
     campaign = turn.state.campaign
     if campaign is None:
         return
@@ -67,11 +70,10 @@ def interrupt_campaign(turn: Turn, reason: str, *, tell: bool = True, exit_code:
         recover_now(turn)
     if tell:
         turn.emit(StopCampaign(turn.now, reason))
-    text = (
-        f"campaign of epoch {campaign.epoch} stopped after {campaign.taken} of {campaign.n} samples: {reason}; s2r sample goes on with it"
-    )
+    why = said or reason
+    text = f"campaign of epoch {campaign.epoch} stopped after {campaign.taken} of {campaign.n} samples: {why}; s2r sample goes on with it"
     if campaign.inputs:
-        text = f"inputs stopped after {campaign.taken} of {campaign.n} rows: {reason}"
+        text = f"inputs stopped after {campaign.taken} of {campaign.n} rows: {why}"
     turn.answer(campaign.request_id, exit_code, text)
 
 
@@ -133,7 +135,9 @@ def source_stopped(turn: Turn, event: SourceStopped) -> None:
 
 
 def override(turn: Turn, event: OverrideChanged) -> None:
-    """A transport's emergency stop or manual override."""
+    """A transport's emergency stop or manual override, or a second robot under this one's name."""
+    if event.kind == "robot_twin":
+        turn.set(fault=event.detail)
     stop(turn, event.kind, event.detail)
 
 
@@ -150,8 +154,9 @@ def halt(turn: Turn, reason: str, detail: str = "") -> None:
     if not any(isinstance(output, Send) for output in turn.outputs):
         recover_now(turn)
     turn.set(idle=0)
-    interrupt_campaign(turn, reason)
-    end_deployment(turn, reason, f"refused: {reason}")
+    said = f"{reason}: {detail}" if detail and turn.settings.fault_share else reason
+    interrupt_campaign(turn, reason, said=said)
+    end_deployment(turn, reason, f"refused: {said}")
 
 
 # ---------------------------------------------------------------- the robot's side

@@ -99,7 +99,8 @@ class State(Struct, frozen=True):
     was asked. `repeats`: of an observation whose command was sent. `issuing`: the job whose certificate is being signed.
     gate_said: the reason last recorded; `ended`: why the last deployment ended. clear_since_ns: since when all standing
     conditions of the gate hold. driven: a controller has, since the gap came into force; excited: given inputs were. trace_due_ns: when a
-    growth of the gap is to be traced; traced_radius: the radius when one was traced last. unsaved: the memory holds what was not
+    growth of the gap is to be traced; traced_radius: the radius when one was traced last. `fault`: what was wrong with the last faulty
+    observation; `faulty`: whether none that is good came since; fault_level: see `core.faults`. unsaved: the memory holds what was not
     persisted yet; saved_e_value: the watch's in what was.
     """
 
@@ -145,6 +146,9 @@ class State(Struct, frozen=True):
     excited: bool = False
     trace_due_ns: int | None = None
     traced_radius: float = 0.0
+    fault: str = ""
+    fault_level: float = 0.0
+    faulty: bool = False
     unsaved: bool = False
     saved_e_value: float = 1.0
 

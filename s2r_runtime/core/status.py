@@ -6,8 +6,10 @@ import math
 
 import msgspec
 
+from s2r_runtime import gate
 from s2r_runtime.core import ledger, stream
-from s2r_runtime.core.state import NANO, State, certificate, unix_now, usable_gap
+from s2r_runtime.core.state import NANO, State, certificate, situation, unix_now, usable_gap
+from s2r_runtime.messages import Decided, Output
 
 
 def status(state: State) -> dict[str, object]:
@@ -104,3 +106,15 @@ def _stream(state: State) -> dict[str, object] | None:
         "exchange": memory.watch_exchange,
         "exchange_at": 1.0 / alpha,
     }
+
+
+def against_sampler(state: State, outputs: tuple[Output, ...]) -> str:
+    """Why the recovery command went out in the sampler's place. state: after the event, outputs: of the event.
+
+    The gate's verdict on its command where there is one, otherwise what stands against it now; `interrupted` if nothing does any more.
+    """
+    for output in outputs:
+        if isinstance(output, Decided) and output.source == "sampler" and not output.allow:
+            return output.reason
+    refusal = None if state.settings is None else gate.standing(state.settings, situation(state), "sampler", state.now_ns)
+    return "interrupted" if refusal is None else refusal.reason

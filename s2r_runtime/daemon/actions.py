@@ -19,6 +19,7 @@ import msgspec
 from s2r_runtime import messages as m
 from s2r_runtime.controllers.file import ControllerFile
 from s2r_runtime.core import stream
+from s2r_runtime.core.status import against_sampler
 from s2r_runtime.daemon.analytics import Watching
 from s2r_runtime.daemon.worker import Failed, GapJob, Progress, Result, TraceJob, VerifyJob
 
@@ -50,7 +51,7 @@ class Actions:
         self._d = daemon
         self.unsaved = ""
         self.last_sent = 0
-        self._reason = ""
+        self._refused_for = ""
         self.results: dict[str, Any] = {}
         self.last_trace: m.TraceEnded | None = None
         self.episodes: deque[m.EpisodeEnded] = deque(maxlen=KEPT_EPISODES)
@@ -68,7 +69,6 @@ class Actions:
             m.StartJob: self._start_job,
             m.IssueCertificate: self._issue,
             m.Persist: self._persist,
-            m.Decided: self._decided,
             m.Answer: self._answer,
             m.ModelAdopted: self._model_adopted,
             m.TraceEnded: self._trace_ended,
@@ -77,6 +77,8 @@ class Actions:
     def carry_out(self, outputs: Sequence[m.Output]) -> None:
         """One event's outputs."""
         put, sent = self._d.logbook.put, False
+        if self._d.sampler.running and any(isinstance(output, m.Send) and output.source == "recovery" for output in outputs):
+            self._refused_for = against_sampler(self._d.state, tuple(outputs))
         if any(isinstance(output, m.GateChanged) and not output.open for output in outputs):
             sent = True
             for output in outputs:
@@ -141,10 +143,7 @@ class Actions:
             self._d.feed(change)
         self._d.watcher.sent(send)
         if send.source == "recovery" and self._d.sampler.running:
-            self._d.sampler.refused(send.obs_seq, self._reason)
-
-    def _decided(self, decided: m.Decided) -> None:
-        self._reason = decided.reason
+            self._d.sampler.refused(send.obs_seq, self._refused_for)
 
     # ------------------------------------------------------------------ sources
 
@@ -285,7 +284,7 @@ class Actions:
             match output:
                 case m.Send(source="recovery") if not sent:
                     self._send(output)
-                case m.StopController() | m.StopCampaign() | m.Answer() | m.Persist() | m.Decided() | m.ModelAdopted():
+                case m.StopController() | m.StopCampaign() | m.Answer() | m.Persist() | m.ModelAdopted():
                     self._do[type(output)](output)
                 case m.StartController():
                     self._d.feed(m.SourceStopped(0, "controller", "start_failed", why))

@@ -56,6 +56,7 @@ from s2r_runtime.messages import (
     LinkChanged,
     Memory,
     Observation,
+    ObservationRefused,
     Observed,
     OverrideChanged,
     Proposed,
@@ -336,7 +337,7 @@ class Daemon:
                 self.watcher.wait()
         elif isinstance(message, Command):
             self.feed(Proposed(0, msgspec.structs.replace(message, source="external")))
-        elif isinstance(message, LinkChanged | OverrideChanged):
+        else:
             self.feed(message)
 
     # ------------------------------------------------------------------ events
@@ -380,7 +381,7 @@ class Daemon:
 
     def _handle(self, event: Event) -> None:
         t_ns = event.t_ns
-        if isinstance(event, LinkChanged | OverrideChanged):
+        if isinstance(event, LinkChanged | OverrideChanged | ObservationRefused):
             t_ns = 0  # a transport's stamps are the host's
         elif isinstance(event, EpisodeEnded):
             self.actions.episodes.append(event)

@@ -78,6 +78,8 @@ def settings_of(profile: Profile, model: ModelSpec, facts: ModelFacts, seed: int
         run_length=profile.watch.run_length,
         norm_set=profile.norm.set,
         norm_weights=tuple(profile.norm.weights.get(name, 1.0) for name in facts.states),
+        fault_share=gate.fault_share,
+        fault_burst=gate.fault_burst,
     )
 
 

@@ -13,9 +13,9 @@ import math
 from typing import NamedTuple, TypeGuard, cast, get_args, get_type_hints
 
 from s2r_runtime.hookspecs import Transport
-from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
+from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, ObservationRefused, OverrideChanged
 
-Inbound = Observation | Command | LinkChanged | OverrideChanged
+Inbound = Observation | Command | LinkChanged | OverrideChanged | ObservationRefused
 
 DROPPED = "transport: receive "
 """How the text of the stop begins that the daemon takes dropped input for."""
@@ -143,8 +143,11 @@ def _message(given: object, nx: int) -> None:
     elif type(given) is OverrideChanged:
         if given.kind not in KINDS or not _text(given.detail) or not _whole(given.t_ns):
             raise TypeError("gave an OverrideChanged whose kind, detail or t_ns is not what it may be")
+    elif type(given) is ObservationRefused:
+        if not _text(given.detail) or not _whole(given.t_ns):
+            raise TypeError("gave an ObservationRefused whose detail or t_ns is not of its type")
     else:
-        raise TypeError(f"gave {_kind(given)}, must be Observation, Command, LinkChanged or OverrideChanged")
+        raise TypeError(f"gave {_kind(given)}, must be Observation, ObservationRefused, Command, LinkChanged or OverrideChanged")
 
 
 def _override(given: object) -> OverrideChanged | None:

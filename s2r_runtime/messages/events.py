@@ -79,11 +79,21 @@ class Stopping(Struct, frozen=True, tag="stopping"):
 
 
 class OverrideChanged(Struct, frozen=True, tag="override_changed"):
-    """A transport's emergency stop or manual override signal (latches until cleared)."""
+    """A transport's emergency stop or manual override signal, or two robots under one name (each latches until cleared)."""
 
     t_ns: int
-    kind: Literal["emergency_stop", "manual_override"]
+    kind: Literal["emergency_stop", "manual_override", "robot_twin"]
     detail: str = ""
+
+
+class ObservationRefused(Struct, frozen=True, tag="observation_refused"):
+    """A transport dropped something that came in the robot's name, although the robot is well: an echo, a late or a foreign message.
+
+    The gate stays as it is; the core counts these, together with faulty observations (`gate.fault_share`). detail: what was wrong.
+    """
+
+    t_ns: int
+    detail: str
 
 
 class Measured(Struct, frozen=True, tag="measured"):
@@ -240,5 +250,5 @@ class Requested(Struct, frozen=True, tag="requested"):
 Event = (
     Started | Observed | Proposed | Ticked | WallClockRead | LinkChanged | RecorderChanged | AnalyticsChanged | OverrideChanged | Measured
     | EpisodeEnded | SourceStarted | SourceStopped | SampleTaken | CampaignFinished | InputsFinished | JobFinished | CertificateStored
-    | CertificateFailed | CertificatesDistrusted | Requested | Stopping
+    | CertificateFailed | CertificatesDistrusted | Requested | Stopping | ObservationRefused
 )  # fmt: skip

@@ -63,6 +63,9 @@ class Settings(Struct, frozen=True):
     norm_set: Literal["", "ball", "box"] = ""
     norm_weights: tuple[float, ...] = ()
     """The norm that every gap here is measured in: its set, and a weight for each state; empty: not said."""
+    fault_share: float = 0.0
+    fault_burst: int = 0
+    """The share of observations that may be faulty, and how many may be so at once; share 0: a run before there was such a bound."""
 
 
 MEMORY_SCHEMA = 1

@@ -67,8 +67,11 @@ def _table() -> dict[str, type[Struct]]:
     table.update((f"event/{_tag(kind)}", kind) for kind in get_args(messages.Event))
     table.update((f"out/{_tag(kind)}", kind) for kind in get_args(messages.Output))
     table.update((f"log/{_tag(kind)}", kind) for kind in (Seal, Unrecorded, LogDeleted))
-    return table
+    return table | {name: table.pop(name) for name in LATER}
 
+
+LATER = ("event/observation_refused",)
+"""Channels that came after others had their numbers, in the order in which they came."""
 
 CHANNELS: dict[str, type[Struct]] = _table()
 """Name -> type of its messages. The position is the channel's number (from 1) in files of this version."""

@@ -16,7 +16,7 @@ import pytest
 from s2r_runtime.daemon import transport_values
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import Transport
-from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
+from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, ObservationRefused, OverrideChanged
 
 PATIENCE_S = 10.0
 """How long anything may take that takes milliseconds on an idle machine."""
@@ -63,7 +63,7 @@ class Line:
         self.transport, self.robot = rig.transport, rig.robot
         self._numbered = numbered
         self.frames: list[Frame] = []
-        self.messages: list[Observation | Command | LinkChanged | OverrideChanged] = []
+        self.messages: list[Observation | ObservationRefused | Command | LinkChanged | OverrideChanged] = []
         self._seq = 100
 
     @property
