@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 import random
+from pathlib import Path
 
 import msgspec
 import pytest
 from core_rig import DT, Rig, of, one
 
+from s2r_runtime.audit.log import audit
+from s2r_runtime.audit.older import as_recorded
 from s2r_runtime.core.status import against_sampler
 from s2r_runtime.messages import (
     Decided,
@@ -234,8 +237,6 @@ def test_a_sample_is_never_rejected_because_it_was_allowed() -> None:
 
 
 def _profile(text: str = "", *, as_before: bool = False) -> Profile:
-    from pathlib import Path
-
     table = (Path(__file__).parent.parent / "profiles" / "robotarium.toml").read_text(encoding="utf-8")
     return parse_profile(table + text, "p.toml", Path(), as_before=as_before)
 
@@ -246,6 +247,32 @@ def test_a_profile_of_before_is_audited_as_it_was() -> None:
     assert "fault_share" not in plain_table("gate", then.gate)
     assert then.digest() != now.digest()
     assert set(msgspec.to_builtins(now.gate)) - set(plain_table("gate", then.gate)) == {"fault_share", "fault_burst"}
+
+
+def test_a_log_of_before_is_replayed_by_its_own_rule() -> None:
+    """`Bench(...).sample().drive(40).stop()` as the version before wrote it."""
+    import audit_bench
+
+    log = Path(__file__).parent / "replay" / "log_before_fault_bound.mcap"
+    result = audit([log], audit_bench.PUBLIC)
+    assert result.ok, result.text()
+    assert "1 runs by an earlier version's rule" in result.text()
+
+
+def test_a_record_of_before_may_lack_later_fields_and_nothing_else() -> None:
+    now = b'{"type":"started","settings":{"a":1,"later":0.0},"t_ns":5}'
+    assert as_recorded(now, now)
+    assert as_recorded(now, b'{"type":"started","settings":{"a":1},"t_ns":5}')
+    for other in (
+        b'{"type":"started","settings":{"a":1},"t_ns":6}',
+        b'{"type":"started","t_ns":5,"settings":{"a":1}}',
+        b'{"type":"started","settings":{"a":1,"a":1},"t_ns":5}',
+        b'{"type":"started","settings":{"a":1},"t_ns":5,"more":1}',
+        b'{"type":"started", "settings":{"a":1},"t_ns":5}',
+        b'{"type":"started","settings":{"a":1.0},"t_ns":5}',
+        b"{",
+    ):
+        assert not as_recorded(now, other), other
 
 
 @pytest.mark.parametrize("setting", ["fault_share = -0.1", "fault_share = 1.5", "fault_burst = -1"])
