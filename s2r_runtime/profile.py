@@ -139,7 +139,7 @@ class Gate(_Table, frozen=True):
     command_ttl: float = 0.1
     """s; for how long a command is good, and how long an answer may take."""
     controller_deadline: float = 0.05
-    """s; a controller that has not answered by then is at fault. In lockstep it has 1 s at least."""
+    """s; a controller that has not answered by then is at fault. In lockstep it has `machine.process_timeout` at least."""
     hysteresis: float = 0.1
     """s; the gate opens when nothing has stood against it for so long."""
     settle_periods: int = 30
@@ -203,6 +203,28 @@ class Recording(_Table, frozen=True):
     """Of all logs; the oldest runs beyond are deleted. 0: all are kept."""
     keep_days: float = 0.0
     """Older runs are deleted. 0: all are kept."""
+    max_delay: float = 0.5
+    """s; so much of the log may wait for the disk, and be lost in a crash, while the gate is open. More closes it (`recorder_down`) until
+    it is written; in lockstep the robot is kept waiting instead. The default is ten times the 0.05 s between two writes."""
+
+
+class Machine(_Table, frozen=True):
+    """How long the computer's own disk and processes are waited for. No bound on the robot's data or commands is among these, and a
+    certificate is not bound to them: a quicker computer is no other robot. `s2r doctor --load` measures what this computer needs.
+    """
+
+    disk_timeout: float = 5.0
+    """s; so long is the disk waited for where something must be on it before it takes effect (an opening of the gate, a certificate), and
+    the gate's loop stands still meanwhile. Then it does not take effect. In lockstep 30 s at least. The default: syncs of a busy disk
+    took 1 to 2 s."""
+    watch_delay: float = 2.0
+    """s; so far may the watch be behind the robot while a controller drives. More closes the gate (`analytics_down`) until it has caught
+    up. The default: a step of a model takes 1 ms, and a busy computer let a process wait for up to 1.5 s."""
+    process_timeout: float = 10.0
+    """s; analytics that is silent for so long counts as hung, and is started anew; in lockstep, where the robot waits, a controller is at
+    fault. The default: some six times the longest wait for a processor that was seen, 1.5 s."""
+    start_timeout: float = 30.0
+    """s; until analytics, or a controller, has loaded its libraries. The default: ten times what a small computer needs, its disk cold."""
 
 
 class Repair(_Table, frozen=True):
@@ -265,6 +287,7 @@ class Profile(_Table, frozen=True):
     watch: Watch = Watch()
     certificate: CertificateSettings = CertificateSettings()
     recording: Recording = Recording()
+    machine: Machine = Machine()
     repair: Repair = Repair()
     clock: Literal["realtime", "lockstep"] = "realtime"
     """`lockstep`: the robot's clock is the clock, and stands still while nobody answers (a simulation)."""
@@ -276,9 +299,9 @@ class Profile(_Table, frozen=True):
         return {value["file"]: value["text"] for value in named}
 
     def digest(self) -> str:
-        """Digest of everything but the model (it has a digest of its own) and where logs go."""
+        """Digest of everything but the model (it has a digest of its own), where logs go, and what the computer is given time for."""
         plain = msgspec.to_builtins(self)
-        del plain["model"], plain["recording"]
+        del plain["model"], plain["recording"], plain["machine"]
         return digest_of({**plain, **{name: plain_table(name, getattr(self, name)) for name in AS_BEFORE if name in plain}})
 
     def task_digest(self) -> str:

@@ -15,7 +15,19 @@ from typing import TYPE_CHECKING
 from s2r_runtime.gate import REASONS
 
 if TYPE_CHECKING:
-    from s2r_runtime.profile import Driving, Gate, Profile, Recording, Recovery, Repair, Robot, Sampling, VerificationSettings, Watch
+    from s2r_runtime.profile import (
+        Driving,
+        Gate,
+        Machine,
+        Profile,
+        Recording,
+        Recovery,
+        Repair,
+        Robot,
+        Sampling,
+        VerificationSettings,
+        Watch,
+    )
 
 SHORTEST_S, LONGEST_S = 1e-9, 1e9
 """Times are kept in whole nanoseconds of 64 bits: no less than one, and 1e9 s (some 30 years) is well below what fits."""
@@ -42,6 +54,7 @@ def problems(p: Profile) -> Iterator[tuple[str, object, str]]:
         _home(p),
         _watch(p.watch),
         _recording(p.recording),
+        _machine(p.machine),
         _repair(p.repair),
         _rest(p),
     )
@@ -160,6 +173,20 @@ def _recording(r: Recording) -> Iterator[Check]:
         yield value >= 0, f"recording.{field}", value, ">= 0 (0: no rotation by it)"
     for field, value in (("keep_bytes", r.keep_bytes), ("keep_days", r.keep_days)):
         yield value >= 0, f"recording.{field}", value, ">= 0 (0: all logs are kept)"
+    yield 0.1 <= r.max_delay <= LONGEST_S, "recording.max_delay", r.max_delay, "0.1 s at least (a chunk is written every 0.05 s)"
+
+
+def _machine(m: Machine) -> Iterator[Check]:
+    """The service manager ends a daemon whose loop stands still for 10 s (WatchdogSec of the unit)."""
+    yield (
+        0.1 <= m.disk_timeout < 10.0,
+        "machine.disk_timeout",
+        m.disk_timeout,
+        "0.1 s to less than 10 s: the gate's loop stands still for it",
+    )
+    yield 0.1 <= m.process_timeout <= LONGEST_S, "machine.process_timeout", m.process_timeout, "0.1 to 1e9 s"
+    yield 0.1 <= m.watch_delay <= m.process_timeout, "machine.watch_delay", m.watch_delay, "0.1 s to machine.process_timeout"
+    yield _lasting(m.start_timeout), "machine.start_timeout", m.start_timeout, "> 0 s and at most 1e9 s"
 
 
 def _repair(r: Repair) -> Iterator[Check]:

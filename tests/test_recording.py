@@ -386,6 +386,45 @@ def test_while_the_disk_hangs_put_goes_on_and_health_says_so(tmp_path: Path) -> 
     assert [entry.message for entry in read(tmp_path / "a.mcap")] == [Ticked(i) for i in range(1000)]
 
 
+def test_how_much_may_wait_for_the_disk_is_the_profiles_and_a_write_in_time_keeps_the_health_good(tmp_path: Path) -> None:
+    writer = Writer(tmp_path / "a.mcap", run="test", timed=False)
+    recorder = Recorder(writer, max_delay_s=60.0)
+    with writer._writing:
+        recorder.put(Ticked(1), 1)
+        time.sleep(0.8)
+        assert recorder.health().ok
+        assert 0.8 <= recorder.delay_s < 60.0
+        assert not recorder.caught_up(0.1, 0.05)
+    assert recorder.caught_up(0.5, 20.0)
+    assert recorder.close().ok
+
+
+def test_a_pause_of_the_process_is_no_stall_of_the_disk(tmp_path: Path) -> None:
+    """The clock stands for the daemon's, which counts one look for a pause of any length."""
+    now_s = 0.0
+    writer = Writer(tmp_path / "a.mcap", run="test", timed=False)
+    recorder = Recorder(writer, max_delay_s=0.5, clock=lambda: now_s)
+    with writer._writing:
+        recorder.put(Ticked(1), 1)
+        now_s = 0.1
+        assert recorder.health().ok
+        now_s = 0.6
+        assert "nothing reached the disk for 0.6 s (recording.max_delay is 0.5 s)" in recorder.health().detail
+    assert recorder.durable()
+    assert recorder.health().ok
+    assert recorder.close().ok
+
+
+def test_a_dead_recorder_is_seen_at_once_however_long_the_disk_may_take(tmp_path: Path) -> None:
+    recorder = Recorder(Writer(tmp_path / "a.mcap", run="test", timed=False), max_delay_s=1e6)
+    ident = recorder._thread.ident
+    assert ident is not None
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(ident), ctypes.py_object(SystemExit))
+    recorder._thread.join(20.0)
+    assert "died" in recorder.health().detail
+    assert not recorder.put(Ticked(1), 1)
+
+
 def test_a_full_memory_ends_the_log_counts_what_is_missing_and_never_makes_a_hole(tmp_path: Path) -> None:
     writer = Writer(tmp_path / "a.mcap", run="test", timed=False)
     recorder = Recorder(writer, limit_bytes=20_000)

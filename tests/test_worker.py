@@ -262,7 +262,7 @@ def test_model_is_checked_beside_the_measuring(analytics: Analytics) -> None:
     analytics.check(8, current, "adopt")
     came: list[Ready | Refused | Reply] = []
     while len(came) < 2:
-        came += analytics.poll(time.monotonic_ns())
+        came += analytics.poll()
     assert isinstance(came[0], Refused)
     assert "did you mean 'bicycle'?" in came[0].text
     assert isinstance(came[1], Ready)

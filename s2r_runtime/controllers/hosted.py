@@ -161,6 +161,14 @@ class HostedController:
         else:
             self._put(asked)
 
+    def postpone(self, time_ns: int) -> None:
+        """Every deadline that runs now is that much later."""
+        self._start_deadline_ns += time_ns
+        if self._asked is not None:
+            self._asked = self._asked._replace(deadline_ns=self._asked.deadline_ns + time_ns)
+        if self._waiting is not None:
+            self._waiting = self._waiting._replace(deadline_ns=self._waiting.deadline_ns + time_ns)
+
     def poll(self, now_ns: int) -> list[Ready | Reply | Stopped]:
         """What happened since the last call. Call it when `fileno` is readable, at `deadline_ns`, and every 20 ms anyway.
 

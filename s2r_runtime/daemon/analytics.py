@@ -10,6 +10,7 @@ from __future__ import annotations
 import gc
 import sys
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -23,9 +24,6 @@ from s2r_runtime.profile import Profile
 
 if TYPE_CHECKING:
     from s2r_runtime.watch import Stream
-
-REPLY_WITHIN_S = 2.0
-"""A step of a model takes well under a millisecond; a process that is silent this long is stopped, swapped out or dead."""
 
 
 class Setup(msgspec.Struct, frozen=True, tag="setup"):
@@ -98,13 +96,19 @@ def start() -> Child:
 
 
 class Analytics:
-    """The daemon's end. `poll` and `wait` give what came; `down` says why it is no more, or nothing."""
+    """The daemon's end. `poll` and `wait` give what came; `down` says why it is no more, or nothing.
 
-    def __init__(self, profile: Profile, where: str, child: Child | None = None) -> None:
-        """child: the process, if it was started earlier (see `start`)."""
+    `late`: the watch is behind the robot by more than `machine.watch_delay`. A process that is silent for `machine.process_timeout` hangs,
+    and is down.
+    """
+
+    def __init__(self, profile: Profile, where: str, child: Child | None = None, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        """child: the process, if it was started earlier (see `start`). clock: ns, of how long it is waited for."""
         self.down = ""
         self._child = child or start()
-        self._waiting: dict[int, int] = {}  # observation -> host time at which its reply is overdue, ns
+        self._clock, self._machine = clock, profile.machine
+        self._waiting: dict[int, int] = {}  # observation -> when it was handed over, ns
+        self._spoke_ns = clock()
         self._child.send(_ENCODE(Setup(profile, where)))
 
     @property
@@ -116,11 +120,11 @@ class Analytics:
         """Readable when `poll` has something."""
         return self._child.fileno()
 
-    def facts(self, timeout_s: float = 30.0) -> ModelFacts:
+    def facts(self) -> ModelFacts:
         """Waits for the answer to the set-up. Raises ConfigError with what is wrong with the profile."""
-        line = self._child.wait(timeout_s)
+        line = self._child.wait(self._machine.start_timeout)
         if line is None:
-            raise ConfigError(f"the analytics process did not start: {self._child.ending()}")
+            raise ConfigError(f"the analytics process did not start: {self._child.ending()} (machine.start_timeout)")
         answer = _DECODE_UP(line)
         if isinstance(answer, Ready):
             return answer.facts
@@ -141,28 +145,40 @@ class Analytics:
 
     def observed(self, observation: Observation) -> None:
         """The robot was seen there; a Reply comes."""
-        self._waiting[observation.seq] = time.monotonic_ns() + round(REPLY_WITHIN_S * 1e9)
+        now_ns = self._clock()
+        if not self._waiting:
+            self._spoke_ns = now_ns
+        self._waiting.setdefault(observation.seq, now_ns)
         self._send(observation)
+
+    @property
+    def late(self) -> str:
+        """By how much it is behind the robot, in words; empty while that is within `machine.watch_delay`."""
+        behind_s = (self._clock() - next(iter(self._waiting.values()), self._clock())) * 1e-9
+        allowed_s = self._machine.watch_delay
+        return f"analytics is {behind_s:.1f} s behind the robot (machine.watch_delay is {allowed_s:g} s)" if behind_s > allowed_s else ""
 
     def wait(self) -> list[Upward]:
         """As `poll`, once every observation has its reply; or it is down."""
         came: list[Upward] = []
-        deadline = time.monotonic() + REPLY_WITHIN_S
+        deadline = time.monotonic() + self._machine.process_timeout
         while self._waiting and not self.down:
             line = self._child.wait(deadline - time.monotonic())
             if line is None:
-                self._gone(time.monotonic_ns())
+                self.down = f"analytics: {self._child.ending()}"
                 break
             came += self._taken(line)
         return came
 
-    def poll(self, now_ns: int) -> list[Upward]:
+    def poll(self) -> list[Upward]:
         """What came since the last call; notices a process that died or hangs."""
         if self.down:
             return []
         self._child.retry()
         came = [message for line in self._child.lines() for message in self._taken(line)]
-        self._gone(now_ns)
+        silent_ns = self._clock() - self._spoke_ns if self._waiting else 0
+        if not self._child.alive() or silent_ns > self._machine.process_timeout * 1e9:
+            self.down = f"analytics: {self._child.ending()}"
         return came
 
     def stop(self) -> None:
@@ -180,14 +196,10 @@ class Analytics:
         except msgspec.DecodeError as error:
             self.down = f"analytics is out of step: {error}"
             return []
+        self._spoke_ns = self._clock()
         if isinstance(message, Reply):
             self._waiting.pop(message.obs_seq, None)
         return [message]
-
-    def _gone(self, now_ns: int) -> None:
-        overdue = next(iter(self._waiting.values()), now_ns)
-        if not self._child.alive() or overdue < now_ns:
-            self.down = f"analytics: {self._child.ending()}"
 
 
 # ---------------------------------------------------------------- in the child

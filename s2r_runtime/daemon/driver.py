@@ -9,12 +9,11 @@ from collections.abc import Callable
 from s2r_runtime.controllers.episodes import Episode
 from s2r_runtime.controllers.file import ControllerFile
 from s2r_runtime.controllers.hosted import HostedController, Ready, Reply, Stopped
+from s2r_runtime.daemon.awake import AwakeClock
+from s2r_runtime.daemon.settings import controller_deadline_s
 from s2r_runtime.errors import ControllerError
 from s2r_runtime.messages import Command, EpisodeEnded, Event, Observation, Proposed, Settings, SourceStarted, SourceStopped
 from s2r_runtime.profile import Profile
-
-LOCKSTEP_DEADLINE_S = 1.0
-"""The robot waits for the answer there, so a host that is slow for a moment need not end a drive."""
 
 
 class Driver:
@@ -28,13 +27,14 @@ class Driver:
         emit: Callable[[Event], None],
         now: Callable[[], int],
         next_seq: Callable[[], int],
+        awake: AwakeClock,
     ) -> None:
-        """settings: those in force. next_seq: numbers the commands of all sources."""
+        """settings: those in force. next_seq: numbers the commands of all sources. awake: knows for how long the daemon stood still."""
         self._selector, self._profile, self._settings = selector, profile, settings
         self._emit, self._now, self._next_seq = emit, now, next_seq
         self._host: HostedController | None = None
-        deadline_s = profile.gate.controller_deadline
-        self._deadline_ns = round(1e9 * (max(deadline_s, LOCKSTEP_DEADLINE_S) if profile.clock == "lockstep" else deadline_s))
+        self._awake, self._stood_still_ns = awake, 0
+        self._deadline_ns = round(1e9 * controller_deadline_s(profile))
         self.latency_ns = 0
         self._contained: tuple[str, ...] = ()
 
@@ -61,9 +61,16 @@ class Driver:
     def start(self, file: ControllerFile, seed: int) -> None:
         """Starts the process; SourceStarted or SourceStopped(start_failed) follows."""
         self.stop()
+        self._stood_still_ns = self._awake.stood_still_ns
         settings = self._settings()
         host = HostedController(
-            file, model=self._profile.model, nx=len(settings.states), nu=len(settings.inputs), task=self._profile.task, seed=seed
+            file,
+            model=self._profile.model,
+            nx=len(settings.states),
+            nu=len(settings.inputs),
+            task=self._profile.task,
+            seed=seed,
+            start_timeout_s=self._profile.machine.start_timeout,
         )
         try:
             host.start()
@@ -82,6 +89,7 @@ class Driver:
         """Asks what to do about it; Proposed or SourceStopped follows."""
         if self._host is None:
             return
+        self._forgive_pause()
         try:
             self._host.ask(observation, time.monotonic_ns() + self._deadline_ns)
         except ValueError as error:
@@ -91,6 +99,7 @@ class Driver:
         """Takes what came. now_ns: the host's clock."""
         if self._host is None:
             return
+        self._forgive_pause()
         for message in self._host.poll(now_ns):
             t_ns = self._now()
             if isinstance(message, Reply):
@@ -113,6 +122,12 @@ class Driver:
             host, self._host = self._host, None
             self._selector.unregister(host)
             host.close()
+
+    def _forgive_pause(self) -> None:
+        """While the daemon stood still the controller may have, too: such time is not its fault. How old its answer is, the gate sees."""
+        paused_ns, self._stood_still_ns = self._awake.stood_still_ns - self._stood_still_ns, self._awake.stood_still_ns
+        if paused_ns and self._host is not None:
+            self._host.postpone(paused_ns)
 
     def _end(self, event: SourceStopped) -> None:
         self.stop()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -20,8 +20,6 @@ from s2r_runtime.profile import Recording
 from s2r_runtime.recording.recorder import Health, Recorder
 from s2r_runtime.recording.writer import Writer
 
-LOCKSTEP_WAIT_S = 2.0
-"""There the robot waits too, so a log that is written slower than messages come may slow the loop down."""
 Attachment = tuple[str, str, bytes]
 
 
@@ -38,10 +36,15 @@ class Logbook:
         lockstep: bool,
         file: Path | None,
         retention: Retention | None = None,
+        disk_timeout_s: float = 5.0,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """file: the log's path, if it isn't to have a name of its own in `folder`. retention: notes what the logs are evidence of."""
+        """file: the log's path, if it isn't to have a name of its own in `folder`. retention: notes what the logs are evidence of.
+        disk_timeout_s: how long the disk is waited for. clock: s, of the time for which messages wait to be written.
+        """
         self._folder, self._robot, self._file = folder, robot, file
         self._settings, self._signer, self._lockstep = settings, signer, lockstep
+        self._disk_timeout_s, self._clock = disk_timeout_s, clock
         self._writer: Writer | None = None
         self._recorder: Recorder | None = None
         self._next: Writer | None = None
@@ -114,7 +117,8 @@ class Logbook:
         self._writer = writer
         if self._retention is not None:
             self._retention.begin(writer.path.stem)
-        self._recorder = Recorder(writer, block_s=LOCKSTEP_WAIT_S if self._lockstep else 0.0)
+        waits_s = self._disk_timeout_s if self._lockstep else 0.0  # there the robot waits too, so a slow log may slow the loop down
+        self._recorder = Recorder(writer, block_s=waits_s, max_delay_s=max(self._settings.max_delay, waits_s), clock=self._clock)
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -152,12 +156,21 @@ class Logbook:
     def durable(self) -> bool:
         """Whether all that was put is on the disk now, and what it is evidence of noted there."""
         noted = self._retention is None or self._retention.save(self.anchor())
-        return noted and self._recorder is not None and self._recorder.durable()
+        return noted and self._recorder is not None and self._recorder.durable(self._disk_timeout_s)
+
+    @property
+    def behind(self) -> bool:
+        """Whether more of the log waits for the disk than may be lost (`recording.max_delay`)."""
+        return self._recorder is not None and self._recorder.delay_s > self._settings.max_delay
+
+    def caught_up(self, timeout_s: float) -> bool:
+        """Waits until it is not `behind`. False: not within the time."""
+        return self._recorder is None or self._recorder.caught_up(self._settings.max_delay, timeout_s)
 
     def settled(self) -> bool:
         """Whether all that was put so far came to the disk, by itself and within a few seconds. For a thread that has time."""
         recorder = self._recorder
-        return recorder is not None and recorder.settled()
+        return recorder is not None and recorder.settled(self._disk_timeout_s)
 
     def health(self) -> Health:
         """How it is."""

@@ -28,6 +28,7 @@ from s2r_runtime.core import reducer as core
 from s2r_runtime.core.state import State
 from s2r_runtime.daemon import control, issuing, past
 from s2r_runtime.daemon.actions import Actions
+from s2r_runtime.daemon.awake import LOOK_S, AwakeClock
 from s2r_runtime.daemon.desk import Desk
 from s2r_runtime.daemon.driver import Driver
 from s2r_runtime.daemon.every import Every
@@ -40,7 +41,7 @@ from s2r_runtime.daemon.persistence import StateFolder
 from s2r_runtime.daemon.retention import Retention
 from s2r_runtime.daemon.robot_link import Clock, link_of
 from s2r_runtime.daemon.sampler import Keeper, Sampler
-from s2r_runtime.daemon.settings import ModelFacts, settings_of
+from s2r_runtime.daemon.settings import ModelFacts, disk_timeout_s, settings_of
 from s2r_runtime.daemon.stop_signals import StopSignals
 from s2r_runtime.daemon.systemd import Notifier
 from s2r_runtime.daemon.transport_values import Inbound
@@ -111,6 +112,7 @@ class Daemon:
         self._log_dir = log_file.parent if log_file else log_dir or self.state_dir / profile.recording.directory
         self.selector = selectors.DefaultSelector()
         self.clock = Clock(lockstep=profile.clock == "lockstep")
+        self.awake = AwakeClock()
         self.notifier = Notifier()
         self.state: State = core.initial()
         self.memory: Memory
@@ -189,7 +191,7 @@ class Daemon:
 
     def _start_helpers(self, stack: ExitStack) -> None:
         """Analytics now, a worker when there is work."""
-        self.watcher = Watcher(self.selector, self.profile, str(self._profile_path), self.feed, self._analytics)
+        self.watcher = Watcher(self.selector, self.profile, str(self._profile_path), self.feed, self._analytics, self.awake.now_ns)
         stack.callback(self.watcher.close)
         for plugin in registry().loaded:
             if plugin.error:
@@ -205,7 +207,17 @@ class Daemon:
         self.retention = None
         if self._log_file is None:
             self.retention = Retention(self._log_dir, self.folder.path, robot, kept.keep_bytes, kept.keep_days, self.say)
-        self.logbook = Logbook(self._log_dir, robot, kept, self.key, lockstep=lockstep, file=self._log_file, retention=self.retention)
+        self.logbook = Logbook(
+            self._log_dir,
+            robot,
+            kept,
+            self.key,
+            lockstep=lockstep,
+            file=self._log_file,
+            retention=self.retention,
+            disk_timeout_s=disk_timeout_s(self.profile),
+            clock=self.awake.now_s,
+        )
         self.facts: ModelFacts = self.watcher.facts()
         self.settings = settings_of(self.profile, self.profile.model, self.facts, self.seed)
         self.link = link_of(self.profile, self.facts, self._record_frame, self.guard)
@@ -221,7 +233,7 @@ class Daemon:
         sampling, logs = self.profile.sampling, lambda: tuple(map(str, self.logbook.paths))
         self.sampler = Sampler(self.folder, self.keeper, sampling, logs, self.next_seq, taken)
         self.excitation = Excitation()
-        self.driver = Driver(self.selector, self.profile, lambda: self.settings, self.feed, self.clock.now, self.next_seq)
+        self.driver = Driver(self.selector, self.profile, lambda: self.settings, self.feed, self.clock.now, self.next_seq, self.awake)
         stack.callback(self.driver.stop)
 
     def _open_desk(self, stack: ExitStack) -> None:
@@ -287,7 +299,9 @@ class Daemon:
     def _turn(self) -> None:
         while not (self._signals.name or self._ended):
             due_ns = self._next_tick_ns if self.driver.due_ns is None else min(self._next_tick_ns, self.driver.due_ns)
-            for key, mask in self.selector.select(max(0, due_ns - time.monotonic_ns()) * 1e-9):
+            ready = self.selector.select(max(0, due_ns - time.monotonic_ns()) * 1e-9)
+            self.awake.look()
+            for key, mask in ready:
                 key.data(mask)
             now_ns = time.monotonic_ns()
             if now_ns >= due_ns:
@@ -324,8 +338,17 @@ class Daemon:
         self.notifier.status(f"gate {'open' if self.state.gate_open else 'closed'} ({self.state.gate_reason})")
 
     def _robot_ready(self, _mask: int) -> None:
+        if self.clock.lockstep and self._recorder_ok and self.logbook.behind:
+            self._wait_for_log()
         for arrival_ns, message in self.link.receive():
             self._from_robot(arrival_ns, message)
+
+    def _wait_for_log(self) -> None:
+        """Lockstep: the robot waits while the disk is slow, so that a crash loses no more of what it did, and the gate stays as it is."""
+        until_s = time.monotonic() + disk_timeout_s(self.profile)
+        while not (self.logbook.caught_up(LOOK_S) or self.logbook.faulty or self._signals.name) and time.monotonic() < until_s:
+            self.awake.look()
+            self.notifier.alive(time.monotonic_ns())
 
     def _from_robot(self, arrival_ns: int, message: Inbound) -> None:
         if isinstance(message, Observation):

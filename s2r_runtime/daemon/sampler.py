@@ -29,6 +29,8 @@ from s2r_runtime.messages import (
 )
 from s2r_runtime.profile import Sampling
 
+AGAIN_S = 1.0
+"""Between two tries to keep a campaign that the disk did not take."""
 AHEAD = 1
 """Samples that may be kept and not logged: the newest one may be kept before the log is given it; all before it are in the log first."""
 
@@ -44,7 +46,7 @@ class Kept(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Keeper:
-    """Writes the newest of what it is given, from a thread of its own. A write that fails is told once, and tried with the next.
+    """Writes the newest of what it is given, from a thread of its own. A write that fails is told once, and tried again.
 
     logged: waits until the log has what it was given, and says whether it has. It goes first: a kept sample that no log has is one that
     somebody may have made up, and the campaign would not be gone on with.
@@ -89,6 +91,11 @@ class Keeper:
                 if str(error) != failed:
                     failed = str(error)
                     self._complain(f"the campaign cannot be kept, so an interruption would lose it: {error}")
+                with self._wake:
+                    if self._ending:
+                        continue
+                    self._newest = self._newest or kept
+                    self._wake.wait_for(lambda: self._ending, AGAIN_S)
 
 
 class Sampler:

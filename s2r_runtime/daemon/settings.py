@@ -83,6 +83,22 @@ def settings_of(profile: Profile, model: ModelSpec, facts: ModelFacts, seed: int
     )
 
 
+LOCKSTEP_DISK_S = 30.0
+"""There nothing moves while the disk is waited for. Four times the slowest sync that was seen on a busy disk (7.1 s)."""
+
+
+def disk_timeout_s(profile: Profile) -> float:
+    """For how long the loop may wait for the disk, s."""
+    set_s = profile.machine.disk_timeout
+    return max(set_s, LOCKSTEP_DISK_S) if profile.clock == "lockstep" else set_s
+
+
+def controller_deadline_s(profile: Profile) -> float:
+    """How long a controller may take for an answer, s. In lockstep the robot waits for it, so only one that hangs is ended."""
+    set_s = profile.gate.controller_deadline
+    return max(set_s, profile.machine.process_timeout) if profile.clock == "lockstep" else set_s
+
+
 def campaign_digest(profile: Profile) -> str:
     """Digest of what a gap rests on besides the model: the law of the samples, the norm, and what was fixed beforehand."""
     tables = (profile.region, profile.geofence, profile.inputs, profile.norm, profile.sampling, profile.guarantee)

@@ -96,13 +96,21 @@ class Watcher:
     """The analytics process, kept alive. Events come through `emit`; t_ns is the daemon's to give."""
 
     def __init__(
-        self, selector: selectors.BaseSelector, profile: Profile, where: str, emit: Callable[[Event], None], child: Child | None = None
+        self,
+        selector: selectors.BaseSelector,
+        profile: Profile,
+        where: str,
+        emit: Callable[[Event], None],
+        child: Child | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Starts it at once: what follows goes on while it loads. child: the process, if it was started earlier."""
-        self._selector, self._profile, self._where, self._emit = selector, profile, where, emit
-        self._analytics: Analytics | None = Analytics(profile, where, child)
+        """Starts it at once: what follows goes on while it loads. child: the process, if it was started earlier. clock: ns, of how long
+        it is waited for.
+        """
+        self._selector, self._profile, self._where, self._emit, self._clock = selector, profile, where, emit, clock
+        self._analytics: Analytics | None = Analytics(profile, where, child, clock)
         self._again_ns = 0
-        self._ready = False
+        self._ready = self._late = False
         self._checks: dict[int, Callable[[str, ModelFacts | None], None]] = {}
         self._watching: Watching | None = None
         self._stood: tuple[Gap, WatchStood] | None = None
@@ -115,8 +123,8 @@ class Watcher:
 
     @property
     def up(self) -> bool:
-        """Whether it can measure."""
-        return self._analytics is not None and self._ready
+        """Whether it can measure, and is not behind the robot."""
+        return self._analytics is not None and self._ready and not self._late
 
     def facts(self) -> ModelFacts:
         """Waits until it is up. Raises ConfigError with what is wrong with the profile."""
@@ -176,13 +184,14 @@ class Watcher:
     def tick(self, now_ns: int) -> None:
         """Takes what came; notices its end; starts it again. now_ns: the host's clock."""
         if self._analytics is not None:
-            for message in self._analytics.poll(now_ns):
+            for message in self._analytics.poll():
                 self._take(message)
+            self._check_late()
             self._check_alive(now_ns)
         elif now_ns >= self._again_ns:
             self._again_ns = now_ns + AGAIN_AFTER_NS
             try:
-                self._analytics = Analytics(self._profile, self._where)
+                self._analytics = Analytics(self._profile, self._where, clock=self._clock)
             except OSError:
                 return  # no process to be had now; the gate stays closed
             self._register(self._analytics)
@@ -204,13 +213,22 @@ class Watcher:
         if self._watching is not None:
             self.begin(self._watching)
 
+    def _check_late(self) -> None:
+        """Nobody may drive unwatched for longer than the profile allows; a process that catches up watches on where it was."""
+        if self._analytics is None or self._analytics.down:
+            return
+        late = self._analytics.late
+        if bool(late) != self._late and self._ready:
+            self._late = bool(late)
+            self._emit(AnalyticsChanged(0, up=not late, detail=late))
+
     def _check_alive(self, now_ns: int) -> None:
         analytics = self._analytics
         if analytics is None or not analytics.down:
             return
         self._selector.unregister(analytics)
         analytics.stop()
-        self._analytics, self._ready = None, False
+        self._analytics, self._ready, self._late = None, False, False
         self._again_ns = now_ns + AGAIN_AFTER_NS
         self._emit(AnalyticsChanged(0, up=False, detail=analytics.down))
         for answer in self._checks.values():

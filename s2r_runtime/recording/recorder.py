@@ -1,6 +1,8 @@
 """The recorder: a log written by a thread of its own, so that a slow disk holds up nobody.
 
-`put` encodes the message and returns (about 3 µs); the thread seals, compresses and writes every `chunk_s`. A log has no holes: a
+`put` encodes the message and returns (about 3 µs); the thread seals, compresses and writes every `chunk_s`. A write may have to wait for
+a sync that is under way (a file system that commits the file's length lets nobody change it), so after a slow sync the next one rests for
+as long. A log has no holes: a
 message that cannot be taken, because memory is full or it cannot be encoded, is the end of the log. It and all that come
 after it are counted, the recorder's health stays bad until a new one is made, and the log says how many it lacks. A disk that is
 full for a while is no end: what is in memory is written when there is room. A sync that fails is one: the system says so once, and the next
@@ -12,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+from collections.abc import Callable
 from typing import NamedTuple
 
 from s2r_runtime.messages import LogHead, Struct
@@ -22,10 +25,12 @@ LIMIT_BYTES = 16 << 20
 """Memory for what the disk has not taken: at 100 Hz about a minute and a half."""
 RETRY_S = 0.2
 """After a failed write."""
-STALLED_S = 0.5
-"""Older than that and not in the file: the disk (or the thread) hangs."""
+DELAY_S = 0.5
+"""Default of `recording.max_delay`: ten times the chunk's time. What a kill costs at most while the health is good."""
 SYNC_S = 0.05
 """Between two syncs, by a thread of their own: with a chunk's time what a power cut may take, where nothing asked for more."""
+REST_S = 1.0
+"""The longest rest between two syncs, after one that took as long: it bounds what the rest adds to the loss of a power cut."""
 
 
 class Health(NamedTuple):
@@ -40,11 +45,21 @@ class Health(NamedTuple):
 
 class Recorder:
     """Owns a `Writer` made with `timed=False`. limit_bytes: what may wait in memory. block_s: how long `put` may wait for
-    room (lockstep, where the robot waits too); 0: it never waits. sync_s: between two syncs.
+    room (lockstep, where the robot waits too); 0: it never waits. sync_s: between two syncs. max_delay_s: a message that waits for the
+    disk for longer makes the health bad, until it is written. clock: s, of that wait.
     """
 
-    def __init__(self, writer: Writer, *, limit_bytes: int = LIMIT_BYTES, block_s: float = 0.0, sync_s: float = SYNC_S) -> None:
-        self._writer, self._sync_s = writer, sync_s
+    def __init__(
+        self,
+        writer: Writer,
+        *,
+        limit_bytes: int = LIMIT_BYTES,
+        block_s: float = 0.0,
+        sync_s: float = SYNC_S,
+        max_delay_s: float = DELAY_S,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._writer, self._sync_s, self._max_delay_s, self._clock = writer, sync_s, max_delay_s, clock
         writer.deferring = True
         self._limit_bytes, self._block_s = limit_bytes, block_s
         self._wake = threading.Event()
@@ -54,7 +69,7 @@ class Recorder:
         self._trouble = self._sync_trouble = ""
         self._unrecorded = 0
         self._last_ns = 0
-        self._flushed_s = time.monotonic()
+        self._written_s, self._written_awake_s = time.monotonic(), clock()
         self._requested = self._granted = self._writes = 0
         self._ending = self._over = False
         self._head = ""
@@ -107,9 +122,19 @@ class Recorder:
         detail = self._fault or self._trouble or self._sync_trouble
         if not detail and not self._thread.is_alive() and not self._ending:
             detail = "the recorder's thread is dead"
-        if not detail and pending and (late := time.monotonic() - self._flushed_s) > STALLED_S + self._writer.chunk_s:
-            detail = f"nothing reached the disk for {late:.1f} s"
+        if not detail and pending and (late := self._clock() - self._written_awake_s) > self._max_delay_s:
+            detail = f"nothing reached the disk for {late:.1f} s (recording.max_delay is {self._max_delay_s:g} s)"
         return Health(not detail, detail, self._unrecorded, pending, self._writer.recorded)
+
+    @property
+    def delay_s(self) -> float:
+        """An upper bound on the time for which the oldest message has waited for the disk, s; 0: none waits."""
+        return time.monotonic() - self._written_s if self._writer.pending_bytes else 0.0
+
+    def caught_up(self, delay_s: float, timeout_s: float) -> bool:
+        """Waits until no message has waited for longer than delay_s. False: not within the time, or the log is at its end."""
+        with self._room:
+            return self._room.wait_for(lambda: self.delay_s <= delay_s or self._over, timeout_s) and not self._over
 
     @property
     def head(self) -> str:
@@ -164,7 +189,8 @@ class Recorder:
     def _run(self) -> None:
         try:
             while not self._ending:
-                self._wake.wait(RETRY_S if self._trouble else self._writer.chunk_s)
+                since_s = time.monotonic() - self._written_s
+                self._wake.wait(RETRY_S if self._trouble else max(0.0, self._writer.chunk_s - since_s))
                 self._wake.clear()
                 self._write()
             self._finish()
@@ -178,9 +204,12 @@ class Recorder:
 
     def _keep_synced(self) -> None:
         """The other thread. What it cannot sync is bad health, until it can: the log is then not what it promises after a power cut."""
-        while not self._stop_syncing.wait(RETRY_S if self._sync_trouble else self._sync_s):
+        rest_s = self._sync_s
+        while not self._stop_syncing.wait(RETRY_S if self._sync_trouble else rest_s):
+            began_s = time.monotonic()
             try:
                 self._writer.sync()
+                rest_s = max(self._sync_s, min(time.monotonic() - began_s, REST_S))
                 self._sync_trouble = ""
             except OSError as error:
                 self._sync_trouble = f"the log cannot be synced: {error.strerror}"
@@ -189,6 +218,7 @@ class Recorder:
     def _write(self) -> None:
         with self._room:
             ticket = self._requested
+        began_s, began_awake_s = time.monotonic(), self._clock()  # what is put while this is written waits from here on
         try:
             if ticket > self._granted:
                 self._writer.durable()
@@ -199,7 +229,7 @@ class Recorder:
             self._doubt()
             return
         self._trouble = ""
-        self._flushed_s = time.monotonic()
+        self._written_s, self._written_awake_s = began_s, began_awake_s
         with self._room:
             self._granted, self._writes = ticket, self._writes + 1
             self._room.notify_all()
