@@ -14,8 +14,18 @@ def s2r_transports() -> list[Offer]:
 @hookimpl
 def s2r_recordings() -> list[Offer]:
     """Logs of a CAN bus."""
-    what = {"log": "candump", "asc": "Vector ASC", "blf": "Vector BLF"}
-    return [Offer(f"can.{suffix}", "s2r_can.recordings:read", f"{name} logs of a bus, by its DBC") for suffix, name in what.items()]
+    what = {
+        "log": ("candump", "candump"),
+        "asc": ("Vector ASC", "asc"),
+        "blf": ("Vector BLF", "blf"),
+        "trc": ("PCAN TRC", "trc"),
+        "csv": ("python-can CSV", "csv"),
+        "db": ("python-can SQLite", "sqlite"),
+    }
+    return [
+        Offer(f"can.{suffix}", "s2r_can.recordings:read", f"{name} logs of a bus, by its DBC", recognises=f"s2r_can.kinds:is_{kind}")
+        for suffix, (name, kind) in what.items()
+    ]
 
 
 @hookimpl

@@ -1,4 +1,4 @@
-"""The hook `s2r_recordings`: candump, ASC and BLF logs -> states and inputs, through the profile's DBC and mapping.
+"""The hook `s2r_recordings`: CAN logs (`logs`) -> states and inputs, through the profile's DBC and mapping.
 
 Frames are judged as on the bus (`hearing`). A message's values make a row at its stamp; messages that come together (within MERGE of the
 shortest usual interval between two of one kind) make one, stamped with the trigger if it is among them. Where a state is dead
@@ -22,12 +22,15 @@ from s2r_can.database import Database
 from s2r_can.hearing import Heard, Hearing
 from s2r_can.layout import Group, Layout
 from s2r_can.listening import layout_of
-from s2r_can.logs import LogFrame, read_frames
+from s2r_can.logs import read_frames
 from s2r_can.odometry import Odometry
 from s2r_can.options import checked
 from s2r_can.proposals import CommandReader
 from s2r_can.reckoning import Reckoning, odometry_of
+from s2r_can.records import ERROR, REMOTE, LogFrame
+from s2r_can.tally import Tally
 from s2r_runtime.errors import RecordingError
+from s2r_runtime.hookspecs import ReadLog
 
 Array = NDArray[np.float64]
 Stretch = tuple[tuple[Array, Array], tuple[Array, Array]]
@@ -39,12 +42,13 @@ AGAIN_S = 1.0
 """A stamp that is farther back begins another drive: logs that were put together."""
 
 
-def read(path: Path, states: tuple[str, ...], inputs: tuple[str, ...], options: dict[str, Any]) -> list[Stretch]:
-    """A log's stretches; see `hookspecs.s2r_recordings`. Raises ConfigError, RecordingError."""
+def read(path: Path, states: tuple[str, ...], inputs: tuple[str, ...], options: dict[str, Any]) -> ReadLog:
+    """A log's stretches, and what of it could not be used; see `hookspecs.s2r_recordings`. Raises ConfigError, RecordingError."""
     known = checked(options)
     database = Database(known.dbc)
     layout = layout_of(known, database, states, inputs)
-    drives = _chosen(path, layout, str(known.robot.get("channel", "")))
+    tally = Tally()
+    drives = _chosen(path, layout, str(known.robot.get("channel", "")), tally)
     window = _window(drives, layout)
     stretches: list[Stretch] = []
     refused: Counter[str] = Counter()
@@ -54,25 +58,30 @@ def read(path: Path, states: tuple[str, ...], inputs: tuple[str, ...], options: 
             rows.take(frame)
         stretches += [stretch for stretch in rows.stretches() if len(stretch[0][0])]
         refused.update(rows.hearing.counts)
+        refused["wrong command"] += rows.wrong_commands
+    counts = ", ".join(f"{name} {count}" for name, count in sorted(refused.items()) if count and name != "lost")
+    frames = sum(map(len, drives))
     if not stretches:
-        counts = ", ".join(f"{name} {count}" for name, count in refused.items() if count and name != "lost")
-        frames = sum(map(len, drives))
         raise RecordingError(f"{path}: none of {frames} frames with states can be believed ({counts or 'no value in them'})")
-    return stretches
+    believed = [f"of {frames} frames of the profile's messages these were not believed, as on the bus: {counts}"] if counts else []
+    lost = [f"{refused['lost']} frames are missing, by the counters in the others"] if refused["lost"] else []
+    return ReadLog(stretches, (*tally.notes(), *believed, *lost))
 
 
-def _chosen(path: Path, layout: Layout, robot: str) -> list[list[LogFrame]]:
+def _chosen(path: Path, layout: Layout, robot: str, tally: Tally) -> list[list[LogFrame]]:
     """Drives: frames that matter, of one interface, in time."""
     listened, sent = set(layout.inbound), set(layout.commands)
     seen: Counter[str] = Counter()
     others = 0
     frames: list[LogFrame] = []
-    for frame in read_frames(path):
+    for frame in read_frames(path, tally):
         if frame.key in listened or frame.key in sent:
             frames.append(frame)
             seen[frame.channel] += frame.key in listened
         else:
             others += 1
+            if frame.key & (ERROR | REMOTE):
+                tally.left_out["error frames" if frame.key & ERROR else "remote frames"] += 1
     if not sum(seen.values()):
         wanted = ", ".join(sorted({m.name for m in layout.inbound.values()}))
         raise RecordingError(f"{path}: holds none of the messages that the profile reads ({wanted}) among {others + len(frames)} frames")
@@ -80,6 +89,10 @@ def _chosen(path: Path, layout: Layout, robot: str) -> list[list[LogFrame]]:
     commanded = {f.channel for f in frames if f.key in sent}
     source = channel if channel in commanded else next(iter(sorted(commanded)), channel)
     kept = [f for f in frames if f.channel == (channel if f.key in listened else source)]
+    if len(kept) < len(frames):
+        tally.said.append(
+            f"{len(frames) - len(kept)} frames of the profile's messages are of another interface than {channel!r} and left out"
+        )
     backward = sum(b.t < a.t for a, b in pairwise(kept))
     if backward > max(1.0, BACKWARD_SHARE * len(kept)):
         raise RecordingError(f"{path}: time runs backwards {backward} times: stamps must be times, not the differences of candump -td")
@@ -109,6 +122,7 @@ class _Rows:
         self._columns = {index: column for column, index in enumerate(layout.states) if index is not None}
         self._commands = CommandReader(layout, inputs)
         self._origin: float | None = None
+        self.wrong_commands = 0
         self._parts: list[tuple[list[float], list[list[float]], list[float], list[list[float]]]] = [([], [], [], [])]
         self._row: list[float] = []
         self._row_t = 0.0
@@ -173,6 +187,7 @@ class _Rows:
 
     def _command(self, frame: LogFrame) -> None:
         values, wrong = self._commands.read(frame.key, frame.payload)
+        self.wrong_commands += bool(wrong)
         if not wrong:
             self._parts[-1][2].append(frame.t)
             self._parts[-1][3].append(values)

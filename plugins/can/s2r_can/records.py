@@ -13,12 +13,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 HEADER = struct.Struct("<QIBB")
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
 FD, SWITCH, INDICATOR = 1, 2, 4
 PAYLOAD_MAX = 64
+STAMP_MAX = 1e11
+"""s: no log's clock is beyond that."""
 RECORDS_MAX = 4096
 """Bytes of records in one frame that is decoded: a receiver with the longest queue gives fewer at a time."""
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
@@ -26,6 +28,29 @@ FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 
 BUS_OFF, RESTARTED = 0x40, 0x100
 """Error classes (linux/can/error.h): the controller left the bus; it is back."""
+
+
+class LogFrame(NamedTuple):
+    """A frame of a log. t: s, as the log counts. channel: as the log calls it. key: identifier with its flags."""
+
+    t: float
+    channel: str
+    key: int
+    payload: bytes
+
+
+def frame_of(message: Any, t: float) -> LogFrame | None:
+    """A frame from python-can's Message; None for one that cannot be: a stamp that is no time, an identifier or a length beyond CAN's."""
+    identifier, payload = message.arbitration_id, bytes(message.data)
+    if not abs(t) < STAMP_MAX or not 0 <= identifier <= (0x1FFFFFFF if message.is_extended_id else 0x7FF):
+        return None
+    if message.is_error_frame:
+        return LogFrame(t, str(message.channel), identifier | ERROR, payload)
+    if message.is_remote_frame and not message.is_fd:  # CAN FD has none: python-can's ASC reader takes a frame without data for one
+        return LogFrame(t, str(message.channel), key_of(identifier, extended=message.is_extended_id) | REMOTE, b"")
+    if len(payload) > PAYLOAD_MAX or (not message.is_fd and len(payload) != min(message.dlc, 8)):
+        return None
+    return LogFrame(t, str(message.channel), key_of(identifier, extended=message.is_extended_id), payload)
 
 
 class Record(NamedTuple):

@@ -100,7 +100,7 @@ def test_every_format_says_the_same(tmp_path: Path, options: dict[str, Any], mes
     path = written(tmp_path / name.removesuffix(".gz"), messages)
     if name.endswith(".gz"):
         (tmp_path / name).write_bytes(gzip.compress(path.read_bytes()))
-    (((t, x), (tu, u)),) = read(tmp_path / name, STATES, INPUTS, options)
+    (((t, x), (tu, u)),) = read(tmp_path / name, STATES, INPUTS, options).stretches
     assert x.shape == (1000, 5)
     assert np.isfinite(x).all(), "what comes together makes one row"
     assert u.shape == (1000, 2)
@@ -119,7 +119,7 @@ def test_messages_that_do_not_come_together_make_rows_with_blanks(tmp_path: Path
     shifted = [m for m in drive(2.0) if m.arbitration_id != 386]
     late = [moved(m, 0.01) for m in drive(2.0) if m.arbitration_id == 386]
     path = written(tmp_path / "late.log", sorted([*shifted, *late], key=lambda m: m.timestamp))
-    (((_, x), _),) = read(path, STATES, INPUTS, options)
+    (((_, x), _),) = read(path, STATES, INPUTS, options).stretches
     assert len(x) == 200
     assert np.array_equal(np.isnan(x).sum(axis=1), [2, 3] * 100)
 
@@ -135,8 +135,8 @@ def test_pose_is_reckoned_where_the_log_has_none(tmp_path: Path, options: dict[s
     }
     messages = list(drive(20.0))
     path = written(tmp_path / "wheels.log", messages)
-    (((_, x), _),) = read(path, STATES, INPUTS, reckoned)
-    (((_, truth), _),) = read(path, STATES, INPUTS, options)
+    (((_, x), _),) = read(path, STATES, INPUTS, reckoned).stretches
+    (((_, truth), _),) = read(path, STATES, INPUTS, options).stretches
     way = float(np.sum(np.hypot(np.diff(truth[:, 0]), np.diff(truth[:, 1]))))
     # the trapezoid knows the speeds at both ends of a period and not how they changed within (time constant 60 ms, period 20 ms)
     assert np.hypot(*(x[-1, :2] - truth[-1, :2])) < 0.02 * way
@@ -156,8 +156,8 @@ def test_frames_that_are_wrong_repeated_or_of_another_interface_leave_no_row(tmp
         if draw.random() < 0.05:
             spoilt.append(moved(m, 5e-4))
         spoilt.append(moved(m, 2e-4, data=b"\x01" * 8, channel=1))
-    (((t, x), _),) = read(written(tmp_path / "spoilt.log", spoilt), STATES, INPUTS, options)
-    (((t_clean, x_clean), _),) = read(written(tmp_path / "clean.log", clean), STATES, INPUTS, options)
+    (((t, x), _),) = read(written(tmp_path / "spoilt.log", spoilt), STATES, INPUTS, options).stretches
+    (((t_clean, x_clean), _),) = read(written(tmp_path / "clean.log", clean), STATES, INPUTS, options).stretches
     assert len(t) < len(t_clean) + 20
     for column in range(5):
         there = np.isfinite(x[:, column])
@@ -168,7 +168,7 @@ def test_frames_that_are_wrong_repeated_or_of_another_interface_leave_no_row(tmp
 def test_robot_that_started_anew_begins_another_stretch(tmp_path: Path, options: dict[str, Any]) -> None:
     first = list(drive(2.0))[:-40]  # its counters end at 92, and begin at 0 without a silence: nothing that a loss explains
     again = [moved(m, 1.85) for m in drive(2.0)]
-    found = read(written(tmp_path / "twice.log", [*first, *again]), STATES, INPUTS, options)
+    found = read(written(tmp_path / "twice.log", [*first, *again]), STATES, INPUTS, options).stretches
     assert len(found) >= 2
 
 
@@ -181,8 +181,8 @@ def bad_logs(messages: list[can.Message]) -> list[tuple[str, bytes, str]]:
         ("other.log", line.encode() * 5, "holds none of the messages that the profile reads (BaseStatus, Heading, Position, WheelSpeeds)"),
         ("bare.log", b"  can0  123   [4]  DE AD BE EF\n" * 3, "line 1 has no time stamp"),
         ("text.log", b"hello world\n" * 3, "is no candump log: line 1: 'hello world'"),
-        ("mixed.log", (line * 50 + "what?\n" * 10).encode(), "10 lines are no candump lines, the first is line 51: 'what?'"),
-        ("not.blf", b"no BLF at all, and long enough to look at" * 20, "cannot be read as BLF after 0 frames"),
+        ("mixed.log", (line * 50 + "what?\n" * 10).encode(), "10 of 60 lines are no candump lines, the first is line 51: 'what?'"),
+        ("not.blf", b"no BLF at all, and long enough to look at" * 20, "cannot be read as BLF: its header is not whole"),
         ("not.asc", b"no ASC at all\n" * 20, "holds no CAN frame"),
         ("bad.log.gz", b"\x1f\x8b\x08garbage", "gzip"),
         ("delta.log", "".join(f"(0.{k * 7919 % 1000:03d}) can0 182#{'00' * 8}\n" for k in range(200)).encode(), "time runs backwards"),
@@ -207,7 +207,7 @@ def test_log_that_ends_in_the_middle_of_a_frame_is_read_up_to_there(
 ) -> None:
     path = written(tmp_path / name, messages)
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * 0.9) - 7])
-    (((t, _), _),) = read(path, STATES, INPUTS, options)
+    (((t, _), _),) = read(path, STATES, INPUTS, options).stretches
     assert 100 < len(t) < 1000
 
 
