@@ -84,8 +84,8 @@ $(STAMP): pyproject.toml constraints.txt plugins/zenoh/pyproject.toml plugins/ca
 	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || { echo "the venv module is missing: sudo apt-get install python3-venv" >&2; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-	    --editable '.[report,dev]' --editable plugins/zenoh --editable plugins/can --editable plugins/mavlink --editable 'plugins/standins[sim]' \
-	    --editable plugins/ros2
+	    --editable '.[report,formats,dev]' --editable plugins/zenoh --editable plugins/can --editable plugins/mavlink --editable 'plugins/standins[sim]' \
+	    --editable 'plugins/ros2[formats]'
 	@$(BIN)/python -m compileall -q s2r_runtime plugins  # else each start does it again where PYTHONDONTWRITEBYTECODE is set
 	@touch $(STAMP)
 

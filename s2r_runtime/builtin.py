@@ -75,6 +75,17 @@ def s2r_tasks() -> list[Offer]:
 
 
 @hookimpl
+def s2r_formats() -> list[Offer]:
+    """Formats whose readers need no robot's protocol; their libraries are in the extra `formats`."""
+    return [
+        Offer("ulog", "s2r_runtime.formats.ulog:ULogFile", "PX4 ULog, by pyulog"),
+        Offer("mdf", "s2r_runtime.formats.mdf:open_mdf", "MF4 and MDF measurement files, by asammdf"),
+        Offer("parquet", "s2r_runtime.formats.parquet:open_parquet", "Parquet files and LeRobot data sets, by pyarrow"),
+        Offer("matlab", "s2r_runtime.formats.matlab:open_matlab", "MATLAB files up to version 7, by scipy"),
+    ]
+
+
+@hookimpl
 def s2r_kits() -> list[Offer]:
     """For those of the above that the kits can't try on values of their own."""
     return [

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -25,6 +26,15 @@ def canonical(value: Any) -> bytes:
 def digest(data: bytes) -> str:
     """`sha256:` and 64 hex digits."""
     return "sha256:" + hashlib.sha256(data).hexdigest()
+
+
+def digest_of_path(path: Path) -> str:
+    """Digest of a file's bytes, read piece by piece; of a folder, that of the names and digests of its files. Raises OSError."""
+    if path.is_dir():
+        files = sorted(file for file in path.rglob("*") if file.is_file())
+        return digest_of([[file.relative_to(path).as_posix(), digest_of_path(file)] for file in files])
+    with path.open("rb") as file:
+        return "sha256:" + hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def digest_of(value: Any) -> str:

@@ -22,6 +22,10 @@ class RecordingError(UsageError):
     """A recording (CSV or MCAP) does not hold what was asked of it, or holds it wrongly."""
 
 
+class MissingSignal(RecordingError):
+    """A recording lacks a topic or message that a reader looks for by default; another one in it may do."""
+
+
 class NotEnoughEvidence(S2RError):
     """The data do not carry the statement. `missing`: how many more independent samples would (0: not a matter of number). `also`: what
     `--json` tells besides.

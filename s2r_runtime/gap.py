@@ -65,6 +65,8 @@ class Transitions:
     assumption: str = ""
     samples_digest: str = ""
     content_digest: str = ""
+    parts: tuple[str, ...] = ()
+    """Digests of each recording, of its bytes and of its numbers, where there are several."""
     noise: Array | None = None
     drive: Drive | None = field(default=None, repr=False)
     notes: tuple[str, ...] = ()
@@ -171,7 +173,7 @@ def _in_order(series: list[Array], rounding: float) -> Whiteness | None:
 
 def refuse_fitted(model: ComposedModel, tr: Transitions) -> None:
     """Raises NotEnoughEvidence if the model was fitted on this recording or these samples (G6)."""
-    if {tr.digest, tr.samples_digest, tr.content_digest} & set(model.spec.fitted_on) - {""}:
+    if {tr.digest, tr.samples_digest, tr.content_digest, *tr.parts} & set(model.spec.fitted_on) - {""}:
         raise NotEnoughEvidence(
             f"{tr.source}: the model was fitted on this recording, which therefore can't bound its gap; take one that the fit never saw"
         )

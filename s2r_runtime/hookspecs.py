@@ -9,6 +9,7 @@ heavy is imported until it is used. Built-in models, effects and tasks come thro
     transport                          `s2r_transports`, `Transport`: a robot's protocol. Its robot logs: `s2r_recordings`
     model, effect                      `s2r_models`, `NominalModel`; `s2r_effects`, `Effect`
     task, with its safety metric       `s2r_tasks`, `Task`: the metric is what `safety` says, >= 0 iff safe
+    format of files                    `s2r_formats`: named time series, whatever robot they are of
     kit                                `s2r_kits`: how `s2r plugin check` tries what is offered
     controller                         no hook: a Python file, named where it is used (its bytes are what a certificate is about)
     recorder, dashboard                no hook: the log can be read while it is written, by a process of one's own (docs/plugin-author.md)
@@ -362,6 +363,16 @@ def s2r_recordings() -> list[Offer]:
     profile is of another transport. A list of contiguous stretches; t (N,) s, ascending, of one clock; x (N, nx), u (M, nu) in SI units,
     NaN where a column was not received at that stamp. Raises ConfigError for bad or missing options, RecordingError for a file that
     can't be read.
+    """
+    return []
+
+
+@hookspec
+def s2r_formats() -> list[Offer]:
+    """Readers of files that hold named time series, whatever robot they are of. An offer's name is that of a form in
+    `formats.recognise`, which recognises files by their content. The attribute is a function `open(path) -> Opened`
+    (`formats.series.Opened`: its topics, and samples of the fields that are wanted). Raises RecordingError for a file that can't be read,
+    ImportError where its library is not installed.
     """
     return []
 

@@ -21,7 +21,7 @@ from s2r_runtime import hookspecs
 from s2r_runtime.errors import PluginError, one_line
 from s2r_runtime.hookspecs import API_VERSION, GROUP, Offer
 
-KINDS = ("transports", "models", "effects", "tasks", "recordings", "robots", "kits")
+KINDS = ("transports", "models", "effects", "tasks", "recordings", "formats", "robots", "kits")
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 TARGET = re.compile(r"\w+(\.\w+)*:\w+")
 OFFERS_MOST = 1000

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.errors import ConfigError, RecordingError, UsageError
+from s2r_runtime.formats.recognise import BAG, recognised
 from s2r_runtime.hookspecs import HEAD_BYTES, ReadLog
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.plugins import registry
@@ -71,8 +72,11 @@ def head_of(path: Path) -> bytes:
 
 def readers_of(path: Path) -> list[str]:
     """Names of the offers that may read this file: those that recognise its content, else those for its suffix. Raises OSError."""
-    offers, head = registry(), head_of(path)
+    offers, form = registry(), _form_of(path)
     named = offers.names("recordings")
+    if form:  # a bag is read by the plug-in of ROS 2, whatever its name; what has named signals by none
+        return [name for name in named if form == BAG and name.partition(".")[2] == BAG]
+    head = head_of(path)
     if head and not head.startswith(MCAP_MAGIC):
         known = [name for name in named if offers.recogniser(name)(head)]
         if known:
@@ -97,6 +101,15 @@ def is_robot_log(path: Path) -> bool:
         return bool(_readers_by_suffix(path))
 
 
+def _form_of(path: Path) -> str:
+    """Its format's reader, by its content; empty for one that has none, or that cannot be read."""
+    try:
+        form = recognised(path)
+    except RecordingError:
+        return ""
+    return form.name if form else ""
+
+
 def is_mcap(path: Path) -> bool:
     """Whether it begins as an MCAP does, whatever its name. Raises OSError."""
     with path.open("rb") as file:
@@ -106,7 +119,7 @@ def is_mcap(path: Path) -> bool:
 def is_table(path: Path) -> bool:
     """Whether a recording is read as a table: it is no MCAP, and no log that a plug-in reads. One that cannot be read says so itself."""
     try:
-        return not is_mcap(path) and not is_robot_log(path)
+        return not _form_of(path) and not is_mcap(path) and not is_robot_log(path)
     except OSError:
         return True
 

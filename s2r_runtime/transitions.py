@@ -10,7 +10,8 @@ beyond the order of the samples (`whiteness`). Left out, and counted by reason: 
 `too_short`; `not_received`, where rows reach t0 + dt and a state in them does not; `duplicate_stamp`, all rows on one stamp; `too_coarse`,
 the rows around t0 + dt more than 1.5 dt apart, so that x1 would be made up.
 
-CSV without segments, and a log in a robot's own format (`robot_logs`): ordinary driving (`driving`).
+CSV without segments, a log in a robot's own format (`robot_logs`), and a file with named signals (`formats`): ordinary driving
+(`driving`). Several recordings at once are of one kind, and count together.
 """
 
 from __future__ import annotations
@@ -19,19 +20,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.canonical import digest, digest_of
+from s2r_runtime.canonical import digest_of, digest_of_path
 from s2r_runtime.driving import MAX_GAP, Streams, drive_transitions, resolution, state_at, streams_noise
 from s2r_runtime.errors import RecordingError, UsageError
+from s2r_runtime.formats.mapping import Recorded
+from s2r_runtime.formats.routes import read_recording
 from s2r_runtime.gap import Transitions
 from s2r_runtime.messages import CampaignFinished, Observed, SampleTaken, Send, Started
 from s2r_runtime.models.bound import wrap
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.robot_logs import content_digest, is_mcap, is_robot_log, merged_rows, read_robot_log
+from s2r_runtime.recording.origin import other_writer
+from s2r_runtime.robot_logs import content_digest, is_mcap, is_robot_log, merged_rows
 from s2r_runtime.sensor_noise import FEWEST, NORMAL_MAD
 from s2r_runtime.tables import TIME, read_csv
 
@@ -40,32 +44,92 @@ Array = NDArray[np.float64]
 CHANNELS = ("event/started", "event/observed", "event/sample_taken", "event/campaign_finished", "out/send")
 
 
+class _Read(NamedTuple):
+    """A recording that is no log of this software. drawn: its streams are samples of a campaign. recording, content: digests."""
+
+    streams: list[Streams]
+    drawn: bool
+    recording: str
+    content: str
+    source: str
+    notes: tuple[str, ...] = ()
+
+
 def load_transitions(
-    path: Path | str,
+    path: Path | str | Sequence[Path | str],
     model: ComposedModel,
     columns: Mapping[str, str] | None = None,
     *,
     epoch: int | None = None,
     transport: Mapping[str, Any] | None = None,
+    signals: Mapping[str, str] | None = None,
 ) -> Transitions:
-    """The transitions of a recording, whichever form it has. columns: model name, or `t` -> column name, where they differ. transport: the
-    profile's, for a log in a robot's own format.
+    """The transitions of a recording, or of several, whichever form they have. columns: model name, or `t` -> column name, where they
+    differ. transport: the profile's, for a log in a robot's own format. signals: name in the model -> signal, of a file with such.
 
-    Raises RecordingError (not readable, columns missing, of another robot).
+    Raises RecordingError (not readable, columns missing, of another robot), UsageError (recordings of different kinds, or one given twice).
     """
-    path = Path(path)
+    paths = [Path(one) for one in ([path] if isinstance(path, str | Path) else path)]
+    own = [one for one in paths if _is_own_log(one)]
+    if len(own) > 1 or (own and len(paths) > 1):
+        raise UsageError(f"{own[0]}: is a log of this software; the number of samples of each campaign was fixed for itself: give it alone")
+    if own:
+        return from_mcap(own[0], model, epoch=epoch)
+    if epoch is not None:
+        raise UsageError(f"{paths[0]}: a CSV has no epochs, nor has a log that is not of the daemon")
+    return _together(model, [_read_one(one, model, columns or {}, transport, signals) for one in paths])
+
+
+def _is_own_log(path: Path) -> bool:
+    """A log of this software, or what has its suffix and cannot be told from a damaged one."""
+    if path.is_dir():
+        return False
     try:
-        log = is_mcap(path)
+        return (is_mcap(path) or path.suffix == ".mcap") and not other_writer(path) and not is_robot_log(path)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
-    robots = is_robot_log(path)
-    if (log or path.suffix == ".mcap") and not robots:
-        return from_mcap(path, model, epoch=epoch)
-    if epoch is not None:
-        raise UsageError(f"{path}: a CSV has no epochs, nor has a log that is not of the daemon")
-    if robots:
-        return from_robot_log(path, model, transport)
-    return from_csv(path, model, columns or {}, model.dt)
+
+
+def _read_one(
+    path: Path,
+    model: ComposedModel,
+    columns: Mapping[str, str],
+    transport: Mapping[str, Any] | None,
+    signals: Mapping[str, str] | None,
+) -> _Read:
+    recorded = read_recording(path, model, columns=columns, transport=transport, signals=signals)
+    if recorded is None:
+        return _of_table(path, model, columns)
+    content = content_digest(recorded.stretches, model)
+    return _Read(_streams(recorded, len(model.states)), recorded.drawn, digest_of_path(path), content, str(path), recorded.notes)
+
+
+def _streams(recorded: Recorded, nx: int) -> list[Streams]:
+    return [Streams(t, values[:, :nx], values[:, nx:]) for t, values in map(merged_rows, recorded.stretches)]
+
+
+def _together(model: ComposedModel, reads: Sequence[_Read]) -> Transitions:
+    """Transitions of all recordings. Raises UsageError where one is there twice, or where samples and driving come together."""
+    for k, read in enumerate(reads):
+        if twin := next((one for one in reads[:k] if read.recording == one.recording or read.content == one.content), None):
+            raise UsageError(f"{read.source}: is the recording {twin.source} once more (the same values); give each of them once")
+        if read.drawn != reads[0].drawn:
+            names = (read.source, reads[0].source) if read.drawn else (reads[0].source, read.source)
+            raise UsageError(
+                f"{names[0]} has segments, which count as samples, {names[1]} is ordinary driving; give recordings of one kind"
+            )
+    streams = [one for read in reads for one in read.streams]
+    source = ", ".join(read.source for read in reads)
+    recording = reads[0].recording if len(reads) == 1 else digest_of(sorted(read.recording for read in reads))
+    if reads[0].drawn:
+        found = _segment_transitions(model, streams, recording, source)
+        found = replace(found, noise=streams_noise(model, streams))
+    else:
+        found = drive_transitions(model, streams, recording, source)
+    if len(reads) == 1:
+        return replace(found, content_digest=reads[0].content, notes=reads[0].notes)
+    notes = tuple(f"{Path(read.source).name}: {line}" for read in reads for line in read.notes)
+    return replace(found, notes=notes, parts=tuple(one for read in reads for one in (read.recording, read.content)))
 
 
 # ---------------------------------------------------------------- CSV
@@ -75,19 +139,21 @@ def from_csv(path: Path, model: ComposedModel, columns: Mapping[str, str], dt: f
     """Transitions of `dt` s (the model's step) from a CSV or CSV.gz. Raises RecordingError; UsageError if dt isn't the model's."""
     if dt != model.dt:
         raise UsageError(f"dt is {dt} s, the model's step is {model.dt} s")
+    return _together(model, [_of_table(path, model, columns)])
+
+
+def _of_table(path: Path, model: ComposedModel, columns: Mapping[str, str]) -> _Read:
     names = [columns.get(name, name) for name in (*model.states, *model.inputs)]
     table = read_csv(path, names, time=columns.get(TIME, TIME))
     values = np.column_stack([table.columns[name] for name in names])
     nx = len(model.states)
     whole = Streams(table.t, values[:, :nx], values[:, nx:])
-    recording = digest(path.read_bytes())
-    content = table.content_digest(names)
+    recording, content = digest_of_path(path), table.content_digest(names)
     if table.segment is None:
-        return replace(drive_transitions(model, [whole], recording, str(path)), content_digest=content)
+        return _Read([whole], False, recording, content, str(path))
     edges = np.flatnonzero(np.diff(table.segment, prepend=-1, append=-1))
     segments = [whole.rows(slice(a, b)) for a, b in pairwise(edges.tolist())]
-    found = _segment_transitions(model, segments, recording, str(path))
-    return replace(found, noise=streams_noise(model, segments), content_digest=content)
+    return _Read(segments, True, recording, content, str(path))
 
 
 @dataclass(frozen=True)
@@ -195,21 +261,13 @@ def _rows(rows: Sequence[Array], width: int) -> Array:
     return np.array(rows) if rows else np.empty((0, width))
 
 
-def from_robot_log(path: Path, model: ComposedModel, transport: Mapping[str, Any] | None) -> Transitions:
-    """Transitions of ordinary driving from a log in a robot's own format."""
-    (stretches, notes), nx = read_robot_log(path, model, transport), len(model.states)
-    drives = [Streams(t, values[:, :nx], values[:, nx:]) for t, values in map(merged_rows, stretches)]
-    found = drive_transitions(model, drives, digest(path.read_bytes()), str(path))
-    return replace(found, content_digest=content_digest(stretches, model), notes=notes)
-
-
 # ---------------------------------------------------------------- MCAP
 
 
 def from_mcap(path: Path, model: ComposedModel, *, epoch: int | None = None) -> Transitions:
     """Samples of a log's campaign: the last complete one, or `epoch`. Raises RecordingError."""
     log = _read_log(path, model)
-    recording = digest(path.read_bytes())
+    recording = digest_of_path(path)
     if epoch is not None and epoch not in log.samples:
         there = ", ".join(str(e) for e in log.samples) or "none"
         raise RecordingError(f"{path}: has no samples of epoch {epoch}; it has samples of: {there}")

@@ -41,11 +41,45 @@ def add_model_options(verb: argparse.ArgumentParser) -> None:
     )
 
 
+def add_signal_options(verb: argparse.ArgumentParser) -> None:
+    """--state, --input: which signal of a recording is what."""
+    for option, what in (("--state", "state"), ("--input", "input")):
+        verb.add_argument(
+            option,
+            action="append",
+            default=[],
+            metavar="NAME=SIGNAL",
+            help=f"the signal that is this {what} of the model: TOPIC.FIELD, times a number if need be (*0.01); s2r topics lists them, "
+            "usual names are guessed; may be repeated",
+        )
+
+
+def signals_of(args: argparse.Namespace, model: ComposedModel) -> dict[str, str]:
+    """Name in the model -> signal, as --state and --input say. Raises UsageError."""
+    found: dict[str, str] = {}
+    for option, names in (("--state", model.states), ("--input", model.inputs)):
+        what = option[2:]
+        for item in getattr(args, what):
+            name, sign, signal = (part.strip() for part in item.partition("="))
+            if not name or not sign or not signal:
+                raise UsageError(f"{option} {item}: must be NAME=SIGNAL, a name of the model and a signal of the recording")
+            if name not in names:
+                other = model.inputs if option == "--state" else model.states
+                hint = f"; it is an{' input: --input' if option == '--state' else ' state: --state'} {item}" if name in other else ""
+                raise UsageError(f"{option} {item}: the model has no {what} {name!r}{hint}; it has: {', '.join(names)}")
+            if name in found:
+                raise UsageError(f"{option} {item}: {name} is {found[name]} already")
+            found[name] = signal
+    return found
+
+
 def columns_of(args: argparse.Namespace, model: ComposedModel, profile: Profile | None, *recordings: Path | None) -> dict[str, str]:
-    """Name in the model, or `t` -> column of the table, where they differ: the profile's, and those of --column instead. recordings: what
-    is read. Raises UsageError for a name that the model does not have, or two on one column; and if there is no table for --column.
+    """Name in the model, or `t` -> column of the table, where they differ: the profile's, and those of --column, or of --state and --input,
+    instead. recordings: what is read. Raises UsageError for a name that the model does not have, or two on one column; and if there is no
+    table for --column.
     """
     columns = dict(profile.columns) if profile else {}
+    columns |= signals_of(args, model) if hasattr(args, "state") else {}
     if not args.column:
         return columns
     from s2r_runtime.robot_logs import is_table
@@ -53,7 +87,7 @@ def columns_of(args: argparse.Namespace, model: ComposedModel, profile: Profile 
 
     for path in recordings:
         if path is not None and not is_table(path):
-            raise UsageError(f"--column: belongs to a table; {path} is a log, whose states and inputs have their names")
+            raise UsageError(f"--column: belongs to a table; {path} is none: --state NAME=SIGNAL and --input NAME=SIGNAL say what is what")
     names = (*model.states, *model.inputs, TIME)
     asked: dict[str, str] = {}
     for item in args.column:

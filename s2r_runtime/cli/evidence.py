@@ -12,6 +12,7 @@ import msgspec
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import (
     add_model_options,
+    add_signal_options,
     chosen_model,
     columns_of,
     controller_at,
@@ -20,6 +21,7 @@ from s2r_runtime.cli.choices import (
     not_negative,
     positive,
     probability,
+    signals_of,
     weights_of,
 )
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
@@ -38,9 +40,14 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verbs of this module."""
     gap = verbs.add_parser("gap", help="the sim2real gap that a recording shows, and its statement")
     gap.add_argument(
-        "recording", type=Path, metavar="RECORDING", help="a campaign's MCAP, CSV (.gz), or a robot's own log that a plug-in reads"
+        "recording",
+        type=Path,
+        nargs="+",
+        metavar="RECORDING",
+        help="a campaign's MCAP, CSV (.gz), or somebody else's format (docs/recordings.md); several of one kind count together",
     )
     add_model_options(gap)
+    add_signal_options(gap)
     gap.add_argument("--epsilon", type=probability, metavar="E", help="violation probability (default: the profile's, else 0.01)")
     gap.add_argument("--beta", type=probability, metavar="B", help="one minus the confidence (default 0.05)")
     gap.add_argument("--discard", type=count, metavar="K", help="largest discrepancies to leave out, fixed beforehand (default 0)")
@@ -93,8 +100,9 @@ def run_gap(args: argparse.Namespace) -> int:
     from s2r_runtime.transitions import load_transitions
 
     model, profile = chosen_model(args)
-    columns = columns_of(args, model, profile, args.recording)
-    found = load_transitions(args.recording, model, columns, transport=profile.transport if profile else None)
+    columns, signals = columns_of(args, model, profile, *args.recording), signals_of(args, model)
+    transport = profile.transport if profile else None
+    found = load_transitions(args.recording, model, columns, transport=transport, signals=signals)
     output.notes(found.source, found.notes)
     if args.blocking:
         found = gaps.blocked(found, args.blocking, model.dt)

@@ -25,6 +25,7 @@ GROUPS = (
     "daemon_verbs",
     "evidence",
     "trace_verb",
+    "topics_verb",
     "synthesize_verb",
     "certify",
     "trials_verb",

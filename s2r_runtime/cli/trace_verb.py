@@ -4,11 +4,24 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Set
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import add_model_options, apart, chosen_model, columns_of, count, own_file, positive, weights_of, writable
+from s2r_runtime.cli.choices import (
+    add_model_options,
+    add_signal_options,
+    apart,
+    chosen_model,
+    columns_of,
+    count,
+    own_file,
+    positive,
+    signals_of,
+    weights_of,
+    writable,
+)
 from s2r_runtime.cli.daemon_verbs import add_daemon_options, run_live_trace
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
 
@@ -28,9 +41,14 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verb."""
     verb = verbs.add_parser("trace", help="find the effect that the model lacks, add it, and report the error before and after")
     verb.add_argument(
-        "recording", type=Path, nargs="?", metavar="RECORDING", help="a log's MCAP, CSV (.gz), or a robot's own log that a plug-in reads"
+        "recording",
+        type=Path,
+        nargs="*",
+        metavar="RECORDING",
+        help="a log's MCAP, CSV (.gz), or somebody else's format (docs/recordings.md); each of several is a run of its own",
     )
     add_model_options(verb)
+    add_signal_options(verb)
     verb.add_argument(
         "--test",
         type=Path,
@@ -76,13 +94,18 @@ def run(args: argparse.Namespace) -> int:
     """Exit 0 with any verdict, 3 with too little data."""
     from s2r_runtime.trace.tracer import load_dataset, trace
 
-    if (args.recording is None) == (args.live is None):
+    if bool(args.recording) == (args.live is not None):
         raise UsageError("trace: give a RECORDING, or --live with what the running daemon recorded")
     for path in (args.output, args.report, args.suggest):
         writable(path)
     apart(
         {"-o": args.output, "--report": args.report, "--suggest": args.suggest},
-        {"the recording": args.recording, "the test recording": args.test, "the model": args.model, "the profile": args.profile},
+        {
+            **{f"the recording {one}" if len(args.recording) > 1 else "the recording": one for one in args.recording},
+            "the test recording": args.test,
+            "the model": args.model,
+            "the profile": args.profile,
+        },
     )
     if args.live:
         return run_live_trace(args)
@@ -95,10 +118,11 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--suggest-duration {args.suggest_duration:g}: must be at most {most:g} s, {MOST_SUGGESTED} steps of the model")
     if args.horizon and args.horizon < model.dt:
         raise UsageError(f"--horizon {args.horizon:g}: must be at least the model's step, {model.dt:g} s")
-    columns, transport = columns_of(args, model, profile, args.recording, args.test), profile.transport if profile else None
-    data = load_dataset(args.recording, model, columns, bandwidth=args.bandwidth, transport=transport)
+    columns, transport = columns_of(args, model, profile, *args.recording, args.test), profile.transport if profile else None
+    read = partial(load_dataset, model=model, columns=columns, transport=transport, signals=signals_of(args, model))
+    data = read(args.recording, bandwidth=args.bandwidth)
     used = data.reconstruction.bandwidth if data.reconstruction and not data.reconstruction.axes else args.bandwidth
-    test = load_dataset(args.test, model, columns, bandwidth=used, transport=transport, behind=data.behind) if args.test else None
+    test = read(args.test, bandwidth=used, behind=data.behind) if args.test else None
     for one in (data, test):
         output.notes(one.source if one else "", one.notes if one else ())
     if test and set(test.digests) & set(data.digests):

@@ -75,7 +75,7 @@ def kits(plugin: str) -> list[type]:
 
 
 def _default(kind: str, name: str) -> tuple[type, ...]:
-    if kind in ("recordings", "robots"):
+    if kind in ("recordings", "formats", "robots"):
         return ()
     if kind == "transports":
         return (_NothingChecked,)

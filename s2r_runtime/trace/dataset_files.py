@@ -1,4 +1,5 @@
-"""Datasets from files: a table (CSV, CSV.gz), a log in a robot's own format, or one of the daemon (MCAP, one part or several).
+"""Datasets from files: a table (CSV, CSV.gz), a log in a robot's own format, a file with named signals, or a log of the daemon (MCAP, one
+part or several). Several recordings that are no parts of a log are runs of their own.
 
 In a log the states are the observations that carry no fault, on the robot's clock. A command acts from the stamp of the observation
 that it answers, plus what the daemon took to answer (`obs_seq` ties the two clocks together); in lockstep that is nothing.
@@ -7,18 +8,21 @@ that it answers, plus what the daemon took to answer (`obs_seq` ties the two clo
 from __future__ import annotations
 
 import difflib
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from s2r_runtime.errors import RecordingError
+from s2r_runtime.canonical import digest_of_path
+from s2r_runtime.errors import RecordingError, UsageError
+from s2r_runtime.formats.mapping import Recorded
+from s2r_runtime.formats.routes import read_recording
 from s2r_runtime.messages import CampaignFinished, Observed, Send, StartCampaign, Started
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.robot_logs import content_digest, is_mcap, is_robot_log, read_robot_log
+from s2r_runtime.recording.origin import other_writer
+from s2r_runtime.robot_logs import content_digest, is_mcap, is_robot_log
 from s2r_runtime.trace.dataset import Array, Dataset, Stream, columns_of, from_streams
 from s2r_runtime.trace.hidden import told_through
 from s2r_runtime.trace.late_poses import earlier, late_pose
@@ -41,8 +45,10 @@ def load_dataset(
     bandwidth: float | None = None,
     transport: Mapping[str, Any] | None = None,
     behind: Mapping[str, float] | None = None,
+    signals: Mapping[str, str] | None = None,
 ) -> Dataset:
-    """Reads a recording on the model's grid. columns: name in the model, or `t` -> column of the table. Several paths: parts of one log.
+    """Reads a recording on the model's grid. columns: name in the model, or `t` -> column of the table. Several paths: parts of one log, or
+    recordings of one kind, each of them a run of its own. signals: name in the model -> signal, for a file with named signals.
     epoch: of a log, only what was recorded while that campaign was under way. bandwidth: Hz within which states that the table does not
     have are reconstructed from those that it has (None: what the data bear, and only those that the motion
     needs: unseen.py). transport: the profile's, for a log in a robot's own format. behind: s by which states of the pose come late, if that
@@ -50,20 +56,20 @@ def load_dataset(
 
     Raises RecordingError (unreadable, lacks a column that does not follow from others, too slow for the model's dt), ConfigError if
     somebody's own model fails at the states of a table, NotEnoughEvidence if states were measured at one moment only, or too seldom for
-    what was not measured.
+    what was not measured, UsageError if a recording is there twice.
     """
     paths = tuple(Path(p) for p in ([path] if isinstance(path, str | Path) else path))
     digests = tuple(_digest(p) for p in paths)
     source = ", ".join(str(p) for p in paths)
-    robots = is_robot_log(paths[0])
-    if is_mcap(paths[0]) and not robots:
+    own = [one for one in paths if _is_own_log(one)]
+    if own and len(own) < len(paths):
+        raise UsageError(f"{own[0]}: is a log of this software, other recordings are none; trace one kind at a time")
+    _once(paths, digests)
+    if own:
         return replace(from_streams(model, _log_segments(paths, model, epoch), source, digests, paths), commanded=True)
-    called: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-    if robots:
-        segments, missing, content, notes = _robot_segments(paths[0], model, transport)
-    else:
-        segments, missing, content, called = _table_segments(paths[0], model, columns or {}, hidden=not bandwidth)
+    parts = [_read_one(one, model, columns or {}, transport, signals, hidden=not bandwidth) for one in paths]
+    _once(paths, [part.content for part in parts])
+    segments, missing, called = _joined(paths, parts)
     if not missing:
         _check_steps(model, segments)
     if behind is None:
@@ -81,7 +87,9 @@ def load_dataset(
     if missing:
         segments, done = reconstruct(model, segments, missing, source, bandwidth, slow)
     named = called if len(called) > 1 and done is None else ()  # what was reconstructed may be in more parts
-    data = from_streams(model, segments, source, (*digests, content), paths, done)
+    data = from_streams(model, segments, source, (*digests, *(part.content for part in parts)), paths, done)
+    names = [f"{one.name}: " if len(paths) > 1 else "" for one in paths]
+    notes = tuple(f"{name}{line}" for name, part in zip(names, parts, strict=True) for line in part.notes)
     return replace(data, behind=dict(behind), called=named, notes=notes)
 
 
@@ -98,8 +106,7 @@ def _check_steps(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]]
 def _digest(path: Path) -> str:
     """As guarantee G6 wants it: of the file's bytes."""
     try:
-        with path.open("rb") as file:
-            return "sha256:" + hashlib.file_digest(file, "sha256").hexdigest()
+        return digest_of_path(path)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
 
@@ -150,17 +157,71 @@ def _hidden(path: Path, model: ComposedModel, free: set[str], columns: Mapping[s
     return {*lacks} if told_through(model.nominal, missing) else set()
 
 
-def _robot_segments(
-    path: Path, model: ComposedModel, transport: Mapping[str, Any] | None
-) -> tuple[list[tuple[Stream, Stream]], tuple[str, ...], str, tuple[str, ...]]:
-    """The same of a log in a robot's own format, whose segments have no names; and the notes of its reader."""
-    stretches, notes = read_robot_log(path, model, transport)
+class _Part(NamedTuple):
+    """A recording that is no log of this software: its segments, the states that it lacks, the digest of what it says, the names of its
+    segments, and notes on how it was read.
+    """
+
+    segments: list[tuple[Stream, Stream]]
+    missing: tuple[str, ...]
+    content: str
+    called: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+
+def _is_own_log(path: Path) -> bool:
+    try:
+        return not path.is_dir() and is_mcap(path) and not other_writer(path) and not is_robot_log(path)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _once(paths: Sequence[Path], digests: Sequence[str]) -> None:
+    """Raises UsageError if a recording is there twice: it would count twice."""
+    for k, digest in enumerate(digests):
+        if digest in digests[:k]:
+            twin = paths[list(digests).index(digest)]
+            raise UsageError(f"{paths[k]}: is the recording {twin} once more (the same values); give each of them once")
+
+
+def _read_one(
+    path: Path,
+    model: ComposedModel,
+    columns: Mapping[str, str],
+    transport: Mapping[str, Any] | None,
+    signals: Mapping[str, str] | None,
+    *,
+    hidden: bool,
+) -> _Part:
+    recorded = read_recording(path, model, columns=columns, transport=transport, signals=signals)
+    return _Part(*_table_segments(path, model, columns, hidden)) if recorded is None else _recorded_segments(recorded, model)
+
+
+def _joined(paths: Sequence[Path], parts: Sequence[_Part]) -> tuple[list[tuple[Stream, Stream]], tuple[str, ...], tuple[str, ...]]:
+    """Segments, states that are missing, and names of segments, of all recordings. Raises RecordingError if they lack different states."""
+    for path, part in zip(paths, parts, strict=True):
+        if part.missing != parts[0].missing:
+            differ = ", ".join(sorted({*part.missing} ^ {*parts[0].missing}))
+            raise RecordingError(f"{path}: does not have the states that {paths[0]} has: one of them lacks {differ}; trace them one by one")
+    if len(parts) == 1:
+        return parts[0].segments, parts[0].missing, parts[0].called
+    called = tuple(
+        f"{path.name}: {part.called[k]}" if len(part.called) > 1 else path.name
+        for path, part in zip(paths, parts, strict=True)
+        for k in range(len(part.segments))
+    )
+    return [segment for part in parts for segment in part.segments], parts[0].missing, called
+
+
+def _recorded_segments(recorded: Recorded, model: ComposedModel) -> _Part:
+    """Of a robot's own log or a file with named signals. States that follow from others may lack."""
+    stretches = recorded.stretches
     seen = ~np.isnan(np.concatenate([stretch.states.values for stretch in stretches])).all(axis=0)
     free = getattr(model.nominal, "follows", {})
     missing = tuple(name for name, there in zip(model.states, seen, strict=True) if not there and name in free)
     kept = [i for i, name in enumerate(model.states) if name not in missing]
     given = [(Stream(s.states.t, s.states.values[:, kept]), Stream(*s.inputs)) for s in stretches]
-    return given, missing, content_digest(stretches, model), notes
+    return _Part(given, missing, content_digest(stretches, model), recorded.called, recorded.notes)
 
 
 def _log_segments(paths: tuple[Path, ...], model: ComposedModel, epoch: int | None) -> list[tuple[Stream, Stream]]:

@@ -14,7 +14,7 @@ def s2r_transports() -> list[Offer]:
 @hookimpl
 def s2r_recordings() -> list[Offer]:
     """Bags."""
-    return [Offer(f"ros2.{suffix}", "s2r_ros2.bags:read", "rosbag2 bags in MCAP files") for suffix in ("mcap", "zstd")]
+    return [Offer("ros2.bag", "s2r_ros2.bags:read", "bags of ROS 2 (MCAP, SQLite, folders) and ROS 1")]
 
 
 @hookimpl

@@ -1,0 +1,1 @@
+"""Recordings in other people's formats as named time series: bags, flight logs, measurement files, Parquet, MATLAB."""
