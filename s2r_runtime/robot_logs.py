@@ -117,11 +117,18 @@ def is_mcap(path: Path) -> bool:
 
 
 def is_table(path: Path) -> bool:
-    """Whether a recording is read as a table: it is no MCAP, and no log that a plug-in reads. One that cannot be read says so itself."""
+    """Whether a recording is read as a table: it is no MCAP, has no named signals, and no plug-in reads it. One that cannot be read says so
+    itself.
+    """
     try:
         return not _form_of(path) and not is_mcap(path) and not is_robot_log(path)
     except OSError:
         return True
+
+
+def has_columns(path: Path) -> bool:
+    """Whether a recording is read by names that the user may say: a table, or a file with named signals that is no bag."""
+    return _form_of(path) not in ("", BAG) or is_table(path)
 
 
 def read_robot_log(path: Path, model: ComposedModel, transport: Mapping[str, Any] | None) -> RobotLog:

@@ -15,6 +15,7 @@ FACTORS: dict[str, float] = {
     "m/s": 1.0, "mps": 1.0, "cm/s": 0.01, "mm/s": 0.001, "km/h": 1.0 / 3.6, "kph": 1.0 / 3.6, "kmh": 1.0 / 3.6, "mph": 0.44704,
     "m/s^2": 1.0, "m/s2": 1.0, "m/s/s": 1.0, "mm/s^2": 0.001, "mm/s2": 0.001, "g": _G,
     "rad": 1.0, "mrad": 0.001, "deg": _DEGREE, "degree": _DEGREE, "degrees": _DEGREE, "°": _DEGREE, "grad": _DEGREE,
+    "degheading": _DEGREE, "cdeg": 0.01 * _DEGREE, "cdeg/s": 0.01 * _DEGREE, "mdeg": 0.001 * _DEGREE,
     "rad/s": 1.0, "mrad/s": 0.001, "deg/s": _DEGREE, "degree/s": _DEGREE, "degrees/s": _DEGREE, "°/s": _DEGREE, "dps": _DEGREE,
     "rpm": _TURN / 60.0, "1/min": _TURN / 60.0, "rev/min": _TURN / 60.0, "r/min": _TURN / 60.0, "u/min": _TURN / 60.0, "rps": _TURN,
     "rad/s^2": 1.0, "rad/s2": 1.0, "deg/s^2": _DEGREE, "deg/s2": _DEGREE, "°/s^2": _DEGREE, "°/s2": _DEGREE,

@@ -82,12 +82,12 @@ def columns_of(args: argparse.Namespace, model: ComposedModel, profile: Profile 
     columns |= signals_of(args, model) if hasattr(args, "state") else {}
     if not args.column:
         return columns
-    from s2r_runtime.robot_logs import is_table
+    from s2r_runtime.robot_logs import has_columns
     from s2r_runtime.tables import TIME
 
     for path in recordings:
-        if path is not None and not is_table(path):
-            raise UsageError(f"--column: belongs to a table; {path} is none: --state NAME=SIGNAL and --input NAME=SIGNAL say what is what")
+        if path is not None and not has_columns(path):
+            raise UsageError(f"--column: belongs to a table; {path} is a log, whose states and inputs have their names")
     names = (*model.states, *model.inputs, TIME)
     asked: dict[str, str] = {}
     for item in args.column:

@@ -8,6 +8,7 @@ missing values. Stamps out of order are sorted, of two values of a signal on one
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +22,10 @@ from s2r_runtime.formats.series import Array, Opened, Run, Samples
 from s2r_runtime.formats.signals import Signal, resolve
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.robot_logs import Rows, Stretch
-from s2r_runtime.tables import LARGEST
+from s2r_runtime.tables import LARGEST, TIME
+from s2r_runtime.units import factor_of
+
+UNITY = 1e-12
 
 
 class Recorded(NamedTuple):
@@ -36,7 +40,8 @@ class Recorded(NamedTuple):
 
 
 def read_signals(path: Path, model: ComposedModel, signals: Mapping[str, str], opened: Opened | None = None) -> Recorded:
-    """The recording, by what each state and input is. signals: name in the model -> signal; states that the model can do without may lack.
+    """The recording, by what each state and input is. signals: name in the model (or `t`, the stamps) -> signal; states that the
+    model can do without may lack.
 
     Raises RecordingError (unreadable, no value), UsageError (no such signal).
     """
@@ -46,8 +51,12 @@ def read_signals(path: Path, model: ComposedModel, signals: Mapping[str, str], o
     for signal in found.values():
         fields = wanted.setdefault(signal.topic, [])
         fields += [one for one in signal.fields if one not in fields]
+    time = resolve(signals[TIME], list(opened.topics()), f"{path}: t={signals[TIME]}") if TIME in signals and TIME not in found else None
+    if time is not None:
+        wanted.setdefault(time.topic, []).extend(one for one in time.fields if one not in wanted.get(time.topic, []))
     parts, called = [], []
-    for run in opened.read(wanted):
+    for given in opened.read(wanted):
+        run = given if time is None else _stamped(given, time)
         for stretch in _stretches(run, model, found):
             parts.append(stretch)
             called.append(run.name)
@@ -56,6 +65,14 @@ def read_signals(path: Path, model: ComposedModel, signals: Mapping[str, str], o
             if name in found and not any(np.isfinite(part[kind].values[:, column]).any() for part in parts):
                 raise RecordingError(f"{path}: {found[name].name} holds no number ({name})")
     return Recorded(parts, tuple(called) if any(called) else (), opened.drawn, tuple(opened.notes))
+
+
+def _stamped(run: Run, time: Signal) -> Run:
+    """The run with a signal of its own in the place of its stamps."""
+    samples = run.samples.get(time.topic)
+    if samples is None:
+        return run
+    return replace(run, samples={**run.samples, time.topic: Samples(time.values(samples.values), samples.values)})
 
 
 def resolved(path: Path, model: ComposedModel, signals: Mapping[str, str], opened: Opened) -> dict[str, Signal]:
@@ -74,14 +91,18 @@ def resolved(path: Path, model: ComposedModel, signals: Mapping[str, str], opene
 
 
 def unit_notes(found: Mapping[str, Signal]) -> list[str]:
-    """What is brought to SI, in words."""
-    return [
-        f"{name}: {signal.name} is in {signal.unit}, taken times {signal.factor:.6g}" for name, signal in found.items() if _scaled(signal)
-    ]
-
-
-def _scaled(signal: Signal) -> bool:
-    return bool(signal.unit) and len(signal.fields) == 1 and abs(signal.factor - 1.0) > 1e-12
+    """What is brought to SI, and what is not since its unit is not known, in words."""
+    notes = []
+    for name, signal in found.items():
+        if len(signal.fields) > 1 or not signal.unit:
+            continue
+        if factor_of(signal.unit) is None:
+            notes.append(
+                f"{name}: the unit of {signal.name}, {signal.unit}, is not known here; its numbers are taken as SI ({name}=SIGNAL*FACTOR)"
+            )
+        elif abs(signal.factor - 1.0) > UNITY:
+            notes.append(f"{name}: {signal.name} is in {signal.unit}, taken times {signal.factor:.6g}")
+    return notes
 
 
 def _stretches(run: Run, model: ComposedModel, found: Mapping[str, Signal]) -> list[Stretch]:

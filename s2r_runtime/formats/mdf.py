@@ -38,7 +38,7 @@ class MeasurementFile:
         with _quiet(path):
             import asammdf
 
-            self._file: Any = asammdf.MDF(path)
+            self._file: Any = _with_silent_end(asammdf).MDF(path)
             self._places = dict(self._named())
 
     def topics(self) -> list[Topic]:
@@ -133,6 +133,25 @@ def _quiet(path: Path) -> Iterator[None]:
         raise RecordingError(f"{path}: this MF4 (ASAM MDF) file cannot be read: {why}") from None
     finally:
         logger.disabled = before
+
+
+def _with_silent_end(library: Any) -> Any:
+    """The library, whose objects do not complain on stderr when they end after a failed start (`__del__` assumes that `__init__`
+    has ended: 8.8).
+    """
+    from asammdf.blocks import mdf_v3, mdf_v4
+
+    for kind in (mdf_v3.MDF3, mdf_v4.MDF4):
+        end = getattr(kind, "__del__", None)
+        if end is not None and not hasattr(end, "silent"):
+
+            def silent(self: Any, end: Any = end) -> None:
+                with contextlib.suppress(Exception):
+                    end(self)
+
+            silent.silent = True  # type: ignore[attr-defined]
+            kind.__del__ = silent  # type: ignore[method-assign]
+    return library
 
 
 def open_mdf(path: Path) -> MeasurementFile:

@@ -28,8 +28,8 @@ def read_recording(
 ) -> Recorded | None:
     """The recording's stretches; None for a table, and for a log of this software.
 
-    columns: a profile's names, used where the user gives no `signals` (name in the model -> signal). transport: the profile's. What was
-    guessed is in the notes. Raises RecordingError, UsageError.
+    columns, signals: name in the model (or `t`, the stamps) -> signal; `columns` may be a profile's, and is not for bags. transport: the
+    profile's. What was guessed is in the notes. Raises RecordingError, UsageError.
     """
     form = recognised(path)
     robots = is_robot_log(path)
@@ -43,7 +43,10 @@ def read_recording(
             if transport or form is None or form.name != BAG:
                 raise
             return _by_guess(path, model, form, error)
-    return None if form is None else _by_signals(path, model, form, signals or columns or {})
+    if form is None:
+        return None
+    known = {} if form.name == BAG else dict(columns or {})
+    return _by_signals(path, model, form, known | dict(signals or {}))
 
 
 def _by_guess(path: Path, model: ComposedModel, form: Form, error: MissingSignal) -> Recorded:

@@ -18,6 +18,12 @@ def s2r_recordings() -> list[Offer]:
 
 
 @hookimpl
+def s2r_formats() -> list[Offer]:
+    """The log that the autopilot itself writes."""
+    return [Offer("dataflash", "s2r_mavlink.dataflash:open_dataflash", "ArduPilot DataFlash logs (.bin, or as text), by pymavlink")]
+
+
+@hookimpl
 def s2r_kits() -> list[Offer]:
     """How the transport is tried."""
     return [

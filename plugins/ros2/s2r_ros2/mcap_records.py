@@ -17,13 +17,14 @@ import gzip
 import io
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import lz4.frame
 import zstandard
 
+from s2r_ros2.records import Channel, Definition, Message, kind_of, unpacked
 from s2r_runtime.errors import RecordingError
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -36,37 +37,22 @@ _CHUNK = struct.Struct("<QQQI")
 GZIP, ZSTD = b"\x1f\x8b", b"\x28\xb5\x2f\xfd"
 
 
-class Channel(NamedTuple):
-    """A topic. kind: the message's type, as `nav_msgs/msg/Odometry`; encoding: of its payloads (cdr)."""
-
-    topic: str
-    kind: str
-    encoding: str
-
-
-class Message(NamedTuple):
-    """log_ns: when it was recorded."""
-
-    channel: Channel
-    log_ns: int
-    data: bytes
-
-
 class Bag:
-    """An MCAP file that is being read. `channels`: topics seen so far, with how many messages; `broken`: chunks left out; `cut`: the file
-    ends before its end.
-    """
+    """An MCAP file that is being read (`records.Messages`); `broken`: chunks left out, and payloads that do not unpack."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.counts: dict[Channel, int] = {}
+        self.definitions: dict[str, Definition] = {}
         self.broken = 0
         self.cut = False
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, Channel] = {}
+        self._only: Container[str] | None = None
 
-    def messages(self) -> Iterator[Message]:
-        """All messages, in the file's order. Raises RecordingError for what is no MCAP file."""
+    def messages(self, only: Container[str] | None = None) -> Iterator[Message]:
+        """Messages of these topics (None: of all), in the file's order. Raises RecordingError for what is no MCAP file."""
+        self._only = only
         try:
             with _unpacked(self.path) as file:
                 if file.read(len(MAGIC)) != MAGIC:
@@ -126,21 +112,20 @@ class Bag:
                 channel = self._channels.get(number)
                 if channel is not None:
                     self.counts[channel] += 1
-                    yield Message(channel, log_ns, content[_MESSAGE.size :])
+                    if self._only is None or channel.topic in self._only:
+                        yield Message(channel, log_ns, unpacked(content[_MESSAGE.size :]))
             elif opcode == SCHEMA:
-                self._schemas[int.from_bytes(content[:2], "little")] = _text(content, 2)[0]
+                name, at = _text(content, 2)
+                language, at = _text(content, at)
+                self._schemas[int.from_bytes(content[:2], "little")] = name
+                self.definitions.setdefault(kind_of(name), Definition(language, _text(content, at)[0]))
             elif opcode == CHANNEL:
                 number, schema = struct.unpack_from("<HH", content)
                 topic, at = _text(content, 4)
-                self._channels[number] = Channel(topic, _kind(self._schemas.get(schema, "")), _text(content, at)[0])
+                self._channels[number] = Channel(topic, kind_of(self._schemas.get(schema, "")), _text(content, at)[0])
                 self.counts.setdefault(self._channels[number], 0)
         except (struct.error, ValueError):
             self.broken += 1
-
-
-def _kind(name: str) -> str:
-    """`nav_msgs/msg/Odometry`, also of `nav_msgs/Odometry`, as converters write it."""
-    return name.replace("/", "/msg/") if name.count("/") == 1 else name
 
 
 def _text(content: bytes, at: int) -> tuple[str, int]:

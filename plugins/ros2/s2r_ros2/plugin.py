@@ -18,6 +18,12 @@ def s2r_recordings() -> list[Offer]:
 
 
 @hookimpl
+def s2r_formats() -> list[Offer]:
+    """Bags as named time series."""
+    return [Offer("bag", "s2r_ros2.series:open_series", "bags of ROS 2 and ROS 1: topics of any type, by rosbags")]
+
+
+@hookimpl
 def s2r_kits() -> list[Offer]:
     """How the transport is tried."""
     return [Offer("transports.ros2", "s2r_ros2.kits:BridgeKit"), Offer("transports.ros2.rmw", "s2r_ros2.kits:RmwKit")]
