@@ -6,6 +6,7 @@
 # make mutation  does a test notice every small change of the gate, the certificate and the core, and is every line of them run
 # make robotarium-experiment  the paper's experiment, reading by reading, with its figures on one page (robotarium-experiment.html)
 # make quadruped-experiment   the paper's other experiment, on a walking robot in rigid-body physics (quadruped-experiment.html)
+# make rover-experiment       the whole loop on a real autopilot in its own simulator, in real time (rover-experiment.html); STORIES=3, SITL=FOLDER
 # make bench-trace  the tracer on seeded recordings that it has never seen, in some 15 minutes; SETS="--seeds 0:5 --failures" for others
 # make bench-quadruped  two and a half simulated hours of walking: falls, tracking, and how fast the simulation is
 # make bench-endurance  the daemon for half an hour at 100 Hz and half an hour at 1 kHz: memory, latency, jitter. MINUTES=5 for less
@@ -14,7 +15,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: bench-endurance run test test-long check quadruped-experiment mutation bench bench-trace bench-quadruped robotarium-experiment format clean wheels setup
+.PHONY: bench-endurance run test test-long check quadruped-experiment mutation bench bench-trace bench-quadruped robotarium-experiment rover-experiment format clean wheels setup
 
 run: $(STAMP)
 	$(BIN)/s2r demo
@@ -53,6 +54,12 @@ robotarium-experiment: $(STAMP)
 
 quadruped-experiment: $(STAMP)
 	$(BIN)/python tools/quadruped_experiment.py -o quadruped-experiment.html --json quadruped-experiment.json
+
+STORIES ?= 1
+SITL ?= $(S2R_SITL)
+
+rover-experiment: $(STAMP)
+	$(BIN)/python tools/rover_experiment.py --stories $(STORIES) $(if $(SITL),--sitl $(SITL)) -o rover-experiment.html --json rover-experiment.json
 
 SETS ?= --seeds 1000000:1000020 --jobs 2
 
