@@ -224,8 +224,10 @@ class Story:
     def _until(self, condition: Callable[[], bool], seconds: float, what: str) -> None:
         limit = time.monotonic() + seconds
         while not condition():
-            if time.monotonic() > limit or (self._daemon is not None and self._daemon.poll() is not None):
-                said = (self._folder / "daemon.txt").read_text()[-500:]
+            said = (self._folder / "daemon.txt").read_text()[-500:]
+            if self._daemon is not None and self._daemon.poll() is not None:
+                raise Ended(f"the daemon ended: {said}")
+            if time.monotonic() > limit:
                 raise Ended(f"waited {seconds:.0f} s for {what}; the daemon said: {said}")
             time.sleep(LOOK_S)
 
