@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from s2r_runtime.errors import RecordingError, UsageError
+from s2r_runtime.formats.isolated import IsolatedFile
 from s2r_runtime.formats.series import Opened
 from s2r_runtime.plugins import registry
 from s2r_runtime.recording.origin import other_writer
@@ -111,7 +112,7 @@ def open_recording(path: Path, form: Form | None = None) -> Opened:
     if form.name not in registry().names("formats"):
         raise UsageError(hint)
     try:
-        found: Opened = registry().get("formats", form.name)(path)
+        found: Opened = registry().get("formats", form.name)(path) if form.name == BAG else IsolatedFile(path, form.name, form.what)
     except ImportError as error:
         raise UsageError(f"{hint} ({error.name or error} is missing)") from None
     return found

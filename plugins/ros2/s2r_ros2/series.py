@@ -26,6 +26,7 @@ from s2r_ros2.typed import LARGEST_BYTES, Types, fields_of, getter_of, stamp_of
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.formats.series import Run, Samples, Topic
 
+TREES = (TF, "tf/msg/tfMessage")
 PAIRS = 64
 """Pairs of frames of a transform topic that are listed."""
 TRANSFORM = ("translation.x", "translation.y", "translation.z", "rotation.x", "rotation.y", "rotation.z", "rotation.w")
@@ -126,7 +127,7 @@ class BagSeries:
         for message in bag.messages():
             topic = seen.setdefault(message.channel.topic, _Seen(message.channel.kind))
             topic.at(message.log_ns)
-            if message.channel.kind == TF:
+            if message.channel.kind in TREES:
                 _note_pairs(seen, message, types)
             elif not topic.tried:
                 topic.tried = True

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ ELEMENTS = 16
 DEPTH = 8
 LARGEST_BYTES = 65_536
 """Of a message that has fields."""
+OTHER_NAMES = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 SKIPPED = ("header", "covariance")
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 
@@ -44,12 +46,15 @@ class Types:
             raise ValueError(f"{channel.kind}: {type(error).__name__}") from None
 
     def to_cdr(self, channel: Channel, data: bytes) -> bytes:
-        """A payload of ROS 1 as CDR. Raises ValueError."""
+        """A payload of ROS 1 as CDR of the same type in ROS 2, whose header has no sequence number. Raises ValueError."""
         if channel.encoding != "ros1":
             return data
-        store = self._store(channel)
+        kind = OTHER_NAMES.get(channel.kind, channel.kind)
+        store = _store_of(kind, "cdr", None)
+        if store is None:
+            raise ValueError(f"{channel.kind}: ROS 2 has no such type")
         try:
-            return bytes(store.ros1_to_cdr(data, channel.kind))
+            return bytes(store.ros1_to_cdr(data, kind))
         except Exception as error:  # noqa: BLE001 - as above
             raise ValueError(f"{channel.kind}: {type(error).__name__}") from None
 
@@ -57,31 +62,33 @@ class Types:
         """Raises ValueError for a type that nobody describes."""
         key = (channel.kind, channel.encoding)
         if key not in self._stores:
-            self._stores[key] = self._made(channel)
+            self._stores[key] = _store_of(channel.kind, channel.encoding, self._definitions.get(channel.kind))
         if self._stores[key] is None:
             raise ValueError(f"{channel.kind}: neither the bag nor ROS says what it is")
         return self._stores[key]
 
-    def _made(self, channel: Channel) -> Any:
-        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-        definition = self._definitions.get(channel.kind)
-        usual = Stores.ROS1_NOETIC if channel.encoding == "ros1" else Stores.LATEST
-        if definition is not None:
-            try:
-                store: Any = get_typestore(Stores.EMPTY)
-                if definition.language == "ros2idl":
-                    for text in re.split(r"^=+\n(?:IDL: .*\n)?", definition.text, flags=re.MULTILINE):
-                        if text.strip():
-                            store.register(get_types_from_idl(text))
-                else:
-                    store.register(get_types_from_msg(definition.text, channel.kind))
-                store.get_msgdef(channel.kind)
-                return store
-            except Exception:  # noqa: BLE001 - a definition that nobody can read is as good as none
-                pass
-        store = get_typestore(usual)
-        return store if channel.kind in store.fielddefs else None
+@lru_cache(maxsize=256)
+def _store_of(kind: str, encoding: str, definition: Definition | None) -> Any:
+    """A type store that has the type; None if nobody describes it."""
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    usual = Stores.ROS1_NOETIC if encoding == "ros1" else Stores.LATEST
+    if definition is not None:
+        try:
+            store: Any = get_typestore(Stores.EMPTY)
+            if definition.language == "ros2idl":
+                for text in re.split(r"^=+\n(?:IDL: .*\n)?", definition.text, flags=re.MULTILINE):
+                    if text.strip():
+                        store.register(get_types_from_idl(text))
+            else:
+                store.register(get_types_from_msg(definition.text, kind))
+            store.get_msgdef(kind)
+            return store
+        except Exception:  # noqa: BLE001 - a definition that nobody can read is as good as none
+            pass
+    store = get_typestore(usual)
+    return store if kind in store.fielddefs else None
 
 
 def fields_of(message: Any) -> Iterator[str]:
@@ -101,7 +108,7 @@ def _fields(value: Any, path: str, depth: int) -> Iterator[str]:
                 yield from _fields(item, f"{path}[{k}]", depth + 1)
     elif depth < DEPTH and not isinstance(value, str | bytes):
         for name in getattr(value, "__dataclass_fields__", {}):
-            if name not in SKIPPED and not name.startswith("__") and name != "covariance":
+            if name not in SKIPPED and not name.startswith("__"):
                 yield from _fields(getattr(value, name), f"{path}.{name}" if path else name, depth + 1)
 
 
