@@ -5,9 +5,14 @@ listened to (rmw: its gid; another one is a fault as long as the first is heard)
 nothing of it counts, and a faulty observation says why. One that is older than the newest is dropped and counted, one that took longer
 than `max_age` beyond the fastest is faulty. Observations are numbered here: by one, and by one more for each that was lost (rmw: by the
 sequence number; bridge, and transforms: by the stamps, if the profile says how far they are apart).
+
+Two robots (`s2r_runtime.twins`). The publisher that is listened to goes on after another one was heard; or, where publishers can't be told
+apart, stamps or sequence numbers go on in two tracks, or stamps come CROWDED times as often as the profile says.
 """
 
 from __future__ import annotations
+
+from collections import deque
 
 from s2r_ros2.cdr import Malformed
 from s2r_ros2.clock import RobotClock
@@ -15,10 +20,17 @@ from s2r_ros2.keys import Attached, attached, opened
 from s2r_ros2.options import Options
 from s2r_ros2.payloads import Located, decode_odometry, decode_pose_stamped, decode_transforms
 from s2r_ros2.pose import Planar
-from s2r_runtime.messages import Frame, LinkChanged, Observation
+from s2r_runtime.messages import Frame, LinkChanged, Observation, ObservationRefused, OverrideChanged
+from s2r_runtime.twins import Pair, Track
+
+Said = Observation | ObservationRefused | LinkChanged | OverrideChanged
 
 LOST_MOST = 1_000_000
 """Counted at once; more is no loss but another count."""
+EARLY_NS = 500_000_000
+"""By which a pose may be older than the first one and be no more than late."""
+CROWDED, INTERVALS = 1.6, 16
+"""A robot keeps its period within some percent; two robots halve it. Judged over so many intervals of stamps, which no network changes."""
 
 
 class Told:
@@ -67,6 +79,10 @@ class Observer:
         self.clock = RobotClock(self._silence_ns)
         self._publisher: Attached | None = None
         self._seq = -1
+        self._named, self._counts, self._crowd = Pair(), Pair(signs=2), Pair()
+        self._track = Track(early=EARLY_NS)
+        self._stamps: deque[int] = deque(maxlen=INTERVALS + 1)
+        self._repeats = options.pose == "tf"  # a transform is often published again as it was
         self.malformed = self.lost = self.foreign = 0
 
     @property
@@ -81,58 +97,111 @@ class Observer:
         s, a = self.clock.newest
         return s + min(max(t_ns - a, 0), self._silence_ns)
 
-    def decode(self, frame: Frame) -> list[Observation | LinkChanged]:
+    def decode(self, frame: Frame) -> list[Said]:
         """What a message about the pose means."""
+        said: list[Said] = []
         try:
             extra, payload = opened(frame.data)
             publisher = attached(extra) if self._rmw else None
             poses = self._told.poses(payload)
             if poses and publisher is not None:
-                self._same(publisher, frame.arrival_ns)
+                said += self._same(publisher, frame.arrival_ns)
         except Malformed as error:
             self.malformed += 1
             return [self._fault(f"malformed {frame.channel}: {error}")]
         if not poses:
             self.foreign += 1
-        said: list[Observation | LinkChanged] = []
         for stamp_ns, x in poses:
             said += self._observed(frame.arrival_ns if self._arrival else stamp_ns, frame.arrival_ns, x, publisher)
         return said
 
-    def _same(self, publisher: Attached, arrival_ns: int) -> None:
-        """Two publishers on one topic are two robots, or a robot and somebody who poses as it."""
+    def _same(self, publisher: Attached, arrival_ns: int) -> list[Said]:
+        """Two publishers on one topic are two robots, or a robot and somebody who poses as it. One that falls silent was restarted."""
         known, newest = self._publisher, self.clock.newest
-        if known is not None and newest is not None and known.gid != publisher.gid and arrival_ns - newest[1] < self._silence_ns:
+        if known is None or newest is None:
+            return []
+        if known.gid == publisher.gid:
+            if self._named.goes_on(arrival_ns):
+                return [_twin(arrival_ns, f"publisher {known.gid.hex()} goes on after another one was heard")]
+        elif arrival_ns - newest[1] < self._silence_ns:
+            self._named.other()
             raise Malformed("another publisher is on the topic")
+        else:
+            self._named.forget()
+        return []
 
     def _fault(self, why: str) -> Observation:
         stamp = self.clock.stamp() if self.clock.newest is not None else 0
         return Observation(max(self._seq, 0), stamp, (), fault=why)
 
-    def _observed(self, s: int, a: int, x: tuple[float, ...], publisher: Attached | None) -> list[Observation | LinkChanged]:
+    def _observed(self, s: int, a: int, x: tuple[float, ...], publisher: Attached | None) -> list[Said]:
         before = self.clock.newest
         if before is not None and s > before[0] and self._stands(publisher, a - before[1]):
             self.malformed += 1
+            self._counts.other()
             return [self._fault("malformed pose: its sequence number does not rise with its stamp")]
         verdict = self.clock.take(s, a)
-        if verdict in ("old", "ahead"):
-            return []
+        if verdict == "old":
+            return self._old(s, a, x)
+        if verdict == "ahead":
+            self._counts.other()
+            return [ObservationRefused(a, "its stamp is from the future")]
         lost = self._gap(s, before[0], publisher) if before is not None and verdict == "taken" else 0
         self._publisher = publisher
         self.lost += lost
-        said: list[Observation | LinkChanged] = []
+        said: list[Said] = []
         if before is None:
             self._seq = 0
             said = [LinkChanged(a, up=True)]
         elif verdict == "restarted":
             self._seq += 2
+            self._forget()
             said = [LinkChanged(a, up=False, detail="the robot's clock was set, or began anew"), LinkChanged(a, up=True)]
         else:
             self._seq += 1 + lost
+            said = self._two(s, a)
+        self._track.accept(s, x)
         late = self.clock.age_ns(s, a)
         if late > self._max_age_ns:
             return [*said, self._fault(f"came {late * 1e-9:.2f} s later than the fastest")]
         return [*said, Observation(self._seq, self.clock.stamp(), x)]
+
+    # ------------------------------------------------------------------ two robots, echoes, late messages
+
+    def _old(self, s: int, a: int, x: tuple[float, ...]) -> list[Said]:
+        """A pose that is not newer than the newest."""
+        kind = self._track.judge(s, x)
+        if kind == "echo":
+            return [] if self._repeats else [ObservationRefused(a, "an echo: this pose was heard before")]
+        if kind == "late" and not self._crowds(s):
+            return [ObservationRefused(a, "a late pose: a newer one was heard before")]
+        self._counts.other()
+        return [ObservationRefused(a, "a pose with an old stamp that the robot did not send when it was due")]
+
+    def _crowds(self, s: int) -> bool:
+        """Whether there is no room for a lost pose of this stamp between those that came."""
+        earlier = max((one for one in self._stamps if one < s), default=None)
+        later = min((one for one in self._stamps if one > s), default=None)
+        return bool(self._period_ns) and earlier is not None and later is not None and later - earlier < 1.5 * self._period_ns
+
+    def _two(self, s: int, a: int) -> list[Said]:
+        """A pose was taken: is it one of two robots'?"""
+        if self._counts.goes_on(a):
+            return [_twin(a, "poses go on in two tracks of stamps or sequence numbers")]
+        self._stamps.append(s)
+        span, most = s - self._stamps[0], INTERVALS * self._period_ns / CROWDED
+        if len(self._stamps) > INTERVALS and span < most:
+            self._crowd.other()
+            if self._crowd.goes_on(a):
+                each, told = span * 1e-6 / INTERVALS, self._period_ns * 1e-6
+                return [_twin(a, f"a pose comes every {each:.3g} ms, transport.period is {told:.3g} ms: two robots, or another period")]
+        return []
+
+    def _forget(self) -> None:
+        self._track.forget()
+        self._stamps.clear()
+        self._counts.forget()
+        self._named.forget()
 
     def _stands(self, publisher: Attached | None, silent_ns: int) -> bool:
         """Whether a publisher that is known, and was not silent, counted no further. Two poses of one message have one number."""
@@ -151,3 +220,7 @@ class Observer:
         elif self._period_ns:
             lost = round((s - before) / self._period_ns) - 1
         return lost if 0 < lost <= LOST_MOST else 0
+
+
+def _twin(t_ns: int, why: str) -> OverrideChanged:
+    return OverrideChanged(t_ns, "robot_twin", why)

@@ -26,12 +26,12 @@ from s2r_ros2.observer import Observer
 from s2r_ros2.options import MEANINGS, Options, checked
 from s2r_ros2.payloads import decode_bool
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
+from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, ObservationRefused, OverrideChanged
 
 if TYPE_CHECKING:
     import zenoh
 
-Decoded = Observation | Command | LinkChanged | OverrideChanged
+Decoded = Observation | ObservationRefused | Command | LinkChanged | OverrideChanged
 
 OVERRIDES_WAITING = 16
 LOOK_NS = 1_000_000_000
@@ -159,7 +159,7 @@ class Ros2Transport:
             for message in said:
                 if isinstance(message, LinkChanged):
                     self._up = message.up
-                elif not message.fault:
+                elif isinstance(message, Observation) and not message.fault:
                     self._heard_ns = frame.arrival_ns
             return [*said]
         if frame.channel == "proposal":

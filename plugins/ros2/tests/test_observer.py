@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -19,7 +21,7 @@ from s2r_ros2.payloads import (
 from s2r_ros2.testing import message
 from s2r_ros2.transport import Ros2Transport
 
-from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
+from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, ObservationRefused, OverrideChanged
 
 MS = 1_000_000
 START = 1_700_000_000_000 * MS
@@ -143,7 +145,7 @@ def test_clock_that_is_set_back_takes_the_link_down_and_up() -> None:
     for k in range(5):
         t.decode(frame(k))
     hour = 3600 * 1000 * MS
-    assert t.decode(frame(5, stamp=START - hour)) == []
+    assert refusals(t.decode(frame(5, stamp=START - hour)))
     said = t.decode(frame(12, stamp=START - hour + 350 * MS))
     assert [m.up for m in said if isinstance(m, LinkChanged)] == [False, True]
     (o,) = good(said)
@@ -230,3 +232,113 @@ def test_button_stops_the_robot_and_so_does_garbage_on_its_topic() -> None:
     (told,) = t.decode(Frame(5, "manual_override", envelope(b"", b"?")))
     assert isinstance(told, OverrideChanged)
     assert told.kind == "emergency_stop"
+
+
+# ---------------------------------------------------------------- two robots, echoes, order
+
+
+def refusals(said: list[Any]) -> list[str]:
+    return [m.detail for m in said if isinstance(m, ObservationRefused)]
+
+
+def twins(said: list[Any]) -> list[str]:
+    return [m.detail for m in said if isinstance(m, OverrideChanged) and m.kind == "robot_twin"]
+
+
+def test_second_publisher_is_a_twin_as_soon_as_the_first_goes_on() -> None:
+    t = transport(layout="rmw")
+    assert good(t.decode(frame(0, gid=A)))
+    assert not twins(t.decode(frame(1, gid=B)))
+    said = t.decode(frame(2, gid=A))
+    assert isinstance(said[0], OverrideChanged), "before the observation that somebody would answer"
+    assert twins(said) == [f"publisher {A.hex()} goes on after another one was heard"]
+
+
+def test_twin_that_lasts_is_said_once_a_second() -> None:
+    t = transport(layout="rmw")
+    said = [(k, twins(t.decode(frame(k, gid=(A, B)[k % 2])))) for k in range(100)]
+    at = [0.05 * k for k, told in said if told]
+    assert at[0] == 0.1
+    assert len(at) == 5
+    assert min(b - a for a, b in pairwise(at)) >= 1.0
+
+
+@pytest.mark.parametrize("pause", [12, 100])
+def test_restarted_publisher_is_no_twin(pause: int) -> None:
+    """Its count begins anew, its gid is another, and the old one is silent for longer than the observation timeout (0.5 s)."""
+    t = transport(layout="rmw")
+    said = [m for k in range(20) for m in t.decode(frame(k, gid=A, seq=1000 + k))]
+    said += [m for k in range(20 + pause, 80 + pause) for m in t.decode(frame(k, gid=B, seq=k - pause - 19))]
+    assert not twins(said)
+    assert len(good(said)) == 80
+
+
+def test_publisher_that_restarts_within_the_timeout_is_faulty_until_then_and_no_twin() -> None:
+    t = transport(layout="rmw")
+    said = [m for k in range(10) for m in t.decode(frame(k, gid=A))]
+    said += [m for k in range(11, 60) for m in t.decode(frame(k, gid=B, seq=k))]
+    assert not twins(said)
+    assert set(faults(said)) == {"malformed pose: another publisher is on the topic"}
+    assert len(good(said)) == 10 + 60 - 19  # from 0.5 s after the last one
+
+
+def test_first_robot_that_comes_back_beside_its_replacement_is_a_twin() -> None:
+    t = transport(layout="rmw")
+    t.decode(frame(0, gid=A))
+    assert good(t.decode(frame(20, gid=B)))
+    assert faults(t.decode(frame(21, gid=A)))
+    assert twins(t.decode(frame(22, gid=B)))
+
+
+def test_sequence_numbers_that_interleave_under_one_gid_are_a_twin() -> None:
+    t = transport(layout="rmw")
+    said: list[Any] = []
+    for k in range(6):
+        said += t.decode(frame(2 * k, gid=A, seq=1000 + k))
+        said += t.decode(frame(2 * k + 1, gid=A, seq=5 + k))
+    assert twins(said) == ["poses go on in two tracks of stamps or sequence numbers"]
+
+
+def test_twice_as_many_poses_as_the_period_says_are_two_robots() -> None:
+    """Behind a bridge nothing names the publisher; the clocks agree, so that stamps rise."""
+    t = transport(period=0.05)
+    alone = [m for k in range(40) for m in t.decode(frame(k))]
+    assert not twins(alone)
+    said = []
+    for k in range(40, 80):
+        said += t.decode(frame(k))
+        said += t.decode(frame(k, (3.0, 1.0, 0.0), stamp=START + (50 * k + 21) * MS, arrival=(50 * k + 21) * MS))
+    assert re.fullmatch(r"a pose comes every (29|3\d)\.?\d* ms, transport\.period is 50 ms: two robots, or another period", twins(said)[0])
+    first = next(i for i, m in enumerate(said) if isinstance(m, OverrideChanged))
+    assert first <= 32, "within 16 periods"
+
+
+def test_second_robot_whose_clock_is_behind_is_a_twin_where_the_period_is_known() -> None:
+    t = transport(period=0.05)
+    said = []
+    for k in range(40):
+        said += t.decode(frame(k))
+        said += t.decode(frame(k, (3.0, 1.0, 0.0), stamp=START + (50 * k - 733) * MS, arrival=(50 * k + 21) * MS))
+    assert twins(said)[0] == "poses go on in two tracks of stamps or sequence numbers"
+
+
+def test_echoes_and_late_poses_are_refused_and_no_twin() -> None:
+    for options in ({}, {"period": 0.05}, {"layout": "rmw"}):
+        t = transport(**options)
+        gid = {"gid": A} if "layout" in options else {}
+        said = [m for k in range(40) for m in (*t.decode(frame(k, **gid)), *t.decode(frame(max(0, k - 3), arrival=50 * k * MS + 5, **gid)))]
+        assert set(refusals(said)) == {"an echo: this pose was heard before"}
+        assert not twins(said)
+        assert len(good(said)) == 40
+        t = transport(**options)
+        order = [k + (1, -1)[k % 2] for k in range(40)]  # every second one is late
+        said = [m for place, k in enumerate(order) for m in t.decode(frame(k, arrival=50 * place * MS, **gid))]
+        assert set(refusals(said)) == {"a late pose: a newer one was heard before"}
+        assert not twins(said)
+
+
+def test_transform_that_is_published_again_is_no_echo() -> None:
+    t = transport(layout="rmw", pose="tf", frame="odom", child_frame="base_footprint")
+    said = [m for k in range(20) for n in range(2) for m in t.decode(frame(k, gid=A, seq=2 * k + n + 1, pose="tf"))]
+    assert not refusals(said)
+    assert len(good(said)) == 20
