@@ -6,7 +6,8 @@ and a late message from another count:
 
     number accepted before, same content     echo
     number accepted before, other content    other: one robot does not say two things under one number
-    number never accepted, in its place      late (its stamp lies between those of its neighbours, where stamps are given)
+    number never accepted, in its place      late (its stamp lies between those of its neighbours, where stamps are given, and it is not
+                                             far below the next one)
     all else                                 other
 """
 
@@ -57,11 +58,12 @@ class Pair:
 class Track:
     """The last accepted messages: numbers that rise, contents, and stamps where there are any.
 
-    early: by how much a number may be below the very first one, and the message still be late (in their unit).
+    early: by how much a number may be below the very first one, and the message still be late (in their unit). deep: by how much below the
+    next one that was accepted.
     """
 
-    def __init__(self, early: int = 8) -> None:
-        self._early = early
+    def __init__(self, early: int = 8, deep: int = KEPT) -> None:
+        self._early, self._deep = early, deep
         self._kept: deque[tuple[int, int, int]] = deque(maxlen=KEPT)
         self._first = True
 
@@ -80,7 +82,7 @@ class Track:
         if at == 0:
             before_first = self._first and kept and kept[0][0] - number <= self._early and stamp <= kept[0][1]
             return "late" if before_first else "other"
-        if at == len(kept):
+        if at == len(kept) or kept[at][0] - number > self._deep:
             return "other"
         return "late" if not stamp or kept[at - 1][1] <= stamp <= kept[at][1] else "other"
 

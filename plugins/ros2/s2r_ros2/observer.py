@@ -80,7 +80,7 @@ class Observer:
         self._publisher: Attached | None = None
         self._seq = -1
         self._named, self._counts, self._crowd = Pair(), Pair(signs=2), Pair()
-        self._track = Track(early=EARLY_NS)
+        self._track = Track(early=EARLY_NS, deep=1 << 62)
         self._stamps: deque[int] = deque(maxlen=INTERVALS + 1)
         self._repeats = options.pose == "tf"  # a transform is often published again as it was
         self.malformed = self.lost = self.foreign = 0

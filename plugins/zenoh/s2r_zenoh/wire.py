@@ -11,6 +11,9 @@ Order. A robot's `seq` and `stamp_ns` rise within one boot. The same bytes again
 lockstep that fell is answered. A robot that started anew says so by another `boot`, or by having been silent for `restart_ns`: its
 numbers then go on above the old ones (`stamp_ns` by one second at least), so that nobody downstream ever sees a clock run
 backwards, and a link down and up is reported between the two. The first observation of all reports the link up, before itself.
+
+Two robots (`s2r_runtime.twins`). A `boot` number goes on that another one had replaced; or, under one boot number, `seq` goes on in two
+tracks, has two contents, or does not rise together with `stamp_ns`, and the robot that is followed goes on as well.
 """
 
 from __future__ import annotations
@@ -22,10 +25,11 @@ from typing import Literal, TypeVar
 
 import msgspec
 
-from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
+from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, ObservationRefused, OverrideChanged
+from s2r_runtime.twins import Pair, Track
 
 T = TypeVar("T")
-Decoded = Observation | Command | LinkChanged | OverrideChanged
+Decoded = Observation | ObservationRefused | Command | LinkChanged | OverrideChanged
 
 PAYLOAD_MAX = 65_536
 """Bytes. Longer payloads are malformed; nothing that this software needs comes near."""
@@ -37,6 +41,8 @@ COUNT_MAX = 2**53
 """Largest seq and obs_seq: what every JSON library holds exactly."""
 STAMP_MAX = 2**62
 RESTART_GAP_NS = 1_000_000_000
+BOOTS_KEPT = 8
+"""Of boot numbers that were replaced."""
 
 
 class ObservationPayload(msgspec.Struct):
@@ -96,6 +102,8 @@ class Wire:
         self._last: ObservationPayload | None = None
         self._arrival_ns = 0
         self._seq_offset = self._stamp_offset = 0
+        self._track, self._boots = Track(), dict[int, ObservationPayload]()
+        self._counts, self._named = Pair(signs=2), Pair()
 
     @property
     def newest(self) -> int:
@@ -135,23 +143,49 @@ class Wire:
                 self._accept(payload, frame)
                 return [LinkChanged(frame.arrival_ns, up=True), Observation(payload.seq, payload.stamp_ns, x)]
             if payload.boot != last.boot or (payload.seq <= last.seq and frame.arrival_ns - self._arrival_ns >= self._restart_ns):
-                return [*self._restart(payload, frame), self._numbered(payload, x)]
+                twin = self._replaced(last, payload, frame.arrival_ns)
+                return [*twin, *self._restart(payload, frame), self._numbered(payload, x)]
             if payload.seq == last.seq and payload == last:
                 self._arrival_ns = frame.arrival_ns
                 return []
             if payload.seq < last.seq:
                 self.old, self.too_old = self.old + 1, frame.data
-                return []
+                return [self._behind(payload, frame.arrival_ns)]
             if payload.seq == last.seq:
+                self._counts.other()
                 raise Malformed("seq was used before, for other content")
             if payload.stamp_ns <= last.stamp_ns:
+                self._counts.other()
                 raise Malformed("stamp_ns does not rise with seq")
         except Malformed as error:
             self.malformed += 1
             return [self._unusable(frame, f"malformed observation: {error}")]
         self.lost += payload.seq - last.seq - 1
         self._accept(payload, frame)
-        return [self._numbered(payload, x)]
+        twin = self._counts.goes_on(frame.arrival_ns)
+        told = [_twin(frame.arrival_ns, "observations go on in two tracks of seq and stamp_ns")] if twin else []
+        return [*told, self._numbered(payload, x)]
+
+    def _replaced(self, last: ObservationPayload, payload: ObservationPayload, now_ns: int) -> list[Decoded]:
+        """A robot that started anew; or one that never stopped, beside another."""
+        self._boots.pop(last.boot, None)
+        while len(self._boots) >= BOOTS_KEPT:
+            del self._boots[next(iter(self._boots))]
+        self._boots[last.boot] = last
+        before = self._boots.get(payload.boot)
+        if payload.boot == last.boot or before is None or payload.seq <= before.seq or payload.stamp_ns <= before.stamp_ns:
+            return []
+        self._named.other()
+        went_on = f"the robot with boot {payload.boot} goes on at seq {payload.seq} after one with boot {last.boot} was heard"
+        return [_twin(now_ns, went_on)] if self._named.goes_on(now_ns) else []
+
+    def _behind(self, payload: ObservationPayload, now_ns: int) -> ObservationRefused:
+        """A number below the newest."""
+        kind = self._track.judge(payload.seq, tuple(payload.state.items()), payload.stamp_ns)
+        if kind == "other":
+            self._counts.other()
+        why = {"echo": "an echo of", "late": "it came late:", "other": "not the robot's, or replayed:"}[kind]
+        return ObservationRefused(now_ns, f"{why} observation {payload.seq}")
 
     def _unusable(self, frame: Frame, fault: str) -> Observation:
         """No state, and its own place in the count where that can be read and comes next; else the place of the one before."""
@@ -171,6 +205,7 @@ class Wire:
 
     def _accept(self, payload: ObservationPayload, frame: Frame) -> None:
         self._last, self._arrival_ns, self.too_old = payload, frame.arrival_ns, b""
+        self._track.accept(payload.seq, tuple(payload.state.items()), payload.stamp_ns)
 
     def _numbered(self, payload: ObservationPayload, x: tuple[float, ...]) -> Observation:
         return Observation(payload.seq + self._seq_offset, payload.stamp_ns + self._stamp_offset, x)
@@ -181,6 +216,8 @@ class Wire:
         seq = self._last.seq + self._seq_offset + 2
         stamp = self._last.stamp_ns + self._stamp_offset + RESTART_GAP_NS
         self._seq_offset, self._stamp_offset = seq - payload.seq, stamp - payload.stamp_ns
+        self._track.forget()
+        self._counts.forget()
         self._accept(payload, frame)
         t_ns = frame.arrival_ns
         return [LinkChanged(t_ns, up=False, detail="the robot started anew"), LinkChanged(t_ns, up=True)]
@@ -206,6 +243,10 @@ class Wire:
             self.malformed += 1
             return [OverrideChanged(frame.arrival_ns, "emergency_stop", f"malformed override: {error}")]
         return [OverrideChanged(frame.arrival_ns, payload.kind, payload.detail[:200])]
+
+
+def _twin(t_ns: int, why: str) -> OverrideChanged:
+    return OverrideChanged(t_ns, "robot_twin", why)
 
 
 def _parsed(decoder: msgspec.json.Decoder[T], data: bytes) -> T:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from s2r_zenoh.transport import ZenohTransport
 from s2r_zenoh.wire import PAYLOAD_MAX, Wire
 
-from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
+from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, ObservationRefused, OverrideChanged
 
 SECOND = 1_000_000_000
 
@@ -105,7 +105,7 @@ def test_repeat_is_nothing_new_and_an_older_one_is_dropped() -> None:
     w = wire()
     seen(w, observation(7))
     assert w.decode(frame(observation(7))) == []
-    assert w.decode(frame(observation(5))) == []
+    assert w.decode(frame(observation(5))) == [ObservationRefused(0, "it came late: observation 5")]
     assert (w.old, w.lost) == (1, 0)
     seen(w, observation(10))
     assert w.lost == 2
@@ -147,7 +147,7 @@ def test_keep_alives_of_a_waiting_robot_hold_off_the_restart_time() -> None:
     w = wire()
     for quarter in range(12):
         w.decode(frame(observation(10), quarter * SECOND // 4))
-    assert w.decode(frame(observation(9), 3 * SECOND)) == []
+    assert seen(w, observation(9), 3 * SECOND) == []
 
 
 def test_robot_without_a_boot_number_that_repeats_an_old_count_is_one_that_started_anew_after_the_restart_time() -> None:
@@ -161,12 +161,95 @@ def test_robot_without_a_boot_number_that_repeats_an_old_count_is_one_that_start
 
     assert heard(first, 0)[-1] == Observation(900, 900_000, (0.1, 0.2))
     assert heard(first, SECOND // 10) == [], "it waits"
-    assert [heard(again, SECOND // 5 * k) for k in (1, 2)] == [[], []], "an echo of the past, for all that is known"
+    for k in (1, 2):
+        (refused,) = heard(again, SECOND // 5 * k)
+        assert isinstance(refused, ObservationRefused), "an echo of the past, for all that is known"
     down, up, anew = heard(again, SECOND)
     assert (down.up, up.up, anew.seq > 900, anew.x) == (False, True, True, (0.1, 0.2))
     transport.send(transport.encode(Command(1, SECOND, "controller", (0.1, 0.0), anew.seq, SECOND)))
     assert heard(again, SECOND + 1) == [], "it waits"
     assert transport.counters()["repeated"] == 2, "and gets its answer once more, which may have been lost"
+
+
+# ---------------------------------------------------------------- two robots, echoes, order
+
+
+def twins(said: list[Any]) -> list[str]:
+    return [m.detail for m in said if isinstance(m, OverrideChanged) and m.kind == "robot_twin"]
+
+
+def refusals(said: list[Any]) -> list[str]:
+    return [m.detail for m in said if isinstance(m, ObservationRefused)]
+
+
+def told(payloads: list[dict[str, Any]], period_ns: int = SECOND // 40) -> list[Any]:
+    w = wire()
+    return [m for k, payload in enumerate(payloads) for m in w.decode(frame(payload, k * period_ns))]
+
+
+def test_boot_number_that_goes_on_after_another_one_is_a_twin_before_anybody_is_answered() -> None:
+    w = wire()
+    w.decode(frame(observation(7, boot=1), 0))
+    assert not twins(w.decode(frame(observation(900, boot=2), 1)))
+    said = w.decode(frame(observation(8, boot=1), 2))
+    assert isinstance(said[0], OverrideChanged)
+    assert said[0].detail == "the robot with boot 1 goes on at seq 8 after one with boot 2 was heard"
+
+
+def test_robot_that_starts_anew_again_and_again_is_no_twin() -> None:
+    assert not twins(told([observation(k, boot=boot) for boot in (1, 2, 3, 1, 2) for k in range(5)]))
+
+
+@pytest.mark.parametrize("ahead", [0, 1, 10, 63, 500, 10_000])
+@pytest.mark.parametrize("first", [0, 1000])
+def test_two_counts_that_interleave_are_a_twin_at_any_distance(ahead: int, first: int) -> None:
+    """Two robots without boot numbers; the clock of the second one is another."""
+    both = [(observation(first + k), observation(first + k + ahead, 77 + 1000 * (first + k), x=3.0)) for k in range(200)]
+    said = told([one for pair in both for one in pair])
+    assert twins(said)
+
+
+@pytest.mark.parametrize(("ahead", "most"), [(0, 6), (500, 6), (-30, 6)])
+def test_two_counts_are_a_twin_within_three_observations_each(ahead: int, most: int) -> None:
+    both = [(observation(100 + k), observation(100 + k + ahead, 77 + 1000 * (k + 30), x=3.0)) for k in range(-20, 3)]
+    flat = [observation(100 + k) for k in range(-60, -20)] + [one for pair in both for one in pair]
+    said = [twins([m]) for m in told(flat)]
+    w, heard = wire(), 0
+    for k, payload in enumerate(flat):
+        heard += k >= 40
+        if twins(w.decode(frame(payload, k * SECOND // 40))):
+            break
+    assert any(said)
+    assert heard <= most + 1
+
+
+def test_echoes_and_late_observations_are_refused_and_no_twin() -> None:
+    said = told([one for k in range(3, 60) for one in (observation(k), observation(k - 3))])
+    assert set(refusals(said)[3:]) == {f"an echo of observation {k}" for k in range(3, 57)}
+    assert not twins(said)
+    assert len([m for m in said if isinstance(m, Observation)]) == 57
+    said = told([observation(k + (1, -1)[k % 2]) for k in range(60)])
+    assert set(refusals(said)) == {f"it came late: observation {k}" for k in range(0, 60, 2)}
+    assert not twins(said)
+
+
+def test_single_late_observation_is_refused_and_that_is_all() -> None:
+    order = [*range(10), 11, 10, *range(12, 30)]
+    said = told([observation(k) for k in order])
+    assert refusals(said) == ["it came late: observation 10"]
+    assert [m.seq for m in said if isinstance(m, Observation)] == [k for k in range(30) if k != 10]
+    assert not any(m.fault for m in said if isinstance(m, Observation))
+
+
+@pytest.mark.parametrize("boot", [0, 1])
+def test_legitimate_restart_is_no_twin(boot: int) -> None:
+    w = wire()
+    said = [m for k in range(50) for m in w.decode(frame(observation(500 + k), k * SECOND // 20))]
+    after = 50 * SECOND // 20 + SECOND
+    said += [m for k in range(50) for m in w.decode(frame(observation(k, boot=boot), after + k * SECOND // 20))]
+    assert not twins(said)
+    assert not refusals(said)
+    assert [m.up for m in said if isinstance(m, LinkChanged)] == [True, False, True]
 
 
 def test_command_is_named_inputs_with_all_that_the_robot_needs() -> None:
