@@ -8,6 +8,8 @@ the log says it too:
     dropped N                 N messages about the pose gave way, the runtime was late
     rejected REASON=N ...     since the last such note, at most one a second
     twin, alone               two robots answer to one system id, and both hear what is sent to one; only one does again
+    elsewhere                 another address sends under the robot's ids what the robot does not send, at most once a second
+    refused WHY               a message about the pose came in the robot's name and did not count; the next one after a good one
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from s2r_mavlink.dialect import COMMAND_ACK, HEARTBEAT, MESSAGE_INTERVAL, STATUSTEXT, TIMESYNC
+from s2r_mavlink.elsewhere import Elsewhere
 from s2r_mavlink.endpoints import Endpoint, Piece
 from s2r_mavlink.frames import SIGNED, V2, header, payload
 from s2r_mavlink.sequence import Sequence
@@ -53,7 +56,10 @@ class Door:
     def __init__(self, ids: frozenset[tuple[int, int]], autopilot: tuple[int, int], pose: frozenset[int], queue: int) -> None:
         self._ids, self._autopilot, self._pose, self._queue = ids, autopilot, pose, queue
         self._tracks = {sender: Sequence() for sender in ids}
+        self._elsewhere = Elsewhere()
+        self._elsewhere_ns = -NOTE_NS
         self._twin = False
+        self._refused, self._clean = "", True
         self._noted: dict[str, int] = {}
         self._note_ns = 0
         self.signing: Signing | None = None
@@ -84,8 +90,13 @@ class Door:
         for source, arrival_ns, came in pieces:
             self.received += len(came)
             for data in came:
+                self._refused = ""
                 number = self._admitted(line, source, arrival_ns, data)
+                if self._refused and self._clean and header(data).number in self._pose:  # once after each good one: the log must not fill
+                    self._clean = False
+                    frames.append(Frame(arrival_ns, "door", b"refused " + self._refused.encode()))
                 if number in self._pose:
+                    self._clean = True
                     about_pose += 1
                     frames.append(Frame(arrival_ns, "robot", data))
                 elif number in ANSWERS and not (number == TIMESYNC and self._question(data)):
@@ -107,10 +118,18 @@ class Door:
                 return self._reject(reason)
         elif signed:
             return self._reject("signed_without_key")
-        if not line.accept(source, now_ns):  # whoever it is, it doesn't hear what is sent to the robot
-            return self._reject("other_address")
         facts = header(data)
+        if not line.accept(source, now_ns):  # whoever it is, it doesn't hear what is sent to the robot
+            if facts.number in self._pose:
+                self._elsewhere.strange(data)
+            return self._reject("other_address")
+        if facts.number in self._pose:
+            self._elsewhere.own(data, now_ns)
         place = track.place(facts.sequence, now_ns, checked=facts.known)
+        if place == "again":
+            self._refused = "echo"
+        elif place == "off":
+            self._refused = "out_of_order"
         if place == "off" or place == "again" or not facts.known:
             return -1
         if facts.number in self._pose:
@@ -121,6 +140,8 @@ class Door:
 
     def _reject(self, reason: str) -> int:
         self.rejected[reason] += 1
+        if reason not in ("foreign", "other_address"):  # somebody else's on a shared line; a copy of the robot's own by another way
+            self._refused = reason
         return -1
 
     def _question(self, data: bytes) -> bool:
@@ -137,7 +158,7 @@ class Door:
         gone = sum(surplus.values())
         kept: list[Frame] = []
         for frame in frames:
-            pose = header(frame.data).number in self._pose
+            pose = frame.channel == "robot" and header(frame.data).number in self._pose
             if surplus[pose]:
                 surplus[pose] -= 1
             else:
@@ -154,6 +175,9 @@ class Door:
         if twin != self._twin:
             self._twin = twin
             made.append(Frame(now_ns, "door", b"twin" if twin else b"alone"))
+        if self._elsewhere.shared(now_ns) and now_ns - self._elsewhere_ns >= NOTE_NS:
+            self._elsewhere_ns = now_ns
+            made.append(Frame(now_ns, "door", b"elsewhere"))
         if now_ns - self._note_ns >= NOTE_NS:
             # somebody else's frames on a shared line are no incident
             counts = {name: count for name, count in self.rejected.items() if name != "foreign"}

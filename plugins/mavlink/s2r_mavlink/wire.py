@@ -5,7 +5,7 @@ Channels of frames:
     robot      a whole MAVLink frame of the robot's, as it came (checked, and its signature verified, where it came in: `Door`)
     ground,
     companion  a frame of somebody else that would move the robot: it was not passed on, it is logged and refused
-    door       a note of what was noticed where frames come in: `dropped N`, `rejected ...`, `twin`, `alone`
+    door       a note of what was noticed where frames come in: `dropped N`, `rejected ...`, `twin`, `alone`, `elsewhere`, `refused WHY`
     command    outbound: SET_POSITION_TARGET_LOCAL_NED in the body's frame, numbered by its command; link number and signature are put on it
                when it leaves
 
@@ -35,9 +35,10 @@ from s2r_mavlink.frames import build, header, is_frame, payload
 from s2r_mavlink.options import INPUTS
 from s2r_mavlink.pose import SOURCES, Pose, PoseSource
 from s2r_mavlink.robot_state import RobotState, mode_number
-from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
+from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, ObservationRefused, OverrideChanged
+from s2r_runtime.twins import AGAIN_NS, Pair, Track
 
-Decoded = Observation | Command | LinkChanged | OverrideChanged
+Decoded = Observation | ObservationRefused | Command | LinkChanged | OverrideChanged
 Fields = tuple[Any, ...]
 
 BODY_NED = BODY_FRAMES[0]
@@ -46,6 +47,9 @@ IGNORES_VELOCITY, IGNORES_YAW_RATE = 1 | 2 | 4 | 8 | 16 | 32, 2048
 NUMBER_MAX = 1e9
 TWIN = "two robots answer to this system id"
 ANSWERS_KEPT = 64
+EARLY_NS = 500_000_000
+"""By which an observation may be older than the first one and be no more than late."""
+WHY_REFUSED = {"echo": "an echo of a message about the pose", "out_of_order": "a message about the pose that is out of order"}
 
 
 class Wire:
@@ -66,6 +70,8 @@ class Wire:
         self.malformed = self.stale = 0
         self._seen = self._commands = 0
         self._twin = False
+        self._twin_said_ns = -AGAIN_NS
+        self._track, self._counts = Track(early=EARLY_NS, deep=1 << 62), Pair(signs=2)
         self.ups = 0
         self._columns = tuple(inputs.index(name) if name in inputs else None for name in INPUTS)
         takers: dict[int, Callable[[Fields, Frame], list[Decoded]]] = {
@@ -85,11 +91,29 @@ class Wire:
         if frame.channel == "robot":
             return self._from_robot(frame)
         if frame.channel == "door":
-            self._twin = frame.data == b"twin" or (self._twin and frame.data != b"alone")
-            return [self._faulty(TWIN)] if frame.data == b"twin" else []
+            return self._noticed(frame)
         if frame.channel in ("ground", "companion"):
             return [self._refused(frame)]
         return []
+
+    def _noticed(self, frame: Frame) -> list[Decoded]:
+        """A note of the door's."""
+        self._twin = frame.data == b"twin" or (self._twin and frame.data != b"alone")
+        if frame.data == b"twin":
+            return [*self._two_robots(frame.arrival_ns), self._faulty(TWIN)]
+        if frame.data == b"elsewhere":
+            return self._two_robots(frame.arrival_ns, f"{TWIN}, from two addresses")
+        if frame.data.startswith(b"refused "):
+            why = frame.data[8:].decode("ascii", "replace")
+            return [ObservationRefused(frame.arrival_ns, WHY_REFUSED.get(why, f"a message about the pose: {why}")[:200])]
+        return []
+
+    def _two_robots(self, now_ns: int, why: str = TWIN) -> list[Decoded]:
+        """Said again each second, as long as it is so."""
+        if now_ns - self._twin_said_ns < AGAIN_NS:
+            return []
+        self._twin_said_ns = now_ns
+        return [OverrideChanged(now_ns, "robot_twin", why)]
 
     def _from_robot(self, frame: Frame) -> list[Decoded]:
         data = frame.data
@@ -110,16 +134,29 @@ class Wire:
     def _observed(self, pose: Pose, now_ns: int) -> list[Decoded]:
         verdict = self.clock.take(pose.stamp_ns, now_ns)
         if verdict in ("old", "ahead"):
-            return []
+            return [self._refusal(pose, verdict, now_ns)]
         messages: list[Decoded] = []
+        if self._twin or (verdict == "taken" and self._counts.goes_on(now_ns)):
+            messages = self._two_robots(now_ns)
         if verdict == "restarted":
             self.pose.restarted()
-            messages = [LinkChanged(now_ns, up=False, detail="the robot's clock began anew"), *self.robot.restarted(now_ns)]
+            self._track.forget()
+            self._counts.forget()
+            messages += [LinkChanged(now_ns, up=False, detail="the robot's clock began anew"), *self.robot.restarted(now_ns)]
         if verdict == "restarted" or not self.ups:
             self.ups += 1
             messages.append(LinkChanged(now_ns, up=True))
+        self._track.accept(pose.stamp_ns, pose.x)
         messages.append(self._numbered(pose, self._fault(pose, now_ns)))
         return messages
+
+    def _refusal(self, pose: Pose, verdict: str, now_ns: int) -> ObservationRefused:
+        """A pose with a stamp that is not newer than the newest, or from the future."""
+        kind = self._track.judge(pose.stamp_ns, pose.x) if verdict == "old" else "other"
+        if kind == "other":
+            self._counts.other()
+        why = {"echo": "an echo of a pose", "late": "a late pose", "other": "a pose with a time since boot that is not the robot's"}[kind]
+        return ObservationRefused(now_ns, why)
 
     def _fault(self, pose: Pose, now_ns: int) -> str:
         """Why the observation can't be used, or empty."""

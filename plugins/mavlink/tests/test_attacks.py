@@ -115,7 +115,8 @@ def test_somebody_at_another_address_is_not_the_robot_while_it_is_there(truth: T
         truth.tell()
         assert k >= 0
     assert truth.lies() == []
-    assert truth.runtime.overrides == [], "a forged heartbeat is no person's hand"
+    assert {stop.kind for stop in truth.runtime.overrides} == {"robot_twin"}, "two robots, and a forged heartbeat is no person's hand"
+    assert truth.runtime.overrides[0].detail == "two robots answer to this system id, from two addresses"
     assert truth.runtime.counters["rejected_other_address"] >= 60
     assert truth.heard()
     assert truth.runtime.faults == []
@@ -124,6 +125,22 @@ def test_somebody_at_another_address_is_not_the_robot_while_it_is_there(truth: T
     assert stranger.received() == [], "commands go to the robot"
     assert truth.robot.received()
     assert any(frame.channel == "door" and b"other_address" in frame.data for frame in truth.runtime.frames), "the log says it"
+
+
+def test_copy_of_the_robots_frames_by_another_way_is_no_second_robot(truth: Truth, stranger: Robot) -> None:
+    for k in range(40):
+        heartbeat = [truth.robot.heartbeat()] if k % 5 == 0 else []
+        stamp_ns = 10_000 * MS + time.monotonic_ns() - truth._begin
+        frames = [truth.robot.pack(message) for message in [*heartbeat, *truth.robot.messages(stamp_ns, (0.001, 0.0, 0.0))]]
+        ways = [truth.robot.line, stranger.line]
+        for line in ways if k % 2 else reversed(ways):  # now the one is faster, now the other
+            for data in frames:
+                line.write(data)
+        truth.runtime.run(0.02)
+    assert truth.runtime.counters["rejected_other_address"] >= 60
+    assert truth.runtime.overrides == []
+    truth.tell()
+    assert truth.heard()
 
 
 def test_robot_that_comes_back_from_another_port_is_the_robot(truth: Truth, stranger: Robot) -> None:
@@ -280,6 +297,7 @@ def test_two_robots_on_one_stream_are_noticed() -> None:
             one.tell()
         assert one.lies() == []
         assert runtime.faults[-1] == "two robots answer to this system id"
+        assert {stop.kind for stop in runtime.overrides} >= {"robot_twin"}
     line.close()
 
 
