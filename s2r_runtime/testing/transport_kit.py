@@ -41,7 +41,11 @@ class RobotEnd(Protocol):
 
 
 class Rig(Protocol):
-    """A transport, not yet opened, and a robot's end that reaches it once it is. Leaving the rig frees both."""
+    """A transport, not yet opened, and a robot's end that reaches it once it is. Leaving the rig frees both.
+
+    It should also have `twin() -> RobotEnd`: another robot under the same name, with an identity of its own (session, publisher, address,
+    node), which is freed with the rig. Without it, nothing shows what the transport makes of two.
+    """
 
     transport: Transport
     robot: RobotEnd
@@ -75,6 +79,11 @@ class Line:
     def links(self) -> list[bool]:
         """Link changes so far: up or not."""
         return [m.up for m in self.messages if isinstance(m, LinkChanged)]
+
+    @property
+    def twins(self) -> list[str]:
+        """What was said of a second robot."""
+        return [m.detail for m in self.messages if isinstance(m, OverrideChanged) and m.kind == "robot_twin"]
 
     @property
     def last(self) -> int:
@@ -282,6 +291,48 @@ class TransportKit:
         replayed = [m for frame in line.frames for m in again.decode(frame)]
         live = [m for m in line.messages if not isinstance(m, LinkChanged)]
         assert [m for m in replayed if not isinstance(m, LinkChanged)] == live
+
+    # ------------------------------------------------------------------ whose they are
+
+    def test_two_robots_under_one_name_are_told(self, bench: Rig, line: Line) -> None:
+        """Both would obey every command, and the gate would see only one of them."""
+        if not hasattr(bench, "twin"):
+            pytest.skip("the rig has no twin(): nothing shows what the transport makes of two robots under one name")
+        other: RobotEnd = bench.twin()
+        base, nx = line.last, len(bench.states)
+        for k in range(1, 150):
+            line.robot.publish(base + k, (base + k) * PERIOD_NS, (0.001 * k,) * nx)
+            other.publish(base // 2 + k, (base // 2 + k) * PERIOD_NS, (2.0 - 0.001 * k,) * nx)
+            begin = time.monotonic()
+            while time.monotonic() - begin < 0.01:
+                line.turn()
+            if line.twins:
+                break
+        assert line.twins, "two robots published for 1.5 s and nobody was told"
+
+    def test_robot_that_starts_anew_after_a_silence_is_no_second_one(self, bench: Rig, line: Line) -> None:
+        """Longer than the time after which its link counts as lost. Its numbers and its clock begin anew."""
+        assert line.until(lambda: bool(line.links) and not line.links[-1]), "its silence was not noticed"
+        nx, before = len(bench.states), len(line.good)
+        for k in range(1, 40):
+            line.robot.publish(k, k * PERIOD_NS, (0.001 * k,) * nx)
+            begin = time.monotonic()
+            while time.monotonic() - begin < 0.01:
+                line.turn()
+        assert len(line.good) > before, "it was not heard again"
+        assert line.twins == []
+
+    def test_echoes_are_refused_and_no_second_robot(self, bench: Rig, line: Line) -> None:
+        base, nx = line.last, len(bench.states)
+        for k in range(1, 40):
+            for seq in (base + k, base + max(1, k - 3)):
+                line.robot.publish(seq, seq * PERIOD_NS, (0.001 * (seq - base),) * nx)
+            begin = time.monotonic()
+            while time.monotonic() - begin < 0.01:
+                line.turn()
+        assert line.until(lambda: line.reached(base + 39))
+        assert line.twins == []
+        assert any(isinstance(m, ObservationRefused) for m in line.messages), "what is dropped must count (`ObservationRefused`)"
 
     # ------------------------------------------------------------------ the link
 

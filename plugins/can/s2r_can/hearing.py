@@ -11,13 +11,16 @@ from typing import NamedTuple
 from s2r_can.bits import Bits, selected
 from s2r_can.layout import Group, Inbound, Layout
 from s2r_can.sequence import ACCEPTED, Kind, Sequence
+from s2r_can.twins import CounterTwins, CycleTwins
 
+WHY = {"echo": "an echo", "late": "it came late", "other": "not the robot's, or replayed"}
 COUNTS = ("malformed", "checksum", "repeated", "old", "jumped", "lost")
 
 
 class Heard(NamedTuple):
     """What a frame came to. groups: those that are good now; bad: those of which it was known that they were in it, and are not.
 
+    twin: why two nodes send this message, if they do; refused: why a frame was dropped that is no fault of the robot's.
     wrong: what is wrong with it, if anything; believed: whether the frame is, whatever is wrong with numbers in it; kind, lost: as the
     counter says. little, big: the payload as integers.
     """
@@ -30,6 +33,8 @@ class Heard(NamedTuple):
     little: int = 0
     big: int = 0
     believed: bool = True
+    twin: str = ""
+    refused: str = ""
 
 
 class Hearing:
@@ -43,6 +48,10 @@ class Hearing:
             for m in layout.inbound.values()
             if m.counter is not None
         }
+        self._counters = {m.key: CounterTwins(m.counter.modulus) for m in layout.inbound.values() if m.counter is not None}
+        self._cycles = {
+            m.key: CycleTwins(m.cycle_ns, silence_ns) for m in layout.inbound.values() if m.counter is None and m.cycle_ns
+        }  # fmt: skip
         self._all = {m.key: tuple(m.groups) for m in layout.inbound.values()}
 
     def frame(self, message: Inbound, payload: bytes, now_ns: int) -> Heard:
@@ -60,13 +69,22 @@ class Hearing:
                 self.counts["checksum"] += 1
                 return _refused(groups, f"{message.name} has a wrong checksum")
         kind: Kind = "next"
-        lost = 0
+        lost, twin = 0, ""
         if message.counter is not None:
-            kind, lost = self._sequences[message.key].judge(field(message.counter.bits, little, big), now_ns)
+            counter, twins = field(message.counter.bits, little, big), self._counters[message.key]
+            kind, lost = self._sequences[message.key].judge(counter, now_ns)
             if kind not in ACCEPTED:
                 self.counts[kind] += 1
-                return _refused(groups, f"the counter of {message.name} jumped") if kind == "jumped" else _refused((), "")
+                what = twins.refused(counter, payload)
+                if kind == "jumped":
+                    return _refused(groups, f"the counter of {message.name} jumped")
+                return _refused((), "")._replace(refused=f"{message.name} {counter}: {WHY[what]}")
             self.counts["lost"] += lost
+            if twins.taken(counter, payload, now_ns, anew=kind in ("resumed", "restarted")):
+                twin = f"two nodes send {message.name}: its counter goes on in two tracks"
+        elif message.key in self._cycles and (each := self._cycles[message.key].came(now_ns)):
+            told = f"its cycle is {message.cycle_ns * 1e-6:g} ms (transport.cycles, or the DBC)"
+            twin = f"two nodes send {message.name}: it comes every {each * 1e3:.3g} ms, {told}"
         good, bad, wrong = [], [], ""
         for group in groups:
             if group.selectors and not selected(group.selectors, payload):
@@ -78,7 +96,7 @@ class Hearing:
                 wrong = said
             else:
                 good.append(group)
-        return Heard(tuple(good), tuple(bad), wrong, kind, lost, little, big)
+        return Heard(tuple(good), tuple(bad), wrong, kind, lost, little, big, twin=twin)
 
 
 def _refused(groups: tuple[Group, ...], why: str) -> Heard:

@@ -51,7 +51,7 @@ class Counter:
 
 @dataclass
 class Inbound:
-    """A message that is listened to. lengths: of payload that a frame of it may have."""
+    """A message that is listened to. lengths: of payload that a frame of it may have. cycle_ns: 0 if it does not come in a known cycle."""
 
     name: str
     key: int
@@ -60,6 +60,7 @@ class Inbound:
     groups: list[Group] = field(default_factory=list)
     counter: Counter | None = None
     checksum: tuple[Bits, Guarded] | None = None
+    cycle_ns: int = 0
 
 
 @dataclass

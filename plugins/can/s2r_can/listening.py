@@ -46,6 +46,8 @@ class _Listening:
     def layout(self, states: tuple[str, ...]) -> Layout:
         """All but what is sent."""
         o = self._options
+        for name in o.cycles:
+            self._database.message(name, f"transport.cycles.{name}")
         reckoned = tuple(s for s in ("x", "y", "theta") if s in states and s not in o.states) if o.dead_reckoning else ()
         complete("states", o.states, tuple(s for s in states if s not in reckoned), states)
         at = tuple(None if s in reckoned else self._value(o.states[s], f"transport.states.{s}")[0] for s in states)
@@ -88,7 +90,14 @@ class _Listening:
         if found is None:
             padded = next((n for n in FD_LENGTHS if n >= message.length), message.length)
             found = self._inbound[key] = Inbound(message.name, key, message.length, frozenset({message.length, padded}))
+            found.cycle_ns = self._cycle_ns(message)
         return found
+
+    def _cycle_ns(self, message: Message) -> int:
+        cycle = self._options.cycles.get(message.name)
+        if cycle is None:
+            return _cycle_ns(message)
+        return 0 if math.isinf(cycle) else round(1e9 * cycle)
 
     def _value(self, source: Source, where: str) -> tuple[int, Scaled]:
         """(index of the value, its signal)."""
@@ -150,3 +159,10 @@ class _Listening:
         if len(inbound.groups) > 1 or inbound.groups[0].selectors:
             raise ConfigError(f"{where}: message {name} is multiplexed; name a signal of the branch that is to count, as {name}.Signal")
         return inbound.groups[0]
+
+
+def _cycle_ns(message: Message) -> int:
+    """Between two frames of a message that is sent in a cycle and at no other time, as far as the DBC says; else 0."""
+    kind = (message.send_type or "cyclic").lower()
+    at_other_times = not kind.startswith("cyclic") or any(word in kind for word in ("active", "and", "spontan", "event", "change", "write"))
+    return 0 if at_other_times or message.is_multiplexed() else round(1e6 * (message.cycle_time or 0))

@@ -16,9 +16,9 @@ from s2r_can.odometry import Odometry
 from s2r_can.reckoning import Reckoning
 from s2r_can.records import BUS_OFF, ERROR, HEADER, PAYLOAD_MAX, REMOTE
 from s2r_can.sequence import RobotClock
-from s2r_runtime.messages import Command, LinkChanged, Observation, OverrideChanged
+from s2r_runtime.messages import Command, LinkChanged, Observation, ObservationRefused, OverrideChanged
 
-Decoded = Observation | Command | LinkChanged | OverrideChanged
+Decoded = Observation | ObservationRefused | Command | LinkChanged | OverrideChanged
 Override = Literal["emergency_stop", "manual_override"]
 
 SECOND_NS = 1_000_000_000
@@ -49,7 +49,7 @@ class Observer:
         self._triggered_ns: int | None = None
         self._said_ns: dict[str, int] = {}
         self._up = False
-        self._anew = False
+        self._anew, self._clean = False, True
         self._commands = layout.commands
         vital = {index for index in (*layout.states, *layout.reckoning.values()) if index is not None}
         self._vital = {group.index for group in layout.groups if vital & set(group.into)}
@@ -87,6 +87,11 @@ class Observer:
         """A frame of a message that is listened to."""
         heard, trigger = self._hearing.frame(message, payload, self._now_ns), self._layout.trigger
         self._reckoning.forget(heard.bad)
+        if heard.twin:
+            said.append(OverrideChanged(self._now_ns, "robot_twin", heard.twin))
+        if heard.refused and self._clean:  # once after each observation: a storm must not fill the log
+            self._clean = False
+            said.append(ObservationRefused(self._now_ns, heard.refused))
         for group in heard.bad:
             self.times[group.index] = None
             if group is trigger and heard.believed:
@@ -181,7 +186,7 @@ class Observer:
         if not self._up:
             said.append(LinkChanged(now_ns, up=True))
             self._up, self.bus_off = True, False
-        self.newest = self._seq, stamp_ns
+        self.newest, self._clean = (self._seq, stamp_ns), True
         said.append(Observation(self._seq, stamp_ns, x))
 
     def _complete(self, now_ns: int) -> bool:

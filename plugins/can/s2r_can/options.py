@@ -22,6 +22,7 @@ OPTIONS: dict[str, str] = {
     "stamp": "signal that holds the robot's own clock; without one the frames' arrival counts",
     "trigger": "message that makes an observation when it comes (default: of the stamp, else of the first state)",
     "timeouts": "message -> s for which what it said is good (default: 1.5 of its cycle in the DBC, else message_timeout)",
+    "cycles": "message -> s between two of its frames, where the DBC says another cycle than is true, or none; inf: it has none",
     "message_timeout": "s for which a message is good whose cycle the DBC doesn't say (default 0.1)",
     "observation_timeout": "s without an observation after which the link counts as lost (default 0.5)",
     "dead_reckoning": "pose from wheel speeds: { left, right, track, wheel_radius } or { speed, yaw_rate } or { speed, heading }; start",
@@ -29,7 +30,19 @@ OPTIONS: dict[str, str] = {
     "forward": "what of the robot's bus the controllers' side hears: all, named (what this profile reads), none (default all)",
     "queue": "frames kept for a runtime that is late; older ones are dropped and counted (default 1024)",
 }
-TABLES = ("robot", "controller", "states", "inputs", "constants", "counters", "checksums", "overrides", "timeouts", "dead_reckoning")
+TABLES = (
+    "robot",
+    "controller",
+    "states",
+    "inputs",
+    "constants",
+    "counters",
+    "checksums",
+    "overrides",
+    "timeouts",
+    "cycles",
+    "dead_reckoning",
+)
 Kind = Literal["emergency_stop", "manual_override"]
 KINDS: tuple[Kind, ...] = ("emergency_stop", "manual_override")
 FORWARD = ("all", "named", "none")
@@ -74,6 +87,7 @@ class Options:
     checksums: dict[str, ChecksumOption] = field(default_factory=dict)
     overrides: dict[Kind, str] = field(default_factory=dict)
     timeouts: dict[str, float] = field(default_factory=dict)
+    cycles: dict[str, float] = field(default_factory=dict)
     dead_reckoning: dict[str, Any] = field(default_factory=dict)
     stamp: str = ""
     trigger: str = ""
@@ -108,6 +122,7 @@ def checked(given: dict[str, Any]) -> Options:
         checksums={name: _checksum(value, f"transport.checksums.{name}") for name, value in given.get("checksums", {}).items()},
         overrides=_overrides(given.get("overrides", {})),
         timeouts={name: _seconds(value, f"transport.timeouts.{name}", endless=True) for name, value in given.get("timeouts", {}).items()},
+        cycles={name: _seconds(value, f"transport.cycles.{name}", endless=True) for name, value in given.get("cycles", {}).items()},
         dead_reckoning=_reckoning(given.get("dead_reckoning", {})),
         stamp=_text(given.get("stamp", ""), "transport.stamp"),
         trigger=_text(given.get("trigger", ""), "transport.trigger"),

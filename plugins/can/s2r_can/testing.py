@@ -200,13 +200,20 @@ class Rig:
         self.options = {**options_of(self.dbc, robot), **more}
         self.transport = CanTransport(self.options, STATES, INPUTS)
         self.robot = Robot(robot, self.dbc)
+        self._twins: list[Robot] = []
+
+    def twin(self) -> Robot:
+        """Another node that sends the same identifiers."""
+        self._twins.append(Robot(self.options["robot"], self.dbc))
+        return self._twins[-1]
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.transport.close()
-        self.robot.close()
+        for robot in (self.robot, *self._twins):
+            robot.close()
 
 
 class VirtualRig(Rig):

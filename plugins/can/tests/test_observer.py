@@ -14,7 +14,7 @@ from s2r_can.testing import CLASSIC, INPUTS, STATES, Robot, options_of
 from s2r_can.transport import CanTransport
 
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
+from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, ObservationRefused, OverrideChanged
 
 MS = 1_000_000
 STATE_SIGNALS = {"x": "Position.X", "y": "Position.Y", "theta": "Heading.Theta"}
@@ -308,3 +308,102 @@ def test_two_multicast_groups_on_one_port_are_refused_because_both_would_hear_bo
     sides = {side: {"interface": "udp_multicast", "channel": f"239.74.163.{n}"} for side, n in (("robot", 1), ("controller", 2))}
     with pytest.raises(ConfigError, match="share a port of udp_multicast"):
         checked({"dbc": "x", **sides})
+
+
+# ---------------------------------------------------------------- two nodes with one identifier, echoes, order
+
+
+def twins(said: list[Any]) -> list[str]:
+    return [m.detail for m in said if isinstance(m, OverrideChanged) and m.kind == "robot_twin"]
+
+
+def refusals(said: list[Any]) -> list[str]:
+    return [m.detail for m in said if isinstance(m, ObservationRefused)]
+
+
+@pytest.mark.parametrize("ahead", [0, 1, 3, 9, 200, 30_000])
+def test_two_robots_on_one_bus_are_noticed_within_a_few_periods(ahead: int) -> None:
+    bench = Bench()
+    for k in range(100):
+        bench.period(k)
+    first = 0
+    for k in range(100, 160):
+        bench.period(k, x=(1.0 + 0.001 * k, 2.0, 0.5))
+        bench.hear(*bench.records(k + ahead, (9.0, 9.0, 0.1)), after_ms=0.1)
+        first = first or (k if twins(bench.messages) else 0)
+    assert 0 < first <= 115
+    assert "its counter goes on in two tracks" in twins(bench.messages)[0]
+
+
+def test_twin_that_lasts_is_said_about_once_a_second() -> None:
+    bench = Bench()
+    for k in range(500):  # five seconds
+        bench.period(k)
+        bench.hear(*bench.records(k + 7, (9.0, 9.0, 0.1)))
+    assert 4 <= len(twins(bench.messages)) <= 2 * 6, "by each of two messages"
+
+
+@pytest.mark.parametrize("silent_ms", [0.0, 2000.0])
+def test_robot_that_starts_anew_is_no_twin(silent_ms: float) -> None:
+    bench = Bench()
+    for k in range(300, 400):
+        bench.period(k)
+    bench.now_ns += round(silent_ms * MS)
+    for k in range(100):
+        bench.period(k)
+    assert not twins(bench.messages)
+
+
+@pytest.mark.parametrize("behind", [1, 3, 7])
+def test_echoes_are_refused_once_an_observation_and_no_twin(behind: int) -> None:
+    bench = Bench()
+    sent: list[list[Record]] = []
+    for k in range(200):
+        sent.append(bench.records(k, (1.0 + 0.001 * k, 2.0, 0.5)))
+        bench.now_ns += 9_000_000
+        bench.hear(*sent[k])
+        if k >= behind:
+            bench.hear(*sent[k - behind])
+    assert not twins(bench.messages)
+    assert len(refusals(bench.messages)) == 200 - behind
+    assert all(text.startswith("Heading") and text.endswith("an echo") for text in refusals(bench.messages))
+
+
+def test_frame_that_comes_late_is_refused_and_no_twin() -> None:
+    bench = Bench()
+    for k in range(40):
+        bench.period(k + (1, -1)[k % 2])
+    assert not twins(bench.messages)
+    assert {text.partition(": ")[2] for text in refusals(bench.messages)} == {"it came late"}
+
+
+CYCLES = {"cycles": {"Position": 0.01}, "counters": {}}
+
+
+def test_identifier_that_comes_twice_in_its_cycle_has_two_senders() -> None:
+    bench = Bench(**CYCLES)
+    for k in range(600):
+        bench.period(k)
+    assert not twins(bench.messages)
+    begun_ns = bench.now_ns
+    while not twins(bench.messages):
+        k += 1
+        bench.period(k)
+        bench.hear(*bench.records(k, (9.0, 9.0, 0.1))[:1])
+    assert bench.now_ns - begun_ns < 2_500 * MS
+    assert "two nodes send Position: it comes every 6" in twins(bench.messages)[0]
+
+
+def test_busy_machine_that_hands_frames_over_in_bursts_is_no_twin() -> None:
+    bench = Bench(**CYCLES)
+    for second in range(20):
+        for k in range(100):
+            if k == 0:
+                bench.now_ns += 250 * MS  # nothing was taken in for a quarter of a second, and then all of it
+            bench.hear(*bench.records(100 * second + k), after_ms=0.01 if k < 25 else 3.33)
+    assert not twins(bench.messages)
+
+
+def test_cycle_is_of_a_message_that_is_there() -> None:
+    with pytest.raises(ConfigError, match=r"transport\.cycles\.Positron"):
+        Bench(cycles={"Positron": 0.01})

@@ -138,14 +138,23 @@ class MavlinkRig:
             **options,
         }
         self.transport = MavlinkTransport(self.options, STATES, INPUTS)
-        self.robot = Robot(line, odometry=odometry)
+        self.robot, self._odometry = Robot(line, odometry=odometry), odometry
+        self._twins: list[Robot] = []
+
+    def twin(self) -> Robot:
+        """Another robot with the same system id: at another address where there are addresses, on the same line elsewhere."""
+        where = self.options["robot"]
+        line = UdpLine("127.0.0.1", int(where.rpartition(":")[2])) if where.startswith("udp:") else self.robot.line
+        self._twins.append(Robot(line, odometry=self._odometry))
+        return self._twins[-1]
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.transport.close()
-        self.robot.line.close()
+        for robot in (*self._twins, self.robot):
+            robot.line.close()
 
 
 # ---------------------------------------------------------------- the stand-in rover, and a loop like the daemon's

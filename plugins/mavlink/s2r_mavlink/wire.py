@@ -124,17 +124,19 @@ class Wire:
         message = MESSAGES.get(number)
         if message is None:
             return []
-        fields = message.unpack(payload(data))
+        content = payload(data)
+        fields = message.unpack(content)
         if number in self._pose_numbers:
             pose = self.pose.take(number, fields)
-            return [] if pose is None else self._observed(pose, frame.arrival_ns)
+            return [] if pose is None else self._observed(pose, content, frame.arrival_ns)
         taker = self._takers.get(number)
         return [] if taker is None else taker(fields, frame)
 
-    def _observed(self, pose: Pose, now_ns: int) -> list[Decoded]:
+    def _observed(self, pose: Pose, content: bytes, now_ns: int) -> list[Decoded]:
+        """A pose. content: the payload of the message that brought it."""
         verdict = self.clock.take(pose.stamp_ns, now_ns)
         if verdict in ("old", "ahead"):
-            return [self._refusal(pose, verdict, now_ns)]
+            return [self._refusal(pose.stamp_ns, content, verdict, now_ns)]
         messages: list[Decoded] = []
         if self._twin or (verdict == "taken" and self._counts.goes_on(now_ns)):
             messages = self._two_robots(now_ns)
@@ -146,13 +148,13 @@ class Wire:
         if verdict == "restarted" or not self.ups:
             self.ups += 1
             messages.append(LinkChanged(now_ns, up=True))
-        self._track.accept(pose.stamp_ns, pose.x)
+        self._track.accept(pose.stamp_ns, content)
         messages.append(self._numbered(pose, self._fault(pose, now_ns)))
         return messages
 
-    def _refusal(self, pose: Pose, verdict: str, now_ns: int) -> ObservationRefused:
+    def _refusal(self, stamp_ns: int, content: bytes, verdict: str, now_ns: int) -> ObservationRefused:
         """A pose with a stamp that is not newer than the newest, or from the future."""
-        kind = self._track.judge(pose.stamp_ns, pose.x) if verdict == "old" else "other"
+        kind = self._track.judge(stamp_ns, content) if verdict == "old" else "other"
         if kind == "other":
             self._counts.other()
         why = {"echo": "an echo of a pose", "late": "a late pose", "other": "a pose with a time since boot that is not the robot's"}[kind]

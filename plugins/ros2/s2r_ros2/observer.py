@@ -172,7 +172,8 @@ class Observer:
         """A pose that is not newer than the newest."""
         kind = self._track.judge(s, x)
         if kind == "echo":
-            return [] if self._repeats else [ObservationRefused(a, "an echo: this pose was heard before")]
+            again = self._repeats and self.clock.newest is not None and s == self.clock.newest[0]
+            return [] if again else [ObservationRefused(a, "an echo: this pose was heard before")]
         if kind == "late" and not self._crowds(s):
             return [ObservationRefused(a, "a late pose: a newer one was heard before")]
         self._counts.other()

@@ -155,11 +155,19 @@ class Ros2Rig:
             **more,
         }
         self.transport = Ros2Transport(self.options, STATES, INPUTS)
-        self.robot = Node(Layout(layout), pose, command, connect=self.endpoint)
+        self._of: tuple[Any, ...] = (Layout(layout), pose, command)
+        self.robot = Node(*self._of, connect=self.endpoint)
+        self._twins: list[Node] = []
+
+    def twin(self) -> Node:
+        """Another robot's node on the same topics, with a session and a publisher of its own."""
+        self._twins.append(Node(*self._of, connect=self.endpoint, gid=GID[::-1]))
+        return self._twins[-1]
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.transport.close()
-        self.robot.close()
+        for node in (self.robot, *self._twins):
+            node.close()

@@ -120,11 +120,18 @@ class ZenohRig:
             "queue": 16,
         }
         self.transport = ZenohTransport(self.options, STATES, INPUTS)
-        self.robot = Robot(self.endpoint, mode)
+        self.robot, self._mode = Robot(self.endpoint, mode), mode
+        self._twins: list[Robot] = []
+
+    def twin(self) -> Robot:
+        """Another robot on the same keys, with a session of its own."""
+        self._twins.append(Robot(self.endpoint, self._mode))
+        return self._twins[-1]
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.transport.close()
-        self.robot.close()
+        for robot in (self.robot, *self._twins):
+            robot.close()
