@@ -17,6 +17,8 @@ from bisect import bisect_left
 from collections import deque
 from typing import Literal
 
+from s2r_runtime.messages import ObservationRefused, OverrideChanged
+
 WITHIN_NS = 5_000_000_000
 """Between two signs of one second robot at most: it reports once a second at the least."""
 AGAIN_NS = 1_000_000_000
@@ -90,3 +92,34 @@ class Track:
         """The robot counts anew."""
         self._kept.clear()
         self._first = True
+
+
+class Numbered:
+    """Both, for robots that number their observations: what `decode` gives besides them.
+
+    >>> robot = Numbered()
+    >>> robot.taken(7, 70, (0.1,), 0), robot.dropped(5, 50, (0.3,), 1)
+    ([], [ObservationRefused(t_ns=1, detail='observation 5 came late')])
+    """
+
+    def __init__(self) -> None:
+        self._track, self._pair = Track(), Pair(signs=2)
+
+    def taken(self, seq: int, stamp_ns: int, x: object, now_ns: int) -> list[OverrideChanged]:
+        """An observation counts; what goes before it."""
+        self._track.accept(seq, x, stamp_ns)
+        twin = self._pair.goes_on(now_ns)
+        return [OverrideChanged(now_ns, "robot_twin", "observations go on in two tracks of numbers and stamps")] if twin else []
+
+    def dropped(self, seq: int, stamp_ns: int, x: object, now_ns: int) -> list[ObservationRefused]:
+        """An observation does not come after the newest, in number or stamp."""
+        kind = self._track.judge(seq, x, stamp_ns)
+        if kind == "other":
+            self._pair.other()
+        why = {"echo": "is an echo", "late": "came late", "other": "is not the robot's, or replayed"}[kind]
+        return [ObservationRefused(now_ns, f"observation {seq} {why}")]
+
+    def forget(self) -> None:
+        """The robot started anew."""
+        self._track.forget()
+        self._pair.forget()

@@ -19,9 +19,10 @@ import pytest
 from s2r_runtime.effects.step_effect import ForceEffect
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import Parameter
-from s2r_runtime.messages import Command, Frame, LinkChanged, Observation
+from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, ObservationRefused, OverrideChanged
 from s2r_runtime.models.forces import Axis, Push
 from s2r_runtime.testing import EffectKit, TransportKit, transport_kit
+from s2r_runtime.twins import Numbered
 
 
 class Loop:
@@ -41,6 +42,7 @@ class Loop:
         self.socket: socket.socket | None = None
         self.numbers = dict.fromkeys(("received", "sent", "dropped_in", "dropped_out", "malformed", "lost"), 0)
         self.last, self.heard_ns, self.up = (-1, -1), 0, None
+        self.others = Numbered()
 
     def open(self) -> None:
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
@@ -76,10 +78,10 @@ class Loop:
             self.numbers["malformed"] += 1
             return [Observation(*self.last, (), fault="malformed")]
         if seq <= self.last[0] or stamp_ns <= self.last[1]:
-            return []
+            return self.others.dropped(seq, stamp_ns, x, frame.arrival_ns)
         self.numbers["lost"] += seq - self.last[0] - 1 if self.last[0] >= 0 else 0
         self.last = (seq, stamp_ns)
-        return [Observation(seq, stamp_ns, x)]
+        return [*self.others.taken(seq, stamp_ns, x, frame.arrival_ns), Observation(seq, stamp_ns, x)]
 
     def poll(self, now_ns: int) -> list[LinkChanged]:
         up = self.last[0] >= 0 and now_ns - self.heard_ns <= self.options["timeout"] * 1e9
@@ -131,6 +133,9 @@ class LoopRig:
         self._socket.close()
         self._folder.cleanup()
 
+    def twin(self) -> Self:
+        return self
+
     def publish(self, seq: int, stamp_ns: int, x: tuple[float, ...]) -> None:
         self.publish_raw(json.dumps([seq, stamp_ns, x]).encode())
 
@@ -163,6 +168,16 @@ class ForgetsTtl(Loop):
 class SwapsNothingButRounds(Loop):
     def decode(self, frame: Frame) -> list[Any]:
         return [Observation(m.seq, m.stamp_ns, tuple(round(v, 3) for v in m.x), m.fault) for m in super().decode(frame)]
+
+
+class DropsSilently(Loop):
+    def decode(self, frame: Frame) -> list[Any]:
+        return [m for m in super().decode(frame) if not isinstance(m, ObservationRefused)]
+
+
+class SeesNoTwin(Loop):
+    def decode(self, frame: Frame) -> list[Any]:
+        return [m for m in super().decode(frame) if not isinstance(m, OverrideChanged)]
 
 
 class LetsNanOut(Loop):
@@ -257,6 +272,8 @@ BROKEN = {
     Dawdles: "test_no_call_waits",
     ForgetsTtl: "test_command_carries_its_time_to_live",
     SwapsNothingButRounds: "test_every_field_of_an_observation_arrives",
+    DropsSilently: "test_echoes_are_refused_and_no_second_robot",
+    SeesNoTwin: "test_two_robots_under_one_name_are_told",
     LetsNanOut: "test_command_that_is_not_finite_is_refused",
     Raises: "test_garbage_becomes_a_fault_or_nothing_and_never_an_exception",
     BelievesNan: "test_numbers_that_are_not_finite_never_come_through",

@@ -20,9 +20,9 @@ REASON = "observation_faults"
 
 
 def note(turn: Turn, observation: Observation) -> None:
-    """Keeps what is wrong with an observation, before the gate looks at it."""
+    """Keeps what is wrong with an observation, before the gate looks at it; but what latched the gate is not forgotten for what follows."""
     if observation.fault:
-        turn.set(fault=observation.fault)
+        _keep(turn, observation.fault)
 
 
 def judge(turn: Turn, observation: Observation, before: Observation | None) -> None:
@@ -45,12 +45,17 @@ def refused(turn: Turn, detail: str) -> None:
 
 def _count(turn: Turn, what: str) -> None:
     settings, state = turn.settings, turn.state
-    turn.set(fault=what)
+    _keep(turn, what)
     if not settings.fault_share or state.faulty or REASON in turn.memory.latched:
         return
     turn.set(faulty=True, fault_level=state.fault_level + 1.0 - settings.fault_share)
     if turn.state.fault_level > settings.fault_burst:
         stop(turn, REASON, f"more than {settings.fault_share:.0%} of the observations are faulty, the last: {what}")
+
+
+def _keep(turn: Turn, what: str) -> None:
+    if not {REASON, "robot_twin"} & set(turn.memory.latched):
+        turn.set(fault=what)
 
 
 def forgive(turn: Turn) -> None:

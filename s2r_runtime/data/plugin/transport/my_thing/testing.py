@@ -44,6 +44,9 @@ class Rig:
         self.transport = MyThingTransport(self.options, self.states, self.inputs)
         self.robot = RobotEnd(self._line, ("127.0.0.1", port))
 
+    def twin(self):
+        return RobotEnd(self._line, ("127.0.0.1", self.options["port"]))  # behind one address, as by a router
+
     def __enter__(self):
         return self
 

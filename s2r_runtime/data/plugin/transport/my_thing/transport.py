@@ -12,6 +12,7 @@ import msgspec
 
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import Frame, LinkChanged, Observation
+from s2r_runtime.twins import Numbered
 
 SO_RXQ_OVFL = 40  # Linux, socket(7): each datagram says how many were dropped before it, because the queue was full
 LOST_NS = 500_000_000  # without an observation for so long, the link is down
@@ -24,7 +25,7 @@ class MyThingTransport:
         if wrong := set(options) ^ set(self.OPTIONS):
             raise ConfigError(f"transport.{min(wrong)}: the options of my_thing are {', '.join(self.OPTIONS)}, no more and no less")
         self._here, self._robot = ("", options["port"]), (options["robot_host"], options["robot_port"])
-        self._nx, self._nu = len(states), len(inputs)
+        self._nx, self._nu, self._others = len(states), len(inputs), Numbered()  # others: a second robot under this one's name
         self._socket = self._up = self._newest = self._answer = None
         self._last, self._decoded_ns, self._heard_ns = (-1, -1), 0, 0  # of the newest observation: seq and stamp, arrivals
         self._counts = dict.fromkeys(("received", "sent", "dropped_in", "dropped_out", "malformed", "lost"), 0)
@@ -67,12 +68,12 @@ class MyThingTransport:
             self._counts["malformed"] += 1
             return []
         if frame.arrival_ns - self._decoded_ns > LOST_NS:
-            self._last = (-1, -1)  # it was silent: it may have been started anew, and counts from 0
+            self._last, self._others = (-1, -1), Numbered()  # it was silent: it may have been started anew, and counts from 0
         if o.seq <= self._last[0] or o.stamp_ns <= self._last[1]:
-            return []  # late, or a repeated one
+            return self._others.dropped(o.seq, o.stamp_ns, o.x, frame.arrival_ns)  # late, an echo, or another's
         self._counts["lost"] += o.seq - self._last[0] - 1 if self._last[0] >= 0 else 0
         self._last, self._decoded_ns = (o.seq, o.stamp_ns), frame.arrival_ns
-        return [Observation(o.seq, o.stamp_ns, o.x)]
+        return [*self._others.taken(o.seq, o.stamp_ns, o.x, frame.arrival_ns), Observation(o.seq, o.stamp_ns, o.x)]
 
     def poll(self, now_ns):
         silent = now_ns - self._heard_ns > LOST_NS
@@ -96,5 +97,4 @@ class MyThingTransport:
         return dict(self._counts)
 
     def close(self):
-        if self._socket is not None:
-            self._socket = self._socket.close()
+        self._socket = self._socket and self._socket.close()
