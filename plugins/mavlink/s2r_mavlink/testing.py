@@ -29,7 +29,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from s2r_mavlink.rover import Rover, parser
 from s2r_mavlink.rover_lines import Line, TcpServerLine, UdpLine, line_of, pseudo_terminal
 from s2r_mavlink.transport import MavlinkTransport
-from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, OverrideChanged
+from s2r_runtime.messages import Command, Frame, LinkChanged, Observation, ObservationRefused, OverrideChanged
 
 STATES, INPUTS = ("x", "y", "theta"), ("v", "w")
 GUIDED, HOLD = 15, 4
@@ -239,7 +239,7 @@ class Runtime:
         self.options = {"robot": robot, **options}
         self.transport = MavlinkTransport(self.options, STATES, INPUTS)
         self.frames: list[Frame] = []
-        self.messages: list[Observation | Command | LinkChanged | OverrideChanged] = []
+        self.messages: list[Observation | ObservationRefused | Command | LinkChanged | OverrideChanged] = []
         self.lines: list[str] = []
         self.command: tuple[float, float] | None = None
         self.source: Any = "sampler"

@@ -162,8 +162,8 @@ class Wire:
             return [self._unusable(frame, f"malformed observation: {error}")]
         self.lost += payload.seq - last.seq - 1
         self._accept(payload, frame)
-        twin = self._counts.goes_on(frame.arrival_ns)
-        told = [_twin(frame.arrival_ns, "observations go on in two tracks of seq and stamp_ns")] if twin else []
+        two = self._counts.goes_on(frame.arrival_ns)
+        told = [_twin(frame.arrival_ns, "observations go on in two tracks of seq and stamp_ns")] if two else []
         return [*told, self._numbered(payload, x)]
 
     def _replaced(self, last: ObservationPayload, payload: ObservationPayload, now_ns: int) -> list[Decoded]:
