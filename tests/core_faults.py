@@ -24,6 +24,7 @@ from hostile import spoiled
 from s2r_runtime import gate
 from s2r_runtime.messages import (
     AnalyticsChanged,
+    AnswerLate,
     CampaignFinished,
     CertificateFailed,
     CertificatesDistrusted,
@@ -128,7 +129,9 @@ def next_event(world: World, rng: random.Random) -> Event:
         CertificateFailed(t, "no key", world.requests),
         LinkChanged(t, True),
         RecorderChanged(t, True),
+        RecorderChanged(t, False, late=True),
         AnalyticsChanged(t, True),
+        AnswerLate(t, world.seq),
     ]
     return rng.choice(found)
 

@@ -151,6 +151,9 @@ class Law:
                 self.revoked |= {facts.id for facts in self.stored if facts.id in event.reasons}
             case m.Proposed():
                 self._proposed(event.command, outputs)
+            case m.AnswerLate():
+                asked = self.asked
+                self.refused = asked is not None and (asked.source, asked.obs_seq) == ("controller", event.obs_seq)
             case m.Requested():
                 self._requested(event)
             case _:

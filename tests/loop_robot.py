@@ -51,11 +51,13 @@ def sabotage(sabotage: str, value: float = 0.0) -> None:
         time.time = lambda: wall() / 1e9 + value
     elif sabotage == "slow disk":
         os.fsync = os.fdatasync = lambda number: (time.sleep(value), CLOCKS["fsync"](number))[1]  # type: ignore[func-returns-value]
+    elif sabotage == "slow write":
+        os.pwrite = lambda *given: (time.sleep(value), CLOCKS["pwrite"](*given))[1]
     elif sabotage == "hang":
         time.sleep(value)
 
 
-CLOCKS = {"monotonic": time.monotonic_ns, "wall": time.time_ns, "fsync": os.fsync}
+CLOCKS = {"monotonic": time.monotonic_ns, "wall": time.time_ns, "fsync": os.fsync, "pwrite": os.pwrite}
 
 
 class LoopTransport:

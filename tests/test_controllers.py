@@ -22,7 +22,7 @@ import pytest
 from s2r_runtime.controllers import confined_process
 from s2r_runtime.controllers.code import batch_control
 from s2r_runtime.controllers.episodes import Episodes
-from s2r_runtime.controllers.hosted import ControllerFile, HostedController, Ready, Reply, Stopped, load
+from s2r_runtime.controllers.hosted import ControllerFile, HostedController, Late, Ready, Reply, Stopped, load
 from s2r_runtime.messages import Observation
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
@@ -62,14 +62,24 @@ def loaded(folder: Path, body: str, head: str = "") -> ControllerFile:
 class Hosted:
     """A hosted controller and a loop like the daemon's."""
 
-    def __init__(self, file: ControllerFile, task: TaskChoice | None = None, start_timeout_s: float = 60.0) -> None:
+    def __init__(
+        self, file: ControllerFile, task: TaskChoice | None = None, start_timeout_s: float = 60.0, patience_s: float = 0.0
+    ) -> None:
         self.host = HostedController(
-            file, model=MODEL, nx=3, nu=2, task=task, seed=7, memory_bytes=1 << 28, start_timeout_s=start_timeout_s
+            file,
+            model=MODEL,
+            nx=3,
+            nu=2,
+            task=task,
+            seed=7,
+            memory_bytes=1 << 28,
+            start_timeout_s=start_timeout_s,
+            patience_s=patience_s,
         )
         self.host.start()
         self.seq = 0
 
-    def next(self) -> Ready | Reply | Stopped:
+    def next(self) -> Ready | Reply | Late | Stopped:
         """The next event, however long it takes: the deadlines are the controller's."""
         while True:
             due = self.host.deadline_ns
@@ -79,16 +89,16 @@ class Hosted:
                 assert len(events) == 1
                 return events[0]
 
-    def ask(self, x: tuple[float, ...] = (0.5, 0.25, 0.0), deadline_ns: int = PATIENT_NS) -> Ready | Reply | Stopped:
+    def ask(self, x: tuple[float, ...] = (0.5, 0.25, 0.0), deadline_ns: int = PATIENT_NS) -> Ready | Reply | Late | Stopped:
         self.seq += 1
         self.host.ask(Observation(self.seq, 0, x), time.monotonic_ns() + deadline_ns)
         return self.next()
 
 
 @contextlib.contextmanager
-def hosted(file: ControllerFile, task: TaskChoice | None = None) -> Iterator[Hosted]:
+def hosted(file: ControllerFile, task: TaskChoice | None = None, patience_s: float = 0.0) -> Iterator[Hosted]:
     """Started and ready."""
-    it = Hosted(file, task)
+    it = Hosted(file, task, patience_s=patience_s)
     try:
         ready = it.next()
         assert isinstance(ready, Ready), ready
@@ -173,6 +183,72 @@ def test_a_controller_that_hangs_is_stopped_at_its_deadline(tmp_path: Path) -> N
         stopped = it.ask((2.0, 0.0, 0.0), deadline_ns=100_000_000)
         assert stopped == Stopped("deadline", "did not answer observation 2 within 100 ms")
         assert is_gone(it.host.pid)
+
+
+def test_a_controller_that_waits_for_a_processor_is_late_and_not_at_fault(tmp_path: Path) -> None:
+    """Nine processes want one processor, each with a ninth of it: 40 ms of work take 0.36 s."""
+    file = loaded(
+        tmp_path,
+        """
+        begun = time.thread_time()
+        while time.thread_time() < begun + 0.04:
+            pass
+        return np.zeros((len(x), 2))
+        """,
+        "import time",
+    )
+    program = "import os\nos.sched_setaffinity(0, {0})\nwhile True: pass"
+    with hosted(file, patience_s=60.0) as it:
+        hogs = [subprocess.Popen([sys.executable, "-c", program], start_new_session=True) for _ in range(8)]
+        try:
+            os.sched_setaffinity(it.host.pid, {0})
+            while not all(int(Path(f"/proc/{hog.pid}/schedstat").read_text().split()[0]) > 50_000_000 for hog in hogs):
+                time.sleep(0.02)
+            found = it.ask(deadline_ns=100_000_000)
+            assert isinstance(found, Late)
+            assert found.obs_seq == 1
+            assert "had the processor for" in found.detail
+            reply = it.next()
+            assert isinstance(reply, Reply)
+            assert (reply.obs_seq, reply.late) == (1, True)
+        finally:
+            for hog in hogs:
+                hog.kill()
+                hog.wait()
+        reply = it.ask()
+        assert isinstance(reply, Reply)
+        assert not reply.late
+
+
+def test_a_controller_that_sleeps_or_is_stopped_is_at_fault_whatever_the_computer_does(tmp_path: Path) -> None:
+    file = loaded(tmp_path, "time.sleep(5.0)\nreturn np.zeros((len(x), 2))", "import time")
+    for stop in (False, True):
+        with hosted(file, patience_s=60.0) as it:
+            if stop:
+                os.kill(it.host.pid, signal.SIGSTOP)
+            found = it.ask(deadline_ns=100_000_000)
+            while isinstance(found, Late):  # it had to wait before it could begin to sleep
+                found = it.next()
+            assert isinstance(found, Stopped)
+            assert found.reason == "deadline"
+
+
+def test_time_in_which_the_asker_stood_still_is_not_held_against_the_controller(tmp_path: Path) -> None:
+    with hosted(loaded(tmp_path, "return np.zeros((len(x), 2))"), patience_s=60.0) as it:
+        os.kill(it.host.pid, signal.SIGSTOP)
+        asked_ns = time.monotonic_ns()
+        it.host.ask(Observation(1, 0, (0.5, 0.25, 0.0)), asked_ns + 500_000_000)
+        time.sleep(0.6)
+        it.host.forgive(time.monotonic_ns() - asked_ns)
+        (late,) = it.host.poll(time.monotonic_ns())
+        assert isinstance(late, Late)
+        assert "the daemon stood still for" in late.detail
+        it.host.ask(Observation(2, 0, (0.5, 0.25, 0.0)), time.monotonic_ns() + 1_000_000)
+        os.kill(it.host.pid, signal.SIGCONT)
+        found = [it.next()]
+        while not isinstance(found[-1], Reply):
+            found.append(it.next())
+        assert (found[-1].obs_seq, found[-1].late) == (1, True)
 
 
 def test_an_answer_that_is_there_counts_also_when_the_daemon_looks_late(tmp_path: Path) -> None:

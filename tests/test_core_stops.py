@@ -13,6 +13,7 @@ from s2r_runtime.core import reducer as core
 from s2r_runtime.messages import (
     AnalyticsChanged,
     Answer,
+    AnswerLate,
     Ask,
     GateChanged,
     LinkChanged,
@@ -134,6 +135,36 @@ def test_what_the_drive_needs_closes_the_gate_when_it_goes_and_opens_it_when_it_
     assert sources(rig.observe()) == ["recovery"]
     rig.feed(msgspec.structs.replace(up, t_ns=rig.t))
     assert reopen(rig) == 3
+
+
+def test_an_answer_that_is_late_for_the_computers_reasons_closes_the_gate_and_latches_nothing() -> None:
+    rig = Rig()
+    rig.driving()
+    rig.observe()
+    asked = rig.state.asked
+    assert asked is not None
+    assert rig.feed(AnswerLate(rig.t, asked.obs_seq - 1)) == []
+    outputs = rig.feed(AnswerLate(rig.t, asked.obs_seq, "the daemon stood still for 80 ms"))
+    assert kinds(outputs) == ["GateChanged", "Send"]
+    assert (one(outputs, GateChanged).reason, one(outputs, GateChanged).detail) == ("command_stale", "the daemon stood still for 80 ms")
+    assert (sources(outputs), rig.state.memory.latched) == (["recovery"], ())
+    assert kinds(rig.propose()) == ["Decided"], "the answer answers nothing any more"
+    assert rig.state.deployment is not None
+    assert reopen(rig) == 4, "the hysteresis begins with the next observation"
+
+
+@pytest.mark.parametrize(("late", "goes_on"), [(True, True), (False, False)])
+def test_a_campaign_waits_for_a_slow_disk_and_ends_for_a_log_that_failed(late: bool, goes_on: bool) -> None:
+    rig = Rig()
+    rig.sampling()
+    rig.observe()
+    rig.feed(RecorderChanged(rig.t, False, "nothing reached the disk", late))
+    assert (rig.state.campaign is not None) == goes_on
+    if goes_on:
+        outputs = rig.propose(source="sampler")
+        assert sources(outputs) == ["recovery"], "nothing moves meanwhile"
+        rig.feed(RecorderChanged(rig.t, False, "a sync of the log failed"))
+        assert rig.state.campaign is None
 
 
 def test_a_link_that_goes_while_settling_still_answers_the_open_question() -> None:

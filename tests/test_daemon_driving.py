@@ -131,7 +131,15 @@ def test_killed_controller_is_replaced_by_the_recovery_command(rig: Rig) -> None
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP], ids=["dead", "frozen"])
-def test_nobody_drives_unwatched(rig: Rig, how: signal.Signals) -> None:
+def test_nobody_drives_unwatched(tmp_path: Path, how: signal.Signals) -> None:
+    rig = Rig(tmp_path, more="[machine]\nprocess_timeout = 3.0")
+    try:
+        _nobody_drives_unwatched(rig, how)
+    finally:
+        rig.close()
+
+
+def _nobody_drives_unwatched(rig: Rig, how: signal.Signals) -> None:
     driving(rig)
     pid = rig.status()["pids"]["analytics"]
     os.kill(pid, how)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from test_worker import gap, profile, step
 
 from s2r_runtime.daemon.analytics import Watching
-from s2r_runtime.daemon.awake import LOOK_S, AwakeClock
+from s2r_runtime.daemon.awake import TURN_S, AwakeClock
 from s2r_runtime.daemon.workshop import Watcher
 from s2r_runtime.messages import AnalyticsChanged, Event, Measured
 
@@ -79,7 +79,7 @@ def test_a_pause_of_the_daemon_is_not_held_against_analytics() -> None:
         awake.look()
         watcher.tick(host_ns)
         assert happened == []
-        assert awake.stood_still_ns == 3_600_000_000_000 - round(LOOK_S * 1e9)
+        assert awake.stood_still_ns == 3_600_000_000_000 - round(TURN_S * 1e9)
         for _ in range(6):  # from here on the daemon is awake, and analytics is not
             host_ns += 100_000_000
             awake.look()

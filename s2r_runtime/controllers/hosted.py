@@ -7,6 +7,9 @@
 The child is not trusted. It gets the bytes that were digested, one question at a time, and a deadline for each; whatever else
 than an answer in time comes from it (an error, a malformed line, an answer to nothing, silence, its end) is a
 `Stopped` with the reason, and its whole process group is killed. What it can't do meanwhile stands in `confinement`.
+
+An answer that is late for a reason of the computer's is no fault of the controller: it waited for a processor, or the daemon stood
+still. Then `Late` comes at the deadline, and the answer when it is there, marked as late. `patience_s` bounds that.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from s2r_runtime.controllers.confined_process import ConfinedProcess
 from s2r_runtime.controllers.episodes import Episode
 from s2r_runtime.controllers.file import ControllerFile, Identity, load
 from s2r_runtime.controllers.hosting import Chosen, Ended, Loaded, Message, Package, Question, Up
+from s2r_runtime.controllers.processor import Used, used
 from s2r_runtime.errors import ControllerError, one_line
 from s2r_runtime.messages import Observation
 from s2r_runtime.modelspec import ModelSpec
@@ -49,13 +53,21 @@ class Ready(NamedTuple):
 
 
 class Reply(NamedTuple):
-    """What it wants to do, u (nu,), finite. `latency_ns`: from `ask` until it was read. The rest is the child's word only."""
+    """What it wants to do, u (nu,), finite. `latency_ns`: from `ask` until it was read. `late`: after a `Late`. The rest is its word."""
 
     obs_seq: int
     u: tuple[float, ...]
     episode: Episode | None
     ended: Episode | None
     latency_ns: int
+    late: bool = False
+
+
+class Late(NamedTuple):
+    """It did not answer in time, and could not. detail: why."""
+
+    obs_seq: int
+    detail: str
 
 
 class Stopped(NamedTuple):
@@ -67,12 +79,29 @@ class Stopped(NamedTuple):
 
 
 class _Asked(NamedTuple):
+    """used: what the process had had of the processor when it was asked. forgiven_ns: for how long the daemon has stood still since."""
+
     question: Question
     deadline_ns: int
     asked_ns: int
+    used: Used | None = None
+    forgiven_ns: int = 0
+    late: bool = False
 
 
 _DECODER = msgspec.json.Decoder(Message)
+
+
+def _excuse(pid: int, asked: _Asked, passed_ns: int, allowed_ns: int) -> str:
+    """Why it is not the controller's fault that it has not answered yet; empty if it is. passed_ns: while the daemon was awake."""
+    if passed_ns <= allowed_ns:
+        return f"the daemon stood still for {asked.forgiven_ns / 1e6:.0f} ms"
+    before, now = asked.used, used(pid)
+    if before is None or now is None:
+        return ""
+    ran_ns, waited_ns = now.ran_ns - before.ran_ns, now.waited_ns - before.waited_ns
+    spent_ns = ran_ns if now.ready else passed_ns - waited_ns
+    return f"its process had the processor for {ran_ns / 1e6:.0f} ms of these" if spent_ns <= allowed_ns else ""
 
 
 def batch_control(file: ControllerFile, nu: int | None = None) -> Control:
@@ -96,10 +125,12 @@ class HostedController:
         seed: int,
         memory_bytes: int = MEMORY_BYTES,
         start_timeout_s: float = START_TIMEOUT_S,
+        patience_s: float = 0.0,
     ) -> None:
+        """patience_s: how long an answer may take in all where the computer is to blame; 0: its deadline, whoever is to blame."""
         self.file, self._nx, self._nu = file, nx, nu
         self._package = Package(file, model, nu, task, seed, memory_bytes)
-        self._start_timeout_ns = round(start_timeout_s * 1e9)
+        self._start_timeout_ns, self._patience_ns = round(start_timeout_s * 1e9), round(patience_s * 1e9)
         self._start_deadline_ns = 0
         self._process: ConfinedProcess | None = None
         self._running = False
@@ -141,7 +172,8 @@ class HostedController:
             return None
         if not self._ready:
             return self._start_deadline_ns
-        return self._asked.deadline_ns if self._asked is not None else None
+        awaited = self._awaited()
+        return None if awaited is None else self._due_ns(awaited)
 
     def ask(self, observation: Observation, deadline_ns: int) -> None:
         """Asks what to do about an observation; the answer must be there by then (host's monotonic clock).
@@ -161,15 +193,15 @@ class HostedController:
         else:
             self._put(asked)
 
-    def postpone(self, time_ns: int) -> None:
-        """Every deadline that runs now is that much later."""
+    def forgive(self, time_ns: int) -> None:
+        """For so long whoever asks stood still: it is not held against the controller."""
         self._start_deadline_ns += time_ns
         if self._asked is not None:
-            self._asked = self._asked._replace(deadline_ns=self._asked.deadline_ns + time_ns)
+            self._asked = self._asked._replace(forgiven_ns=self._asked.forgiven_ns + time_ns)
         if self._waiting is not None:
-            self._waiting = self._waiting._replace(deadline_ns=self._waiting.deadline_ns + time_ns)
+            self._waiting = self._waiting._replace(forgiven_ns=self._waiting.forgiven_ns + time_ns)
 
-    def poll(self, now_ns: int) -> list[Ready | Reply | Stopped]:
+    def poll(self, now_ns: int) -> list[Ready | Reply | Late | Stopped]:
         """What happened since the last call. Call it when `fileno` is readable, at `deadline_ns`, and every 20 ms anyway.
 
         An answer that is there counts, also if this call comes after its deadline: the daemon was late then, and the gate
@@ -180,7 +212,7 @@ class HostedController:
         if not self._running:
             self._process.reap()
             return []
-        found: list[Ready | Reply | Stopped] = []
+        found: list[Ready | Reply | Late | Stopped] = []
         lines, open_ = self._process.receive()
         for line in lines:
             if (event := self._take(line)) is not None:
@@ -188,8 +220,8 @@ class HostedController:
             if isinstance(event, Stopped):
                 break
         else:
-            stopped = self._silence(now_ns) if open_ else self._fault("died", self._process.ending())
-            found += [stopped] if stopped is not None else []
+            silent = self._silence(now_ns) if open_ else self._fault("died", self._process.ending())
+            found += [silent] if silent is not None else []
         if found and isinstance(found[-1], Stopped):
             self.stop()
         return found
@@ -212,7 +244,7 @@ class HostedController:
         return self._process
 
     def _put(self, asked: _Asked) -> None:
-        self._asked, self._waiting = asked, None
+        self._asked, self._waiting = asked._replace(used=used(self.pid) if self._patience_ns else None), None
         self._there().send(msgspec.json.encode(asked.question))
 
     def _take(self, line: bytes) -> Ready | Reply | Stopped | None:
@@ -240,15 +272,34 @@ class HostedController:
         self._asked = None
         if self._waiting is not None:
             self._put(self._waiting)
-        return Reply(message.obs_seq, message.u, message.episode, message.ended, latency_ns)
+        return Reply(message.obs_seq, message.u, message.episode, message.ended, latency_ns, asked.late)
 
-    def _silence(self, now_ns: int) -> Stopped | None:
+    def _silence(self, now_ns: int) -> Stopped | Late | None:
         if not self._ready and now_ns > self._start_deadline_ns:
             return self._fault("deadline", f"was not ready after {self._start_timeout_ns / 1e9:g} s")
-        if self._asked is not None and now_ns > self._asked.deadline_ns:
-            allowed_ms = (self._asked.deadline_ns - self._asked.asked_ns) / 1e6
-            return self._fault("deadline", f"did not answer observation {self._asked.question.obs_seq} within {allowed_ms:.0f} ms")
-        return None
+        asked = self._asked
+        if asked is None or now_ns <= self._due_ns(asked):
+            return None
+        allowed_ns, seq = asked.deadline_ns - asked.asked_ns, asked.question.obs_seq
+        passed_ns = now_ns - asked.asked_ns - asked.forgiven_ns
+        excuse = _excuse(self.pid, asked, passed_ns, allowed_ns) if self._patience_ns > max(passed_ns, allowed_ns) else ""
+        if not excuse:
+            return self._fault("deadline", f"did not answer observation {seq} within {allowed_ns / 1e6:.0f} ms")
+        if not asked.late:
+            self._asked = asked._replace(late=True)
+        elif (waiting := self._waiting) is not None and now_ns > waiting.deadline_ns:
+            self._waiting, seq = None, waiting.question.obs_seq
+        else:
+            return None
+        return Late(seq, f"no answer to observation {seq} within {allowed_ns / 1e6:.0f} ms: {excuse}")
+
+    def _awaited(self) -> _Asked | None:
+        """The question whose deadline comes next."""
+        return self._waiting if self._asked is not None and self._asked.late else self._asked
+
+    def _due_ns(self, asked: _Asked) -> int:
+        """When it is late. Who has no patience to lend waits for as long as it stood still itself."""
+        return asked.deadline_ns + (0 if self._patience_ns else asked.forgiven_ns)
 
     def _fault(self, reason: Reason, detail: str, ended: Episode | None = None) -> Stopped:
         """Before it was ready every reason is a failed start."""

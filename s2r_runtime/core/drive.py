@@ -16,7 +16,7 @@ from typing import Literal
 
 from s2r_runtime import gate, goto
 from s2r_runtime.core.state import Asked, Turn, situation
-from s2r_runtime.messages import Ask, Command, Decided, GateChanged, Observation, Send, Source
+from s2r_runtime.messages import AnswerLate, Ask, Command, Decided, GateChanged, Observation, Send, Source
 
 RETURNED_WITHIN_M = 0.05
 """`return` stops this near to home: the go-to law is exponential, it would never arrive."""
@@ -296,6 +296,18 @@ def proposed(turn: Turn, command: Command) -> None:
     else:
         turn.set(sampler_seq=command.seq)
     _send(turn, source, tuple(float(value) for value in command.u), asked.obs_seq, min(command.ttl_ns, turn.settings.command_ttl_ns))
+
+
+def answer_late(turn: Turn, event: AnswerLate) -> None:
+    """The controller could not answer in time for a reason of the computer's: the gate closes as for a stale command, and nothing latches
+    that the profile does not list. The answer, when it comes, answers nothing any more.
+    """
+    asked = turn.state.asked
+    if asked is None or asked.source != "controller" or asked.obs_seq != event.obs_seq:
+        return
+    close(turn, "command_stale", event.detail)
+    if turn.state.asked is not None:
+        recover_now(turn)
 
 
 def _decided(turn: Turn, command: Command, verdict: gate.Verdict) -> None:

@@ -7,9 +7,9 @@ the logged events from `initial()` gives the logged outputs, byte for byte; that
 
 What the daemon owes the core. Outputs take effect in their order, and before the next event is handled. `Persist` and
 `GateChanged(open=True)` are durable before the outputs after them take effect: opening, counters and certificates are on disk
-before they matter, while closing acts first and is logged next. Every `Ask` is answered by a `Proposed`, or by the
-`SourceStopped` of that source. A `Send` of the recovery command while a campaign runs means that another input than the
-campaign's acted: the campaign must be told. Everything that happens comes as an event, in the order in which it is logged.
+before they matter, while closing acts first and is logged next. Every `Ask` is answered by a `Proposed`, by the `SourceStopped` of that
+source, or by an `AnswerLate`. A `Send` of the recovery command while a campaign runs means that another input than the campaign's acted:
+the campaign must be told. Everything that happens comes as an event, in the order in which it is logged.
 
 The parts: `state`, `drive` (instants, sends, the gate opening and closing), `faults` (of observations, counted), `sources` (who may
 command), `gaps` (campaigns, gap, watch), `excitation` (given inputs), `repair` (traces, proposed models), `certificates` (attempts,
@@ -29,6 +29,7 @@ from s2r_runtime.messages import (
     MEMORY_SCHEMA,
     AnalyticsChanged,
     Answer,
+    AnswerLate,
     CampaignFinished,
     CertificateFailed,
     CertificatesDistrusted,
@@ -127,6 +128,8 @@ def _dispatch(turn: Turn, event: Event) -> None:
             faults.judge(turn, event.observation, before)
         case Proposed():
             drive.proposed(turn, event.command)
+        case AnswerLate():
+            drive.answer_late(turn, event)
         case Ticked():
             _ticked(turn)
         case Measured():
@@ -155,7 +158,7 @@ def _noted(turn: Turn, event: Event) -> None:
         case WallClockRead():
             turn.set(unix_s=event.unix_s, unix_ns=event.t_ns)
         case RecorderChanged():
-            turn.set(recorder_ok=event.ok)
+            turn.set(recorder_ok=event.ok, recorder_late=event.late and not event.ok)
         case AnalyticsChanged():
             turn.set(analytics_up=event.up)
         case SampleTaken():

@@ -79,9 +79,13 @@ def interrupt_campaign(turn: Turn, reason: str, *, tell: bool = True, exit_code:
 
 def check_campaign(turn: Turn) -> None:
     """Interrupts the campaign where the sampler may not drive any more."""
-    if turn.state.campaign is None:
+    campaign = turn.state.campaign
+    if campaign is None:
         return
     refusal = gate.standing(turn.settings, situation(turn.state), "sampler", turn.now)
+    waits = turn.state.recorder_late and not campaign.inputs  # given inputs with a hole in them are others
+    if refusal is not None and refusal.reason == "recorder_down" and waits:
+        return
     if refusal is not None and (refusal.reason in INTERRUPTS or refusal.reason.startswith("latched:")):
         interrupt_campaign(turn, refusal.reason)
 

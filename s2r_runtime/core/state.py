@@ -113,6 +113,8 @@ class State(Struct, frozen=True):
     unix_ns: int = 0
     link_up: bool = False
     recorder_ok: bool = True
+    recorder_late: bool = False
+    """It is not ok for one reason only: the disk is slow."""
     analytics_up: bool = True
     observation: Observation | None = None
     observation_ns: int = 0

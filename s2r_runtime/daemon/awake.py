@@ -12,6 +12,8 @@ from collections.abc import Callable
 
 LOOK_S = 0.1
 """Five ticks of the loop: a busy machine delays most ticks by less, and a pause of the process counts for one look."""
+TURN_S = 0.02
+"""A turn of the loop takes no longer, or the loop was late with it."""
 
 
 class AwakeClock:
@@ -21,15 +23,14 @@ class AwakeClock:
         self._clock = clock
         self._looked_ns = self._now_ns = clock()
         self.stood_still_ns = 0
-        """Time that does not count, in all."""
+        """For how long turns of the loop were late, in all."""
 
     def look(self) -> None:
         """Time goes on up to now, by LOOK_S at most."""
         at_ns = self._clock()
         passed_ns = max(0, at_ns - self._looked_ns)
-        counted_ns = min(passed_ns, round(LOOK_S * 1e9))
-        self._now_ns += counted_ns
-        self.stood_still_ns += passed_ns - counted_ns
+        self._now_ns += min(passed_ns, round(LOOK_S * 1e9))
+        self.stood_still_ns += max(0, passed_ns - round(TURN_S * 1e9))
         self._looked_ns = at_ns
 
     def now_ns(self) -> int:

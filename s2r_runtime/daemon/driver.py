@@ -8,11 +8,11 @@ from collections.abc import Callable
 
 from s2r_runtime.controllers.episodes import Episode
 from s2r_runtime.controllers.file import ControllerFile
-from s2r_runtime.controllers.hosted import HostedController, Ready, Reply, Stopped
+from s2r_runtime.controllers.hosted import HostedController, Late, Ready, Reply, Stopped
 from s2r_runtime.daemon.awake import AwakeClock
 from s2r_runtime.daemon.settings import controller_deadline_s
 from s2r_runtime.errors import ControllerError
-from s2r_runtime.messages import Command, EpisodeEnded, Event, Observation, Proposed, Settings, SourceStarted, SourceStopped
+from s2r_runtime.messages import AnswerLate, Command, EpisodeEnded, Event, Observation, Proposed, Settings, SourceStarted, SourceStopped
 from s2r_runtime.profile import Profile
 
 
@@ -35,6 +35,7 @@ class Driver:
         self._host: HostedController | None = None
         self._awake, self._stood_still_ns = awake, 0
         self._deadline_ns = round(1e9 * controller_deadline_s(profile))
+        self._patience_s = 0.0 if profile.clock == "lockstep" else profile.machine.process_timeout
         self.latency_ns = 0
         self._contained: tuple[str, ...] = ()
 
@@ -71,6 +72,7 @@ class Driver:
             task=self._profile.task,
             seed=seed,
             start_timeout_s=self._profile.machine.start_timeout,
+            patience_s=self._patience_s,
         )
         try:
             host.start()
@@ -105,8 +107,12 @@ class Driver:
             if isinstance(message, Reply):
                 self.latency_ns = message.latency_ns
                 self._episode(t_ns, message.ended)
+                if message.late:
+                    continue  # its question is void
                 ttl_ns = self._settings().command_ttl_ns
                 self._emit(Proposed(t_ns, Command(self._next_seq(), t_ns, "controller", message.u, message.obs_seq, ttl_ns)))
+            elif isinstance(message, Late):
+                self._emit(AnswerLate(t_ns, message.obs_seq, message.detail))
             elif isinstance(message, Stopped):
                 self._episode(t_ns, message.ended)
                 self._end(SourceStopped(t_ns, "controller", message.reason, message.detail))
@@ -127,7 +133,7 @@ class Driver:
         """While the daemon stood still the controller may have, too: such time is not its fault. How old its answer is, the gate sees."""
         paused_ns, self._stood_still_ns = self._awake.stood_still_ns - self._stood_still_ns, self._awake.stood_still_ns
         if paused_ns and self._host is not None:
-            self._host.postpone(paused_ns)
+            self._host.forgive(paused_ns)
 
     def _end(self, event: SourceStopped) -> None:
         self.stop()

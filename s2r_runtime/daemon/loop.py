@@ -123,7 +123,7 @@ class Daemon:
         self._draining = False
         self._last_ns = 0
         self._numbers = 0
-        self._recorder_ok = True
+        self._recorder_ok, self._log_late = True, False
         self._next_tick_ns = 0
         self._round, self._wall_clock, self._new_log, self._prune = map(Every, (ROUND_NS, WALL_CLOCK_NS, NEW_LOG_NS, PRUNE_NS))
         self._heads = Heads(self.say)
@@ -423,9 +423,10 @@ class Daemon:
     def _look_at_log(self, now_ns: int) -> None:
         """Says when the log fails or works again; begins a new one, and with it a new run, when the old one is at its end."""
         health = self.logbook.health()
-        ok = health.ok and not self.actions.unsaved and not self.trust.trouble
-        if ok != self._recorder_ok:
-            self.log_changed(ok, health.detail or self.actions.unsaved or self.trust.trouble)
+        other = self.actions.unsaved or self.trust.trouble
+        ok, late = health.ok and not other, health.late and not other
+        if (ok, late) != (self._recorder_ok, self._log_late):
+            self.log_changed(ok, other or health.detail, late=late)
         if self.logbook.faulty and self._new_log.due(now_ns) and self.logbook.prepare():
             self._run_anew()
 
@@ -438,7 +439,7 @@ class Daemon:
         self.link = link_of(self.profile, self.facts, self._record_frame, self.guard)
         self.logbook.switch()
         self.say(f"a new log begins: {self.logbook.paths[-1]}")
-        self.memory, self._recorder_ok, self.observation = self.state.memory, True, None
+        self.memory, self._recorder_ok, self._log_late, self.observation = self.state.memory, True, False, None
         self._begin_run()
         self._open_link()
 
@@ -455,11 +456,11 @@ class Daemon:
         for gone in () if self.retention is None else self.retention.deleted():
             self.logbook.put(msgspec.structs.replace(gone, t_ns=self._last_ns), self._last_ns)
 
-    def log_changed(self, ok: bool, detail: str) -> None:
-        """The recorder failed, or works again."""
-        self._recorder_ok = ok
+    def log_changed(self, ok: bool, detail: str, *, late: bool = False) -> None:
+        """The recorder failed, or works again. late: it only waits for the disk."""
+        self._recorder_ok, self._log_late = ok, late
         self.say("log and state can be relied on again" if ok else f"log or state cannot be relied on: {detail}")
-        self.feed_first(RecorderChanged(0, ok, detail))
+        self.feed_first(RecorderChanged(0, ok, detail, late))
 
     def _end_sources(self, why: str) -> None:
         self.feed(*self.sampler.stop(0, why), *self.excitation.stop(0, why))

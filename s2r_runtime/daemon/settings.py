@@ -83,6 +83,8 @@ def settings_of(profile: Profile, model: ModelSpec, facts: ModelFacts, seed: int
     )
 
 
+TICK_S = 0.02
+"""Of the daemon's loop."""
 LOCKSTEP_DISK_S = 30.0
 """There nothing moves while the disk is waited for. Four times the slowest sync that was seen on a busy disk (7.1 s)."""
 
@@ -94,9 +96,14 @@ def disk_timeout_s(profile: Profile) -> float:
 
 
 def controller_deadline_s(profile: Profile) -> float:
-    """How long a controller may take for an answer, s. In lockstep the robot waits for it, so only one that hangs is ended."""
-    set_s = profile.gate.controller_deadline
-    return max(set_s, profile.machine.process_timeout) if profile.clock == "lockstep" else set_s
+    """How long a controller may take for an answer, s. In lockstep the robot waits for it, so only one that hangs is ended.
+
+    In real time the core gives an answer up after `gate.command_ttl`, whoever is to blame; the daemon, which knows, comes a tick before.
+    """
+    set_s, ttl_s = profile.gate.controller_deadline, profile.gate.command_ttl
+    if profile.clock == "lockstep":
+        return max(set_s, profile.machine.process_timeout)
+    return min(set_s, max(ttl_s - TICK_S, 0.5 * ttl_s))
 
 
 def campaign_digest(profile: Profile) -> str:

@@ -12,6 +12,7 @@ Everybody imports from here: `from s2r_runtime.messages import Observation`. The
 
 from s2r_runtime.messages.events import (
     AnalyticsChanged,
+    AnswerLate,
     CampaignFinished,
     CertificateFailed,
     CertificatesDistrusted,
@@ -91,7 +92,7 @@ from s2r_runtime.messages.results import (
 )
 
 __all__ = [
-    "MEMORY_SCHEMA", "SERIAL", "Action", "AlarmRaised", "AnalyticsChanged", "Answer", "Ask", "AttemptEnded", "AttemptSpent",
+    "MEMORY_SCHEMA", "SERIAL", "Action", "AlarmRaised", "AnalyticsChanged", "Answer", "AnswerLate", "Ask", "AttemptEnded", "AttemptSpent",
     "CampaignFinished", "CertificateFacts", "CertificateFailed", "CertificateInstalled", "CertificateStored", "CertificatesDistrusted",
     "ChangeNoticed", "Command", "Decided", "EpisodeEnded", "EpochChanged", "Event", "Frame", "Gap", "GateChanged", "InputsFinished",
     "IssueCertificate", "JobFinished", "LawResult", "LinkChanged", "LogHead", "Measured", "Memory", "ModelAdopted", "Observation",

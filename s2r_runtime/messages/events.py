@@ -54,11 +54,15 @@ class LinkChanged(Struct, frozen=True, tag="link_changed"):
 
 
 class RecorderChanged(Struct, frozen=True, tag="recorder_changed"):
-    """The recorder failed (disk full, thread dead) or works again."""
+    """The recorder failed (disk full, thread dead) or works again.
+
+    late: nothing is lost, but more of the log waits for the disk than may be lost in a crash. A campaign waits until it is written.
+    """
 
     t_ns: int
     ok: bool
     detail: str = ""
+    late: bool = False
 
 
 class AnalyticsChanged(Struct, frozen=True, tag="analytics_changed"):
@@ -130,6 +134,16 @@ class SourceStopped(Struct, frozen=True, tag="source_stopped"):
     t_ns: int
     source: Source
     reason: Literal["finished", "raised", "died", "deadline", "malformed", "stopped", "start_failed"]
+    detail: str = ""
+
+
+class AnswerLate(Struct, frozen=True, tag="answer_late"):
+    """The controller's answer is not there at its deadline, for a reason of the computer's: the daemon stood still, or the controller's
+    process waits for a processor. The question is void; the controller is not at fault.
+    """
+
+    t_ns: int
+    obs_seq: int
     detail: str = ""
 
 
@@ -250,5 +264,5 @@ class Requested(Struct, frozen=True, tag="requested"):
 Event = (
     Started | Observed | Proposed | Ticked | WallClockRead | LinkChanged | RecorderChanged | AnalyticsChanged | OverrideChanged | Measured
     | EpisodeEnded | SourceStarted | SourceStopped | SampleTaken | CampaignFinished | InputsFinished | JobFinished | CertificateStored
-    | CertificateFailed | CertificatesDistrusted | Requested | Stopping | ObservationRefused
+    | CertificateFailed | CertificatesDistrusted | Requested | Stopping | ObservationRefused | AnswerLate
 )  # fmt: skip

@@ -34,13 +34,16 @@ REST_S = 1.0
 
 
 class Health(NamedTuple):
-    """`ok` iff every message so far is in the file or about to be. `unrecorded`: how many never will."""
+    """`ok` iff every message so far is in the file or about to be. `unrecorded`: how many never will. `late`: it is not ok only because
+    the disk is slow.
+    """
 
     ok: bool
     detail: str
     unrecorded: int
     pending_bytes: int
     recorded: int
+    late: bool = False
 
 
 class Recorder:
@@ -122,9 +125,10 @@ class Recorder:
         detail = self._fault or self._trouble or self._sync_trouble
         if not detail and not self._thread.is_alive() and not self._ending:
             detail = "the recorder's thread is dead"
+        slow = False
         if not detail and pending and (late := self._clock() - self._written_awake_s) > self._max_delay_s:
-            detail = f"nothing reached the disk for {late:.1f} s (recording.max_delay is {self._max_delay_s:g} s)"
-        return Health(not detail, detail, self._unrecorded, pending, self._writer.recorded)
+            slow, detail = True, f"nothing reached the disk for {late:.1f} s (recording.max_delay is {self._max_delay_s:g} s)"
+        return Health(not detail, detail, self._unrecorded, pending, self._writer.recorded, slow)
 
     @property
     def delay_s(self) -> float:
