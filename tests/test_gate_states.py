@@ -19,7 +19,7 @@ from core_world import World
 from gate_law import DOCUMENT
 
 from s2r_runtime.core.state import VERIFYING, certificate, job, unix_now
-from s2r_runtime.messages import RecorderChanged, Stopping, WallClockRead
+from s2r_runtime.messages import AnswerLate, RecorderChanged, Stopping, WallClockRead
 
 
 def _clear(world: World) -> None:
@@ -54,6 +54,7 @@ EVENTS: dict[str, Letter] = {
     )
 }
 EVENTS |= {
+    "answer late": lambda world: world.feed(AnswerLate(world.t, world.state.asked.obs_seq if world.state.asked else 0)),
     "recorder up": lambda world: world.feed(RecorderChanged(world.t, ok=True)),
     "wall clock right": lambda world: world.feed(WallClockRead(world.t, 1500)),
     "clear": _clear,
