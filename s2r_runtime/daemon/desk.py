@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 PLAIN = ("undeploy", "revoke", "clear", "stop", "permit", "sample", "cancel", "trace", "verify")
 """Verbs that the core can have as they are."""
 MOVING = ("sample", "deploy", "excite")
-SETTLE_WITHIN_NS = 2_000_000_000
+SETTLE_WITHIN_NS = 5_000_000_000
+"""Three times the longest that a busy computer let a robot's or a link's process wait."""
 LOAD_TIMEOUT_S = 30.0
 INPUTS_TIMEOUT_S = 120.0
 """The model is rolled out over them, one step after the other: 0.1 ms a row."""
@@ -108,8 +109,9 @@ class Desk:
         return number
 
     def _put(self) -> None:
-        """Hands requests to the core, in order. In lockstep one that makes the robot move waits until it stands, which takes
-        milliseconds: when it was typed would otherwise decide at which of the robot's periods its story begins.
+        """Hands requests to the core, in order. One that makes the robot move waits until it is heard, where a busy computer lost it for a
+        moment. In lockstep it waits until the robot stands, which takes milliseconds: when it was typed would otherwise decide at which of
+        the robot's periods its story begins.
         """
         while self._postponed:
             request, limit_ns = self._postponed[0]
@@ -119,10 +121,12 @@ class Desk:
             self._d.feed(request)
 
     def _settling(self) -> bool:
-        """Lockstep, nothing drives, and the robot still gets its recovery commands."""
+        """Nothing drives, and a robot that was there is not heard at this moment; or, in lockstep, it still gets its recovery commands."""
         state = self._d.state
-        idle = state.campaign is None and state.deployment is None
-        return self._d.clock.lockstep and idle and state.link_up and state.observation is not None and state.answered
+        if state.campaign is not None or state.deployment is not None:
+            return False
+        heard = state.link_up and state.observation is not None
+        return state.answered if heard and self._d.clock.lockstep else not heard and self._d.observation is not None
 
     def answered(self, answer: Answer) -> None:
         """The core's answer goes to whoever asked."""

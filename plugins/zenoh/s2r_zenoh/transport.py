@@ -157,7 +157,8 @@ class ZenohTransport:
 
         A robot in lockstep repeats its observation until it is answered. Repeats are not frames: where the answer was given, it is
         sent once more, so a lost command costs a tenth of a second and nothing else. What it repeats though it is behind what came
-        before is a frame each time: without a boot number only that tells, after a while, of a robot that started anew.
+        before is a frame each time: without a boot number only that tells, after a while, of a robot that started anew. What it repeats
+        after the link was lost is a frame as well: what was observed before is forgotten then.
         """
         self._bell.answer()
         frames = []
@@ -165,7 +166,7 @@ class ZenohTransport:
             self._heard_ns = arrival_ns
             if not self._newest:
                 self._up = True  # `decode` says so, before anybody acts on the first observation
-            if data == self._newest and data != self._wire.too_old:
+            if data == self._newest and data != self._wire.too_old and self._up is not False:
                 self._repeated += 1
                 self._send_again()
                 continue

@@ -211,8 +211,11 @@ class Wire:
         return Observation(payload.seq + self._seq_offset, payload.stamp_ns + self._stamp_offset, x)
 
     def _restart(self, payload: ObservationPayload, frame: Frame) -> list[Decoded]:
-        """The robot began to count anew: go on above its old numbers, with a hole that nobody takes for one period."""
+        """The robot began to count anew, or repeats itself after a silence: go on above its old numbers, with a hole that nobody takes for
+        one period.
+        """
         assert self._last is not None  # noqa: S101 - a restart follows something
+        why = "the robot was silent, and waits where it was" if payload == self._last else "the robot started anew"
         seq = self._last.seq + self._seq_offset + 2
         stamp = self._last.stamp_ns + self._stamp_offset + RESTART_GAP_NS
         self._seq_offset, self._stamp_offset = seq - payload.seq, stamp - payload.stamp_ns
@@ -220,7 +223,7 @@ class Wire:
         self._counts.forget()
         self._accept(payload, frame)
         t_ns = frame.arrival_ns
-        return [LinkChanged(t_ns, up=False, detail="the robot started anew"), LinkChanged(t_ns, up=True)]
+        return [LinkChanged(t_ns, up=False, detail=why), LinkChanged(t_ns, up=True)]
 
     # ------------------------------------------------------------------ what others send
 

@@ -195,6 +195,29 @@ def test_robot_that_is_not_answered_waits_and_the_link_stays_up() -> None:
         assert runtime.transport.counters()["repeated"] > 3
 
 
+def test_robot_that_waits_in_lockstep_is_observed_again_after_the_link_was_lost() -> None:
+    """It repeats what it said before the silence: without that observation nobody could ever command it again."""
+    with ZenohRig() as rig:
+        rig.transport.open()
+        runtime = Runtime(robot_listen=free_endpoint())
+        runtime.transport = rig.transport
+        runtime.answering = False
+        end = time.monotonic() + PATIENCE_S
+        while not runtime.observations and time.monotonic() < end:
+            rig.robot.publish(1, 33_000_000, (0.0, 0.0, 0.0))
+            runtime.turn()
+        while runtime.ups[-1:] != [False] and time.monotonic() < end:
+            runtime.turn()
+        seen = len(runtime.observations)
+        while (runtime.ups[-1:] != [True] or len(runtime.observations) == seen) and time.monotonic() < end:
+            rig.robot.publish(1, 33_000_000, (0.0, 0.0, 0.0))
+            runtime.turn()
+        assert runtime.ups[:2] == [True, False]
+        (again,) = runtime.observations[seen:]
+        assert (again.x, again.fault) == ((0.0, 0.0, 0.0), "")
+        assert rising(runtime.observations)
+
+
 def test_endpoint_that_is_taken_is_one_clear_line() -> None:
     endpoint = free_endpoint()
     with session("peer", listen=endpoint), pytest.raises(ConfigError, match=f"robot_listen '{endpoint}'"):

@@ -111,6 +111,19 @@ def test_repeat_is_nothing_new_and_an_older_one_is_dropped() -> None:
     assert w.lost == 2
 
 
+def test_a_robot_that_waited_through_a_silence_is_observed_again_above_its_old_number() -> None:
+    w = wire()
+    seen(w, observation(7), arrival_ns=5)
+    assert w.decode(frame(observation(7), arrival_ns=6)) == []
+    down, up, again = w.decode(frame(observation(7), arrival_ns=5 + 2 * SECOND))
+    assert isinstance(down, LinkChanged)
+    assert isinstance(up, LinkChanged)
+    assert (down.up, down.detail, up.up) == (False, "the robot was silent, and waits where it was", True)
+    assert isinstance(again, Observation)
+    assert again.seq > 7
+    assert again.x == (0.1, 0.2)
+
+
 def test_same_seq_with_other_content_and_a_stamp_that_does_not_rise_are_faults() -> None:
     w = wire()
     seen(w, observation(7))
