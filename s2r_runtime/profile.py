@@ -112,7 +112,7 @@ class VerificationSettings(_Table, frozen=True):
     required: tuple[Literal["uniform", "persistent", "adversarial"], ...] = ("uniform", "persistent")
     """Those of them that must pass."""
     timeout: float = 60.0
-    """s; a controller that is not done by then has not passed."""
+    """s; a controller that is not done by then has not passed. Time in which it waits for a processor does not count."""
 
 
 TaskLaw = float | str | list[float] | dict[str, list[float]]
@@ -241,7 +241,7 @@ class Repair(_Table, frozen=True):
     rows: int = 40_000
     """Observations that are traced at most, the newest."""
     timeout: float = 600.0
-    """s; then a trace is ended, and the log says so."""
+    """s; then a trace is ended, and the log says so. Time in which it waits for a processor does not count."""
     adopt: Literal["ask", "always"] = "ask"
     """`ask`: a person adopts it (`s2r adopt`); `always`: it is in force as soon as nothing drives."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import platform
 import shutil
@@ -19,9 +20,14 @@ import msgspec
 
 from s2r_runtime.cli import output
 from s2r_runtime.errors import S2RError
+from s2r_runtime.profile import Gate, Machine, Recording, load_profile
 
 MINIMUM_FREE_BYTES = 1_000_000_000
 """A day of a 100 Hz log is about 2 GB; below half of that a robot should not start a mission."""
+
+
+IDLE_S, LOADED_S = 2.0, 10.0
+"""For how long the computer is tried. Waits of a second come some times in ten of a busy one."""
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -34,6 +40,15 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     check.set_defaults(run=profile_check)
 
     doctor = verbs.add_parser("doctor", help="what is missing on this machine, and what to do about it")
+    doctor.add_argument(
+        "--load", action="store_true", help="try the computer beside as many busy loops as it has processors, for 10 s; else idle, for 2 s"
+    )
+    doctor.add_argument(
+        "--profile",
+        type=Path,
+        metavar="PROFILE",
+        help="the robot's profile whose times are to be held (default: those of a profile's defaults)",
+    )
     doctor.add_argument("--json", action="store_true", help="print one JSON object")
     doctor.set_defaults(run=doctor_run)
 
@@ -73,7 +88,7 @@ class Finding(NamedTuple):
 
 def doctor_run(args: argparse.Namespace) -> int:
     """Exit 0 if nothing that is needed is missing, else 1."""
-    findings = list(_findings())
+    findings = [*_findings(), *_computer(args.profile, loaded=args.load)]
     if args.json:
         output.result_json({"ok": all(f.ok is not False for f in findings), "findings": [f._asdict() for f in findings]})
     else:
@@ -189,6 +204,37 @@ def _confinement() -> Finding:
         return Finding("confinement", True, "controllers can compute, import and answer, and nothing else")
     mend = "docs/threat-model.md says what that leaves open; reading takes Landlock, Linux 5.13 or newer"
     return Finding("confinement", None, f"this kernel does not contain a controller's {', '.join(lacking)}", mend)
+
+
+@contextlib.contextmanager
+def _busy(loops: int) -> Iterator[None]:
+    """So many processes that compute without end beside."""
+    busy = [subprocess.Popen([sys.executable, "-S", "-c", "while True: pass"]) for _ in range(loops)]
+    try:
+        yield
+    finally:
+        for one in busy:
+            one.kill()
+            one.wait()
+
+
+def _computer(path: Path | None, *, loaded: bool) -> Iterator[Finding]:
+    """Whether this computer holds the times of the profile: a finding for each that it doesn't."""
+    from s2r_runtime.daemon import computer, control
+
+    profile = load_profile(path) if path is not None else None
+    folder = next(one for one in (control.state_root(), *control.state_root().parents) if one.is_dir())
+    with _busy(os.cpu_count() or 1 if loaded else 0):
+        ability = computer.measure(folder, LOADED_S if loaded else IDLE_S)
+    how = f"beside {os.cpu_count() or 1} busy loops" if loaded else "as it is now"
+    yield Finding("computer", True, f"{how}, it {ability}")
+    gate, recording, machine, clock = (
+        (profile.gate, profile.recording, profile.machine, profile.clock)
+        if profile is not None
+        else (Gate(), Recording(), Machine(), "realtime")
+    )
+    for line in computer.not_held(ability, gate, recording, machine, realtime=clock != "lockstep"):
+        yield Finding("computer", None, line)
 
 
 def _governor() -> Finding:

@@ -13,6 +13,7 @@ import contextlib
 import gc
 import selectors
 import sys
+import threading
 import time
 import traceback
 from collections import deque
@@ -26,7 +27,7 @@ from s2r_runtime import keys
 from s2r_runtime.child import Child
 from s2r_runtime.core import reducer as core
 from s2r_runtime.core.state import State
-from s2r_runtime.daemon import control, issuing, past
+from s2r_runtime.daemon import computer, control, issuing, past
 from s2r_runtime.daemon.actions import Actions
 from s2r_runtime.daemon.awake import LOOK_S, AwakeClock
 from s2r_runtime.daemon.desk import Desk
@@ -76,6 +77,8 @@ from s2r_runtime.profile import Profile
 TICK_NS = 20_000_000
 ROUND_NS = 100_000_000
 WALL_CLOCK_NS = 1_000_000_000
+MEASURED_S = 1.0
+"""For so long the computer is tried at the start: some 150 wake-ups and seven syncs."""
 PRUNE_NS = 60_000_000_000
 """Between two looks whether old logs are to be deleted."""
 NEW_LOG_NS = 1_000_000_000
@@ -173,8 +176,17 @@ class Daemon:
         if self.memory.gap is not None:
             self.sampler.recall(self.memory.gap.epoch)
         self._begin_run()
+        threading.Thread(target=self._say_what_is_not_held, name="computer", daemon=True).start()
         self.notifier.ready("waiting for the robot")
         self.say(f"robot {self.profile.robot.name!r}: log {self.logbook.paths[-1]}, state {self.folder.path}")
+
+    def _say_what_is_not_held(self) -> None:
+        """In a thread of its own: what this computer cannot hold of the profile, as it is at the start."""
+        ability = computer.measure(self._log_dir, MEASURED_S)
+        gate, recording, machine = self.profile.gate, self.profile.recording, self.profile.machine
+        lacking = computer.not_held(ability, gate, recording, machine, realtime=not self.clock.lockstep)
+        for line in lacking or [f"it {ability}: it holds the profile's times"]:
+            self.say(f"this computer: {line}")
 
     def _open_state(self, stack: ExitStack) -> list[SampleTaken]:
         """Memory, key, trust, and the model in force. Returns the samples of an unfinished campaign that were logged."""

@@ -21,6 +21,7 @@ from s2r_runtime.controllers.file import ControllerFile
 from s2r_runtime.daemon.given_inputs import GivenInputs
 from s2r_runtime.errors import S2RError
 from s2r_runtime.messages import Gap, SampleTaken, Stretch, Verification
+from s2r_runtime.processor import family, used
 from s2r_runtime.profile import Profile
 from s2r_runtime.recording.stretches import Cut
 
@@ -137,7 +138,10 @@ _DECODE_UP = msgspec.json.Decoder(Upward).decode
 
 
 class Worker:
-    """The daemon's end. `poll` gives progress and, last, a Result or Failed: always one of them, whatever happens to the process."""
+    """The daemon's end. `poll` gives progress and, last, a Result or Failed: always one of them, whatever happens to the process.
+
+    timeout_s: of its time. What it waits for a processor is not, as far as the kernel counts it, nor what it is paused for.
+    """
 
     def __init__(self, job: Job, timeout_s: float) -> None:
         self._child = Child("s2r_runtime.daemon.worker")
@@ -145,6 +149,7 @@ class Worker:
         setting = {VerifyJob: " (verification.timeout)", TraceJob: " (repair.timeout)"}.get(type(job), "")
         self._overdue = f"not done within {timeout_s:g} s{setting}"
         self._paused_ns: int | None = None
+        self._waited: dict[int, int] = {}
         self._child.send(_ENCODE(job))
 
     @property
@@ -170,8 +175,19 @@ class Worker:
         if not self._child.alive():
             came.append(Failed(f"the worker died: {self._child.ending()}"))
         elif self._paused_ns is None and now_ns > self._deadline_ns:
-            came.append(Failed(self._overdue))
+            self._deadline_ns += self._kept_waiting_ns()
+            if now_ns > self._deadline_ns:
+                came.append(Failed(self._overdue))
         return came
+
+    def _kept_waiting_ns(self) -> int:
+        """For how long it, or the controller's process that it waits for, has waited for a processor since the last call."""
+        more = 0
+        for pid in family(self._child.pid):
+            if (found := used(pid)) is not None:
+                more += found.waited_ns - self._waited.get(pid, 0)
+                self._waited[pid] = found.waited_ns
+        return more
 
     def pause(self, now_ns: int) -> None:
         """Others go first: the process stands still, and its time with it. May be called twice."""

@@ -16,6 +16,17 @@ class Used(NamedTuple):
     ready: bool
 
 
+def family(pid: int) -> list[int]:
+    """The process and its descendants, as far as the kernel names them."""
+    found = [pid]
+    for parent in found:
+        try:
+            found += map(int, Path(f"/proc/{parent}/task/{parent}/children").read_text(encoding="ascii").split())
+        except (OSError, ValueError):
+            continue
+    return found
+
+
 def used(pid: int) -> Used | None:
     """None where the kernel does not say (no /proc, no schedstat), or the process is gone."""
     folder = Path(f"/proc/{pid}")
