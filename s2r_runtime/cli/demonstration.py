@@ -25,7 +25,8 @@ from s2r_runtime.messages import SERIAL
 from s2r_runtime.plugins import registry
 from s2r_runtime.whiteness import SERIAL_ALPHA
 
-START_S, STOP_S, CAMPAIGN_S = 20.0, 20.0, 900.0
+START_S, STOP_S, CAMPAIGN_S = 90.0, 60.0, 900.0
+"""A process that ended is noticed at once; one that loads its libraries on a busy computer is waited for."""
 DRIVES = 8
 """So often the controller is let drive, at most: mostly the radius has grown meanwhile, so that it soon fails."""
 

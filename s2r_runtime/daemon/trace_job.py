@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from s2r_runtime.trace.dataset import Dataset
     from s2r_runtime.trace.result import TraceResult
 
-WRITTEN_WITHIN_S = 10.0
-"""The recorder hands over what it has every 50 ms; a disk that takes nothing for this long is full."""
+WRITTEN_WITHIN_S = 45.0
+"""The recorder hands over what it has every 50 ms; a disk that takes nothing for this long is full. Nobody waits but this process."""
 NICE = 10
 VOLATILE = ("model_path", "cpu_s")
 """What a result says that does not follow from the log."""
