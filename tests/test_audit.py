@@ -17,6 +17,7 @@ from audit_bench import KEY, OTHER, PUBLIC, Bench, entries
 
 from s2r_runtime import messages as m
 from s2r_runtime.audit.log import AuditResult, audit
+from s2r_runtime.cli.main import main
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, RecordingError
 from s2r_runtime.recording import writer as writer_module
 from s2r_runtime.recording.channels import CHANNELS, FRAME_IN, FRAME_OUT, NUMBERS, LogDeleted
@@ -89,10 +90,28 @@ def test_parts_of_a_rotated_log_are_audited_as_one_in_any_order(run: Any, tmp_pa
     assert result.ok, result.text()
     without = audit([parts[-1], *parts[:-2]])
     assert not without.ok
-    assert "a part of the run is missing" in without.unchecked[0]
+    assert without.only_incomplete
+    assert without.incomplete[0].startswith("part 2 of run ")
+    assert without.text().startswith("INCOMPLETE INPUT: ")
     later = audit(parts[:-1])
     assert not later.ok
-    assert "without the parts before it" in later.unchecked[0]
+    assert later.only_incomplete
+    assert later.incomplete[0].startswith("part 1 of run ")
+    (alone,) = audit(parts[:1]).incomplete
+    assert alone.startswith(f"parts {', '.join(map(str, range(1, len(parts))))} of run ")
+    assert alone.endswith(f"({parts[0].name} is part {len(parts)})")
+    assert main(["audit", str(parts[0])]) == 3
+    head = bytes.fromhex(read_head(parts[-1]))
+    asked = audit(parts[:1], heads=[head])
+    assert asked.only_incomplete
+    assert "the part that has the published head" in asked.incomplete[1]
+    damaged = bytearray(parts[0].read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    parts[0].write_bytes(damaged)
+    assert not audit(parts[:1]).only_incomplete  # what is there must hold all the same
+    assert main(["audit", str(parts[0])]) == 1
+    damaged[len(damaged) // 2] ^= 1
+    parts[0].write_bytes(damaged)
     sooner = audit(parts[1:])
     assert sooner.ok
     assert sooner.missing[0] == f"what came after {parts[1].name}: it goes on in part {len(parts)}, which was not given"

@@ -14,12 +14,16 @@ from s2r_runtime.recording.reading import Reading
 
 def continues(before: Reading | None, reading: Reading, findings: Findings) -> bool:
     """Whether a part goes on where the one before ended."""
+    after = 0 if before is None else before.part
+    if reading.part > after + 1:
+        which = ", ".join(map(str, range(after + 1, reading.part)))
+        several = "parts" if reading.part > after + 2 else "part"
+        findings.incomplete_input(f"{several} {which} of run {reading.run} ({reading.path.name} is part {reading.part})")
+        return False
     if before is None:
-        if reading.part > 1:
-            findings.cannot(f"{reading.path.name} is part {reading.part} of its run; without the parts before it nothing can be recomputed")
-        return reading.part <= 1
-    if reading.part != before.part + 1 or reading.public_key != before.public_key:
-        findings.cannot(f"between {before.path.name} and {reading.path.name} a part of the run is missing")
+        return True
+    if reading.public_key != before.public_key:
+        findings.cannot(f"{reading.path.name} is of another key than {before.path.name}, the part before it")
         return False
     if reading.previous_head != before.head or reading.first_index != before.ending.index:
         findings.differ(reading.first_index, "log/chain", "this part does not continue the one before", reading.previous_head, before.head)
@@ -50,6 +54,9 @@ def anchored(readings: Sequence[Reading], heads: Sequence[bytes], findings: Find
     for head in heads:
         if head not in met:
             findings.file = last.path.name
+            if findings.incomplete:
+                findings.incomplete_input(f"the part that has the published head {head.hex()}, if any has it")
+                continue
             what = "the log does not come to a head that was published: its tail was cut off, or it is another log"
             findings.differ(last.ending.index, "log/chain", what, last.head.hex(), head.hex())
         else:

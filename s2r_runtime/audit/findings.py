@@ -52,6 +52,7 @@ class Findings:
         self.differences = 0
         self.counts: dict[str, int] = {}
         self.unchecked: dict[str, None] = {}
+        self.incomplete: dict[str, None] = {}
         self.missing: list[str] = []
         self.skipped: dict[str, None] = {}
         self.models: list[ModelFinding] = []
@@ -70,6 +71,10 @@ class Findings:
     def cannot(self, what: str) -> None:
         """Something that is there could not be recomputed here: no pass."""
         self.unchecked[what] = None
+
+    def incomplete_input(self, what: str) -> None:
+        """Parts of a run were not given, so that what is there could not be recomputed: neither passed nor failed."""
+        self.incomplete[what] = None
 
     def skip(self, what: str) -> None:
         """Something could be recomputed here, but nobody asked for so much: neither passed nor failed."""
@@ -90,6 +95,7 @@ class Findings:
         for one in other.missing:
             self.lack(one)
         self.unchecked |= other.unchecked
+        self.incomplete |= other.incomplete
 
     def _place(self, one: Difference) -> tuple[int, int]:
         return self.files.index(one.file) if one.file in self.files else -1, one.index

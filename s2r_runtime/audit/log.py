@@ -49,8 +49,10 @@ class AuditResult(msgspec.Struct, frozen=True):
     """What an audit says (docs/json.md).
 
     `ok`: everything that is there was recomputed and holds. `chain`: intact, broken or unsigned tail. `recomputed`: how many of what.
-    `unchecked`: what could not be recomputed here, and why: then it is not ok. `skipped`: what was not, because it takes long: neither
-    passed nor failed. `models`: those that were put in force. `signed_by`: the key, and whether it is one that was asked for.
+    `unchecked`: what could not be recomputed here, and why: then it is not ok. `incomplete`: parts that were not given, without which the
+    rest can't be recomputed: then it is not ok either, and `only_incomplete` if that is all. `skipped`: what was not recomputed, because it
+    takes long: neither passed nor failed. `models`: those that were put in force. `signed_by`: the key, and whether it is one that was asked
+    for.
     `head`: of the chain, to compare with what the daemon printed.
     """
 
@@ -68,6 +70,8 @@ class AuditResult(msgspec.Struct, frozen=True):
     files: list[str]
     skipped: list[str] = []
     models: list[ModelFinding] = []
+    incomplete: list[str] = []
+    only_incomplete: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Plain data."""
@@ -76,12 +80,14 @@ class AuditResult(msgspec.Struct, frozen=True):
 
     def text(self) -> str:
         """For people."""
-        lines = [f"{'holds' if self.ok else 'DOES NOT HOLD'}: {self.records} records in {', '.join(self.files)}"]
+        answer = "holds" if self.ok else "INCOMPLETE INPUT" if self.only_incomplete else "DOES NOT HOLD"
+        lines = [f"{answer}: {self.records} records in {', '.join(self.files)}"]
         lines.append(f"chain        {self.chain}; {self.signed_by}; head {self.head}")
         if self.first_difference is not None:
             d = self.first_difference
             lines.append(f"differs      {self.differences} times, first at record {d.index} ({d.channel}) of {d.file}: {d.what}")
             lines += [f"  recorded   {d.recorded}", f"  recomputed {d.recomputed}"]
+        lines += [f"not given    {one}; give all parts of the run" for one in self.incomplete]
         lines += [f"missing      {one}" for one in self.missing]
         lines += [f"unchecked    {one}" for one in self.unchecked]
         lines += [f"skipped      {one}" for one in self.skipped]
@@ -137,8 +143,9 @@ def audit(
     signed_by, trusted_all = _signers(readings, public_key, revoked or {})
     chain = _chain(readings)
     valid = all(one.valid for one in findings.certificates.values())
+    good = findings.first is None and not findings.unchecked and chain != "broken" and trusted_all and valid
     return AuditResult(
-        ok=findings.first is None and not findings.unchecked and chain != "broken" and trusted_all and valid,
+        ok=good and not findings.incomplete,
         records=records,
         certificates=list(findings.certificates.values()),
         first_difference=findings.first,
@@ -152,6 +159,8 @@ def audit(
         files=[reading.path.name for reading in readings],
         skipped=list(findings.skipped),
         models=list(findings.models),
+        incomplete=list(findings.incomplete),
+        only_incomplete=good and bool(findings.incomplete),
     )
 
 

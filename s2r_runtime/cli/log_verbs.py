@@ -7,7 +7,7 @@ from pathlib import Path
 
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import apart, writable
-from s2r_runtime.errors import UsageError
+from s2r_runtime.errors import NotEnoughEvidence, UsageError
 
 HEAD_BYTES = 32
 
@@ -58,7 +58,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def run_audit(args: argparse.Namespace) -> int:
-    """Exit 0 if all that is there holds, 1 if something does not."""
+    """Exit 0 if all that is there holds, 1 if something does not, 3 if nothing fails but parts that are needed were not given."""
     from s2r_runtime import keys, revocations
     from s2r_runtime.audit.log import audit
 
@@ -80,6 +80,8 @@ def run_audit(args: argparse.Namespace) -> int:
         output.result_json(result.to_json())
     else:
         output.out(result.text())
+    if result.only_incomplete:
+        return NotEnoughEvidence.exit_code
     return 0 if result.ok else 1
 
 

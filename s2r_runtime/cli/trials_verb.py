@@ -73,7 +73,8 @@ def trials_of(
         bar.close()
     if not result.ok:
         first = result.first_difference
-        what = first.what if first is not None else "; ".join(result.unchecked) or f"the chain is {result.chain}"
+        lacks = [*(f"{one} was not given" for one in result.incomplete), *result.unchecked]
+        what = first.what if first is not None else "; ".join(lacks) or f"the chain is {result.chain}"
         raise ConfigError(f"{', '.join(map(str, logs))}: does not hold, so no trials are taken from it: {what} (s2r audit says more)")
     task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
     digests = {"controller_digest": controller.digest, "model_digest": model.spec.digest()}
