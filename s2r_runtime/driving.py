@@ -30,6 +30,10 @@ MOST_STEPS = 100.0
 """Of the model from row to row: more says that a unit of time is wrong, and the grid of them all would fill the memory."""
 SILENCE_S = 60.0
 """After so long without any row the drive begins anew, at rest."""
+WARM_UP_S = 3.0
+"""Of driving, after which what was commanded before a cut does not act any more: longer than delays and time constants of motors."""
+REASONS = ("", "state_gap", "no_input", "cut", "outside")
+"""Why a step is left out; empty: it is not."""
 DOUBT = "the transitions are of ordinary driving, one follows the other, and were not drawn independently"
 
 
@@ -66,19 +70,29 @@ def state_at(streams: Streams, column: int, when: Array, angle: bool, tolerance:
     return np.interp(when, t, x), width
 
 
-def drive_transitions(model: ComposedModel, stretches: list[Streams], digest: str, source: str) -> Transitions:
-    """All transitions of a drive, stretch after stretch. Stretches that hold no measured state are left out."""
+def drive_transitions(model: ComposedModel, stretches: list[Streams], digest: str, source: str, *, under_way: bool = False) -> Transitions:
+    """All transitions of a drive, stretch after stretch. Stretches that hold no measured state are left out. under_way: each was cut out of
+    a longer one, so that its first WARM_UP_S are left out (`cut`): what was commanded before them may still act.
+    """
     nx, nu = len(model.states), len(model.inputs)
     _check_pace(model, stretches, source)
     parts = [part for stretch in stretches for part in _continuous(stretch)]
-    x0, x1, u, t0 = [np.empty((0, nx))], [np.empty((0, nx))], [np.empty((0, nu))], [np.empty(0)]
-    inputs, steps, offset = [np.empty((0, nu))], [np.empty(0, dtype=np.int64)], 0
+    x0: list[Array] = []
+    x1: list[Array] = []
+    u: list[Array] = []
+    t0: list[Array] = []
+    inputs: list[Array] = []
+    steps: list[NDArray[np.int64]] = []
+    offset = 0
     rejected: dict[str, int] = {}
     for part in parts:
         grid, x, mean_u, reason = _on_grid(model, part)
-        used = np.flatnonzero(reason == "")
-        for name in np.unique(reason[(reason != "") & (reason != "outside")]).tolist():
-            rejected[name] = rejected.get(name, 0) + int(np.count_nonzero(reason == name))
+        if under_way and len(reason):
+            reason[(reason == 0) & (grid[:-1] < grid[0] + WARM_UP_S)] = REASONS.index("cut")
+        used = np.flatnonzero(reason == 0)
+        for name, count in zip(REASONS, np.bincount(reason, minlength=len(REASONS)).tolist(), strict=True):
+            if count and name not in {"", "outside"}:
+                rejected[name] = rejected.get(name, 0) + count
         x0.append(x[used])
         x1.append(x[used + 1])
         u.append(mean_u[used])
@@ -86,22 +100,29 @@ def drive_transitions(model: ComposedModel, stretches: list[Streams], digest: st
         steps.append(used + offset)
         inputs.append(mean_u)
         offset += len(mean_u)
-    drive = Drive(tuple(inputs[1:] or inputs), np.concatenate(steps))
+    drive = Drive(tuple(inputs) or (np.empty((0, nu)),), np.concatenate(steps) if steps else np.empty(0, dtype=np.int64))
     return Transitions(
-        np.concatenate(x0),
-        np.concatenate(u),
-        np.concatenate(x1),
+        _joined(x0, (0, nx)),
+        _joined(u, (0, nu)),
+        _joined(x1, (0, nx)),
         None,
         1,
         independent=False,
         rejected=rejected,
         digest=digest,
-        t0_s=np.concatenate(t0),
+        t0_s=_joined(t0, (0,)),
         source=source,
         doubt=DOUBT,
         noise=streams_noise(model, parts),
         drive=drive,
     )
+
+
+def _joined(parts: list[Array], empty: tuple[int, ...]) -> Array:
+    """One array of all parts, which are given up; of that shape if there are none."""
+    joined = parts[0] if len(parts) == 1 else np.concatenate(parts) if parts else np.empty(empty)
+    parts.clear()
+    return joined
 
 
 def _check_pace(model: ComposedModel, stretches: list[Streams], source: str) -> None:
@@ -128,12 +149,12 @@ def _continuous(streams: Streams) -> list[Streams]:
     return [streams.rows(slice(a, b)) for a, b in pairwise(edges) if b - a > 1]
 
 
-def _on_grid(model: ComposedModel, s: Streams) -> tuple[Array, Array, Array, NDArray[np.str_]]:
-    """(t (m+1,), x (m+1, nx), mean u (m, nu), why each of the m steps is left out, empty if it is not)."""
+def _on_grid(model: ComposedModel, s: Streams) -> tuple[Array, Array, Array, NDArray[np.int8]]:
+    """(t (m+1,), x (m+1, nx), mean u (m, nu), index in REASONS of each of the m steps)."""
     dt, tolerance = model.dt, resolution(s.t, model.dt)
     known = [s.t[np.isfinite(s.x[:, c])] for c in range(s.x.shape[1])]
     if not all(len(t) for t in known):
-        return np.empty(0), np.empty((0, s.x.shape[1])), np.empty((0, s.u.shape[1])), np.empty(0, dtype=np.str_)
+        return np.empty(0), np.empty((0, s.x.shape[1])), np.empty((0, s.u.shape[1])), np.empty(0, dtype=np.int8)
     start, stop = max(float(t[0]) for t in known), min(float(t[-1]) for t in known)
     heard = [s.t[np.isfinite(s.u[:, c])] for c in range(s.u.shape[1])]
     first_input = min((float(t[0]) for t in heard if len(t)), default=start)
@@ -146,11 +167,11 @@ def _on_grid(model: ComposedModel, s: Streams) -> tuple[Array, Array, Array, NDA
         values, hole = state_at(s, column, grid, angle, tolerance)
         x[:, column] = wrap(values) if angle else values
         width = np.maximum(width, hole)
-    reason = np.full(max(0, len(grid) - 1), "", dtype="<U9")
+    reason = np.zeros(max(0, len(grid) - 1), dtype=np.int8)
     hole = np.maximum(width[:-1], width[1:])
-    reason[hole > MAX_GAP * dt] = "state_gap"
-    reason[grid[:-1] < all_inputs - tolerance] = "no_input"
-    reason[np.isinf(hole)] = "outside"
+    reason[hole > MAX_GAP * dt] = REASONS.index("state_gap")
+    reason[grid[:-1] < all_inputs - tolerance] = REASONS.index("no_input")
+    reason[np.isinf(hole)] = REASONS.index("outside")
     return grid, x, _averages(s, grid), reason
 
 
@@ -174,12 +195,19 @@ def streams_noise(model: ComposedModel, parts: list[Streams]) -> Array | None:
     """(nx,) standard deviation of the measurements in these runs together; None where they do not show it (`sensor_noise`)."""
     if not parts:
         return None
-    xs = []
-    for part in parts:
-        x = part.x.copy()
-        for column in model.angle_columns:
-            received = np.isfinite(x[:, column])
-            x[received, column] = np.unwrap(x[received, column])
-        xs.append(x)
-    number = np.concatenate([np.full(len(p.t), i) for i, p in enumerate(parts)])
-    return stream_noise(np.concatenate([p.t for p in parts]), np.concatenate(xs), number)
+    found = []
+    number = np.concatenate([np.full(len(p.t), i) for i, p in enumerate(parts)]) if len(parts) > 1 else None
+    t = _joined([p.t for p in parts], (0,))
+    for column in range(len(model.states)):
+        values = np.concatenate([p.x[:, column] for p in parts])
+        if column in model.angle_columns:
+            place = 0
+            for p in parts:
+                received = place + np.flatnonzero(np.isfinite(values[place : place + len(p.t)]))
+                values[received] = np.unwrap(values[received])
+                place += len(p.t)
+        noise = stream_noise(t, values[:, None], number)
+        if noise is None:
+            return None
+        found.append(noise[0])
+    return np.array(found)

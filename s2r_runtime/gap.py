@@ -22,6 +22,7 @@ from s2r_runtime.errors import ConfigError, NotEnoughEvidence, UsageError
 from s2r_runtime.messages import SERIAL, Gap
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.profile_checks import HEAVIEST, LIGHTEST
+from s2r_runtime.table_rows import Subset
 from s2r_runtime.whiteness import DEPENDENT, SERIAL_ALPHA, Whiteness, body_axes, serial_p, whiteness
 
 Array = NDArray[np.float64]
@@ -48,7 +49,8 @@ class Transitions:
     `independent`: drawn independently from one law; if not, `doubt` says why, and there is no statement. `assumption`: what the user
     vouched for instead. `digest`: of the recording's bytes; `samples_digest`: of a campaign's samples, alike in every log that holds
     them; `content_digest`: of a table's numbers, however they are written; for driving in a daemon's log, of which run it is.
-    `noise`: (nx,) standard deviation of the measurements, None if the recording doesn't show it.
+    `noise`: (nx,) standard deviation of the measurements, None if the recording doesn't show it. `subset`: which rows of a long recording
+    are used (None: all).
     """
 
     x0: Array
@@ -69,6 +71,7 @@ class Transitions:
     """Digests of each recording, of its bytes and of its numbers, where there are several."""
     noise: Array | None = None
     drive: Drive | None = field(default=None, repr=False)
+    subset: Subset | None = None
     notes: tuple[str, ...] = ()
     """What a person should know of how the recording was read, one line each."""
 
@@ -192,9 +195,13 @@ def radius_of_noise(model: ComposedModel, tr: Transitions, weights: Array, kind:
     largest = []
     exact, _ = model.step(tr.x0, tr.u, model.at_rest(n))
     for _ in range(min(101, max(9, NOISE_DRAWS // n))):
-        before, after = rng.normal(size=(2, *tr.x0.shape)) * tr.noise
-        predicted, _ = model.step(tr.x0 + before, tr.u, model.at_rest(n))
-        largest.append(_largest(discrepancy(model.difference(exact + after, predicted), weights, kind), discard))
+        d = np.empty(n)
+        for a in range(0, n, NOISE_DRAWS):
+            rows = slice(a, a + NOISE_DRAWS)
+            before, after = rng.normal(size=(2, *tr.x0[rows].shape)) * tr.noise
+            predicted, _ = model.step(tr.x0[rows] + before, tr.u[rows], model.at_rest(len(before)))
+            d[rows] = discrepancy(model.difference(exact[rows] + after, predicted), weights, kind)
+        largest.append(_largest(d, discard))
     return float(np.median(largest))
 
 
@@ -301,6 +308,8 @@ def gap_json(gap: Gap, tr: Transitions, states: tuple[str, ...]) -> dict[str, An
         "rejected": gap.rejected,
         "epoch": gap.epoch,
         "recording": tr.source,
+        "subset": tr.subset.to_json() if tr.subset else None,
+        "notes": list(tr.notes),
         "model_digest": gap.model_digest,
         "transitions_digest": gap.transitions_digest,
         "statement": statement(gap, tr.independent, assumption=tr.assumption, doubt=tr.doubt, states=states),

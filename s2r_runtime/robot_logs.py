@@ -20,6 +20,7 @@ from s2r_runtime.hookspecs import HEAD_BYTES, ReadLog
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.recording.origin import other_writer
+from s2r_runtime.table_text import refuse_special
 from s2r_runtime.tables import LARGEST, Table
 
 Array = NDArray[np.float64]
@@ -111,7 +112,8 @@ def _form_of(path: Path) -> str:
 
 
 def is_mcap(path: Path) -> bool:
-    """Whether it begins as an MCAP does, whatever its name. Raises OSError."""
+    """Whether it begins as an MCAP does, whatever its name. Raises OSError, RecordingError for a pipe or a device."""
+    refuse_special(path)
     with path.open("rb") as file:
         return file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
 

@@ -19,6 +19,8 @@ FEWEST = 30
 """Sets of four below which a median says little (its standard error is then 20 %)."""
 NORMAL_MAD = 0.6744897501960817
 """Median of |z| of a standard normal z."""
+AT_ONCE = 100_000
+"""Sets of four in memory at a time."""
 GAP = 2.5
 """Steps of this many median steps are not neighbours any more."""
 
@@ -33,15 +35,25 @@ def _deviation(t: Array, values: Array, segment: NDArray[np.int64] | None) -> fl
     received = np.flatnonzero(np.isfinite(values))
     if len(received) < FEWEST + 3:
         return None
+    usual = float(np.median(np.diff(t[received])))
+    if usual <= 0.0:
+        return None
+    parts = [_misfits(t, values, segment, received[a : a + AT_ONCE + 3], usual) for a in range(0, len(received) - 3, AT_ONCE)]
+    misfits = np.concatenate(parts)
+    if len(misfits) < FEWEST:
+        return None
+    sigma = float(np.median(misfits)) / NORMAL_MAD
+    return sigma if sigma > 0.0 else None
+
+
+def _misfits(t: Array, values: Array, segment: NDArray[np.int64] | None, received: NDArray[np.int64], usual: float) -> Array:
+    """(m,) how far the second of four neighbours is off the parabola, in units of what unit noise makes; usual: s between stamps."""
     rows = np.lib.stride_tricks.sliding_window_view(received, 4)
     stamps, x = t[rows], values[rows]
     steps = np.diff(stamps, axis=1)
-    usual = float(np.median(steps))
     near = np.all((steps > 0.1 * usual) & (steps < GAP * usual), axis=1)
     if segment is not None:
         near &= segment[rows[:, 0]] == segment[rows[:, 3]]
-    if usual <= 0.0 or np.count_nonzero(near) < FEWEST:
-        return None
     stamps, x = stamps[near], x[near]
     others = (0, 2, 3)
     rest, power = x[:, 1].copy(), np.ones(len(x))
@@ -52,5 +64,4 @@ def _deviation(t: Array, values: Array, segment: NDArray[np.int64] | None) -> fl
                 weight *= (stamps[:, 1] - stamps[:, j]) / (stamps[:, i] - stamps[:, j])
         rest -= weight * x[:, i]
         power += weight**2
-    sigma = float(np.median(np.abs(rest) / np.sqrt(power))) / NORMAL_MAD
-    return sigma if sigma > 0.0 else None
+    return np.asarray(np.abs(rest) / np.sqrt(power))

@@ -1,19 +1,20 @@
 """Recordings in table form: CSV, or CSV.gz (docs/recordings.md).
 
-A header row; `t` in seconds; one column for each measured state and each input; an optional `segment` column for runs that are
-not contiguous (any labels; the rows of one run stand together); a blank cell means *not received at this stamp*. Stamps do not
-run backwards within a run; equal stamps are allowed (two streams, two rows). Columns that nobody asked for are not looked at.
+A header row; the stamps (`t`, s); one column for each measured state and each input, by the model's name, a usual other one
+(`column_names`) or one that the person stated; an optional `segment` column for runs that are not contiguous (any labels; the rows of
+one run stand together). A blank cell, or a word for "no value" (`MISSING`), means *not received at this stamp*. Stamps do not run backwards
+within a run; equal stamps are allowed (two streams, two rows). Columns that nobody asked for are not looked at.
+
+Read in one pass, block by block: what is stored is 8 bytes a number.
 """
 
 from __future__ import annotations
 
 import csv
-import difflib
-import gzip
-import io
+import hashlib
 import math
-import zlib
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -22,71 +23,135 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.canonical import digest
+from s2r_runtime.column_names import TIME, Place, missing, places, told
 from s2r_runtime.errors import RecordingError
+from s2r_runtime.table_rows import RowStore, Subset
+from s2r_runtime.table_text import Limits, Progress, TextLines
 
 if TYPE_CHECKING:
     from _csv import Reader
 
+__all__ = ["LARGEST", "MISSING", "SEGMENT", "TIME", "Limits", "Subset", "Table", "header_of", "places_of", "read_csv"]
+
 Array = NDArray[np.float64]
 
-TIME, SEGMENT = "t", "segment"
+SEGMENT = "segment"
 
 LARGEST = 1e30
 """In size, whatever the unit: what is beyond (the largest float of 32 or 64 bits) says that there is no value, and its square overflows."""
+MISSING = frozenset(("nan", "+nan", "-nan", "na", "n/a", "<na>", "null", "none", "nil"))
+"""Cells, in small letters, that hold no value: what pandas, NumPy, R, MATLAB and databases write where there is none."""
+
+BLOCK_ROWS, BLOCK_CELLS = 8192, 400_000
+"""Rows that are Python objects at a time; fewer of a wide table."""
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(inf|infinity)", re.ASCII | re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class Table:
     """t: (N,) s. columns: name -> (N,), NaN where nothing was received. segment: (N,) number of the run, 0, 1, ..., or None; segments: what
-    the file calls them.
+    the file calls them. file_digest: of the file's bytes; content: of all its rows (`content_digest`). piece: (N,) number of the contiguous
+    stretch, where only a subset of the rows is here. notes: what was guessed or converted, one sentence each.
     """
 
     t: Array
     columns: dict[str, Array]
     segment: NDArray[np.int64] | None
     segments: tuple[str, ...] = ()
+    file_digest: str = ""
+    content: str = ""
+    piece: NDArray[np.int64] | None = None
+    subset: Subset | None = None
+    notes: tuple[str, ...] = ()
 
     def content_digest(self, names: Sequence[str]) -> str:
         """Digest of the numbers in `t`, since the first stamp and to the microsecond, and in these columns: the same for every
-        file that says the same, packed, formatted or shifted in time.
+        file that holds the same, packed, formatted or shifted in time. Of a table that was read: of all its rows and names.
         """
-        t = np.round(self.t - self.t[0], 6)
-        numbers = np.column_stack([t, *(self.columns[name] for name in names)]) + 0.0  # no -0
+        if self.content:
+            return self.content
+        content = _Content()
+        for a in range(0, len(self.t), BLOCK_ROWS):
+            content.add(self.t[a : a + BLOCK_ROWS], [self.columns[name][a : a + BLOCK_ROWS] for name in names])
+        return content.digest
+
+
+class _Content:
+    """The content digest of rows that come block by block."""
+
+    def __init__(self) -> None:
+        self._hash = hashlib.sha256()
+        self._first: float | None = None
+
+    def add(self, t: Array, columns: Sequence[Array]) -> None:
+        if self._first is None:
+            self._first = float(t[0])
+        numbers = np.column_stack([np.round(t - self._first, 6), *columns]) + 0.0  # no -0
         numbers[np.isnan(numbers)] = np.nan
-        return digest(np.ascontiguousarray(numbers, dtype="<f8").tobytes())
+        self._hash.update(np.ascontiguousarray(numbers, dtype="<f8").tobytes())
+
+    @property
+    def digest(self) -> str:
+        return "sha256:" + self._hash.hexdigest()
 
 
-def read_csv(path: Path | str, wanted: Sequence[str] | None = None, optional: Sequence[str] = (), time: str = TIME) -> Table:
-    """Reads the columns `wanted` (None: all), and those of `optional` that are there. time: the column of the stamps.
+def read_csv(
+    path: Path | str,
+    wanted: Sequence[str] | None = None,
+    optional: Sequence[str] = (),
+    columns: Mapping[str, str] | None = None,
+    *,
+    order: Sequence[str] = (),
+    angles: Sequence[str] = (),
+    max_rows: int | None = None,
+    whole_segments: bool = False,
+    limits: Limits | None = None,
+    progress: Progress | None = None,
+) -> Table:
+    """Reads the states and inputs `wanted` (None: every column, by its own name), and those of `optional` that are there.
 
+    columns: name (or `t`) -> column, as the person stated. order: of names in the content digest (default: as asked for). angles: names
+    of angles. max_rows: more rows than that are thinned (`table_rows`), by whole segments if `whole_segments`. limits: of the text.
     Raises RecordingError, one line: file, line, column, value, what would be right.
     """
-    path = Path(path)
-    header, rows = _opened(path)
-    names = _checked_names(path, header, wanted, optional, time)
-    for name in optional:
-        if name not in header and (near := [h for h in header if h.lower() == name.lower()]):
-            raise RecordingError(f"{path}: lacks the column {name!r}, and has {near[0]!r}; column names must match exactly")
-    names += [name for name in dict.fromkeys(optional) if name in header and name not in names]
-    cells, lines = _cells(path, rows, len(header))
-    numbers = {name: _numbers(path, name, cells[header.index(name)], lines) for name in (time, *names)}
-    t = numbers.pop(time)
-    if blank := np.flatnonzero(np.isnan(t)).tolist():
-        raise RecordingError(f"{path}: line {lines[blank[0]]}: column {time!r} is blank, every row needs its stamp")
-    segment, called = _segments(path, cells[header.index(SEGMENT)], lines) if SEGMENT in header else (None, ())
-    _check_time(path, t, segment, lines)
-    return Table(t, numbers, segment, called)
+    path, columns = Path(path), dict(columns or {})
+    text = TextLines(path, limits, progress)
+    header, rows = _opened(path, text)
+    found = _places(path, header, wanted, optional, columns, angles)
+    names = [name for name in (order or found) if name in found and name != TIME]
+    reading = _Reading(path, header, found, names, RowStore(len(names), max_rows, whole_segments=whole_segments))
+    for cells, lines in _blocks(path, rows, len(header)):
+        reading.add(cells, lines, text.has_odd)
+    if not reading.store.rows:
+        raise RecordingError(f"{path}: has a header and no rows")
+    t, values, segment, piece, subset = reading.store.end()
+    note = told(found)
+    return Table(
+        t,
+        dict(zip(names, values, strict=True)),
+        segment,
+        tuple(reading.labels),
+        text.digest,
+        reading.content.digest,
+        piece,
+        subset,
+        (note,) if note else (),
+    )
 
 
 def header_of(path: Path | str) -> list[str]:
     """Names of the columns. Raises RecordingError as `read_csv`."""
-    return _opened(Path(path))[0]
+    return _opened(Path(path), TextLines(Path(path)))[0]
 
 
-def _opened(path: Path) -> tuple[list[str], Reader]:
+def places_of(path: Path | str, wanted: Sequence[str], columns: Mapping[str, str], angles: Sequence[str] = ()) -> dict[str, Place]:
+    """Where a table has these names, of those that it has. Raises RecordingError as `read_csv`."""
+    return places(header_of(path), wanted, columns, str(path), angles)
+
+
+def _opened(path: Path, text: TextLines) -> tuple[list[str], Reader]:
     """The header, and the rows after it."""
-    rows = csv.reader(io.StringIO(_text(path), newline=""), strict=True)
+    rows = csv.reader(iter(text), strict=True)
     try:
         return [name.strip() for name in next(rows)], rows
     except StopIteration:
@@ -95,51 +160,97 @@ def _opened(path: Path) -> tuple[list[str], Reader]:
         raise RecordingError(f"{path}: line 1: not CSV: {error}") from None
 
 
-def _text(path: Path) -> str:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
-    if path.suffix == ".gz" or data.startswith(b"\x1f\x8b"):
-        try:
-            data = gzip.decompress(data)
-        except (OSError, EOFError, zlib.error) as error:
-            raise RecordingError(f"{path}: is not a whole gzip file: {error}") from None
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise RecordingError(f"{path}: line {line}: not UTF-8 text (byte {data[error.start]:#04x})") from None
-    if "\0" in text:
-        raise RecordingError(f"{path}: line {text.count(chr(10), 0, text.index(chr(0))) + 1}: holds a zero byte, is not a CSV file")
-    return text
-
-
-def _checked_names(path: Path, header: list[str], wanted: Sequence[str] | None, optional: Sequence[str], time: str) -> list[str]:
-    """The columns to read, without the stamps and `segment`."""
+def _places(
+    path: Path,
+    header: list[str],
+    wanted: Sequence[str] | None,
+    optional: Sequence[str],
+    columns: Mapping[str, str],
+    angles: Sequence[str],
+) -> dict[str, Place]:
+    """Where the stamps and the names are that are to be read."""
     if not any(header):
         raise RecordingError(f"{path}: is empty, must start with a header row")
+    time = columns.get(TIME, TIME)
     for name in (*(wanted or ()), *optional):
-        if name in {time, SEGMENT}:
-            raise RecordingError(f"{path}: column {name!r} has the {'stamps' if name == time else 'runs'}, can be no state or input")
-    for name in (name for name in header if name) if wanted is None else (time, SEGMENT, *wanted, *optional):
-        if header.count(name) > 1:
-            raise RecordingError(f"{path}: column {name!r} is there {header.count(name)} times, must be there once")
-    needed = [time, *(wanted or ())]
-    if missing := [name for name in needed if name not in header]:
-        raise RecordingError(f"{path}: {_missing(missing, header)}")
-    return [name for name in (header if wanted is None else needed) if name not in {time, SEGMENT, ""}]
+        if (column := columns.get(name, name)) in {time, SEGMENT}:
+            raise RecordingError(f"{path}: column {column!r} has the {'stamps' if column == time else 'runs'}, can be no state or input")
+    asked = [TIME, *(header if wanted is None else wanted)]
+    asked = [name for name in dict.fromkeys(asked) if name not in {SEGMENT, ""}]
+    for column in header if wanted is None else (SEGMENT, *(columns.get(name, name) for name in (*asked, *optional))):
+        if column and header.count(column) > 1:
+            raise RecordingError(f"{path}: column {column!r} is there {header.count(column)} times, must be there once")
+    found = places(header, [*asked, *(name for name in optional if name not in asked)], columns, str(path), angles)
+    if absent := [columns.get(name, name) for name in asked if name not in found]:
+        raise RecordingError(f"{path}: {_missing(absent, header)}")
+    for name, place in found.items():
+        if header.count(place.column) > 1:
+            raise RecordingError(
+                f"{path}: column {place.column!r} ({name}) is there {header.count(place.column)} times, must be there once"
+            )
+    return found
 
 
-def _missing(missing: list[str], header: list[str]) -> str:
+def _missing(absent: list[str], header: list[str]) -> str:
     if len(header) == 1 and (other := [sign for sign in (";", "\t", "|") if sign in header[0]]):
-        names = ", ".join(map(repr, missing))
+        names = ", ".join(map(repr, absent))
         return f"lacks {names}; are its columns separated by commas? {other[0]!r} seems to stand between them; decimal numbers need a point"
     if all(_is_number(name) for name in header):
-        return f"starts with numbers, must start with a header row that names the columns: {', '.join(missing)}, ..."
-    near = {name: difflib.get_close_matches(name, header, 1, 0.5) or [h for h in header if h.lower() == name.lower()] for name in missing}
-    listed = ", ".join(f"{name!r}" + (f" (nearest: {near[name][0]!r})" if near[name] else "") for name in missing)
-    return f"lacks the column{'s' if len(missing) > 1 else ''} {listed}; it has: {', '.join(header)}"
+        return f"starts with numbers, must start with a header row that names the columns: {', '.join(absent)}, ..."
+    return missing(absent, header)
+
+
+class _Reading:
+    """Checks blocks of rows, and stores their numbers."""
+
+    def __init__(self, path: Path, header: list[str], found: Mapping[str, Place], names: list[str], store: RowStore) -> None:
+        self.store, self.content, self.labels = store, _Content(), {}  # type: ignore[var-annotated]
+        self._path = path
+        self._columns = [(found[name], header.index(found[name].column)) for name in (TIME, *names)]
+        self._segment = header.index(SEGMENT) if SEGMENT in header else None
+        self._last = -math.inf
+        self._run = -1
+        self._label = ""
+
+    def add(self, cells: list[tuple[str, ...]], lines: list[int], odd: bool) -> None:
+        """The next rows, as columns of cells; lines: on which each ends; odd: whether cells may hold what only looks like a number."""
+        t, *values = (_numbers(self._path, place.column, cells[column], lines, odd) * place.scale for place, column in self._columns)
+        if blank := np.flatnonzero(np.isnan(t)).tolist():
+            raise RecordingError(
+                f"{self._path}: line {lines[blank[0]]}: column {self._columns[0][0].column!r} is blank, every row needs its stamp"
+            )
+        segment = None if self._segment is None else self._numbered(cells[self._segment], lines)
+        self._check_time(t, segment, lines)
+        self.content.add(t, values)
+        self.store.add(t, values, segment)
+
+    def _numbered(self, cells: tuple[str, ...], lines: list[int]) -> NDArray[np.int64]:
+        """(n,) 0, 1, ... in order of appearance."""
+        numbers: list[int] = []
+        for label, rows in groupby(cell.strip() for cell in cells):
+            line = lines[len(numbers)]
+            if not label:
+                raise RecordingError(f"{self._path}: line {line}: column {SEGMENT!r} is blank, every row needs its segment")
+            if label != self._label:
+                if label in self.labels:
+                    raise RecordingError(
+                        f"{self._path}: line {line}: segment {label!r} goes on after another one began; its rows must stand together"
+                    )
+                self._label = label
+                self.labels[label] = len(self.labels)
+            numbers += [self.labels[label]] * sum(1 for _ in rows)
+        return np.array(numbers, dtype=np.int64)
+
+    def _check_time(self, t: Array, segment: NDArray[np.int64] | None, lines: list[int]) -> None:
+        backwards = np.diff(t, prepend=self._last) < 0.0
+        if segment is not None:
+            backwards &= np.diff(segment, prepend=self._run) == 0
+            self._run = int(segment[-1])
+        if back := np.flatnonzero(backwards).tolist():
+            row = back[0]
+            before = float(t[row - 1]) if row else self._last
+            raise RecordingError(f"{self._path}: line {lines[row]}: time runs backwards, from {before} s to {float(t[row])} s")
+        self._last = float(t[-1])
 
 
 def _is_number(text: str) -> bool:
@@ -150,64 +261,49 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _cells(path: Path, rows: Reader, width: int) -> tuple[list[tuple[str, ...]], list[int]]:
+def _blocks(path: Path, rows: Reader, width: int) -> Iterator[tuple[list[tuple[str, ...]], list[int]]]:
     """Columns of cells, and the line on which each row ends. Blank lines are skipped."""
-    kept, lines = [], []
+    kept: list[list[str]] = []
+    lines: list[int] = []
+    most = max(1, min(BLOCK_ROWS, BLOCK_CELLS // width))
     try:
         for row in rows:
             if len(row) == width:
                 kept.append(row)
                 lines.append(rows.line_num)
+                if len(kept) >= most:
+                    yield list(zip(*kept, strict=True)), lines
+                    kept, lines = [], []
             elif row:
                 commas = "; are there commas in decimal numbers? They need a point" if len(row) == 2 * width else ""
                 raise RecordingError(f"{path}: line {rows.line_num}: has {len(row)} cells, the header has {width}{commas}")
     except csv.Error as error:
         raise RecordingError(f"{path}: line {rows.line_num}: not CSV: {error}") from None
-    if not kept:
-        raise RecordingError(f"{path}: has a header and no rows")
-    return list(zip(*kept, strict=True)), lines
+    if kept:
+        yield list(zip(*kept, strict=True)), lines
 
 
-def _numbers(path: Path, name: str, cells: tuple[str, ...], lines: list[int]) -> Array:
-    """(N,), NaN for blank cells."""
+def _numbers(path: Path, name: str, cells: tuple[str, ...], lines: list[int], odd: bool) -> Array:
+    """(N,), NaN for cells without a value."""
     try:
+        if odd:
+            raise ValueError
         values = np.array([float(cell) if cell else math.nan for cell in cells])
     except ValueError:
         values = np.array([_number(path, name, cell, line) for cell, line in zip(cells, lines, strict=True)])
-    for row in np.flatnonzero(~(np.abs(values) <= LARGEST)).tolist():
-        if cells[row].strip():
-            must = f"a number within {LARGEST:g}" if math.isfinite(values[row]) else "a finite number"
-            raise RecordingError(f"{path}: line {lines[row]}: column {name!r} is {cells[row]!r}, must be {must} (or blank: not received)")
+    if np.all(np.abs(values) <= LARGEST):
+        return values
+    for row in np.flatnonzero(np.abs(values) > LARGEST).tolist():
+        must = f"a number within {LARGEST:g}" if math.isfinite(values[row]) else "a finite number"
+        raise RecordingError(f"{path}: line {lines[row]}: column {name!r} is {cells[row]!r}, must be {must} (or blank: not received)")
     return values
 
 
 def _number(path: Path, name: str, cell: str, line: int) -> float:
-    try:
-        return float(cell) if cell.strip() else math.nan
-    except ValueError:
-        must = "have a decimal point" if _is_number(cell.replace(",", ".")) else "be a number (or blank: not received)"
-        raise RecordingError(f"{path}: line {line}: column {name!r} is {cell!r}, must {must}") from None
-
-
-def _segments(path: Path, cells: tuple[str, ...], lines: list[int]) -> tuple[NDArray[np.int64], tuple[str, ...]]:
-    """(N,) 0, 1, ... in order of appearance, and what each is called."""
-    numbers: list[int] = []
-    seen: dict[str, int] = {}
-    for label, rows in groupby(cell.strip() for cell in cells):
-        line = lines[len(numbers)]
-        if not label:
-            raise RecordingError(f"{path}: line {line}: column {SEGMENT!r} is blank, every row needs its segment")
-        if label in seen:
-            raise RecordingError(f"{path}: line {line}: segment {label!r} goes on after another one began; its rows must stand together")
-        seen[label] = len(seen)
-        numbers += [seen[label]] * sum(1 for _ in rows)
-    return np.array(numbers, dtype=np.int64), tuple(seen)
-
-
-def _check_time(path: Path, t: Array, segment: NDArray[np.int64] | None, lines: list[int]) -> None:
-    backwards = np.diff(t) < 0.0
-    if segment is not None:
-        backwards &= np.diff(segment) == 0
-    if back := np.flatnonzero(backwards).tolist():
-        row = back[0]
-        raise RecordingError(f"{path}: line {lines[row + 1]}: time runs backwards, from {float(t[row])} s to {float(t[row + 1])} s")
+    text = cell.strip()
+    if not text or text.lower() in MISSING:
+        return math.nan
+    if _NUMBER.fullmatch(text):
+        return float(text)
+    must = "have a decimal point" if _NUMBER.fullmatch(text.replace(",", ".")) else "be a number (or blank: not received)"
+    raise RecordingError(f"{path}: line {line}: column {name!r} is {cell!r}, must {must}")

@@ -37,9 +37,14 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.recording.origin import other_writer
 from s2r_runtime.robot_logs import content_digest, is_mcap, is_robot_log, merged_rows
 from s2r_runtime.sensor_noise import FEWEST, NORMAL_MAD
-from s2r_runtime.tables import TIME, read_csv
+from s2r_runtime.table_rows import Subset, joined
+from s2r_runtime.table_text import Limits, Progress, refuse_special
+from s2r_runtime.tables import read_csv
 
 Array = NDArray[np.float64]
+
+MAX_VALUES = 12_100_000
+"""Numbers of a table that are used, 97 MB: two million rows of a planar robot. All that is computed from them takes four times as much."""
 
 CHANNELS = ("event/started", "event/observed", "event/sample_taken", "event/campaign_finished", "out/send")
 
@@ -53,6 +58,7 @@ class _Read(NamedTuple):
     content: str
     source: str
     notes: tuple[str, ...] = ()
+    subset: Subset | None = None
 
 
 def load_transitions(
@@ -63,13 +69,18 @@ def load_transitions(
     epoch: int | None = None,
     transport: Mapping[str, Any] | None = None,
     signals: Mapping[str, str] | None = None,
+    limits: Limits | None = None,
+    progress: Progress | None = None,
 ) -> Transitions:
     """The transitions of a recording, or of several, whichever form they have. columns: model name, or `t` -> column name, where they
     differ. transport: the profile's, for a log in a robot's own format. signals: name in the model -> signal, of a file with such.
+    limits, progress: of reading a table; of one with more than MAX_VALUES numbers a subset is used.
 
     Raises RecordingError (not readable, columns missing, of another robot), UsageError (recordings of different kinds, or one given twice).
     """
     paths = [Path(one) for one in ([path] if isinstance(path, str | Path) else path)]
+    for one in paths:
+        refuse_special(one)
     own = [one for one in paths if _is_own_log(one)]
     if len(own) > 1 or (own and len(paths) > 1):
         raise UsageError(f"{own[0]}: is a log of this software; the number of samples of each campaign was fixed for itself: give it alone")
@@ -77,7 +88,8 @@ def load_transitions(
         return from_mcap(own[0], model, epoch=epoch)
     if epoch is not None:
         raise UsageError(f"{paths[0]}: a CSV has no epochs, nor has a log that is not of the daemon")
-    return _together(model, [_read_one(one, model, columns or {}, transport, signals) for one in paths])
+    tables = _Tables(columns or {}, MAX_VALUES // len(paths), limits, progress)
+    return _together(model, [_read_one(one, model, tables, transport, signals) for one in paths])
 
 
 def _is_own_log(path: Path) -> bool:
@@ -90,16 +102,25 @@ def _is_own_log(path: Path) -> bool:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
 
 
+class _Tables(NamedTuple):
+    """How tables are read. max_values: numbers of each that are used."""
+
+    columns: Mapping[str, str]
+    max_values: int
+    limits: Limits | None = None
+    progress: Progress | None = None
+
+
 def _read_one(
     path: Path,
     model: ComposedModel,
-    columns: Mapping[str, str],
+    tables: _Tables,
     transport: Mapping[str, Any] | None,
     signals: Mapping[str, str] | None,
 ) -> _Read:
-    recorded = read_recording(path, model, columns=columns, transport=transport, signals=signals)
+    recorded = read_recording(path, model, columns=tables.columns, transport=transport, signals=signals)
     if recorded is None:
-        return _of_table(path, model, columns)
+        return _of_table(path, model, tables)
     content = content_digest(recorded.stretches, model)
     return _Read(_streams(recorded, len(model.states)), recorded.drawn, digest_of_path(path), content, str(path), recorded.notes)
 
@@ -125,7 +146,8 @@ def _together(model: ComposedModel, reads: Sequence[_Read]) -> Transitions:
         found = _segment_transitions(model, streams, recording, source)
         found = replace(found, noise=streams_noise(model, streams))
     else:
-        found = drive_transitions(model, streams, recording, source)
+        found = drive_transitions(model, streams, recording, source, under_way=any(read.subset for read in reads))
+    found = replace(found, subset=joined([read.subset for read in reads], [sum(len(s.t) for s in read.streams) for read in reads]))
     if len(reads) == 1:
         return replace(found, content_digest=reads[0].content, notes=reads[0].notes)
     notes = tuple(f"{Path(read.source).name}: {line}" for read in reads for line in read.notes)
@@ -139,21 +161,34 @@ def from_csv(path: Path, model: ComposedModel, columns: Mapping[str, str], dt: f
     """Transitions of `dt` s (the model's step) from a CSV or CSV.gz. Raises RecordingError; UsageError if dt isn't the model's."""
     if dt != model.dt:
         raise UsageError(f"dt is {dt} s, the model's step is {model.dt} s")
-    return _together(model, [_of_table(path, model, columns)])
+    return _together(model, [_of_table(path, model, _Tables(columns, MAX_VALUES))])
 
 
-def _of_table(path: Path, model: ComposedModel, columns: Mapping[str, str]) -> _Read:
-    names = [columns.get(name, name) for name in (*model.states, *model.inputs)]
-    table = read_csv(path, names, time=columns.get(TIME, TIME))
-    values = np.column_stack([table.columns[name] for name in names])
-    nx = len(model.states)
+def _of_table(path: Path, model: ComposedModel, how: _Tables) -> _Read:
+    names = (*model.states, *model.inputs)
+    table = read_csv(
+        path,
+        names,
+        columns=how.columns,
+        angles=model.nominal.angles,
+        max_rows=how.max_values // (1 + len(names)),
+        whole_segments=True,
+        limits=how.limits,
+        progress=how.progress,
+    )
+    nx, values = len(model.states), np.empty((len(table.t), len(names)))
+    for place, name in enumerate(names):
+        values[:, place] = table.columns.pop(name)
     whole = Streams(table.t, values[:, :nx], values[:, nx:])
-    recording, content = digest_of_path(path), table.content_digest(names)
-    if table.segment is None:
-        return _Read([whole], False, recording, content, str(path))
-    edges = np.flatnonzero(np.diff(table.segment, prepend=-1, append=-1))
-    segments = [whole.rows(slice(a, b)) for a, b in pairwise(edges.tolist())]
-    return _Read(segments, True, recording, content, str(path))
+    number = table.segment if table.segment is not None else table.piece
+    parts = [whole] if number is None else _pieces(whole, number)
+    return _Read(parts, table.segment is not None, table.file_digest, table.content, str(path), table.notes, table.subset)
+
+
+def _pieces(whole: Streams, number: NDArray[np.int64]) -> list[Streams]:
+    """Rows with the same number, in order."""
+    edges = np.flatnonzero(np.diff(number, prepend=-1, append=-1))
+    return [whole.rows(slice(a, b)) for a, b in pairwise(edges.tolist())]
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -62,8 +63,8 @@ def whiteness(model: ComposedModel, x0: Array, u: Array, e: Array, *, first_lag:
     if n < FEWEST + LAGS:
         return Whiteness(False, f"{n} transitions are too few to tell")
     e = body_axes(model, x0, e)
-    inputs = _input_terms(model, u)
     found: list[tuple[float, str]] = []
+    ranked: list[tuple[str, Array]] = []
     for column, state in enumerate(model.states):
         values = e[:, column]
         if np.max(np.abs(values)) <= 1e-12 * max(1.0, float(np.max(np.abs(x0[:, column])))):
@@ -72,8 +73,10 @@ def whiteness(model: ComposedModel, x0: Array, u: Array, e: Array, *, first_lag:
         found.append((_normal_p(_mean_score(values)), f"the mean of the residual in {state} is {np.mean(values):.3g}, not zero"))
         if np.ptp(ranks) > 0.0:
             found.append((_serial_p(ranks, first_lag), f"the residual in {state} {DEPENDENT}"))
-            score = math.sqrt(n - 1)
-            found += [(_normal_p(score * _correlation(ranks, r)), f"the residual in {state} depends on {name}") for name, r in inputs]
+            ranked.append((state, ranks))
+    score = math.sqrt(n - 1)
+    for name, r in _input_terms(model, u) if ranked else ():
+        found += [(_normal_p(score * _correlation(ranks, r)), f"the residual in {state} depends on {name}") for state, ranks in ranked]
     structure = sorted((DEPENDENT not in reason, p, reason) for p, reason in found if p * len(found) < ALPHA)
     return Whiteness(False, structure[0][2]) if structure else Whiteness(True, "")
 
@@ -109,15 +112,21 @@ def body_axes(model: ComposedModel, x0: Array, e: Array) -> Array:
     return turned
 
 
-def _input_terms(model: ComposedModel, u: Array) -> list[tuple[str, Array]]:
-    """(name, ranks (n,)) of the terms of u that vary."""
-    terms = [(name, u[:, j]) for j, name in enumerate(model.inputs)]
-    terms += [(f"|{name}|", np.abs(u[:, j])) for j, name in enumerate(model.inputs)]
+def _input_terms(model: ComposedModel, u: Array) -> Iterator[tuple[str, Array]]:
+    """(name, ranks (n,)) of the terms of u that vary, one after the other."""
+    for name, values in _terms(model, u):
+        if np.ptp(values) > 0.0:
+            yield name, _ranks(values)
+
+
+def _terms(model: ComposedModel, u: Array) -> Iterator[tuple[str, Array]]:
+    for j, name in enumerate(model.inputs):
+        yield name, u[:, j]
+        yield f"|{name}|", np.abs(u[:, j])
     for (j, a), (k, b) in itertools.permutations(enumerate(model.inputs), 2):
-        terms.append((f"{a}*|{b}|", u[:, j] * np.abs(u[:, k])))
+        yield f"{a}*|{b}|", u[:, j] * np.abs(u[:, k])
         if j < k:
-            terms.append((f"{a}*{b}", u[:, j] * u[:, k]))
-    return [(name, _ranks(values)) for name, values in terms if np.ptp(values) > 0.0]
+            yield f"{a}*{b}", u[:, j] * u[:, k]
 
 
 def _ranks(values: Array) -> Array:

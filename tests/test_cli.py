@@ -94,7 +94,7 @@ def test_too_few_samples_say_how_many_more(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "code", "words"),
     [
-        (lambda t: t.replace("theta", "yaw"), 2, ("theta", "column")),
+        (lambda t: t.replace("theta", "facing"), 2, ("theta", "column")),
         (lambda t: t.replace("\n5,0.1,", "\n5,0.1,abc", 1), 2, ("line 18", "abc")),
         (lambda t: t.replace("\n5,0.1,", "\n5,0.1,nan#", 1).replace("nan#0.021672240802675585", "nan"), 2, ("line 18",)),
         (lambda t: t.replace("\n5,0.2,", "\n5,0.05,", 1), 2, ("line 19", "backwards")),

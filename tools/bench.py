@@ -19,6 +19,7 @@ ORDER = (
     "bench_crash.py",
     "bench_tamper.py",
     "bench_audit.py",
+    "bench_recordings.py",
     "bench_can.py",
     "fuzz_can.py",
     "bench_mavlink.py",

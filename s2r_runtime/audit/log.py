@@ -51,8 +51,7 @@ class AuditResult(msgspec.Struct, frozen=True):
     `ok`: everything that is there was recomputed and holds. `chain`: intact, broken or unsigned tail. `recomputed`: how many of what.
     `unchecked`: what could not be recomputed here, and why: then it is not ok. `incomplete`: parts that were not given, without which the
     rest can't be recomputed: then it is not ok either, and `only_incomplete` if that is all. `skipped`: what was not recomputed, because it
-    takes long: neither passed nor failed. `models`: those that were put in force. `signed_by`: the key, and whether it is one that was asked
-    for.
+    takes long: neither passed nor failed. `models`: those that were put in force. `signed_by`: the key, and whether it was asked for.
     `head`: of the chain, to compare with what the daemon printed.
     """
 

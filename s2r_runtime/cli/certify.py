@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import apart, controller_at, load_checked, own_file, writable
+from s2r_runtime.cli.choices import add_limit, apart, controller_at, load_checked, own_file, writable
 from s2r_runtime.errors import UsageError
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     verb.add_argument("--model", metavar="MODEL.toml", help="a repaired model instead of the profile's")
     verb.add_argument("--key", type=Path, metavar="FILE", help="signing key (default: the user's; make one with s2r keys new)")
     verb.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the controller; may be repeated")
+    add_limit(verb)
     verb.add_argument("--json", action="store_true", help="print one JSON object")
     verb.set_defaults(run=run)
 
@@ -51,6 +52,7 @@ def run(args: argparse.Namespace) -> int:
     from s2r_runtime.bounds import attempt_beta, epoch_beta
     from s2r_runtime.cli.evidence import gap_of, profile_model, run_verification
     from s2r_runtime.cli.trials_verb import trials_of
+    from s2r_runtime.table_text import file_digest
 
     writable(args.output, replaced=True)  # now, because what is spent below stays spent, whatever becomes of the certificate
     inputs = {"the controller": args.controller, "the profile": args.profile, "the recording": args.recording, "the model": args.model}
@@ -61,11 +63,11 @@ def run(args: argparse.Namespace) -> int:
     key_path = args.key or keys.default_path()
     key = keys.load(key_path)
     controller = controller_at(args.controller, args.param)
-    recording = _digest(args.recording)
+    recording = file_digest(args.recording)
     trials = trials_of(args.trials, controller, model, profile) if args.trials else None
     ledger, beta = offline_ledger.open_ledger(key_path, profile.robot.name), profile.guarantee.beta
     epoch = ledger.epoch_for(recording, model.spec.digest(), profile.digest())
-    gap, assumption = gap_of(args.recording, model, profile, beta=epoch_beta(beta, epoch), epoch=epoch)
+    gap, assumption = gap_of(args.recording, model, profile, beta=epoch_beta(beta, epoch), epoch=epoch, max_gb=args.max_gb)
     attempt = ledger.spend_attempt(controller.digest)
     result = run_verification(
         controller,
@@ -89,15 +91,6 @@ def run(args: argparse.Namespace) -> int:
         output.err(f"s2r: {trouble}")
         return UsageError.exit_code
     return 0 if result.passed else 1
-
-
-def _digest(path: Path) -> str:
-    from s2r_runtime.canonical import digest
-
-    try:
-        return digest(path.read_bytes())
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 def _write(

@@ -39,6 +39,12 @@ def add_model_options(verb: argparse.ArgumentParser) -> None:
         metavar="NAME=COLUMN",
         help="the table's column of a state, an input, or t (the stamps), of another name (else as a profile says); may be repeated",
     )
+    add_limit(verb)
+
+
+def add_limit(verb: argparse.ArgumentParser) -> None:
+    """--max-gb."""
+    verb.add_argument("--max-gb", type=positive, metavar="GB", help="largest table that is read, as text, unpacked (default 4)")
 
 
 def add_signal_options(verb: argparse.ArgumentParser) -> None:

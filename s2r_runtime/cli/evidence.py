@@ -11,6 +11,7 @@ import msgspec
 
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import (
+    add_limit,
     add_model_options,
     add_signal_options,
     chosen_model,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from s2r_runtime.messages import Gap, Verification
     from s2r_runtime.models.composed import ComposedModel
     from s2r_runtime.profile import Profile
+    from s2r_runtime.table_rows import Subset
 
 LAWS = ("uniform", "persistent", "adversarial")
 
@@ -90,6 +92,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         help=f"disturbance law: {', '.join(LAWS)}; may be repeated (default: the profile's)",
     )
     verify.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the controller; may be repeated")
+    add_limit(verify)
     verify.add_argument("--json", action="store_true", help="print one JSON object")
     verify.set_defaults(run=run_verify)
 
@@ -97,12 +100,17 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def run_gap(args: argparse.Namespace) -> int:
     """Exit 0 with a statement, 3 if the data do not carry one (the numbers are printed all the same)."""
     from s2r_runtime import gap as gaps
+    from s2r_runtime.table_text import limits_of
     from s2r_runtime.transitions import load_transitions
 
     model, profile = chosen_model(args)
     columns, signals = columns_of(args, model, profile, *args.recording), signals_of(args, model)
-    transport = profile.transport if profile else None
-    found = load_transitions(args.recording, model, columns, transport=transport, signals=signals)
+    transport, bar = profile.transport if profile else None, output.Progress("reading")
+    limits = limits_of(args.max_gb)
+    try:
+        found = load_transitions(args.recording, model, columns, transport=transport, signals=signals, limits=limits, progress=bar)
+    finally:
+        bar.close()
     output.notes(found.source, found.notes)
     if args.blocking:
         found = gaps.blocked(found, args.blocking, model.dt)
@@ -121,11 +129,11 @@ def run_gap(args: argparse.Namespace) -> int:
     if args.json:
         output.result_json(answer)
     else:
-        _print_gap(answer)
+        _print_gap(answer, found.subset)
     return 0 if found.independent else 3
 
 
-def _print_gap(answer: dict[str, Any]) -> None:
+def _print_gap(answer: dict[str, Any], subset: Subset | None) -> None:
     output.out(f"gap radius      {answer['radius']:.6g}   (unweighted norm: {answer['radius_literal']:.6g})")
     if answer["hold_periods"] > 1:
         output.out(f"hold gap        {answer['hold_radius']:.6g} over {answer['hold_periods']} periods")
@@ -134,6 +142,8 @@ def _print_gap(answer: dict[str, Any]) -> None:
 
         output.out(f"noise alone     would make about {noise_share(answer['radius_noise'], answer['radius'])} of it")
     output.out(f"transitions     {answer['n']}, {answer['discarded']} discarded, rejected: {answer['rejected'] or 'none'}")
+    if subset is not None:
+        output.out(f"subset          {subset.text()}")
     weights = ", ".join(f"{name} {weight:g}" for name, weight in answer["weights"].items())
     output.out(f"norm            {answer['set']}, weights {weights}")
     output.out("residual        " + ("white" if answer["white"] else f"not white: {answer['white_reason']}"))
@@ -146,7 +156,7 @@ def run_verify(args: argparse.Namespace) -> int:
 
     profile = load_checked(args.profile)
     model = profile_model(args, profile)
-    epoch_gap = gap_of(args.recording, model, profile)[0] if args.recording else None
+    epoch_gap = gap_of(args.recording, model, profile, max_gb=args.max_gb)[0] if args.recording else None
     laws = tuple(args.law) if args.law else profile.verification.laws
     gap = epoch_gap or gap_at(args.radius, args.hold_radius, model, profile)
     headroom = args.headroom or (profile.verification.headroom if epoch_gap else 1.0)
@@ -196,14 +206,17 @@ def profile_model(args: argparse.Namespace, profile: Profile) -> ComposedModel:
     return compose(profile.model, f"{args.profile}: model")
 
 
-def gap_of(recording: Path, model: ComposedModel, profile: Profile, *, beta: float | None = None, epoch: int = 1) -> tuple[Gap, str]:
+def gap_of(
+    recording: Path, model: ComposedModel, profile: Profile, *, beta: float | None = None, epoch: int = 1, max_gb: float | None = None
+) -> tuple[Gap, str]:
     """The gap that a campaign shows under the profile's settings, or driving that the profile vouches for, with the assumption that it
     then rests on. beta: the epoch's share; without one the gap founds no certificate. Raises NotEnoughEvidence if it carries no statement.
     """
     from s2r_runtime import gap as gaps
+    from s2r_runtime.table_text import limits_of
     from s2r_runtime.transitions import load_transitions
 
-    found = load_transitions(recording, model, dict(profile.columns), transport=profile.transport)
+    found = load_transitions(recording, model, dict(profile.columns), transport=profile.transport, limits=limits_of(max_gb))
     output.notes(found.source, found.notes)
     share = beta or profile.guarantee.beta
     if found.drive is not None and profile.driving.block > 0.0:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import apart, controller_at, count, load_checked, own_file, positive, writable
+from s2r_runtime.cli.choices import add_limit, apart, controller_at, count, load_checked, own_file, positive, writable
 from s2r_runtime.errors import ControllerError, UsageError
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     verb.add_argument("--scenarios", type=count, default=100, metavar="N", help="scenarios for each candidate and law (default 100)")
     verb.add_argument("--seed", type=count, default=1, metavar="S", help="of the search (default 1)")
     verb.add_argument("--key", type=Path, metavar="FILE", help="key whose ledger pays for the verification (default: the user's)")
+    add_limit(verb)
     verb.add_argument("--json", action="store_true", help="print one JSON object")
     verb.set_defaults(run=run)
 
@@ -65,7 +66,10 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"-o {args.output}: must lie beside {args.controller}, which imports {', '.join(controller.modules)} from there")
     bounds = candidates.declared_bounds(controller, dict(_bound(item) for item in args.bound))
     ledger = offline_ledger.open_ledger(args.key or keys.default_path(), profile.robot.name)
-    gap = gap_of(args.recording, model, profile)[0] if args.recording else gap_at(args.radius, args.hold_radius, model, profile)
+    if args.recording:
+        gap = gap_of(args.recording, model, profile, max_gb=args.max_gb)[0]
+    else:
+        gap = gap_at(args.radius, args.hold_radius, model, profile)
     headroom = profile.verification.headroom if args.recording else 1.0
     asked = msgspec.structs.replace(profile, model=model.spec)
     amid = headroom**0.5  # with room to spare, and not so much that nothing passes

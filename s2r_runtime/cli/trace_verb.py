@@ -92,6 +92,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Exit 0 with any verdict, 3 with too little data."""
+    from s2r_runtime.table_text import limits_of
     from s2r_runtime.trace.tracer import load_dataset, trace
 
     if bool(args.recording) == (args.live is not None):
@@ -119,10 +120,15 @@ def run(args: argparse.Namespace) -> int:
     if args.horizon and args.horizon < model.dt:
         raise UsageError(f"--horizon {args.horizon:g}: must be at least the model's step, {model.dt:g} s")
     columns, transport = columns_of(args, model, profile, *args.recording, args.test), profile.transport if profile else None
+    reading = output.Progress("reading")
     read = partial(load_dataset, model=model, columns=columns, transport=transport, signals=signals_of(args, model))
-    data = read(args.recording, bandwidth=args.bandwidth)
-    used = data.reconstruction.bandwidth if data.reconstruction and not data.reconstruction.axes else args.bandwidth
-    test = read(args.test, bandwidth=used, behind=data.behind) if args.test else None
+    read = partial(read, limits=limits_of(args.max_gb), progress=reading)
+    try:
+        data = read(args.recording, bandwidth=args.bandwidth)
+        used = data.reconstruction.bandwidth if data.reconstruction and not data.reconstruction.axes else args.bandwidth
+        test = read(args.test, bandwidth=used, behind=data.behind) if args.test else None
+    finally:
+        reading.close()
     for one in (data, test):
         output.notes(one.source if one else "", one.notes if one else ())
     if test and set(test.digests) & set(data.digests):

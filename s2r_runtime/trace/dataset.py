@@ -15,7 +15,7 @@ changes its speed at once would look slow.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import NotEnoughEvidence, RecordingError
 from s2r_runtime.gap import Transitions
 from s2r_runtime.models.composed import SUBSTEPS, ComposedModel
+from s2r_runtime.table_rows import Subset
 from s2r_runtime.tables import LARGEST
 from s2r_runtime.trace.chains import Inputs
 from s2r_runtime.trace.reconstruct import Reconstruction, at_step, independent_step, snapped
@@ -170,6 +171,8 @@ class Dataset:
     """Commands changed between rows, nobody knows when: transitions in which one does are left out (`unplaced`)."""
     called: tuple[str, ...] = ()
     """Names of its segments; empty if it has one, or none has a name."""
+    subset: Subset | None = None
+    """Which rows of a long recording are here; None: all."""
     notes: tuple[str, ...] = ()
     """What a person should know of how the recording was read, one line each."""
     forgetting: tuple[tuple[float, float], ...] = ()
@@ -430,11 +433,6 @@ def least_parts(model: ComposedModel) -> int:
     """S for inputs that change between steps only: 1, unless effects may meet something for which the order within a step matters."""
     straight = all(a.effect.stage != "input" or getattr(a.effect, "linear", False) for a in model.effects)
     return 1 if straight and not getattr(model.nominal, "reached", None) else SUBSTEPS
-
-
-def columns_of(model: ComposedModel, columns: Mapping[str, str]) -> dict[str, str]:
-    """Name in the model -> column of the recording."""
-    return {name: columns.get(name, name) for name in (*model.states, *model.inputs)}
 
 
 def _first(states: Stream) -> float:

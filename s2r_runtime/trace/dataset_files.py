@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +24,9 @@ from s2r_runtime.messages import CampaignFinished, Observed, Send, StartCampaign
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.recording.origin import other_writer
 from s2r_runtime.robot_logs import content_digest, is_mcap, is_robot_log
-from s2r_runtime.trace.dataset import Array, Dataset, Stream, columns_of, from_streams
+from s2r_runtime.table_rows import Subset, joined
+from s2r_runtime.table_text import Limits, Progress, refuse_special
+from s2r_runtime.trace.dataset import Array, Dataset, Stream, from_streams
 from s2r_runtime.trace.hidden import told_through
 from s2r_runtime.trace.late_poses import earlier, late_pose
 from s2r_runtime.trace.reconstruct import late_speeds, reconstruct
@@ -31,6 +34,9 @@ from s2r_runtime.trace.residual import check_steps
 from s2r_runtime.trace.unseen import unneeded, without
 
 Row = tuple[float, ...]
+
+MAX_ROWS = 262_144
+"""Rows of a table that are traced: a search takes as much longer as there are more, and a fit uses 4000 of them."""
 
 MISSPELT = 0.75
 """Likeness of names from which on one is the other, misspelt; upper and lower are 0.6 alike."""
@@ -46,19 +52,24 @@ def load_dataset(
     transport: Mapping[str, Any] | None = None,
     behind: Mapping[str, float] | None = None,
     signals: Mapping[str, str] | None = None,
+    limits: Limits | None = None,
+    progress: Progress | None = None,
 ) -> Dataset:
     """Reads a recording on the model's grid. columns: name in the model, or `t` -> column of the table. Several paths: parts of one log, or
     recordings of one kind, each of them a run of its own. signals: name in the model -> signal, for a file with named signals.
     epoch: of a log, only what was recorded while that campaign was under way. bandwidth: Hz within which states that the table does not
     have are reconstructed from those that it has (None: what the data bear, and only those that the motion
     needs: unseen.py). transport: the profile's, for a log in a robot's own format. behind: s by which states of the pose come late, if that
-    is known from another recording (None: as this one says, `late_poses`).
+    is known from another recording (None: as this one says, `late_poses`). limits, progress: of reading a table; of one with more than
+    MAX_ROWS rows stretches that are evenly spread are used (`Dataset.subset`).
 
     Raises RecordingError (unreadable, lacks a column that does not follow from others, too slow for the model's dt), ConfigError if
     somebody's own model fails at the states of a table, NotEnoughEvidence if states were measured at one moment only, or too seldom for
     what was not measured, UsageError if a recording is there twice.
     """
     paths = tuple(Path(p) for p in ([path] if isinstance(path, str | Path) else path))
+    for one in paths:
+        refuse_special(one)
     digests = tuple(_digest(p) for p in paths)
     source = ", ".join(str(p) for p in paths)
     own = [one for one in paths if _is_own_log(one)]
@@ -67,7 +78,8 @@ def load_dataset(
     _once(paths, digests)
     if own:
         return replace(from_streams(model, _log_segments(paths, model, epoch), source, digests, paths), commanded=True)
-    parts = [_read_one(one, model, columns or {}, transport, signals, hidden=not bandwidth) for one in paths]
+    tables = _Tables(columns or {}, not bandwidth, MAX_ROWS // len(paths), limits, progress)
+    parts = [_read_one(one, model, tables, transport, signals) for one in paths]
     _once(paths, [part.content for part in parts])
     segments, missing, called = _joined(paths, parts)
     if not missing:
@@ -88,9 +100,10 @@ def load_dataset(
         segments, done = reconstruct(model, segments, missing, source, bandwidth, slow)
     named = called if len(called) > 1 and done is None else ()  # what was reconstructed may be in more parts
     data = from_streams(model, segments, source, (*digests, *(part.content for part in parts)), paths, done)
+    subset = joined([part.subset for part in parts], [sum(len(states.t) for states, _ in part.segments) for part in parts])
     names = [f"{one.name}: " if len(paths) > 1 else "" for one in paths]
     notes = tuple(f"{name}{line}" for name, part in zip(names, parts, strict=True) for line in part.notes)
-    return replace(data, behind=dict(behind), called=named, notes=notes)
+    return replace(data, behind=dict(behind), called=named, subset=subset, notes=notes)
 
 
 def _check_steps(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]]) -> None:
@@ -111,46 +124,63 @@ def _digest(path: Path) -> str:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _table_segments(
-    path: Path, model: ComposedModel, columns: Mapping[str, str], hidden: bool
-) -> tuple[list[tuple[Stream, Stream]], tuple[str, ...], str, tuple[str, ...]]:
-    """The segments, the states that the table does not have although they may be left out, the digest of what it says, however it is
-    written, and what the segments are called. A column that the caller named must be there. hidden: whether states may be left out that
-    others tell by the model alone.
-    """
-    from s2r_runtime.tables import TIME, read_csv
+class _Tables(NamedTuple):
+    """How tables are read. hidden: whether states may be left out that others tell by the model alone. max_rows: of each that are used."""
 
-    names = columns_of(model, columns)
+    columns: Mapping[str, str]
+    hidden: bool
+    max_rows: int
+    limits: Limits | None
+    progress: Progress | None
+
+
+def _table_segments(path: Path, model: ComposedModel, how: _Tables) -> _Part:
+    """A table's. A column that the caller stated must be there."""
+    from s2r_runtime.tables import read_csv
+
+    columns, names = how.columns, (*model.states, *model.inputs)
     free = {name for name in getattr(model.nominal, "follows", {}) if name not in columns}
-    free |= _hidden(path, model, free, columns) if hidden else set()
-    needed, spare = ([names[n] for n in names if (n in free) == may] for may in (False, True))
-    table = read_csv(path, needed, spare, columns.get(TIME, TIME))
+    free |= _hidden(path, model, free, columns) if how.hidden else set()
+    needed, spare = ([name for name in names if (name in free) == may] for may in (False, True))
+    table = read_csv(
+        path,
+        needed,
+        spare,
+        columns,
+        order=names,
+        angles=model.nominal.angles,
+        max_rows=how.max_rows,
+        limits=how.limits,
+        progress=how.progress,
+    )
     unsaid = {s for s in model.states if s not in columns and np.isnan(table.columns.get(s, np.array(np.nan))).all()}
-    if not unsaid <= free and not (hidden and told_through(model.nominal, [s for s in model.states if s in unsaid])):
+    if not unsaid <= free and not (how.hidden and told_through(model.nominal, [s for s in model.states if s in unsaid])):
         unsaid &= free
     missing = tuple(s for s in model.states if s in unsaid)
-    states = np.column_stack([table.columns[names[s]] for s in model.states if s not in missing])
-    inputs = np.column_stack([table.columns[names[i]] for i in model.inputs])
-    where = np.zeros(len(table.t), dtype=np.int64) if table.segment is None else table.segment
+    states = np.column_stack([table.columns[s] for s in model.states if s not in missing])
+    inputs = np.column_stack([table.columns[i] for i in model.inputs])
+    where = table.piece if table.piece is not None else table.segment
+    where = np.zeros(len(table.t), dtype=np.int64) if where is None else where
+    edges = np.flatnonzero(np.diff(where, prepend=-1, append=-1))
     given = []
-    for segment in np.unique(where):
-        rows = where == segment
-        t, y, u = table.t[rows], states[rows], inputs[rows]
+    for a, b in pairwise(edges.tolist()):
+        t, y, u = table.t[a:b], states[a:b], inputs[a:b]
         measured, commanded = ~np.isnan(y).all(axis=1), ~np.isnan(u).all(axis=1)
         given.append((Stream(t[measured], y[measured]), Stream(t[commanded], u[commanded])))
-    return given, missing, table.content_digest([names[n] for n in names if n not in missing]), table.segments
+    called = table.segments if table.subset is None else ()  # stretches of one segment are runs of their own
+    return _Part(given, missing, table.content, called, table.notes, table.subset)
 
 
 def _hidden(path: Path, model: ComposedModel, free: set[str], columns: Mapping[str, str]) -> set[str]:
     """States that the table does not have, and that other ones tell by the model (`hidden`). Not where it has a column that nobody asked
     for, of nearly the same name: that is it, misspelt.
     """
-    from s2r_runtime.tables import header_of
+    from s2r_runtime.tables import header_of, places_of
 
     header = header_of(path)
-    there = {name for name in (*model.states, *model.inputs) if columns.get(name, name) in header}
+    there = places_of(path, (*model.states, *model.inputs), columns, model.nominal.angles)
     lacks = [s for s in model.states if s not in {*there, *free, *columns}]
-    spare = [name for name in header if name not in {columns.get(one, one) for one in there}]
+    spare = [name for name in header if name not in {place.column for place in there.values()}]
     if not lacks or any(difflib.get_close_matches(name.lower(), [other.lower() for other in spare], 1, MISSPELT) for name in lacks):
         return set()
     missing = [s for s in model.states if s not in there]
@@ -167,6 +197,7 @@ class _Part(NamedTuple):
     content: str
     called: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    subset: Subset | None = None
 
 
 def _is_own_log(path: Path) -> bool:
@@ -187,14 +218,12 @@ def _once(paths: Sequence[Path], digests: Sequence[str]) -> None:
 def _read_one(
     path: Path,
     model: ComposedModel,
-    columns: Mapping[str, str],
+    tables: _Tables,
     transport: Mapping[str, Any] | None,
     signals: Mapping[str, str] | None,
-    *,
-    hidden: bool,
 ) -> _Part:
-    recorded = read_recording(path, model, columns=columns, transport=transport, signals=signals)
-    return _Part(*_table_segments(path, model, columns, hidden)) if recorded is None else _recorded_segments(recorded, model)
+    recorded = read_recording(path, model, columns=tables.columns, transport=transport, signals=signals)
+    return _table_segments(path, model, tables) if recorded is None else _recorded_segments(recorded, model)
 
 
 def _joined(paths: Sequence[Path], parts: Sequence[_Part]) -> tuple[list[tuple[Stream, Stream]], tuple[str, ...], tuple[str, ...]]:

@@ -13,6 +13,7 @@ from s2r_runtime.effects.classes import same
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
+from s2r_runtime.table_rows import Subset
 from s2r_runtime.trace.account import account
 from s2r_runtime.trace.domain import Range
 from s2r_runtime.trace.domain import told as domain_told
@@ -90,6 +91,11 @@ class TraceResult:
     """Transitions that were left out since a command changed in them, nobody knows when."""
     domain: tuple[Range, ...] = ()
     """Of each state, then each input: where it was fitted or judged. Beyond that nothing speaks for what was found."""
+    subset: Subset | None = None
+    """Which rows of a long recording were used; None: all. test_subset: of the one that it was judged on."""
+    test_subset: Subset | None = None
+    notes: tuple[str, ...] = ()
+    """What was guessed of the recording's columns, one sentence each."""
 
     def same(self, found: Found) -> tuple[Found, ...]:
         """Of `ambiguous_with`: other names of the very same thing on this model."""
@@ -125,7 +131,8 @@ class TraceResult:
     @property
     def done_to_data(self) -> tuple[str, ...]:
         """What stands between the measurements and what was fitted, one line each."""
-        lines = [] if self.reconstruction is None else self.reconstruction.text()
+        lines = [one.text() + of for one, of in ((self.subset, ""), (self.test_subset, " of what it is judged on")) if one]
+        lines += [] if self.reconstruction is None else self.reconstruction.text()
         if self.unseen:
             was = "was" if len(self.unseen) == 1 else "were"
             lines.append(f"{', '.join(self.unseen)} {was} not measured, and not needed: the motion follows from the inputs without")
@@ -257,6 +264,9 @@ class TraceResult:
             "seen_within": {one.name: one.to_json() for one in self.domain},
             "step_s": self.nominal.dt,
             "step_parts": self._parts,
+            "subset": self.subset.to_json() if self.subset else None,
+            "test_subset": self.test_subset.to_json() if self.test_subset else None,
+            "notes": list(self.notes),
             "n_fit": self.n_fit,
             "n_test": len(self.held.steps),
         }

@@ -114,7 +114,10 @@ def trace(
 
     with threadpool_limits(limits=1):
         horizon = usual_horizon(model.dt) if horizon is None else horizon
-        return _traced(_Asked(dataset, test, model, horizon, seed, progress or (lambda done, total, detail: None), weights, kind))
+        found = _traced(_Asked(dataset, test, model, horizon, seed, progress or (lambda done, total, detail: None), weights, kind))
+    return replace(
+        found, subset=dataset.subset, test_subset=test.subset if test else None, notes=(*dataset.notes, *(test.notes if test else ()))
+    )
 
 
 @dataclass(frozen=True)
