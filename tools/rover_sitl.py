@@ -29,7 +29,8 @@ ROOT = Path(__file__).resolve().parent.parent
 SETTING, BESIDE = "S2R_SITL", ROOT.parent / "shared" / "sitl"
 PROGRAM, PARAMETERS = "ardurover", "rover-skid.parm"
 FIRST_PORT, PORTS_EACH = 5760, 10
-INSTANCES = range(20, 400)
+INSTANCES = range(20, 250)
+"""It keeps the number in one byte: 288 would listen on the ports of 32."""
 START_S, ANSWER_S, READY_S = 20.0, 10.0, 120.0
 """Until it listens; until a parameter is answered; until its estimator is ready (40 s on an idle machine)."""
 RETRY_S = 1.0
