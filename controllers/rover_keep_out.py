@@ -11,10 +11,10 @@ PARAMETERS = {
     "speed": 0.8,  # m/s
     "slow": 0.8,  # of the distance to the goal, 1/s: the speed at most
     "least": 0.4,  # m/s, near the goal
-    "turn": 1.2,  # yaw rate per heading error, 1/s
-    "max_turn": 0.9,  # rad/s
+    "turn": 2.0,  # yaw rate per heading error, 1/s
+    "max_turn": 0.98,  # rad/s
     "area": 1.2,  # radius of a keep-out area with the rover's own, m; as in the task
-    "margin": 0.8,  # m
+    "margin": 1.0,  # m
     "edge": 6.8,  # the rover keeps within this of the origin on each axis, m
     "aligned": 0.6,  # cosine of the heading error below which it turns on the spot
 }
