@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,8 @@ from s2r_runtime.report.story import tell as fold
 Array = NDArray[np.float64]
 AROUND_S = 30.0
 """Before and after the fault, in its figure."""
+SHOWN_M = 0.1
+"""Larger discrepancies are drawn there: a rover drives no farther in one step."""
 
 
 def page(stories: list[Told], bare: dict[str, Any], lines: list[str]) -> str:
@@ -43,7 +46,7 @@ def _story(result: Page, told: Told) -> None:
     rows = [
         (
             f"{step['at_s']:.0f}",
-            f"s2r {step['verb'].split('/')[-1]}",
+            f"s2r {_without_folders(step['verb'])}",
             f"{step['seconds']:.0f}",
             step["exit_code"],
             _first_line(step["text"]),
@@ -58,8 +61,13 @@ def _story(result: Page, told: Told) -> None:
     _watched(result, told)
 
 
+def _without_folders(text: str) -> str:
+    return " ".join(word.rsplit("/", 1)[-1] for word in text.split())
+
+
 def _first_line(text: str) -> str:
-    return next(iter(text.strip().splitlines()), "")[:120]
+    """The answer's first line; of a digest its first digits, which tell it from others."""
+    return re.sub(r"(sha256:[0-9a-f]{8})[0-9a-f]+", r"\1...", next(iter(text.strip().splitlines()), ""))[:140]
 
 
 def _gap(result: Page, gap: Gap, seen: Story) -> None:
@@ -81,6 +89,7 @@ def _drive(result: Page, seen: Story) -> None:
         )
     if measured:
         t, d, _, radius, verified = (np.array(column) for column in zip(*measured, strict=True))
+        d = np.minimum(d, SHOWN_M)
         curves = {
             "discrepancy": (t, 1e3 * d, plots.BLUE),
             "radius in force": (t, 1e3 * radius, plots.ORANGE),
