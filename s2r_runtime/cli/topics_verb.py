@@ -81,14 +81,21 @@ def _listed(path: Path) -> tuple[str, Sequence[Topic], list[str]]:
 
 def _table(path: Path) -> Topic:
     """A CSV as one topic without a name."""
+    import numpy as np
+
     from s2r_runtime.formats.series import Topic
     from s2r_runtime.tables import SEGMENT, TIME, header_of, read_csv
 
     header = [name for name in header_of(path) if name and name != SEGMENT]
     if TIME not in header:
         return Topic("", "table", 0, math.nan, math.nan, dict.fromkeys(header, ""), "no column t (the stamps): --column t=NAME")
-    t = read_csv(path, []).t
-    return Topic("", "table", len(t), float(t.min()), float(t.max()), {name: "" for name in header if name != TIME})
+    table = read_csv(path, [])
+    fields = {name: "" for name in header if name != TIME}
+    if table.segment is None:
+        return Topic("", "table", len(table.t), float(table.t.min()), float(table.t.max()), fields)
+    lasts = sum(float(np.ptp(table.t[table.segment == k])) for k in range(len(table.segments)))
+    note = f"{len(table.segments)} runs, by {SEGMENT}"
+    return Topic("", "table", len(table.t), float(table.t.min()), float(table.t.max()), fields, note, lasts)
 
 
 def _model(name: str) -> ComposedModel:

@@ -32,11 +32,14 @@ ALIASES: dict[str, tuple[str, ...]] = {
 
 
 class Source(NamedTuple):
-    """Topics of a type, or of a name, and what of theirs is what. names: pieces of topic names, the likelier first (bags)."""
+    """Topics of a type, or of a name, and what of theirs is what. names: ends of topic names, the likelier first (bags). only_named: topics
+    of other names are something else.
+    """
 
     match: str
     paths: Mapping[str, str]
     names: tuple[str, ...] = ()
+    only_named: bool = False
 
 
 _POSE = {"x": "position.x", "y": "position.y", "theta": "orientation"}
@@ -58,6 +61,12 @@ STATES: tuple[Source, ...] = (
         "geometry_msgs/msg/TransformStamped",
         {"x": "transform.translation.x", "y": "transform.translation.y", "theta": "transform.rotation"},
         ("vicon",),
+    ),
+    Source(
+        "tf2_msgs/msg/TFMessage",
+        {"x": "translation.x", "y": "translation.y", "theta": "rotation"},
+        tuple(f"tf[{frame}->{child}]" for frame in ("odom", "map") for child in ("base_footprint", "base_link", "base")),
+        only_named=True,
     ),
     Source("turtlesim/msg/Pose", {"x": "x", "y": "y", "theta": "theta"}),
     Source("sensor_msgs/msg/JointState", {"q": "position[0]", "qd": "velocity[0]"}, ("joint_states",)),
@@ -140,6 +149,8 @@ def _by_source(source: Source, lacks: Sequence[str], topics: Sequence[Topic]) ->
         there = [topic for topic in topics if topic.name == source.match[1:]]
     else:
         there = [topic for topic in topics if topic.kind == source.match]
+    if source.only_named:
+        there = [topic for topic in there if topic.name.strip("/").endswith(source.names)]
     if not there:
         return {}
     topic = min(there, key=lambda one: _rank(one, source))

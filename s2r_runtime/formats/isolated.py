@@ -46,8 +46,8 @@ class IsolatedFile:
         self.drawn: bool = answer["drawn"]
         self.notes: list[str] = answer["notes"]
         self._topics = [
-            Topic(name, kind, n, math.nan if first is None else first, math.nan if last is None else last, fields, note)
-            for name, kind, n, first, last, fields, note in answer["topics"]
+            Topic(name, kind, n, math.nan if first is None else first, math.nan if last is None else last, fields, note, lasts)
+            for name, kind, n, first, last, fields, note, lasts in answer["topics"]
         ]
 
     def topics(self) -> Sequence[Topic]:
@@ -194,7 +194,7 @@ def _answer(request: Any, opened: dict[tuple[str, str, int], Opened]) -> tuple[d
         file = opened[key]
         if request["wanted"] is None:
             topics = [
-                [t.name, t.kind, t.n, *(s if math.isfinite(s) else None for s in (t.first_s, t.last_s)), dict(t.fields), t.note]
+                [t.name, t.kind, t.n, *(s if math.isfinite(s) else None for s in (t.first_s, t.last_s)), dict(t.fields), t.note, t.lasts_s]
                 for t in file.topics()
             ]
             return {"kind": file.kind, "drawn": file.drawn, "notes": file.notes, "topics": topics}, []

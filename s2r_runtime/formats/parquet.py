@@ -77,7 +77,8 @@ class ParquetTable:
             note = "; ".join(filter(None, [note, f"{len(runs)} runs, by {self._labels}"]))
         fields = dict.fromkeys((name for name in self._columns if name != self._labels), "")
         first, last = (float(np.nanmin(stamps)), float(np.nanmax(stamps))) if whole else (np.nan, np.nan)
-        return [Topic("", "table", len(stamps), first, last, fields, note)]
+        lasts = sum(float(np.ptp(run.samples[""].t)) for run in runs) if whole and len(runs) > 1 else 0.0
+        return [Topic("", "table", len(stamps), first, last, fields, note, lasts)]
 
     def read(self, wanted: Mapping[str, Sequence[str]]) -> list[Run]:
         """Runs of the table."""

@@ -28,7 +28,8 @@ MAX_FILE_BYTES = 4_000_000_000
 class Topic(NamedTuple):
     """fields: name -> unit ("" where none is known), numbers only. n: messages; first_s, last_s: their stamps (NaN without any).
 
-    note: why it cannot be used, or what a reader should know; empty fields and no note: it holds no number.
+    note: why it cannot be used, or what a reader should know; empty fields and no note: it holds no number. lasts_s: of all runs together,
+    where there are several, whose stamps may begin anew.
     """
 
     name: str
@@ -38,11 +39,12 @@ class Topic(NamedTuple):
     last_s: float
     fields: Mapping[str, str]
     note: str = ""
+    lasts_s: float = 0.0
 
     @property
     def rate(self) -> float:
         """Messages a second; 0 where fewer than two stamps differ."""
-        span = self.last_s - self.first_s
+        span = self.lasts_s or self.last_s - self.first_s
         return (self.n - 1) / span if self.n > 1 and span > 0.0 else 0.0
 
 

@@ -205,6 +205,49 @@ def test_decoding_agrees_with_an_independent_reader(tmp_path: Path) -> None:
         assert open_recording(path).topics() == sorted(open_recording(path).topics())
 
 
+def test_payloads_that_cyclonedds_serialized(tmp_path: Path) -> None:
+    """CDR of the middleware that ROS 2 itself may use, in a database that is written here by rosbag2's schema."""
+    pytest.importorskip("cyclonedds")
+    from cyclonedds.idl import make_idl_struct
+    from cyclonedds.idl.types import array, float64, int32, uint32
+
+    def struct_of(name: str, **fields: Any) -> Any:
+        return make_idl_struct(name, name, fields)
+
+    time, vector = struct_of("Time", sec=int32, nanosec=uint32), struct_of("Vector3", x=float64, y=float64, z=float64)
+    header = struct_of("Header", stamp=time, frame_id=str)
+    turn = struct_of("Quaternion", x=float64, y=float64, z=float64, w=float64)
+    pose = struct_of("Pose", position=vector, orientation=turn)
+    twist = struct_of("Twist", linear=vector, angular=vector)
+    poses = struct_of("PoseWithCovariance", pose=pose, covariance=array[float64, 36])
+    twists = struct_of("TwistWithCovariance", twist=twist, covariance=array[float64, 36])
+    odometry = struct_of("Odometry", header=header, child_frame_id=str, pose=poses, twist=twists)
+    rows = driven(7)
+    with sqlite3.connect(tmp_path / "a.db3") as database:
+        database.execute(
+            "CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT, offered_qos_profiles TEXT)"
+        )
+        database.execute("CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)")
+        for place, (name, kind) in enumerate([("/odom", "nav_msgs/msg/Odometry"), ("/cmd_vel", "geometry_msgs/msg/Twist")], start=1):
+            database.execute("INSERT INTO topics VALUES (?, ?, ?, 'cdr', '')", (place, name, kind))
+        for row in rows:
+            (x, y, theta), (v, w) = row.pose, row.twist
+            given = twist(vector(v, 0.0, 0.0), vector(0.0, 0.0, w))
+            at = pose(vector(x, y, 0.0), turn(0.0, 0.0, float(np.sin(theta / 2)), float(np.cos(theta / 2))))
+            stamp = header(time(row.t_ns // SECOND, row.t_ns % SECOND), "odom")
+            seen = odometry(stamp, "base", poses(at, [0.0] * 36), twists(given, [0.0] * 36))
+            for topic, message in ((2, given), (1, seen)):
+                payload = message.serialize(use_version_2=False)
+                database.execute("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", (topic, row.t_ns, payload))
+    database.close()
+    x, u = truth(rows)
+    signals = {"x": "/odom.pose.pose.position.x", "v": "/cmd_vel.linear.x"}
+    for found in (load_transitions(tmp_path / "a.db3", MODEL), load_transitions(tmp_path / "a.db3", MODEL, signals=signals)):
+        assert len(found.x0) == len(rows) - 1
+        assert np.max(np.abs(MODEL.difference(found.x1, x[1:]))) < 1e-6
+        assert np.max(np.abs(found.u - u[:-1])) < 1e-5
+
+
 @pytest.mark.parametrize("kind", ["ros1", "ros1 bz2", "sqlite3", "sqlite3 message", "mcap message"])
 def test_spoilt_bags_are_one_line_or_read_as_far_as_they_hold(kind: str, tmp_path: Path) -> None:
     path = KINDS[kind](tmp_path / "whole", driven(6, 30))
