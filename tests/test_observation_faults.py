@@ -202,6 +202,17 @@ def test_a_twin_stops_everything_at_once_with_zero_input(recovery: str) -> None:
     assert all(send.u == (0.0, 0.0) for send in of(it.outputs, Send)[-20:])
 
 
+def test_what_a_twin_sends_latches_nothing_besides() -> None:
+    it = rig()
+    it.observe()
+    it.feed(OverrideChanged(it.t, "robot_twin", "two"))
+    for _ in range(60):
+        it.observe()
+        faulty(it, "another publisher is on the topic")
+    assert latched(it) == ("robot_twin",)
+    assert it.state.fault == "two"
+
+
 def test_a_twin_outlives_a_restart_and_keeps_the_sampler_out() -> None:
     it = rig()
     it.feed(OverrideChanged(it.t, "robot_twin", "two"))

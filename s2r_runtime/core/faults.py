@@ -20,9 +20,9 @@ REASON = "observation_faults"
 
 
 def note(turn: Turn, observation: Observation) -> None:
-    """Keeps what is wrong with an observation, before the gate looks at it; but what latched the gate is not forgotten for what follows."""
-    if observation.fault:
-        _keep(turn, observation.fault)
+    """Keeps what is wrong with an observation, before the gate looks at it."""
+    if observation.fault and not _latched(turn):
+        turn.set(fault=observation.fault)
 
 
 def judge(turn: Turn, observation: Observation, before: Observation | None) -> None:
@@ -45,17 +45,18 @@ def refused(turn: Turn, detail: str) -> None:
 
 def _count(turn: Turn, what: str) -> None:
     settings, state = turn.settings, turn.state
-    _keep(turn, what)
-    if not settings.fault_share or state.faulty or REASON in turn.memory.latched:
+    if _latched(turn):  # what latched is not forgotten for what follows; what a second robot sends needs no second clearing
+        return
+    turn.set(fault=what)
+    if not settings.fault_share or state.faulty:
         return
     turn.set(faulty=True, fault_level=state.fault_level + 1.0 - settings.fault_share)
     if turn.state.fault_level > settings.fault_burst:
         stop(turn, REASON, f"more than {settings.fault_share:.0%} of the observations are faulty, the last: {what}")
 
 
-def _keep(turn: Turn, what: str) -> None:
-    if not {REASON, "robot_twin"} & set(turn.memory.latched):
-        turn.set(fault=what)
+def _latched(turn: Turn) -> bool:
+    return not {REASON, "robot_twin"}.isdisjoint(turn.memory.latched)
 
 
 def forgive(turn: Turn) -> None:
