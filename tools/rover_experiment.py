@@ -66,6 +66,8 @@ def outcome_lines(stories: list[Told], bare: dict[str, Any]) -> list[str]:
         lines.append(f"{told.name}: {'complete' if told.is_complete else 'not complete'}; drove {told.driven_s:.0f} s under a certificate")
         closed = ", ".join(f"{reason} {seconds:.0f} s" for reason, seconds in told.closed.items())
         lines.append(f"  gate closed meanwhile: {closed or 'never'}; false revocation: {told.false_revocation or 'none'}")
+        if told.deployed_again:
+            lines.append(f"  controller_fault cleared and deployed again {told.deployed_again} times")
         if told.noticed_after_s is not None:
             lines.append(
                 f"  fault noticed after {told.noticed_after_s:.1f} s ({told.reason_noticed}); deployed again: refused {told.refused_again}"
