@@ -108,14 +108,19 @@ def open_recording(path: Path, form: Form | None = None) -> Opened:
     form = form or recognised(path)
     if form is None:
         raise UsageError(f"{path}: is none of the formats that have named signals; a table and a robot's own log are read as they are")
-    hint = f"{path}: this is {form.what}; pip install '{form.install}'"
     if form.name not in registry().names("formats"):
-        raise UsageError(hint)
+        raise not_installed(path, form)
     try:
         found: Opened = registry().get("formats", form.name)(path) if form.name == BAG else IsolatedFile(path, form.name, form.what)
     except ImportError as error:
-        raise UsageError(f"{hint} ({error.name or error} is missing)") from None
+        raise not_installed(path, form, error) from None
     return found
+
+
+def not_installed(path: Path, form: Form, error: ImportError | None = None) -> UsageError:
+    """What the file is, and the command that installs its reader. error: what its import raised, if it is there and lacks a library."""
+    lacks = "" if error is None else f" ({error.name or error} is missing)"
+    return UsageError(f"{path}: this is {form.what}; pip install '{form.install}'{lacks}")
 
 
 def _folder(path: Path) -> Form:

@@ -13,7 +13,7 @@ from typing import Any
 from s2r_runtime.errors import MissingSignal, UsageError
 from s2r_runtime.formats.guess import guessed
 from s2r_runtime.formats.mapping import Recorded, read_signals, resolved, unit_notes
-from s2r_runtime.formats.recognise import BAG, Form, open_recording, recognised
+from s2r_runtime.formats.recognise import BAG, Form, not_installed, open_recording, recognised
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.robot_logs import is_robot_log, read_robot_log
 
@@ -39,6 +39,10 @@ def read_recording(
         try:
             log = read_robot_log(path, model, transport)
             return Recorded(log.stretches, notes=log.notes)
+        except ImportError as error:
+            if form is None:
+                raise
+            raise not_installed(path, form, error) from None
         except MissingSignal as error:
             if transport or form is None or form.name != BAG:
                 raise

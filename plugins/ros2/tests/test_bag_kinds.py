@@ -6,6 +6,7 @@ import random
 import shutil
 import sqlite3
 import struct
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -299,3 +300,14 @@ def test_a_bag_of_a_topic_that_is_not_driving_says_what_there_is(tmp_path: Path,
     assert "/chatter (std_msgs/msg/String" in said
     assert "Give --state x=SIGNAL" in said
     assert main(["topics", str(path)]) == 3
+
+
+def test_without_its_library_a_ros1_bag_is_said_with_the_command_that_helps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = rosbag1(tmp_path / "a.bag", driven(1, 12))
+    for module in ("rosbags.rosbag1", "rosbags.typesys"):
+        monkeypatch.setitem(sys.modules, module, None)
+    for verb in ("gap", "trace", "topics"):
+        assert main([verb, str(path), *(UNICYCLE if verb != "topics" else [])]) == 2
+        assert "this is a ROS 1 bag; pip install 's2r-ros2[formats]'" in capsys.readouterr().err
