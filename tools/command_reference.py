@@ -26,6 +26,8 @@ def text() -> str:
         rows = [(_form(a), (a.help or "").replace("|", "\\|")) for a in verb._actions if a.dest != "help"]
         if any(help_text for _, help_text in rows):
             lines += ["| option | meaning |", "| --- | --- |", *(f"| `{form}` | {help_text} |" for form, help_text in rows), ""]
+        if verb.epilog:
+            lines += [verb.epilog, ""]
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -8,7 +8,11 @@ from typing import Any
 
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import count, positive
+from s2r_runtime.cli.presence import Presence
 from s2r_runtime.errors import UsageError
+
+WAITING = ("sample", "excite", "deploy", "trace", "verify")
+"""Requests whose answer takes long. A person who leaves before it stops what drives for it."""
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -25,7 +29,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     run.add_argument("--seed", type=count, help="seed of the campaigns and scenarios (default: the profile's)")
     run.set_defaults(run=run_daemon)
 
-    sample = verbs.add_parser("sample", help="one sampling campaign, through the running daemon if there is one")
+    sample = verbs.add_parser(
+        "sample",
+        help="one sampling campaign, through the running daemon if there is one",
+        epilog="Ctrl-C, a closed terminal, a dropped ssh or a killed command stop the robot and keep the campaign; the same command goes "
+        "on with it. With --detach the campaign goes on by itself.",
+    )
     sample.add_argument("profile", type=Path, metavar="PROFILE", help="the robot's profile (TOML)")
     sample.add_argument("-o", "--output", type=Path, metavar="FILE.mcap", help="the recording (without a running daemon)")
     sample.add_argument(
@@ -37,7 +46,10 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         metavar="S",
         help="without a daemon: for how many seconds the robot may be driven (default 3600). Running this verb is the permit",
     )
-    sample.add_argument("--cancel", action="store_true", help="stop the running daemon's campaign, or the given inputs that it drives")
+    end = sample.add_mutually_exclusive_group()
+    end.add_argument("--detach", action="store_true", help="return when the daemon drives; the campaign goes on without this command")
+    end.add_argument("--pause", action="store_true", help="stop the running daemon's campaign and keep it; s2r sample goes on with it")
+    end.add_argument("--cancel", action="store_true", help="stop the running daemon's campaign and give it up; its share of beta is spent")
     sample.add_argument(
         "--inputs",
         type=Path,
@@ -47,7 +59,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     _common(sample)
     sample.set_defaults(run=run_sample)
 
-    deploy = _talker(verbs, "deploy", "let this controller drive, if a certificate covers it; verify it first if none does")
+    deploy = _talker(
+        verbs,
+        "deploy",
+        "let this controller drive, if a certificate covers it; verify it first if none does",
+        "Ctrl-C before the controller drives withdraws it. Once it drives, it drives on without this command: s2r undeploy ends that.",
+    )
     deploy.add_argument("controller", type=Path, metavar="CONTROLLER", help="a Python file with control(x, theta, parameters)")
     deploy.add_argument("--certificate", type=Path, metavar="CERT", help="a certificate made by s2r certify")
     deploy.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the controller; may be repeated")
@@ -79,8 +96,10 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     status.set_defaults(run=run_status)
 
 
-def _talker(verbs: argparse._SubParsersAction[argparse.ArgumentParser], name: str, summary: str) -> argparse.ArgumentParser:
-    verb = verbs.add_parser(name, help=summary)
+def _talker(
+    verbs: argparse._SubParsersAction[argparse.ArgumentParser], name: str, summary: str, epilog: str | None = None
+) -> argparse.ArgumentParser:
+    verb = verbs.add_parser(name, help=summary, epilog=epilog)
     _common(verb)
     return verb
 
@@ -129,24 +148,30 @@ def run_sample(args: argparse.Namespace) -> int:
             raise UsageError(
                 f"-o: robot {profile.robot.name!r} has a running daemon, which records the campaign in its own log; leave -o out"
             )
-        if args.inputs and (args.cancel or args.n):
-            raise UsageError("--inputs: drives what is in the file; leave -n and --cancel out")
+        if args.inputs and (args.cancel or args.pause or args.n):
+            raise UsageError("--inputs: drives what is in the file; leave -n, --pause and --cancel out")
         if args.inputs and not args.inputs.is_file():
             raise UsageError(f"--inputs {args.inputs}: no such file; s2r trace --suggest writes one")
-        request = {"verb": "excite", "path": str(args.inputs.resolve())} if args.inputs else {"verb": "sample", "count": args.n}
-        return _say(args, {"verb": "cancel"} if args.cancel else request, socket)
+        request: dict[str, Any] = {"verb": "sample", "count": args.n}
+        if args.inputs:
+            request = {"verb": "excite", "path": str(args.inputs.resolve())}
+        if args.detach:
+            request["detached"] = True
+        return _say(args, {"verb": "cancel"} if args.cancel else {"verb": "pause"} if args.pause else request, socket)
     if args.inputs:
         raise UsageError(f"--inputs: no daemon of robot {profile.robot.name!r} is running; start one: s2r run {args.profile}")
-    if args.cancel:
-        raise UsageError(f"--cancel: no daemon of robot {profile.robot.name!r} is running")
+    for option in ("cancel", "pause", "detach"):
+        if getattr(args, option):
+            raise UsageError(f"--{option}: no daemon of robot {profile.robot.name!r} is running; start one: s2r run {args.profile}")
     from s2r_runtime.daemon.campaign_run import run_campaign
 
     out = args.output or Path(f"{profile.robot.name}-campaign.mcap")
     bar = output.Progress("sampling")
-    try:
-        result = run_campaign(profile, args.profile, out, n=args.n, permit_s=args.permit or 3600.0, progress=bar)
-    finally:
-        bar.close()
+    with Presence(signals=False) as presence:  # the daemon in this process listens for them
+        try:
+            result = run_campaign(profile, args.profile, out, n=args.n, permit_s=args.permit or 3600.0, progress=bar, left=presence.look)
+        finally:
+            bar.close()
     if args.json:
         output.result_json(result)
     else:
@@ -166,7 +191,10 @@ def run_deploy(args: argparse.Namespace) -> int:
             raise UsageError(f"{args.certificate}: cannot be read: {error.strerror}") from None
         except UnicodeDecodeError:
             raise UsageError(f"{args.certificate}: is no certificate: not UTF-8 text") from None
-    return _say(args, request)
+    code = _say(args, request)
+    if code == 0 and not args.json:
+        output.err("it drives on without this command; s2r undeploy ends that, s2r stop is the emergency stop")
+    return code
 
 
 def run_adopt(args: argparse.Namespace) -> int:
@@ -242,10 +270,16 @@ def _call(args: argparse.Namespace, request: dict[str, Any], socket: Path | None
             bar.close()
             output.err(str(line["text"]))
 
-    try:
+    if request["verb"] not in WAITING:
         return control.call(path, request, on_progress)
-    finally:
-        bar.close()
+    with Presence() as presence:
+        try:
+            answer = control.call(path, request, on_progress, presence)
+        finally:
+            bar.close()
+    if presence.left and answer["exit_code"]:
+        return {**answer, "exit_code": presence.exit_code, "text": f"interrupted: {answer['text']}"}
+    return answer
 
 
 def _parameters(items: list[str]) -> dict[str, float]:

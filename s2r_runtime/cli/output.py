@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import shutil
+import stat
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -56,9 +58,10 @@ def _to_stdout(text: str) -> None:
         if not text:
             sys.stdout.flush()
     except OSError as error:
+        closed_terminal = error.errno == errno.EIO and stat.S_ISCHR(os.fstat(sys.stdout.fileno()).st_mode)
         # what is buffered would be tried again when Python ends, and complained about; what comes yet has nowhere to go either
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if not isinstance(error, BrokenPipeError):
+        if not (isinstance(error, BrokenPipeError) or closed_terminal):
             raise UsageError(f"the result cannot be written to stdout: {error.strerror}") from None
 
 
@@ -134,14 +137,18 @@ class Progress:
         share = min(max(done / total, 0.0), 1.0) if total else 0.0
         bar = "█" * int(24 * share) + "░" * (24 - int(24 * share))
         left = "" if seconds_left is None else f" · {_duration(seconds_left)} left"
-        sys.stderr.write(f"\r\x1b[2K{self._label} {bar} {int(done)}/{int(total)}{left}{' · ' + detail if detail else ''}")
-        sys.stderr.flush()
+        _draw(f"\r\x1b[2K{self._label} {bar} {int(done)}/{int(total)}{left}{' · ' + detail if detail else ''}")
 
     def close(self) -> None:
         """Clears the line."""
         if self._live and self._drawn:
-            sys.stderr.write("\r\x1b[2K")
-            sys.stderr.flush()
+            _draw("\r\x1b[2K")
+
+
+def _draw(text: str) -> None:
+    with contextlib.suppress(OSError):  # the terminal closed
+        sys.stderr.write(text)
+        sys.stderr.flush()
 
 
 def _duration(seconds: float) -> str:

@@ -16,6 +16,7 @@ from s2r_runtime.core.certificates import begin_verification, refusal_to_verify,
 from s2r_runtime.core.drive import recover_now, regate
 from s2r_runtime.core.excitation import begin_inputs
 from s2r_runtime.core.gaps import begin_campaign
+from s2r_runtime.core.leaving import pause
 from s2r_runtime.core.repair import requested_adoption, requested_trace
 from s2r_runtime.core.sources import check_campaign, end_deployment, interrupt_campaign, stop
 from s2r_runtime.core.state import NANO, Deployment, Turn, job, situation
@@ -66,6 +67,8 @@ def requested(turn: Turn, request: Requested) -> None:
             _excite(turn, request)
         case "cancel":
             _cancel(turn, request)
+        case "pause":
+            pause(turn, request)
         case "trace":
             requested_trace(turn, request)
 

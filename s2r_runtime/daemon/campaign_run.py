@@ -30,15 +30,17 @@ Progress = Callable[..., None]
 class _Script:
     """What a person would do: wait for the robot, give the permit, ask for the campaign, wait for its end."""
 
-    def __init__(self, n: int, permit_s: float, progress: Progress | None) -> None:
-        self._n, self._permit_s, self._progress = n, permit_s, progress
+    def __init__(self, n: int, permit_s: float, progress: Progress | None, left: Callable[[], str] | None) -> None:
+        self._n, self._permit_s, self._progress, self._left = n, permit_s, progress, left
         self._began = self._heard = time.monotonic()
         self._number = 0
         self.exit_code, self.text = 1, ""
 
     def __call__(self, daemon: Daemon) -> None:
         """Called with every tick of the daemon's loop."""
-        if not self._number:
+        if self._left is not None and (why := self._left()):
+            daemon.end(why)
+        elif not self._number:
             self._begin(daemon)
         elif (answer := daemon.desk.answers.get(self._number)) is not None:
             self.exit_code, self.text = answer.exit_code, answer.text
@@ -77,13 +79,15 @@ def run_campaign(
     state_dir: Path | None = None,
     seed: int | None = None,
     progress: Progress | None = None,
+    left: Callable[[], str] | None = None,
 ) -> dict[str, Any]:
     """Samples, and founds the gap. n: how many (0: as many as the profile or its beta asks for). progress(done, total, detail,
-    seconds_left). The answer: `exit_code` (0: complete), `text`, `n`, `rejected`, `log`, `gap`.
+    seconds_left). left: why nobody waits for it any more, or empty; then it is interrupted. The answer: `exit_code` (0: complete), `text`,
+    `n`, `rejected`, `log`, `gap`.
 
     Raises UsageError if `out` exists and there is nothing to go on with, ConfigError for what makes a start impossible.
     """
-    script = _Script(n, permit_s, progress)
+    script = _Script(n, permit_s, progress, left)
     daemon = Daemon(profile, profile_path=profile_path, state_dir=state_dir, log_file=out, seed=seed, on_tick=script)
     if out.exists() and not _unfinished(daemon.state_dir / "state.json"):
         raise UsageError(f"{out}: is there already, and there is no unfinished campaign to go on with; name another file")

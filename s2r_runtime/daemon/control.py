@@ -2,8 +2,9 @@
 
 A Unix socket `<robot>.sock` (0600) in a folder of its owner's (0700); the kernel names the peer's user, and only the owner and
 root are heard. One connection is one request: a JSON line `{"verb": ...}`, answered by any number of progress lines and one final
-line that has `exit_code`, `text` and `data`. The server never waits for a client: requests are bounded and must arrive in time,
-and a client that doesn't read its answers is dropped.
+line that has `exit_code`, `text` and `data`. A client that waits may send one line more, `{"verb": "interrupt", "text": WHY}`: it wants
+no more of it, and hears what became of it. A client that hangs up means the same. The server never waits for a client: requests are
+bounded and must arrive in time, and a client that doesn't read its answers is dropped.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ import socket
 import stat
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from s2r_runtime.errors import ConfigError, UsageError
 
@@ -28,6 +29,10 @@ CLIENTS_MAX = 32
 REQUEST_WITHIN_NS = 5_000_000_000
 FIRST_LINE_WITHIN_S = 45.0
 """Longer than the daemon's loop may wait for a disk: 30 s, in lockstep."""
+INTERRUPTED_WITHIN_S = 10.0
+"""For the answer to an interrupted request; the robot is stopped long before."""
+INTERRUPT_MAX = 4096
+GONE = "its command is gone"
 _PATH_MAX = 107  # sun_path of unix(7), less the final zero
 
 Request = dict[str, Any]
@@ -76,6 +81,13 @@ class Connection:
             self.gone = True
             self._server.forget(self, self._sock)
             self._sock.close()
+            if not self._final:
+                self._server.left(self, GONE)
+
+    @property
+    def listening(self) -> bool:
+        """Whether its final answer is still awaited."""
+        return not (self.gone or self._final)
 
     def waiting(self) -> bool:
         """Whether its request is not there yet."""
@@ -107,6 +119,12 @@ class Connection:
             elif len(self._in) > REQUEST_MAX:
                 self._asked = True
                 self.answer(2, f"the request is longer than {REQUEST_MAX} bytes")
+        elif self.listening:
+            self._in += data
+            line, end, _ = self._in.partition(b"\n")
+            if end or len(self._in) > INTERRUPT_MAX:
+                self._in.clear()
+                self._server.left(self, _reason(bytes(line)))
 
     def _put(self, fields: dict[str, Any]) -> None:
         if self.gone or self._final:
@@ -135,9 +153,16 @@ class Connection:
 class ControlServer:
     """Listens for the daemon. `on_request(connection, request)` is called for each well-formed request."""
 
-    def __init__(self, path: Path, selector: selectors.BaseSelector, on_request: Callable[[Connection, Request], None]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        selector: selectors.BaseSelector,
+        on_request: Callable[[Connection, Request], None],
+        on_left: Callable[[Connection, str], None] | None = None,
+    ) -> None:
+        """on_left(connection, why): a client hung up, or wants no more of its request (then it still listens)."""
         self.path = path
-        self._selector, self._on_request = selector, on_request
+        self._selector, self._on_request, self._on_left = selector, on_request, on_left
         self._socket: socket.socket | None = None
         self._clients: list[Connection] = []
 
@@ -171,6 +196,7 @@ class ControlServer:
 
     def close(self) -> None:
         """Hangs up on everybody and removes the socket; may be called twice."""
+        self._on_left = None
         for client in list(self._clients):
             client.close()
         if self._socket is not None:
@@ -191,6 +217,11 @@ class ControlServer:
             return
         client.progress(accepted=True)
         self._on_request(client, request)
+
+    def left(self, client: Connection, why: str) -> None:
+        """A client is gone, or interrupted its request."""
+        if self._on_left is not None:
+            self._on_left(client, why)
 
     def interest(self, client: Connection, sock: socket.socket, *, writing: bool) -> None:
         """Whether the loop is to call when the socket can be written."""
@@ -218,6 +249,15 @@ class ControlServer:
             client.answer(2, f"user {uid} may not talk to this daemon; it belongs to user {os.getuid()}")
         elif len(self._clients) > CLIENTS_MAX:
             client.answer(70, "too many clients at once; try again")
+
+
+def _reason(line: bytes) -> str:
+    """Why a client interrupts its request, as printable text."""
+    try:
+        said = json.loads(line)["text"]
+    except (ValueError, RecursionError, KeyError, TypeError, IndexError):
+        said = ""
+    return "".join(filter(str.isprintable, said[:100])) if isinstance(said, str) and said else "interrupted"
 
 
 def _peer(sock: socket.socket) -> int:
@@ -261,8 +301,21 @@ def find_socket(robot: str | None = None, *, required: bool = True) -> Path | No
     return next(iter(found.values()))
 
 
-def call(path: Path, request: Request, on_progress: Callable[[Request], None] | None = None) -> Request:
-    """Sends a request and returns its final answer: `exit_code`, `text`, `data`. Raises UsageError if nobody answers."""
+class Presence(Protocol):
+    """Whether the person who gave a command is still there. `left`: why not, or empty."""
+
+    @property
+    def left(self) -> str:
+        """Why the person is not there any more, or empty."""
+
+    def wait(self, sock: socket.socket) -> None:
+        """Returns when the socket can be read, or the person left. Raises TimeoutError after the socket's own timeout."""
+
+
+def call(path: Path, request: Request, on_progress: Callable[[Request], None] | None = None, presence: Presence | None = None) -> Request:
+    """Sends a request and returns its final answer: `exit_code`, `text`, `data`. When the person leaves, the request is interrupted, and
+    the answer says what became of it. Raises UsageError if nobody answers.
+    """
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
         sock.settimeout(FIRST_LINE_WITHIN_S)
         try:
@@ -270,23 +323,44 @@ def call(path: Path, request: Request, on_progress: Callable[[Request], None] | 
             if (whose := _peer(sock)) not in (0, os.geteuid()) and os.geteuid() != 0:
                 raise UsageError(f"{path}: whoever listens there is user {whose}, and no daemon of yours; nothing was said to him")
             sock.sendall(json.dumps(request).encode() + b"\n")
-            with sock.makefile("rb") as lines:
-                for line in lines:
-                    answer: Request = json.loads(line)
-                    if "exit_code" in answer:
-                        return answer
-                    sock.settimeout(None)  # it was heard; some requests take as long as a campaign
-                    if on_progress is not None and "accepted" not in answer:
-                        on_progress(answer)
+            for answer in _answers(sock, presence):
+                if "exit_code" in answer:
+                    return answer
+                if on_progress is not None and "accepted" not in answer:
+                    on_progress(answer)
         except PermissionError:
             raise UsageError(f"{path}: belongs to another user's daemon; only its owner and root may talk to it") from None
         except TimeoutError:
+            if presence is not None and presence.left:
+                raise UsageError(f"{path}: the daemon does not answer; it stops the robot when it sees that this command is gone") from None
             raise UsageError(f"{path}: the daemon does not answer (waited {FIRST_LINE_WITHIN_S:.0f} s)") from None
         except OSError as error:
             raise UsageError(f"{path}: no daemon answers: {error.strerror or error}") from None
         except ValueError as error:
             raise UsageError(f"{path}: no daemon answers: {error}") from None
     raise UsageError(f"{path}: the daemon hung up before it answered; its log says why")
+
+
+def _answers(sock: socket.socket, presence: Presence | None) -> Iterator[Request]:
+    """The daemon's lines, until it hangs up. Raises TimeoutError if none comes when it should."""
+    buffer, interrupted = bytearray(), False
+    while True:
+        if presence is not None and not interrupted:
+            presence.wait(sock)
+            if presence.left:
+                interrupted = True
+                sock.settimeout(INTERRUPTED_WITHIN_S)
+                sock.sendall(json.dumps({"verb": "interrupt", "text": presence.left}).encode() + b"\n")
+        data = sock.recv(1 << 16)
+        if not data:
+            return
+        buffer += data
+        *lines, rest = buffer.split(b"\n")
+        buffer = bytearray(rest)
+        for line in lines:
+            yield json.loads(line)
+        if lines and not interrupted:
+            sock.settimeout(None)  # it was heard; some requests take as long as a campaign
 
 
 def _listening(path: Path) -> bool:

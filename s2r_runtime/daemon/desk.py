@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
@@ -27,9 +27,12 @@ from s2r_runtime.modelspec import ModelSpec, dump_model
 if TYPE_CHECKING:
     from s2r_runtime.daemon.loop import Daemon
 
-PLAIN = ("undeploy", "revoke", "clear", "stop", "permit", "sample", "cancel", "trace", "verify")
+PLAIN = ("undeploy", "revoke", "clear", "stop", "permit", "sample", "cancel", "pause", "trace", "verify")
 """Verbs that the core can have as they are."""
 MOVING = ("sample", "deploy", "excite")
+"""Verbs that make the robot move. Whoever asked for one and is gone before its answer stops it (`core.leaving`)."""
+DETACHED = "it goes on without this command. Look: s2r status; stop: s2r sample PROFILE --pause; stop everything: s2r stop"
+STILL = "nothing drives for it; what the daemon still computes goes on: s2r status"
 SETTLE_WITHIN_NS = 5_000_000_000
 """Three times the longest that a busy computer let a robot's or a link's process wait."""
 LOAD_TIMEOUT_S = 30.0
@@ -42,7 +45,8 @@ RESULT_OF = {"sample": "gap", "trace": "trace", "deploy": "verify", "verify": "v
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a client may ask. deploy: path, parameters, certificate (text). adopt: text of the model's TOML, base its folder; no text: the
-    proposed one. excite: path. trace: text says what.
+    proposed one. excite: path. trace: text says what. detached (sample, excite): answered when it drives, and not stopped when the
+    client is gone.
     """
 
     verb: str
@@ -53,6 +57,15 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     base: str = ""
     duration_s: float = 0.0
     count: int = 0
+    detached: bool = False
+
+
+class Waiting(NamedTuple):
+    """A request without a final answer. connection: whose, None for this process itself or a client that is gone."""
+
+    verb: str
+    connection: Connection | None
+    detached: bool = False
 
 
 class Desk:
@@ -62,7 +75,7 @@ class Desk:
         self._d = daemon
         self._server: ControlServer | None = None
         self._numbers = 0
-        self._waiting: dict[int, tuple[str, Connection | None]] = {}
+        self._waiting: dict[int, Waiting] = {}
         self.answers: dict[int, Answer] = {}  # to requests of this process itself
         self._said = (0, "")
         self._postponed: list[tuple[Requested, int]] = []
@@ -70,7 +83,7 @@ class Desk:
 
     def open(self, path: Path) -> None:
         """Listens. Raises ConfigError if another daemon does."""
-        self._server = ControlServer(path, self._d.selector, self._requested)
+        self._server = ControlServer(path, self._d.selector, self._requested, self._left)
         self._server.open()
 
     def close(self) -> None:
@@ -94,16 +107,19 @@ class Desk:
 
     def progress(self, done: float, total: float, detail: str, left_s: float | None = None) -> None:
         """How far what is being waited for is."""
-        for _, connection in self._waiting.values():
-            if connection is not None:
+        for waiting in tuple(self._waiting.values()):  # one that is found gone here makes a request of its own
+            if (connection := waiting.connection) is not None:
                 connection.progress(done=done, total=total, detail=detail, seconds_left=left_s)
 
-    def request(self, verb: Any, connection: Connection | None = None, **fields: Any) -> int:
-        """Puts a request to the core; its number. by: the connection's user, or this process's."""
+    def request(
+        self, verb: Any, connection: Connection | None = None, *, detached: bool = False, by: int | None = None, **fields: Any
+    ) -> int:
+        """Puts a request to the core; its number. detached: as in `Request`. by: default the connection's user, or this process's."""
         self._numbers += 1
         number = self._numbers
-        self._waiting[number] = (verb, connection)
-        by = os.getuid() if connection is None else connection.uid
+        self._waiting[number] = Waiting(verb, connection, detached)
+        if by is None:
+            by = os.getuid() if connection is None else connection.uid
         self._postponed.append((Requested(0, number, verb, by, **fields), time.monotonic_ns() + SETTLE_WITHIN_NS))
         self._put()
         return number
@@ -119,6 +135,38 @@ class Desk:
                 return
             self._postponed.pop(0)
             self._d.feed(request)
+            self._let_go(request.request_id)
+
+    def _let_go(self, number: int) -> None:
+        """A detached request drives: its client need not wait."""
+        campaign, waiting = self._d.state.campaign, self._waiting.get(number)
+        if waiting is None or not waiting.detached or campaign is None or campaign.request_id != number:
+            return
+        what = f"{campaign.n} rows of inputs are driven"
+        if not campaign.inputs:
+            what = f"campaign of epoch {campaign.epoch} runs, {campaign.taken} of {campaign.n} samples taken"
+        self._waiting[number] = Waiting(waiting.verb, None)
+        if waiting.connection is not None:
+            waiting.connection.answer(0, f"{what}; {DETACHED}")
+
+    def _left(self, connection: Connection, why: str) -> None:
+        """A client is gone, or wants no more of its request: what drives for it alone stops, and nothing begins to."""
+        number = next((n for n, waiting in self._waiting.items() if waiting.connection is connection), None)
+        if number is None:  # it has no number yet: its file is being read
+            connection.answer(1, f"withdrawn before anything moved: {why}")
+            return
+        verb, _, detached = self._waiting[number]
+        postponed = [one for one in self._postponed if one[0].request_id == number]
+        if verb in MOVING and postponed:
+            self._postponed.remove(postponed[0])
+            self._waiting.pop(number)
+            connection.answer(1, f"withdrawn before anything moved: {why}")
+        elif verb in MOVING and not detached:
+            self.request("pause", by=connection.uid, count=number, text=why)
+        if connection.listening:  # the core had nothing to stop
+            connection.answer(1, f"{verb}: {STILL}")
+        if number in self._waiting:
+            self._waiting[number] = Waiting(verb, None)
 
     def _settling(self) -> bool:
         """Nothing drives, and a robot that was there is not heard at this moment; or, in lockstep, it still gets its recovery commands."""
@@ -130,7 +178,7 @@ class Desk:
 
     def answered(self, answer: Answer) -> None:
         """The core's answer goes to whoever asked."""
-        verb, connection = self._waiting.get(answer.request_id, ("", None))
+        verb, connection, _ = self._waiting.get(answer.request_id, Waiting("", None))
         if not answer.final:
             self._said = (answer.exit_code, answer.text)
             if connection is not None:
@@ -176,18 +224,22 @@ class Desk:
             case verb if verb in PLAIN:
                 if not 0.0 <= request.duration_s < float("inf") or not 0 <= request.count < 2**31:
                     raise ConfigError(f"{verb}: duration_s is {request.duration_s} and count {request.count}, must be >= 0 and finite")
-                self.request(verb, connection, text=request.text, duration_s=request.duration_s, count=request.count)
+                text = "" if verb == "pause" else request.text
+                count, detached = (0 if verb == "pause" else request.count), verb == "sample" and request.detached
+                self.request(verb, connection, detached=detached, text=text, duration_s=request.duration_s, count=count)
             case verb:
                 connection.answer(2, f"{verb}: no such request; there are: status, deploy, adopt, excite, {', '.join(PLAIN)}")
 
     def _deploy(self, connection: Connection, request: Request) -> None:
         def loaded(result: Result | Failed) -> None:
+            if not connection.listening:
+                return
             if isinstance(result, Failed) or result.controller is None:
                 connection.answer(78, result.text if isinstance(result, Failed) else "no controller was loaded")
                 return
             self._d.actions.keep_controller(result.controller)
             digest = result.controller.digest
-            if not request.certificate or self._install(connection, request.certificate, digest):
+            if (not request.certificate or self._install(connection, request.certificate, digest)) and connection.listening:
                 self.request("deploy", connection, digest=digest, text=request.path)
 
         self._d.workshop.start(LoadJob(request.path, dict(request.parameters)), LOAD_TIMEOUT_S, loaded)
@@ -195,7 +247,7 @@ class Desk:
     def _install(self, connection: Connection, text: str, digest: str) -> bool:
         """A certificate that came along. Refused, it ends the request: nobody asked for an attempt of this robot's budget instead."""
         self._numbers += 1
-        self._waiting[self._numbers] = ("certificate", connection)
+        self._waiting[self._numbers] = Waiting("certificate", connection)
         self._said = (0, "")
         try:
             self._d.feed(issuing.load(self._d, text, "--certificate", digest, self._numbers))
@@ -214,13 +266,15 @@ class Desk:
             return
 
         def loaded(result: Result | Failed) -> None:
+            if not (connection.listening or request.detached):
+                return
             if isinstance(result, Failed) or result.inputs is None:
                 connection.answer(1, f"refused: {result.text if isinstance(result, Failed) else 'no inputs were read'}")
                 return
             given = result.inputs
             self._d.excitation.keep(given)
             self._d.logbook.attach(f"inputs/{given.digest}", "text/csv", given.text.encode())
-            self.request("excite", connection, digest=given.digest, count=len(given.rows))
+            self.request("excite", connection, detached=request.detached, digest=given.digest, count=len(given.rows))
 
         seen = state.observation if not state.trouble else None
         job = InputsJob(request.path, self._d.profile, () if seen is None else seen.x)
@@ -235,6 +289,8 @@ class Desk:
         profile = msgspec.structs.replace(current, model=spec)
 
         def checked(wrong: str, facts: ModelFacts | None) -> None:
+            if not connection.listening:
+                return
             if wrong or facts != self._d.facts:
                 connection.answer(78, wrong or "adopt: the model has other states or inputs than the robot's")
                 return

@@ -1,4 +1,4 @@
-"""SIGTERM and SIGINT as something that a loop can wait for."""
+"""SIGTERM, SIGINT and SIGHUP as something that a loop can wait for."""
 
 from __future__ import annotations
 
@@ -7,10 +7,14 @@ import os
 import selectors
 import signal
 
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+"""SIGHUP: the terminal closed. Unhandled, it would end the daemon without its last command."""
+
 
 class StopSignals:
-    """`name`: of the signal that came, or empty. The handler runs between two lines of anything, so all it does is to note the
-    name and to write into a pipe, which wakes the loop. Use as a context manager, in the main thread.
+    """`name`: of the signal that came, or empty. A signal that is ignored (`nohup`) stays ignored. The handler runs between two lines of
+    anything, so all it does is to note the name and to write into a pipe, which wakes the loop. Use as a context manager, in the main
+    thread.
     """
 
     def __init__(self, selector: selectors.BaseSelector) -> None:
@@ -20,7 +24,8 @@ class StopSignals:
     def __enter__(self) -> StopSignals:
         self._reading, self._writing = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._selector.register(self._reading, selectors.EVENT_READ, lambda _: os.read(self._reading, 100))
-        self._before = {number: signal.signal(number, self._came) for number in (signal.SIGTERM, signal.SIGINT)}
+        heard = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+        self._before = {number: signal.signal(number, self._came) for number in heard}
         return self
 
     def __exit__(self, *_: object) -> None:

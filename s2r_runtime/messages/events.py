@@ -248,12 +248,15 @@ class Requested(Struct, frozen=True, tag="requested"):
 
     deploy: `digest` of the controller that was loaded for it. adopt: `digest` of the model. revoke: `text` a certificate
     id, or empty for all. clear: `text` the reason. permit: `duration_s`. sample: `count` (0: the profile's). excite: `digest` of the
-    inputs, `count` their rows. trace: `text` a stretch (empty: campaign).
+    inputs, `count` their rows. trace: `text` a stretch (empty: campaign). pause: `count` the request whose asker is gone (0: none,
+    a person pauses whatever the sampler drives), `text` why.
     """
 
     t_ns: int
     request_id: int
-    verb: Literal["deploy", "undeploy", "revoke", "adopt", "clear", "stop", "permit", "sample", "cancel", "trace", "verify", "excite"]
+    verb: Literal[
+        "deploy", "undeploy", "revoke", "adopt", "clear", "stop", "permit", "sample", "cancel", "trace", "verify", "excite", "pause"
+    ]
     by: int
     digest: str = ""
     text: str = ""
