@@ -21,6 +21,7 @@ from s2r_runtime.controllers.file import ControllerFile
 from s2r_runtime.core import stream
 from s2r_runtime.core.status import against_sampler
 from s2r_runtime.daemon.analytics import Watching
+from s2r_runtime.daemon.console import campaign_line
 from s2r_runtime.daemon.worker import Failed, GapJob, Progress, Result, TraceJob, VerifyJob
 
 if TYPE_CHECKING:
@@ -148,6 +149,7 @@ class Actions:
     # ------------------------------------------------------------------ sources
 
     def _start_campaign(self, order: m.StartCampaign) -> None:
+        self._d.desk.note("sample", campaign_line(order, self._d.state))
         self._d.feed(*self._d.sampler.start(order, self._d.settings))
 
     def _start_inputs(self, order: m.StartInputs) -> None:

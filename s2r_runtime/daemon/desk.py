@@ -111,6 +111,12 @@ class Desk:
             if (connection := waiting.connection) is not None:
                 connection.progress(done=done, total=total, detail=detail, seconds_left=left_s)
 
+    def note(self, verb: str, text: str) -> None:
+        """A line for whoever waits for the answer to this verb."""
+        for waiting in tuple(self._waiting.values()):
+            if waiting.verb == verb and waiting.connection is not None:
+                waiting.connection.progress(text=text)
+
     def request(
         self, verb: Any, connection: Connection | None = None, *, detached: bool = False, by: int | None = None, **fields: Any
     ) -> int:

@@ -30,6 +30,7 @@ from s2r_runtime.core.state import State
 from s2r_runtime.daemon import computer, control, issuing, past
 from s2r_runtime.daemon.actions import Actions
 from s2r_runtime.daemon.awake import LOOK_S, AwakeClock
+from s2r_runtime.daemon.console import Console
 from s2r_runtime.daemon.desk import Desk
 from s2r_runtime.daemon.driver import Driver
 from s2r_runtime.daemon.every import Every
@@ -44,7 +45,7 @@ from s2r_runtime.daemon.robot_link import Clock, link_of
 from s2r_runtime.daemon.sampler import Keeper, Sampler
 from s2r_runtime.daemon.settings import ModelFacts, disk_timeout_s, settings_of
 from s2r_runtime.daemon.stop_signals import StopSignals
-from s2r_runtime.daemon.systemd import Notifier
+from s2r_runtime.daemon.systemd import Notifier, to_journal
 from s2r_runtime.daemon.transport_values import Inbound
 from s2r_runtime.daemon.trust import Trust
 from s2r_runtime.daemon.workshop import Watcher, Workshop
@@ -129,7 +130,8 @@ class Daemon:
         self._recorder_ok, self._log_late = True, False
         self._next_tick_ns = 0
         self._round, self._wall_clock, self._new_log, self._prune = map(Every, (ROUND_NS, WALL_CLOCK_NS, NEW_LOG_NS, PRUNE_NS))
-        self._heads = Heads(self.say)
+        self._heads = Heads(self.say if to_journal() else lambda _: None)
+        self._console = Console(self.say if log_file is None else lambda _: None)  # else whoever runs it in this process speaks
         self._log_closed = False
         self._ended = ""
 
@@ -426,6 +428,8 @@ class Daemon:
         self.logbook.put(event, self._last_ns)
         self.state, outputs = core.handle(self.state, event)
         self.actions.carry_out(outputs)
+        self._console.happened(event)
+        self._console.decided(outputs, self.state)
 
     def _record_frame(self, frame: Frame) -> None:
         self.logbook.put(frame, self._last_ns)

@@ -11,6 +11,15 @@ import socket
 from s2r_runtime.daemon.every import Every
 
 
+def to_journal() -> bool:
+    """Whether stderr is the journal's (systemd.exec(5), JOURNAL_STREAM), and so kept where nobody who changes the log can reach it."""
+    try:
+        found = os.fstat(2)
+    except OSError:
+        return False
+    return os.environ.get("JOURNAL_STREAM") == f"{found.st_dev}:{found.st_ino}"
+
+
 class Notifier:
     """Sends state to the service manager, if one asked for it; without one every call does nothing.
 
