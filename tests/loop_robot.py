@@ -163,6 +163,9 @@ def saturated(v: float, w: float, speed: float = 0.2, track: float = 0.105) -> t
     return (left + right) / 2, (right - left) / track
 
 
+SWAY_S = 200.0
+
+
 class Robot:
     """A unicycle with arcs, one period of latency, wheels that saturate, a gain on w, and a little noise."""
 
@@ -191,6 +194,7 @@ class Robot:
         self.acting = saturated(u[0], u[1] * self.gain)
         x, y, theta = self.x
         middle = theta + 0.5 * w * self.dt
+        v *= 1.0 + self.args.sway * (self.stamp_ns * 1e-9 % SWAY_S > 0.5 * SWAY_S)
         chord = v * self.dt * (math.sin(0.5 * w * self.dt) / (0.5 * w * self.dt) if w else 1.0)
         self.x = [x + chord * math.cos(middle), y + chord * math.sin(middle), theta + w * self.dt]
         self.seq += 1
@@ -232,6 +236,7 @@ def main() -> int:
     robot.add_argument("--dt", type=float, default=0.033)
     robot.add_argument("--gain", type=float, default=1.0)
     robot.add_argument("--seed", type=int, default=1)
+    robot.add_argument("--sway", type=float, default=0.0, help="its speed is wrong by this share for half of the time")
     for name in ("daemon", "campaign"):
         daemon = which.add_parser(name)
         daemon.add_argument("profile", type=Path)

@@ -52,6 +52,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PeopleRig]:
     """One daemon for all of them: a campaign that was stopped goes on in the next test."""
     opened = PeopleRig(tmp_path_factory.mktemp("people"))
     text = opened.profile.read_text().replace("epsilon = 0.3\nbeta = 0.5", "epsilon = 0.01\nbeta = 0.05", 1)
+    text = text.replace("observation_timeout = 0.5", "observation_timeout = 10.0")  # a busy machine is no reason to refuse a campaign
     opened.profile.write_text(text.replace('clock = "lockstep"', 'clock = "realtime"'))
     opened.start()
     opened.start_robot()
@@ -139,8 +140,8 @@ def _ssh_without_terminal(rig: PeopleRig) -> float:
     import socket
 
     ours, theirs = socket.socketpair()
-    with ours, theirs:
-        command = rig.command("sample", str(rig.profile), stdin=theirs, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    with ours, theirs, (rig.folder / "daemon.txt").open("ab") as sink:
+        command = rig.command("sample", str(rig.profile), stdin=theirs, stdout=subprocess.DEVNULL, stderr=sink)
         theirs.close()
         rig.sampling()
         ours.shutdown(socket.SHUT_WR)  # the end of its input is no reason

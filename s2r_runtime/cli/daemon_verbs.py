@@ -46,6 +46,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         metavar="S",
         help="without a daemon: for how many seconds the robot may be driven (default 3600). Running this verb is the permit",
     )
+    sample.add_argument(
+        "--retry",
+        action="store_true",
+        help="if its samples turn out to depend on each other, which 1 in 200 good campaigns seem to, repeat it once; "
+        "the repetition is the next epoch, and spends its share of beta",
+    )
     end = sample.add_mutually_exclusive_group()
     end.add_argument("--detach", action="store_true", help="return when the daemon drives; the campaign goes on without this command")
     end.add_argument("--pause", action="store_true", help="stop the running daemon's campaign and keep it; s2r sample goes on with it")
@@ -148,8 +154,8 @@ def run_sample(args: argparse.Namespace) -> int:
             raise UsageError(
                 f"-o: robot {profile.robot.name!r} has a running daemon, which records the campaign in its own log; leave -o out"
             )
-        if args.inputs and (args.cancel or args.pause or args.n):
-            raise UsageError("--inputs: drives what is in the file; leave -n, --pause and --cancel out")
+        if args.inputs and (args.cancel or args.pause or args.n or args.retry):
+            raise UsageError("--inputs: drives what is in the file; leave -n, --retry, --pause and --cancel out")
         if args.inputs and not args.inputs.is_file():
             raise UsageError(f"--inputs {args.inputs}: no such file; s2r trace --suggest writes one")
         request: dict[str, Any] = {"verb": "sample", "count": args.n}
@@ -157,6 +163,8 @@ def run_sample(args: argparse.Namespace) -> int:
             request = {"verb": "excite", "path": str(args.inputs.resolve())}
         if args.detach:
             request["detached"] = True
+        if args.retry and not args.inputs:
+            request["text"] = "retry"
         return _say(args, {"verb": "cancel"} if args.cancel else {"verb": "pause"} if args.pause else request, socket)
     if args.inputs:
         raise UsageError(f"--inputs: no daemon of robot {profile.robot.name!r} is running; start one: s2r run {args.profile}")
@@ -169,7 +177,9 @@ def run_sample(args: argparse.Namespace) -> int:
     bar = output.Progress("sampling")
     with Presence(signals=False) as presence:  # the daemon in this process listens for them
         try:
-            result = run_campaign(profile, args.profile, out, n=args.n, permit_s=args.permit or 3600.0, progress=bar, left=presence.look)
+            result = run_campaign(
+                profile, args.profile, out, n=args.n, permit_s=args.permit or 3600.0, progress=bar, left=presence.look, retry=args.retry
+            )
         finally:
             bar.close()
     if args.json:
@@ -239,9 +249,24 @@ def run_status(args: argparse.Namespace) -> int:
     output.out(f"gate        {output.styled(gate, 'green' if gate == 'open' else 'yellow')}  ({data.pop('reason', '')})")
     if data.get("radius") and data.get("verified_radius"):
         output.out(f"covered     gap {data['radius']:.4g}, certified to {data['verified_radius']:.4g}")
+    if line := _budget(data):
+        output.out(f"budget      {line}")
     for key, value in data.items():
         output.out(f"{key.replace('_', ' '):11s} {_plain(value)}")
     return int(answer["exit_code"])
+
+
+def _budget(data: dict[str, Any]) -> str:
+    """What is spent, and that there is always a next attempt: the i-th spends 3 beta / (pi^2 i^2), which sums to beta / 2."""
+    campaign, attempt = data.pop("next_campaign", None), data.pop("next_attempt", None)
+    if not campaign or not attempt:
+        return ""
+    takes = f", {campaign['n']} samples" if campaign["n"] else ""
+    return (
+        f"{data['beta_spent']:.3g} of beta {data['beta']:g} is spent. It never runs out: number i spends 3 beta/(pi^2 i^2), "
+        f"so later ones take more samples. Next: campaign {campaign['epoch']} ({campaign['beta']:.2g}{takes}), "
+        f"attempt {attempt['attempt']} ({attempt['beta']:.2g})"
+    )
 
 
 def _say(args: argparse.Namespace, request: dict[str, Any], socket: Path | None = None) -> int:

@@ -13,7 +13,7 @@ from s2r_runtime.core import ledger, stream
 from s2r_runtime.core.certificates import ROUNDING, facts_problem, install, reverify_if_due, revoke
 from s2r_runtime.core.drive import latch, recover_now, regate
 from s2r_runtime.core.sources import end_deployment
-from s2r_runtime.core.state import Campaign, Job, Turn, certificate, job, usable_gap
+from s2r_runtime.core.state import Campaign, Job, Turn, certificate, job, situation, usable_gap
 from s2r_runtime.messages import (
     SERIAL,
     AlarmRaised,
@@ -25,6 +25,7 @@ from s2r_runtime.messages import (
     JobFinished,
     Measured,
     RadiusGrew,
+    RefusedCampaign,
     StartCampaign,
     StartJob,
 )
@@ -34,11 +35,16 @@ REFUTED = 100
 1 / i^2, so a robot has few; 100 of them are 7 KB of what is persisted.
 """
 
+GOOD_REFUSED = 200
+"""Of so many campaigns whose samples are independent, the test of their order refuses one at most (`whiteness.SERIAL_ALPHA`)."""
+RETRY = "retry"
+"""The text of a request to sample, and to repeat it once if it is refused so."""
+
 # ---------------------------------------------------------------- campaigns
 
 
-def begin_campaign(turn: Turn, count: int, request_id: int) -> None:
-    """Begins a campaign, or goes on with one that was begun. count: how many samples, 0 for the profile's number."""
+def begin_campaign(turn: Turn, count: int, request_id: int, *, retry: bool = False) -> None:
+    """Begins a campaign, or goes on with one that was begun. count: number of samples, 0: the profile's. retry: as in `Campaign`."""
     memory, settings = turn.memory, turn.settings
     resume = memory.campaign_epoch > 0
     epoch = memory.campaign_epoch if resume else memory.epochs + 1
@@ -57,7 +63,7 @@ def begin_campaign(turn: Turn, count: int, request_id: int) -> None:
         asked = f"epoch {epoch} needs at least {needed} samples at epsilon {settings.epsilon:g} with {settings.discard} discarded"
         turn.answer(request_id, 3, f"{asked}; {n} are {needed - n} too few")
         return
-    turn.set(campaign=Campaign(epoch, n, request_id))
+    turn.set(campaign=Campaign(epoch, n, request_id, retry=retry))
     if not resume:
         turn.remember(epochs=epoch, campaign_epoch=epoch, campaign_n=n)
         turn.persist()
@@ -79,7 +85,7 @@ def campaign_finished(turn: Turn, event: CampaignFinished) -> None:
         text = f"campaign of epoch {event.epoch} ended after {event.n} of {campaign.n} samples{why}; s2r sample goes on with it"
         turn.answer(campaign.request_id, 3, text)
         return
-    one = Job(turn.state.next_job, "gap", campaign.request_id, campaign.epoch)
+    one = Job(turn.state.next_job, "gap", campaign.request_id, campaign.epoch, retry=campaign.retry)
     turn.add_job(one)
     turn.emit(StartJob(turn.now, one.id, "gap", epoch=one.epoch, beta=ledger.share(turn.settings.beta, one.epoch)))
     turn.answer(one.request_id, 0, f"{campaign.n} samples taken; computing the gap", final=False)
@@ -106,9 +112,50 @@ def gap_finished(turn: Turn, done: Job, event: JobFinished) -> None:
 def _not_independent(turn: Turn, done: Job, gap: Gap) -> None:
     """The samples depend on each other, so they bound nothing (guarantee G1): the campaign is given up, and its share stays spent."""
     turn.remember(campaign_epoch=0, campaign_n=0)
-    turn.persist()
     why = f"the samples of epoch {gap.epoch} were not drawn independently: {gap.white_reason}; they bound nothing"
-    turn.answer(done.request_id, 3, f"no gap: {why}, and their share of beta is spent: find out what drifts before the next campaign")
+    if turn.settings.rules < 1:
+        turn.persist()
+        turn.answer(done.request_id, 3, f"no gap: {why}, and their share of beta is spent: find out what drifts before the next campaign")
+        return
+    before = turn.memory.refused_campaign
+    share, in_a_row = ledger.share(turn.settings.beta, gap.epoch), 1 if before is None else before.in_a_row + 1
+    turn.remember(refused_campaign=RefusedCampaign(gap.epoch, gap.n, share, gap.white_reason, in_a_row))
+    turn.persist()
+    standing = gate.standing(turn.settings, msgspec.structs.replace(situation(turn.state), campaign_running=True), "sampler", turn.now)
+    repeats = done.retry and in_a_row == 1 and standing is None
+    text = f"no gap: {why}, and their share of beta ({share:.2g}) is spent. {_after_refusal(turn, in_a_row, repeats=repeats)}"
+    if done.retry and standing is not None:
+        text += f" Not repeated: {standing.reason}."
+    turn.answer(done.request_id, 3, text, final=not repeats)
+    if repeats:
+        begin_campaign(turn, 0 if gap.n < _samples_of_next(turn) else gap.n, done.request_id)
+
+
+def _after_refusal(turn: Turn, in_a_row: int, *, repeats: bool) -> str:
+    """What a refusal means, and what to do about it."""
+    epoch = turn.memory.epochs + 1
+    costs = f"epoch {epoch} takes {_samples_of_next(turn)} samples and spends {ledger.share(turn.settings.beta, epoch):.2g}"
+    look = "Look at what changes while it samples (battery, temperature, tyres, localisation): s2r trace --live campaign, s2r report LOG."
+    if in_a_row > 1:
+        return (
+            f"The test refuses at most 1 in {GOOD_REFUSED} good campaigns; {in_a_row} in a row are hardly chance: the robot drifts. {look}"
+        )
+    chance = f"The test refuses at most 1 in {GOOD_REFUSED} good campaigns, so once may be chance"
+    if repeats:
+        return f"{chance}; it is repeated now ({costs}). {look}"
+    return f"{chance} and repeating is right: s2r sample PROFILE --retry ({costs}). {look}"
+
+
+def _samples_of_next(turn: Turn) -> int:
+    """How many samples the next epoch needs at least; 0 if no number would do (its campaign says so)."""
+    settings = turn.settings
+    try:
+        return max(
+            ledger.campaign_size(settings.epsilon, ledger.share(settings.beta, turn.memory.epochs + 1), settings.discard),
+            settings.campaign_n,
+        )
+    except ValueError:
+        return 0
 
 
 def _gap_problem(turn: Turn, gap: Gap, epoch: int) -> str:
@@ -136,7 +183,9 @@ def _enforce(turn: Turn, gap: Gap) -> None:
     if before is not None and (usable_gap(turn.state) is None or turn.memory.radius > before.radius):
         _distrust(turn, before)
     epochs = max(turn.memory.epochs, gap.epoch)
-    turn.remember(gap=gap, radius=gap.radius, epochs=epochs, alarm_epoch=0, campaign_digest=turn.settings.campaign_digest)
+    turn.remember(
+        gap=gap, radius=gap.radius, epochs=epochs, alarm_epoch=0, campaign_digest=turn.settings.campaign_digest, refused_campaign=None
+    )
     _watch_anew(turn)
     revoke(turn, old, "new_epoch")
     turn.persist()
@@ -152,7 +201,7 @@ def _distrust(turn: Turn, gap: Gap) -> None:
 def void_gap(turn: Turn, reason: str) -> None:
     """No gap any more, nor an unfinished campaign; certificates end with it. Counters stay: what is spent is spent."""
     old = [facts.id for facts in turn.memory.certificates]
-    turn.remember(gap=None, radius=0.0, campaign_epoch=0, campaign_n=0, alarm_epoch=0, traced=False)
+    turn.remember(gap=None, radius=0.0, campaign_epoch=0, campaign_n=0, alarm_epoch=0, traced=False, refused_campaign=None)
     _watch_anew(turn)
     revoke(turn, old, reason)
 

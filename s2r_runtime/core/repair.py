@@ -39,8 +39,9 @@ STRETCHES: dict[str, Stretch] = {"": "campaign", "campaign": "campaign", "drive"
 
 def begin_trace(turn: Turn, stretch: Stretch, request_id: int) -> None:
     """Traces the residual of the model in force in what was recorded until now."""
-    gap, model = turn.memory.gap, turn.memory.model_digest
-    one = Job(turn.state.next_job, "trace", request_id, 0 if gap is None else gap.epoch, digest=model, stretch=stretch)
+    gap, refused, model = turn.memory.gap, turn.memory.refused_campaign, turn.memory.model_digest
+    epoch = refused.epoch if refused is not None and stretch == "campaign" else 0 if gap is None else gap.epoch
+    one = Job(turn.state.next_job, "trace", request_id, epoch, digest=model, stretch=stretch)
     turn.add_job(one)
     rows = turn.settings.trace_rows
     turn.emit(StartJob(turn.now, one.id, "trace", epoch=one.epoch, digest=model, stretch=stretch, rows=rows))
@@ -51,7 +52,7 @@ def requested_trace(turn: Turn, request: Requested) -> None:
     state, stretch = turn.state, STRETCHES.get(request.text)
     if stretch is None:
         turn.answer(request.request_id, 2, f"{request.text!r} can't be traced; there are: campaign, drive, inputs")
-    elif stretch == "campaign" and turn.memory.gap is None:
+    elif stretch == "campaign" and turn.memory.gap is None and turn.memory.refused_campaign is None:
         turn.answer(request.request_id, 3, "there is no finished campaign to trace; sample first: s2r sample")
     elif stretch == "drive" and not state.driven:
         turn.answer(request.request_id, 3, "no controller has driven since the gap came into force and the daemon began; deploy one first")
@@ -115,7 +116,9 @@ def trace_finished(turn: Turn, done: Job, event: JobFinished) -> None:
     """What the tracer says is a finding; that an effect is known and not adopted counts, and a model that it proposes waits."""
     trace = event.trace if event.trace is not None and not event.error else {}
     verdict = trace.get("verdict")
-    told = f"trace of the {done.stretch}"
+    refused = turn.memory.refused_campaign
+    its = "refused " if done.stretch == "campaign" and refused is not None and refused.epoch == done.epoch else ""
+    told = f"trace of the {its}{done.stretch}"
     if not isinstance(verdict, str):
         why = event.error or "the worker returned none"
         turn.emit(TraceEnded(turn.now, done.id, done.stretch, done.epoch, "", why))

@@ -15,7 +15,7 @@ from s2r_runtime.core import faults
 from s2r_runtime.core.certificates import begin_verification, refusal_to_verify, revoke, start_controller, valid_certificate
 from s2r_runtime.core.drive import recover_now, regate
 from s2r_runtime.core.excitation import begin_inputs
-from s2r_runtime.core.gaps import begin_campaign
+from s2r_runtime.core.gaps import RETRY, begin_campaign
 from s2r_runtime.core.leaving import pause
 from s2r_runtime.core.repair import requested_adoption, requested_trace
 from s2r_runtime.core.sources import check_campaign, end_deployment, interrupt_campaign, stop
@@ -159,7 +159,7 @@ def _sample(turn: Turn, request: Requested) -> None:
     if request.count < 0:
         turn.answer(request.request_id, 2, f"{request.count} samples make no campaign")
     elif _sampler_may_drive(turn, request):
-        begin_campaign(turn, request.count, request.request_id)
+        begin_campaign(turn, request.count, request.request_id, retry=request.text == RETRY)
 
 
 def _excite(turn: Turn, request: Requested) -> None:

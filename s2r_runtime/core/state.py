@@ -40,7 +40,7 @@ class Asked(Struct, frozen=True):
 
 class Campaign(Struct, frozen=True):
     """A campaign that samples, or given inputs that are driven. `running`: its source has started. `inputs`: their digest; then epoch is 0,
-    and n, taken count rows.
+    and n, taken count rows. retry: it is repeated once if its samples depend on each other.
     """
 
     epoch: int
@@ -49,6 +49,7 @@ class Campaign(Struct, frozen=True):
     running: bool = False
     taken: int = 0
     inputs: str = ""
+    retry: bool = False
 
 
 class Deployment(Struct, frozen=True):
@@ -70,7 +71,7 @@ class Job(Struct, frozen=True):
     radius: the most that is asked for; least_radius: the least that will do.
 
     reverify: of the driving controller, whose certificate `certificate_id` the radius has outgrown. trace: of the model `digest`
-    in `stretch`.
+    in `stretch`. retry: as in `Campaign`.
     """
 
     id: int
@@ -85,6 +86,7 @@ class Job(Struct, frozen=True):
     again: bool = False
     stretch: Stretch = "campaign"
     least_radius: float = 0.0
+    retry: bool = False
 
 
 VERIFYING = ("deploy", "verify", "reverify")

@@ -9,7 +9,7 @@ import msgspec
 from s2r_runtime import gate
 from s2r_runtime.core import ledger, stream
 from s2r_runtime.core.state import NANO, State, certificate, situation, unix_now, usable_gap
-from s2r_runtime.messages import Decided, Output
+from s2r_runtime.messages import Decided, Memory, Output, Settings
 
 
 def status(state: State) -> dict[str, object]:
@@ -47,6 +47,9 @@ def status(state: State) -> dict[str, object]:
         if campaign is None or not campaign.inputs
         else {"digest": campaign.inputs, "driven": campaign.taken, "n": campaign.n, "running": campaign.running},
         "unfinished_epoch": memory.campaign_epoch or None,
+        "refused_campaign": None if memory.refused_campaign is None else msgspec.structs.asdict(memory.refused_campaign),
+        "next_campaign": None if settings is None else _next_campaign(settings, memory),
+        "next_attempt": None if settings is None else {"attempt": memory.attempts + 1, "beta": ledger.share(beta, memory.attempts + 1)},
         "permit_left_s": left_ns / NANO,
         "jobs": [one.purpose for one in state.jobs],
         "measurement_faults": state.faults,
@@ -58,6 +61,17 @@ def status(state: State) -> dict[str, object]:
         "traced": memory.traced,
         "link": state.link_up,
     }
+
+
+def _next_campaign(settings: Settings, memory: Memory) -> dict[str, object]:
+    """What the next campaign spends and takes. n: None where no number of samples would do."""
+    epoch = memory.epochs + 1
+    share = ledger.share(settings.beta, epoch)
+    try:
+        n: int | None = max(ledger.campaign_size(settings.epsilon, share, settings.discard), settings.campaign_n)
+    except ValueError:
+        n = None
+    return {"epoch": epoch, "beta": share, "n": n}
 
 
 def _ratio(part: float, whole: float) -> float | None:

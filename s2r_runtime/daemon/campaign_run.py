@@ -13,6 +13,7 @@ from typing import Any
 
 import msgspec
 
+from s2r_runtime.core.gaps import RETRY
 from s2r_runtime.daemon.loop import Daemon
 from s2r_runtime.daemon.persistence import read, unseal
 from s2r_runtime.errors import UsageError
@@ -30,8 +31,8 @@ Progress = Callable[..., None]
 class _Script:
     """What a person would do: wait for the robot, give the permit, ask for the campaign, wait for its end."""
 
-    def __init__(self, n: int, permit_s: float, progress: Progress | None, left: Callable[[], str] | None) -> None:
-        self._n, self._permit_s, self._progress, self._left = n, permit_s, progress, left
+    def __init__(self, n: int, permit_s: float, progress: Progress | None, left: Callable[[], str] | None, text: str) -> None:
+        self._text, self._n, self._permit_s, self._progress, self._left = text, n, permit_s, progress, left
         self._began = self._heard = time.monotonic()
         self._number = 0
         self.exit_code, self.text = 1, ""
@@ -63,7 +64,7 @@ class _Script:
     def _begin(self, daemon: Daemon) -> None:
         if daemon.state.link_up and daemon.state.observation is not None:
             daemon.desk.request("permit", duration_s=self._permit_s)
-            self._number = daemon.desk.request("sample", count=self._n)
+            self._number = daemon.desk.request("sample", count=self._n, text=self._text)
         elif time.monotonic() - self._began > ROBOT_WITHIN_S:
             self.exit_code, self.text = 3, f"the robot does not answer: no usable observation within {ROBOT_WITHIN_S:g} s"
             daemon.end(self.text)
@@ -80,14 +81,15 @@ def run_campaign(
     seed: int | None = None,
     progress: Progress | None = None,
     left: Callable[[], str] | None = None,
+    retry: bool = False,
 ) -> dict[str, Any]:
     """Samples, and founds the gap. n: how many (0: as many as the profile or its beta asks for). progress(done, total, detail,
-    seconds_left). left: why nobody waits for it any more, or empty; then it is interrupted. The answer: `exit_code` (0: complete), `text`,
-    `n`, `rejected`, `log`, `gap`.
+    seconds_left). left: why nobody waits for it any more, or empty; then it is interrupted. retry: repeat it once if its samples depend
+    on each other. The answer: `exit_code` (0: complete), `text`, `n`, `rejected`, `log`, `gap`.
 
     Raises UsageError if `out` exists and there is nothing to go on with, ConfigError for what makes a start impossible.
     """
-    script = _Script(n, permit_s, progress, left)
+    script = _Script(n, permit_s, progress, left, RETRY if retry else "")
     daemon = Daemon(profile, profile_path=profile_path, state_dir=state_dir, log_file=out, seed=seed, on_tick=script)
     if out.exists() and not _unfinished(daemon.state_dir / "state.json"):
         raise UsageError(f"{out}: is there already, and there is no unfinished campaign to go on with; name another file")

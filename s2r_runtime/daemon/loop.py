@@ -175,8 +175,9 @@ class Daemon:
         self.actions = Actions(self)
         self._open_desk(stack)
         self._open_link()
-        if self.memory.gap is not None:
-            self.sampler.recall(self.memory.gap.epoch)
+        newest = self.memory.refused_campaign or self.memory.gap
+        if newest is not None:
+            self.sampler.recall(newest.epoch)
         self._begin_run()
         threading.Thread(target=self._say_what_is_not_held, name="computer", daemon=True).start()
         self.notifier.ready("waiting for the robot")

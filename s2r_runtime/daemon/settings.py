@@ -11,7 +11,7 @@ import math
 import msgspec
 
 from s2r_runtime.canonical import digest_of
-from s2r_runtime.messages import Settings
+from s2r_runtime.messages import RULES, Settings
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Profile
 
@@ -80,6 +80,7 @@ def settings_of(profile: Profile, model: ModelSpec, facts: ModelFacts, seed: int
         norm_weights=tuple(profile.norm.weights.get(name, 1.0) for name in facts.states),
         fault_share=gate.fault_share,
         fault_burst=gate.fault_burst,
+        rules=RULES,
     )
 
 

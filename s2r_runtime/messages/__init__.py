@@ -47,8 +47,10 @@ from s2r_runtime.messages.link import (
 )
 from s2r_runtime.messages.memory import (
     MEMORY_SCHEMA,
+    RULES,
     Memory,
     Proposal,
+    RefusedCampaign,
     Settings,
     Stretch,
     WatchStood,
@@ -92,12 +94,14 @@ from s2r_runtime.messages.results import (
 )
 
 __all__ = [
-    "MEMORY_SCHEMA", "SERIAL", "Action", "AlarmRaised", "AnalyticsChanged", "Answer", "AnswerLate", "Ask", "AttemptEnded", "AttemptSpent",
+    "MEMORY_SCHEMA", "RULES", "SERIAL", "Action", "AlarmRaised", "AnalyticsChanged", "Answer", "AnswerLate", "Ask", "AttemptEnded",
+    "AttemptSpent",
     "CampaignFinished", "CertificateFacts", "CertificateFailed", "CertificateInstalled", "CertificateStored", "CertificatesDistrusted",
     "ChangeNoticed", "Command", "Decided", "EpisodeEnded", "EpochChanged", "Event", "Frame", "Gap", "GateChanged", "InputsFinished",
     "IssueCertificate", "JobFinished", "LawResult", "LinkChanged", "LogHead", "Measured", "Memory", "ModelAdopted", "Observation",
     "ObservationRefused", "Observed", "Output", "OverrideChanged", "Persist", "Proposal", "Proposed", "RadiusGrew", "RadiusTried",
-    "Record", "RecorderChanged", "Requested", "Revoked", "SampleTaken", "Send", "Settings", "Source", "SourceStarted", "SourceStopped",
+    "Record", "RecorderChanged", "RefusedCampaign", "Requested", "Revoked", "SampleTaken", "Send", "Settings", "Source",
+    "SourceStarted", "SourceStopped",
     "StartCampaign", "StartController", "StartInputs", "StartJob", "Started", "StopCampaign", "StopController", "Stopping", "Stretch",
     "Struct", "Ticked", "TraceEnded", "Trials", "Verification", "WallClockRead", "WatchStood",
 ]  # fmt: skip

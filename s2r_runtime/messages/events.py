@@ -247,7 +247,8 @@ class Requested(Struct, frozen=True, tag="requested"):
     """An operator's decision, from the control socket. `by`: user id of the peer. Unused fields are at their defaults.
 
     deploy: `digest` of the controller that was loaded for it. adopt: `digest` of the model. revoke: `text` a certificate
-    id, or empty for all. clear: `text` the reason. permit: `duration_s`. sample: `count` (0: the profile's). excite: `digest` of the
+    id, or empty for all. clear: `text` the reason. permit: `duration_s`. sample: `count` (0: the profile's), `text` "retry" to
+    repeat it once if its samples depend on each other. excite: `digest` of the
     inputs, `count` their rows. trace: `text` a stretch (empty: campaign). pause: `count` the request whose asker is gone (0: none,
     a person pauses whatever the sampler drives), `text` why.
     """

@@ -67,7 +67,12 @@ class Settings(Struct, frozen=True):
     fault_burst: int = 0
     """The share of observations that may be faulty, and how many may be so at once; share 0: a run before there was such a bound."""
 
+    rules: int = 0
+    """Of the core's rules, those that the run was made by; a log of before has 0 and is audited by them. See `RULES`."""
 
+
+RULES = 1
+"""1: a campaign that is refused for dependent samples is remembered, and can be traced and repeated."""
 MEMORY_SCHEMA = 1
 """Of `Memory`: a memory of another schema is refused."""
 
@@ -94,6 +99,19 @@ class Proposal(Struct, frozen=True):
     stretch: Stretch
     epoch: int
     effects: tuple[str, ...] = ()
+
+
+class RefusedCampaign(Struct, frozen=True):
+    """A campaign whose samples depend on each other (guarantee G1). It bounds no gap; its share `beta` is spent. Its data can be traced.
+
+    reason: the test's, with its p-value. in_a_row: campaigns that were refused since the last gap, this one included.
+    """
+
+    epoch: int
+    n: int
+    beta: float
+    reason: str
+    in_a_row: int = 1
 
 
 class Memory(Struct, frozen=True):
@@ -131,3 +149,5 @@ class Memory(Struct, frozen=True):
     """The newest repaired model that waits to be adopted."""
     refuted: tuple[str, ...] = ()
     """Digests of the transitions whose gaps ended refuted or outgrown: they found no later epoch."""
+    refused_campaign: RefusedCampaign | None = None
+    """The newest campaign, if its samples depend on each other; None as soon as a later one found a gap."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from s2r_runtime.bounds import anytime_upper
 from s2r_runtime.core import stream
+from s2r_runtime.core.gaps import GOOD_REFUSED
 from s2r_runtime.gap import discrepancy, residuals, statement
 from s2r_runtime.messages import Gap, Settings
 from s2r_runtime.modelspec import ModelSpec
@@ -38,6 +39,7 @@ def log_page(paths: Sequence[Path]) -> str:
     _summary(page, story)
     _timeline(page, story)
     _gaps(page, story, log.models())
+    add_refused(page, story, log.models())
     for number, trace in enumerate(story.traces, 1):
         page.heading(f"Residual traced{f' ({number})' if len(story.traces) > 1 else ''}")
         _made_on(page, trace)
@@ -158,6 +160,27 @@ def _gaps(page: Page, story: Story, models: dict[str, ModelSpec]) -> None:
             )
         if gap.rejected:
             page.text("Samples not taken: " + ", ".join(f"{reason} {number}" for reason, number in sorted(gap.rejected.items())), "soft")
+
+
+def add_refused(page: Page, story: Story, models: dict[str, ModelSpec]) -> None:
+    """Campaigns whose samples depend on each other: what they cost, and what to look at."""
+    for gap, seconds in story.refused:
+        page.heading(f"Refused campaign of epoch {gap.epoch}")
+        page.text(f"No gap: {gap.white_reason}. Its samples were not drawn independently, so they bound nothing.", "bad")
+        page.table(("cost: samples", "driven for", "β spent"), [(gap.n, f"{seconds:.0f} s", f"{gap.beta:.4g}")])
+        page.text(
+            f"The test refuses at most 1 in {GOOD_REFUSED} good campaigns, so one refusal may be chance; repeat it (s2r sample --retry). "
+            "Two in a row are hardly chance. Then look below for a trend, and for what changes while the robot samples."
+        )
+        values = _discrepancies(story, gap, models)
+        if values is not None:
+            number = np.arange(1.0, len(values) + 1.0)
+            page.figure(
+                plots.series(
+                    {"discrepancy": (number, values, plots.BLUE)}, "sample", "discrepancy", "discrepancies in the order of samples"
+                ),
+                f"The {len(values)} discrepancies in the order in which they were sampled. Independent ones show no trend.",
+            )
 
 
 def _discrepancies(story: Story, gap: Gap, models: dict[str, ModelSpec]) -> plots.Array | None:

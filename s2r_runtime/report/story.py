@@ -50,6 +50,8 @@ class Story:
     """(when, what, kind) with kind one of good, bad, plain"""
     samples: dict[int, list[m.SampleTaken]] = field(default_factory=dict)
     gaps: list[m.Gap] = field(default_factory=list)
+    refused: list[tuple[m.Gap, float]] = field(default_factory=list)
+    """(what was computed on a campaign whose samples depend on each other, how long it was driven for in this run, s)"""
     verifications: list[tuple[m.Verification, dict[str, list[float]]]] = field(default_factory=list)
     traces: list[dict[str, Any]] = field(default_factory=list)
     certificates: list[m.CertificateFacts] = field(default_factory=list)
@@ -65,6 +67,8 @@ class Story:
     """epoch -> its gap, and where its watch stands at the end"""
     answers: list[tuple[float, str]] = field(default_factory=list)
     records: int = 0
+    _campaign_began: float = 0.0
+    _campaign_ended: float = 0.0
     _driving: bool = False
     _radius: float = 0.0
     _verified: float = 0.0
@@ -123,6 +127,13 @@ def _take_decision(story: Story, message: Any) -> None:
         story.marks.append((story.seconds(message.t_ns), what, kind))
 
     match message:
+        case m.StartCampaign():
+            story._campaign_began = story.seconds(message.t_ns)
+        case m.CampaignFinished():
+            story._campaign_ended = story.seconds(message.t_ns)
+        case m.JobFinished(kind="gap", gap=m.Gap() as gap) if gap.white_reason.startswith(m.SERIAL):
+            story.refused.append((gap, story._campaign_ended - story._campaign_began))
+            mark(f"campaign of epoch {gap.epoch} refused: its samples depend on each other", "bad")
         case m.EpochChanged(epoch=epoch, gap=None):
             mark(f"campaign of epoch {epoch} begins")
         case m.EpochChanged(epoch=epoch, gap=m.Gap() as gap):
