@@ -26,6 +26,10 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     opened.close()
 
 
+BUSY = ("log ", "this computer: ", "the robot is ", "gate closed: the robot is not heard", "gate closed: no controller is deployed")
+"""Where a log is; and what a busy machine adds: a robot that gets no processor for a second is not heard."""
+
+
 def lines(rig: Rig) -> list[str]:
     """What the daemon said since its log began, without digests."""
     said = [line.removeprefix("s2r: ") for line in rig.said().splitlines()]
@@ -56,7 +60,7 @@ def test_a_short_story_on_the_console_line_by_line(rig: Rig) -> None:
     gap = f"{radius:.6g}"
     by = f"user {os.getuid()}"
     said = lines(rig)
-    told = [line for line in said[said.index(f"{by}: s2r sample") :] if not line.startswith("log ")]
+    told = [line for line in said[said.index(f"{by}: s2r sample") :] if not line.startswith(BUSY)]
     expected = [
         f"{by}: s2r sample",
         "refused: no_permit: give one: s2r permit DURATION",
