@@ -348,7 +348,11 @@ def test_what_makes_no_sense_is_one_line(tmp_path: Path, argv: list[str], said: 
 def test_beside_a_file_of_inputs_nothing_else_is_asked_for(rigs: Any) -> None:
     rig = rigs()
     path = inputs_file(rig, 3)
-    for more, said in ((["-n", "3"], "leave -n and --cancel out"), (["--cancel"], "leave -n and --cancel out"), ([], "no such file")):
+    for more, said in (
+        (["-n", "3"], "leave -n, --retry, --pause and --cancel out"),
+        (["--cancel"], "leave -n, --retry, --pause and --cancel out"),
+        ([], "no such file"),
+    ):
         file = str(path) if more else "none.csv"
         done = rig.s2r("sample", str(rig.profile), "--inputs", file, *more)
         assert (done.returncode, said in done.stderr) == (2, True), done.stderr
