@@ -31,10 +31,9 @@ PROGRAM, PARAMETERS = "ardurover", "rover-skid.parm"
 FIRST_PORT, PORTS_EACH = 5760, 10
 INSTANCES = range(20, 250)
 """It keeps the number in one byte: 288 would listen on the ports of 32."""
-START_S, ANSWER_S, READY_S = 20.0, 10.0, 120.0
-"""Until it listens; until a parameter is answered; until its estimator is ready (40 s on an idle machine)."""
+START_S, ANSWER_S = 20.0, 10.0
+"""Until it listens; until a parameter is answered."""
 RETRY_S = 1.0
-GUIDED_MODE = 15.0
 ARMED = 0x80
 LISTENS = b"Waiting for connection"
 
@@ -142,12 +141,6 @@ class Client:
 
         self._until(message, is_confirmed, f"parameter {name} = {value:g}")
 
-    def parameter(self, name: str) -> float:
-        """Its value now. Raises TimeoutError if the robot does not answer."""
-        message = self._mav.param_request_read_encode(1, 1, name.encode(), -1)
-        answer = self._until(message, lambda m: m.get_type() == "PARAM_VALUE" and m.param_id == name, f"parameter {name}")
-        return float(answer.param_value)
-
     def set_mode(self, number: float) -> None:
         """Returns when the robot is in this mode."""
         message = self._mav.command_long_encode(1, 1, mavlink.MAV_CMD_DO_SET_MODE, 0, 1.0, number, 0, 0, 0, 0, 0)
@@ -164,16 +157,6 @@ class Client:
         while time.monotonic() < limit:
             heard += self._take()
         return heard
-
-    def await_estimator(self, seconds: float = READY_S) -> None:
-        """Until the robot knows where it is and could be driven; it is left as it was. Raises TimeoutError."""
-        want = mavlink.ESTIMATOR_POS_HORIZ_ABS | mavlink.ESTIMATOR_ATTITUDE
-        message = self._mav.command_long_encode(
-            1, 1, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS, *[0.0] * 6
-        )
-        self._until(
-            message, lambda m: m.get_type() == "ESTIMATOR_STATUS" and m.flags & want == want, "an estimate of its position", seconds
-        )
 
     def _until(self, message: Any, is_there: Callable[[Any], bool], what: str, seconds: float = ANSWER_S) -> Any:
         limit, again = time.monotonic() + seconds, -math.inf
