@@ -51,6 +51,10 @@ class Offer(NamedTuple):
     `files`: of a transport, the options that name a file (relative to the profile) whose content says what frames mean. Where a profile
     is read, such an option becomes `{"file": as written, "text": content}`: bound into the profile's digest, and attached to the log.
 
+    `normal_form`: of a transport, `module:function`: function(options, option) -> str, what the file that this option names states for
+    these options, in a form that does not depend on how it is written; the profile's digest covers that instead of the text, and the
+    option gets it as `"stated"`. Raises ConfigError for a file that cannot be used.
+
     `recognises`: of a recording, `module:function`: function(head) -> bool, whether a file that begins with these bytes (unpacked, up to
     `HEAD_BYTES`) is of this kind, whatever its name.
     """
@@ -60,6 +64,7 @@ class Offer(NamedTuple):
     summary: str = ""
     files: tuple[str, ...] = ()
     recognises: str = ""
+    normal_form: str = ""
 
 
 class ReadLog(NamedTuple):

@@ -110,9 +110,10 @@ class Registry:
         if not isinstance(offer.target, str) or not TARGET.fullmatch(offer.target):
             errors.append(one_line(f"s2r_{kind}: {offer.name} has the target {offer.target!r}, must be module:attribute"))
             return ""
-        if not isinstance(offer.recognises, str) or (offer.recognises and not TARGET.fullmatch(offer.recognises)):
-            errors.append(one_line(f"s2r_{kind}: {offer.name} recognises by {offer.recognises!r}, must be module:attribute"))
-            return ""
+        for target in (offer.recognises, offer.normal_form):
+            if not isinstance(target, str) or (target and not TARGET.fullmatch(target)):
+                errors.append(one_line(f"s2r_{kind}: {offer.name} names the function {target!r}, must be module:attribute"))
+                return ""
         known = self._offers[kind].get(offer.name)
         if known is not None:
             errors.append(f"{kind[:-1]} {offer.name!r} of {distribution} is refused: {known.distribution} has that name")
@@ -142,6 +143,12 @@ class Registry:
         """
         target = self.offered("recordings", name).offer.recognises
         found: Callable[[bytes], bool] = self._load("recordings", name, target) if target else _recognises_nothing
+        return found
+
+    def normal_form(self, transport: str) -> Callable[[dict[str, Any], str], str] | None:
+        """The function that gives what a file of a transport states (`Offer.normal_form`), if it has one. Raises PluginError."""
+        target = self.offered("transports", transport).offer.normal_form
+        found: Callable[[dict[str, Any], str], str] | None = self._load("transports", transport, target) if target else None
         return found
 
     def _load(self, kind: str, name: str, target: str) -> Any:

@@ -5,6 +5,7 @@ Everything a statement depends on is fixed here, before any data are seen. The p
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import re
 import tomllib
@@ -295,20 +296,31 @@ class Profile(_Table, frozen=True):
     @property
     def files(self) -> dict[str, str]:
         """Name as written in the profile -> text, of the files that its transport names (`Offer.files`)."""
-        named = [value for value in self.transport.values() if isinstance(value, dict) and set(value) == {"file", "text"}]
+        named = [value for value in self.transport.values() if is_file(value)]
         return {value["file"]: value["text"] for value in named}
 
     def digest(self) -> str:
         """Digest of everything but the model (it has a digest of its own), where logs go, and what the computer is given time for."""
         plain = msgspec.to_builtins(self)
         del plain["model"], plain["recording"], plain["machine"]
+        plain["transport"] = {name: _covered(value) for name, value in self.transport.items()}
         return digest_of({**plain, **{name: plain_table(name, getattr(self, name)) for name in AS_BEFORE if name in plain}})
+
+    def by_text(self) -> Profile:
+        """The same, with a digest that covers the whole text of each file that its transport names, as earlier versions computed it."""
+        whole = {name: {"file": v["file"], "text": v["text"]} if is_file(v) else v for name, v in self.transport.items()}
+        return msgspec.structs.replace(self, transport=whole)
 
     def task_digest(self) -> str:
         """Digest of the task: its name, parameters, threshold and the model step it runs on."""
         return digest_of(
             {"task": self.task.name, "parameters": self.task.parameters, "dt": self.model.dt, "threshold": self.verification.threshold}
         )
+
+
+def is_file(option: Any) -> bool:
+    """Whether a transport's option is a file with its content: `{"file": ..., "text": ...}`, and `"stated"` of a transport that has it."""
+    return isinstance(option, dict) and {"file", "text"} <= set(option) <= {"file", "text", "stated"}
 
 
 def load_driving_profile(path: Path) -> Profile:
@@ -355,15 +367,34 @@ def parse_profile(text: str, where: str, base: Path, files: Mapping[str, str] | 
     return msgspec.structs.replace(profile, model=_resolved(profile.model, where, base), transport=transport)
 
 
+def _covered(option: Any) -> Any:
+    """What of a transport's option the profile's digest covers: of a file its normal form, where there is one, else its text."""
+    return {name: option[name] for name in ("file", "stated")} if is_file(option) and "stated" in option else option
+
+
 def _with_files(transport: dict[str, Any], where: str, base: Path, given: Mapping[str, str] | None) -> dict[str, Any]:
-    """The transport's options, with the content of the files that they name (`Offer.files`). A transport that isn't known has none."""
+    """The transport's options, with the content of the files that they name (`Offer.files`), and the normal form of that, where the
+    transport has one. A transport that isn't known has no files.
+    """
     from s2r_runtime.plugins import registry
 
     found = registry()
     if transport.get("name") not in found.names("transports"):
         return transport
+    options = _read_files(transport, found.offered("transports", transport["name"]).offer.files, where, base, given)
+    normal_form = found.normal_form(transport["name"])
+    with contextlib.suppress(ConfigError):  # the transport itself says what is wrong with it
+        if normal_form is not None:
+            plain = {name: value for name, value in options.items() if name != "name"}
+            options = {name: {**v, "stated": normal_form(plain, name)} if is_file(v) else v for name, v in options.items()}
+    return options
+
+
+def _read_files(
+    transport: dict[str, Any], named: tuple[str, ...], where: str, base: Path, given: Mapping[str, str] | None
+) -> dict[str, Any]:
     options = dict(transport)
-    for option in found.offered("transports", transport["name"]).offer.files:
+    for option in named:
         name = options.get(option)
         if not isinstance(name, str) or not name:
             continue  # the transport says what is wrong with it

@@ -216,6 +216,9 @@ class RunAudit:
             if name not in attached:
                 raise ConfigError(f"{self._where()}: {name} is not attached, so nothing can be recomputed")
         profile = self._profile_of(attached, as_before=not event.settings.fault_share)
+        if profile.digest() != event.settings.profile_digest == profile.by_text().digest():
+            profile = profile.by_text()
+            self._findings.count("runs by an earlier version's rule: their profile's digest covers the whole text of its files")
         self._profile = self._with_model(profile, event.settings.model_digest)
         settings = event.settings
         facts = ModelFacts(settings.states, settings.inputs, settings.angles)

@@ -1,14 +1,18 @@
-"""The user's DBC (or KCD, SYM, ARXML, CDD): read by cantools, asked by name, with the nearest names where there is no such one."""
+"""The user's DBC (or KCD, SYM, ARXML, CDD): read by cantools, looked up by name, with the nearest names where there is no such one.
+
+Of a DBC cantools gets only the messages that the profile names (`dbc`), so that nothing else in it can refuse the file.
+"""
 
 from __future__ import annotations
 
 import difflib
 import logging
-import re
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from s2r_can.dbc import Outline
+from s2r_can.options import checked, named
 from s2r_can.records import key_of
 from s2r_runtime.errors import ConfigError
 
@@ -17,8 +21,6 @@ if TYPE_CHECKING:
     from cantools.database.can import Message, Signal
 
 FORMATS = {"dbc": "dbc", "kcd": "kcd", "sym": "sym", "arxml": "arxml", "cdd": "cdd"}
-_MESSAGE = re.compile(r"^BO_[ \t]+(\d+)[ \t]+\w+[ \t]*:(.*?)(?=^BO_[ \t]|\Z)", re.MULTILINE | re.DOTALL)
-_BRANCH = re.compile(r"^[ \t]*SG_[ \t]+(\w+)[ \t]+m\d+M?[ \t]*:", re.MULTILINE)
 
 
 class Named(NamedTuple):
@@ -31,24 +33,56 @@ class Named(NamedTuple):
         return f"{self.message.name}.{self.signal.name}"
 
 
-class Database:
-    """option: what the user wrote for `transport.dbc`: a path, or the file as the profile holds it. Raises ConfigError."""
+def stated(options: dict[str, Any], option: str) -> str:
+    """What the DBC states of the messages that these options name (`Offer.normal_form`); of another format, all of its text.
 
-    def __init__(self, option: Any) -> None:
+    Raises ConfigError.
+    """
+    name, text = _text(options[option])
+    if kind_of(name) != "dbc":
+        return text
+    cut = Outline(text).cut(*named(checked(options)))
+    return "\n".join([cut.text, *(f"{alias} {given}" for alias, given in sorted(cut.names.items()))])
+
+
+class Database:
+    """option: what the user wrote for `transport.dbc`: a path, or the file as the profile holds it. names: of messages, and of signals
+    without one, that are looked up (None: all). Raises ConfigError.
+    """
+
+    def __init__(self, option: Any, names: tuple[set[str], set[str]] | None = None) -> None:
         self.name, text = _text(option)
-        messages = _parsed(self.name, text).messages
+        aliases: dict[str, str] = {}
+        self._all: dict[str, list[str]] = {}
+        keys: list[tuple[int, str]] = []
+        self._branches: dict[int, set[str]] = {}
+        if kind_of(self.name) == "dbc":
+            outline = Outline(text)
+            self._all = {message.called: message.names() for message in outline.messages}
+            keys = [(message.number, message.called) for message in outline.messages]
+            self._branches = {message.number: message.branches() for message in outline.messages}
+            if not keys:
+                raise ConfigError(f"transport.dbc: {self.name}: has no messages: no line of it begins one (BO_)")
+            try:
+                text, aliases = outline.cut(*(names or ({*self._all}, set())))
+            except ConfigError as error:
+                raise ConfigError(f"transport.dbc: {self.name}: {error}") from None
+        messages = _parsed(self.name, text).messages if not keys or "BO_ " in text else []
+        _renamed(messages, aliases)
         self._messages = {message.name: message for message in messages}
-        self._twice = {name for name, count in Counter(message.name for message in messages).items() if count > 1}
+        if not keys:
+            self._all = {message.name: [signal.name for signal in message.signals] for message in messages}
+            keys = [(key_of(message.frame_id, extended=message.is_extended_frame), message.name) for message in messages]
+        self._twice = {name for name, count in Counter(name for _, name in keys).items() if count > 1}
         self._same: dict[int, list[str]] = {}
-        for message in messages:
-            self._same.setdefault(key_of(message.frame_id, extended=message.is_extended_frame), []).append(message.name)
-        self._branches = {int(number): set(_BRANCH.findall(body)) for number, body in _MESSAGE.findall(text)}
+        for key, name in keys:
+            self._same.setdefault(key, []).append(name)
 
     def message(self, name: object, where: str) -> Message:
         """The message of that name. Raises ConfigError."""
         found = self._messages.get(name) if isinstance(name, str) else None
         if found is None:
-            raise ConfigError(f"{where}: {self.name} has no message {name!r}; {_nearest(str(name), list(self._messages))}")
+            raise ConfigError(f"{where}: {self.name} has no message {name!r}; {_nearest(str(name), list(self._all))}")
         same = self._same[key_of(found.frame_id, extended=found.is_extended_frame)]
         if name in self._twice or len(same) > 1:
             what = f"has several messages {name!r}" if name in self._twice else f"gives one identifier to {' and '.join(same)}"
@@ -71,7 +105,7 @@ class Database:
             if having:
                 several = ", ".join(f"{m.name}.{name}" for m in having[:5])
                 raise ConfigError(f"{where}: {len(having)} messages of {self.name} have a signal {name!r}: say which: {several}")
-        known = [f"{m.name}.{s.name}" for m in self._messages.values() for s in m.signals]
+        known = [f"{message}.{signal}" for message, signals in self._all.items() for signal in signals]
         raise ConfigError(f"{where}: {self.name} has no signal {name!r}; {_nearest(name, known)}")
 
     def signal_in(self, message: Message, name: object, where: str) -> Named:
@@ -90,7 +124,7 @@ class Database:
 
 
 def _text(option: Any) -> tuple[str, str]:
-    if isinstance(option, dict) and set(option) == {"file", "text"}:
+    if isinstance(option, dict) and {"file", "text"} <= set(option):
         return str(option["file"]), str(option["text"])
     if not isinstance(option, str) or not option:
         raise ConfigError(f"transport.dbc is {option!r}, must be the path of a DBC file")
@@ -104,12 +138,26 @@ def _text(option: Any) -> tuple[str, str]:
         return option, data.decode("cp1252", "replace")
 
 
+def kind_of(name: str) -> str:
+    """The file's format, by its suffix."""
+    return FORMATS.get(Path(name).suffix.lower().removeprefix("."), "dbc")
+
+
+def _renamed(messages: list[Message], names: dict[str, str]) -> None:
+    """Gives messages and signals the names that their file has. names: what cantools read -> the name."""
+    for message in messages:
+        message.name = names.get(message.name, message.name)
+        for signal in message.signals:
+            signal.name = names.get(signal.name, signal.name)
+            if signal.multiplexer_signal is not None:
+                signal.multiplexer_signal = names.get(signal.multiplexer_signal, signal.multiplexer_signal)
+
+
 def _parsed(name: str, text: str) -> CanDatabase:
     import cantools
 
     logging.getLogger("cantools").setLevel(logging.CRITICAL)  # what it warns of is refused here, where it matters
-    suffix = Path(name).suffix.lower().removeprefix(".")
-    kind = FORMATS.get(suffix, "dbc")
+    kind = kind_of(name)
     try:
         # what does not fit or overlaps is refused where it is used: files of others are rarely clean throughout
         found = cantools.database.load_string(text, database_format=kind, strict=False)

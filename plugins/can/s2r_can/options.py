@@ -134,6 +134,16 @@ def checked(given: dict[str, Any]) -> Options:
     )
 
 
+def named(options: Options) -> tuple[set[str], set[str]]:
+    """(names of messages, names of signals without one) that the options mention, as they are written there."""
+    references = [source.signal for source in (*options.states.values(), *options.inputs.values())]
+    references += [one.signal for one in options.dead_reckoning.values() if isinstance(one, Source)]
+    references += [*options.constants, *options.overrides.values(), options.stamp]
+    messages = {*options.counters, *options.checksums, *options.timeouts, options.trigger.partition(".")[0]}
+    messages |= {one.partition(".")[0] for one in references if isinstance(one, str) and "." in one}
+    return messages - {""}, {one for one in references if isinstance(one, str) and "." not in one} - {""}
+
+
 def _known(name: str, known: Any, where: str, what: str) -> None:
     if name in known:
         return

@@ -8,7 +8,8 @@ from s2r_runtime.hookspecs import Offer, hookimpl
 @hookimpl
 def s2r_transports() -> list[Offer]:
     """The CAN transport."""
-    return [Offer("can", "s2r_can.transport:CanTransport", "robots on a CAN bus, described by its DBC", files=("dbc",))]
+    what = "robots on a CAN bus, described by its DBC"
+    return [Offer("can", "s2r_can.transport:CanTransport", what, files=("dbc",), normal_form="s2r_can.database:stated")]
 
 
 @hookimpl

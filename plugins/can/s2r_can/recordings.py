@@ -24,7 +24,7 @@ from s2r_can.layout import Group, Layout
 from s2r_can.listening import layout_of
 from s2r_can.logs import read_frames
 from s2r_can.odometry import Odometry
-from s2r_can.options import checked
+from s2r_can.options import checked, named
 from s2r_can.proposals import CommandReader
 from s2r_can.reckoning import Reckoning, odometry_of
 from s2r_can.records import ERROR, REMOTE, LogFrame
@@ -45,7 +45,7 @@ AGAIN_S = 1.0
 def read(path: Path, states: tuple[str, ...], inputs: tuple[str, ...], options: dict[str, Any]) -> ReadLog:
     """A log's stretches, and what of it could not be used; see `hookspecs.s2r_recordings`. Raises ConfigError, RecordingError."""
     known = checked(options)
-    database = Database(known.dbc)
+    database = Database(known.dbc, named(known))
     layout = layout_of(known, database, states, inputs)
     tally = Tally()
     drives = _chosen(path, layout, str(known.robot.get("channel", "")), tally)

@@ -19,7 +19,7 @@ from s2r_can.database import Database
 from s2r_can.inbox import Bell, Inbox, Metronome
 from s2r_can.listening import layout_of
 from s2r_can.observer import Decoded, Observer
-from s2r_can.options import OPTIONS, Options, checked
+from s2r_can.options import OPTIONS, Options, checked, named
 from s2r_can.port import Port
 from s2r_can.proposals import Proposals
 from s2r_can.reckoning import odometry_of
@@ -37,7 +37,7 @@ class CanTransport:
 
     def __init__(self, options: dict[str, Any], states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
         self._options: Options = checked(options)
-        self._layout = layout_of(self._options, Database(self._options.dbc), states, inputs)
+        self._layout = layout_of(self._options, Database(self._options.dbc, named(self._options)), states, inputs)
         self._timeout_ns = round(self._options.observation_timeout * 1e9)
         self._cycle_ns = round(self._options.command_cycle * 1e9)
         self._observer = Observer(self._layout, states, odometry_of(self._options), self._timeout_ns)

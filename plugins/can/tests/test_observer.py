@@ -286,7 +286,7 @@ def test_pose_is_dead_reckoned_along_arcs() -> None:
         ({"queue": 1}, "transport.queue is 1, must be a whole number >= 2"),
         ({"dbc": ""}, "transport.dbc is missing"),
         ({"dbc": "/no/such.dbc"}, "/no/such.dbc: cannot be read: No such file"),
-        ({"dbc": {"file": "a.dbc", "text": "BO_ nonsense"}}, "a.dbc: cannot be read as DBC"),
+        ({"dbc": {"file": "a.dbc", "text": "BO_ nonsense"}}, "a.dbc: has no messages"),
         ({"dbc": {"file": "a.dbc", "text": 'VERSION ""\n'}}, "a.dbc: has no messages"),
         ({"robot": {"channel": "can0"}}, "transport.robot.interface is missing"),
         ({"robot": {}}, "transport.robot is missing"),
