@@ -15,15 +15,21 @@ HEARTBEAT = 0
 ATTITUDE = 30
 LOCAL_POSITION_NED = 32
 GLOBAL_POSITION_INT = 33
+SERVO_OUTPUT_RAW = 36
+MANUAL_CONTROL = 69
+RC_CHANNELS_OVERRIDE = 70
 COMMAND_INT = 75
 COMMAND_LONG = 76
 COMMAND_ACK = 77
 SET_POSITION_TARGET_LOCAL_NED = 84
+SET_POSITION_TARGET_GLOBAL_INT = 86
+HIL_ACTUATOR_CONTROLS = 93
 VISION_POSITION_ESTIMATE = 102
 TIMESYNC = 111
 MESSAGE_INTERVAL = 244
 STATUSTEXT = 253
 ODOMETRY = 331
+ACTUATOR_OUTPUT_STATUS = 375
 
 DO_SET_MODE = 176
 COMPONENT_ARM_DISARM = 400
@@ -67,6 +73,10 @@ def _message(number: int, name: str, layout: str, fields: str) -> Message:
     return Message(number, name, struct.Struct("<" + layout), tuple(fields.split()))
 
 
+def _numbered(name: str, first: int, last: int) -> str:
+    return " ".join(name.format(k) for k in range(first, last + 1))
+
+
 _TARGET = "target_system target_component"
 
 MESSAGES: dict[int, Message] = {
@@ -98,6 +108,34 @@ MESSAGES: dict[int, Message] = {
         ),
     )
 }
+
+LOGGED: dict[int, Message] = {
+    m.number: m
+    for m in (
+        _message(
+            SERVO_OUTPUT_RAW,
+            "SERVO_OUTPUT_RAW",
+            "I8HB8H",
+            f"time_usec {_numbered('servo{}_raw', 1, 8)} port {_numbered('servo{}_raw', 9, 16)}",
+        ),
+        _message(MANUAL_CONTROL, "MANUAL_CONTROL", "4hHB", "x y z r buttons target"),
+        _message(
+            RC_CHANNELS_OVERRIDE,
+            "RC_CHANNELS_OVERRIDE",
+            "8H2B10H",
+            f"{_numbered('chan{}_raw', 1, 8)} {_TARGET} {_numbered('chan{}_raw', 9, 18)}",
+        ),
+        _message(
+            SET_POSITION_TARGET_GLOBAL_INT,
+            "SET_POSITION_TARGET_GLOBAL_INT",
+            "I2i9fH3B",
+            f"time_boot_ms lat_int lon_int alt vx vy vz afx afy afz yaw yaw_rate type_mask {_TARGET} coordinate_frame",
+        ),
+        _message(HIL_ACTUATOR_CONTROLS, "HIL_ACTUATOR_CONTROLS", "QQ16fB", "time_usec flags controls mode"),
+        _message(ACTUATOR_OUTPUT_STATUS, "ACTUATOR_OUTPUT_STATUS", "QI32f", "time_usec active actuator"),
+    )
+}
+"""Messages that only logs are read for: what somebody commanded by other means, and what the actuators got."""
 
 # fmt: off
 CRC_EXTRA: dict[int, int] = {

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import difflib
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 from s2r_mavlink.endpoints import Address, parse
+from s2r_mavlink.logged_commands import SIGNALS
 from s2r_mavlink.pose import POSE_ONLY, QUANTITIES, SOURCES
 from s2r_mavlink.robot_state import mode_number
 from s2r_runtime.errors import ConfigError
 
 INPUTS = ("v", "w")
+SIGNALS_ARE = "v, w, manual_x, _y, _z, _r, rc1 to rc18, servo1 to servo16, actuator1 to actuator32, control1 to control16"
 TAKE_OVER = ("never", "mode", "arm")
 STOP_WHEN = ("emergency", "closed")
 
@@ -35,6 +37,7 @@ DEFAULTS: dict[str, Any] = {
     "queue": 64,
     "signing_key_file": "",
     "signing_state": "",
+    "log_inputs": {},
 }
 
 MEANINGS: dict[str, str] = {
@@ -56,6 +59,7 @@ MEANINGS: dict[str, str] = {
     "max_age": "s; an observation that was longer on its way is faulty (default 0.3)",
     "queue": "messages about the pose kept for a runtime that is late; older ones are dropped and counted (default 64)",
     "signing_key_file": "file with the key (64 hexadecimal digits, readable by its owner only): everything is signed and must be",
+    "log_inputs": "input -> what a telemetry log has for it: rc3, servo1, manual_x, ..., or { signal, scale, offset } (default: v and w)",
     "signing_state": "file that keeps the newest stamp over a restart (default: in the user's state folder, one a key)",
 }
 
@@ -87,8 +91,36 @@ def checked(given: dict[str, Any], states: tuple[str, ...], inputs: tuple[str, .
     _choice("pose", options["pose"], tuple(SOURCES))
     _modes(options)
     _origin(options)
+    log_inputs(options["log_inputs"], inputs)
     _quantities(options["pose"], states, inputs)
     return options
+
+
+class LogInput(NamedTuple):
+    """An input in a telemetry log: value = signal * scale + offset."""
+
+    signal: str
+    scale: float = 1.0
+    offset: float = 0.0
+
+
+def log_inputs(given: dict[str, Any], inputs: tuple[str, ...]) -> dict[str, LogInput]:
+    """The signal of each input of the model: as `log_inputs` maps it, else the one of its own name. Raises ConfigError."""
+    found = {name: LogInput(name) for name in inputs}
+    for name, value in given.items():
+        where = f"transport.log_inputs.{name}"
+        if name not in inputs:
+            raise ConfigError(f"{where}: the model has no such input; it has: {', '.join(inputs)}")
+        table = {"signal": value} if isinstance(value, str) else value
+        if not isinstance(table, dict) or not isinstance(table.get("signal"), str) or not set(table) <= set(LogInput._fields):
+            raise ConfigError(f"{where} is {value!r}, must be a signal, or {{ signal = ..., scale = ..., offset = ... }}")
+        numbers = [table.get("scale", 1.0), table.get("offset", 0.0)]
+        if not all(isinstance(n, int | float) and not isinstance(n, bool) and math.isfinite(n) for n in numbers) or numbers[0] == 0:
+            raise ConfigError(f"{where} is {value!r}; scale and offset must be finite numbers, and scale not 0")
+        if table["signal"] not in INPUTS and not SIGNALS.fullmatch(table["signal"]):
+            raise ConfigError(f"{where}: {table['signal']!r} is no signal of a telemetry log; there are: {SIGNALS_ARE}")
+        found[name] = LogInput(table["signal"], float(numbers[0]), float(numbers[1]))
+    return found
 
 
 def _known(name: str, value: Any) -> None:
@@ -98,7 +130,7 @@ def _known(name: str, value: Any) -> None:
         raise ConfigError(f"transport.{name} is not an option of the mavlink transport; {hint}")
     wanted = (int, float) if isinstance(DEFAULTS[name], float) else type(DEFAULTS[name])
     if isinstance(value, bool) or not isinstance(value, wanted):
-        kind = {str: "text", int: "a whole number", float: "a number", list: "[latitude, longitude]"}[type(DEFAULTS[name])]
+        kind = {str: "text", int: "a whole number", float: "a number", list: "[latitude, longitude]", dict: "a table"}[type(DEFAULTS[name])]
         raise ConfigError(f"transport.{name} is {value!r}, must be {kind}")
 
 

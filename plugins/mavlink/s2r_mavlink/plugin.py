@@ -14,7 +14,14 @@ def s2r_transports() -> list[Offer]:
 @hookimpl
 def s2r_recordings() -> list[Offer]:
     """Telemetry logs."""
-    return [Offer("mavlink.tlog", "s2r_mavlink.tlog:read", "telemetry logs of MAVLink ground stations (.tlog, .tlog.gz)")]
+    return [
+        Offer(
+            "mavlink.tlog",
+            "s2r_mavlink.tlog:read",
+            "telemetry logs of MAVLink ground stations (.tlog, .tlog.gz)",
+            recognises="s2r_mavlink.tlog:is_tlog",
+        )
+    ]
 
 
 @hookimpl

@@ -5,8 +5,9 @@ A record is 8 bytes, the logging computer's clock in microseconds (big-endian), 
 
     h = rate b + delay(h),   delay: the least of (arrival - rate b) over telemetry of about the same second
 
-so that a radio that is late now and then moves no command. A command acts until the next one, or for 3 s (ArduPilot's Rover stops then).
+so that a radio that is late now and then moves no command. A velocity acts until the next one, or for 3 s (ArduPilot's Rover stops then).
 Only stretches in which the robot obeyed (mode and arming in its heartbeats) are driving; a clock that goes back is another start of it.
+Where the inputs are sticks or what the actuators got (`logged_commands`), any mode will do in which it is armed.
 """
 
 from __future__ import annotations
@@ -21,17 +22,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_mavlink.dialect import BODY_FRAMES, HEARTBEAT, MESSAGES, SET_POSITION_TARGET_LOCAL_NED
+from s2r_mavlink.dialect import HEARTBEAT, MESSAGES
 from s2r_mavlink.frames import header, length_at, payload, whole
-from s2r_mavlink.options import DEFAULTS, INPUTS
+from s2r_mavlink.logged_commands import NUMBERS, SIGNALS, VELOCITIES, Commands, Raw, Velocity
+from s2r_mavlink.options import DEFAULTS, SIGNALS_ARE, LogInput, log_inputs
 from s2r_mavlink.pose import POSE_ONLY, QUANTITIES, SOURCES, PoseSource
 from s2r_mavlink.robot_state import ARMED, mode_number
 from s2r_runtime.errors import RecordingError
+from s2r_runtime.hookspecs import ReadLog
 
 Array = NDArray[np.float64]
 Rows = tuple[Array, Array]
 
 STAMP = 8
+STAMP_MAX_US = 1 << 53
+"""In the year 2255."""
 LAPSE_S = 3.0
 """After so long without a command ArduPilot's Rover stops."""
 REORDERED_S = 1.0
@@ -39,7 +44,6 @@ REORDERED_S = 1.0
 BIN_S = 1.0
 ROVERS = (10, 11)
 """MAV_TYPE of a ground rover and a boat, whose modes have the numbers that are known here."""
-POSITION_OR_ANY_VELOCITY, IGNORES_YAW_RATE = 8 | 16 | 32, 2048
 
 
 class Record(NamedTuple):
@@ -53,30 +57,57 @@ class Record(NamedTuple):
 
 
 class Start(NamedTuple):
-    """What was logged between two starts of the robot: poses (host s, robot s, x), times at which it was known to obey or not to."""
+    """What was logged between two starts of the robot: poses (host s, robot s, x, heading in rad), and times at which it was
+    known to obey or not to.
+    """
 
     host: list[float]
     boot: list[float]
     x: list[tuple[float, ...]]
+    theta: list[float]
     obeyed: list[tuple[float, bool]]
 
 
-def read(path: Path, states: tuple[str, ...], inputs: tuple[str, ...], options: dict[str, Any]) -> list[tuple[Rows, Rows]]:
-    """Hook `s2r_recordings`: see `hookspecs`. Raises RecordingError."""
+def read(path: Path, states: tuple[str, ...], inputs: tuple[str, ...], options: dict[str, Any]) -> ReadLog:
+    """Hook `s2r_recordings`: see `hookspecs`. Raises RecordingError, ConfigError."""
     data = _bytes(path)
-    records = list(_records(data))
+    mapped = log_inputs(options.get("log_inputs", {}), inputs)
+    skipped: list[int] = []
+    records = list(_records(data, skipped))
     if not records:
         raise RecordingError(f"{path}: holds no MAVLink frame, must be a telemetry log (.tlog)")
-    chosen = _options(path, records, options, states, inputs)
-    starts, commands = _sorted(records, chosen, states)
+    chosen = _options(path, records, options, states, mapped)
+    starts, commands = _sorted(records, chosen, states, mapped)
     begins = [start.host[0] for start in starts[1:]]
     found: list[tuple[Rows, Rows]] = []
     for start, since, until in zip(starts, [-np.inf, *begins], [*begins, np.inf], strict=True):
-        given = [command for command in commands if since <= command[0] < until]
-        found += _stretches(start, _acting(start, given, inputs), len(states), len(inputs))
+        found += _stretches(start, _acting(start, commands, (since, until), mapped), len(states), len(inputs))
     if not found:
-        raise RecordingError(f"{path}: system {chosen['system']} tells no pose while it obeys (mode {chosen['mode'] or 'any'}, armed)")
-    return found
+        armed = ", armed" if chosen["armed"] else ""
+        raise RecordingError(f"{path}: system {chosen['system']} tells no pose while it obeys (mode {chosen['mode'] or 'any'}{armed})")
+    unused, counted = commands.account(), len(commands.velocities) + len(commands.raw)
+    if not counted and unused:
+        raise RecordingError(f"{path}: no command in it counts: {unused}")
+    notes = [f"commands that do not count: {unused}"] if unused else [] if counted else ["holds no command"]
+    if counted and not any(len(u) for _, (_, u) in found):
+        notes.append("no command was given while the robot obeyed")
+    notes += [f"{sum(skipped)} bytes are no record of a telemetry log and left out"] if skipped else []
+    return ReadLog(found, tuple(notes))
+
+
+def is_tlog(head: bytes) -> bool:
+    """Whether a file begins with two records: a stamp of this century or the last, and a frame (`Offer.recognises`)."""
+    at = 0
+    for _ in range(2):
+        size = length_at(head, at + STAMP) if len(head) > at + STAMP else 0
+        if (
+            size <= 0
+            or not whole(head[at + STAMP : at + STAMP + size], 0, size)
+            or int.from_bytes(head[at : at + STAMP], "big") > STAMP_MAX_US
+        ):
+            return False
+        at += STAMP + size
+    return True
 
 
 def _bytes(path: Path) -> bytes:
@@ -92,8 +123,11 @@ def _bytes(path: Path) -> bytes:
         raise RecordingError(f"{path}: is not a whole gzip file: {error}") from None
 
 
-def _records(data: bytes) -> Iterator[Record]:
-    """In the file's order; what is no record is skipped byte by byte, and a last one that was cut is left out."""
+def _records(data: bytes, skipped: list[int]) -> Iterator[Record]:
+    """In the file's order; what is no record is skipped byte by byte, and a last one that was cut is left out.
+
+    skipped: takes the numbers of bytes.
+    """
     at, end = 0, len(data) - STAMP
     while at < end:
         size = length_at(data, at + STAMP)
@@ -106,12 +140,16 @@ def _records(data: bytes) -> Iterator[Record]:
             at = start + size
         else:
             at += 1
+            skipped.append(1)
+    skipped += [len(data) - at] if at < len(data) else []
 
 
 # ---------------------------------------------------------------- which robot, which source
 
 
-def _options(path: Path, records: list[Record], given: dict[str, Any], states: tuple[str, ...], inputs: tuple[str, ...]) -> dict[str, Any]:
+def _options(
+    path: Path, records: list[Record], given: dict[str, Any], states: tuple[str, ...], inputs: dict[str, LogInput]
+) -> dict[str, Any]:
     """The profile's options, or what the log itself suggests."""
     counts = Counter((r.system, r.number) for r in records)
     options = {**DEFAULTS, **given}
@@ -130,23 +168,30 @@ def _options(path: Path, records: list[Record], given: dict[str, Any], states: t
         if r.number == HEARTBEAT and r.system == options["system"]
     ):
         options["mode"] = ""
+    options["armed"] = bool(options["mode"])
+    if not {one.signal for one in inputs.values()} & set(VELOCITIES):
+        options["mode"], options["armed"] = "", True  # sticks and actuators: in whatever mode
     told = POSE_ONLY if options["pose"] == "vision" else QUANTITIES
-    for what, names, known in (("states", states, told), ("inputs", inputs, INPUTS)):
-        if unknown := [name for name in names if name not in known]:
-            raise RecordingError(f"{path}: a telemetry log has the {what} {', '.join(known)}; the model also has {', '.join(unknown)}")
+    if unknown := [name for name in states if name not in told]:
+        raise RecordingError(f"{path}: a telemetry log has the states {', '.join(told)}; the model also has {', '.join(unknown)}")
+    if unknown := [name for name, one in inputs.items() if one.signal not in VELOCITIES and not SIGNALS.fullmatch(one.signal)]:
+        raise RecordingError(
+            f"{path}: a telemetry log has the inputs {SIGNALS_ARE}; the model also has {', '.join(unknown)}, "
+            "which transport.log_inputs can map"
+        )
     return options
 
 
 def _sorted(
-    records: list[Record], options: dict[str, Any], states: tuple[str, ...]
-) -> tuple[list[Start], list[tuple[float, float, float]]]:
-    """By start of the robot; and the commands (host s, v, w)."""
+    records: list[Record], options: dict[str, Any], states: tuple[str, ...], inputs: dict[str, LogInput]
+) -> tuple[list[Start], Commands]:
+    """By start of the robot; and the commands."""
     numbers = frozenset(SOURCES[options["pose"]])
     teller = options["pose_component"] or options["component"]
-    source = PoseSource(options["pose"], states, tuple(options["origin"] or (0.0, 0.0)))
+    source = PoseSource(options["pose"], (*states, "theta"), tuple(options["origin"] or (0.0, 0.0)))
     wanted = mode_number(options["mode"]) if options["mode"] else None
-    starts = [Start([], [], [], [])]
-    commands: list[tuple[float, float, float]] = []
+    starts = [Start([], [], [], [], [])]
+    commands = Commands(options["system"], tuple(one.signal for one in inputs.values()))
     for record in records:
         if record.system == options["system"] and record.number in numbers and record.component in (teller, options["component"]):
             pose = source.take(record.number, MESSAGES[record.number].unpack(payload(record.frame)))
@@ -154,12 +199,10 @@ def _sorted(
                 _take_pose(starts, source, record.host_s, pose.stamp_ns * 1e-9, pose.x)
         elif record.number == HEARTBEAT and (record.system, record.component) == (options["system"], options["component"]):
             f = MESSAGES[HEARTBEAT].unpack(payload(record.frame))
-            starts[-1].obeyed.append((record.host_s, wanted is None or (f[0] == wanted and bool(f[3] & ARMED))))
-        elif record.number == SET_POSITION_TARGET_LOCAL_NED:
-            f = MESSAGES[record.number].unpack(payload(record.frame))
-            known = f[15] in BODY_FRAMES and not f[12] & (POSITION_OR_ANY_VELOCITY | IGNORES_YAW_RATE)
-            if known and f[13] in (options["system"], 0) and np.isfinite((f[4], f[11])).all():
-                commands.append((record.host_s, f[4], 0.0 - f[11]))
+            obeys = (wanted is None or f[0] == wanted) and (not options["armed"] or bool(f[3] & ARMED))
+            starts[-1].obeyed.append((record.host_s, obeys))
+        elif record.number in NUMBERS:
+            commands.take(record.host_s, record.system, record.number, payload(record.frame))
     return starts, commands
 
 
@@ -169,30 +212,67 @@ def _take_pose(starts: list[Start], source: PoseSource, host_s: float, boot_s: f
         if start.boot[-1] - boot_s <= REORDERED_S:
             return
         source.restarted()
-        start = Start([], [], [], [])
+        start = Start([], [], [], [], [])
         starts.append(start)
     start.host.append(host_s)
     start.boot.append(boot_s)
-    start.x.append(x)
+    start.x.append(x[:-1])
+    start.theta.append(x[-1])
 
 
 # ---------------------------------------------------------------- one clock
 
 
-def _acting(start: Start, commands: list[tuple[float, float, float]], inputs: tuple[str, ...]) -> Rows:
-    """The commands on the robot's clock, with the zero that follows a lapse."""
-    columns = [INPUTS.index(name) for name in inputs]
-    if len(start.boot) < 2 or not commands:
-        return np.empty(0), np.empty((0, len(inputs)))
-    given = np.array(commands)
-    t = _robot_time(np.array(start.host), np.array(start.boot), given[:, 0])
+def _acting(start: Start, commands: Commands, span: tuple[float, float], inputs: dict[str, LogInput]) -> Rows:
+    """(t, u): the commands of a span of the host's clock on the robot's clock, as the model's inputs."""
+    parts: list[tuple[Array, Array, tuple[str, ...]]] = []
+    if len(start.boot) >= 2:
+        host, boot = np.array(start.host), np.array(start.boot)
+        velocities = [one for one in commands.velocities if span[0] <= one.host_s < span[1]]
+        if velocities:
+            t = _robot_time(host, boot, np.array([one.host_s for one in velocities]))
+            parts.append((*_velocities(boot, np.array(start.theta), t, velocities), VELOCITIES))
+        raw = [one for one in commands.raw if span[0] <= one.host_s < span[1]]
+        if raw:
+            parts.append(_signals(_robot_time(host, boot, np.array([one.host_s for one in raw])), raw))
+    rows = [np.empty((0, len(inputs)))]
+    for t, values, names in parts:
+        u = np.full((len(t), len(inputs)), np.nan)
+        for column, one in enumerate(inputs.values()):
+            if one.signal in names:
+                u[:, column] = one.scale * values[:, names.index(one.signal)] + one.offset
+        rows.append(u)
+    stamps, table = np.concatenate([np.empty(0), *(t for t, _, _ in parts)]), np.concatenate(rows)
+    order = np.argsort(stamps, kind="stable")
+    return stamps[order], table[order]
+
+
+def _signals(t: Array, raw: list[Raw]) -> tuple[Array, Array, tuple[str, ...]]:
+    names = tuple(sorted({name for one in raw for name in one.values}))
+    return t, np.array([[one.values.get(name, np.nan) for name in names] for one in raw]), names
+
+
+def _velocities(boot: Array, theta: Array, t: Array, given: list[Velocity]) -> tuple[Array, Array]:
+    """(t, (v, w)) of the body, with the zero that follows a lapse. What is commanded along north and east turns against the body as that
+    turns: a row at each pose while it acts.
+    """
     order = np.argsort(t, kind="stable")
-    t, u = t[order], given[order, 1:][:, columns]
-    lapsed = np.append(np.diff(t) > LAPSE_S, True)
-    t = np.concatenate([t, t[lapsed] + LAPSE_S])
-    u = np.concatenate([u, np.zeros((int(lapsed.sum()), len(inputs)))])
-    order = np.argsort(t, kind="stable")
-    return t[order], u[order]
+    t, given = t[order], [given[k] for k in order]
+    heading = np.unwrap(theta)
+    times: list[Array] = []
+    values: list[Array] = []
+    for k, one in enumerate(given):
+        until = min(t[k] + LAPSE_S, t[k + 1] if k + 1 < len(t) else np.inf)
+        at = t[k : k + 1]
+        if not one.body:
+            at = np.concatenate([at, boot[(boot > t[k]) & (boot < until)]])
+        turned = np.zeros(len(at)) if one.body else np.interp(at, boot, heading)  # counter-clockwise from north; east is to the right of it
+        v = one.along * np.cos(turned) - (0.0 if one.body else one.across) * np.sin(turned)
+        lapsed = until == t[k] + LAPSE_S
+        times += [at, np.array([until])] if lapsed else [at]
+        values.append(np.column_stack([v, np.full(len(at), one.w)]))
+        values += [np.zeros((1, 2))] if lapsed else []
+    return np.concatenate(times), np.concatenate(values)
 
 
 def _robot_time(host: Array, boot: Array, when: Array) -> Array:

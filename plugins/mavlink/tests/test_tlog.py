@@ -12,17 +12,22 @@ from typing import Any
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
-from s2r_mavlink.tlog import read
+from s2r_mavlink.tlog import read as read_log
 
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.robot_logs import readers_of
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.transitions import load_transitions
 
 STATES, INPUTS = ("x", "y", "theta"), ("v", "w")
 SITL = Path("../shared/data/rover_sitl.tlog.gz")
 UNIX_S = 1_795_000_000.0
+
+
+def read(path: Path, states: tuple[str, ...], inputs: tuple[str, ...], options: dict[str, Any]) -> list[Any]:
+    return read_log(path, states, inputs, options).stretches
 
 
 class Log:
@@ -121,7 +126,7 @@ def test_only_what_a_rover_obeys_is_an_input(tmp_path: Path) -> None:
     log.sent(1.0, 0.5, 0.1)
     log.sent(1.5, 0.6, 0.1, mask=1479 | 32)
     log.sent(2.0, 0.7, 0.1, mask=1479 | 2048)
-    log.sent(2.5, 0.8, 0.1, frame=1)
+    log.sent(2.5, 0.8, 0.1, frame=20)
     log.sent(3.0, 0.9, 0.1, system=7)
     log.sent(3.5, math.nan, 0.1)
     ((_, _), (t_u, _)) = read(log.write(tmp_path / "a.tlog"), STATES, INPUTS, {})[0]
@@ -234,3 +239,93 @@ def test_recording_of_ardupilots_rover_shows_its_ramp_and_its_turn_rate() -> Non
 
     assert np.sqrt(np.mean((ramp(0, 0.20, 1.0) - x[:, 3]) ** 2)) < 0.05
     assert np.sqrt(np.mean((ramp(1, 0.05, 2.09) - x[:, 4]) ** 2)) < 0.02
+
+
+# ---------------------------------------------------------------- commands of every kind
+
+
+def turning(frame: int, encode: Any = None, seconds: float = 8.0) -> Log:
+    """A rover that turns while a velocity along north and east is commanded; other kinds are added by the caller."""
+    log = Log()
+    log.drive(0.0, seconds)
+    for k in range(8):
+        t, north, east, w = 0.5 + 0.9 * k, 0.3 + 0.05 * k, -0.2 + 0.1 * k, 0.1 * k - 0.3
+        fields = (0, 0, 0, north, east, 0, 0, 0, 0, 0, -w)
+        encode = encode or log.station.set_position_target_local_ned_encode
+        message = encode(0, 1, 1, frame, 1479, *fields)
+        log.records.append((UNIX_S + t, bytes(message.pack(log.station))))
+    return log
+
+
+@pytest.mark.parametrize(("frame", "name"), [(1, "local_ned"), (7, "local_ned"), (5, "global_int"), (6, "global_int"), (11, "global_int")])
+def test_velocity_along_north_and_east_is_turned_by_the_heading_at_each_moment(tmp_path: Path, frame: int, name: str) -> None:
+    station = mavlink.MAVLink(None, 255, 190)
+    log = turning(frame, getattr(station, f"set_position_target_{name}_encode"))
+    ((_, _), (t, u)) = read(log.write(tmp_path / "a.tlog"), STATES, INPUTS, {})[0]
+    k = np.clip(np.floor((t + 0.004 - 0.5) / 0.9 + 1e-3), 0, 7)
+    north, east, yaw = 0.3 + 0.05 * k, -0.2 + 0.1 * k, 0.5 * t
+    assert len(t) > 300, "a row at each pose"
+    assert u[:-1, 0] == pytest.approx((north * np.cos(yaw) + east * np.sin(yaw))[:-1], abs=1e-5)
+    assert u[:-1, 1] == pytest.approx((0.1 * k - 0.3)[:-1], abs=1e-6)
+
+
+@pytest.mark.parametrize("frame", [8, 9, 12])
+def test_velocity_in_the_bodys_frames_is_the_bodys(tmp_path: Path, frame: int) -> None:
+    ((_, _), (_, u)) = read(turning(frame).write(tmp_path / "a.tlog"), STATES, INPUTS, {})[0]
+    assert u[:-1, 0] == pytest.approx(0.3 + 0.05 * np.arange(8), abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_sticks_and_actuators_are_inputs_as_pymavlink_encodes_them(tmp_path: Path, seed: int) -> None:
+    draw, log = random.Random(seed), Log()
+    log.drive(0.0, 6.0, mode=0)
+    wanted: dict[str, list[float]] = {name: [] for name in ("manual_x", "manual_r", "rc1", "rc18", "servo3", "actuator1", "control16")}
+    for k in range(10):
+        t = 0.3 + 0.5 * k
+        x, r = draw.randrange(-1000, 1001), draw.randrange(-1000, 1001)
+        rc, servo = [draw.randrange(1000, 2001) for _ in range(18)], [draw.randrange(900, 2101) for _ in range(16)]
+        outputs, controls = [draw.uniform(-1, 1) for _ in range(32)], [draw.uniform(-1, 1) for _ in range(16)]
+        for later, message, sender in (
+            (0.00, log.station.manual_control_encode(1, x, 0, 0, r, 0), log.station),
+            (0.01, log.station.rc_channels_override_encode(1, 1, *rc), log.station),
+            (0.02, log.robot.servo_output_raw_encode(0, 0, *servo), log.robot),
+            (0.03, log.robot.actuator_output_status_encode(0, 32, outputs), log.robot),
+            (0.04, log.robot.hil_actuator_controls_encode(0, controls, 0, 0), log.robot),
+            (0.05, log.station.manual_control_encode(9, 1, 1, 1, 1, 0), log.station),
+        ):
+            log.records.append((UNIX_S + t + later, bytes(message.pack(sender))))
+        values = (x / 1000, r / 1000, (rc[0] - 1500) / 500, (rc[17] - 1500) / 500, (servo[2] - 1500) / 500, outputs[0], controls[15])
+        for name, value in zip(wanted, values, strict=True):
+            wanted[name].append(value)
+    path = log.write(tmp_path / "a.tlog")
+    found = read_log(path, STATES, (*wanted, "v"), {"log_inputs": {"v": {"signal": "servo3", "scale": 2.0, "offset": 1.0}}})
+    (((_, _), (_, u)),) = found.stretches
+    for column, name in enumerate(wanted):
+        assert u[~np.isnan(u[:, column]), column] == pytest.approx(wanted[name], abs=1e-6), name
+    assert u[~np.isnan(u[:, -1]), -1] == pytest.approx(2.0 * np.array(wanted["servo3"]) + 1.0, abs=1e-6)
+    assert found.notes == ("commands that do not count: 10 MANUAL_CONTROL (for another system)",)
+
+
+def test_log_in_which_no_command_counts_says_which_there_are_and_why(tmp_path: Path) -> None:
+    log = Log()
+    log.drive(0.0, 8.0)
+    log.sent(1.0, 0.5, 0.1, mask=1479 | 2048)
+    log.sent(2.0, 0.5, 0.1, frame=20)
+    log.records.append((UNIX_S + 3.0, bytes(log.station.manual_control_encode(1, 0, 0, 0, 0, 0).pack(log.station))))
+    with pytest.raises(RecordingError) as raised:
+        read(log.write(tmp_path / "a.tlog"), STATES, INPUTS, {})
+    assert str(raised.value).endswith(
+        "no command in it counts: 1 MANUAL_CONTROL (no input of the model has the name of its signals (manual_x, manual_r, ...; "
+        "transport.log_inputs maps them)), "
+        "1 SET_POSITION_TARGET_LOCAL_NED (in frame 20, which is neither the body's nor along north and east), "
+        "1 SET_POSITION_TARGET_LOCAL_NED (their type mask ignores the yaw rate, which w is)"
+    )
+
+
+def test_telemetry_log_is_known_by_its_content(tmp_path: Path) -> None:
+    log = Log()
+    log.drive(0.0, 8.0)
+    log.sent(1.0, 0.5, 0.1)
+    path = log.write(tmp_path / "a.csv")
+    assert readers_of(path) == ["mavlink.tlog"]
+    assert load_dataset(path, compose(ModelSpec("unicycle", 0.1))).rows > 300
