@@ -73,16 +73,18 @@ def head_of(path: Path) -> bytes:
 
 def readers_of(path: Path) -> list[str]:
     """Names of the offers that may read this file: those that recognise its content, else those for its suffix. Raises OSError."""
-    offers, form = registry(), _form_of(path)
-    named = offers.names("recordings")
+    form, named = _form_of(path), registry().names("recordings")
     if form:  # a bag is read by the plug-in of ROS 2, whatever its name; what has named signals by none
         return [name for name in named if form == BAG and name.partition(".")[2] == BAG]
-    head = head_of(path)
-    if head and not head.startswith(MCAP_MAGIC):
-        known = [name for name in named if offers.recogniser(name)(head)]
-        if known:
-            return known
-    return _readers_by_suffix(path)
+    return known_by_content(path) or _readers_by_suffix(path)
+
+
+def known_by_content(path: Path) -> list[str]:
+    """Names of the offers that recognise the file's content. Raises OSError."""
+    offers, head = registry(), head_of(path)
+    if not head or head.startswith(MCAP_MAGIC):
+        return []
+    return [name for name in offers.names("recordings") if offers.recogniser(name)(head)]
 
 
 def _readers_by_suffix(path: Path) -> list[str]:

@@ -10,12 +10,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from s2r_runtime.errors import MissingSignal, UsageError
+from s2r_runtime.errors import MissingSignal, RecordingError, UsageError
 from s2r_runtime.formats.guess import guessed
 from s2r_runtime.formats.mapping import Recorded, read_signals, resolved, unit_notes
 from s2r_runtime.formats.recognise import BAG, Form, not_installed, open_recording, recognised
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.robot_logs import is_robot_log, read_robot_log
+from s2r_runtime.robot_logs import is_robot_log, known_by_content, read_robot_log
 
 
 def read_recording(
@@ -31,8 +31,13 @@ def read_recording(
     columns, signals: name in the model (or `t`, the stamps) -> signal; `columns` may be a profile's, and is not for bags. transport: the
     profile's. What was guessed is in the notes. Raises RecordingError, UsageError.
     """
-    form = recognised(path)
     robots = is_robot_log(path)
+    try:
+        form = recognised(path)
+    except RecordingError:
+        if not robots or not known_by_content(path):
+            raise
+        form = None  # of a kind that is read by plug-ins only, such as a database of CAN frames
     if signals and form is None and robots:
         raise UsageError(f"{path}: --state and --input are for files with named signals; this log is read by its profile (--profile P)")
     if robots and not signals:

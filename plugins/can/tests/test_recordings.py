@@ -22,6 +22,9 @@ from s2r_can.recordings import read
 from s2r_can.standin import DBC
 
 from s2r_runtime.errors import ConfigError, RecordingError
+from s2r_runtime.formats.routes import read_recording
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import load_profile
 
 ROOT = Path(__file__).parents[3]
@@ -72,7 +75,14 @@ def written(path: Path, messages: list[can.Message]) -> Path:
             lines.append(f" ({m.timestamp:.6f})  can0  {identifier:>8}   [{m.dlc}]  {m.data.hex(' ').upper()}\n")
         path.write_text("".join(lines))
         return path
-    writer = {".log": can.CanutilsLogWriter, ".asc": can.ASCWriter, ".blf": can.BLFWriter}[path.suffix]
+    writer = {
+        ".log": can.CanutilsLogWriter,
+        ".asc": can.ASCWriter,
+        ".blf": can.BLFWriter,
+        ".trc": can.TRCWriter,
+        ".csv": can.CSVWriter,
+        ".db": can.SqliteWriter,
+    }[path.suffix]
     with writer(path) as log:
         for message in messages:
             log.on_message_received(message)
@@ -95,12 +105,15 @@ def messages() -> list[can.Message]:
     return list(drive(20.0))
 
 
-@pytest.mark.parametrize("name", ["a.log", "a.txt.log", "a.asc", "a.blf", "a.log.gz", "a.blf.gz"])
+@pytest.mark.parametrize("name", ["a.log", "a.txt.log", "a.asc", "a.blf", "a.log.gz", "a.blf.gz", "a.trc", "a.csv", "a.csv.gz"])
 def test_every_format_says_the_same(tmp_path: Path, options: dict[str, Any], messages: list[can.Message], name: str) -> None:
     path = written(tmp_path / name.removesuffix(".gz"), messages)
     if name.endswith(".gz"):
         (tmp_path / name).write_bytes(gzip.compress(path.read_bytes()))
     (((t, x), (tu, u)),) = read(tmp_path / name, STATES, INPUTS, options).stretches
+    recorded = read_recording(tmp_path / name, compose(ModelSpec("differential_drive", 0.02)), transport={"name": "can", **options})
+    assert recorded is not None, "it is no table, whatever its name"
+    assert len(recorded.stretches[0].states.t) == 1000
     assert x.shape == (1000, 5)
     assert np.isfinite(x).all(), "what comes together makes one row"
     assert u.shape == (1000, 2)
@@ -113,6 +126,13 @@ def test_every_format_says_the_same(tmp_path: Path, options: dict[str, Any], mes
     np.testing.assert_allclose(x[:, 0], [v["X"] for v in at["p"]], atol=1e-12)
     np.testing.assert_allclose(np.degrees(x[:, 2]), [v["Angle"] for v in at["h"]], atol=1e-10)
     np.testing.assert_allclose(u[:, 0], [v["LeftTarget"] for v in at["c"]], atol=1e-12)
+
+
+def test_database_of_frames_is_read_although_other_databases_are_no_recordings(tmp_path: Path, options: dict[str, Any]) -> None:
+    path = written(tmp_path / "a.db", list(drive(1.9)))  # python-can's writer loses what is beyond 500 frames when it ends at once
+    recorded = read_recording(path, compose(ModelSpec("differential_drive", 0.02)), transport={"name": "can", **options})
+    assert recorded is not None
+    assert len(recorded.stretches[0].states.t) == 95
 
 
 def test_messages_that_do_not_come_together_make_rows_with_blanks(tmp_path: Path, options: dict[str, Any]) -> None:
