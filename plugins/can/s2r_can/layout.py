@@ -95,6 +95,8 @@ class Layout:
     trigger: Group
     stamp: tuple[Bits, float] | None
     reckoning: dict[str, int]
+    sources: dict[str, int] = field(default_factory=dict)
+    """J1939 messages whose source address counts otherwise than the DBC has it (`addresses`)."""
 
     @property
     def commands(self) -> dict[int, str]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from s2r_can.addresses import ANY, keyed
 from s2r_can.bits import NUMBER_MAX, Bits, Part, Scaled, bits_of, reader, selectors_of
 from s2r_can.database import Database, Named
 from s2r_can.layout import Group, Inbound, Layout, complete, scaled
 from s2r_can.options import Options, Source
-from s2r_can.records import FD_LENGTHS, key_of
+from s2r_can.records import FD_LENGTHS
 from s2r_can.sending import outbound, protect
 from s2r_can.units import factor_of
 from s2r_runtime.errors import ConfigError
@@ -29,7 +30,12 @@ def layout_of(options: Options, database: Database, states: tuple[str, ...], inp
     sent = outbound(options, database, inputs)
     layout = _Listening(options, database).layout(states)
     layout.outbound += sent
+    layout.sources = dict(options.source_addresses)
+    for name in options.source_addresses:
+        database.message(name, f"transport.source_addresses.{name}")
     for out in sent:
+        if layout.sources.get(out.name) == ANY:
+            raise ConfigError(f"transport.source_addresses.{out.name}: it is sent by the runtime, from one address")
         if out.key in layout.inbound:
             raise ConfigError(f"transport: message {out.name} is read and sent, but only the runtime may send what the robot obeys")
     protect(layout, options, database)
@@ -85,7 +91,7 @@ class _Listening:
         return group
 
     def _message(self, message: Message) -> Inbound:
-        key = key_of(message.frame_id, extended=message.is_extended_frame)
+        key = keyed(message, self._options)
         found = self._inbound.get(key)
         if found is None:
             padded = next((n for n in FD_LENGTHS if n >= message.length), message.length)

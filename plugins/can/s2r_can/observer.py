@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+from s2r_can.addresses import Addresses
 from s2r_can.hearing import Heard, Hearing, field
 from s2r_can.layout import Group, Inbound, Layout
 from s2r_can.odometry import Odometry
@@ -51,6 +52,8 @@ class Observer:
         self._up = False
         self._anew, self._clean = False, True
         self._commands = layout.commands
+        self._addresses = Addresses(layout.inbound, layout.sources, silence_ns)
+        self._addressed = self._addresses.used
         vital = {index for index in (*layout.states, *layout.reckoning.values()) if index is not None}
         self._vital = {group.index for group in layout.groups if vital & set(group.into)}
         self._reckoning = Reckoning(layout, odometry, self._values)
@@ -76,8 +79,10 @@ class Observer:
                 self._malformed(said, "a CAN frame came before the one before it")
                 continue
             self._now_ns = stamp_ns
-            message = inbound.get(key)
-            if message is not None:
+            message = inbound.get(self._addresses.message(key) if self._addressed else key)
+            if message is not None and self._addressed and (twin := self._addresses.twin(key, stamp_ns)):
+                self._malformed(said, twin)
+            elif message is not None:
                 self._heard(said, message, payload)
             else:
                 self._other(said, key)

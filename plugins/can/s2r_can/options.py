@@ -27,6 +27,7 @@ OPTIONS: dict[str, str] = {
     "observation_timeout": "s without an observation after which the link counts as lost (default 0.5)",
     "dead_reckoning": "pose from wheel speeds: { left, right, track, wheel_radius } or { speed, yaw_rate } or { speed, heading }; start",
     "command_cycle": "s between repetitions of a command while its time to live lasts (default 0: each is sent once)",
+    "source_addresses": "J1939 message -> source address whose frames count, whatever their priority, or any (default: as in the DBC)",
     "forward": "what of the robot's bus the controllers' side hears: all, named (what this profile reads), none (default all)",
     "queue": "frames kept for a runtime that is late; older ones are dropped and counted (default 1024)",
 }
@@ -42,6 +43,7 @@ TABLES = (
     "timeouts",
     "cycles",
     "dead_reckoning",
+    "source_addresses",
 )
 Kind = Literal["emergency_stop", "manual_override"]
 KINDS: tuple[Kind, ...] = ("emergency_stop", "manual_override")
@@ -96,6 +98,7 @@ class Options:
     command_cycle: float = 0.0
     forward: str = "all"
     queue: int = 1024
+    source_addresses: dict[str, int] = field(default_factory=dict)
 
 
 def checked(given: dict[str, Any]) -> Options:
@@ -130,6 +133,9 @@ def checked(given: dict[str, Any]) -> Options:
         observation_timeout=_seconds(given.get("observation_timeout", 0.5), "transport.observation_timeout"),
         command_cycle=_cycle(given.get("command_cycle", 0.0)),
         forward=_choice(given.get("forward", "all"), FORWARD, "transport.forward"),
+        source_addresses={
+            name: _address(value, f"transport.source_addresses.{name}") for name, value in given.get("source_addresses", {}).items()
+        },
         queue=_whole(given.get("queue", 1024), "transport.queue", 2),
     )
 
@@ -139,7 +145,7 @@ def named(options: Options) -> tuple[set[str], set[str]]:
     references = [source.signal for source in (*options.states.values(), *options.inputs.values())]
     references += [one.signal for one in options.dead_reckoning.values() if isinstance(one, Source)]
     references += [*options.constants, *options.overrides.values(), options.stamp]
-    messages = {*options.counters, *options.checksums, *options.timeouts, options.trigger.partition(".")[0]}
+    messages = {*options.counters, *options.checksums, *options.timeouts, *options.source_addresses, options.trigger.partition(".")[0]}
     messages |= {one.partition(".")[0] for one in references if isinstance(one, str) and "." in one}
     return messages - {""}, {one for one in references if isinstance(one, str) and "." not in one} - {""}
 
@@ -269,6 +275,14 @@ def _cycle(value: Any) -> float:
     if cycle != 0.0 and not 0.001 <= cycle <= 1.0:
         raise ConfigError(f"transport.command_cycle is {value}, must be 0 or in 0.001 to 1 s")
     return cycle
+
+
+def _address(value: Any, where: str) -> int:
+    if value == "any":
+        return -1
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 253:
+        raise ConfigError(f'{where} is {value!r}, must be a source address in 0 to 253, or "any"')
+    return value
 
 
 def _whole(value: Any, where: str, least: int) -> int:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_can.addresses import Addresses
 from s2r_can.database import Database
 from s2r_can.hearing import Heard, Hearing
 from s2r_can.layout import Group, Layout
@@ -59,6 +60,7 @@ def read(path: Path, states: tuple[str, ...], inputs: tuple[str, ...], options: 
         stretches += [stretch for stretch in rows.stretches() if len(stretch[0][0])]
         refused.update(rows.hearing.counts)
         refused["wrong command"] += rows.wrong_commands
+        refused["of a second source address"] += rows.twins
     counts = ", ".join(f"{name} {count}" for name, count in sorted(refused.items()) if count and name != "lost")
     frames = sum(map(len, drives))
     if not stretches:
@@ -74,7 +76,10 @@ def _chosen(path: Path, layout: Layout, robot: str, tally: Tally) -> list[list[L
     seen: Counter[str] = Counter()
     others = 0
     frames: list[LogFrame] = []
+    addresses = Addresses(layout.inbound, layout.sources)
     for frame in read_frames(path, tally):
+        if frame.key not in sent and addresses.message(frame.key) in listened:
+            listened.add(frame.key)  # whatever its source address
         if frame.key in listened or frame.key in sent:
             frames.append(frame)
             seen[frame.channel] += frame.key in listened
@@ -102,9 +107,9 @@ def _chosen(path: Path, layout: Layout, robot: str, tally: Tally) -> list[list[L
 
 def _window(drives: list[list[LogFrame]], layout: Layout) -> float:
     """s within which messages belong together."""
-    intervals = []
+    intervals, addresses = [], Addresses(layout.inbound, layout.sources)
     for key in layout.inbound:
-        apart = [np.diff([frame.t for frame in drive if frame.key == key]) for drive in drives]
+        apart = [np.diff([frame.t for frame in drive if addresses.message(frame.key) == key]) for drive in drives]
         if sum(map(len, apart)) > 1:
             intervals.append(float(np.median(np.concatenate(apart))))
     return MERGE * min(intervals, default=0.0)
@@ -122,7 +127,8 @@ class _Rows:
         self._columns = {index: column for column, index in enumerate(layout.states) if index is not None}
         self._commands = CommandReader(layout, inputs)
         self._origin: float | None = None
-        self.wrong_commands = 0
+        self.wrong_commands = self.twins = 0
+        self._addresses = Addresses(layout.inbound, layout.sources, silence_ns)
         self._parts: list[tuple[list[float], list[list[float]], list[float], list[list[float]]]] = [([], [], [], [])]
         self._row: list[float] = []
         self._row_t = 0.0
@@ -132,7 +138,10 @@ class _Rows:
         """The next frame, in time."""
         if self._origin is None:
             self._origin = frame.t
-        message = self._layout.inbound.get(frame.key)
+        if self._addresses.used and self._addresses.twin(frame.key, round((frame.t - self._origin) * 1e9)):
+            self.twins += 1
+            return
+        message = self._layout.inbound.get(self._addresses.message(frame.key))
         if message is None:
             self._command(frame)
             return

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from s2r_can.addresses import keyed
 from s2r_can.bits import Scaled, Selector, bits_of, selectors_of
 from s2r_can.checksums import guarded, scheme_of
 from s2r_can.database import Database, Named
 from s2r_can.layout import Counter, Inbound, Layout, Outbound, scaled
 from s2r_can.options import CounterOption, Options
-from s2r_can.records import key_of
 from s2r_runtime.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def outbound(options: Options, database: Database, inputs: tuple[str, ...]) -> l
         named = database.signal(options.inputs[name].signal, where)
         signal = scaled(named, options.inputs[name], where)
         _stops(signal, where)
-        key = key_of(named.message.frame_id, extended=named.message.is_extended_frame)
+        key = keyed(named.message, options)
         messages[key] = named.message
         frames.setdefault((key, selectors_of(named.message, named.signal, where)), []).append((index, named, signal))
     constants = _constants(options, database, {message.name for message in messages.values()})
@@ -117,7 +117,7 @@ def protect(layout: Layout, options: Options, database: Database) -> None:
         for name, option in entries.items():
             where = f"transport.{table}.{name}"
             message = database.message(name, where)
-            key = key_of(message.frame_id, extended=message.is_extended_frame)
+            key = keyed(message, options)
             users: list[Inbound | Outbound] = [out for out in layout.outbound if out.key == key]
             users += [layout.inbound[key]] if key in layout.inbound else []
             signal = database.signal_in(message, str(option.signal).removeprefix(f"{name}."), where).signal

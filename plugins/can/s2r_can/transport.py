@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterable
 from typing import Any, ClassVar
 
+from s2r_can.addresses import Addresses
 from s2r_can.commander import Commander
 from s2r_can.database import Database
 from s2r_can.inbox import Bell, Inbox, Metronome
@@ -47,6 +48,7 @@ class CanTransport:
         self._inbox = Inbox(self._bell, self._options.queue)
         self._others = Inbox(self._bell, PROPOSALS_PER_SECOND)
         self._commands = self._layout.commands
+        self._addresses = Addresses(self._layout.inbound, self._layout.sources)
         self._ring = self._keys()
         self._robot: Port | None = None
         self._controllers: Port | None = None
@@ -105,7 +107,7 @@ class CanTransport:
 
     def _from_robot(self, record: Record) -> None:
         """On the port's thread: keeps what this profile reads, and passes on what the other side may hear."""
-        ring = self._ring.get(record.key)
+        ring = self._ring.get(self._addresses.message(record.key))
         if ring is not None:  # of a stranger's commands some will do
             self._inbox.put(record, ring=ring, per_second=STRANGERS_PER_SECOND if record.key in self._commands else 0)
         elif record.key & ERROR:
@@ -130,7 +132,7 @@ class CanTransport:
         batch: list[Record] = []
         for record in self._inbox.take():
             batch.append(record)
-            if self._ring.get(record.key, True):
+            if self._ring.get(self._addresses.message(record.key), True):
                 frames.append(_frame("robot", batch))
                 batch = []
         if batch:
