@@ -145,7 +145,14 @@ def named(options: Options) -> tuple[set[str], set[str]]:
     references = [source.signal for source in (*options.states.values(), *options.inputs.values())]
     references += [one.signal for one in options.dead_reckoning.values() if isinstance(one, Source)]
     references += [*options.constants, *options.overrides.values(), options.stamp]
-    messages = {*options.counters, *options.checksums, *options.timeouts, *options.source_addresses, options.trigger.partition(".")[0]}
+    messages = {
+        *options.counters,
+        *options.checksums,
+        *options.timeouts,
+        *options.cycles,
+        *options.source_addresses,
+        options.trigger.partition(".")[0],
+    }
     messages |= {one.partition(".")[0] for one in references if isinstance(one, str) and "." in one}
     return messages - {""}, {one for one in references if isinstance(one, str) and "." not in one} - {""}
 

@@ -21,7 +21,7 @@ from typing import Any
 from s2r_can.kinds import ASC, CSV, TRC
 from s2r_can.records import LogFrame, frame_of
 from s2r_can.tally import Tally
-from s2r_runtime.errors import RecordingError
+from s2r_runtime.errors import RecordingError, one_line
 
 TRC_VERSIONS = ("1.1", "1.3", "2.0", "2.1")
 _ASC_STAMP = re.compile(r"\s*(-?)(\d{1,12}(?:\.\d{0,12})?)(?=\s)")
@@ -83,8 +83,11 @@ def frames(path: Path, kind: str, lines: Iterator[Numbered], tally: Tally) -> It
                     continue
                 tally.frames += 1
                 yield frame
-        except Exception:  # noqa: BLE001 - python-can's readers raise what they like at a line that is none of theirs
-            tally.unreadable(*(given.waiting or (form.number, "")))
+        except Exception as error:  # noqa: BLE001 - python-can's readers raise what they like at a line that is none of theirs
+            if given.waiting is None:  # it failed at the header, and so will the next one
+                said = one_line(str(error), 120) or type(error).__name__
+                raise RecordingError(f"{path}: cannot be read as {kind}: its header is wrong: {said}") from None
+            tally.unreadable(*given.waiting)
             given.waiting = None
             if not given.ended:
                 continue

@@ -281,3 +281,13 @@ def test_bomb_an_endless_object_and_an_endless_view_are_refused(tmp_path: Path) 
         )
     with pytest.raises(RecordingError, match="has no table `messages`"):
         list(read_frames(database))
+
+
+@pytest.mark.parametrize("line", [";$STARTTIME=soon", ";$FILEVERSION=2.1\n;$STARTTIME=1e99", ";$COLUMNS="])
+def test_header_at_which_python_can_fails_ends_the_reading(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "a.trc"
+    FORMS["trc 2.1"][1](path, frames(1))
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([line, *(one for one in lines if not one.startswith(line.partition("=")[0]))]) + "\n")
+    with pytest.raises(RecordingError, match=r"its header is wrong|are no TRC lines|is no TRC log"):
+        list(read_frames(path))
