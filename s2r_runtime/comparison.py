@@ -6,12 +6,19 @@ One sample, from observations x and inputs u, one each period of dt:
            still under it (stiction; a walker that takes small commands for none) is asked for more of the same, within its bounds
     stop   zero input for `stop_periods` periods and 0 to 3 more (drawn: a robot or camera with a rhythm of its own is not
            met at one phase of it again and again)
-    hold   x0 = x now, u ~ uniform(input bounds) held for `hold_periods`; x1 = x one period later; held = x at the hold's end
+    hold   u ~ uniform(input bounds) held for `hold_periods` from the state that the stop left; held = x at the hold's end.
+           (x0, x1) = x at the beginning and at the end of one period of it: drawn uniformly (`sampling.period = "random"`), or the first
 
-The law pi of (x0, u): x0 as the stop leaves it inside the region; u uniform over those inputs whose hold cannot leave the
-geofence from x0 (a disc of 1.1 times the commanded way; where the geofence is wider than the region by that much: all of them).
-x0's heading, and on which side of its waypoint it lies, still depend on where the robot came from; the long hold before is what
-makes that nearly as random as a fresh start, as in the paper.
+The law pi of (x0, u): the hold begins where the stop leaves the robot inside the region; u uniform over those inputs whose hold cannot
+leave the geofence from there (a disc of 1.1 times the commanded way; where the geofence is wider than the region by that much: all of
+them). With a random period x0 is a state of the moving robot, as a controller meets it; the first period begins at rest and is
+blind to whatever acts late. The heading at the hold's start, and on which side of its waypoint it lies, still depend on where the robot
+came from; the long hold before is what makes that nearly as random as a fresh start, as in the paper.
+
+Stamps (guarantee G7): a period counts if x1 was observed EARLY before one step after x0 or later, and no later than LATE after
+it; with a model that does not step exactly at any length, within EARLY either way. It is compared with a step of its own length. Where
+the period that was drawn is off, the next one of a random order counts: stamps decide, states do not. A hold ends by the same rule.
+The commands before x0 are recorded, so that effects with memory begin with what the robot was commanded.
 
 Whether a sample counts is settled by x0, u, stamps and the gate, never by a prediction: nothing here knows the model's, so no
 rejection can depend on the discrepancy. The robot's own motion can cost a sample in one way only, by crossing the geofence, which
@@ -25,6 +32,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -33,13 +41,19 @@ import msgspec
 from s2r_runtime import goto
 from s2r_runtime.canonical import digest_of
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.messages import Observation, SampleTaken, Settings
-from s2r_runtime.profile import Sampling
+from s2r_runtime.messages import GRID, RULES, Observation, SampleTaken, Settings
+from s2r_runtime.profile import Sampling, plain_table
 
 Bounds = tuple[tuple[float, float], ...]
 
-STAMP_TOLERANCE = 0.2
-"""Of dt: x1 and the hold's end must be within this of the stamp at which they are due. A period lost is 1.0 off."""
+EARLY, LATE = 0.01, 0.2
+"""Of dt: how much earlier and later than due x1 and the hold's end may be observed. A shorter transition would show less than a step's
+discrepancy; a longer one shows no less, and is compared with a step of its own length. A period lost is 1.0 off.
+"""
+EARLY_BEFORE = 0.2
+"""`EARLY` under rules before `GRID`: such a sample may be a fifth shorter than a step, and its gap too small."""
+PAST_ROWS = 20
+"""Commands before a hold that are recorded, at most: the stop is one, the approach has one a period."""
 JITTER_PERIODS = 4
 DRAWS = 1000
 """Inputs tried at one x0 until one's hold stays inside; the rarest admissible share met in practice is some percent."""
@@ -110,7 +124,13 @@ class Campaign:
         epoch: int,
         seed: int,
         gains: goto.Gains | None = None,
+        rules: int = RULES,
+        any_step: bool = False,
     ) -> None:
+        self._on_grid = rules >= GRID
+        self._early, self._late = (EARLY, LATE if any_step else EARLY) if rules >= GRID else (EARLY_BEFORE, EARLY_BEFORE)
+        self._off = "off_step" if rules >= GRID else "lost_observation"
+        self._random = rules >= GRID and settings.period == "random"
         self._model = model_name
         self._gains = gains or goto.Gains(settings.position_gain, settings.heading_gain)
         goto.distance(model_name, (0.0,) * len(states), (0.0, 0.0))  # the law must exist
@@ -123,7 +143,8 @@ class Campaign:
         self._box = _waypoint_box(states, region, geofence, settings.waypoint_margin)
         self._guard = min(0.05, 0.5 * settings.waypoint_margin)
         self._zero = (0.0,) * len(input_bounds)
-        self.digest = digest_of([model_name, states, region, geofence, input_bounds, dt, settings, n, epoch, seed, self._gains])
+        law = [model_name, states, region, geofence, input_bounds, dt, plain_table("sampling", settings), n, epoch, seed, self._gains]
+        self.digest = digest_of([*law, rules, any_step] if rules >= GRID else law)
         self._index = self._run = self._try = 0
         self._rejected: dict[str, int] = {}
         self._elapsed_ns, self._last_ns = 0, -1
@@ -131,8 +152,9 @@ class Campaign:
         self._refused, self._refusals, self._motionless = False, 0, 0
         self._held_u = self._zero
         self._mark: tuple[int, tuple[float, ...]] | None = None
-        self._x0: Observation | None = None
-        self._x1: Observation | None = None
+        self._instants: list[Observation] = []
+        self._apart_ns: list[int] = []
+        self._commands: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=PAST_ROWS)
         self._phases: dict[str, Callable[[Observation], CampaignStep]] = {"goto": self._goto, "stop": self._stop, "hold": self._hold}
         self._begin_try()
 
@@ -151,6 +173,8 @@ class Campaign:
             n=n,
             epoch=epoch,
             seed=seed,
+            rules=settings.rules,
+            any_step=settings.any_step,
         )
 
     # ------------------------------------------------------------------ interruption
@@ -191,15 +215,22 @@ class Campaign:
             if self._phase == "hold":
                 self._reject("interrupted")
             self._began_ns, self._mark = now, None
+            self._commands.clear()
         else:
             self._elapsed_ns += now - self._last_ns
         self._last_ns = now
         if self._failed:
             return self._over()
         if observation.fault or len(observation.x) != len(self._region):
-            return self._answer(self._held_u if self._phase == "hold" else self._zero)
-        step = self._phases[self._phase](observation)
+            return self._commanded(now, self._answer(self._held_u if self._phase == "hold" else self._zero))
+        step = self._commanded(now, self._phases[self._phase](observation))
         self._refused = False
+        return step
+
+    def _commanded(self, now_ns: int, step: CampaignStep) -> CampaignStep:
+        """Notes what acts from now on."""
+        if not self._commands or self._commands[-1][1] != step.u:
+            self._commands.append((now_ns, step.u))
         return step
 
     def refused(self, obs_seq: int, reason: str) -> None:
@@ -213,6 +244,7 @@ class Campaign:
         self._refused = True
         self._refusals += 1
         self._mark = None
+        self._commands.clear()  # the recovery command acted, and the hold that follows begins after a new stop
         if self._phase == "hold":
             self._reject(reason)
         if self._refusals * self._dt >= self._settings.stuck_after and not self._failed:
@@ -228,7 +260,7 @@ class Campaign:
         self._stop_periods = self._settings.stop_periods + self._rng.randrange(JITTER_PERIODS)
         self._phase = "goto"
         self._began_ns = self._last_ns
-        self._held_u, self._mark, self._x0, self._x1 = self._zero, None, None, None
+        self._held_u, self._mark, self._instants = self._zero, None, []
         self._standing: Observation | None = None
         self._before: tuple[float, ...] = ()
         self._way = math.inf
@@ -285,42 +317,67 @@ class Campaign:
         u = self._draw_input(observation.x)
         if u is None:
             return self._again("outside_geofence", observation)
-        self._phase, self._began_ns, self._held_u, self._x0 = "hold", observation.stamp_ns, u, observation
-        if before is not None and abs(observation.stamp_ns - before.stamp_ns - self._dt_ns) <= STAMP_TOLERANCE * self._dt_ns:
+        self._phase, self._began_ns, self._held_u, self._instants = "hold", observation.stamp_ns, u, [observation]
+        if before is not None and abs(observation.stamp_ns - before.stamp_ns - self._dt_ns) <= EARLY_BEFORE * self._dt_ns:
             self._before = before.x
+        self._order = self._rng.sample(range(periods := self._settings.hold_periods), periods) if self._random else [0]
         return self._answer(u)
 
     def _hold(self, observation: Observation) -> CampaignStep:
         since, dt, periods = observation.stamp_ns - self._began_ns, self._dt_ns, self._settings.hold_periods
-        slack = STAMP_TOLERANCE * dt
-        if self._x1 is None and since >= dt - slack:
-            if since > dt + slack:
-                return self._again("lost_observation", observation)
-            self._x1 = observation
-        if since < periods * dt - slack:
+        first = len(self._instants) == 1
+        if self._random or (first and since >= dt - self._early * dt):
+            self._instants.append(observation)
+        if first:
+            self._apart_ns = [*self._apart_ns[-9:], since]
+        if first and not self._random and since > dt + self._late * dt:
+            return self._again(self._off, observation)
+        if since < periods * dt - self._early * dt:
             return self._answer(self._held_u)
-        if since > periods * dt + slack or self._x1 is None:
-            return self._again("lost_observation", observation)
-        return self._take(observation)
+        most = periods + self._late + (1.0 if self._late > self._early else 0.0)  # the last instant may come too early for an end
+        chosen = next((j for j in self._order if self._is_step(j)), None)
+        if since > most * dt or chosen is None:
+            return self._again(self._off, observation)
+        return self._take(observation, chosen)
 
-    def _take(self, observation: Observation) -> CampaignStep:
+    def _is_step(self, j: int) -> bool:
+        """Whether instants j and j + 1 of the hold are one step apart, by their stamps."""
+        if j + 1 >= len(self._instants):
+            return False
+        lasts = self._instants[j + 1].stamp_ns - self._instants[j].stamp_ns
+        return -self._early * self._dt_ns <= lasts - self._dt_ns <= self._late * self._dt_ns
+
+    def _take(self, observation: Observation, chosen: int) -> CampaignStep:
         """The hold is over: one sample more. The same observation begins the way to the next waypoint."""
-        assert self._x0 is not None  # noqa: S101 - set on entering the hold
-        assert self._x1 is not None  # noqa: S101 - checked by the caller
+        start, x0, x1 = self._instants[0], self._instants[chosen], self._instants[chosen + 1]
         periods = self._settings.hold_periods
         sample = SampleTaken(
             t_ns=observation.stamp_ns,
             epoch=self._epoch,
             index=self._index,
-            obs_seq0=self._x0.seq,
-            t0_ns=self._x0.stamp_ns,
+            obs_seq0=x0.seq,
+            t0_ns=x0.stamp_ns,
             u=self._held_u,
-            x0=self._x0.x,
-            x1=self._x1.x,
+            x0=x0.x,
+            x1=x1.x,
             held=observation.x if periods > 1 else (),
             periods=periods,
             before=self._before,
         )
+        if self._on_grid:
+            past = [(begin, u) for begin, u in self._commands if begin < start.stamp_ns]
+            ends = [*(begin for begin, _ in past[1:]), start.stamp_ns][: len(past)]
+            sample = msgspec.structs.replace(
+                sample,
+                lasts_ns=x1.stamp_ns - x0.stamp_ns,
+                period=chosen,
+                start=start.x,
+                start_seq=start.seq,
+                start_ns=start.stamp_ns,
+                hold_ns=observation.stamp_ns - start.stamp_ns if periods > 1 else 0,
+                past_u=tuple(u for _, u in past),
+                past_ns=tuple(end - begin for (begin, _), end in zip(past, ends, strict=True)),
+            )
         self._index, self._try, self._refusals = self._index + 1, 0, 0
         self._begin_try()
         following = self._over() if self._index >= self._n else self._goto(observation)
@@ -343,6 +400,13 @@ class Campaign:
         if total > most:
             counts = ", ".join(f"{name} {count}" for name, count in sorted(self._rejected.items()))
             self._failed = f"more than {most} samples were rejected after {self._index} of {self._n}: {counts}"
+            if 2 * self._rejected.get("off_step", 0) > total and self._apart_ns:
+                apart = sorted(self._apart_ns)[len(self._apart_ns) // 2] * 1e-9
+                early, late = 100.0 * self._early, 100.0 * self._late
+                self._failed += (
+                    f"; off_step: observations that should end a step come {apart:.6g} s after its beginning, the model's step is "
+                    f"{self._dt:g} s (-{early:g} %, +{late:g} %): let the robot report a whole number of times a step"
+                )
         self._begin_try()
 
     def _again(self, reason: str, observation: Observation) -> CampaignStep:

@@ -18,15 +18,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.bounds import check_probability, sample_size, scenario_confidence, split
-from s2r_runtime.errors import ConfigError, NotEnoughEvidence, UsageError
+from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.messages import SERIAL, Gap
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.prediction import Holds, acting_over, hold_residuals, residuals
 from s2r_runtime.profile_checks import HEAVIEST, LIGHTEST
 from s2r_runtime.table_rows import Subset
 from s2r_runtime.whiteness import DEPENDENT, SERIAL_ALPHA, Whiteness, body_axes, serial_p, whiteness
 
 Array = NDArray[np.float64]
 Kind = Literal["ball", "box"]
+
+__all__ = [
+    "Drive", "Kind", "Transitions", "blocked", "discrepancy", "doubted", "estimate_gap", "gap_json", "hold_residuals", "noise_share",
+    "radius_of_noise", "refuse_fitted", "residuals", "statement",
+]  # fmt: skip
 
 NOISE_DRAWS = 200_000
 """Simulated transitions behind `radius_noise`: its own error is then a few per cent of it."""
@@ -50,7 +56,7 @@ class Transitions:
     vouched for instead. `digest`: of the recording's bytes; `samples_digest`: of a campaign's samples, alike in every log that holds
     them; `content_digest`: of a table's numbers, however they are written; for driving in a daemon's log, of which run it is.
     `noise`: (nx,) standard deviation of the measurements, None if the recording doesn't show it. `subset`: which rows of a long recording
-    are used (None: all).
+    are used (None: all). `holds`: of a campaign's samples, how long each lasted and what was commanded before; None: one step, from rest.
     """
 
     x0: Array
@@ -71,29 +77,10 @@ class Transitions:
     """Digests of each recording, of its bytes and of its numbers, where there are several."""
     noise: Array | None = None
     drive: Drive | None = field(default=None, repr=False)
+    holds: Holds | None = field(default=None, repr=False)
     subset: Subset | None = None
     notes: tuple[str, ...] = ()
     """What a person should know of how the recording was read, one line each."""
-
-
-def residuals(model: ComposedModel, transitions: Transitions) -> Array:
-    """(n, nx) e = x1 (-) f(x0, u). Samples of a campaign begin at rest; in a drive, memory is carried from its beginning.
-
-    Raises ConfigError if the model's step gives something that isn't finite.
-    """
-    if transitions.drive is None:
-        predicted, _ = model.step(transitions.x0, transitions.u, model.at_rest(len(transitions.u)))
-    else:
-        predicted = _driven(model, transitions, transitions.drive)
-    return _finite(model, model.difference(transitions.x1, predicted))
-
-
-def hold_residuals(model: ComposedModel, transitions: Transitions) -> Array | None:
-    """(n, nx) of the state after the hold; None if the transitions do not have it."""
-    if transitions.held is None or transitions.hold_periods <= 1:
-        return None
-    predicted = model.hold(transitions.x0, transitions.u, transitions.hold_periods)
-    return _finite(model, model.difference(transitions.held, predicted))
 
 
 def discrepancy(e: Array, weights: Array, kind: Kind) -> Array:
@@ -193,14 +180,15 @@ def radius_of_noise(model: ComposedModel, tr: Transitions, weights: Array, kind:
     rng = np.random.default_rng(0)
     n = len(tr.x0)
     largest = []
-    exact, _ = model.step(tr.x0, tr.u, model.at_rest(n))
+    mean, end, lasts = acting_over(model, replace(tr, drive=None))  # in a drive, what a moment of noise does does not hang on its past
+    exact = model.advance(tr.x0, mean, end, lasts)
     for _ in range(min(101, max(9, NOISE_DRAWS // n))):
         d = np.empty(n)
         for a in range(0, n, NOISE_DRAWS):
             rows = slice(a, a + NOISE_DRAWS)
             before, after = rng.normal(size=(2, *tr.x0[rows].shape)) * tr.noise
-            predicted, _ = model.step(tr.x0[rows] + before, tr.u[rows], model.at_rest(len(before)))
-            d[rows] = discrepancy(model.difference(exact[rows] + after, predicted), weights, kind)
+            moved = model.advance(tr.x0[rows] + before, mean[rows], end[rows], None if lasts is None else lasts[rows])
+            d[rows] = discrepancy(model.difference(exact[rows] + after, moved), weights, kind)
         largest.append(_largest(d, discard))
     return float(np.median(largest))
 
@@ -316,29 +304,9 @@ def gap_json(gap: Gap, tr: Transitions, states: tuple[str, ...]) -> dict[str, An
     }
 
 
-def _driven(model: ComposedModel, tr: Transitions, drive: Drive) -> Array:
-    """(n, nx) predictions with the effects' memory carried along the drive."""
-    mean = np.concatenate(drive.inputs)
-    end = mean.copy()
-    row = 0
-    for stretch in drive.inputs if any(a.effect.stage == "input" for a in model.effects) else ():
-        hidden = model.at_rest(1)
-        for u in stretch:
-            mean[row : row + 1], end[row : row + 1], hidden = model.act(u[None, :], hidden)
-            row += 1
-    return model.advance(tr.x0, mean[drive.step], end[drive.step])
-
-
 def _largest(d: Array, k: int) -> float:
     """The (k+1)-th largest of d (n,)."""
     return float(np.partition(d, len(d) - 1 - k)[len(d) - 1 - k])
-
-
-def _finite(model: ComposedModel, e: Array) -> Array:
-    if not np.all(np.isfinite(e)):
-        row, column = (int(i) for i in np.argwhere(~np.isfinite(e))[0])
-        raise ConfigError(f"model {model.spec.name!r}: its step gives a {model.states[column]} that isn't finite, at transition {row}")
-    return e
 
 
 def _checked_weights(model: ComposedModel, weights: tuple[float, ...] | Array, kind: str) -> Array:

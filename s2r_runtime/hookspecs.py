@@ -225,8 +225,8 @@ class Effect(Protocol):
       (`models.forces`). A model solves for all its forces together, and does not call `after_step`;
     - `side_by_side` = True: `input_sequence` also takes u (T, runs, nu), many short runs at once;
     - `uneven` = True: `input_sequence` also takes dt as (T,), how long each row lasts (and `start` as (T,), when each begins, where it is
-      `timed`), with which runs come one after the other, a row of zeros and REST_S seconds (`trace.chains`) between two; `after_step` also
-      takes dt as (n,). Without it, rows that do not last alike are taken to;
+      `timed`), with which runs come one after the other, a row of zeros and REST_S seconds (`models.input_chains`) between two;
+      `after_step` also takes dt as (n,). Without it, rows that do not last alike are taken to;
     - `takes_mixed` = True: `input_sequence(..., mixed=True)` is asked where rows are parts of a step: a row within which the input
       changed has the mean of before and after, and is no command of its own;
     - `within_step(dt, p) -> bool`: whether what acts changes within a step although the input is held over it;

@@ -9,7 +9,7 @@ import contextlib
 import difflib
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -52,7 +52,11 @@ class Sampling(_Table, frozen=True):
     n: int = 0
     """Samples, fixed beforehand; 0: as many as the epoch's share of beta asks for."""
     hold_periods: int = 50
-    """For how many periods each input is held. The first gives the sample, the last the hold gap."""
+    """For how many periods each input is held. One of them gives the sample, the end of the last one the hold gap."""
+    period: Literal["random", "first"] = "random"
+    """Which period of each hold gives the sample. `random`: drawn uniformly, so that the robot is moving as it does when it is driven.
+    `first`: from a full stop, as in the paper; blind to whatever acts late.
+    """
     stop_periods: int = 4
     """Periods of zero input before a sample begins, at least the robot's delay + 1."""
     waypoint_radius: float = 0.1
@@ -247,7 +251,7 @@ class Repair(_Table, frozen=True):
     """`ask`: a person adopts it (`s2r adopt`); `always`: it is in force as soon as nothing drives."""
 
 
-AS_BEFORE: dict[str, dict[str, Any]] = {"gate": {"fault_share": 0.0, "fault_burst": 0}}
+AS_BEFORE: dict[str, dict[str, Any]] = {"gate": {"fault_share": 0.0, "fault_burst": 0}, "sampling": {"period": "first"}}
 """Settings that were added later: table -> setting -> the value by which everything was done before it was there. A log is audited, and a
 digest computed, as if a profile with that value did not have the setting.
 """
@@ -342,17 +346,17 @@ def load_profile(path: Path) -> Profile:
     return parse_profile(text, str(path), path.parent)
 
 
-def parse_profile(text: str, where: str, base: Path, files: Mapping[str, str] | None = None, *, as_before: bool = False) -> Profile:
+def parse_profile(text: str, where: str, base: Path, files: Mapping[str, str] | None = None, *, as_before: Iterable[str] = ()) -> Profile:
     """As `load_profile`, from text; relative files are looked up from `base`. files: the transport's, by name, instead of the disk's.
-    as_before: what the text lacks is as it was before the setting was there (`AS_BEFORE`), not today's default.
+    as_before: tables in which what the text lacks is as it was before the setting was there (`AS_BEFORE`), not today's default.
     """
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{where}: not TOML: {error}") from None
-    for name, settings in AS_BEFORE.items() if as_before else ():
+    for name in as_before:
         if isinstance(given := table.get(name, {}), dict):
-            table[name] = {**settings, **given}
+            table[name] = {**AS_BEFORE[name], **given}
     try:
         profile = msgspec.convert(table, Profile)
     except msgspec.ValidationError as error:

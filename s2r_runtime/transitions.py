@@ -34,6 +34,7 @@ from s2r_runtime.gap import Transitions
 from s2r_runtime.messages import CampaignFinished, Observed, SampleTaken, Send, Started
 from s2r_runtime.models.bound import wrap
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.prediction import Holds
 from s2r_runtime.recording.origin import other_writer
 from s2r_runtime.robot_logs import content_digest, is_mcap, is_robot_log, merged_rows
 from s2r_runtime.sensor_noise import FEWEST, NORMAL_MAD
@@ -328,7 +329,7 @@ def from_samples(samples: Sequence[SampleTaken], *, rejected: Mapping[str, int] 
     kinds = {(len(s.held), s.periods) for s in samples}
     (width, periods), same_hold = next(iter(kinds)), len(kinds) == 1
     held = np.array([s.held for s in samples]) if same_hold and width == len(samples[0].x0) and periods > 1 else None
-    data = digest_of([[s.u, s.x0, s.x1, s.held, s.periods] for s in samples])
+    data = digest_of([_recorded(s) for s in samples])
     return Transitions(
         np.array([s.x0 for s in samples], dtype=np.float64),
         np.array([s.u for s in samples], dtype=np.float64),
@@ -342,14 +343,30 @@ def from_samples(samples: Sequence[SampleTaken], *, rejected: Mapping[str, int] 
         source=source,
         samples_digest=data,
         noise=_standing_noise(samples),
+        holds=_holds(samples) if all(s.lasts_ns for s in samples) else None,
     )
+
+
+def _recorded(s: SampleTaken) -> list[Any]:
+    """What a sample's digest covers."""
+    found = [s.u, s.x0, s.x1, s.held, s.periods]
+    return [*found, s.lasts_ns, s.period, s.start, s.start_ns, s.hold_ns, s.past_u, s.past_ns] if s.lasts_ns else found
+
+
+def _holds(samples: Sequence[SampleTaken]) -> Holds:
+    """The holds that samples were taken from. Under which law: a hold's first period in all of them, or any."""
+    nu = len(samples[0].u)
+    seconds = np.array([(s.lasts_ns, s.t0_ns - s.start_ns, s.hold_ns) for s in samples], dtype=np.float64) * 1e-9
+    past = tuple((np.array(s.past_ns, dtype=np.float64) * 1e-9, np.array(s.past_u, dtype=np.float64).reshape(-1, nu)) for s in samples)
+    start = np.array([s.start for s in samples], dtype=np.float64)
+    return Holds(seconds[:, 0], seconds[:, 1], start, seconds[:, 2], past, "random" if any(s.period for s in samples) else "first")
 
 
 def _standing_noise(samples: Sequence[SampleTaken]) -> Array | None:
     """(nx,) from two observations of the robot at rest before each sample; the median doesn't mind angles that jump at the cut."""
     if len(samples) < FEWEST or not all(len(s.before) == len(s.x0) for s in samples):
         return None
-    spread = np.median(np.abs(np.array([s.x0 for s in samples]) - np.array([s.before for s in samples])), axis=0)
+    spread = np.median(np.abs(np.array([s.start or s.x0 for s in samples]) - np.array([s.before for s in samples])), axis=0)
     return np.asarray(spread / (NORMAL_MAD * np.sqrt(2.0))) if np.all(spread > 0.0) else None
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from fractions import Fraction
 
 import msgspec
 from core_rig import SETTINGS, S, of
@@ -71,6 +72,9 @@ class Law:
     gate: bool = False
     instant: int | None = None
     instant_stamp: int | None = None
+    origin: int = 0
+    index: int = 0
+    report: int = 0
     answered: bool = True
     last: m.Send | None = None
     refused: bool = False
@@ -182,7 +186,7 @@ class Law:
 
     def _forget(self) -> None:
         """The robot's sequence begins anew."""
-        self.usable, self.latest, self.good, self.odd, self.instant_stamp = False, None, None, None, None
+        self.usable, self.latest, self.good, self.odd, self.instant_stamp, self.report = False, None, None, None, None, 0
 
     def _up(self, what: str, up: bool) -> None:
         self.up = self.up | {what} if up else self.up - {what}
@@ -214,6 +218,9 @@ class Law:
         ordered = self.good is None or (seen.seq > self.good.seq and seen.stamp_ns > self.good.stamp_ns)
         again = seen.seq == self.odd if lockstep else self.now - self.good_ns > self.settings.observation_timeout_ns
         self.usable = valid and (ordered or again)
+        if self.usable and not ordered:  # the robot started anew, and the grid with it
+            self.instant_stamp, self.report = None, 0
+            self._on_grid(seen.stamp_ns)
         if valid:
             self.odd = None if self.usable else seen.seq
         if self.usable or not valid:
@@ -298,28 +305,48 @@ class Law:
     # ------------------------------------------------------------------ what was sent
 
     def _instant(self, event: m.Event) -> bool:
-        """Whether this event begins a control instant: an observation in order, at least 0.9 dt after that of the last one. An
-        unusable one can be an instant too, but what stamp it has is believed for one period only.
+        """Whether this event begins a control instant: an observation in order that no later one can be nearer to a point of the grid
+        than, where the last interval between observations goes on. In lockstep, where one comes a step: at least 0.9 dt after the last
+        instant. An unusable one can be an instant too, but what stamp it has is believed for one period only.
         """
-        if not isinstance(event, m.Observed) or (self.asked is not None and not self.anew and not self.paused):
+        if not isinstance(event, m.Observed):
             return False
-        seen, last = event.observation, self.instant_stamp
+        seen, last, dt = event.observation, self.instant_stamp, self.settings.dt_ns
         if seen == self.good or (self.latest is not None and seen.seq == self.latest.seq):
             return False
-        dt = self.settings.dt_ns
-        due = last is None or 10 * (seen.stamp_ns - last) >= 9 * dt
-        if seen.fault or len(seen.x) != 3 or not all(map(math.isfinite, seen.x)):
+        usable = not seen.fault and len(seen.x) == 3 and all(map(math.isfinite, seen.x))
+        ordered = self.good is not None and seen.seq > self.good.seq and seen.stamp_ns > self.good.stamp_ns
+        if self.good is not None and ordered and usable:
+            self.report = min(seen.stamp_ns - self.good.stamp_ns, dt)
+        before = self.report
+        if self.asked is not None and not self.anew and not self.paused:
+            return False
+        wanted = self.origin + (self.index + 1) * dt
+        due = last is None or Fraction(before, 2) >= wanted - seen.stamp_ns
+        if last is not None and self.settings.lockstep and before > Fraction(dt, 2):
+            due = seen.stamp_ns - last >= Fraction(9 * dt, 10)
+        if not usable:
             if due:
-                self.instant_stamp = seen.stamp_ns if last is None else min(seen.stamp_ns, last + dt)
+                self._on_grid(seen.stamp_ns if last is None else min(seen.stamp_ns, last + dt))
             return False
         fresh = self.good is None or (seen.seq > self.good.seq and seen.stamp_ns > self.good.stamp_ns)
         return fresh and (due or (last is not None and seen.stamp_ns < last))
+
+    def _on_grid(self, stamp: int) -> None:
+        """An instant: it takes the nearest grid point, one that no instant had."""
+        if self.instant_stamp is None or stamp < self.instant_stamp:
+            self.origin, self.index = stamp, 0
+        else:
+            nearest = math.floor(Fraction(stamp - self.origin, self.settings.dt_ns) + Fraction(1, 2))
+            self.index = max(self.index + 1, nearest)
+        self.instant_stamp = stamp
 
     def _sends(self, event: m.Event, outputs: tuple[m.Output, ...], instant: bool) -> None:
         lockstep, sends = self.settings.lockstep, of(list(outputs), m.Send)
         if instant and isinstance(event, m.Observed):
             assert self.answered or lockstep or self.anew or self.paused, "an instant before this one got no command"
-            self.instant, self.instant_stamp, self.answered = event.observation.seq, event.observation.stamp_ns, False
+            self.instant, self.answered = event.observation.seq, False
+            self._on_grid(event.observation.stamp_ns)
             self.last = None  # whatever number it has, nothing was sent for it yet
         for output in outputs:
             if isinstance(output, m.GateChanged):

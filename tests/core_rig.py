@@ -13,6 +13,7 @@ from s2r_runtime.core.state import State
 from s2r_runtime.headroom import grid
 from s2r_runtime.messages import (
     MEMORY_SCHEMA,
+    RULES,
     Answer,
     CampaignFinished,
     CertificateFacts,
@@ -79,6 +80,7 @@ SETTINGS = Settings(
     campaign_digest="campaign",
     norm_set="ball",
     norm_weights=(1.0, 1.0, 0.05),
+    rules=RULES,
 )
 GAP = Gap(0.01, 0.1, 0.1, 50, "ball", (1.0, 1.0, 0.05), 160, 0, 0.03, 0.0152, 1, "model", "transitions")
 

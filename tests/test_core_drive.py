@@ -78,7 +78,7 @@ def test_the_gate_opens_within_an_answer_if_the_hysteresis_ends_there() -> None:
 def test_each_control_instant_gets_exactly_one_command_in_real_time() -> None:
     rig = Rig()
     rig.driving()
-    for step, sends in ((DT // 2, 0), (DT // 2, 1), (DT * 9 // 10 - 1, 0), (1, 1), (DT, 1), (5 * DT, 1)):
+    for step, sends in ((DT // 4, 0), (3 * DT // 4, 1), (DT // 2, 0), (DT // 2, 1), (DT, 1), (5 * DT, 1), (DT // 2, 0)):
         outputs = rig.observe(after=step)
         if rig.state.asked is not None:
             outputs += rig.propose()

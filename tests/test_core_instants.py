@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import random
 from typing import Any
 
 import msgspec
@@ -139,6 +141,55 @@ def test_a_good_observation_at_the_stamp_of_an_unusable_one_is_no_second_instant
     first = rig.t
     assert sources(rig.observe(stamp_ns=first)) == []
     assert sources(rig.observe(stamp_ns=first + DT)) == ["recovery"]
+
+
+@pytest.mark.parametrize("reports", [1, 3, 7, 9, 10, 25])
+def test_instants_stand_on_the_models_grid(reports: int) -> None:
+    """Also where a step is no whole number of intervals: 33 ms in 7 of them are 4.714 ms, rounded to a nanosecond."""
+    rig = Rig()
+    instants = stamps_of_instants(rig, [round(k * DT / reports) for k in range(20 * reports)])
+    assert [stamp - instants[0] for stamp in instants] == pytest.approx([k * DT for k in range(20)], abs=1)
+
+
+@pytest.mark.parametrize("reports", [2.5, 9.5, 13.7])
+@pytest.mark.parametrize("jitter", [0.0, 0.3])
+def test_an_instant_is_the_observation_nearest_to_its_grid_point_and_none_drifts(reports: float, jitter: float) -> None:
+    """No farther from it than half of the longest interval and half of what the last interval was off by."""
+    rig, rng = Rig(), random.Random(3)
+    times = [round((k + jitter * rng.uniform(-0.5, 0.5)) * DT / reports) for k in range(round(200 * reports))]
+    instants = stamps_of_instants(rig, times)
+    offsets = [(stamp - instants[0] + DT // 2) % DT - DT // 2 for stamp in instants]
+    interval = DT / reports
+    assert max(map(abs, offsets)) <= interval * (0.5 + 1.5 * jitter) + 1
+    steps = [round((b - a) / DT) for a, b in itertools.pairwise(instants)]
+    assert set(steps) == {1}
+
+
+def test_a_robot_that_reports_more_slowly_than_the_step_is_answered_every_time() -> None:
+    rig = Rig()
+    assert len(stamps_of_instants(rig, [k * DT * 13 // 10 for k in range(50)])) == 50
+
+
+def test_a_hole_in_the_observations_leaves_the_grid_where_it_was() -> None:
+    rig = Rig()
+    times = [k * DT // 4 for k in range(200) if not 50 <= k < 71]
+    instants = stamps_of_instants(rig, times)
+    assert {round((b - instants[0]) / DT * 4) % 4 for b in instants} <= {0, 3}  # the last interval before the hole's end is the hole
+    assert all((stamp - instants[0]) % DT == 0 for stamp in instants[-20:])
+
+
+def test_under_the_rules_of_before_an_instant_is_nine_tenths_of_a_step_after_the_last_one() -> None:
+    rig = Rig(rules=0)
+    instants = stamps_of_instants(rig, [k * DT // 10 for k in range(100)])
+    assert {b - a for a, b in itertools.pairwise(instants)} == {DT * 9 // 10}
+
+
+def stamps_of_instants(rig: Rig, times: list[int]) -> list[int]:
+    """Stamps of the observations at these times after now that were answered, each the only time."""
+    began, found = rig.t, []
+    for when in times:
+        found += [rig.t] if sources(rig.observe(after=began + when - rig.t)) else []
+    return found
 
 
 def test_a_command_goes_out_again_at_every_second_repetition() -> None:

@@ -9,10 +9,10 @@ import pytest
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.messages import Observation, Observed, Send
 from s2r_runtime.models.composed import compose
+from s2r_runtime.models.input_chains import Inputs
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.recording.writer import Writer
 from s2r_runtime.trace.beginning import with_history
-from s2r_runtime.trace.chains import Inputs
 from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams, thinned
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.trace.residual import acting, first_steps, rollout_starts, steps_of

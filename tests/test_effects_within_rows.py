@@ -6,9 +6,9 @@ import pytest
 from s2r_runtime.effects.follower import mixtures
 from s2r_runtime.effects.input_backlash import InputBacklash
 from s2r_runtime.models.composed import AppliedEffect, compose
+from s2r_runtime.models.input_chains import Inputs
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.chains import Inputs
 
 DT, FINE, LATE = 0.01, 50, 13
 """Rows, fine rows in one, and the fine row of each in which the input changes."""

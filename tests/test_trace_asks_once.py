@@ -15,10 +15,10 @@ from s2r_runtime.models import forces
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.models.double_integrator import DoubleIntegrator
 from s2r_runtime.models.file_model import FileModel
+from s2r_runtime.models.input_chains import Inputs
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import exchange, fields, fitting, lack_of_fit, relevance, residual, retimed, scores, selection, whole
-from s2r_runtime.trace.chains import Inputs
 from s2r_runtime.trace.changes import rivals_that_happen
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.errors import Held, noise_floor

@@ -15,9 +15,9 @@ from test_trace_arms_and_quadrotors import ARM
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.models.file_model import FileModel
 from s2r_runtime.models.forces import coupled
+from s2r_runtime.models.input_chains import Inputs
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.beginning import with_history
-from s2r_runtime.trace.chains import Inputs
 from s2r_runtime.trace.dataset import from_streams
 from s2r_runtime.trace.holdout import part
 from s2r_runtime.trace.reconstruct import at_step

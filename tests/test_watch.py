@@ -219,15 +219,46 @@ def test_memory_stays_right_when_recovery_commands_are_sent_without_observations
     assert [m.obs_seq for m in found] == [*range(1, 20), *range(31, 60)]
 
 
-@pytest.mark.parametrize(("late", "ends"), [(0.15, True), (-0.15, True), (0.3, False)])
+@pytest.mark.parametrize(("late", "ends"), [(0.15, True), (-0.009, True), (-0.02, False), (0.3, False)])
 def test_only_observations_about_one_period_apart_end_a_transition(late: float, ends: bool) -> None:
     model = compose(ModelSpec("unicycle", 0.033))
     stream = Stream(model, gap(0.01, model))
     stream.observed(Observation(0, 0, (0.0, 0.0, 0.0)))
     stream.sent(send(0, (0.1, 0.0)))
-    measured = stream.observed(Observation(1, round(DT_NS * (1 + late)), (0.0033, 0.0, 0.0)))
+    lasts = 0.033 * (1 + late)
+    measured = stream.observed(Observation(1, round(1e9 * lasts), (0.1 * lasts, 0.0, 0.0)))
     assert (measured is not None) == ends
-    assert stream.lost == (not ends)
+    assert stream.lost == (late > 0.2)
+    if measured is not None:
+        assert measured.discrepancy < 0.001 * 0.1 * 0.033 or abs(late) < 0.01
+
+
+def test_a_longer_transition_is_compared_with_a_step_of_its_own_length_and_the_memory_of_what_was_commanded() -> None:
+    """A lag whose time constant is two steps, after commands at uneven stamps: the closed form of its mean over the last transition."""
+    tau, dt = 0.066, 0.033
+    model = compose(ModelSpec("unicycle", dt, effects=(EffectSpec("input_lag", "v", {"time_constant": tau}),)))
+    stream = Stream(model, gap(0.01, model))
+    t, x, y, found = 0.0, 0.0, 0.0, []
+    for k, (lasts, v) in enumerate([(1.0, 0.1), (1.12, 0.2), (1.05, -0.1), (1.18, 0.15), (1.0, 0.0)]):
+        measured = stream.observed(Observation(k, round(t * 1e9), (x, 0.0, 0.0)))
+        found += [measured.discrepancy] if measured is not None else []
+        stream.sent(Send(round(t * 1e9), k, "controller", (v, 0.0), k, DT_NS))
+        T = lasts * dt
+        x += v * T + (y - v) * tau * (1.0 - math.exp(-T / tau))
+        y = v + (y - v) * math.exp(-T / tau)
+        t += T
+    assert len(found) == 4
+    assert max(found) < 1e-9  # stamps are rounded to a nanosecond
+
+
+def test_under_the_rules_of_before_a_transition_may_be_a_fifth_short() -> None:
+    model = compose(ModelSpec("unicycle", 0.033))
+    stream = Stream(model, gap(0.01, model), rules=0)
+    stream.observed(Observation(0, 0, (0.0, 0.0, 0.0)))
+    stream.sent(send(0, (0.1, 0.0)))
+    measured = stream.observed(Observation(1, round(DT_NS * 0.85), (0.0033, 0.0, 0.0)))
+    assert measured is not None
+    assert measured.discrepancy < 1e-12
 
 
 def test_observations_faster_than_commands_end_a_transition_when_its_period_is_over() -> None:

@@ -86,9 +86,9 @@ class Beside:
         self._quiet = False
         self._tell("sent", _ENCODE(send))
 
-    def begin(self, profile: Profile, gap: Gap, memory: Memory, *, lockstep: bool) -> None:
+    def begin(self, profile: Profile, gap: Gap, memory: Memory, *, lockstep: bool, rules: int) -> None:
         """A controller starts: see `WatchReplay.begin`. The process composes the model itself."""
-        self._tell("begin", profile, gap, memory, lockstep)
+        self._tell("begin", profile, gap, memory, lockstep, rules)
 
     def stop(self) -> None:
         """It is stopped."""
@@ -197,13 +197,13 @@ class _Server:
         self._watch.sent(send)
         self._frames.send(send)
 
-    def begin(self, profile: Profile, gap: Gap, memory: Memory, lockstep: bool) -> None:
+    def begin(self, profile: Profile, gap: Gap, memory: Memory, lockstep: bool, rules: int) -> None:
         from s2r_runtime.models.composed import compose
 
         key = profile.model.digest()
         if key not in self._models:
             self._models[key] = compose(profile.model)
-        self._watch.begin(self._models[key], gap, profile, memory, lockstep=lockstep)
+        self._watch.begin(self._models[key], gap, profile, memory, lockstep=lockstep, rules=rules)
 
     def stop(self) -> None:
         self._watch.end()

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 
 from s2r_runtime.audit.findings import Findings
-from s2r_runtime.comparison import STAMP_TOLERANCE, Campaign
+from s2r_runtime.comparison import EARLY, EARLY_BEFORE, Campaign
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import (
     Ask,
@@ -47,7 +47,9 @@ class CampaignReplay:
         self._campaign: Campaign | None = None
         self._order: StartCampaign | None = None
         self._place = (0, "event/source_started")
-        self._dt_ns = 0
+        self._settings: Settings | None = None
+        self._sampling = Sampling()
+        self._short: set[int] = set()
         self._due: deque[SampleTaken | Proposed | SourceStopped] = deque()
         self._observations: deque[Observation] = deque(maxlen=KEPT)
         self._sends: deque[Send] = deque(maxlen=KEPT)
@@ -70,7 +72,7 @@ class CampaignReplay:
 
     def start(self, order: StartCampaign, settings: Settings, sampling: Sampling) -> None:
         """A campaign begins, or goes on."""
-        self._order, self._dt_ns = order, settings.dt_ns
+        self._order, self._settings, self._sampling = order, settings, sampling
         self._campaign, self._doubtful = None, False
         self._due.clear()
         self._asked.clear()
@@ -148,8 +150,22 @@ class CampaignReplay:
     def started(self, entry: Entry, event: SourceStarted) -> None:
         """The sampler runs: with these settings."""
         self._place = (entry.index, entry.channel)
+        self._stricter(event.digest)
         if self._campaign is not None and event.digest != self._campaign.digest:
             self._findings.differ(entry.index, entry.channel, "the campaign has other settings", entry.raw, self._campaign.digest)
+
+    def _stricter(self, wanted: str) -> None:
+        """A daemon that does not know yet that its model steps at any length takes none but whole steps, which is never wrong."""
+        order, settings, campaign = self._order, self._settings, self._campaign
+        if campaign is None or order is None or settings is None or not settings.any_step or campaign.digest == wanted:
+            return
+        strict = msgspec.structs.replace(settings, any_step=False)
+        other = Campaign.from_settings(strict, self._sampling, n=order.n, epoch=order.epoch, seed=order.seed)
+        if other.digest == wanted:
+            if self._resumed is not None:
+                self._resumed = {**self._resumed, "digest": wanted}
+                other.restore(self._resumed)
+            self._campaign, self._settings, self._snapshots[order.epoch] = other, strict, other.snapshot()
 
     def proposed(self, entry: Entry, event: Proposed) -> None:
         """The sampler's command."""
@@ -216,26 +232,63 @@ class CampaignReplay:
         self._findings.count(what)
 
     def _find(self, entry: Entry, sample: SampleTaken) -> None:
-        """x0, x1 and the hold's end must be observations, at their times, with nothing but the sample's input sent in between."""
-        recent = takewhile(lambda o: o.seq >= sample.obs_seq0, reversed(self._observations))
+        """The hold's start, x0, x1 and the hold's end must be observations, at their times, with nothing but the sample's input sent
+        meanwhile.
+        """
+        first = sample.start_seq if sample.lasts_ns else sample.obs_seq0
+        recent = takewhile(lambda o: o.seq >= first, reversed(self._observations))
         seen = {o.seq: o for o in recent if not o.fault}
-        start = seen.get(sample.obs_seq0)
         end = self._observations[-1] if self._observations else None
-        problem = ""
-        if start is None or (start.x, start.stamp_ns) != (sample.x0, sample.t0_ns):
-            problem = "x0 is not the observation that it names"
-        elif not any(o.x == sample.x1 and self._after(start, o, 1) for o in seen.values()):
-            problem = "x1 was not observed one period after x0"
-        elif sample.held and (end is None or end.x != sample.held or not self._after(start, end, sample.periods)):
-            problem = "the state at the hold's end was not observed there"
-        elif end is not None:
-            recent_sends = takewhile(lambda s: s.obs_seq >= start.seq, reversed(self._sends))
+        problem = _misplaced(sample, seen, end) if sample.lasts_ns else self._misplaced_before(sample, seen, end)
+        if not problem and end is not None:
+            recent_sends = takewhile(lambda s: s.obs_seq >= first, reversed(self._sends))
             if any((s.u, s.source) != (sample.u, "sampler") for s in recent_sends if s.obs_seq < end.seq):
                 problem = "another input was sent during the hold"
         if problem:
             self._findings.differ(entry.index, entry.channel, problem, entry.raw, None)
         else:
             self._findings.count("samples found in the observations")
+            self._one_step(entry, sample, seen)
+
+    def _misplaced_before(self, sample: SampleTaken, seen: dict[int, Observation], end: Observation | None) -> str:
+        """What is wrong with the places of a sample that was taken under rules before `GRID`, or nothing."""
+        start = seen.get(sample.obs_seq0)
+        if start is None or (start.x, start.stamp_ns) != (sample.x0, sample.t0_ns):
+            return "x0 is not the observation that it names"
+        if not any(o.x == sample.x1 and self._after(start, o, 1) for o in seen.values()):
+            return "x1 was not observed one period after x0"
+        if sample.held and (end is None or end.x != sample.held or not self._after(start, end, sample.periods)):
+            return "the state at the hold's end was not observed there"
+        return ""
 
     def _after(self, start: Observation, end: Observation, periods: int) -> bool:
-        return abs(end.stamp_ns - start.stamp_ns - periods * self._dt_ns) <= STAMP_TOLERANCE * self._dt_ns
+        dt = 0 if self._settings is None else self._settings.dt_ns
+        return abs(end.stamp_ns - start.stamp_ns - periods * dt) <= EARLY_BEFORE * dt
+
+    def _one_step(self, entry: Entry, sample: SampleTaken, seen: dict[int, Observation]) -> None:
+        """By today's rule (guarantee G7): rules before `GRID` compared a transition a fifth too short or too long with a whole step."""
+        if sample.lasts_ns or self._settings is None or sample.epoch in self._short:
+            return
+        dt = self._settings.dt_ns
+        lasts = min((o.stamp_ns - sample.t0_ns for o in seen.values() if o.x == sample.x1 and o.stamp_ns > sample.t0_ns), default=dt)
+        if abs(lasts - dt) > EARLY * dt:
+            self._short.add(sample.epoch)
+            took = f"x1 of sample {sample.index} was observed {lasts * 1e-9:.6g} s after x0 and compared with a step of {dt * 1e-9:g} s"
+            what = f"the samples of epoch {sample.epoch} were not a step long: {took}; its gap is too small by about as much"
+            self._findings.differ(entry.index, entry.channel, what, entry.raw, None)
+
+
+def _misplaced(sample: SampleTaken, seen: dict[int, Observation], end: Observation | None) -> str:
+    """What is wrong with a sample's places among the observations (by number), or nothing. How long it lasts is the campaign's to judge,
+    which is run again.
+    """
+    start, x0 = seen.get(sample.start_seq), seen.get(sample.obs_seq0)
+    if start is None or (start.x, start.stamp_ns) != (sample.start, sample.start_ns):
+        return "the hold's start is not the observation that it names"
+    if x0 is None or (x0.x, x0.stamp_ns) != (sample.x0, sample.t0_ns):
+        return "x0 is not the observation that it names"
+    if not any((o.x, o.stamp_ns) == (sample.x1, sample.t0_ns + sample.lasts_ns) for o in seen.values()):
+        return "x1 was not observed when it says"
+    if sample.held and (end is None or (end.x, end.stamp_ns) != (sample.held, sample.start_ns + sample.hold_ns)):
+        return "the state at the hold's end was not observed when it says"
+    return ""

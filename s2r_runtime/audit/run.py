@@ -20,9 +20,11 @@ from s2r_runtime.canonical import digest
 from s2r_runtime.core.state import unix_now
 from s2r_runtime.core.status import against_sampler
 from s2r_runtime.daemon.model_store import parse_model
-from s2r_runtime.daemon.settings import ModelFacts, settings_of
+from s2r_runtime.daemon.settings import ModelFacts, facts_of, settings_of
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import (
+    GRID,
+    RULES,
     Ask,
     AttemptSpent,
     CampaignFinished,
@@ -43,6 +45,7 @@ from s2r_runtime.messages import (
     Revoked,
     SampleTaken,
     Send,
+    Settings,
     SourceStarted,
     SourceStopped,
     StartCampaign,
@@ -215,19 +218,18 @@ class RunAudit:
         for name in ("profile.toml", "model.toml"):
             if name not in attached:
                 raise ConfigError(f"{self._where()}: {name} is not attached, so nothing can be recomputed")
-        profile = self._profile_of(attached, as_before=not event.settings.fault_share)
+        profile = self._profile_of(attached, event.settings)
         if profile.digest() != event.settings.profile_digest == profile.by_text().digest():
             profile = profile.by_text()
             self._findings.count("runs by an earlier version's rule: their profile's digest covers the whole text of its files")
         self._profile = self._with_model(profile, event.settings.model_digest)
         settings = event.settings
-        facts = ModelFacts(settings.states, settings.inputs, settings.angles)
+        facts = ModelFacts(settings.states, settings.inputs, settings.angles, any_step=settings.any_step)
         model = self._compose(self._profile.model)
         if model is not None:
-            facts = ModelFacts(model.states, model.inputs, tuple(model.nominal.angles))
-        told = settings_of(self._profile, self._profile.model, facts, settings.seed)
-        if 0 <= settings.rules <= told.rules:  # an earlier version's rules are run again as they were
-            told = msgspec.structs.replace(told, rules=settings.rules)
+            facts = facts_of(model)
+        rules = settings.rules if 0 <= settings.rules <= RULES else RULES  # an earlier version's rules are run again as they were
+        told = settings_of(self._profile, self._profile.model, facts, settings.seed, rules)
         if told != settings:
             self._findings.differ(
                 entry.index, entry.channel, "the settings are not those of the attached profile and model", settings, told
@@ -244,12 +246,14 @@ class RunAudit:
             self._findings.count("runs by an earlier version's rule: it let any number of faulty observations pass")
         self._begun = True
 
-    def _profile_of(self, attached: Mapping[str, Attached], *, as_before: bool) -> Profile:
+    def _profile_of(self, attached: Mapping[str, Attached], settings: Settings) -> Profile:
         """The attached profile. Raises ConfigError; not by the log's fault: a version that checked less may have written it."""
         text = self._text(attached["profile.toml"])
         files = {name.removeprefix("profile/"): self._text(one) for name, one in attached.items() if name.startswith("profile/")}
         try:
-            return parse_profile(text, f"{self._where()}: profile.toml", Path(), files, as_before=as_before)
+            older = {"gate"} if not settings.fault_share else set()
+            older |= {"sampling"} if settings.rules < GRID else set()
+            return parse_profile(text, f"{self._where()}: profile.toml", Path(), files, as_before=older)
         except ConfigError as error:
             raise ConfigError(f"{error}; this version takes no such profile, so nothing can be recomputed") from None
 
@@ -290,11 +294,14 @@ class RunAudit:
             case StartInputs():
                 self._inputs.start(entry, output, profile, settings.inputs, self._attached())
             case StartCampaign():
-                in_force = settings_of(profile, profile.model, ModelFacts(settings.states, settings.inputs, settings.angles), settings.seed)
+                model = self._compose(profile.model)
+                any_step = settings.any_step if model is None else model.any_step
+                facts = ModelFacts(settings.states, settings.inputs, settings.angles, any_step=any_step)
+                in_force = settings_of(profile, profile.model, facts, settings.seed, settings.rules)
                 self._campaigns.start(output, in_force, profile.sampling)
             case StartController():
                 if state.memory.gap is not None and self._compose(profile.model) is not None:
-                    self._beside.begin(profile, state.memory.gap, state.memory, lockstep=settings.lockstep)
+                    self._beside.begin(profile, state.memory.gap, state.memory, lockstep=settings.lockstep, rules=settings.rules)
             case StopController():
                 self._beside.stop()
             case StartJob():

@@ -36,10 +36,11 @@ class WatchReplay:
         """t_ns: of the observation."""
         self._lockstep = False
         self._sure = True
+        self._rules = 0
 
-    def begin(self, model: ComposedModel, gap: Gap, profile: Profile, memory: Memory, *, lockstep: bool) -> None:
-        """A controller starts. memory: the core's, which says where this epoch's watch stands."""
-        self._lockstep, self._sure = lockstep, True
+    def begin(self, model: ComposedModel, gap: Gap, profile: Profile, memory: Memory, *, lockstep: bool, rules: int) -> None:
+        """A controller starts. memory: the core's, which says where this epoch's watch stands. rules: the run's."""
+        self._lockstep, self._sure, self._rules = lockstep, True, rules
         self._begun = (model, gap, profile)
         if self._stood is None or self._stood[0].epoch != gap.epoch:
             self._stood = (gap, stream.stood(memory))
@@ -106,4 +107,4 @@ class WatchReplay:
         model, gap, profile = self._begun
         stood = msgspec.structs.asdict(self._stood[1])
         alpha, watch = profile.guarantee.alpha, profile.watch
-        self._stream = Stream(model, gap, fault_jump=watch.fault_jump, alpha=alpha, run_length=watch.run_length, **stood)
+        self._stream = Stream(model, gap, fault_jump=watch.fault_jump, alpha=alpha, run_length=watch.run_length, rules=self._rules, **stood)

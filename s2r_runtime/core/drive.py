@@ -1,6 +1,9 @@
 """What the robot is told: control instants, questions to the sources, the gate's state, the recovery command.
 
-A *control instant* is an observation at least 0.9 dt after that of the last one, by the robot's stamps. Each gets exactly one `Send`:
+A *control instant* is the observation nearest to a point of the model's grid: the first instant's stamp plus whole steps of dt, by the
+robot's clock. Half of the last interval between two observations decides which one is nearest before the next one arrives, and the grid
+itself never moves, so that instants do not drift. (Runs under rules before `GRID` took any observation 0.9 dt after the last instant.) In
+lockstep a robot that reports once a step waits for each answer: there its own steps are the grid. Each instant gets exactly one `Send`:
 the command of the source that was asked, if the gate allows it, else the recovery command. Beyond that, in real time only, the
 recovery command goes out at once when the gate closes between instants, and at the pace of dt while observations fail to come.
 
@@ -16,7 +19,7 @@ from typing import Literal
 
 from s2r_runtime import gate, goto
 from s2r_runtime.core.state import Asked, Turn, situation
-from s2r_runtime.messages import AnswerLate, Ask, Command, Decided, GateChanged, Observation, Send, Source
+from s2r_runtime.messages import GRID, AnswerLate, Ask, Command, Decided, GateChanged, Observation, Send, Source
 
 RETURNED_WITHIN_M = 0.05
 """`return` stops this near to home: the go-to law is exponential, it would never arrive."""
@@ -137,6 +140,8 @@ def observed(turn: Turn, observation: Observation) -> None:
     if trouble == "observation_out_of_order":
         regate(turn)
         return
+    if not trouble and turn.state.observation is not None:
+        turn.set(report_ns=min(observation.stamp_ns - turn.state.observation.stamp_ns, turn.settings.dt_ns))
     begins = turn.state.asked is None and _due(turn, observation, trouble)
     if not trouble:
         turn.set(observation=observation, observation_ns=turn.now, odd_seq=None)
@@ -176,21 +181,32 @@ def forget_observations(turn: Turn) -> None:
     if turn.state.asked is not None:
         recover_now(turn)
     turn.set(observation=None, trouble="", seen_seq=None, odd_seq=None, control_seq=None, control_stamp_ns=None, answered=True)
+    turn.set(report_ns=0, due_ns=0)
 
 
 def _due(turn: Turn, observation: Observation, trouble: str) -> bool:
-    last = turn.state.control_stamp_ns
-    if last is None or 10 * (observation.stamp_ns - last) >= 9 * turn.settings.dt_ns:
-        return True
-    # in order, and yet before the last instant: that one's stamp was of an unusable observation, and wrong
-    return not trouble and observation.stamp_ns < last
+    state, settings, stamp = turn.state, turn.settings, observation.stamp_ns
+    last = state.control_stamp_ns
+    if last is None or (not trouble and stamp < last):
+        return True  # in order, and yet before the last instant: that one's stamp was of an unusable observation, and wrong
+    if settings.rules < GRID or (settings.lockstep and 2 * state.report_ns > settings.dt_ns):
+        return 10 * (stamp - last) >= 9 * settings.dt_ns
+    return 2 * stamp + state.report_ns >= 2 * state.due_ns
 
 
 def _begin_instant(turn: Turn, observation: Observation, trouble: str) -> None:
     last, stamp = turn.state.control_stamp_ns, observation.stamp_ns
     if trouble and last is not None:
         stamp = min(stamp, last + turn.settings.dt_ns)  # the stamp of an unusable observation may be anything
-    turn.set(control_seq=observation.seq, control_stamp_ns=stamp, answered=False, repeats=0)
+    turn.set(control_seq=observation.seq, control_stamp_ns=stamp, due_ns=_next_on_grid(turn, stamp), answered=False, repeats=0)
+
+
+def _next_on_grid(turn: Turn, stamp_ns: int) -> int:
+    """The grid point after the one nearest to this instant. The grid begins with the first instant, and anew where the clock went back."""
+    last, due, dt = turn.state.control_stamp_ns, turn.state.due_ns, turn.settings.dt_ns
+    if last is None or stamp_ns < last:
+        return stamp_ns + dt
+    return due + dt * (1 + max(0, (2 * (stamp_ns - due) + dt) // (2 * dt)))
 
 
 def _repeated(turn: Turn, observation: Observation) -> None:

@@ -97,7 +97,8 @@ class State(Struct, frozen=True):
 
     unix_s was read at unix_ns. `observation`, `observation_ns`: newest usable one and when it came; `trouble`: why the newest is
     not usable, or empty; seen_seq: of the newest, usable or not; odd_seq: of one that came out of order. control_seq,
-    control_stamp_ns: of the newest control instant; `answered`: whether it has its Send. `idle`: recovery instants since a source
+    control_stamp_ns: of the newest control instant; due_ns: grid point of the next one; report_ns: between the last two observations (both
+    by the robot's stamps); `answered`: whether the newest instant has its Send. `idle`: recovery instants since a source
     was asked. `repeats`: of an observation whose command was sent. `issuing`: the job whose certificate is being signed.
     gate_said: the reason last recorded; `ended`: why the last deployment ended. clear_since_ns: since when all standing
     conditions of the gate hold. driven: a controller has, since the gap came into force; excited: given inputs were. trace_due_ns: when a
@@ -125,6 +126,8 @@ class State(Struct, frozen=True):
     odd_seq: int | None = None
     control_seq: int | None = None
     control_stamp_ns: int | None = None
+    due_ns: int = 0
+    report_ns: int = 0
     answered: bool = True
     asked: Asked | None = None
     idle: int = 0

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from s2r_runtime.child import Child, die_with_parent, say, stand_back, take_stdout
-from s2r_runtime.daemon.settings import ModelFacts
+from s2r_runtime.daemon.settings import ModelFacts, facts_of
 from s2r_runtime.errors import ConfigError, S2RError
 from s2r_runtime.messages import Gap, Measured, Observation, Send
 from s2r_runtime.modelspec import ModelSpec
@@ -244,7 +244,7 @@ def _checked(message: Setup | CheckModel) -> Ready | Refused:
         task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
     except S2RError as error:
         return Refused(str(error), ref)
-    return Ready(ModelFacts(model.states, model.inputs, tuple(model.nominal.angles), task.horizon), ref)
+    return Ready(facts_of(model, task.horizon), ref)
 
 
 def _stream(watching: Watching) -> Stream:

@@ -297,7 +297,7 @@ class Desk:
         def checked(wrong: str, facts: ModelFacts | None) -> None:
             if not connection.listening:
                 return
-            if wrong or facts != self._d.facts:
+            if wrong or facts is None or not facts.same_robot(self._d.facts):
                 connection.answer(78, wrong or "adopt: the model has other states or inputs than the robot's")
                 return
             try:
@@ -305,7 +305,7 @@ class Desk:
             except OSError as error:
                 connection.answer(70, f"adopt: the model cannot be kept: {error.strerror}")
                 return
-            self._d.adopting[spec.digest()] = msgspec.structs.replace(profile, model=kept)
+            self._d.adopting[spec.digest()] = msgspec.structs.replace(profile, model=kept), facts
             # before the decision, so that a reader of the log has the model when it comes into force
             self._d.logbook.attach(f"model/{spec.digest()}", "application/toml", dump_model(kept).encode())
             self.request("adopt", connection, digest=spec.digest())

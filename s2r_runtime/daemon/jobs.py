@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from s2r_runtime.controllers.file import ControllerFile, load
 from s2r_runtime.daemon.given_inputs import BYTES_MAX, GivenInputs, parse_inputs
-from s2r_runtime.daemon.settings import ModelFacts, settings_of
+from s2r_runtime.daemon.settings import facts_of, settings_of
 from s2r_runtime.daemon.worker import GapJob, InputsJob, Job, LoadJob, Result, SynthesisJob, TraceJob, VerifyJob
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import Gap
@@ -165,7 +165,7 @@ def inputs(job: InputsJob) -> GivenInputs:
     given = parse_inputs(data, path.name, model.inputs, profile.inputs, model.dt, profile.columns)
     if not job.x:
         return given
-    settings = settings_of(profile, profile.model, ModelFacts(model.states, model.inputs, tuple(model.nominal.angles)))
+    settings = settings_of(profile, profile.model, facts_of(model))
     x, hidden = np.array([job.x], dtype=np.float64), model.at_rest(1)
     for number, row in enumerate(given.rows):
         x, hidden = model.step(x, np.array([row]), hidden)

@@ -121,7 +121,7 @@ class Daemon:
         self.state: State = core.initial()
         self.memory: Memory
         self.observation: Observation | None = None
-        self.adopting: dict[str, Profile] = {}
+        self.adopting: dict[str, tuple[Profile, ModelFacts]] = {}
         self.began_ns = time.monotonic_ns()
         self._queue: deque[Event] = deque()
         self._draining = False
@@ -401,13 +401,14 @@ class Daemon:
 
     def use_model(self, digest: str) -> None:
         """A model was adopted: everything that is started from here on uses it."""
-        profile = self.adopting.pop(digest, None)
+        profile, facts = self.adopting.pop(digest, (None, None))
         if profile is None:  # the profile's own decision for a proposed one
             spec = self.models.load(digest)
             if spec is None:
                 raise RuntimeError(f"the adopted model {digest} is not in {self.models.folder}")
             profile = msgspec.structs.replace(self.profile, model=spec)
         self.profile = profile
+        self.facts = facts or msgspec.structs.replace(self.facts, any_step=False)  # until a restart: the stricter tolerance is never wrong
         self.settings = settings_of(profile, profile.model, self.facts, self.seed)
         self.driver.use(profile)
         self.watcher.use(profile)

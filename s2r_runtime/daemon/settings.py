@@ -7,27 +7,41 @@ anyhow and tells the facts when it starts.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from s2r_runtime.canonical import digest_of
-from s2r_runtime.messages import RULES, Settings
+from s2r_runtime.messages import GRID, RULES, Settings
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.profile import Profile
+from s2r_runtime.profile import Profile, plain_table
+
+if TYPE_CHECKING:
+    from s2r_runtime.models.composed import ComposedModel
 
 
 class ModelFacts(msgspec.Struct, frozen=True):
-    """A model's names, in order; `angles` are the states that wrap. `horizon`: steps of the profile's task."""
+    """A model's names, in order; `angles` are the states that wrap. `horizon`: steps of the profile's task. `any_step`: see `Settings`."""
 
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     angles: tuple[str, ...]
     horizon: int = 0
+    any_step: bool = False
+
+    def same_robot(self, other: ModelFacts) -> bool:
+        """Whether two models are of one robot: all but how they step."""
+        return msgspec.structs.replace(self, any_step=other.any_step) == other
 
 
-def settings_of(profile: Profile, model: ModelSpec, facts: ModelFacts, seed: int | None = None) -> Settings:
+def facts_of(model: ComposedModel, horizon: int = 0) -> ModelFacts:
+    """What there is to know of a model. horizon: of the profile's task."""
+    return ModelFacts(model.states, model.inputs, tuple(model.nominal.angles), horizon, model.any_step)
+
+
+def settings_of(profile: Profile, model: ModelSpec, facts: ModelFacts, seed: int | None = None, rules: int = RULES) -> Settings:
     """What the profile fixes for the core. model: the one in force (the profile's, or one adopted since). seed: instead of the
-    profile's.
+    profile's. rules: those that the run was made under.
 
     An angle without bounds may be anything in its circle. A state that the geofence doesn't name is fenced by the region.
     """
@@ -80,7 +94,8 @@ def settings_of(profile: Profile, model: ModelSpec, facts: ModelFacts, seed: int
         norm_weights=tuple(profile.norm.weights.get(name, 1.0) for name in facts.states),
         fault_share=gate.fault_share,
         fault_burst=gate.fault_burst,
-        rules=RULES,
+        rules=rules,
+        any_step=facts.any_step and rules >= GRID,
     )
 
 
@@ -109,5 +124,6 @@ def controller_deadline_s(profile: Profile) -> float:
 
 def campaign_digest(profile: Profile) -> str:
     """Digest of what a gap rests on besides the model: the law of the samples, the norm, and what was fixed beforehand."""
-    tables = (profile.region, profile.geofence, profile.inputs, profile.norm, profile.sampling, profile.guarantee)
+    sampling = plain_table("sampling", profile.sampling)
+    tables = (profile.region, profile.geofence, profile.inputs, profile.norm, sampling, profile.guarantee)
     return digest_of([msgspec.to_builtins(table) for table in tables])

@@ -46,6 +46,7 @@ from s2r_runtime.messages.link import (
     Struct,
 )
 from s2r_runtime.messages.memory import (
+    GRID,
     MEMORY_SCHEMA,
     RULES,
     Memory,
@@ -94,7 +95,7 @@ from s2r_runtime.messages.results import (
 )
 
 __all__ = [
-    "MEMORY_SCHEMA", "RULES", "SERIAL", "Action", "AlarmRaised", "AnalyticsChanged", "Answer", "AnswerLate", "Ask", "AttemptEnded",
+    "GRID", "MEMORY_SCHEMA", "RULES", "SERIAL", "Action", "AlarmRaised", "AnalyticsChanged", "Answer", "AnswerLate", "Ask", "AttemptEnded",
     "AttemptSpent",
     "CampaignFinished", "CertificateFacts", "CertificateFailed", "CertificateInstalled", "CertificateStored", "CertificatesDistrusted",
     "ChangeNoticed", "Command", "Decided", "EpisodeEnded", "EpochChanged", "Event", "Frame", "Gap", "GateChanged", "InputsFinished",

@@ -148,11 +148,16 @@ class AnswerLate(Struct, frozen=True, tag="answer_late"):
 
 
 class SampleTaken(Struct, frozen=True, tag="sample_taken"):
-    """One independent transition of a campaign (guarantee G1). x0, x1: (nx,), one period apart; u: (nu,), held from x0 on.
+    """One independent transition of a campaign (guarantee G1). x0, x1: (nx,), one period apart; u: (nu,), held before x0 (or from x0 on)
+    until after x1.
 
     `held`: (nx,), the state after `periods` held periods, or empty if the campaign holds for one period only. `obs_seq0`,
     `t0_ns`: of the observation that x0 was; the robot's numbers, so that an auditor finds the raw frame. `again`: logged once more
     when an interrupted campaign goes on in a new log, so that the log holds all of them; its frames are in the earlier one.
+
+    Under `Settings.rules` 1 also: `lasts_ns`: from x0's stamp to x1's. `period`: which period of the hold x0 begins. `start`, `start_seq`,
+    `start_ns`: state, number and stamp of the observation at which the hold began; `hold_ns`: from there to `held`. `past_u`, `past_ns`:
+    the commands before the hold, oldest first, and how long each lasted.
     """
 
     t_ns: int
@@ -166,8 +171,16 @@ class SampleTaken(Struct, frozen=True, tag="sample_taken"):
     held: tuple[float, ...]
     periods: int
     before: tuple[float, ...] = ()
-    """(nx,), observed one period before x0, while the robot stood still: the two differ by measurement noise alone."""
+    """(nx,), observed one period before the hold, while the robot stood still: it differs from the hold's first state by noise alone."""
     again: bool = False
+    lasts_ns: int = 0
+    period: int = 0
+    start: tuple[float, ...] = ()
+    start_seq: int = 0
+    start_ns: int = 0
+    hold_ns: int = 0
+    past_u: tuple[tuple[float, ...], ...] = ()
+    past_ns: tuple[int, ...] = ()
 
 
 class CampaignFinished(Struct, frozen=True, tag="campaign_finished"):

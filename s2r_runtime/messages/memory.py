@@ -69,10 +69,16 @@ class Settings(Struct, frozen=True):
 
     rules: int = 0
     """Of the core's rules, those that the run was made by; a log of before has 0 and is audited by them. See `RULES`."""
+    any_step: bool = False
+    """Whether the model and its effects step exactly at any length, so that a transition may last longer than one step (rules 2)."""
 
 
-RULES = 1
-"""1: a campaign that is refused for dependent samples is remembered, and can be traced and repeated."""
+GRID = 2
+"""Since these rules control instants stand on the model's grid, and transitions are compared with a step of their own length. Before, an
+instant came 0.9 dt after the last one, and a transition could be 0.2 dt off a step.
+"""
+RULES = 2
+"""1: a campaign that is refused for dependent samples is remembered, and can be traced and repeated. 2: `GRID`."""
 MEMORY_SCHEMA = 1
 """Of `Memory`: a memory of another schema is refused."""
 

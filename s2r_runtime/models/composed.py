@@ -136,7 +136,7 @@ class ComposedModel:
     @cached_property
     def substeps(self) -> int:
         """Parts of a step in which the effects of stage `input` are run: 1 where that is exact."""
-        chain = [a for a in self.effects if a.effect.stage == "input" and not self._pushes(a)]
+        chain = [a for a in self.effects if a.effect.stage == "input" and not self.pushes(a)]
         moving = [i for i, a in enumerate(chain) if getattr(a.effect, "within_step", _never)(self.dt, a.p)]
         if not moving:
             return 1
@@ -202,6 +202,17 @@ class ComposedModel:
         steps = (a.effect for a in self.effects if a.effect.stage == "step")
         return all(getattr(thing, "uneven", False) for thing in (self.nominal.shared, *steps))
 
+    @cached_property
+    def any_step(self) -> bool:
+        """Whether it steps exactly at any length: `uneven`, with effects on inputs that are so, or that have no memory."""
+        return self.uneven and all(self._any_length(a) for a in self.effects if a.effect.stage == "input")
+
+    def _any_length(self, a: AppliedEffect) -> bool:
+        if getattr(a.effect, "uneven", False):
+            return True
+        remembers = a.effect.hidden(1, self.nominal, a.channel, self.dt, a.p).size > 0
+        return not remembers and not getattr(a.effect, "within_step", _never)(self.dt, a.p)
+
     def advance(self, x: Array, mean: Array, end: Array, lasts: Array | None = None) -> Array:
         """x one step later under an input that acts as `act` says; angles are not wrapped. lasts: (n,) s, of each step, if `uneven`."""
         dt: Any = self.dt if lasts is None else lasts
@@ -241,18 +252,19 @@ class ComposedModel:
         schemes = [a.effect.integrates(a.p) for a in self.effects if hasattr(a.effect, "integrates")]
         return integrating(self.nominal, schemes[-1]) if schemes else self.nominal
 
-    def _pushes(self, a: AppliedEffect) -> bool:
+    def pushes(self, a: AppliedEffect) -> bool:
+        """Whether an effect on the step is a force on an axis, which applies with all others of them."""
         pushes = getattr(a.effect, "pushes", None)
         return pushes is not None and bool(pushes(self.nominal, a.channel))
 
     @cached_property
     def _forces(self) -> tuple[Pushing, ...]:
-        return tuple((a.effect, a.channel, a.p) for a in self.effects if self._pushes(a))
+        return tuple((a.effect, a.channel, a.p) for a in self.effects if self.pushes(a))
 
     @cached_property
     def _after(self) -> tuple[AppliedEffect, ...]:
         """Effects of stage `step` that are no forces, in the order in which they apply."""
-        those = [a for a in self.effects if a.effect.stage == "step" and not self._pushes(a)]
+        those = [a for a in self.effects if a.effect.stage == "step" and not self.pushes(a)]
         return tuple(
             sorted(those, key=lambda a: FRAMES.index(a.effect.frame(self.nominal, a.channel) if hasattr(a.effect, "frame") else ""))
         )

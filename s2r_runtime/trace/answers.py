@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.chains import Key, values_key
+from s2r_runtime.models.input_chains import Key, values_key
 from s2r_runtime.trace.slots import Free
 
 Array = NDArray[np.float64]

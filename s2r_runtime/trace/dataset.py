@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import NotEnoughEvidence, RecordingError
 from s2r_runtime.gap import Transitions
 from s2r_runtime.models.composed import SUBSTEPS, ComposedModel
+from s2r_runtime.models.input_chains import Inputs
 from s2r_runtime.table_rows import Subset
 from s2r_runtime.tables import LARGEST
-from s2r_runtime.trace.chains import Inputs
 from s2r_runtime.trace.reconstruct import Reconstruction, at_step, independent_step, snapped
 from s2r_runtime.trace.streams import (
     ALIGNED,

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import sys
+from collections import deque
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from s2r_runtime.comparison import EARLY, LATE
 from s2r_runtime.core.ledger import seed
 from s2r_runtime.core.stream import bin_of
-from s2r_runtime.messages import Gap, Measured, Observation, Send
+from s2r_runtime.messages import GRID, RULES, Gap, Measured, Observation, Send
 from s2r_runtime.watch.change import ChangeDetector
 from s2r_runtime.watch.exceedance import EProcess
 from s2r_runtime.watch.exchangeability import ConformalTest
@@ -22,8 +24,11 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-STAMP_TOLERANCE = 0.2
-"""Of dt: how far two observations may be from dt apart to be the ends of one transition."""
+EARLY_BEFORE = 0.2
+"""Of dt: how far two observations might be from dt apart under rules before `GRID`. Since then a campaign's limits hold here, too."""
+
+PAST_ROWS = 200
+"""Commands that a transition of another length than a step is given as its past: some 20 s at 10 Hz."""
 
 LONGEST_HOLD = 2000
 """Periods for which a held input is carried into an effect's memory; after more of them nothing changes any more."""
@@ -40,10 +45,11 @@ def measurement_fault(discrepancy: float, fault_jump: float) -> str:
 class Stream:
     """Observations and commands, in order -> one `Measured` for each transition that ended, for the audit to repeat.
 
-    A transition is an observation, the one command that answered it, and the next observation about dt later. Where an observation
-    is lost, stands at another time, or another command was sent in between, there is none: `lost` counts those. The effects' memory
-    goes on by the commands sent, whatever is observed; it begins at rest. fault_jump: see `measurement_fault`. alpha, run_length: bars of
-    the notices. The rest is where an earlier one stood: see the three tests.
+    A transition is an observation, the one command that answered it, and the first observation that is one step later by the stamps, with a
+    campaign's tolerance (`comparison`). It is compared with a step of its own length. Where an observation is lost, stands at another
+    time, or another command was sent in between, there is none: `lost` counts those. The effects' memory goes on by the commands sent,
+    whatever is observed; it begins at rest. fault_jump: see `measurement_fault`. alpha, run_length: bars of the notices. rules: see
+    `Settings`. The rest is where an earlier one stood: see the three tests.
     """
 
     def __init__(
@@ -60,7 +66,10 @@ class Stream:
         counts: Sequence[int] = (),
         alpha: float = 0.01,
         run_length: float = 1e5,
+        rules: int = RULES,
     ) -> None:
+        self._on_grid = rules >= GRID
+        self._early, self._late = (EARLY, LATE if model.any_step else EARLY) if rules >= GRID else (EARLY_BEFORE, EARLY_BEFORE)
         self._model, self._radius, self._kind = model, gap.radius, gap.set
         self._weights, self._fault_jump = gap.weights, fault_jump
         self._dt_ns = model.dt * 1e9
@@ -76,6 +85,7 @@ class Stream:
         self._open: tuple[Observation, Send] | None = None
         self._last: Send | None = None
         self._clock_ns = 0.0  # on the robot's clock: up to where the memory has gone on
+        self._commands: deque[tuple[float, tuple[float, ...]]] = deque(maxlen=PAST_ROWS)
 
     def sent(self, send: Send) -> None:
         """The robot was told this."""
@@ -93,6 +103,7 @@ class Stream:
             self._clock_ns = float(seen.stamp_ns)
             self._open = (seen, send)
         self._last = send
+        self._commands.append((self._clock_ns, send.u))
 
     def observed(self, observation: Observation) -> Measured | None:
         """The robot was seen there; what that says about the transition that ended with it (t_ns: 0), if one did."""
@@ -108,24 +119,40 @@ class Stream:
             return None
         before, send = self._open
         periods = (observation.stamp_ns - before.stamp_ns) / self._dt_ns
-        if periods < 1.0 - STAMP_TOLERANCE:
+        if periods < 1.0 - self._early:
             return None  # observations come faster than commands
         self._open = None
-        if periods > 1.0 + STAMP_TOLERANCE:
+        if periods > 1.0 + self._late:
             self.lost += 1
             return None
-        return self._measured(observation, self._discrepancy(before, send, observation))
+        own = self._on_grid and self._model.any_step and abs(periods - 1.0) > EARLY
+        return self._measured(observation, self._discrepancy(before, send, observation, periods * self._model.dt if own else None))
 
-    def _discrepancy(self, before: Observation, send: Send, after: Observation) -> float:
+    def _discrepancy(self, before: Observation, send: Send, after: Observation, lasts: float | None) -> float:
+        """lasts: s, where that is not one step."""
         import numpy as np
 
         from s2r_runtime.gap import discrepancy
+        from s2r_runtime.prediction import acting
 
-        model = self._model
-        predicted, _ = model.step(np.array([before.x]), np.array([send.u]), self._hidden)
+        model, u = self._model, np.array([send.u])
+        if lasts is None:
+            predicted, _ = model.step(np.array([before.x]), u, self._hidden)
+        else:
+            mean, end = acting(model, [self._past(before.stamp_ns)], u, np.array([[lasts]]))
+            predicted = model.advance(np.array([before.x]), mean[:, 0], end[:, 0], np.array([lasts]))
         e = model.difference(np.array([after.x]), predicted)
         d = float(discrepancy(e, np.array(self._weights), self._kind)[0])
         return d if math.isfinite(d) else sys.float_info.max  # a model that breaks down is no reason to look away
+
+    def _past(self, until_ns: float) -> tuple[Array, Array]:
+        """The commands before that stamp: how long each lasted (k,) s, and which (k, nu)."""
+        import numpy as np
+
+        rows = [(begin, u) for begin, u in self._commands if begin < until_ns]
+        ends = [*(begin for begin, _ in rows[1:]), until_ns][: len(rows)]
+        lasts = np.array([max(0.0, end - begin) for (begin, _), end in zip(rows, ends, strict=True)]) * 1e-9
+        return lasts, np.array([u for _, u in rows]).reshape(len(rows), len(self._model.inputs))
 
     def _measured(self, observation: Observation, d: float) -> Measured:
         fault = measurement_fault(d, self._fault_jump)
