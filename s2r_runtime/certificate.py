@@ -89,11 +89,12 @@ def issue(
     assumption: str = "",
     traced_not_adopted: bool = False,
     trials: Trials | None = None,
+    period: str = "",
 ) -> Certificate:
     """Writes down what gap and verification show, if they show it. profile: with the model in force.
 
     lifetime_s: the profile's unless given. horizon: the task's, for the sentences. assumption: one the user made about independence.
-    trials: closed-loop runs, if there were any.
+    trials: closed-loop runs, if there were any. period: of each hold that gave the sample, where that is not what the profile says.
     Raises NotEnoughEvidence if the evidence doesn't carry a certificate, ConfigError if its parts don't belong together.
     """
     identity = controller.identity if isinstance(controller, ControllerFile) else controller
@@ -115,7 +116,17 @@ def issue(
         verified_hold_radius=verification.hold_radius,
         verification=verification,
         budget=budget,
-        shown=statements.shown(profile.robot.name, profile.model, profile.task.name, gap, verification, budget, assumption, trials),
+        shown=statements.shown(
+            profile.robot.name,
+            profile.model,
+            profile.task.name,
+            gap,
+            verification,
+            budget,
+            assumption,
+            trials,
+            period or profile.sampling.period,
+        ),
         not_shown=statements.not_shown(gap, verification, horizon, trials=trials is not None),
         issued_unix_s=issued_unix_s,
         expires_unix_s=issued_unix_s + lifetime,
@@ -175,9 +186,12 @@ def signer(data: bytes) -> bytes:
 
 
 def assumption_problem(certificate: Certificate, profile: Profile) -> str:
-    """Why this profile does not vouch for the assumption that the certificate's gap rests on, or empty. (Its key vouches for the rest.)"""
+    """Why this profile does not vouch for what the certificate's gap rests on, or empty. (Its key vouches for the rest.)"""
     rests = [line for line in certificate.shown if statements.ASSUMED in line]
     if not rests:
+        from_stops = any(statements.HELD["first"] in line for line in certificate.shown)
+        if from_stops and profile.sampling.period != "first":
+            return 'its gap was sampled from full stops, and the profile says sampling.period = "random"'
         return ""
     if profile.driving.block <= 0.0:
         return "its gap rests on an assumption about ordinary driving, and the profile makes none ([driving])"

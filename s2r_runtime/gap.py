@@ -82,6 +82,19 @@ class Transitions:
     notes: tuple[str, ...] = ()
     """What a person should know of how the recording was read, one line each."""
 
+    def chosen(self, index: NDArray[np.int64]) -> Transitions:
+        """Those of these numbers (m,); all else is as it was."""
+        return replace(
+            self,
+            x0=self.x0[index],
+            u=self.u[index],
+            x1=self.x1[index],
+            t0_s=self.t0_s[index],
+            held=None if self.held is None else self.held[index],
+            drive=None if self.drive is None else replace(self.drive, step=self.drive.step[index]),
+            holds=None if self.holds is None else self.holds.chosen(index),
+        )
+
 
 def discrepancy(e: Array, weights: Array, kind: Kind) -> Array:
     """(n,) weighted norms of e (n, nx); weights (nx,)."""
@@ -218,16 +231,11 @@ def blocked(tr: Transitions, seconds: float, dt: float) -> Transitions:
     apart = np.diff(tr.t0_s[first], prepend=-np.inf)
     first = first[apart >= seconds - 1.5 * dt]  # where a hole delayed the one of a block, the next block's may be too near
     return replace(
-        tr,
-        x0=tr.x0[first],
-        u=tr.u[first],
-        x1=tr.x1[first],
-        t0_s=tr.t0_s[first],
+        tr.chosen(first),
         independent=True,
         doubt="",
         assumption=f"transitions from different blocks of {seconds:g} s of this drive, one from each, are independent and of one law",
         rejected={**tr.rejected, "blocking": len(tr.x0) - len(first)},
-        drive=replace(tr.drive, step=tr.drive.step[first]),
     )
 
 
@@ -238,8 +246,8 @@ def doubted(gap: Gap, tr: Transitions) -> Transitions:
     return replace(tr, independent=False, doubt=f"the samples were not drawn independently: {gap.white_reason}")
 
 
-def statement(gap: Gap, independent: bool, *, assumption: str = "", doubt: str = "", states: tuple[str, ...] = ()) -> str:
-    """What G1 says of this gap, and no more."""
+def statement(gap: Gap, independent: bool, *, assumption: str = "", doubt: str = "", states: tuple[str, ...] = (), law: str = "") -> str:
+    """What G1 says of this gap, and no more. law: which period of a hold gave each sample, if that is known."""
     rank = "largest" if gap.discarded == 0 else f"largest but {gap.discarded}"
     if not independent:
         why = doubt or "the transitions were not drawn independently"
@@ -259,6 +267,8 @@ def statement(gap: Gap, independent: bool, *, assumption: str = "", doubt: str =
         f"{gap.n} independent transitions, {gap.discarded} discarded, both fixed beforehand; for r alone the confidence is "
         f"{_percent(1.0 - scenario_confidence(gap.n, gap.discarded, gap.epsilon))}."
     )
+    if law:
+        lines.append(f"Each is {'one period drawn uniformly from' if law == 'random' else 'the first period of'} a held input.")
     if assumption:
         lines.append(f"This rests on an assumption that the user made: {assumption}.")
     if DEPENDENT in gap.white_reason:
@@ -275,6 +285,7 @@ def noise_share(noise: float, radius: float) -> str:
 
 def gap_json(gap: Gap, tr: Transitions, states: tuple[str, ...]) -> dict[str, Any]:
     """What `s2r gap --json` prints (docs/json.md)."""
+    law = tr.holds.law if tr.holds is not None else ""
     return {
         "radius": gap.radius,
         "radius_literal": gap.radius_literal,
@@ -300,7 +311,8 @@ def gap_json(gap: Gap, tr: Transitions, states: tuple[str, ...]) -> dict[str, An
         "notes": list(tr.notes),
         "model_digest": gap.model_digest,
         "transitions_digest": gap.transitions_digest,
-        "statement": statement(gap, tr.independent, assumption=tr.assumption, doubt=tr.doubt, states=states),
+        "period": law,
+        "statement": statement(gap, tr.independent, assumption=tr.assumption, doubt=tr.doubt, states=states, law=law),
     }
 
 

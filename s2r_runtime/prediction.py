@@ -43,6 +43,11 @@ class Holds:
     past: tuple[tuple[Array, Array], ...]
     law: str
 
+    def chosen(self, index: NDArray[np.int64]) -> Holds:
+        """Those of these numbers (m,)."""
+        past = tuple(self.past[i] for i in index)
+        return Holds(self.lasts[index], self.elapsed[index], self.start[index], self.ends[index], past, self.law)
+
 
 def residuals(model: ComposedModel, transitions: Transitions) -> Array:
     """(n, nx) e = x1 (-) f(x0, u). Samples without their past begin at rest; in a drive, memory is carried from its beginning.

@@ -13,6 +13,11 @@ from s2r_runtime.messages import Gap, LawResult, Trials, Verification
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Driving
 
+HELD = {
+    "first": "each after a random waypoint and a full stop",
+    "random": "each one period drawn uniformly from a hold that began after a random waypoint and a full stop",
+}
+"""What is said of the period of a hold that gives the sample."""
 ASSUMED = "rests on an assumption that the user made"
 
 
@@ -25,13 +30,15 @@ def shown(
     budget: float,
     assumption: str = "",
     trials: Trials | None = None,
+    period: str = "first",
 ) -> tuple[str, ...]:
-    """The statements G1 to G4 and G8 of this evidence. budget: beta of the robot's life. assumption: one that the user made.
+    """The statements G1 to G4 and G8 of this evidence. budget: beta of the robot's life. assumption: one that the user made. period: of each
+    hold that gave the sample (`sampling.period`).
 
     Whether the numbers carry them is for `certificate.issue` to check.
     """
     return (
-        *_gap(robot, model, gap, assumption),
+        *_gap(robot, model, gap, assumption, period),
         *_controller(task, gap, verification),
         (
             f"Together (G3). The gap's statement and a failure probability of at most {bound(verification.epsilon)} under every required "
@@ -116,7 +123,7 @@ def not_shown(gap: Gap, verification: Verification, horizon: int = 0, *, trials:
     )
 
 
-def _gap(robot: str, model: ModelSpec, gap: Gap, assumption: str) -> tuple[str, ...]:
+def _gap(robot: str, model: ModelSpec, gap: Gap, assumption: str, period: str) -> tuple[str, ...]:
     effects = "".join(f" + {effect.name}({effect.channel})" for effect in model.effects)
     norm = f"{gap.set}, weights {', '.join(f'{w:g}' for w in gap.weights)}"
     hold = ""
@@ -126,11 +133,7 @@ def _gap(robot: str, model: ModelSpec, gap: Gap, assumption: str) -> tuple[str, 
             f"{bound(gap.epsilon)} (r and r_h each took half of beta = {bound(gap.beta)})"
         )
     noise = f"; noise alone would make about {min(gap.radius_noise, gap.radius):.2g} of r" if gap.radius_noise is not None else ""
-    basis = (
-        f"{ASSUMED}: {assumption}"
-        if assumption
-        else "were drawn independently, one from each held input (G7), each after a random waypoint and a full stop"
-    )
+    basis = f"{ASSUMED}: {assumption}" if assumption else f"were drawn independently, one from each held input (G7), {HELD[period]}"
     whether = "they" if not assumption else "their independence"
     law = "the campaign's law" if not assumption else "the law of that driving"
     return (

@@ -32,7 +32,7 @@ from s2r_runtime.daemon import jobs, trace_job
 from s2r_runtime.daemon.excitation import Excitation
 from s2r_runtime.daemon.given_inputs import parse_inputs
 from s2r_runtime.daemon.model_store import parse_model
-from s2r_runtime.daemon.settings import ModelFacts, settings_of
+from s2r_runtime.daemon.settings import facts_of, settings_of
 from s2r_runtime.daemon.worker import GapJob, TraceJob
 from s2r_runtime.headroom import grid
 from s2r_runtime.hookspecs import Offer, hookimpl
@@ -180,7 +180,7 @@ class Bench:
         self.controller = load(folder / "controller.py")
         self.profile = parse_profile(PROFILE, "profile.toml", folder)
         self.model = compose(self.profile.model)
-        facts = ModelFacts(self.model.states, self.model.inputs, tuple(self.model.nominal.angles))
+        facts = facts_of(self.model)
         self.settings = settings_of(self.profile, self.profile.model, facts)
         self.lie, self.lie_at = lie, -1
         self.items: list[Any] = [
@@ -375,7 +375,7 @@ class Bench:
             case m.ModelAdopted():
                 self.profile = msgspec.structs.replace(self.profile, model=self.models[output.digest])
                 self.model = compose(self.profile.model)
-                facts = ModelFacts(self.model.states, self.model.inputs, tuple(self.model.nominal.angles))
+                facts = facts_of(self.model)
                 self.settings = settings_of(self.profile, self.profile.model, facts)
             case m.StopCampaign() if self.campaign is not None:
                 assert self.order is not None

@@ -120,7 +120,7 @@ def test_driving_founds_a_gap_only_where_the_profile_vouches_for_blocks(tmp_path
     with pytest.raises(NotEnoughEvidence, match=r"unless the profile vouches for blocks of it: \[driving\]"):
         gap_of(table, model, plain, beta=share)
     vouching = msgspec.structs.replace(plain, driving=Driving(block=1.0, mixing=1e-9, because=BECAUSE))
-    gap, assumption = gap_of(table, model, vouching, beta=share)
+    gap, assumption, _ = gap_of(table, model, vouching, beta=share)
     assert (gap.n, gap.hold_periods, gap.beta) == (n, 1, share)
     assert gap.radius > 0.0
     assert "different blocks of 1 s" in assumption

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from s2r_runtime.bounds import clopper_pearson_upper, sample_size
 from s2r_runtime.core import reducer as core
 from s2r_runtime.core.state import State, certificate, usable_gap
-from s2r_runtime.daemon.settings import ModelFacts, settings_of
+from s2r_runtime.daemon.settings import facts_of, settings_of
 from s2r_runtime.errors import NotEnoughEvidence
 from s2r_runtime.gap import Transitions, estimate_gap
 from s2r_runtime.headroom import grid, search
@@ -83,7 +83,7 @@ def profile_and_settings() -> tuple[Profile, ComposedModel, Settings]:
     """Of the robot of all missions."""
     profile = parse_profile(PROFILE, "mission.toml", Path())
     model = compose(ModelSpec("unicycle", profile.model.dt))
-    return profile, model, settings_of(profile, profile.model, ModelFacts(model.states, model.inputs, tuple(model.nominal.angles)))
+    return profile, model, settings_of(profile, profile.model, facts_of(model))
 
 
 @dataclass

@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     trials = trials_of(args.trials, controller, model, profile) if args.trials else None
     ledger, beta = offline_ledger.open_ledger(key_path, profile.robot.name), profile.guarantee.beta
     epoch = ledger.epoch_for(recording, model.spec.digest(), profile.digest())
-    gap, assumption = gap_of(args.recording, model, profile, beta=epoch_beta(beta, epoch), epoch=epoch, max_gb=args.max_gb)
+    gap, assumption, period = gap_of(args.recording, model, profile, beta=epoch_beta(beta, epoch), epoch=epoch, max_gb=args.max_gb)
     attempt = ledger.spend_attempt(controller.digest)
     result = run_verification(
         controller,
@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
     trouble = ""
     if result.passed:
         try:
-            _write(args.output, profile, model, controller, gap, result, trials, assumption, key)
+            _write(args.output, profile, model, controller, gap, result, trials, assumption, period, key)
         except UsageError as error:  # the attempt is spent: what it showed is told all the same
             trouble = str(error)
     _tell(args, gap, trials, result, epoch, ledger.spent(beta), beta, written=result.passed and not trouble)
@@ -102,6 +102,7 @@ def _write(
     result: Verification,
     trials: Trials | None,
     assumption: str,
+    period: str,
     key: Ed25519PrivateKey,
 ) -> None:
     """The certificate, signed."""
@@ -119,6 +120,7 @@ def _write(
         horizon=task.horizon,
         trials=trials,
         assumption=assumption,
+        period=period,
     )
     try:
         persistence.replace(path, certificate.sign(issued, key))

@@ -208,9 +208,10 @@ def profile_model(args: argparse.Namespace, profile: Profile) -> ComposedModel:
 
 def gap_of(
     recording: Path, model: ComposedModel, profile: Profile, *, beta: float | None = None, epoch: int = 1, max_gb: float | None = None
-) -> tuple[Gap, str]:
-    """The gap that a campaign shows under the profile's settings, or driving that the profile vouches for, with the assumption that it
-    then rests on. beta: the epoch's share; without one the gap founds no certificate. Raises NotEnoughEvidence if it carries no statement.
+) -> tuple[Gap, str, str]:
+    """The gap that a campaign shows under the profile's settings, or driving that the profile vouches for; the assumption that it rests on;
+    and which period of each hold gave the sample. beta: the epoch's share; without one the gap founds no certificate. Raises
+    NotEnoughEvidence if it carries no statement.
     """
     from s2r_runtime import gap as gaps
     from s2r_runtime.table_text import limits_of
@@ -241,7 +242,7 @@ def gap_of(
     )
     if beta is not None and gaps.doubted(gap, found) is not found:
         raise NotEnoughEvidence(f"{recording}: {gaps.doubted(gap, found).doubt}; its gap carries no statement")
-    return gap, found.assumption
+    return gap, found.assumption, "first" if found.holds is None else found.holds.law
 
 
 def run_verification(

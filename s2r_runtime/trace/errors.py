@@ -293,8 +293,7 @@ def _campaign(model: ComposedModel, given: Held) -> Transitions | None:
     inside = np.abs(apart) < 0.5 * given.data.dt
     if found.drive is not None or np.count_nonzero(inside) < 2:
         return None
-    keep = found.held[inside] if found.held is not None else None
-    return replace(found, x0=found.x0[inside], u=found.u[inside], x1=found.x1[inside], t0_s=found.t0_s[inside], held=keep)
+    return found.chosen(np.flatnonzero(inside))
 
 
 def _in_file(model: ComposedModel, paths: tuple[Path, ...]) -> Transitions | None:
