@@ -100,6 +100,7 @@ def acting(model: ComposedModel, past: Sequence[tuple[Array, Array]], u: Array, 
     parts, count = model.substeps, steps.shape[1]
     inputs, lasts, starts = [], [], []
     for (before, commands), held, own in zip(past, u, steps, strict=True):
+        before, commands = before[before > 0.0], commands[before > 0.0]  # a command that another one replaced at once never acted
         pieces = np.maximum(1, np.rint(before / model.dt).astype(np.int64)) * parts
         rows = np.concatenate([np.repeat(before / pieces, pieces), np.repeat(own / parts, parts)])
         inputs.append(np.concatenate([np.repeat(commands, pieces, axis=0), np.tile(held, (count * parts, 1))]))

@@ -32,8 +32,8 @@ def shown(
     trials: Trials | None = None,
     period: str = "first",
 ) -> tuple[str, ...]:
-    """The statements G1 to G4 and G8 of this evidence. budget: beta of the robot's life. assumption: one that the user made. period: of each
-    hold that gave the sample (`sampling.period`).
+    """The statements G1 to G4 and G8 of this evidence. budget: beta of the robot's life. assumption: one that the user made.
+    period: of each hold that gave the sample (`sampling.period`).
 
     Whether the numbers carry them is for `certificate.issue` to check.
     """

@@ -148,7 +148,7 @@ CORES: dict[str, Lie] = {  # the module and function that the liar replaces, by 
     "the gate opens although a stop latches": (gate, "_about_controller", nothing, stopped, "no_controller"),
     "the sampler drives without a permit": (gate, "_about_sampler", nothing, unpermitted, '"source":"recovery"'),
     "a watch alarm goes unheeded": (gaps, "_alarm", nothing, runaway, "alarm_raised"),
-    "a growing gap goes unheeded": (gaps, "measured", nothing, runaway, "radius_grew"),
+    "a growing gap goes unheeded": (gaps, "measured", nothing, runaway, "radius_above_verified"),  # it grows beyond that at once
     "more of beta is spent than there is": (ledger, "share", lambda beta, number: beta / (3.0 * number) ** 2, sampled, '"attempts":0'),
     "the seed of the scenarios is chosen": (ledger, "seed", lambda *parts: 4711 + len(parts), whole, "start_campaign"),
     "less headroom is verified than was ordered": (certificates, "_radii", narrow, whole, "attempt_spent"),

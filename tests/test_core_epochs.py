@@ -66,7 +66,7 @@ def dependent(rig: Rig) -> None:
     rig.feed(CampaignFinished(rig.t, order.epoch, order.n, complete=True, rejected={}))
     found = msgspec.structs.replace(GAP, epoch=order.epoch, n=order.n, white=False, white_reason=f"{SERIAL} (p = 0.0005)")
     answer = one(rig.finish_gap(found), Answer)
-    assert (answer.exit_code, "find out what drifts" in answer.text) == (3, True)
+    assert (answer.exit_code, "repeating is right" in answer.text) == (3, True)
 
 
 def deploy(rig: Rig, digest: str, *, passed: bool) -> None:

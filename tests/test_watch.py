@@ -251,6 +251,24 @@ def test_a_longer_transition_is_compared_with_a_step_of_its_own_length_and_the_m
     assert max(found) < 1e-9  # stamps are rounded to a nanosecond
 
 
+def test_a_command_that_another_one_replaced_at_once_leaves_no_trace_in_a_longer_transition() -> None:
+    model = compose(ModelSpec("unicycle", 0.033, effects=(EffectSpec("input_lag", "v", {"time_constant": 0.066}),)))
+    found = []
+    for twice in (False, True):
+        stream = Stream(model, gap(0.01, model))
+        stream.observed(Observation(0, 0, (0.0, 0.0, 0.0)))
+        if twice:
+            stream.sent(Send(0, 7, "recovery", (0.2, 0.0), 0, DT_NS))
+        stream.sent(Send(0, 8, "controller", (0.1, 0.0), 0, DT_NS))
+        stream.observed(Observation(1, DT_NS, (0.001, 0.0, 0.0)))
+        stream.sent(Send(DT_NS, 9, "controller", (0.1, 0.0), 1, DT_NS))
+        measured = stream.observed(Observation(2, round(2.1 * DT_NS), (0.003, 0.0, 0.0)))
+        assert measured is not None
+        found.append(measured.discrepancy)
+    assert math.isfinite(found[1])
+    assert found[0] == pytest.approx(found[1], abs=1e-12)
+
+
 def test_under_the_rules_of_before_a_transition_may_be_a_fifth_short() -> None:
     model = compose(ModelSpec("unicycle", 0.033))
     stream = Stream(model, gap(0.01, model), rules=0)
