@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -149,13 +150,12 @@ def walked(robot: Walker, profile: Profile, n: int, seed: int, told: Callable[[i
 
 
 def campaign_of(profile: Profile, n: int, seed: int) -> Campaign:
-    """The campaign that the daemon would make of this profile."""
+    """The paper's campaign under this profile: each sample is the first period of a hold."""
     states = ("x", "y", "theta")
     region, fence = (tuple(table.get(name, WHOLE_TURN) for name in states) for table in (profile.region, profile.geofence))
     bounds = tuple(profile.inputs[name] for name in ("v", "w"))
-    return Campaign(
-        profile.model.name, states, ("theta",), region, fence, bounds, profile.model.dt, profile.sampling, n=n, epoch=1, seed=seed
-    )
+    sampling = msgspec.structs.replace(profile.sampling, period="first")
+    return Campaign(profile.model.name, states, ("theta",), region, fence, bounds, profile.model.dt, sampling, n=n, epoch=1, seed=seed)
 
 
 def stops(robot: Walker, n: int, seed: int, profile: Profile) -> list[Any]:
