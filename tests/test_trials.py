@@ -43,7 +43,10 @@ start = { theta = { normal = [0.0, 0.1] } }
 def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
     """Six scenarios of a controller that turns on the spot: half a turn in all, through headings that it was never verified at."""
     rig = Rig(tmp_path_factory.mktemp("trials"))
-    rig.profile.write_text(rig.profile.read_text().replace('name = "grid_world"\n', TASK))
+    text = rig.profile.read_text().replace('name = "grid_world"\n', TASK)
+    rig.profile.write_text(
+        text.replace("hold_periods = 5\n", "hold_periods = 5\nn = 40\n")
+    )  # eight bound little, and the watch would see that
     try:
         rig.start_robot()
         rig.start()
