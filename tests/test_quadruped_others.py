@@ -77,7 +77,7 @@ def test_one_that_fell_and_says_nothing_of_it_ends_the_campaign_in_minutes(profi
 def test_a_campaign_whose_robot_went_away_is_kept_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     now, ended = [1000.0], []
     monkeypatch.setattr(campaign_run, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    script = campaign_run._Script(0, 60.0, None)
+    script = campaign_run._Script(0, 60.0, None, None, "")
     daemon: Any = SimpleNamespace(
         state=SimpleNamespace(link_up=True, observation=object()),
         desk=SimpleNamespace(request=lambda *_, **__: 7, answers={}),
