@@ -57,7 +57,7 @@ def test_it_is_sampled_whatever_its_habits(profile: Profile, habits: dict[str, f
     step, progress, _ = sampled(profile, **habits)
     assert step.done
     assert progress.taken == 6
-    assert progress.rejected == {}
+    assert progress.rejected.keys() <= ({"off_step"} if "jitter" in habits else set())  # holds whose end was no whole step away
 
 
 @PROFILES
