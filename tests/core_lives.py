@@ -22,9 +22,9 @@ FILE = Path(__file__).parent / "replay" / "core_lives.msgpack.gz"
 WALKS, STEPS = 12, 420
 CASES = 260
 """Random walks and their steps, and seeded cases of faults: enough that every line of the core is run many times over."""
-LATER_MEMORY = ("refused_campaign",)
+LATER_MEMORY = ("refused_campaign", "driven")
 """Fields of the memory that came after the lives were recorded: at their defaults they say nothing else than before."""
-LATER_STATUS = ("refused_campaign", "next_campaign", "next_attempt")
+LATER_STATUS = ("refused_campaign", "next_campaign", "next_attempt", "driven")
 
 
 class Life(msgspec.Struct, frozen=True):

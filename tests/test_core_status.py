@@ -27,6 +27,7 @@ NOTHING: dict[str, Any] = {
     "headroom_used": None,
     "samples_to_certificate": None,
     "stream": None,
+    "driven": None,
     "e_value": 1.0,
     "alarm": False,
     "epoch": 0,

@@ -249,11 +249,19 @@ def run_status(args: argparse.Namespace) -> int:
     output.out(f"gate        {output.styled(gate, 'green' if gate == 'open' else 'yellow')}  ({data.pop('reason', '')})")
     if data.get("radius") and data.get("verified_radius"):
         output.out(f"covered     gap {data['radius']:.4g}, certified to {data['verified_radius']:.4g}")
+    if driven := data.pop("driven", None):
+        output.out(f"driving/gap {_ratio(driven)}")
     if line := _budget(data):
         output.out(f"budget      {line}")
     for key, value in data.items():
         output.out(f"{key.replace('_', ' '):11s} {_plain(value)}")
     return int(answer["exit_code"])
+
+
+def _ratio(driven: dict[str, Any]) -> str:
+    """The driving quantile over the gap in force, as an interval, and which driving showed it."""
+    low, high = ("-" if driven[key] is None else f"{driven[key]:.3g}" for key in ("ratio_lower", "ratio_upper"))
+    return f"{low} to {high} (epoch {driven['epoch']}, {driven['n']} steps)"
 
 
 def _budget(data: dict[str, Any]) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import msgspec
 
 from s2r_runtime import gate
-from s2r_runtime.core import ledger, stream
+from s2r_runtime.core import driven, ledger, stream
 from s2r_runtime.core.certificates import ROUNDING, facts_problem, install, reverify_if_due, revoke
 from s2r_runtime.core.drive import latch, recover_now, regate
 from s2r_runtime.core.sources import end_deployment
@@ -182,11 +182,11 @@ def _enforce(turn: Turn, gap: Gap) -> None:
     before = turn.memory.gap
     if before is not None and (usable_gap(turn.state) is None or turn.memory.radius > before.radius):
         _distrust(turn, before)
+    _watch_anew(turn)
     epochs = max(turn.memory.epochs, gap.epoch)
     turn.remember(
         gap=gap, radius=gap.radius, epochs=epochs, alarm_epoch=0, campaign_digest=turn.settings.campaign_digest, refused_campaign=None
     )
-    _watch_anew(turn)
     revoke(turn, old, "new_epoch")
     turn.persist()
     turn.emit(EpochChanged(turn.now, gap.epoch, ledger.share(turn.settings.beta, gap.epoch), gap))
@@ -201,12 +201,15 @@ def _distrust(turn: Turn, gap: Gap) -> None:
 def void_gap(turn: Turn, reason: str) -> None:
     """No gap any more, nor an unfinished campaign; certificates end with it. Counters stay: what is spent is spent."""
     old = [facts.id for facts in turn.memory.certificates]
-    turn.remember(gap=None, radius=0.0, campaign_epoch=0, campaign_n=0, alarm_epoch=0, traced=False, refused_campaign=None)
     _watch_anew(turn)
+    turn.remember(gap=None, radius=0.0, campaign_epoch=0, campaign_n=0, alarm_epoch=0, traced=False, refused_campaign=None)
     revoke(turn, old, reason)
 
 
 def _watch_anew(turn: Turn) -> None:
+    """The gap in force ends, and its watch with it. What that showed of driving is kept."""
+    if turn.settings.rules >= 3:
+        turn.remember(driven=driven.kept(turn.memory, turn.settings.alpha))
     turn.remember(watch_n=0, watch_exceedances=0, watch_e_value=1.0, watch_change=0.0, watch_exchange=1.0, watch_counts=())
 
 

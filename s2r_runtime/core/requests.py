@@ -11,7 +11,7 @@ import math
 import msgspec
 
 from s2r_runtime import gate
-from s2r_runtime.core import faults
+from s2r_runtime.core import driven, faults
 from s2r_runtime.core.certificates import begin_verification, refusal_to_verify, revoke, start_controller, valid_certificate
 from s2r_runtime.core.drive import recover_now, regate
 from s2r_runtime.core.excitation import begin_inputs
@@ -86,6 +86,8 @@ def _deploy(turn: Turn, request: Requested) -> None:
         turn.answer(request.request_id, 1, f"refused: {_hinted(turn, stopped)}")
     elif state.campaign is not None or job(state, "gap") is not None:
         turn.answer(request.request_id, 1, "refused: a campaign is under way")
+    elif exceeded := driven.refusal(turn.memory, turn.settings):
+        turn.answer(request.request_id, 1, f"refused: {exceeded}")
     elif (facts := valid_certificate(turn, digest)) is not None:
         start_controller(turn, Deployment(digest, request.request_id, "starting"), facts)
     elif refusal := refusal_to_verify(turn):
@@ -128,6 +130,11 @@ def _revoke(turn: Turn, request: Requested) -> None:
 
 def _clear(turn: Turn, request: Requested) -> None:
     reason, latched = request.text.removeprefix("latched:"), turn.memory.latched
+    if reason == driven.REASON and turn.memory.driven is not None:
+        turn.remember(driven=None)
+        turn.persist()
+        turn.answer(request.request_id, 0, "what earlier driving showed is forgotten; the watch goes on")
+        return
     if reason not in latched:
         held = f"latched: {', '.join(latched)}" if latched else "nothing is latched"
         turn.answer(request.request_id, 2, f"{reason or 'no reason'} is not latched; {held}")

@@ -7,7 +7,7 @@ import math
 import msgspec
 
 from s2r_runtime import gate
-from s2r_runtime.core import ledger, stream
+from s2r_runtime.core import driven, ledger, stream
 from s2r_runtime.core.state import NANO, State, certificate, situation, unix_now, usable_gap
 from s2r_runtime.messages import Decided, Memory, Output, Settings
 
@@ -31,6 +31,7 @@ def status(state: State) -> dict[str, object]:
         "headroom_used": None if facts is None else _ratio(memory.radius, facts.verified_radius),
         "samples_to_certificate": samples_to_certificate(state),
         "stream": _stream(state),
+        "driven": driven.status(memory, settings),
         "e_value": state.e_value,
         "alarm": memory.gap is not None and memory.gap.epoch == memory.alarm_epoch,
         "epoch": memory.epochs,

@@ -60,6 +60,20 @@ def quantile(counts: tuple[int, ...], radius: float, epsilon: float, alpha: floa
     return found
 
 
+def quantile_lower(counts: tuple[int, ...], radius: float, epsilon: float, alpha: float) -> float | None:
+    """The largest edge that the (1-epsilon)-quantile was above at some step, with confidence 1-alpha at all times; None: none yet.
+
+    The mirror of `quantile`: P(d > x | past) <= epsilon at every step is P(d <= x | past) >= 1-epsilon, which few d <= x refute.
+    """
+    n, below, found = sum(counts), 0, None
+    for edge, count in zip(EDGES, counts, strict=False):
+        below += count
+        if not refuted(below, n, 1.0 - epsilon, alpha):
+            break
+        found = edge * radius
+    return found
+
+
 def refuted(exceedances: int, n: int, p: float, alpha: float) -> bool:
     """Whether so few of n refute, at 1/alpha, that an exceedance is always at least as probable as p: `bounds.anytime_evidence`."""
     if n == 0 or exceedances + 1 > (n + 1) * p:

@@ -77,8 +77,10 @@ GRID = 2
 """Since these rules control instants stand on the model's grid, and transitions are compared with a step of their own length. Before, an
 instant came 0.9 dt after the last one, and a transition could be 0.2 dt off a step.
 """
-RULES = 2
-"""1: a campaign that is refused for dependent samples is remembered, and can be traced and repeated. 2: `GRID`."""
+RULES = 3
+"""1: a campaign that is refused for dependent samples is remembered, and can be traced and repeated. 2: `GRID`. 3: what driving showed is
+kept over epochs (`Driven`).
+"""
 MEMORY_SCHEMA = 1
 """Of `Memory`: a memory of another schema is refused."""
 
@@ -120,6 +122,22 @@ class RefusedCampaign(Struct, frozen=True):
     in_a_row: int = 1
 
 
+class Driven(Struct, frozen=True):
+    """What the watch of an epoch showed of the discrepancy while driving, in its model and norm (`core.driven`).
+
+    lower, upper: limits of its (1-epsilon)-quantile at all times at once, each with confidence 1-alpha; None: none yet. n: steps.
+    """
+
+    model_digest: str
+    set: Literal["ball", "box"]
+    weights: tuple[float, ...]
+    epsilon: float
+    epoch: int
+    n: int
+    lower: float | None
+    upper: float | None
+
+
 class Memory(Struct, frozen=True):
     """What outlives a restart: counters, the gap in force, the grown radius, certificates and revocations."""
 
@@ -157,3 +175,5 @@ class Memory(Struct, frozen=True):
     """Digests of the transitions whose gaps ended refuted or outgrown: they found no later epoch."""
     refused_campaign: RefusedCampaign | None = None
     """The newest campaign, if its samples depend on each other; None as soon as a later one found a gap."""
+    driven: Driven | None = None
+    """What driving showed in the epochs before this one, where it was worst."""
