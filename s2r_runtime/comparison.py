@@ -41,7 +41,7 @@ import msgspec
 from s2r_runtime import goto
 from s2r_runtime.canonical import digest_of
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.messages import GRID, RULES, Observation, SampleTaken, Settings
+from s2r_runtime.messages import GRID, RESTARTS, RULES, Observation, SampleTaken, Settings
 from s2r_runtime.profile import Sampling, plain_table
 
 Bounds = tuple[tuple[float, float], ...]
@@ -127,7 +127,7 @@ class Campaign:
         rules: int = RULES,
         any_step: bool = False,
     ) -> None:
-        self._on_grid = rules >= GRID
+        self._on_grid, self._notes_restarts = rules >= GRID, rules >= RESTARTS
         self._early, self._late = (EARLY, LATE if any_step else EARLY) if rules >= GRID else (EARLY_BEFORE, EARLY_BEFORE)
         self._off = "off_step" if rules >= GRID else "lost_observation"
         self._random = rules >= GRID and settings.period == "random"
@@ -147,7 +147,7 @@ class Campaign:
         self.digest = digest_of([*law, rules, any_step] if rules >= GRID else law)
         self._index = self._run = self._try = 0
         self._rejected: dict[str, int] = {}
-        self._elapsed_ns, self._last_ns = 0, -1
+        self._elapsed_ns, self._last_ns, self._last_seq = 0, -1, -1
         self._failed = ""
         self._refused, self._refusals, self._motionless = False, 0, 0
         self._held_u = self._zero
@@ -194,7 +194,7 @@ class Campaign:
         if state.digest != self.digest:
             raise ConfigError("campaign snapshot: is of a campaign with other settings; begin a new one")
         self._index, self._run, self._rejected, self._elapsed_ns = state.index, state.run + 1, dict(state.rejected), state.elapsed_ns
-        self._last_ns, self._try, self._failed, self._refusals, self._motionless = -1, 0, "", 0, 0
+        self._last_ns, self._last_seq, self._try, self._failed, self._refusals, self._motionless = -1, -1, 0, "", 0, 0
         self._begin_try()
 
     def progress(self) -> Progress:
@@ -209,6 +209,9 @@ class Campaign:
         if self._failed or self._index >= self._n:
             return self._over()
         now = observation.stamp_ns
+        if observation.seq < self._last_seq:
+            self.restarted()
+        self._last_seq = observation.seq
         if self._last_ns < 0:
             self._last_ns = self._began_ns = now
         if now < self._last_ns or now - self._last_ns > self._pause_ns:
@@ -232,6 +235,15 @@ class Campaign:
         if not self._commands or self._commands[-1][1] != step.u:
             self._commands.append((now_ns, step.u))
         return step
+
+    def restarted(self) -> None:
+        """The robot started anew, or the link to it was lost or found: no sample spans that, and no command from before is its past."""
+        if not self._notes_restarts or self._failed or self._index >= self._n:
+            return
+        if self._phase == "hold":
+            self._reject("interrupted")
+        self._commands.clear()
+        self._mark, self._last_ns = None, -1  # a stop begins anew
 
     def refused(self, obs_seq: int, reason: str) -> None:
         """The gate refused the answer to that observation: another input acted, so the sample under way is lost.

@@ -31,7 +31,7 @@ from s2r_runtime.errors import RecordingError, UsageError
 from s2r_runtime.formats.mapping import Recorded
 from s2r_runtime.formats.routes import read_recording
 from s2r_runtime.gap import Transitions
-from s2r_runtime.messages import CampaignFinished, Observed, SampleTaken, Send, Started
+from s2r_runtime.messages import CampaignFinished, LinkChanged, Observed, SampleTaken, Send, Started
 from s2r_runtime.models.bound import wrap
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.prediction import Holds
@@ -47,7 +47,7 @@ Array = NDArray[np.float64]
 MAX_VALUES = 12_100_000
 """Numbers of a table that are used, 97 MB: two million rows of a planar robot. All that is computed from them takes four times as much."""
 
-CHANNELS = ("event/started", "event/observed", "event/sample_taken", "event/campaign_finished", "out/send")
+CHANNELS = ("event/started", "event/link_changed", "event/observed", "event/sample_taken", "event/campaign_finished", "out/send")
 
 
 class _Read(NamedTuple):
@@ -374,8 +374,8 @@ def _standing_noise(samples: Sequence[SampleTaken]) -> Array | None:
 class _Log:
     """What a log holds of states, inputs and samples (by epoch and index), in its order.
 
-    rows: a list a stretch (a new one wherever the robot's clock went back: it was restarted) of (stamp s, x or (), u or ()). identity: of
-    the run, which a model remembers that was fitted on its driving (guarantee G6).
+    rows: a list a stretch (a new one wherever the robot's clock went back or its link changed: it may have been restarted) of (stamp s,
+    x or (), u or ()). identity: of the run, which a model remembers that was fitted on its driving (guarantee G6).
     """
 
     samples: dict[int, dict[int, SampleTaken]]
@@ -407,6 +407,9 @@ def _read_log(path: Path, model: ComposedModel) -> _Log:
         match entry.message:
             case Started() as started:
                 _check_robot(path, model, started)
+            case LinkChanged():
+                seen.clear()
+                log.rows.append([])
             case Observed(t_ns, observation) if not observation.fault:
                 if seen and observation.stamp_ns < next(iter(seen.values()))[1]:
                     log.rows.append([])

@@ -310,6 +310,9 @@ class Bench:
         while self.queue:
             event = msgspec.structs.replace(self.queue.popleft(), t_ns=self.t_ns)
             self.items.append(event)
+            if isinstance(event, m.LinkChanged):
+                for one in filter(None, (self.stream, self.campaign)):
+                    one.restarted()
             self.state, outputs = core.handle(self.state, event)
             self.reason = against_sampler(self.state, outputs)
             outputs = self._decided(outputs)

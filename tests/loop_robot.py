@@ -107,6 +107,8 @@ class LoopTransport:
                 return found
             if "command" in plain:
                 return [*found, Command(self._counters["received"], frame.arrival_ns, "external", tuple(plain["command"]), 0, 10**9)]
+            if plain.get("anew"):
+                found += [LinkChanged(frame.arrival_ns, up=up, detail="the robot started anew") for up in (False, True)]
             if plain.get("estop"):
                 return [*found, OverrideChanged(frame.arrival_ns, "emergency_stop", "button")]
             x = tuple(float(v) for v in plain["x"])
@@ -172,7 +174,7 @@ class Robot:
     def __init__(self, folder: Path, args: argparse.Namespace) -> None:
         self.folder, self.dt, self.gain, self.args = folder, args.dt, args.gain, args
         self.x, self.acting = [0.0, 0.0, 0.0], (0.0, 0.0)
-        self.seq = self.stamp_ns = 0
+        self.seq, self.stamp_ns = args.since, round(args.since * args.dt * 1e9)
         self.random = random.Random(args.seed)
         self.measured = (-1, b"")
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -185,7 +187,8 @@ class Robot:
         if self.seq != self.measured[0]:
             x = [v + self.random.gauss(0.0, 1e-4) for v in self.x]
             x[2] = math.remainder(x[2], 2.0 * math.pi)
-            self.measured = (self.seq, json.dumps({"seq": self.seq, "stamp_ns": self.stamp_ns, "x": x}).encode())
+            plain = {"seq": self.seq, "stamp_ns": self.stamp_ns, "x": x, "anew": self.seq == self.args.since > 0}
+            self.measured = (self.seq, json.dumps(plain).encode())
         with contextlib.suppress(OSError):
             self.socket.sendto(self.measured[1], str(self.folder / DAEMON))
 
@@ -236,6 +239,7 @@ def main() -> int:
     robot.add_argument("--dt", type=float, default=0.033)
     robot.add_argument("--gain", type=float, default=1.0)
     robot.add_argument("--seed", type=int, default=1)
+    robot.add_argument("--since", type=int, default=0, help="it was restarted: its numbers and stamps go on from this period")
     robot.add_argument("--sway", type=float, default=0.0, help="its speed is wrong by this share for half of the time")
     for name in ("daemon", "campaign"):
         daemon = which.add_parser(name)

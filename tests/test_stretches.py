@@ -5,6 +5,8 @@ from __future__ import annotations
 import random
 from typing import Any
 
+from core_rig import SETTINGS
+
 from s2r_runtime import messages as m
 from s2r_runtime.recording.stretches import BEFORE_NS, Cut, Stretches, log_identity
 
@@ -168,3 +170,17 @@ def test_many_rows_cost_little_memory_and_time() -> None:
 def test_a_log_is_known_again_by_its_run_and_its_key() -> None:
     assert log_identity("run", b"key") == log_identity("run", b"key")
     assert len({log_identity("run", b"key"), log_identity("run", b"other"), log_identity("other", b"key")}) == 3
+
+
+def test_a_link_that_was_lost_begins_a_segment_and_no_command_from_before_belongs_to_it() -> None:
+    log = Log()
+    log.put(m.Started(0, 0, SETTINGS, m.Memory(robot="rig", schema=m.MEMORY_SCHEMA)))
+    campaign(log)
+    log.step(3)
+    log.put(m.LinkChanged(log.t, up=False))
+    log.put(m.Send(log.t, 99, "recovery", (7.0,), log.seq, DT))
+    log.put(m.LinkChanged(log.t, up=True))
+    log.step(2)
+    cut = log.cut("campaign")
+    assert states(cut) == [[1.0, 2.0, 3.0], [4.0, 5.0]]
+    assert 7.0 not in [u[0] for one in cut.segments for _, u in one.inputs]

@@ -182,6 +182,8 @@ class _Server:
                 self._watch.observed(entry, event.observation, event.t_ns)
             case Measured():
                 self._watch.measured(entry, event)
+            case LinkChanged():
+                self._watch.restarted()
             case AnalyticsChanged():
                 self._watch.analytics(up=event.up)
             case SourceStopped(source="controller", reason="start_failed"):

@@ -130,6 +130,12 @@ class CampaignReplay:
             else:
                 self._due.append(Proposed(0, Command(0, ask.t_ns, "sampler", step.u, observation.seq, ttl_ns)))
 
+    def restarted(self) -> None:
+        """The robot started anew, or the link to it was lost or found."""
+        self._settle()
+        if self._campaign is not None:
+            self._campaign.restarted()
+
     def decided(self, reason: str) -> None:
         """Why the command that is sent next, if it is the recovery's, is not the campaign's."""
         self._reason = reason

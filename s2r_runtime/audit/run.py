@@ -35,6 +35,7 @@ from s2r_runtime.messages import (
     InputsFinished,
     IssueCertificate,
     JobFinished,
+    LinkChanged,
     ModelAdopted,
     Observation,
     Observed,
@@ -192,6 +193,8 @@ class RunAudit:
             case Observed(observation=observation):
                 self._seen_seq, self._observation = observation.seq, observation
                 self._campaigns.observed(observation)
+            case LinkChanged():
+                self._campaigns.restarted()
             case Proposed() if event.command.source == "sampler":
                 (self._inputs if self._inputs.driving else self._campaigns).proposed(entry, event)
             case SampleTaken():

@@ -70,6 +70,11 @@ class WatchReplay:
             if measured is not None:
                 self._due.append(msgspec.structs.replace(measured, t_ns=t_ns, epoch=self._begun[1].epoch))
 
+    def restarted(self) -> None:
+        """The robot started anew, or the link to it was lost or found."""
+        if self._stream is not None:
+            self._stream.restarted()
+
     def sent(self, send: Send) -> None:
         """The robot was told this."""
         if self._stream is not None:

@@ -73,6 +73,10 @@ class Refused(msgspec.Struct, frozen=True, tag="refused"):
     ref: int = 0
 
 
+class Restarted(msgspec.Struct, frozen=True, tag="restarted"):
+    """The robot started anew, or the link to it was lost or found."""
+
+
 class Reply(msgspec.Struct, frozen=True, tag="reply"):
     """To an observation: what was measured with it, if a transition ended there. The child has no clock: t_ns is 0."""
 
@@ -80,7 +84,7 @@ class Reply(msgspec.Struct, frozen=True, tag="reply"):
     measured: Measured | None
 
 
-Downward = Setup | CheckModel | Watching | Observation | Send
+Downward = Setup | CheckModel | Watching | Observation | Send | Restarted
 Upward = Ready | Refused | Reply
 
 _ENCODE = msgspec.json.Encoder().encode
@@ -142,6 +146,11 @@ class Analytics:
         """The robot was told this. It goes with the next observation: alone it would only wake the process."""
         if not self.down:
             self._child.queue(_ENCODE(send))
+
+    def restarted(self) -> None:
+        """No transition spans this; it goes with the next observation."""
+        if not self.down:
+            self._child.queue(_ENCODE(Restarted()))
 
     def observed(self, observation: Observation) -> None:
         """The robot was seen there; a Reply comes."""
@@ -225,6 +234,9 @@ def main(arguments: list[str]) -> int:
         elif isinstance(message, Send):
             if stream is not None:
                 stream.sent(message)
+        elif isinstance(message, Restarted):
+            if stream is not None:
+                stream.restarted()
         elif isinstance(message, Watching):
             stream, epoch = _stream(message), message.gap.epoch
             gc.collect()

@@ -428,6 +428,9 @@ class Daemon:
         if event.t_ns != self._last_ns:
             event = msgspec.structs.replace(event, t_ns=self._last_ns)
         self.logbook.put(event, self._last_ns)
+        if isinstance(event, LinkChanged):
+            self.watcher.restarted()
+            self.sampler.restarted()
         self.state, outputs = core.handle(self.state, event)
         self.actions.carry_out(outputs)
         self._console.happened(event)

@@ -171,6 +171,11 @@ class Sampler:
         command = Command(self._next_seq(), t_ns, "sampler", step.u, observation.seq, self._ttl_ns)
         return [*events, Proposed(t_ns, command)]
 
+    def restarted(self) -> None:
+        """The robot started anew, or the link to it was lost or found."""
+        if self._campaign is not None:
+            self._campaign.restarted()
+
     def refused(self, obs_seq: int, reason: str) -> None:
         """The gate let another input through: the sample under way does not count."""
         if self._campaign is not None:

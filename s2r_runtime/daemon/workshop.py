@@ -167,6 +167,11 @@ class Watcher:
         if self._watching is not None and self._analytics is not None and self._ready:
             self._analytics.sent(send)
 
+    def restarted(self) -> None:
+        """The robot started anew, or the link to it was lost or found."""
+        if self._watching is not None and self._analytics is not None and self._ready:
+            self._analytics.restarted()
+
     def observed(self, observation: Observation) -> None:
         """The robot was seen there. A process that still loads its libraries is told nothing: it would be late with its answer, and ended
         for that, again and again on a busy computer.

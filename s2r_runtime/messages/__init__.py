@@ -48,6 +48,7 @@ from s2r_runtime.messages.link import (
 from s2r_runtime.messages.memory import (
     GRID,
     MEMORY_SCHEMA,
+    RESTARTS,
     RULES,
     Driven,
     Memory,
@@ -96,15 +97,13 @@ from s2r_runtime.messages.results import (
 )
 
 __all__ = [
-    "GRID", "MEMORY_SCHEMA", "RULES", "SERIAL", "Action", "AlarmRaised", "AnalyticsChanged", "Answer", "AnswerLate", "Ask", "AttemptEnded",
-    "AttemptSpent",
-    "CampaignFinished", "CertificateFacts", "CertificateFailed", "CertificateInstalled", "CertificateStored", "CertificatesDistrusted",
-    "ChangeNoticed", "Command", "Decided", "Driven",
-    "EpisodeEnded", "EpochChanged", "Event", "Frame", "Gap", "GateChanged", "InputsFinished", "IssueCertificate",
-    "JobFinished", "LawResult", "LinkChanged", "LogHead", "Measured", "Memory", "ModelAdopted", "Observation",
-    "ObservationRefused", "Observed", "Output", "OverrideChanged", "Persist", "Proposal", "Proposed", "RadiusGrew", "RadiusTried",
-    "Record", "RecorderChanged", "RefusedCampaign", "Requested", "Revoked", "SampleTaken", "Send", "Settings", "Source",
-    "SourceStarted", "SourceStopped",
-    "StartCampaign", "StartController", "StartInputs", "StartJob", "Started", "StopCampaign", "StopController", "Stopping", "Stretch",
-    "Struct", "Ticked", "TraceEnded", "Trials", "Verification", "WallClockRead", "WatchStood",
+    "GRID", "MEMORY_SCHEMA", "RESTARTS", "RULES", "SERIAL", "Action", "AlarmRaised", "AnalyticsChanged", "Answer", "AnswerLate", "Ask",
+    "AttemptEnded", "AttemptSpent", "CampaignFinished", "CertificateFacts", "CertificateFailed", "CertificateInstalled",
+    "CertificateStored", "CertificatesDistrusted", "ChangeNoticed", "Command", "Decided", "Driven", "EpisodeEnded", "EpochChanged", "Event",
+    "Frame", "Gap", "GateChanged", "InputsFinished", "IssueCertificate", "JobFinished", "LawResult", "LinkChanged", "LogHead", "Measured",
+    "Memory", "ModelAdopted", "Observation", "ObservationRefused", "Observed", "Output", "OverrideChanged", "Persist", "Proposal",
+    "Proposed", "RadiusGrew", "RadiusTried", "Record", "RecorderChanged", "RefusedCampaign", "Requested", "Revoked", "SampleTaken", "Send",
+    "Settings", "Source", "SourceStarted", "SourceStopped", "StartCampaign", "StartController", "StartInputs", "StartJob", "Started",
+    "StopCampaign", "StopController", "Stopping", "Stretch", "Struct", "Ticked", "TraceEnded", "Trials", "Verification", "WallClockRead",
+    "WatchStood",
 ]  # fmt: skip

@@ -77,9 +77,11 @@ GRID = 2
 """Since these rules control instants stand on the model's grid, and transitions are compared with a step of their own length. Before, an
 instant came 0.9 dt after the last one, and a transition could be 0.2 dt off a step.
 """
-RULES = 3
+RESTARTS = 4
+"""Since these rules nothing is measured across a restart of the robot or a lost link, and no command from before acts after it."""
+RULES = 4
 """1: a campaign that is refused for dependent samples is remembered, and can be traced and repeated. 2: `GRID`. 3: what driving showed is
-kept over epochs (`Driven`).
+kept over epochs (`Driven`). 4: `RESTARTS`.
 """
 MEMORY_SCHEMA = 1
 """Of `Memory`: a memory of another schema is refused."""

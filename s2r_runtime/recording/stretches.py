@@ -5,9 +5,9 @@
     inputs     from the order to drive given inputs to their end: the newest ones, every time that they were driven in this run
 
 All end with the record of the order to trace, at the latest. A stretch is a list of segments, in each of which the robot's clock runs
-on; a segment has rows of observations (the robot's stamp, x) and of commands (u, and the stamp of the observation that it answers plus
-what the daemon took to answer). Where there are more observations than asked for, the newest are taken. The daemon's worker reads a
-log through this, and the audit another time: the same messages give the same rows, and the same digest.
+on and its link holds; a segment has rows of observations (the robot's stamp, x) and of commands (u, and the stamp of the observation that
+it answers plus what the daemon took to answer). Where there are more observations than asked for, the newest are taken. The daemon's
+worker reads a log through this, and the audit another time: the same messages give the same rows, and the same digest.
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ import msgspec
 
 from s2r_runtime.canonical import digest
 from s2r_runtime.messages import (
+    RESTARTS,
     CampaignFinished,
     EpochChanged,
     InputsFinished,
+    LinkChanged,
     Observation,
     Observed,
     SampleTaken,
@@ -29,6 +31,7 @@ from s2r_runtime.messages import (
     SourceStopped,
     StartCampaign,
     StartController,
+    Started,
     StartInputs,
     StopController,
     Stretch,
@@ -36,11 +39,13 @@ from s2r_runtime.messages import (
 )
 
 CHANNELS = (
+    "event/link_changed",
     "event/observed",
     "event/sample_taken",
     "event/campaign_finished",
     "event/inputs_finished",
     "event/source_stopped",
+    "event/started",
     "out/send",
     "out/epoch_changed",
     "out/start_campaign",
@@ -156,6 +161,7 @@ class Stretches:
     def __init__(self, limit: int) -> None:
         self._windows: dict[Stretch, _Window] = {"campaign": _Window(limit), "drive": _Window(limit), "inputs": _Window(limit)}
         self._samples: dict[int, SampleTaken] = {}
+        self._notes_restarts = False
         self.begin_run("")
 
     def begin_run(self, run: str, limit: int | None = None) -> None:
@@ -163,6 +169,7 @@ class Stretches:
         self._run, self._inputs = run, ""
         self._stamps: dict[int, tuple[int, int]] = {}
         self._last = (-1, -1)
+        self._anew = False
         self._row: tuple[int, int, tuple[float, ...]] | None = None
         self._recent: deque[tuple[int, int, tuple[float, ...]]] = deque(maxlen=BEFORE)
         for stretch, window in self._windows.items():
@@ -182,6 +189,12 @@ class Stretches:
                 self._recent.append(row)
                 for window in self._windows.values():
                     window.input(*row)
+            case Started(settings=settings):
+                self._notes_restarts = settings.rules >= RESTARTS
+            case LinkChanged() if self._notes_restarts:
+                self._anew, self._row = True, None
+                self._stamps.clear()
+                self._recent.clear()
             case SampleTaken() if message.epoch == self._windows["campaign"].epoch:
                 self._samples[message.index] = message  # one logged once more is the same; one that a crash took back is drawn anew
             case StartCampaign(epoch=epoch):
@@ -245,7 +258,8 @@ class Stretches:
 
     def _observed(self, index: int, t_ns: int, o: Observation) -> None:
         last_seq, last_ns = self._last
-        if o.seq < last_seq and o.stamp_ns < last_ns:  # both go back: the robot was started anew
+        if self._anew or (o.seq < last_seq and o.stamp_ns < last_ns):  # both go back: the robot was started anew
+            self._anew = False
             self._stamps.clear()
             self._recent.clear()
             for window in self._windows.values():

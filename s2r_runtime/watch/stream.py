@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from s2r_runtime.comparison import EARLY, LATE
 from s2r_runtime.core.ledger import seed
 from s2r_runtime.core.stream import bin_of
-from s2r_runtime.messages import GRID, RULES, Gap, Measured, Observation, Send
+from s2r_runtime.messages import GRID, RESTARTS, RULES, Gap, Measured, Observation, Send
 from s2r_runtime.watch.change import ChangeDetector
 from s2r_runtime.watch.exceedance import EProcess
 from s2r_runtime.watch.exchangeability import ConformalTest
@@ -48,7 +48,9 @@ class Stream:
     A transition is an observation, the one command that answered it, and the first observation that is one step later by the stamps, with a
     campaign's tolerance (`comparison`). It is compared with a step of its own length. Where an observation is lost, stands at another
     time, or another command was sent in between, there is none: `lost` counts those. The effects' memory goes on by the commands sent,
-    whatever is observed; it begins at rest. fault_jump: see `measurement_fault`. alpha, run_length: bars of the notices. rules: see
+    whatever is observed; it begins at rest, and anew when the robot started anew or its link was lost (`restarted`). Since the commands
+    before that are not known to act or not, nothing is measured until the gate lets a controller command again, after recovery commands
+    for as long as its hysteresis. fault_jump: see `measurement_fault`. alpha, run_length: bars of the notices. rules: see
     `Settings`. The rest is where an earlier one stood: see the three tests.
     """
 
@@ -68,7 +70,7 @@ class Stream:
         run_length: float = 1e5,
         rules: int = RULES,
     ) -> None:
-        self._on_grid = rules >= GRID
+        self._on_grid, self._notes_restarts = rules >= GRID, rules >= RESTARTS
         self._early, self._late = (EARLY, LATE if model.any_step else EARLY) if rules >= GRID else (EARLY_BEFORE, EARLY_BEFORE)
         self._model, self._radius, self._kind = model, gap.radius, gap.set
         self._weights, self._fault_jump = gap.weights, fault_jump
@@ -79,7 +81,14 @@ class Stream:
         self.lost = 0
         self._begin()
 
+    def restarted(self) -> None:
+        """The robot started anew, or the link to it was lost or found: what it was commanded before says nothing about what acts."""
+        if self._notes_restarts:
+            self.lost += self._open is not None
+            self._begin()
+
     def _begin(self) -> None:
+        self._settled = not self._notes_restarts
         self._hidden = self._model.at_rest(1)
         self._seen: Observation | None = None
         self._open: tuple[Observation, Send] | None = None
@@ -90,6 +99,7 @@ class Stream:
     def sent(self, send: Send) -> None:
         """The robot was told this."""
         seen, last = self._seen, self._last
+        self._settled = self._settled or send.source == "controller"
         fresh = seen is not None and send.obs_seq == seen.seq and (last is None or last.obs_seq != seen.seq)
         if self._open is not None:
             self.lost += 1
@@ -101,7 +111,7 @@ class Stream:
             self._clock_ns += periods * self._dt_ns
         if fresh and seen is not None:
             self._clock_ns = float(seen.stamp_ns)
-            self._open = (seen, send)
+            self._open = (seen, send) if self._settled else None
         self._last = send
         self._commands.append((self._clock_ns, send.u))
 
@@ -112,6 +122,8 @@ class Stream:
             return None
         if seen is not None and observation.stamp_ns < seen.stamp_ns:
             self._begin()  # the robot's clock began anew
+        elif seen is not None and observation.seq < seen.seq and self._notes_restarts:
+            self._begin()  # its numbers did
         elif seen is not None and observation.seq <= seen.seq:
             return None
         self._seen = observation
