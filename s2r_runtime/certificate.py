@@ -21,7 +21,7 @@ from s2r_runtime.canonical import canonical, digest
 from s2r_runtime.controllers.file import ControllerFile, Identity
 from s2r_runtime.core.ledger import binomial_tail, campaign_size, sample_size, share
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
-from s2r_runtime.messages import SERIAL, CertificateFacts, Gap, Struct, Trials, Verification
+from s2r_runtime.messages import NOT_INDEPENDENT, CertificateFacts, Gap, Struct, Trials, Verification
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Profile, TaskValue
 
@@ -306,7 +306,7 @@ def _evidence(c: Certificate, *, traced_not_adopted: bool) -> list[tuple[str, bo
         ("the verified radius is below the gap", v.radius >= gap.radius and (not holds or v.hold_radius >= gap.hold_radius), 0),
         ("the gap spends more than its epoch's share of beta", gap.beta <= share(c.budget, gap.epoch) * slack, 0),
         ("the verification spends more than its attempt's share of beta", v.beta <= share(c.budget, v.attempt) * slack, 0),
-        (f"the samples were not drawn independently: {gap.white_reason}", not gap.white_reason.startswith(SERIAL), 0),
+        (f"the samples were not drawn independently: {gap.white_reason}", not gap.white_reason.startswith(NOT_INDEPENDENT), 0),
         (
             f"{gap.n} samples do not carry the gap's statement",
             binomial_tail(gap.n, gap.discarded, gap.epsilon) <= gap.beta / (2.0 if holds else 1.0) * slack,

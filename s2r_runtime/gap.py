@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from s2r_runtime.bounds import check_probability, sample_size, scenario_confidence, split
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
-from s2r_runtime.messages import SERIAL, Gap
+from s2r_runtime.messages import NOT_INDEPENDENT, SERIAL, Gap
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.prediction import Holds, acting_over, hold_residuals, residuals
 from s2r_runtime.profile_checks import HEAVIEST, LIGHTEST
+from s2r_runtime.repeats import Repeats, repeats
 from s2r_runtime.table_rows import Subset
 from s2r_runtime.whiteness import DEPENDENT, SERIAL_ALPHA, Whiteness, body_axes, serial_p, whiteness
 
@@ -34,6 +35,8 @@ __all__ = [
     "radius_of_noise", "refuse_fitted", "residuals", "statement",
 ]  # fmt: skip
 
+COPIES = "copies"
+"""The reason in `Gap.rejected` for rows that are copies of others, and so do not count."""
 NOISE_DRAWS = 200_000
 """Simulated transitions behind `radius_noise`: its own error is then a few per cent of it."""
 
@@ -113,7 +116,10 @@ def estimate_gap(
     weights: tuple[float, ...] | Array,
     epoch: int = 1,
 ) -> Gap:
-    """The gap at `beta` (the epoch's share). All samples count; N and k were fixed before they were drawn.
+    """The gap at `beta` (the epoch's share). All samples count, copies of one once; N and k were fixed before they were drawn.
+
+    `radius` is the (k+1)-th largest of all rows, with their copies, and n the number of different ones: sound whether copies are of one
+    draw or equal draws of a law of few values. Rows that repeat each other more than by chance give their numbers and no statement.
 
     Raises UsageError (range of a number), NotEnoughEvidence (fitted on this recording: G6; too few samples, saying how many more).
     Transitions that are not independent give their numbers and no statement; how many there are does not matter then.
@@ -124,7 +130,12 @@ def estimate_gap(
     if discard < 0:
         raise UsageError(f"discard is {discard}, must be >= 0")
     refuse_fitted(model, tr)
-    n = len(tr.x0)
+    alike = different(model, tr)
+    if alike.doubt:
+        tr = replace(tr, independent=False)
+    if alike.distinct < len(tr.x0):
+        tr = replace(tr, rejected={**tr.rejected, COPIES: len(tr.x0) - alike.distinct})
+    n = alike.distinct
     needed = sample_size(epsilon, beta, discard)
     if n < (needed if tr.independent else discard + 1):
         raise NotEnoughEvidence(_too_few(tr, n, needed, epsilon, beta, discard), needed - n)
@@ -132,7 +143,7 @@ def estimate_gap(
     radius = _largest(discrepancy(e, w, kind), discard)
     e_hold = hold_residuals(model, tr)
     paid = e_hold is not None and (not tr.independent or scenario_confidence(n, discard, epsilon) <= split(beta, (1, 1))[0])
-    white = _structure(model, tr, e, e_hold, w, kind)
+    white = Whiteness(False, alike.doubt) if alike.doubt else _structure(model, tr, e, e_hold, w, kind)
     return Gap(
         radius=radius,
         radius_literal=_largest(discrepancy(e, np.ones_like(w), kind), discard),
@@ -172,6 +183,17 @@ def _in_order(series: list[Array], rounding: float) -> Whiteness | None:
     steps = [max(rounding, 1e-9 * float(np.max(np.abs(one)))) for one in series]
     p = min(serial_p(np.round(one / step), clear=SERIAL_ALPHA / len(series)) for one, step in zip(series, steps, strict=True)) * len(series)
     return Whiteness(False, f"{SERIAL} (p = {p:.1g})") if p < SERIAL_ALPHA else None
+
+
+def different(model: ComposedModel, tr: Transitions) -> Repeats:
+    """How many of the transitions count, and why chance does not make them, where it does not. Those of a drive are no draws: all count.
+
+    Where a person vouches for blocks of a drive, copies count once; a robot that stands still repeats itself, which is no doubt of them.
+    """
+    if not tr.independent:
+        return Repeats(len(tr.x0), "")
+    found = repeats(tr.x0, tr.u, tr.x1, model.angle_columns)
+    return found._replace(doubt="") if tr.assumption else found
 
 
 def refuse_fitted(model: ComposedModel, tr: Transitions) -> None:
@@ -239,9 +261,12 @@ def blocked(tr: Transitions, seconds: float, dt: float) -> Transitions:
     )
 
 
-def doubted(gap: Gap, tr: Transitions) -> Transitions:
-    """The transitions, with a doubt where their order matters: then their gap carries no statement (guarantee G1)."""
-    if not tr.independent or not gap.white_reason.startswith(SERIAL):
+def doubted(gap: Gap, tr: Transitions, reasons: tuple[str, ...] = NOT_INDEPENDENT) -> Transitions:
+    """The transitions, with a doubt where they repeat each other or their order matters: then their gap has no statement (guarantee G1).
+
+    reasons: which of NOT_INDEPENDENT count.
+    """
+    if not tr.independent or not gap.white_reason.startswith(reasons):
         return tr
     return replace(tr, independent=False, doubt=f"the samples were not drawn independently: {gap.white_reason}")
 

@@ -13,6 +13,7 @@ from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
 from s2r_runtime.core.gaps import GOOD_REFUSED
 from s2r_runtime.messages import (
+    REPEATED,
     RULES,
     SERIAL,
     Answer,
@@ -82,6 +83,18 @@ def test_retry_repeats_once_in_the_next_epoch_and_answers_once() -> None:
     rig.feed(SourceStarted(rig.t, "sampler", "settings"))
     assert not of(ends(rig, again), StartCampaign), "a second refusal is no chance"
     assert [a.exit_code for a in answers(rig)[number]] == [3]
+
+
+def test_samples_that_repeat_each_other_are_not_taken_again_by_themselves() -> None:
+    rig = Rig(rules=RULES)
+    order = campaign(rig, text="retry")
+    outputs = ends(rig, order, f"{REPEATED} more often than independent ones do (p = 0.0005): 9 of 206 are copies of others")
+    assert not of(outputs, StartCampaign)
+    said = one(outputs, Answer)
+    assert said.exit_code == 3
+    assert "9 of 206 are copies" in said.text
+    assert "plays a recording instead of the robot" in said.text
+    assert rig.state.memory.gap is None
 
 
 def test_retry_does_not_drive_without_a_permit() -> None:

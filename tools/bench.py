@@ -26,6 +26,7 @@ ORDER = (
     "bench_ros2.py",
     "fuzz_ros2.py",
     "bench_coverage.py",
+    "bench_duplicates.py",
     "bench_rates.py",
     "bench_missions.py",
 )

@@ -100,6 +100,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def run_gap(args: argparse.Namespace) -> int:
     """Exit 0 with a statement, 3 if the data do not carry one (the numbers are printed all the same)."""
     from s2r_runtime import gap as gaps
+    from s2r_runtime.messages import NOT_INDEPENDENT, REPEATED
     from s2r_runtime.table_text import limits_of
     from s2r_runtime.transitions import load_transitions
 
@@ -123,8 +124,8 @@ def run_gap(args: argparse.Namespace) -> int:
         kind=args.set or (profile.norm.set if profile else "ball"),
         weights=weights_of(model.states, args.weight, profile),
     )
-    if found.samples_digest:  # of a table nobody can say in which order its segments were drawn: there it stands in the statement
-        found = gaps.doubted(result, found)
+    # of a table nobody can say in which order its segments were drawn: there it stands in the statement
+    found = gaps.doubted(result, found, NOT_INDEPENDENT if found.samples_digest else (REPEATED,))
     answer = gaps.gap_json(result, found, model.states)
     if args.json:
         output.result_json(answer)
@@ -214,6 +215,7 @@ def gap_of(
     NotEnoughEvidence if it carries no statement.
     """
     from s2r_runtime import gap as gaps
+    from s2r_runtime.messages import NOT_INDEPENDENT, REPEATED
     from s2r_runtime.table_text import limits_of
     from s2r_runtime.transitions import load_transitions
 
@@ -240,8 +242,9 @@ def gap_of(
         weights=weights_of(model.states, [], profile),
         epoch=epoch,
     )
-    if beta is not None and gaps.doubted(gap, found) is not found:
-        raise NotEnoughEvidence(f"{recording}: {gaps.doubted(gap, found).doubt}; its gap carries no statement")
+    told = gaps.doubted(gap, found, (REPEATED,) if beta is None else NOT_INDEPENDENT)
+    if told is not found:
+        raise NotEnoughEvidence(f"{recording}: {told.doubt}; its gap carries no statement")
     return gap, found.assumption, "first" if found.holds is None else found.holds.law
 
 

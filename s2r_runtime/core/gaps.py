@@ -15,6 +15,8 @@ from s2r_runtime.core.drive import latch, recover_now, regate
 from s2r_runtime.core.sources import end_deployment
 from s2r_runtime.core.state import Campaign, Job, Turn, certificate, job, situation, usable_gap
 from s2r_runtime.messages import (
+    NOT_INDEPENDENT,
+    REPEATED,
     SERIAL,
     AlarmRaised,
     CampaignFinished,
@@ -97,7 +99,7 @@ def campaign_finished(turn: Turn, event: CampaignFinished) -> None:
 def gap_finished(turn: Turn, done: Job, event: JobFinished) -> None:
     """The campaign's gap comes into force."""
     gap = event.gap
-    if gap is not None and not event.error and gap.white_reason.startswith(SERIAL):
+    if gap is not None and not event.error and gap.white_reason.startswith(NOT_INDEPENDENT):
         _not_independent(turn, done, gap)
         return
     problem = event.error or ("the worker returned none" if gap is None else _gap_problem(turn, gap, done.epoch))
@@ -122,8 +124,8 @@ def _not_independent(turn: Turn, done: Job, gap: Gap) -> None:
     turn.remember(refused_campaign=RefusedCampaign(gap.epoch, gap.n, share, gap.white_reason, in_a_row))
     turn.persist()
     standing = gate.standing(turn.settings, msgspec.structs.replace(situation(turn.state), campaign_running=True), "sampler", turn.now)
-    repeats = done.retry and in_a_row == 1 and standing is None
-    text = f"no gap: {why}, and their share of beta ({share:.2g}) is spent. {_after_refusal(turn, in_a_row, repeats=repeats)}"
+    repeats = done.retry and in_a_row == 1 and standing is None and gap.white_reason.startswith(SERIAL)
+    text = f"no gap: {why}, and their share of beta ({share:.2g}) is spent. {_after_refusal(turn, gap, in_a_row, repeats=repeats)}"
     if done.retry and standing is not None:
         text += f" Not repeated: {standing.reason}."
     turn.answer(done.request_id, 3, text, final=not repeats)
@@ -131,8 +133,10 @@ def _not_independent(turn: Turn, done: Job, gap: Gap) -> None:
         begin_campaign(turn, 0 if gap.n < _samples_of_next(turn) else gap.n, done.request_id)
 
 
-def _after_refusal(turn: Turn, in_a_row: int, *, repeats: bool) -> str:
+def _after_refusal(turn: Turn, gap: Gap, in_a_row: int, *, repeats: bool) -> str:
     """What a refusal means, and what to do about it."""
+    if gap.white_reason.startswith(REPEATED):
+        return "Look for what plays a recording instead of the robot, and for a sensor that is stuck."
     epoch = turn.memory.epochs + 1
     costs = f"epoch {epoch} takes {_samples_of_next(turn)} samples and spends {ledger.share(turn.settings.beta, epoch):.2g}"
     look = "Look at what changes while it samples (battery, temperature, tyres, localisation): s2r trace --live campaign, s2r report LOG."
@@ -169,7 +173,7 @@ def _gap_problem(turn: Turn, gap: Gap, epoch: int) -> str:
         return "its epsilon or discards are not the profile's"
     if settings.norm_weights and (gap.set, gap.weights) != (settings.norm_set, settings.norm_weights):
         return f"its norm is a {gap.set} with weights {gap.weights}, the profile's a {settings.norm_set} with {settings.norm_weights}"
-    if gap.white_reason.startswith(SERIAL):
+    if gap.white_reason.startswith(NOT_INDEPENDENT):
         return f"its samples were not drawn independently: {gap.white_reason}"
     half = 0.5 * ledger.share(settings.beta, epoch)
     if ledger.binomial_tail(gap.n, gap.discarded, gap.epsilon) > half * (1.0 + ROUNDING):

@@ -87,6 +87,8 @@ from s2r_runtime.messages.outputs import (
     TraceEnded,
 )
 from s2r_runtime.messages.results import (
+    NOT_INDEPENDENT,
+    REPEATED,
     SERIAL,
     CertificateFacts,
     Gap,
@@ -97,7 +99,8 @@ from s2r_runtime.messages.results import (
 )
 
 __all__ = [
-    "GRID", "MEMORY_SCHEMA", "RESTARTS", "RULES", "SERIAL", "Action", "AlarmRaised", "AnalyticsChanged", "Answer", "AnswerLate", "Ask",
+    "GRID", "MEMORY_SCHEMA", "NOT_INDEPENDENT", "REPEATED", "RESTARTS", "RULES", "SERIAL", "Action", "AlarmRaised", "AnalyticsChanged",
+    "Answer", "AnswerLate", "Ask",
     "AttemptEnded", "AttemptSpent", "CampaignFinished", "CertificateFacts", "CertificateFailed", "CertificateInstalled",
     "CertificateStored", "CertificatesDistrusted", "ChangeNoticed", "Command", "Decided", "Driven", "EpisodeEnded", "EpochChanged", "Event",
     "Frame", "Gap", "GateChanged", "InputsFinished", "IssueCertificate", "JobFinished", "LawResult", "LinkChanged", "LogHead", "Measured",

@@ -8,6 +8,9 @@ from s2r_runtime.messages.link import Struct
 
 SERIAL = "the error of a sample depends on the one before"
 """`Gap.white_reason` begins with this where the samples were not independent: such a campaign founds no gap (guarantee G1)."""
+REPEATED = "the samples repeat each other"
+"""`Gap.white_reason` begins with this where chance does not make rows so alike: copies, and rows made from rows."""
+NOT_INDEPENDENT = (SERIAL, REPEATED)
 
 
 class Gap(Struct, frozen=True, tag="gap"):

@@ -14,7 +14,7 @@ from s2r_runtime.bounds import anytime_upper
 from s2r_runtime.core import stream
 from s2r_runtime.core.gaps import GOOD_REFUSED
 from s2r_runtime.gap import discrepancy, residuals, statement
-from s2r_runtime.messages import Gap, Settings
+from s2r_runtime.messages import REPEATED, Gap, Settings
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.recording.writer import read_all
 from s2r_runtime.report import plots
@@ -168,6 +168,9 @@ def add_refused(page: Page, story: Story, models: dict[str, ModelSpec]) -> None:
         page.heading(f"Refused campaign of epoch {gap.epoch}")
         page.text(f"No gap: {gap.white_reason}. Its samples were not drawn independently, so they bound nothing.", "bad")
         page.table(("cost: samples", "driven for", "β spent"), [(gap.n, f"{seconds:.0f} s", f"{gap.beta:.4g}")])
+        if gap.white_reason.startswith(REPEATED):
+            page.text("Look for what plays a recording instead of the robot, and for a sensor that is stuck.")
+            continue
         page.text(
             f"The test refuses at most 1 in {GOOD_REFUSED} good campaigns, so one refusal may be chance; repeat it (s2r sample --retry). "
             "Two in a row are hardly chance. Then look below for a trend, and for what changes while the robot samples."

@@ -131,7 +131,7 @@ def _take_decision(story: Story, message: Any) -> None:
             story._campaign_began = story.seconds(message.t_ns)
         case m.CampaignFinished():
             story._campaign_ended = story.seconds(message.t_ns)
-        case m.JobFinished(kind="gap", gap=m.Gap() as gap) if gap.white_reason.startswith(m.SERIAL):
+        case m.JobFinished(kind="gap", gap=m.Gap() as gap) if gap.white_reason.startswith(m.NOT_INDEPENDENT):
             story.refused.append((gap, story._campaign_ended - story._campaign_began))
             mark(f"campaign of epoch {gap.epoch} refused: its samples depend on each other", "bad")
         case m.EpochChanged(epoch=epoch, gap=None):

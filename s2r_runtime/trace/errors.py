@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.bounds import scenario_confidence
 from s2r_runtime.errors import S2RError
-from s2r_runtime.gap import Transitions, discrepancy, hold_residuals, residuals
+from s2r_runtime.gap import Transitions, different, discrepancy, hold_residuals, residuals
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.begun import begun, measured, uncertain
 from s2r_runtime.trace.dataset import Dataset
@@ -262,8 +262,9 @@ def gaps(
     """
     campaign = _campaign(before[0], given)
     if campaign is not None:
-        told = [_campaign_gap(model, campaign, weights, kind) for model, _ in (before, after)]
-        return told[0], told[1], campaign.independent
+        n, independent = _counted(before[0], campaign)
+        told = [_campaign_gap(model, campaign, n, weights, kind) for model, _ in (before, after)]
+        return told[0], told[1], independent
     first, second = (discrepancy(judged.one_step, weights, kind) for _, judged in (before, after))
     return _gap(float(np.max(first)), len(first)), _gap(float(np.max(second)), len(second)), False
 
@@ -272,9 +273,12 @@ def _gap(radius: float, n: int) -> dict[str, Any]:
     return {"radius": radius, "n": n, "epsilon": EPSILON, "beta": scenario_confidence(n, 0, EPSILON)}
 
 
-def _campaign_gap(model: ComposedModel, samples: Transitions, weights: Array, kind: Kind) -> dict[str, Any]:
-    """With what the discrepancy is after the hold: a robot that answers late shows little after one step from rest."""
-    told = _gap(float(np.max(discrepancy(residuals(model, samples), weights, kind))), len(samples.x0))
+def _campaign_gap(model: ComposedModel, samples: Transitions, n: int, weights: Array, kind: Kind) -> dict[str, Any]:
+    """n: how many of them are different.
+
+    With what the discrepancy is after the hold: a robot that answers late shows little after one step from rest.
+    """
+    told = _gap(float(np.max(discrepancy(residuals(model, samples), weights, kind))), n)
     held_too = hold_residuals(model, samples)
     if held_too is not None:
         told |= {"hold_radius": float(np.max(discrepancy(held_too, weights, kind))), "hold_periods": samples.hold_periods}
@@ -294,6 +298,12 @@ def _campaign(model: ComposedModel, given: Held) -> Transitions | None:
     if found.drive is not None or np.count_nonzero(inside) < 2:
         return None
     return found.chosen(np.flatnonzero(inside))
+
+
+def _counted(model: ComposedModel, samples: Transitions) -> tuple[int, bool]:
+    """How many samples are different, and whether they count as independent."""
+    alike = different(model, samples)
+    return alike.distinct, samples.independent and not alike.doubt
 
 
 def _in_file(model: ComposedModel, paths: tuple[Path, ...]) -> Transitions | None:
