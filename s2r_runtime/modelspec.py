@@ -4,13 +4,15 @@ repaired model's TOML hold, and what a model digest is taken of.
 
 from __future__ import annotations
 
-import tomllib
+import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
 
 from s2r_runtime.canonical import digest_of
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.toml_text import load_toml
 
 
 class EffectSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -22,6 +24,9 @@ class EffectSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The input or state that it acts on; `*`: all alike."""
     parameters: dict[str, float | str | list[list[float]]] = {}
     """In SI units."""
+
+    def __post_init__(self) -> None:
+        _check_finite(self.parameters, f"{self.name}.")
 
 
 class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -43,6 +48,7 @@ class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if not 0.0 < self.dt < float("inf"):
             raise ValueError(f"dt is {self.dt} s, must be > 0")
+        _check_finite(self.parameters, "parameters.")
 
     def digest(self) -> str:
         """Digest of what the model computes: two specs with the same digest step alike. `fitted_on` is no part of it."""
@@ -52,12 +58,7 @@ class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def load_model(path: Path) -> ModelSpec:
     """Reads a model TOML (table `[model]`). Raises ConfigError naming file and field."""
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not TOML: {error}") from None
+    table = load_toml(path)
     if "model" not in table:
         raise ConfigError(f"{path}: has no [model] table")
     for name in ModelSpec.__struct_fields__:
@@ -84,6 +85,14 @@ def dump_model(spec: ModelSpec, comments: tuple[str, ...] = ()) -> str:
         if effect.parameters:
             lines += ["[model.effects.parameters]", *(f"{_toml(k)} = {_toml(v)}" for k, v in effect.parameters.items())]
     return "\n".join(lines) + "\n"
+
+
+def _check_finite(parameters: Mapping[str, object], where: str) -> None:
+    """Raises ValueError: JSON, in which models go to other processes and into digests, has no NaN and no infinity."""
+    for name, value in parameters.items():
+        rows = value if isinstance(value, list) else [[value]]
+        if any(isinstance(item, float) and not math.isfinite(item) for row in rows for item in row):
+            raise ValueError(f"{where}{name} must be finite")
 
 
 def _toml(value: object) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import difflib
 import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -19,6 +18,7 @@ from s2r_runtime.canonical import canonical, digest_of
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile_checks import problems
+from s2r_runtime.toml_text import parse_toml, read_text
 
 if TYPE_CHECKING:
     from s2r_runtime.models.composed import ComposedModel
@@ -329,6 +329,10 @@ def is_file(option: Any) -> bool:
 
 def load_driving_profile(path: Path) -> Profile:
     """As `load_profile`, for a robot that is to be driven: it must name its transport."""
+    try:
+        str(path.resolve()).encode()
+    except UnicodeEncodeError:
+        raise ConfigError(f"{path}: the name of the file, or of a folder on its way, is not UTF-8 text; rename it") from None
     profile = load_profile(path)
     if not profile.transport:
         raise ConfigError(f"{path}: transport is missing; to drive a robot, a profile must say how it is reached: [transport] name = ...")
@@ -337,23 +341,14 @@ def load_driving_profile(path: Path) -> Profile:
 
 def load_profile(path: Path) -> Profile:
     """Reads and checks a profile. Raises ConfigError `path: field is value, must be ...`."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from None
-    return parse_profile(text, str(path), path.parent)
+    return parse_profile(read_text(path), str(path), path.parent)
 
 
 def parse_profile(text: str, where: str, base: Path, files: Mapping[str, str] | None = None, *, as_before: Iterable[str] = ()) -> Profile:
     """As `load_profile`, from text; relative files are looked up from `base`. files: the transport's, by name, instead of the disk's.
     as_before: tables in which what the text lacks is as it was before the setting was there (`AS_BEFORE`), not today's default.
     """
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{where}: not TOML: {error}") from None
+    table = parse_toml(text, where)
     for name in as_before:
         if isinstance(given := table.get(name, {}), dict):
             table[name] = {**AS_BEFORE[name], **given}

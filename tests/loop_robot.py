@@ -249,6 +249,7 @@ def main() -> int:
         daemon.add_argument("--break-at", type=int, default=0, help="the core raises at the observation of this number")
         if name == "daemon":
             daemon.add_argument("--log", type=Path)
+            daemon.add_argument("--held", type=Path, help="where to note the longest processor time that a client took from the loop, s")
         else:
             daemon.add_argument("out", type=Path)
     which.add_parser("s2r").add_argument("verb", nargs=argparse.REMAINDER)
@@ -264,6 +265,23 @@ def main() -> int:
         robot_process = Robot(args.folder, args)
         robot_process.realtime() if args.realtime else robot_process.lockstep()
     return run(args)
+
+
+def note_what_clients_take(path: Path) -> None:
+    """Processor time of the longest turn of the loop for a client."""
+    from s2r_runtime.daemon.control import Connection
+
+    ready, longest = Connection.ready, 0.0
+
+    def timed(connection: Connection, mask: int) -> None:
+        nonlocal longest
+        begun = time.thread_time()
+        ready(connection, mask)
+        if (took := time.thread_time() - begun) > longest:
+            longest = took
+            path.write_text(str(longest))
+
+    Connection.ready = timed  # type: ignore[method-assign]
 
 
 def run(args: argparse.Namespace) -> int:
@@ -284,6 +302,8 @@ def run(args: argparse.Namespace) -> int:
             raise ZeroDivisionError("a defect")
         return handle(state, event)
 
+    if getattr(args, "held", None):
+        note_what_clients_take(args.held)
     if args.break_at:
         core.handle = breaking
     try:

@@ -20,7 +20,8 @@ from pathlib import Path
 import pytest
 
 from s2r_runtime.daemon import control
-from s2r_runtime.daemon.control import Connection, ControlServer, Request, call, find_socket
+from s2r_runtime.daemon.control import Connection, ControlServer, call, find_socket
+from s2r_runtime.daemon.door import Request
 from s2r_runtime.daemon.systemd import Notifier
 from s2r_runtime.errors import ConfigError, UsageError
 
@@ -39,9 +40,9 @@ class Desk:
         self._thread.start()
 
     def on_request(self, connection: Connection, request: Request) -> None:
-        match request["verb"]:
+        match request.verb:
             case "echo":
-                connection.answer(0, "as you said", request)
+                connection.answer(0, "as you said", {"verb": request.verb, "text": request.text})
             case "slow":
                 connection.progress(done=1, total=2)
                 connection.progress(text="half way")
@@ -293,3 +294,26 @@ def test_a_client_says_nothing_to_a_third_user_who_listens_in_the_daemons_place(
         assert theirs.stdout.read().strip() == ""
         theirs.wait(30)
         theirs.stdout.close()
+
+
+@pytest.mark.parametrize(
+    ("request_line", "words"),
+    [
+        (b'{"verb": "clear", "text": "\\udcff"}', "surrogate"),
+        (b'{"verb": "clear", "text": "a\\u0000b"}', "control characters"),
+        (b'{"verb": "clear", "text": "' + b"x" * 201 + b'"}', "longer than 200 bytes"),
+        (b'{"verb": "deploy", "path": "\xff"}', "UTF-8"),
+        (b'{"verb": "permit", "duration_s": ' + b"9" * 10_000 + b"}", "must be >= 0 and finite"),
+        (b'{"verb": "adopt", "text": ' + b"[" * 100_000 + b"}", "not understood"),
+    ],
+)
+def test_a_strange_field_is_refused_in_one_printable_line_at_the_door(desk: Desk, request_line: bytes, words: str) -> None:
+    answer = json.loads(raw(desk, request_line + b"\n").splitlines()[-1])
+    assert answer["exit_code"] in (2, 78)
+    assert words in answer["text"]
+    assert answer["text"].isprintable()
+
+
+def test_a_client_says_which_field_is_no_text_before_anything_is_sent(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="deploy: path is not UTF-8 text"):
+        call(tmp_path / "nobody.sock", {"verb": "deploy", "path": "/robots/caf\udce9/c.py"})

@@ -151,13 +151,13 @@ def test_controller_that_hangs_in_verification_is_killed_in_time(tmp_path: Path)
 
 
 def test_controller_is_loaded_with_its_parameters() -> None:
-    said = finished(LoadJob(str(GRID), {"speed": 0.1}))[-1]
+    said = finished(LoadJob(str(GRID), msgspec.Raw(b'{"speed": 0.1}')))[-1]
     assert isinstance(said, Result)
     assert said.controller is not None
     assert said.controller.parameters["speed"] == 0.1
     assert said.controller == load(GRID, {"speed": 0.1})
     for path in (str(GRID.parent), "/dev/zero", "/nowhere.py"):
-        assert finished(LoadJob(path, {}))[-1] == Failed(f"{path}: is no file")
+        assert finished(LoadJob(path))[-1] == Failed(f"{path}: is no file")
 
 
 def test_killed_worker_is_a_job_that_failed() -> None:
@@ -253,20 +253,6 @@ def test_profile_with_a_wrong_name_is_refused_by_the_process_that_loads_it() -> 
     with pytest.raises(ConfigError, match=r"wrong\.toml: region\.z"):
         process.facts()
     process.stop()
-
-
-def test_model_is_checked_beside_the_measuring(analytics: Analytics) -> None:
-    analytics.facts()
-    current = profile()
-    analytics.check(7, msgspec.structs.replace(current, model=msgspec.structs.replace(current.model, name="bicycel")), "adopt")
-    analytics.check(8, current, "adopt")
-    came: list[Ready | Refused | Reply] = []
-    while len(came) < 2:
-        came += analytics.poll()
-    assert isinstance(came[0], Refused)
-    assert "did you mean 'bicycle'?" in came[0].text
-    assert isinstance(came[1], Ready)
-    assert [message.ref for message in came if not isinstance(message, Reply)] == [7, 8]
 
 
 @pytest.mark.parametrize(("how", "words"), [(signal.SIGKILL, "killed by signal 9"), (signal.SIGSTOP, "no longer answers")])

@@ -16,6 +16,7 @@ ORDER = (
     "bench_daemon.py",
     "bench_gate_faults.py",
     "bench_daemon_faults.py",
+    "fuzz_door.py",
     "bench_crash.py",
     "bench_tamper.py",
     "bench_audit.py",

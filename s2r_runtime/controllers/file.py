@@ -145,7 +145,7 @@ def _parameters(tree: ast.Module, path: Path, given: dict[str, Any]) -> dict[str
         if name not in values:
             raise ConfigError(f"{path}: has no parameter {name!r}; it has: {', '.join(values) or 'none'}")
         values[name] = _like(values[name], value, f"{path}: parameter {name}")
-    return {name: _plain(value, f"{path}: parameter {name}") for name, value in values.items()}
+    return {_utf8(name, str(path)): _plain(value, f"{path}: parameter {name}") for name, value in values.items()}
 
 
 def _assignments(body: list[ast.stmt]) -> Iterator[tuple[ast.stmt, ast.expr | None]]:
@@ -171,9 +171,19 @@ def _kind(value: Any) -> str:
     return "nothing"
 
 
+def _utf8(text: str, where: str) -> str:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise ConfigError(f"{where}: holds a text that is not UTF-8 (a lone surrogate): {text!a}") from None
+    return text
+
+
 def _plain(value: Any, where: str) -> Any:
     """Plain JSON data, so that the digest and every process see the same. Tuples become lists."""
-    if isinstance(value, bool | str) or value is None:
+    if isinstance(value, str):
+        return _utf8(value, where)
+    if isinstance(value, bool) or value is None:
         return value
     if isinstance(value, int):
         if abs(value) >= 2**63:
@@ -186,5 +196,5 @@ def _plain(value: Any, where: str) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(item, where) for item in value]
     if isinstance(value, dict) and all(isinstance(key, str) for key in value):
-        return {key: _plain(item, where) for key, item in value.items()}
+        return {_utf8(key, where): _plain(item, where) for key, item in value.items()}
     raise ConfigError(f"{where} is {value!r}, must be numbers, text, true or false, or lists and tables of them")

@@ -17,7 +17,7 @@ import msgspec
 
 from s2r_runtime.child import Child, die_with_parent, say, stand_back, take_stdout
 from s2r_runtime.daemon.settings import ModelFacts, facts_of
-from s2r_runtime.errors import ConfigError, S2RError
+from s2r_runtime.errors import ConfigError, S2RError, one_line
 from s2r_runtime.messages import Gap, Measured, Observation, Send
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Profile
@@ -29,14 +29,6 @@ if TYPE_CHECKING:
 class Setup(msgspec.Struct, frozen=True, tag="setup"):
     """First message: check this profile, and tell the facts of its model."""
 
-    profile: Profile
-    where: str
-
-
-class CheckModel(msgspec.Struct, frozen=True, tag="check_model"):
-    """Whether this model could replace the profile's. `ref` comes back."""
-
-    ref: int
     profile: Profile
     where: str
 
@@ -60,17 +52,15 @@ class Watching(msgspec.Struct, frozen=True, tag="watching"):
 
 
 class Ready(msgspec.Struct, frozen=True, tag="ready"):
-    """The profile or model is sound."""
+    """The profile is sound."""
 
     facts: ModelFacts
-    ref: int = 0
 
 
 class Refused(msgspec.Struct, frozen=True, tag="refused"):
-    """The profile or model is not."""
+    """The profile is not."""
 
     text: str
-    ref: int = 0
 
 
 class Restarted(msgspec.Struct, frozen=True, tag="restarted"):
@@ -84,7 +74,7 @@ class Reply(msgspec.Struct, frozen=True, tag="reply"):
     measured: Measured | None
 
 
-Downward = Setup | CheckModel | Watching | Observation | Send | Restarted
+Downward = Setup | Watching | Observation | Send | Restarted
 Upward = Ready | Refused | Reply
 
 _ENCODE = msgspec.json.Encoder().encode
@@ -133,10 +123,6 @@ class Analytics:
         if isinstance(answer, Ready):
             return answer.facts
         raise ConfigError(answer.text if isinstance(answer, Refused) else "the analytics process is out of step")
-
-    def check(self, ref: int, profile: Profile, where: str) -> None:
-        """Asks whether the profile's model can be used; `poll` brings Ready or Refused with this ref."""
-        self._send(CheckModel(ref, profile, where))
 
     def watch(self, watching: Watching) -> None:
         """Begins to measure."""
@@ -246,17 +232,17 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def _checked(message: Setup | CheckModel) -> Ready | Refused:
+def _checked(message: Setup) -> Ready | Refused:
     from s2r_runtime.plugins import registry
     from s2r_runtime.profile import check_model
 
-    ref, profile = message.ref if isinstance(message, CheckModel) else 0, message.profile
+    profile = message.profile
     try:
         model = check_model(profile, message.where)
         task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
     except S2RError as error:
-        return Refused(str(error), ref)
-    return Ready(facts_of(model, task.horizon), ref)
+        return Refused(one_line(str(error), 2000))
+    return Ready(facts_of(model, task.horizon))
 
 
 def _stream(watching: Watching) -> Stream:

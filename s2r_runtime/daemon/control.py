@@ -21,7 +21,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
-from s2r_runtime.errors import ConfigError, UsageError
+from s2r_runtime.daemon import door
+from s2r_runtime.errors import ConfigError, S2RError, UsageError, one_line
 
 REQUEST_MAX = 1 << 20
 ANSWER_MAX = 8 << 20
@@ -157,7 +158,7 @@ class ControlServer:
         self,
         path: Path,
         selector: selectors.BaseSelector,
-        on_request: Callable[[Connection, Request], None],
+        on_request: Callable[[Connection, door.Request], None],
         on_left: Callable[[Connection, str], None] | None = None,
     ) -> None:
         """on_left(connection, why): a client hung up, or wants no more of its request (then it still listens)."""
@@ -206,14 +207,11 @@ class ControlServer:
             self.path.unlink(missing_ok=True)
 
     def handle(self, client: Connection, line: bytes) -> None:
-        """Parses a request line and hands it on."""
+        """Decodes a request line and hands it on."""
         try:
-            request = json.loads(line)
-        except (ValueError, RecursionError) as error:
-            client.answer(2, f"the request is not JSON: {error}")
-            return
-        if not isinstance(request, dict) or not isinstance(request.get("verb"), str):
-            client.answer(2, 'the request must be an object with a "verb"')
+            request = door.decode_request(line)
+        except S2RError as error:
+            client.answer(error.exit_code, str(error))
             return
         client.progress(accepted=True)
         self._on_request(client, request)
@@ -316,13 +314,14 @@ def call(path: Path, request: Request, on_progress: Callable[[Request], None] | 
     """Sends a request and returns its final answer: `exit_code`, `text`, `data`. When the person leaves, the request is interrupted, and
     the answer says what became of it. Raises UsageError if nobody answers.
     """
+    line = _line(request)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
         sock.settimeout(FIRST_LINE_WITHIN_S)
         try:
             sock.connect(str(path))
             if (whose := _peer(sock)) not in (0, os.geteuid()) and os.geteuid() != 0:
                 raise UsageError(f"{path}: whoever listens there is user {whose}, and no daemon of yours; nothing was said to him")
-            sock.sendall(json.dumps(request).encode() + b"\n")
+            sock.sendall(line)
             for answer in _answers(sock, presence):
                 if "exit_code" in answer:
                     return answer
@@ -339,6 +338,24 @@ def call(path: Path, request: Request, on_progress: Callable[[Request], None] | 
         except ValueError as error:
             raise UsageError(f"{path}: no daemon answers: {error}") from None
     raise UsageError(f"{path}: the daemon hung up before it answered; its log says why")
+
+
+def _line(request: Request) -> bytes:
+    """A request as it is sent. Raises UsageError for what the daemon would refuse."""
+    try:
+        line = json.dumps(request, ensure_ascii=False, allow_nan=False).encode() + b"\n"
+    except UnicodeEncodeError:
+        named = next((name for name, value in request.items() if _is_not_utf8(value)), "a field")
+        raise UsageError(f"{request['verb']}: {named} is not UTF-8 text: {one_line(str(request.get(named, '')), 100)}; rename it") from None
+    except ValueError as error:
+        raise UsageError(f"{request['verb']}: {error}") from None
+    if len(line) > REQUEST_MAX:
+        raise UsageError(f"{request['verb']}: is longer than the {REQUEST_MAX} bytes that a request may have")
+    return line
+
+
+def _is_not_utf8(value: object) -> bool:
+    return isinstance(value, str) and value.encode(errors="replace").decode() != value
 
 
 def _answers(sock: socket.socket, presence: Presence | None) -> Iterator[Request]:

@@ -15,14 +15,12 @@ import msgspec
 
 from s2r_runtime.daemon import issuing
 from s2r_runtime.daemon.control import Connection, ControlServer
+from s2r_runtime.daemon.door import NO_TEXT, Request
 from s2r_runtime.daemon.every import Every
-from s2r_runtime.daemon.model_store import parse_model
-from s2r_runtime.daemon.settings import ModelFacts
 from s2r_runtime.daemon.status import status
-from s2r_runtime.daemon.worker import Failed, InputsJob, LoadJob, Result
-from s2r_runtime.errors import ConfigError, S2RError, UsageError
+from s2r_runtime.daemon.worker import Brought, Failed, InputsJob, LoadJob, ModelJob, Result
+from s2r_runtime.errors import S2RError, UsageError
 from s2r_runtime.messages import Answer, Requested
-from s2r_runtime.modelspec import ModelSpec, dump_model
 
 if TYPE_CHECKING:
     from s2r_runtime.daemon.loop import Daemon
@@ -36,28 +34,13 @@ STILL = "nothing drives for it; what the daemon still computes goes on: s2r stat
 SETTLE_WITHIN_NS = 5_000_000_000
 """Three times the longest that a busy computer let a robot's or a link's process wait."""
 LOAD_TIMEOUT_S = 30.0
+MODEL_TIMEOUT_S = 60.0
+"""A person's own model is run a few times to see that it is one."""
 INPUTS_TIMEOUT_S = 120.0
 """The model is rolled out over them, one step after the other: 0.1 ms a row."""
 PROGRESS_NS = 200_000_000
 RESULT_OF = {"sample": "gap", "trace": "trace", "deploy": "verify", "verify": "verify"}
 """Whose result goes with the answer to a verb."""
-
-
-class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a client may ask. deploy: path, parameters, certificate (text). adopt: text of the model's TOML, base its folder; no text: the
-    proposed one. excite: path. trace: text says what. detached (sample, excite): answered when it drives, and not stopped when the
-    client is gone.
-    """
-
-    verb: str
-    path: str = ""
-    parameters: dict[str, float | str | bool] = {}
-    certificate: str = ""
-    text: str = ""
-    base: str = ""
-    duration_s: float = 0.0
-    count: int = 0
-    detached: bool = False
 
 
 class Waiting(NamedTuple):
@@ -205,12 +188,7 @@ class Desk:
 
     # ------------------------------------------------------------------ the socket
 
-    def _requested(self, connection: Connection, plain: dict[str, Any]) -> None:
-        try:
-            request = msgspec.convert(plain, Request, strict=False)
-        except msgspec.ValidationError as error:
-            connection.answer(2, f"{plain['verb']}: {error}")
-            return
+    def _requested(self, connection: Connection, request: Request) -> None:
         try:
             self._serve(connection, request)
         except S2RError as error:
@@ -228,8 +206,6 @@ class Desk:
             case "excite":
                 self._excite(connection, request)
             case verb if verb in PLAIN:
-                if not 0.0 <= request.duration_s < float("inf") or not 0 <= request.count < 2**31:
-                    raise ConfigError(f"{verb}: duration_s is {request.duration_s} and count {request.count}, must be >= 0 and finite")
                 text = "" if verb == "pause" else request.text
                 count, detached = (0 if verb == "pause" else request.count), verb == "sample" and request.detached
                 self.request(verb, connection, detached=detached, text=text, duration_s=request.duration_s, count=count)
@@ -245,18 +221,20 @@ class Desk:
                 return
             self._d.actions.keep_controller(result.controller)
             digest = result.controller.digest
-            if (not request.certificate or self._install(connection, request.certificate, digest)) and connection.listening:
+            if (result.certificate is None or self._install(connection, result.certificate)) and connection.listening:
                 self.request("deploy", connection, digest=digest, text=request.path)
 
-        self._d.workshop.start(LoadJob(request.path, dict(request.parameters)), LOAD_TIMEOUT_S, loaded)
+        d = self._d
+        job = LoadJob(request.path, request.parameters, request.certificate, d.trust.keys(), d.profile, int(time.time()))
+        d.workshop.start(job, LOAD_TIMEOUT_S, loaded)
 
-    def _install(self, connection: Connection, text: str, digest: str) -> bool:
+    def _install(self, connection: Connection, brought: Brought) -> bool:
         """A certificate that came along. Refused, it ends the request: nobody asked for an attempt of this robot's budget instead."""
         self._numbers += 1
         self._waiting[self._numbers] = Waiting("certificate", connection)
         self._said = (0, "")
         try:
-            self._d.feed(issuing.load(self._d, text, "--certificate", digest, self._numbers))
+            self._d.feed(issuing.take(self._d, brought, self._numbers))
         except S2RError as error:
             self._said = (error.exit_code, str(error))
         self._waiting.pop(self._numbers)
@@ -287,36 +265,25 @@ class Desk:
         self._d.workshop.start(job, INPUTS_TIMEOUT_S, loaded)
 
     def _adopt(self, connection: Connection, request: Request) -> None:
-        """Looks whether the model can take the place of the one in force; the robot has the same states, inputs and step either way."""
-        spec = parse_model(request.text, request.base, "adopt") if request.text else self._proposed()
-        current = self._d.profile
-        if spec.dt != current.model.dt:
-            raise ConfigError(f"adopt: model.dt is {spec.dt} s, must be the profile's {current.model.dt} s")
-        profile = msgspec.structs.replace(current, model=spec)
+        """A worker looks whether the model can take the place of the one in force; the robot's states, inputs and step are the same."""
+        d, proposal = self._d, self._d.state.memory.proposal
+        named = request.model != NO_TEXT
+        if not named and proposal is None:
+            raise UsageError("adopt: no model is proposed; name one, or trace first: s2r trace --live campaign")
+        profile = d.profile
 
-        def checked(wrong: str, facts: ModelFacts | None) -> None:
+        def checked(result: Result | Failed) -> None:
             if not connection.listening:
                 return
-            if wrong or facts is None or not facts.same_robot(self._d.facts):
-                connection.answer(78, wrong or "adopt: the model has other states or inputs than the robot's")
+            if isinstance(result, Failed) or result.model is None:
+                connection.answer(78, result.text if isinstance(result, Failed) else "adopt: no model was loaded")
                 return
-            try:
-                kept = self._d.models.keep(spec)
-            except OSError as error:
-                connection.answer(70, f"adopt: the model cannot be kept: {error.strerror}")
-                return
-            self._d.adopting[spec.digest()] = msgspec.structs.replace(profile, model=kept), facts
+            found = result.model
+            d.adopting[found.digest] = msgspec.structs.replace(profile, model=found.spec), found.facts
             # before the decision, so that a reader of the log has the model when it comes into force
-            self._d.logbook.attach(f"model/{spec.digest()}", "application/toml", dump_model(kept).encode())
-            self.request("adopt", connection, digest=spec.digest())
+            d.logbook.attach(f"model/{found.digest}", "application/toml", found.toml.encode())
+            self.request("adopt", connection, digest=found.digest)
 
-        self._numbers += 1
-        self._d.watcher.check(self._numbers, profile, "adopt", checked)
-
-    def _proposed(self) -> ModelSpec:
-        """The model that tracing proposes. Raises UsageError if there is none."""
-        proposal = self._d.state.memory.proposal
-        spec = None if proposal is None else self._d.models.load(proposal.digest)
-        if spec is None:
-            raise UsageError("adopt: no model is proposed; name one, or trace first: s2r trace --live campaign")
-        return spec
+        digest = "" if named or proposal is None else proposal.digest
+        job = ModelJob(profile, d.facts, str(d.models.folder), d.models.base, request.model, request.base, digest)
+        d.workshop.start(job, MODEL_TIMEOUT_S, checked)

@@ -11,8 +11,9 @@ from s2r_runtime import certificate as certificates
 from s2r_runtime import keys
 from s2r_runtime.daemon.persistence import replace
 from s2r_runtime.daemon.trust import certificate_file
+from s2r_runtime.daemon.worker import Brought
 from s2r_runtime.errors import ConfigError, S2RError
-from s2r_runtime.messages import CertificateFailed, CertificateStored, Gap, IssueCertificate
+from s2r_runtime.messages import CertificateFacts, CertificateFailed, CertificateStored, Gap, IssueCertificate
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -48,39 +49,32 @@ def issue(daemon: Daemon, order: IssueCertificate) -> CertificateStored | Certif
             horizon=daemon.facts.horizon,
             traced_not_adopted=daemon.state.memory.traced,
         )
-        return _store(daemon, certificate, certificates.sign(certificate, daemon.key), None, order.request_id)
+        return _store(daemon, certificates.facts(certificate), certificates.sign(certificate, daemon.key), None, order.request_id)
     except S2RError as error:
         return CertificateFailed(0, str(error), order.request_id)
 
 
-def load(daemon: Daemon, text: str, where: str, controller: str, request_id: int) -> CertificateStored:
-    """A certificate that a person brings for this controller (digest), made elsewhere. Raises ConfigError with what is wrong with it."""
-    folder = daemon.folder.path
-    data = text.encode()
-    if (problem := daemon.trust.objection(certificates.signer(data))) and "revoked" in problem:
-        raise ConfigError(f"{where}: is {problem}; certify again with another key")
-    try:
-        certificate = certificates.load(data, daemon.trust.keys(), int(time.time()), where)
-    except certificates.UntrustedKey as error:
+def take(daemon: Daemon, brought: Brought, request_id: int) -> CertificateStored:
+    """A certificate that a person brought, made elsewhere and read by a worker. Raises ConfigError with what is wrong with it."""
+    where, folder = "--certificate", daemon.folder.path
+    objection = daemon.trust.objection(brought.signer)
+    if "revoked" in objection:
+        raise ConfigError(f"{where}: is {objection}; certify again with another key")
+    if brought.untrusted:
         raise ConfigError(
-            f"{error}; put the signer's public key (.pub) into {folder / 'trusted'}/, or run the daemon with the signer's key"
+            f"{brought.problem}; put the signer's public key (.pub) into {folder / 'trusted'}/, or run the daemon with the signer's key"
             f" (s2r run --key FILE), or certify with this daemon's (s2r certify --key {folder / 'key.pem'}, if run without --key)"
-        ) from None
-    if problem := certificates.assumption_problem(certificate, daemon.profile):
-        raise ConfigError(f"{where}: {problem}")
-    if certificate.controller_digest != controller:
-        raise ConfigError(f"{where}: is of the controller {certificate.controller_digest}; the one to deploy is {controller}")
-    stored = _store(daemon, certificate, data, certificate.gap, request_id)
+        )
+    if brought.problem or brought.facts is None or objection:
+        raise ConfigError(brought.problem or f"{where}: {objection or 'is none'}")
+    stored = _store(daemon, brought.facts, brought.text.encode(), brought.gap, request_id)
     if isinstance(stored, CertificateFailed):
         raise S2RError(stored.error)
     return stored
 
 
-def _store(
-    daemon: Daemon, certificate: certificates.Certificate, data: bytes, gap: Gap | None, request_id: int
-) -> CertificateStored | CertificateFailed:
+def _store(daemon: Daemon, facts: CertificateFacts, data: bytes, gap: Gap | None, request_id: int) -> CertificateStored | CertificateFailed:
     """Into the log and the state folder, and to the disk."""
-    facts = certificates.facts(certificate)
     folder = daemon.folder.path / "certificates"
     daemon.logbook.attach(f"certificate/{facts.id}", "application/json", data)
     try:

@@ -7,14 +7,31 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import msgspec
 
 from s2r_runtime.controllers.file import ControllerFile, load
 from s2r_runtime.daemon.given_inputs import BYTES_MAX, GivenInputs, parse_inputs
+from s2r_runtime.daemon.model_store import ModelStore, parse_model
 from s2r_runtime.daemon.settings import facts_of, settings_of
-from s2r_runtime.daemon.worker import GapJob, InputsJob, Job, LoadJob, Result, SynthesisJob, TraceJob, VerifyJob
-from s2r_runtime.errors import ConfigError
+from s2r_runtime.daemon.worker import (
+    Brought,
+    GapJob,
+    InputsJob,
+    Job,
+    LoadJob,
+    Model,
+    ModelJob,
+    Result,
+    SynthesisJob,
+    TraceJob,
+    VerifyJob,
+)
+from s2r_runtime.errors import ConfigError, one_line
 from s2r_runtime.messages import Gap
+from s2r_runtime.modelspec import dump_model
+from s2r_runtime.profile import Profile, check_model
 
 if TYPE_CHECKING:
     from s2r_runtime.hookspecs import Task
@@ -33,7 +50,9 @@ def run(job: Job, progress: Progress) -> Result:
         case LoadJob():
             if not Path(job.path).is_file():  # a device or a pipe may have no end
                 raise ConfigError(f"{job.path}: is no file")
-            return Result(controller=load(Path(job.path), job.parameters))
+            return brought(job)
+        case ModelJob():
+            return Result(model=model(job))
         case GapJob():
             return Result(gap=gap(job))
         case VerifyJob():
@@ -46,6 +65,65 @@ def run(job: Job, progress: Progress) -> Result:
             return Result(inputs=inputs(job))
         case SynthesisJob():
             return synthesize(job, progress)
+
+
+def opened(raw: msgspec.Raw, kind: Any, what: str) -> Any:
+    """A field of a request that nobody has decoded yet. Raises ConfigError."""
+    try:
+        return msgspec.json.decode(raw, type=kind)
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{what}: {one_line(str(error))}") from None
+
+
+def brought(job: LoadJob) -> Result:
+    """The controller, and the certificate that came along."""
+    file = load(Path(job.path), opened(job.parameters, dict[str, float | str | bool], "parameters"))
+    text = opened(job.certificate, str, "--certificate")
+    if not text or job.profile is None:
+        return Result(controller=file)
+    return Result(controller=file, certificate=_certificate(text, job, job.profile, file.digest))
+
+
+def _certificate(text: str, job: LoadJob, profile: Profile, controller: str) -> Brought:
+    from s2r_runtime import certificate as certificates
+
+    where, data = "--certificate", text.encode()
+    signer = certificates.signer(data)
+    try:
+        found = certificates.load(data, job.keys, job.now_unix_s, where)
+    except certificates.UntrustedKey as error:
+        return Brought(signer, problem=str(error), untrusted=True)
+    except ConfigError as error:
+        return Brought(signer, problem=str(error))
+    problem = certificates.assumption_problem(found, profile)
+    if not problem and found.controller_digest != controller:
+        problem = f"is of the controller {found.controller_digest}; the one to deploy is {controller}"
+    if problem:
+        return Brought(signer, problem=f"{where}: {problem}")
+    return Brought(signer, text, certificates.facts(found), found.gap)
+
+
+def model(job: ModelJob) -> Model:
+    """The model, checked with the profile's names and task, and kept. Raises ConfigError."""
+    from s2r_runtime.plugins import registry
+
+    store = ModelStore(Path(job.folder), job.base)
+    text = opened(job.text, str, "adopt")
+    spec = parse_model(text, job.where, "adopt") if text else store.load(job.digest)
+    if spec is None:
+        raise ConfigError("adopt: the proposed model is not there any more; trace again: s2r trace --live campaign")
+    if spec.dt != job.profile.model.dt:
+        raise ConfigError(f"adopt: model.dt is {spec.dt} s, must be the profile's {job.profile.model.dt} s")
+    profile = msgspec.structs.replace(job.profile, model=spec)
+    composed = check_model(profile, "adopt")
+    facts = facts_of(composed, registry().get("tasks", profile.task.name)(profile.task.parameters, composed.nominal, composed.dt).horizon)
+    if not facts.same_robot(job.facts):
+        raise ConfigError("adopt: the model has other states or inputs than the robot's")
+    try:
+        kept = store.keep(spec)
+    except OSError as error:
+        raise ConfigError(f"adopt: the model cannot be kept: {error.strerror}") from None
+    return Model(kept, spec.digest(), facts, dump_model(kept))
 
 
 def gap(job: GapJob) -> Gap:

@@ -8,7 +8,6 @@ changed since has the last word. Two files of one digest compute the same; what 
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import Memory
 from s2r_runtime.modelspec import ModelSpec, dump_model, load_model
 from s2r_runtime.profile import Profile
+from s2r_runtime.toml_text import load_toml, parse_toml
 
 DIGITS = 16
 """Of a digest, in a file's name; what is in the file is compared with all of it."""
@@ -65,17 +65,14 @@ class ModelStore:
 
 def _of_base(file: Path, base: str) -> bool:
     try:
-        return bool(tomllib.loads(file.read_text(encoding="utf-8")).get("base") == base)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return bool(load_toml(file).get("base") == base)
+    except ConfigError as error:
         raise ConfigError(f"{file}: is damaged: {error}") from None
 
 
 def parse_model(text: str, base: str, where: str) -> ModelSpec:
     """A model from the text of a TOML; a Python file in it is looked up from `base`. Raises ConfigError."""
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{where}: not TOML: {error}") from None
+    table = parse_toml(text, where)
     if "model" not in table:
         raise ConfigError(f"{where}: has no [model] table")
     try:

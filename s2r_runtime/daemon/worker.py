@@ -19,11 +19,16 @@ from s2r_runtime.child import Child, die_with_parent, say, stand_back, take_stdo
 from s2r_runtime.controllers.candidates import Synthesis
 from s2r_runtime.controllers.file import ControllerFile
 from s2r_runtime.daemon.given_inputs import GivenInputs
-from s2r_runtime.errors import S2RError
-from s2r_runtime.messages import Gap, SampleTaken, Stretch, Verification
+from s2r_runtime.daemon.settings import ModelFacts
+from s2r_runtime.errors import S2RError, one_line
+from s2r_runtime.messages import CertificateFacts, Gap, SampleTaken, Stretch, Verification
+from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.processor import family, used
 from s2r_runtime.profile import Profile
 from s2r_runtime.recording.stretches import Cut
+
+SAID_MAX = 2000
+"""Characters of an error: those of a certificate that is refused list all that is wrong with it."""
 
 
 class GapJob(msgspec.Struct, frozen=True, tag="gap"):
@@ -37,10 +42,32 @@ class GapJob(msgspec.Struct, frozen=True, tag="gap"):
 
 
 class LoadJob(msgspec.Struct, frozen=True, tag="load"):
-    """Read a controller's file and what it imports. In a worker, because a path may be slow, or a pipe."""
+    """Read a controller's file and what it imports; and a certificate for it, if one came along. In a worker, because a path may be slow,
+    or a pipe, and a text anything. parameters, certificate: JSON, as it came. keys: whose signature counts. now_unix_s: the daemon's.
+    """
 
     path: str
-    parameters: dict[str, Any]
+    parameters: msgspec.Raw = msgspec.Raw(b"{}")
+    certificate: msgspec.Raw = msgspec.Raw(b'""')
+    keys: tuple[bytes, ...] = ()
+    profile: Profile | None = None
+    now_unix_s: int = 0
+
+
+class ModelJob(msgspec.Struct, frozen=True, tag="model"):
+    """Read a model that is to take the place of the profile's, check that it is of the same robot (`facts`), and keep it in `folder`.
+
+    base: as in `ModelStore`. text: a JSON string, its TOML, as it came; relative files are looked up from `where`. digest: of the
+    proposed model instead, if there is no text.
+    """
+
+    profile: Profile
+    facts: ModelFacts
+    folder: str
+    base: str
+    text: msgspec.Raw = msgspec.Raw(b'""')
+    where: str = ""
+    digest: str = ""
 
 
 class VerifyJob(msgspec.Struct, frozen=True, tag="verify"):
@@ -102,7 +129,29 @@ class SynthesisJob(msgspec.Struct, frozen=True, tag="synthesis"):
     number: int
 
 
-Job = LoadJob | GapJob | VerifyJob | TraceJob | InputsJob | SynthesisJob
+class Brought(msgspec.Struct, frozen=True):
+    """A certificate that a person brought: what the core is to know of it, or `problem`. signer: the key that stands in it.
+    untrusted: nothing but its key is wrong.
+    """
+
+    signer: bytes = b""
+    text: str = ""
+    facts: CertificateFacts | None = None
+    gap: Gap | None = None
+    problem: str = ""
+    untrusted: bool = False
+
+
+class Model(msgspec.Struct, frozen=True):
+    """A model that can take the place of the profile's, and is kept. toml: its text."""
+
+    spec: ModelSpec
+    digest: str
+    facts: ModelFacts
+    toml: str
+
+
+Job = LoadJob | ModelJob | GapJob | VerifyJob | TraceJob | InputsJob | SynthesisJob
 
 
 class Progress(msgspec.Struct, frozen=True, tag="progress"):
@@ -114,13 +163,15 @@ class Progress(msgspec.Struct, frozen=True, tag="progress"):
 
 
 class Result(msgspec.Struct, frozen=True, tag="result"):
-    """What a job found: the fields of JobFinished that it fills, or the controller or inputs that were loaded."""
+    """What a job found: the fields of JobFinished that it fills, or what was loaded."""
 
     gap: Gap | None = None
     verification: Verification | None = None
     trace: dict[str, Any] | None = None
     safety: dict[str, list[float]] = {}
     controller: ControllerFile | None = None
+    certificate: Brought | None = None
+    model: Model | None = None
     inputs: GivenInputs | None = None
     synthesis: Synthesis | None = None
 
@@ -220,17 +271,17 @@ def main(arguments: list[str]) -> int:
             spoken = time.monotonic()
             say(channel, _ENCODE(Progress(done, total, detail)))
 
-    job = msgspec.json.decode(sys.stdin.buffer.readline(), type=Job)
     try:
+        job = msgspec.json.decode(sys.stdin.buffer.readline(), type=Job)
         from s2r_runtime.daemon.jobs import run
 
         line = _ENCODE(run(job, progress))
     except S2RError as error:
-        line = _ENCODE(Failed(str(error)))
+        line = _ENCODE(Failed(one_line(str(error), SAID_MAX)))
     except Exception as error:  # noqa: BLE001 - whatever a job raises is its result; a verification that failed to run is a refusal
         with contextlib.suppress(OSError):  # confined, it may not write to a file
             traceback.print_exc()
-        line = _ENCODE(Failed(f"{type(error).__name__}: {error}"))
+        line = _ENCODE(Failed(one_line(f"{type(error).__name__}: {error}", SAID_MAX)))
     say(channel, line)
     return 0
 

@@ -16,7 +16,7 @@ import msgspec
 
 from s2r_runtime.child import Child
 from s2r_runtime.core import stream
-from s2r_runtime.daemon.analytics import Analytics, Ready, Refused, Reply, Upward, Watching
+from s2r_runtime.daemon.analytics import Analytics, Ready, Reply, Upward, Watching
 from s2r_runtime.daemon.settings import ModelFacts
 from s2r_runtime.daemon.worker import Failed, Job, Progress, Result, TraceJob, Worker
 from s2r_runtime.messages import AnalyticsChanged, Event, Gap, Measured, Observation, Send, WatchStood
@@ -111,7 +111,6 @@ class Watcher:
         self._analytics: Analytics | None = Analytics(profile, where, child, clock)
         self._again_ns = 0
         self._ready = self._late = False
-        self._checks: dict[int, Callable[[str, ModelFacts | None], None]] = {}
         self._watching: Watching | None = None
         self._stood: tuple[Gap, WatchStood] | None = None
         """Where the watch of that gap stands."""
@@ -133,14 +132,6 @@ class Watcher:
         self._register(self._analytics)
         self._ready = True
         return facts
-
-    def check(self, ref: int, profile: Profile, where: str, answer: Callable[[str, ModelFacts | None], None]) -> None:
-        """Whether this profile's model can be used; answers with what is wrong with it (or nothing) and its facts."""
-        if self._analytics is None or not self._ready:
-            answer("the analytics process is down, so no model can be checked now; try again", None)
-            return
-        self._checks[ref] = answer
-        self._analytics.check(ref, profile, where)
 
     def use(self, profile: Profile) -> None:
         """The profile with another model from here on; a restart checks that one."""
@@ -236,9 +227,6 @@ class Watcher:
         self._analytics, self._ready, self._late = None, False, False
         self._again_ns = now_ns + AGAIN_AFTER_NS
         self._emit(AnalyticsChanged(0, up=False, detail=analytics.down))
-        for answer in self._checks.values():
-            answer(analytics.down, None)
-        self._checks.clear()
 
     def _measured(self, measured: Measured) -> None:
         """Keeps where the watch stands, for a process that is started again."""
@@ -251,9 +239,6 @@ class Watcher:
         if isinstance(message, Reply):
             if message.measured is not None:
                 self._measured(message.measured)
-        elif message.ref in self._checks:
-            answer = self._checks.pop(message.ref)
-            answer(message.text, None) if isinstance(message, Refused) else answer("", message.facts)
         elif isinstance(message, Ready):
             self._up()
         else:
