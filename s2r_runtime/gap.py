@@ -24,6 +24,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.prediction import Holds, acting_over, hold_residuals, residuals
 from s2r_runtime.profile_checks import HEAVIEST, LIGHTEST
 from s2r_runtime.repeats import Repeats, repeats
+from s2r_runtime.seen_rows import PREFIX, seen
 from s2r_runtime.table_rows import Subset
 from s2r_runtime.whiteness import DEPENDENT, SERIAL_ALPHA, Whiteness, body_axes, serial_p, whiteness
 
@@ -81,6 +82,8 @@ class Transitions:
     noise: Array | None = None
     drive: Drive | None = field(default=None, repr=False)
     holds: Holds | None = field(default=None, repr=False)
+    measured: tuple[Array, ...] = field(default=(), repr=False)
+    """States as measured, (m, nx) a run, NaN where one was not received, where the model was fitted; else x0 and x1 stand for them."""
     subset: Subset | None = None
     notes: tuple[str, ...] = ()
     """What a person should know of how the recording was read, one line each."""
@@ -197,11 +200,17 @@ def different(model: ComposedModel, tr: Transitions) -> Repeats:
 
 
 def refuse_fitted(model: ComposedModel, tr: Transitions) -> None:
-    """Raises NotEnoughEvidence if the model was fitted on this recording or these samples (G6)."""
+    """Raises NotEnoughEvidence if the model was fitted on this recording, these samples, or some of their rows (G6)."""
     if {tr.digest, tr.samples_digest, tr.content_digest, *tr.parts} & set(model.spec.fitted_on) - {""}:
         raise NotEnoughEvidence(
             f"{tr.source}: the model was fitted on this recording, which therefore can't bound its gap; take one that the fit never saw"
         )
+    for text in model.spec.fitted_on:
+        if text.startswith(PREFIX) and (found := seen(text, tr.measured or (tr.x0, tr.x1))).refused:
+            raise NotEnoughEvidence(
+                f"{tr.source}: the model was fitted on {found.rows / found.of:.3g} of its rows ({found.rows} of {found.of}), so it can't "
+                "bound its gap; take a recording that the fit never saw"
+            )
 
 
 def radius_of_noise(model: ComposedModel, tr: Transitions, weights: Array, kind: Kind, discard: int) -> float | None:

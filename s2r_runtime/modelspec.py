@@ -41,7 +41,8 @@ class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     effects: tuple[EffectSpec, ...] = ()
     """`[[model.effects]]`, in order: what the data sheet says, and what tracing found."""
     fitted_on: tuple[str, ...] = ()
-    """Digests of the recordings that effects were fitted on; a gap is refused on those (guarantee G6). Tracing writes it."""
+    """Digests of the recordings that effects were fitted on, and sketches of their rows; a gap is refused on those (guarantee G6).
+    Tracing writes it."""
     source_digest: str = ""
     """Of the Python file; filled when it is loaded."""
 

@@ -148,11 +148,17 @@ def _together(model: ComposedModel, reads: Sequence[_Read]) -> Transitions:
         found = replace(found, noise=streams_noise(model, streams))
     else:
         found = drive_transitions(model, streams, recording, source, under_way=any(read.subset for read in reads))
+    found = replace(found, measured=_measured(model, streams))
     found = replace(found, subset=joined([read.subset for read in reads], [sum(len(s.t) for s in read.streams) for read in reads]))
     if len(reads) == 1:
         return replace(found, content_digest=reads[0].content, notes=reads[0].notes)
     notes = tuple(f"{Path(read.source).name}: {line}" for read in reads for line in read.notes)
     return replace(found, notes=notes, parts=tuple(one for read in reads for one in (read.recording, read.content)))
+
+
+def _measured(model: ComposedModel, streams: Sequence[Streams]) -> tuple[Array, ...]:
+    """States as measured, for a model that was fitted; else nobody looks at them, and they need not stay in memory."""
+    return tuple(one.x for one in streams) if model.spec.fitted_on else ()
 
 
 # ---------------------------------------------------------------- CSV
@@ -308,7 +314,9 @@ def from_mcap(path: Path, model: ComposedModel, *, epoch: int | None = None) -> 
         there = ", ".join(str(e) for e in log.samples) or "none"
         raise RecordingError(f"{path}: has no samples of epoch {epoch}; it has samples of: {there}")
     if not log.samples:
-        return replace(drive_transitions(model, log.stretches(model), recording, str(path)), content_digest=log.identity)
+        streams = log.stretches(model)
+        found = drive_transitions(model, streams, recording, str(path))
+        return replace(found, content_digest=log.identity, measured=_measured(model, streams))
     complete = [e for e in log.samples if e in log.finished and log.finished[e].complete and len(log.samples[e]) == log.finished[e].n]
     chosen = epoch if epoch is not None else (complete or list(log.samples))[-1]
     ending = log.finished.get(chosen)

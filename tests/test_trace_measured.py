@@ -40,7 +40,7 @@ def test_the_delay_of_a_real_robot_is_found_and_its_heading_is_foretold_as_well_
     assert before == pytest.approx(0.0133, rel=0.12)
     assert after < 0.62 * before
     assert not {f.kind for f in found.faults} - {"dropout"}
-    assert len(found.spec.fitted_on) == 2  # the bytes, and what they say
+    assert len(found.spec.fitted_on) == 3  # the bytes, what they say, and the rows
 
 
 @pytest.mark.skipif(not (FOLDER / "emps_pulses.csv.gz").exists(), reason="the measured recordings are not here")

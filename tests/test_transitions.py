@@ -408,4 +408,5 @@ def test_a_recording_that_was_fitted_on_is_known_again_packed_reformatted_and_in
         for tr in (load_transitions(path, fitted), blocked(load_transitions(path, fitted), 0.5, DT)):
             with pytest.raises(NotEnoughEvidence, match="fitted on this recording"):
                 refuse_fitted(fitted, tr)
-    refuse_fitted(fitted, load_transitions(other, fitted))
+    with pytest.raises(NotEnoughEvidence, match="fitted on 1 of its rows"):
+        refuse_fitted(fitted, load_transitions(other, fitted))

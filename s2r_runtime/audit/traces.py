@@ -28,6 +28,7 @@ from s2r_runtime.messages import JobFinished, Memory, ModelAdopted, SampleTaken,
 from s2r_runtime.recording.layout import Attached
 from s2r_runtime.recording.reading import Entry
 from s2r_runtime.recording.stretches import CHANNELS, Cut, Stretches, log_identity
+from s2r_runtime.seen_rows import PREFIX
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -146,6 +147,7 @@ class Traces:
             cut=cut,
             identities=identities,
             cpu_s=self._seconds or 0.0,
+            row_sketch=any(text.startswith(PREFIX) for text in spec.fitted_on) if (spec := _spec(trace)) else True,
         )
         done = _work(
             job, math.inf if self._seconds is None else PATIENCE * self._seconds, lambda share: self._progress(f"{name}: {share:.0f} %")

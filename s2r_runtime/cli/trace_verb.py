@@ -131,8 +131,10 @@ def run(args: argparse.Namespace) -> int:
         reading.close()
     for one in (data, test):
         output.notes(one.source if one else "", one.notes if one else ())
-    if test and set(test.digests) & set(data.digests):
-        raise UsageError(f"--test {args.test}: is the recording that the fit is made on; take one that the fit never sees")
+    if test and _seen_by_the_fit(data, test):
+        raise UsageError(
+            f"--test {args.test}: is the recording that the fit is made on, or has rows of it; take one that the fit never sees"
+        )
     bar = output.Progress("tracing")
     try:
         result = trace(
@@ -168,6 +170,16 @@ def run(args: argparse.Namespace) -> int:
     for why in trouble.values():  # last: what was found is told all the same
         output.err(f"s2r: {why}")
     return UsageError.exit_code if trouble else 0
+
+
+def _seen_by_the_fit(data: Dataset, test: Dataset) -> bool:
+    """Whether the fit would see rows of the test (guarantee G6)."""
+    from s2r_runtime.seen_rows import PREFIX, seen
+
+    if set(test.digests) & set(data.digests):
+        return True
+    rows = [states.values for states, _ in test.segments]
+    return any(seen(text, rows).refused for text in data.digests if text.startswith(PREFIX))
 
 
 def _files(args: argparse.Namespace, result: TraceResult, suggested: Suggestion | None) -> dict[Path, str]:

@@ -46,7 +46,7 @@ def trace(job: TraceJob, progress: Callable[[float, float, str], None]) -> dict[
         seconds = max(1, round(job.cpu_s))
         resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
     cut, identities = (job.cut, job.identities) if job.cut is not None else _read(job)
-    found, fitted = traced(job.profile, cut, identities, job.seed, progress)
+    found, fitted = traced(job.profile, cut, identities, job.seed, progress, row_sketch=job.row_sketch)
     result: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(plain(job, cut, found, fitted), enc_hook=_number))
     if job.out and fitted.effects != job.profile.model.effects:
         path = Path(job.out)
@@ -57,10 +57,16 @@ def trace(job: TraceJob, progress: Callable[[float, float, str], None]) -> dict[
 
 
 def traced(
-    profile: Profile, cut: Cut, identities: tuple[str, ...], seed: int, progress: Callable[[float, float, str], None]
+    profile: Profile,
+    cut: Cut,
+    identities: tuple[str, ...],
+    seed: int,
+    progress: Callable[[float, float, str], None],
+    *,
+    row_sketch: bool = True,
 ) -> tuple[TraceResult, Any]:
-    """What the tracer says; and the repaired model, which remembers what it was fitted on (guarantee G6): the rows, a campaign's
-    samples in whatever log they stand, and for anything else the whole log.
+    """What the tracer says; and the repaired model, which remembers what it was fitted on (guarantee G6): the stretch, its rows
+    one by one (`row_sketch`), a campaign's samples in whatever log they stand, and for anything else the whole log.
     """
     from s2r_runtime.models.composed import compose
     from s2r_runtime.trace.tracer import trace as tracer
@@ -71,7 +77,7 @@ def traced(
     source = f"{about.stretch} of epoch {about.epoch}"
     samples = from_samples(cut.samples, source=source) if cut.samples else None
     more = identities if samples is None else (samples.digest,)
-    data = replace(dataset(model, cut, source, (about.digest,)), campaign=samples)
+    data = replace(dataset(model, cut, source, (about.digest,), sketched=row_sketch), campaign=samples)
     found = tracer(data, model, seed=seed, progress=progress, weights=weights(profile, model.states), kind=profile.norm.set)
     fitted = found.spec
     if fitted.effects != profile.model.effects:
@@ -123,18 +129,20 @@ def weights(profile: Profile, states: Sequence[str]) -> tuple[float, ...]:
     return tuple(profile.norm.weights.get(name, 1.0) for name in states)
 
 
-def dataset(model: ComposedModel, cut: Cut, source: str, digests: tuple[str, ...]) -> Dataset:
+def dataset(model: ComposedModel, cut: Cut, source: str, digests: tuple[str, ...], *, sketched: bool = True) -> Dataset:
     """The stretch on the model's grid. Raises RecordingError if its rows are not of this model, or too far apart,
     NotEnoughEvidence if it is of one moment only.
     """
     from s2r_runtime.trace.dataset import from_streams
+    from s2r_runtime.trace.dataset_files import row_sketch
 
     for segment in cut.segments:
         for rows, names in ((segment.states, model.states), (segment.inputs, model.inputs)):
             if any(len(values) != len(names) for _, values in rows):
                 raise RecordingError(f"{source}: its rows are not of {', '.join(names)}")
     segments = [(_stream(one.states, len(model.states)), _stream(one.inputs, len(model.inputs))) for one in cut.segments]
-    return replace(from_streams(model, segments, source, digests), commanded=True)
+    seen = row_sketch(model, segments) if sketched else ()
+    return replace(from_streams(model, segments, source, (*digests, *seen)), commanded=True)
 
 
 def _stream(rows: Rows, width: int) -> Any:

@@ -105,6 +105,8 @@ class TraceJob(msgspec.Struct, frozen=True, tag="trace"):
     out: str = ""
     base: str = ""
     cpu_s: float = 0.0
+    row_sketch: bool = True
+    """Whether the model remembers the rows that it was fitted on; an audit of a log from before does not ask for it."""
 
 
 class InputsJob(msgspec.Struct, frozen=True, tag="inputs"):

@@ -24,6 +24,7 @@ from s2r_runtime.messages import CampaignFinished, Observed, Send, StartCampaign
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.recording.origin import other_writer
 from s2r_runtime.robot_logs import content_digest, is_mcap, is_robot_log
+from s2r_runtime.seen_rows import sketch
 from s2r_runtime.table_rows import Subset, joined
 from s2r_runtime.table_text import Limits, Progress, refuse_special
 from s2r_runtime.trace.dataset import Array, Dataset, Stream, from_streams
@@ -77,13 +78,16 @@ def load_dataset(
         raise UsageError(f"{own[0]}: is a log of this software, other recordings are none; trace one kind at a time")
     _once(paths, digests)
     if own:
-        return replace(from_streams(model, _log_segments(paths, model, epoch), source, digests, paths), commanded=True)
+        segments = _log_segments(paths, model, epoch)
+        return replace(from_streams(model, segments, source, (*digests, *row_sketch(model, segments)), paths), commanded=True)
     tables = _Tables(columns or {}, not bandwidth, MAX_ROWS // len(paths), limits, progress)
     parts = [_read_one(one, model, tables, transport, signals) for one in paths]
     _once(paths, [part.content for part in parts])
     segments, missing, called = _joined(paths, parts)
+    rows: tuple[str, ...] = ()
     if not missing:
         _check_steps(model, segments)
+        rows = row_sketch(model, segments)
     if behind is None:
         behind = {} if bandwidth else late_pose(model, segments, missing)
     names = [s for s in model.states if s not in missing]
@@ -99,7 +103,7 @@ def load_dataset(
     if missing:
         segments, done = reconstruct(model, segments, missing, source, bandwidth, slow)
     named = called if len(called) > 1 and done is None else ()  # what was reconstructed may be in more parts
-    data = from_streams(model, segments, source, (*digests, *(part.content for part in parts)), paths, done)
+    data = from_streams(model, segments, source, (*digests, *(part.content for part in parts), *rows), paths, done)
     subset = joined([part.subset for part in parts], [sum(len(states.t) for states, _ in part.segments) for part in parts])
     names = [f"{one.name}: " if len(paths) > 1 else "" for one in paths]
     notes = tuple(f"{name}{line}" for name, part in zip(names, parts, strict=True) for line in part.notes)
@@ -114,6 +118,11 @@ def _check_steps(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]]
     x, u = x[np.isfinite(x).all(axis=1)], u[np.isfinite(u).all(axis=1)]
     if len(x) and len(u):
         check_steps(model, *(e[[0, len(e) // 2, -1]] for e in (x, u)))
+
+
+def row_sketch(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]]) -> tuple[str, ...]:
+    """What stands for the rows of states that were measured (guarantee G6), as text."""
+    return sketch([states.values for states, _ in segments], model.angle_columns)
 
 
 def _digest(path: Path) -> str:

@@ -1,0 +1,165 @@
+"""Which rows of a recording did a fit see? A sketch of measured states, stored with the model that was fitted to them (guarantee G6).
+
+A row is one measured state (nx,), angles as points of a circle. It is hashed in two grids, half a cell apart; a cell is CELL of a column's
+spread. Rows that differ by far less than a cell (rounding, noise of arithmetic) share one of the two, whatever the order, the stamps, and
+what else is in the table. A sketch stores the KEPT lowest hashes of each grid: all of a recording up to that size, else a random subset of
+its rows (bottom-k sampling; Cohen and Kaplan 2007). Of m seen rows out of N it finds two or more with probability 1 - (1 + a) exp(-a) at
+least, a = m KEPT / N.
+
+Null hypothesis: a fresh recording. A row of it falls into a cell that the fit saw with probability `chance`, estimated from the fit: of
+visits to ten times larger cells, the share that another visit shares, a tenth of it. Of a coarse sensor, whose steps are all larger than a
+cell, it is the share of visits that come again, from above. Refused: MIN_SEEN different rows, and more than a Bin(n, SAFETY chance)
+exceeds with probability ALPHA.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from s2r_runtime.errors import ConfigError
+
+Array = NDArray[np.float64]
+Hashes = NDArray[np.uint64]
+
+PREFIX = "rows:"
+"""A sketch stands among `ModelSpec.fitted_on` with this before it."""
+CELL = 1e-5
+"""Of a column's spread: a hundred times what rounding to 7 digits changes, and small beside any motion."""
+COARSER = 10
+KEPT = 16_384
+"""220 KB of text; of 600 transitions out of two million rows, 99.9 % are found."""
+MIN_SEEN = 2
+"""A transition has two rows; one may be where odometry always begins."""
+ALPHA, SAFETY = 1e-3, 3.0
+"""Of fresh recordings of the same motion, this share is refused at most; and how much denser one may be than the fit's."""
+FEW = 7
+"""Added to how often a coarse sensor's cell came again: where the mean is that many, none at all has probability ALPHA (Poisson)."""
+BITS = 40
+_MASK = np.uint64((1 << BITS) - 1)
+
+
+class _Sketch(msgspec.Struct, frozen=True):
+    """cells: (c,) of each column; angles: which states; chance: of one row; grids: KEPT lowest hashes of each; whole: those are all."""
+
+    angles: tuple[int, ...]
+    cells: tuple[float, ...]
+    chance: float
+    whole: bool
+    grids: tuple[bytes, bytes]
+
+
+class Seen(NamedTuple):
+    """rows: how many different rows the fit saw, of `of` that could be looked up; refused: more than chance makes."""
+
+    rows: int
+    of: int
+    refused: bool
+
+
+def sketch(runs: Sequence[Array], angles: Sequence[int]) -> tuple[str, ...]:
+    """The sketch of these runs, each (m, nx), as text; none if no row has all states."""
+    parts = [_plain(run, angles) for run in runs]
+    rows = np.concatenate(parts) if parts else np.empty((0, 0))
+    if not len(rows):
+        return ()
+    low, high = np.min(rows, axis=0), np.max(rows, axis=0)
+    cells = np.maximum(CELL * (high - low), 1e-9 * np.maximum(1.0, np.maximum(np.abs(low), np.abs(high))))
+    grids = [np.unique(_hashes(rows, cells, shift)) for shift in (0.0, 0.5)]
+    raw = np.concatenate(runs)
+    chance = _chance(parts, cells, coarse=_is_coarse(raw[np.all(np.isfinite(raw), axis=1)], CELL))
+    whole = all(len(grid) <= KEPT for grid in grids)
+    made = _Sketch(tuple(angles), tuple(cells.tolist()), chance, whole, (_packed(grids[0][:KEPT]), _packed(grids[1][:KEPT])))
+    return (PREFIX + base64.b64encode(msgspec.msgpack.encode(made)).decode(),)
+
+
+def seen(text: str, runs: Sequence[Array]) -> Seen:
+    """What of these runs, each (m, nx), is in a sketch. Raises ConfigError if it is damaged."""
+    from scipy.stats import binom
+
+    try:
+        made = msgspec.msgpack.decode(base64.b64decode(text.removeprefix(PREFIX), validate=True), type=_Sketch)
+        grids = [_unpacked(grid) for grid in made.grids]
+    except (binascii.Error, ValueError, msgspec.MsgspecError) as error:
+        raise ConfigError(f"model: fitted_on: a sketch of rows is damaged: {error}") from None
+    cells, parts = np.array(made.cells), [_plain(run, made.angles) for run in runs]
+    rows = np.concatenate(parts) if parts else np.empty((0, 0))
+    if not len(rows) or rows.shape[1] != len(cells) or not all(len(grid) for grid in grids):
+        return Seen(0, 0, refused=False)
+    own = [_hashes(rows, cells, shift) for shift in (0.0, 0.5)]
+    looked = np.zeros(len(rows), dtype=np.bool_)
+    found = np.zeros(len(rows), dtype=np.bool_)
+    for grid, hashes in zip(grids, own, strict=True):
+        looked |= np.ones(len(rows), dtype=np.bool_) if made.whole else hashes <= grid[-1]
+        found |= np.isin(hashes, grid)
+    number, of = len(np.unique(own[0][found])), len(np.unique(own[0][looked]))
+    bar = max(MIN_SEEN - 1, int(binom.ppf(1.0 - ALPHA, of, min(1.0, SAFETY * made.chance))) if made.chance else 0)
+    return Seen(number, of, number > bar)
+
+
+def _plain(run: Array, angles: Sequence[int]) -> Array:
+    """(m, c) rows with all states, angles on circles."""
+    run = run[np.all(np.isfinite(run), axis=1)]
+    angles = list(angles)
+    return np.column_stack([np.delete(run, angles, axis=1), np.cos(run[:, angles]), np.sin(run[:, angles])])
+
+
+def _hashes(rows: Array, cells: Array, shift: float) -> Hashes:
+    """(n,) BITS bits of each row's cell (splitmix64's finaliser over the columns)."""
+    out = np.full(len(rows), np.uint64(0x9E3779B97F4A7C15))
+    for column, cell in zip(rows.T, cells, strict=True):
+        out ^= np.clip(np.floor(column / cell + shift), -4e18, 4e18).astype(np.int64).view(np.uint64)
+        out ^= out >> np.uint64(30)
+        out *= np.uint64(0xBF58476D1CE4E5B9)
+        out ^= out >> np.uint64(27)
+        out *= np.uint64(0x94D049BB133111EB)
+        out ^= out >> np.uint64(31)
+    return out & _MASK
+
+
+def _is_coarse(rows: Array, cell: float) -> bool:
+    """Whether all columns (n, nx) are multiples of a step that is larger than `cell` of their spread."""
+    for column in rows.T:
+        apart = np.diff(np.unique(column))
+        apart = apart[apart > 1e-9 * np.ptp(column)]
+        if not len(apart):
+            continue
+        many = apart / np.min(apart)
+        if np.min(apart) < cell * np.ptp(column) or np.any(np.abs(many - np.round(many)) > 0.01 * np.maximum(1.0, 1e-3 * many)):
+            return False
+    return True
+
+
+def _chance(parts: Sequence[Array], cells: Array, *, coarse: bool) -> float:
+    """That a fresh row falls into a cell of these rows. coarse: of a coarse sensor."""
+    wide = cells if coarse else COARSER * cells
+    places, exact = [], []
+    for part in parts:
+        place = _hashes(part, wide, 0.0)
+        enters = np.append(True, place[1:] != place[:-1])[: len(place)]
+        places.append(place[enters])
+        exact.append(_hashes(part[enters], cells, 0.0))
+    place, fine = np.concatenate(places), np.concatenate(exact)
+    if not coarse:  # a row that is there twice is a copy, and says nothing of chance
+        place = place[np.unique(np.column_stack([place, fine]), axis=0, return_index=True)[1]]
+    _, inverse, counts = np.unique(place, return_inverse=True, return_counts=True)
+    again = int(np.count_nonzero(counts[inverse] > 1))
+    return min(1.0, (again + FEW) / len(place)) if coarse else again / len(place) / COARSER
+
+
+def _packed(hashes: Hashes) -> bytes:
+    return hashes.astype("<u8").view(np.uint8).reshape(-1, 8)[:, : BITS // 8].tobytes()
+
+
+def _unpacked(packed: bytes) -> Hashes:
+    """Sorted, as they were packed. Raises ValueError."""
+    short = np.frombuffer(packed, dtype=np.uint8).reshape(-1, BITS // 8)
+    whole = np.zeros((len(short), 8), dtype=np.uint8)
+    whole[:, : BITS // 8] = short
+    return whole.view("<u8").ravel().astype(np.uint64)
