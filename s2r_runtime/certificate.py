@@ -21,7 +21,7 @@ from s2r_runtime.canonical import canonical, digest
 from s2r_runtime.controllers.file import ControllerFile, Identity
 from s2r_runtime.core.ledger import binomial_tail, campaign_size, sample_size, share
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
-from s2r_runtime.messages import NOT_INDEPENDENT, CertificateFacts, Gap, Struct, Trials, Verification
+from s2r_runtime.messages import NOT_INDEPENDENT, CertificateFacts, Gap, Struct, Trials, Tries, Verification
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Profile, TaskValue
 
@@ -63,6 +63,8 @@ class Certificate(Struct, frozen=True):
     issued_unix_s: int
     expires_unix_s: int
     trials: Trials | None = None
+    tries: Tries | None = None
+    """None: issued before seeds were drawn. Then the key is not in the file, as it was not then."""
 
     @property
     def id(self) -> str:
@@ -90,11 +92,13 @@ def issue(
     traced_not_adopted: bool = False,
     trials: Trials | None = None,
     period: str = "",
+    tries: Tries | None = None,
 ) -> Certificate:
     """Writes down what gap and verification show, if they show it. profile: with the model in force.
 
     lifetime_s: the profile's unless given. horizon: the task's, for the sentences. assumption: one the user made about independence.
     trials: closed-loop runs, if there were any. period: of each hold that gave the sample, where that is not what the profile says.
+    tries: what was tried until this attempt (None: as a certificate of before, whose seed anybody knew beforehand).
     Raises NotEnoughEvidence if the evidence doesn't carry a certificate, ConfigError if its parts don't belong together.
     """
     identity = controller.identity if isinstance(controller, ControllerFile) else controller
@@ -126,11 +130,13 @@ def issue(
             assumption,
             trials,
             period or profile.sampling.period,
+            tries,
         ),
         not_shown=statements.not_shown(gap, verification, horizon, trials=trials is not None),
         issued_unix_s=issued_unix_s,
         expires_unix_s=issued_unix_s + lifetime,
         trials=trials,
+        tries=tries,
     )
     for what, ok in (*_bindings(certificate), *_asked_for(profile, gap, verification)):
         if not ok:
@@ -145,7 +151,7 @@ def sign(certificate: Certificate, key: Ed25519PrivateKey) -> bytes:
     """The bytes of the certificate's file."""
     content = _content(certificate)
     plain = msgspec.json.decode(content, type=Certificate)
-    return canonical(_Signed(plain, digest(content), keys.public_bytes(key), key.sign(_DOMAIN + content)))
+    return _file(_Signed(plain, digest(content), keys.public_bytes(key), key.sign(_DOMAIN + content)))
 
 
 def load(data: bytes, trusted_keys: Iterable[bytes], now_unix_s: int | None = None, where: str = "certificate") -> Certificate:
@@ -156,7 +162,7 @@ def load(data: bytes, trusted_keys: Iterable[bytes], now_unix_s: int | None = No
     if len(data) > FILE_MAX:
         raise ConfigError(f"{where}: has {len(data)} bytes, a certificate has at most {FILE_MAX}")
     signed = _decode(data, where)
-    if canonical(signed) != data:
+    if _file(signed) != data:
         raise ConfigError(f"{where}: was changed after it was signed (not the form in which it is written)")
     content = _content(signed.certificate)
     if signed.id != digest(content):
@@ -219,7 +225,18 @@ def facts(certificate: Certificate) -> CertificateFacts:
 
 def _content(certificate: Certificate) -> bytes:
     """Canonical bytes as they are after reading them again: `1` in a place for a float is `1.0`."""
-    return canonical(msgspec.json.decode(canonical(certificate), type=Certificate))
+    return canonical(_plain(msgspec.json.decode(canonical(certificate), type=Certificate)))
+
+
+def _file(signed: _Signed) -> bytes:
+    return canonical({**msgspec.to_builtins(signed), "certificate": _plain(signed.certificate)})
+
+
+def _plain(certificate: Certificate) -> dict[str, Any]:
+    plain: dict[str, Any] = msgspec.to_builtins(certificate)
+    if certificate.tries is None:
+        del plain["tries"]
+    return plain
 
 
 def _decode(data: bytes, where: str) -> _Signed:
@@ -264,6 +281,7 @@ def _bindings(c: Certificate) -> list[tuple[str, bool]]:
         ("the gap is of another model", c.gap.model_digest == c.model_digest),
         ("the verification is of another model", v.model_digest == c.model_digest),
         ("the verification is of another task", v.task_digest == c.task_digest),
+        ("what was tried is not of this attempt", c.tries is None or (c.tries.attempts == v.attempt and c.tries.on_gap >= 1)),
         ("its verified radius is not that of the verification", c.verified_radius == v.radius and c.verified_hold_radius == v.hold_radius),
         (
             "the trials are of another controller, task or model",

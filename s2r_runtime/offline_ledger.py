@@ -2,6 +2,10 @@
 
     epoch i spends 3 beta / (pi^2 i^2), attempt j spends 3 beta / (pi^2 j^2)
 
+Whatever controller an attempt is of, all attempts share this one budget: given everything before it, attempt j certifies wrongly
+with probability at most its share, since its seed is drawn only after it was paid for (`seeds`). The union bound over the attempts then
+holds however many controllers were tried, and however each was chosen.
+
 It lies beside the key, `<name>.ledger.json`, and belongs to it: what a key may state depends on what was tried with it. An entry is
 durable before its number is given out, and never taken back. Two processes that certify at once get different numbers. A
 ledger that is damaged or missing is an error, never an empty one: starting again from 1 would be a retry without paying.
@@ -17,21 +21,30 @@ from typing import Literal
 
 import msgspec
 
+from s2r_runtime import seeds
 from s2r_runtime.core.ledger import share
 from s2r_runtime.daemon.persistence import lock, read, replace, seal, unseal
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.messages import Tries
 
 SCHEMA = 1
 
 
 class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One thing paid for. `subject`: what it was for; `unix_s`: when, for the reader only."""
+    """One thing paid for. `subject`: what it was for; `unix_s`: when, for the reader only.
+
+    Of an attempt: `epoch`: of its gap (0: none that founds a certificate); `seed`: drawn once the entry was durable; `behaviour`: of the
+    controller, once it has answered (`probe`). An entry of an earlier version has none of them.
+    """
 
     robot: str
     kind: Literal["epoch", "attempt"]
     number: int
     subject: tuple[str, ...]
     unix_s: int
+    epoch: int = 0
+    seed: int | None = None
+    behaviour: str = ""
 
 
 class Content(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -84,29 +97,58 @@ class Ledger:
         """
         return self._number("epoch", subject, again=True)
 
-    def spend_attempt(self, *subject: str) -> int:
-        """A new verification attempt, paid for whether or not it passes, also on what was tried before."""
-        return self._number("attempt", subject, again=False)
+    def spend_attempt(self, *subject: str, epoch: int = 0) -> int:
+        """A new verification attempt on the gap of that epoch, paid for whether or not it passes, also on what was tried before."""
+        return self._number("attempt", subject, again=False, epoch=epoch)
+
+    def draw_seed(self, attempt: int) -> int:
+        """The attempt's seed: drawn now that the attempt is paid for, durable in the ledger before it is used, and drawn only once."""
+        paid = [e for e in self.entries() if e.kind == "attempt" and e.number == attempt and e.seed is None]
+        if not paid:
+            raise ConfigError(f"{self.path}: attempt {attempt} was not paid for, or has its seed")
+        seed = seeds.drawn()
+        self._note(attempt, seed=seed)
+        return seed
+
+    def ended(self, attempt: int, behaviour: str) -> Tries:
+        """The attempt is over, the controller behaves so (empty: it gave no answer). What was tried until then, this one included."""
+        self._note(attempt, behaviour=behaviour)
+        made = [e for e in self.entries() if e.kind == "attempt" and e.number <= attempt]
+        on_gap = [e for e in made if e.epoch == made[-1].epoch]
+        return Tries(attempt, len(on_gap), len({e.behaviour or e.subject for e in on_gap}))
 
     def spent(self, beta: float) -> float:
         """How much of the budget beta is gone: sum of 3 beta/(pi^2 i^2) over the epochs and over the attempts."""
         return math.fsum(share(beta, entry.number) for entry in self.entries())
 
-    def _number(self, kind: Literal["epoch", "attempt"], subject: tuple[str, ...], *, again: bool) -> int:
+    def _number(self, kind: Literal["epoch", "attempt"], subject: tuple[str, ...], *, again: bool, epoch: int = 0) -> int:
         held = _locked(self.path)
         try:
             content = self._content()
             mine = [e for e in content.entries if e.robot == self.robot and e.kind == kind]
             if again and (known := [e for e in mine if e.subject == subject]):
                 return known[0].number
-            entry = Entry(self.robot, kind, len(mine) + 1, subject, int(time.time()))
-            try:
-                replace(self.path, seal("ledger", Content(SCHEMA, (*content.entries, entry))))
-            except OSError as error:
-                raise ConfigError(f"{self.path}: cannot be written, so nothing may be certified: {error.strerror}") from None
+            entry = Entry(self.robot, kind, len(mine) + 1, subject, int(time.time()), epoch)
+            self._write((*content.entries, entry))
             return entry.number
         finally:
             os.close(held)
+
+    def _note(self, attempt: int, **changes: int | str) -> None:
+        """What became of an attempt."""
+        held = _locked(self.path)
+        try:
+            key = self.robot, "attempt", attempt
+            entries = self._content().entries
+            self._write(tuple(msgspec.structs.replace(e, **changes) if (e.robot, e.kind, e.number) == key else e for e in entries))
+        finally:
+            os.close(held)
+
+    def _write(self, entries: tuple[Entry, ...]) -> None:
+        try:
+            replace(self.path, seal("ledger", Content(SCHEMA, entries)))
+        except OSError as error:
+            raise ConfigError(f"{self.path}: cannot be written, so nothing may be certified: {error.strerror}") from None
 
     def _content(self) -> Content:
         if not self.path.exists():

@@ -9,7 +9,7 @@ import math
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 
 from s2r_runtime.core.ledger import spent
-from s2r_runtime.messages import Gap, LawResult, Trials, Verification
+from s2r_runtime.messages import BEHAVIOURS, Gap, LawResult, Trials, Tries, Verification
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Driving
 
@@ -31,9 +31,10 @@ def shown(
     assumption: str = "",
     trials: Trials | None = None,
     period: str = "first",
+    tries: Tries | None = None,
 ) -> tuple[str, ...]:
     """The statements G1 to G4 and G8 of this evidence. budget: beta of the robot's life. assumption: one that the user made.
-    period: of each hold that gave the sample (`sampling.period`).
+    period: of each hold that gave the sample (`sampling.period`). tries: what was tried before, if it was counted.
 
     Whether the numbers carry them is for `certificate.issue` to check.
     """
@@ -49,7 +50,22 @@ def shown(
             f"{bound(verification.beta)} of beta = {budget:g}; the epochs and attempts up to these spent "
             f"{bound(spent(budget, gap.epoch, verification.attempt))} of it, and all there will ever be spend no more than all of it."
         ),
+        *(() if tries is None else (_tried(tries, verification),)),
         *(() if trials is None else (of_trials(trials),)),
+    )
+
+
+def _tried(tries: Tries, v: Verification) -> str:
+    """How much was tried, and where the seed came from (G2, G4)."""
+    least = "at least " if tries.controllers >= BEHAVIOURS else ""
+    seed = (
+        "was fixed beforehand, in a simulation that is to be repeatable, so retries were free: this certifies nothing for a robot"
+        if tries.fixed
+        else "was drawn from the operating system's entropy after the attempt was paid for, so trying variants beforehand did not help"
+    )
+    return (
+        f"Tries (G4). This is attempt {tries.attempts}, and number {tries.on_gap} of those counted on this gap; they were of {least}"
+        f"{tries.controllers} controllers that differ in their behaviour. All attempts share one budget. The seed {v.seed} {seed}."
     )
 
 

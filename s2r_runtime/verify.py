@@ -6,7 +6,7 @@ the uncertain model under the same disturbance law scores below s* with probabil
     passed  iff  for every required law:  s* >= threshold  and the task's progress requirement holds
 
 Every required law must pass, so no share of beta is lost to their number. Beside s* stands the Clopper-Pearson upper bound on
-P(s < threshold). The seed is a function of the digests and the attempt number: nobody can shop for one.
+P(s < threshold). The seed of an attempt that counts is drawn after it was paid for (`seeds`): nobody can shop for one.
 
 A range of radii may be asked for: then the result is of the largest at which the controller passes, out of radii fixed beforehand that
 share beta (`headroom`). At each of them the scenarios and draws are those of the same seed.
@@ -14,7 +14,6 @@ share beta (`headroom`). At each of them the scenarios and draws are those of th
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from s2r_runtime import seeds
 from s2r_runtime.bounds import clopper_pearson_upper, sample_size, scenario_confidence
 from s2r_runtime.errors import ControllerError, NotEnoughEvidence, UsageError
 from s2r_runtime.headroom import grid, search
@@ -42,10 +42,9 @@ class Detail:
     rollouts: Rollouts
 
 
-def seed_for(controller_digest: str, model_digest: str, task_digest: str, attempt: int) -> int:
-    """The seed of an attempt, 0 .. 2^63 - 1: a function of what is verified and how often that was tried (guarantee G2)."""
-    text = f"{controller_digest}\n{model_digest}\n{task_digest}\n{attempt}"
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
+def seed_for(controller_digest: str, model_digest: str, task_digest: str, number: int) -> int:
+    """The seed of rollouts that cost nothing and found no certificate (`s2r verify`): none of these is ever the seed of an attempt."""
+    return seeds.known("verify", controller_digest, model_digest, task_digest, number)
 
 
 def verify(control: Control, task: Task, model: ComposedModel, **choices: Any) -> Verification:

@@ -389,6 +389,9 @@ class Bench:
                 self.feed(self._gap(output))
             case m.StartJob(kind="trace"):
                 self.feed(self._trace(output))
+            case m.DrawSeed():
+                drawn = m.SeedDrawn(0, output.job_id, output.attempt, 4000 + output.attempt)
+                self.feed(*self._told("an unpaid seed", (drawn,), lambda e: (msgspec.structs.replace(e[0], attempt=9), *e)))
             case m.StartJob(kind="verify"):
                 self.feed(self._verify(output))
             case m.IssueCertificate():
@@ -483,6 +486,7 @@ class Bench:
             issued_unix_s=START_UNIX_S,
             lifetime_s=order.lifetime_s,
             horizon=BenchTask.horizon,
+            tries=order.tries,
         )
         made = self._told("certificate", made, lambda c: msgspec.structs.replace(c, not_shown=()))
         facts = certificates.facts(made)

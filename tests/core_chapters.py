@@ -115,7 +115,7 @@ def chapter(name: str, *, lockstep: bool) -> World:
     spell("duty", "deploy")
     if name == "verifying":
         return world
-    spell("duty", "duty", "duty", *(["see", "answer"] * 5))
+    spell("duty", "duty", "duty", "duty", *(["see", "answer"] * 5))
     assert world.law.gate
     if name == "asked":
         spell("see")

@@ -22,8 +22,8 @@ FILE = Path(__file__).parent / "replay" / "core_lives.msgpack.gz"
 WALKS, STEPS = 12, 420
 CASES = 260
 """Random walks and their steps, and seeded cases of faults: enough that every line of the core is run many times over."""
-LATER_MEMORY = ("refused_campaign", "driven")
-"""Fields of the memory that came after the lives were recorded: at their defaults they say nothing else than before."""
+LATER: dict[str, object] = {"refused_campaign": None, "driven": None, "gap_attempts": 0, "behaviours": (), "tries": None}
+"""Fields of memory and outputs that came after the lives were recorded: at their defaults they say nothing else than before."""
 LATER_STATUS = ("refused_campaign", "next_campaign", "next_attempt", "driven")
 
 
@@ -49,10 +49,10 @@ def replayed(events: list[Event]) -> list[bytes]:
 def _digest(outputs: tuple[Output, ...], status: dict[str, object]) -> bytes:
     plain = [msgspec.to_builtins(output) for output in outputs]
     for output in plain:
-        memory = output.get("memory", {})
-        for name in LATER_MEMORY:
-            if name in memory and memory[name] is None:
-                del memory[name]
+        for table in (output, output.get("memory", {})):
+            for name, before in LATER.items():
+                if name in table and table[name] == before:
+                    del table[name]
     told = {name: value for name, value in status.items() if name not in LATER_STATUS}
     return hashlib.sha256(msgspec.msgpack.encode((plain, told))).digest()[:6]
 

@@ -19,6 +19,7 @@ from s2r_runtime.messages import (
     CertificateFacts,
     CertificateStored,
     Command,
+    DrawSeed,
     Event,
     Gap,
     IssueCertificate,
@@ -32,6 +33,7 @@ from s2r_runtime.messages import (
     Output,
     Proposed,
     Requested,
+    SeedDrawn,
     Send,
     Settings,
     SourceStarted,
@@ -94,6 +96,7 @@ class Rig:
         self.state: State = core.initial()
         self.t, self.seq, self.numbers, self.requests = S, 0, 0, 0
         self.outputs: list[Output] = []
+        self.draws = True
         if start:
             self.feed(Started(self.t, 1500, self.settings, self.memory))
             self.feed(LinkChanged(self.t, up=True))
@@ -105,7 +108,11 @@ class Rig:
         assert msgspec.json.encode(self.state) == before, "the state was changed"
         self.state = after
         self.outputs += outputs
-        return list(outputs)
+        return [*outputs, *(more for output in outputs if isinstance(output, DrawSeed) for more in self._draw(output))]
+
+    def _draw(self, order: DrawSeed) -> list[Output]:
+        """As the daemon does at once, unless the test wants to."""
+        return self.feed(SeedDrawn(self.t, order.job_id, order.attempt, 1000 + order.attempt)) if self.draws else []
 
     def request(self, verb: Any, **fields: Any) -> list[Output]:
         self.requests += 1

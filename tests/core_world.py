@@ -24,6 +24,7 @@ from s2r_runtime.messages import (
     CertificateFailed,
     CertificateStored,
     Command,
+    DrawSeed,
     Event,
     GateChanged,
     InputsFinished,
@@ -42,6 +43,7 @@ from s2r_runtime.messages import (
     RecorderChanged,
     Requested,
     SampleTaken,
+    SeedDrawn,
     Send,
     SourceStarted,
     SourceStopped,
@@ -119,7 +121,7 @@ class World:
                 self.duties = (*self.duties, output)
             case StopCampaign():
                 self.campaign = self.inputs = None
-            case StartJob() | IssueCertificate() | StartController():
+            case DrawSeed() | StartJob() | IssueCertificate() | StartController():
                 self.duties = (*self.duties, output)
             case Persist():
                 self.memory = output.memory
@@ -261,6 +263,9 @@ class World:
                 digest = "another" if bad and rng.random() < 0.5 else duty.digest
                 failed = SourceStopped(self.t, "controller", "start_failed")
                 self.feed(failed if bad and digest == duty.digest else SourceStarted(self.t, "controller", digest))
+            case DrawSeed():
+                failed = JobFinished(self.t, duty.job_id, "verify", error="the state cannot be saved")
+                self.feed(failed if bad else SeedDrawn(self.t, duty.job_id, duty.attempt, rng.getrandbits(48)))
             case StartJob(kind="gap"):
                 n = self.state.memory.campaign_n
                 model = self.state.memory.model_digest

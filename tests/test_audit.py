@@ -212,6 +212,7 @@ def test_a_head_that_was_published_must_be_reached(run: Any, tmp_path: Path) -> 
         ("sample", "the campaign gives something else here"),
         ("input law", "the campaign gives something else here"),
         ("gap", "the gap of epoch 1 is another one"),
+        ("an unpaid seed", "a seed is drawn for an attempt that waits for none"),
         ("safety", "the numbers of the law uniform are not those of its scenarios"),
         ("headroom", "the radii that were looked at are not those of the search"),
         ("certificate", "what it says is not what the evidence says"),

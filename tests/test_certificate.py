@@ -19,7 +19,7 @@ from s2r_runtime.certificate import Certificate
 from s2r_runtime.controllers.file import ControllerFile
 from s2r_runtime.core.ledger import binomial_tail, campaign_size, sample_size, share
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, S2RError
-from s2r_runtime.messages import Gap, LawResult, Verification
+from s2r_runtime.messages import Gap, LawResult, Tries, Verification
 from s2r_runtime.profile import Profile, parse_profile
 from s2r_runtime.trials import Found, Run, trials
 
@@ -154,6 +154,24 @@ def test_a_signed_certificate_loads_equal_and_states_its_facts(good: Evidence) -
     assert (facts.task_digest, facts.profile_digest) == (good.profile.task_digest(), good.profile.digest())
     assert (facts.radius, facts.verified_radius, facts.epoch, facts.attempt) == (0.004, 0.006, 1, 2)
     assert (facts.issued_unix_s, facts.expires_unix_s) == (NOW, NOW + 3600)
+
+
+def test_a_certificate_of_before_seeds_were_drawn_is_the_same_bytes_and_loads(good: Evidence) -> None:
+    before = good.issue()
+    data = certificate.sign(before, KEY)
+    assert b'"tries"' not in data
+    assert certificate.load(data, [PUBLIC], NOW + 1) == before
+    after = good.issue(tries=Tries(2, 1, 1))
+    assert certificate.load(certificate.sign(after, KEY), [PUBLIC], NOW + 1) == after
+    (told,) = (line for line in after.shown if line not in before.shown)
+    assert told.startswith("Tries (G4).")
+
+
+def test_a_certificate_says_that_a_simulation_fixed_its_seed_and_counts_its_own_attempt(good: Evidence) -> None:
+    simulated = good.issue(tries=Tries(2, 1, 1, fixed=True))
+    assert any("certifies nothing for a robot" in line for line in simulated.shown)
+    with pytest.raises(ConfigError, match="what was tried is not of this attempt"):
+        good.issue(tries=Tries(3, 1, 1))
 
 
 def test_every_single_flipped_bit_is_refused(good: Evidence) -> None:

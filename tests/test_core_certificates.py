@@ -14,6 +14,7 @@ from s2r_runtime import bounds
 from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
 from s2r_runtime.messages import (
+    SEEDS,
     Answer,
     AttemptEnded,
     AttemptSpent,
@@ -21,11 +22,13 @@ from s2r_runtime.messages import (
     CertificateFailed,
     CertificateInstalled,
     CertificateStored,
+    DrawSeed,
     IssueCertificate,
     JobFinished,
     LawResult,
     Persist,
     Revoked,
+    SeedDrawn,
     Send,
     SourceStarted,
     SourceStopped,
@@ -33,6 +36,7 @@ from s2r_runtime.messages import (
     StartController,
     StartJob,
     StopController,
+    Tries,
     WallClockRead,
 )
 
@@ -54,7 +58,7 @@ def test_an_attempt_is_on_disk_before_it_begins_and_runs_at_the_headroom() -> No
     rig.gap()
     rig.measure(0.012)
     outputs = rig.request("deploy", digest="controller")
-    assert kinds(outputs) == ["Persist", "AttemptSpent", "StartJob", "GateChanged"]
+    assert kinds(outputs) == ["Persist", "AttemptSpent", "DrawSeed", "GateChanged", "StartJob"]
     assert one(outputs, Persist).memory.attempts == 1
     assert one(outputs, AttemptSpent).beta == pytest.approx(bounds.attempt_beta(0.05, 1))
     job = one(outputs, StartJob)
@@ -152,13 +156,51 @@ def test_a_radius_that_was_outgrown_while_it_was_verified_is_verified_once_more(
     assert again.least_radius == pytest.approx(0.0125)
 
 
-def test_seeds_follow_from_digests_and_attempt_so_that_nobody_shops_for_one() -> None:
+def test_an_attempt_begins_with_the_first_seed_that_is_drawn_for_it_after_it_was_paid_for() -> None:
+    rig = Rig(memory(certificates=()))
+    rig.draws = False
+    outputs = rig.request("verify", digest="a")
+    order = one(outputs, DrawSeed)
+    assert kinds(outputs).index("Persist") < kinds(outputs).index("AttemptSpent") < kinds(outputs).index("DrawSeed")
+    assert of(rig.feed(SeedDrawn(rig.t, order.job_id, order.attempt - 1, 4)), StartJob) == []  # of an attempt of before
+    assert one(rig.feed(SeedDrawn(rig.t, order.job_id, order.attempt, 5)), StartJob).seed == 5
+    assert rig.feed(SeedDrawn(rig.t, order.job_id, order.attempt, 6)) == []
+
+
+@pytest.mark.parametrize("drawn", [False, True])
+def test_a_result_of_another_seed_than_the_one_that_was_drawn_certifies_nothing(drawn: bool) -> None:
+    rig = Rig(memory(certificates=()))
+    rig.draws = drawn
+    rig.request("verify", digest="a")
+    job = rig.state.jobs[0]
+    order = StartJob(rig.t, job.id, "verify", 1, "a", job.radius, job.hold_radius, job.attempt, 7, 0.01, least_radius=job.least_radius)
+    outputs = rig.feed(JobFinished(rig.t, job.id, "verify", verification=rig.result(order)))
+    assert of(outputs, IssueCertificate) == []
+    assert "of another seed" in one(outputs, AttemptEnded).reason
+
+
+def test_by_the_rules_of_before_the_seed_followed_from_digests_and_attempt() -> None:
     def seed(digest: str, attempts: int, **changes: Any) -> int:
-        rig = Rig(memory(attempts=attempts, certificates=()), **changes)
+        rig = Rig(memory(attempts=attempts, certificates=()), rules=SEEDS - 1, **changes)
         return one(rig.request("verify", digest=digest), StartJob).seed
 
     assert seed("a", 0) == seed("a", 0) == seed("a", 0, seed=77)
     assert len({seed("a", 0), seed("b", 0), seed("a", 1), seed("a", 0, task_digest="other"), seed("a", 0, profile_digest="other")}) == 5
+
+
+def test_a_certificate_is_told_how_many_attempts_and_controllers_its_gap_has_seen() -> None:
+    rig = Rig()
+    rig.gap()
+    for digest, behaviour in (("a", "left"), ("b", "left"), ("c", "right"), ("d", "")):
+        rig.request("verify", digest=digest)
+        job = one(rig.outputs, StartJob, last=True)
+        rig.feed(JobFinished(rig.t, job.job_id, "verify", verification=rig.result(job, passed=False), behaviour=behaviour))
+    rig.request("verify", digest="e")
+    assert one(rig.verified(), IssueCertificate).tries == Tries(5, 5, 4)
+    rig.stored()
+    rig.gap()
+    rig.request("verify", digest="a")
+    assert one(rig.verified(), IssueCertificate).tries == Tries(6, 1, 1)
 
 
 def test_a_failed_verification_is_a_refusal_that_was_paid_for() -> None:
@@ -357,7 +399,7 @@ def test_an_undeployed_controllers_failure_or_outgrown_pass_is_told_to_nobody_tw
         rig.request("undeploy")
         if grown:
             rig.measure(0.5)
-        assert kinds(rig.verified(passed=passed)) == ["AttemptEnded"]
+        assert kinds(rig.verified(passed=passed)) == ["AttemptEnded", "Persist"]
         assert all(len(found) == 1 for found in answers(rig).values())
 
 

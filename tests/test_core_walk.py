@@ -13,8 +13,8 @@ from s2r_runtime.core import reducer as core
 from s2r_runtime.core.state import State
 from s2r_runtime.messages import Started, Stopping
 
-RUNS, STEPS = 14, 3200
-"""Together 90 000 random events."""
+RUNS, STEPS = 15, 3200
+"""Together 96 000 random events."""
 
 
 def walk(seed: int, *, lockstep: bool) -> World:

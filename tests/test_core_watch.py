@@ -34,7 +34,7 @@ def test_growth_within_the_headroom_costs_nothing_and_beyond_it_closes_the_gate_
     assert one(outputs, RadiusGrew) == RadiusGrew(rig.t, 0.015, 0.015, rig.seq)
     assert rig.state.gate_open
     outputs = rig.measure(0.016)
-    assert kinds(outputs) == ["GateChanged", "Send", "RadiusGrew", "Persist", "Persist", "AttemptSpent", "StartJob"]
+    assert kinds(outputs) == ["GateChanged", "Send", "RadiusGrew", "Persist", "Persist", "AttemptSpent", "DrawSeed", "StartJob"]
     assert (one(outputs, GateChanged).reason, sources(outputs)) == ("radius_above_verified", ["recovery"])
     job = one(outputs, StartJob)
     assert (job.attempt, job.radius, job.hold_radius) == (2, pytest.approx(1.5 * 0.016), pytest.approx(1.5 * 0.16))
@@ -83,7 +83,7 @@ def test_a_radius_that_outgrows_the_reverification_is_verified_once_more_and_the
     rig.measure(0.02)
     rig.measure(0.1)
     rig.request("undeploy")
-    assert kinds(rig.verified()) == ["AttemptEnded"]  # nobody waits for it any more
+    assert kinds(rig.verified()) == ["AttemptEnded", "Persist"]  # nobody waits for it any more
 
 
 def test_growth_while_another_controller_is_verified_waits_for_that_attempt() -> None:

@@ -26,6 +26,7 @@ class Bench:
 
     def __init__(self, folder: StateFolder, memory: Memory) -> None:
         self.rig = core_rig.Rig(memory)
+        self.rig.draws = False  # the actions do
         self.done: list[Any] = []
         self.log_takes_it = True
         self.queue: deque[Any] = deque()
@@ -40,6 +41,7 @@ class Bench:
             sampler=SimpleNamespace(running=False, stop=lambda *_: []),
             excitation=SimpleNamespace(running=False, stop=lambda *_: []),
             desk=SimpleNamespace(answered=self.done.append),
+            simulated_seeds=None,
         )
         self.actions = Actions(daemon)
         self.actions._do |= dict.fromkeys(ORDERS, self.done.append)
@@ -144,6 +146,7 @@ def test_no_certificate_is_issued_and_no_controller_started_while_the_state_is_u
 
 def test_each_order_is_refused_while_the_state_is_unsaved_whichever_event_it_belongs_to(folder: StateFolder) -> None:
     bench = Bench(folder, core_rig.memory(certificates=()))
+    bench.rig.draws = True
     bench.rig.observe()
     outputs = [one for one in bench.rig.request("deploy", digest="controller") if isinstance(one, StartJob)]
     bench.actions.unsaved = "the state cannot be saved: as an earlier event found"

@@ -17,6 +17,7 @@ from s2r_runtime.errors import ControllerError, NotEnoughEvidence, UsageError
 from s2r_runtime.messages import Verification
 from s2r_runtime.models.composed import compose
 from s2r_runtime.profile import load_profile
+from s2r_runtime.seeds import drawn
 from s2r_runtime.statements import worst
 from s2r_runtime.tasks.keep_out import KeepOut
 from s2r_runtime.uncertain import GapSet
@@ -166,11 +167,12 @@ def test_laws_that_make_no_sense_are_refused(laws: tuple[str, ...], required: tu
 # ---------------------------------------------------------------- seeds
 
 
-def test_a_seed_belongs_to_what_is_verified_and_to_the_attempt() -> None:
+def test_the_seed_of_rollouts_that_cost_nothing_belongs_to_what_is_verified_and_is_no_attempts() -> None:
     seeds = {seed_for("c", "m", "t", 1), seed_for("d", "m", "t", 1), seed_for("c", "n", "t", 1), seed_for("c", "m", "u", 1)}
     seeds |= {seed_for("c", "m", "t", j) for j in range(1, 50)} | {seed_for("cm", "", "t", 1)}
     assert len(seeds) == 4 + 48 + 1
-    assert all(0 <= seed < 2**63 for seed in seeds)
+    assert all(2**48 <= seed < 2**63 for seed in seeds)
+    assert all(0 <= drawn() < 2**48 for _ in range(100))
     assert seed_for("c", "m", "t", 1) == seed_for("c", "m", "t", 1)
 
 

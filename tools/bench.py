@@ -28,6 +28,7 @@ ORDER = (
     "fuzz_ros2.py",
     "bench_coverage.py",
     "bench_duplicates.py",
+    "bench_grinding.py",
     "bench_rates.py",
     "bench_missions.py",
 )

@@ -26,6 +26,7 @@ from s2r_runtime.messages import (
     CertificateFacts,
     CertificateStored,
     Command,
+    DrawSeed,
     Event,
     Gap,
     IssueCertificate,
@@ -39,6 +40,7 @@ from s2r_runtime.messages import (
     Output,
     Proposed,
     Requested,
+    SeedDrawn,
     Settings,
     SourceStarted,
     StartCampaign,
@@ -109,7 +111,9 @@ class Life:
         """One event, and what the daemon owes the core for its outputs."""
         self.state, outputs = core.handle(self.state, event)
         for output in outputs:
-            if isinstance(output, StartJob) and output.kind == "verify":
+            if isinstance(output, DrawSeed):
+                self.feed(SeedDrawn(self.t, output.job_id, output.attempt, int(self.rng.integers(1 << 48))))
+            elif isinstance(output, StartJob) and output.kind == "verify":
                 self.feed(self._verified(output))
             elif isinstance(output, IssueCertificate):
                 self.feed(self._stored(output))

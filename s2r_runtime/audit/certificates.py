@@ -155,6 +155,7 @@ class Certificates:
             lifetime_s=order.lifetime_s,
             horizon=horizon(),
             traced_not_adopted=traced,
+            tries=order.tries,
         )
         if again.id != certificate.id:
             raise ConfigError("what it says is not what the evidence says")

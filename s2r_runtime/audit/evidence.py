@@ -20,6 +20,7 @@ from s2r_runtime.errors import S2RError
 from s2r_runtime.headroom import follows, grid
 from s2r_runtime.messages import (
     AttemptSpent,
+    DrawSeed,
     EpochChanged,
     Gap,
     IssueCertificate,
@@ -27,6 +28,7 @@ from s2r_runtime.messages import (
     LawResult,
     Memory,
     SampleTaken,
+    SeedDrawn,
     StartJob,
     Verification,
 )
@@ -52,6 +54,8 @@ class Evidence:
         self._verifications: dict[str, str] = {}
         self._in_force: dict[int, Gap] = {}
         self._epochs = self._attempts = 0
+        self._undrawn: set[tuple[int, int]] = set()
+        self._seeds: dict[int, int] = {}
         self._kept: Memory | None = None
         self._saving: Memory | None = None
 
@@ -72,6 +76,7 @@ class Evidence:
     def begin_run(self, entry: Entry, memory: Memory) -> None:
         """A run begins with this memory: it may not forget what an earlier run spent."""
         self._jobs.clear()
+        self._undrawn.clear()
         before = self._kept if self._kept is not None and self._kept.robot == memory.robot else None
         if memory.epochs < self._epochs or memory.attempts < self._attempts:
             told = {"epochs": self._epochs, "attempts": self._attempts}
@@ -107,6 +112,19 @@ class Evidence:
         if number < due or output.beta != ledger.share(beta, number):
             self._findings.differ(entry.index, entry.channel, "the budget is not spent in order", output, [due, ledger.share(beta, due)])
         self._findings.count("shares of the budget")
+
+    def paid(self, order: DrawSeed) -> None:
+        """An attempt is paid for, and its seed is to be drawn."""
+        self._undrawn.add((order.job_id, order.attempt))
+
+    def seed_drawn(self, entry: Entry, event: SeedDrawn) -> None:
+        """Once for each attempt, after it was paid for. What is drawn from 2^48 does not come twice."""
+        if (event.job_id, event.attempt) not in self._undrawn:
+            self._differ(entry, "a seed is drawn for an attempt that waits for none", event, None)
+        elif (other := self._seeds.setdefault(event.seed, event.attempt)) != event.attempt:
+            self._differ(entry, f"attempt {event.attempt} has the seed of attempt {other}", event, None)
+        self._undrawn.discard((event.job_id, event.attempt))
+        self._findings.count("seeds fixed by a simulation" if event.fixed else "seeds drawn after their attempt was paid for")
 
     # ---- what is computed
 
@@ -187,7 +205,7 @@ class Evidence:
         again = _work(order, profile.verification.timeout, self._progress)
         if isinstance(again, Failed) or again.verification is None:
             self._findings.cannot(f"verification attempt {job.attempt}: {again.text if isinstance(again, Failed) else 'no result'}")
-        elif alike(again.verification, found) and again.safety == event.safety:
+        elif alike(again.verification, found) and (again.safety, again.behaviour) == (event.safety, event.behaviour or again.behaviour):
             self._findings.count("verifications run again")
         elif not self._findings.same_platform and _verdicts(again.verification) == _verdicts(found):
             self._findings.count("verifications run again (other platform: same verdicts)")

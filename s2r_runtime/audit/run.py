@@ -25,11 +25,13 @@ from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import (
     GRID,
     RULES,
+    SEEDS,
     Ask,
     AttemptSpent,
     CampaignFinished,
     CertificateStored,
     Decided,
+    DrawSeed,
     EpochChanged,
     Event,
     InputsFinished,
@@ -45,6 +47,7 @@ from s2r_runtime.messages import (
     RecorderChanged,
     Revoked,
     SampleTaken,
+    SeedDrawn,
     Send,
     Settings,
     SourceStarted,
@@ -207,6 +210,8 @@ class RunAudit:
                 (self._inputs if self._inputs.driving else self._campaigns).started(entry, event)
             case SourceStopped(source="sampler"):
                 (self._inputs if self._inputs.driving else self._campaigns).stopped(entry, event)
+            case SeedDrawn():
+                self._evidence.seed_drawn(entry, event)
             case RecorderChanged(ok=False):
                 self._campaigns.doubted()
                 self._evidence.doubted()
@@ -247,6 +252,8 @@ class RunAudit:
         self._beside.run(name, options, facts.states, facts.inputs, counts_faults=bool(settings.fault_share))
         if not settings.fault_share:
             self._findings.count("runs by an earlier version's rule: it let any number of faulty observations pass")
+        if settings.rules < SEEDS:
+            self._findings.count("runs by an earlier version's rule: the seed of a verification followed from digests and attempt")
         self._begun = True
 
     def _profile_of(self, attached: Mapping[str, Attached], settings: Settings) -> Profile:
@@ -307,6 +314,8 @@ class RunAudit:
                     self._beside.begin(profile, state.memory.gap, state.memory, lockstep=settings.lockstep, rules=settings.rules)
             case StopController():
                 self._beside.stop()
+            case DrawSeed():
+                self._evidence.paid(output)
             case StartJob():
                 self._evidence.ordered(output, state.memory.gap)
             case IssueCertificate():

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
     from s2r_runtime.controllers.file import ControllerFile
-    from s2r_runtime.messages import Gap, Trials, Verification
+    from s2r_runtime.messages import Gap, Trials, Tries, Verification
     from s2r_runtime.models.composed import ComposedModel
     from s2r_runtime.profile import Profile
 
@@ -68,8 +68,8 @@ def run(args: argparse.Namespace) -> int:
     ledger, beta = offline_ledger.open_ledger(key_path, profile.robot.name), profile.guarantee.beta
     epoch = ledger.epoch_for(recording, model.spec.digest(), profile.digest())
     gap, assumption, period = gap_of(args.recording, model, profile, beta=epoch_beta(beta, epoch), epoch=epoch, max_gb=args.max_gb)
-    attempt = ledger.spend_attempt(controller.digest)
-    result = run_verification(
+    attempt = ledger.spend_attempt(controller.digest, epoch=epoch)
+    result, behaviour = run_verification(
         controller,
         model,
         profile,
@@ -78,15 +78,17 @@ def run(args: argparse.Namespace) -> int:
         laws=profile.verification.laws,
         n=0,
         attempt=attempt,
+        seed=ledger.draw_seed(attempt),
         beta=attempt_beta(beta, attempt),
     )
+    tries = ledger.ended(attempt, behaviour)
     trouble = ""
     if result.passed:
         try:
-            _write(args.output, profile, model, controller, gap, result, trials, assumption, period, key)
+            _write(args.output, profile, model, controller, gap, result, trials, tries, assumption, period, key)
         except UsageError as error:  # the attempt is spent: what it showed is told all the same
             trouble = str(error)
-    _tell(args, gap, trials, result, epoch, ledger.spent(beta), beta, written=result.passed and not trouble)
+    _tell(args, gap, trials, result, tries, epoch, ledger.spent(beta), beta, written=result.passed and not trouble)
     if trouble:
         output.err(f"s2r: {trouble}")
         return UsageError.exit_code
@@ -101,6 +103,7 @@ def _write(
     gap: Gap,
     result: Verification,
     trials: Trials | None,
+    tries: Tries,
     assumption: str,
     period: str,
     key: Ed25519PrivateKey,
@@ -119,6 +122,7 @@ def _write(
         issued_unix_s=int(time.time()),
         horizon=task.horizon,
         trials=trials,
+        tries=tries,
         assumption=assumption,
         period=period,
     )
@@ -129,7 +133,16 @@ def _write(
 
 
 def _tell(
-    args: argparse.Namespace, gap: Gap, trials: Trials | None, result: Verification, epoch: int, spent: float, beta: float, *, written: bool
+    args: argparse.Namespace,
+    gap: Gap,
+    trials: Trials | None,
+    result: Verification,
+    tries: Tries,
+    epoch: int,
+    spent: float,
+    beta: float,
+    *,
+    written: bool,
 ) -> None:
     """beta: of the whole budget."""
     from s2r_runtime.cli.evidence import print_verification
@@ -143,6 +156,7 @@ def _tell(
                 "certificate": str(args.output) if written else None,
                 "gap": gap,
                 "trials": trials,
+                "tries": tries,
                 "verified_radius": result.radius if result.passed else None,
                 "epoch": epoch,
                 "attempt": result.attempt,
@@ -153,5 +167,6 @@ def _tell(
         return
     print_verification(answer)
     output.out(f"gap epoch {epoch}, verification attempt {result.attempt}: {spent:.4f} of beta {beta} spent")
+    output.out(f"on this gap: {tries.on_gap} attempts on {tries.controllers} controllers that differ in their behaviour")
     told = f"gap {gap.radius:.4g}, certified to {result.radius:.4g}: certificate written to {args.output}"
     output.out(told if written else "no certificate")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -121,8 +122,8 @@ def _common(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--json", action="store_true", help="print one JSON object")
 
 
-def run_daemon(args: argparse.Namespace) -> int:
-    """Runs until SIGTERM or SIGINT. Exit 0 on a clean end."""
+def run_daemon(args: argparse.Namespace, *, simulated_seeds: Iterator[int] | None = None) -> int:
+    """Runs until SIGTERM or SIGINT. Exit 0 on a clean end. simulated_seeds: see `Daemon`; no option of the command line sets them."""
     from s2r_runtime.daemon import analytics
     from s2r_runtime.profile import load_driving_profile
 
@@ -138,6 +139,7 @@ def run_daemon(args: argparse.Namespace) -> int:
         log_dir=args.log,
         seed=args.seed,
         analytics=child,
+        simulated_seeds=simulated_seeds,
     )
     return daemon.run()
 

@@ -246,8 +246,7 @@ class Demonstration:
         argv = [
             sys.executable,
             "-m",
-            "s2r_runtime.cli.main",
-            "run",
+            "s2r_runtime.cli.simulated_daemon",
             str(profile),
             "--state",
             str(state),

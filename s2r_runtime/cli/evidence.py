@@ -164,8 +164,9 @@ def run_verify(args: argparse.Namespace) -> int:
     if headroom < 1.0:
         raise UsageError(f"--headroom {headroom:g}: must be >= 1")
     controller = controller_at(args.controller, args.param)
-    result = run_verification(
-        controller, model, profile, gap=gap, headroom=headroom, laws=laws, n=args.n, attempt=1, beta=profile.guarantee.beta
+    seed = verification.seed_for(controller.digest, model.spec.digest(), profile.task_digest(), 1)
+    result, _ = run_verification(
+        controller, model, profile, gap=gap, headroom=headroom, laws=laws, n=args.n, attempt=1, seed=seed, beta=profile.guarantee.beta
     )
     answer = {**verification.verification_json(result), "gap_radius": gap.radius}
     if args.json:
@@ -258,15 +259,16 @@ def run_verification(
     laws: tuple[str, ...],
     n: int,
     attempt: int,
+    seed: int,
     beta: float,
-) -> Verification:
+) -> tuple[Verification, str]:
     """Verification at the largest radius from the gap's to `headroom` times it at which the controller passes. In a worker process: the
     controller's code runs confined, silenced, and for a limited time.
 
-    A controller that ends the worker or outlasts `verification.timeout` has not passed, with that as the reason.
+    A controller that ends the worker or outlasts `verification.timeout` has not passed, with that as the reason. Also returns its
+    behaviour (`probe`), or an empty text.
     """
     from s2r_runtime import messages
-    from s2r_runtime import verify as verification
     from s2r_runtime.bounds import sample_size
     from s2r_runtime.daemon.worker import Failed, Result, VerifyJob
     from s2r_runtime.headroom import grid
@@ -283,12 +285,11 @@ def run_verification(
         )
     settings = msgspec.structs.replace(profile.verification, laws=laws, required=required, n=n or profile.verification.n)
     asked = msgspec.structs.replace(profile, model=model.spec, verification=settings)
-    seed = verification.seed_for(controller.digest, model.spec.digest(), profile.task_digest(), attempt)
     job = VerifyJob(asked, controller, gap, most, headroom * gap.hold_radius, attempt, seed, beta, gap.radius)
     done = work(job, settings.timeout, "verifying")
     if isinstance(done, Result) and done.verification is not None:
-        return done.verification
-    return messages.Verification(
+        return done.verification, done.behaviour
+    failed = messages.Verification(
         passed=False,
         radius=gap.radius,
         hold_radius=gap.hold_radius,
@@ -303,6 +304,7 @@ def run_verification(
         task_digest=profile.task_digest(),
         reason=done.text if isinstance(done, Failed) else "the worker gave no verification",
     )
+    return failed, ""
 
 
 def work(job: Job, timeout_s: float, label: str) -> Result | Failed:

@@ -74,14 +74,17 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one verb and returns its exit code; errors of the user's are one line on stderr, never a traceback."""
+def main(argv: Sequence[str] | None = None, run: Callable[[argparse.Namespace], int] | None = None) -> int:
+    """Runs one verb and returns its exit code; errors of the user's are one line on stderr, never a traceback.
+
+    run: instead of the verb's own function.
+    """
     output.stand_in_for_closed_streams()
     args = argparse.Namespace()
     try:
         try:
             args = parser().parse_args(argv)
-            run: Callable[[argparse.Namespace], int] = args.run
+            run = run or args.run
             return run(args)
         finally:
             output.flush()  # also after --help, which ends by SystemExit

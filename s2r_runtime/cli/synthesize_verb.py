@@ -88,7 +88,11 @@ def run(args: argparse.Namespace) -> int:
     attempt = ledger.spend_attempt(winner.digest)
     beta = attempt_beta(profile.guarantee.beta, attempt)
     laws = profile.verification.laws
-    result = run_verification(winner, model, profile, gap=gap, headroom=headroom, laws=laws, n=0, attempt=attempt, beta=beta)
+    seed = ledger.draw_seed(attempt)
+    result, behaviour = run_verification(
+        winner, model, profile, gap=gap, headroom=headroom, laws=laws, n=0, attempt=attempt, seed=seed, beta=beta
+    )
+    ledger.ended(attempt, behaviour)
     answer = {**verification.verification_json(result), "gap_radius": gap.radius}
     if args.json:
         spent = {

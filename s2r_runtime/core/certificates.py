@@ -18,6 +18,8 @@ from s2r_runtime.core.sources import end_deployment
 from s2r_runtime.core.state import VERIFYING, Deployment, Job, Turn, certificate, job, situation, usable_gap
 from s2r_runtime.headroom import grid
 from s2r_runtime.messages import (
+    BEHAVIOURS,
+    SEEDS,
     AttemptEnded,
     AttemptSpent,
     CertificateFacts,
@@ -25,12 +27,15 @@ from s2r_runtime.messages import (
     CertificateInstalled,
     CertificatesDistrusted,
     CertificateStored,
+    DrawSeed,
     Gap,
     IssueCertificate,
     JobFinished,
     Revoked,
+    SeedDrawn,
     StartController,
     StartJob,
+    Tries,
     Verification,
 )
 
@@ -74,15 +79,33 @@ def begin_verification(
     attempt, (grown, radius, hold) = memory.attempts + 1, _radii(turn, gap)
     one = Job(turn.state.next_job, purpose, request_id, gap.epoch, digest, attempt, radius, hold, certificate_id, again, least_radius=grown)
     turn.add_job(one)
-    turn.remember(attempts=attempt)
+    turn.remember(attempts=attempt, gap_attempts=memory.gap_attempts + (settings.rules >= SEEDS))
     turn.persist()
-    share = ledger.share(settings.beta, attempt)
-    turn.emit(AttemptSpent(turn.now, attempt, share, digest, radius))
-    seed = ledger.seed(
-        "verification", digest, memory.model_digest, settings.task_digest, settings.profile_digest, gap.transitions_digest, attempt
-    )
-    turn.emit(StartJob(turn.now, one.id, "verify", gap.epoch, digest, radius, hold, attempt, seed, share, least_radius=grown))
+    turn.emit(AttemptSpent(turn.now, attempt, ledger.share(settings.beta, attempt), digest, radius))
+    if settings.rules >= SEEDS:
+        turn.emit(DrawSeed(turn.now, one.id, attempt))
+    else:  # as it was: a seed that whoever knows the digests knows beforehand
+        known = digest, memory.model_digest, settings.task_digest, settings.profile_digest, gap.transitions_digest, attempt
+        _start(turn, one, ledger.seed("verification", *known))
     regate(turn)
+
+
+def seed_drawn(turn: Turn, event: SeedDrawn) -> None:
+    """The attempt's seed is there, and in the log: it begins. Only its first seed counts."""
+    waiting = (one for one in turn.state.jobs if (one.id, one.attempt) == (event.job_id, event.attempt))
+    one = next(waiting, None)
+    if one is None or one.purpose not in VERIFYING or one.seed is not None or turn.settings.rules < SEEDS:
+        return
+    turn.drop_job(one)
+    seeded = msgspec.structs.replace(one, seed=event.seed, fixed=event.fixed)
+    turn.set(jobs=(*turn.state.jobs, seeded))
+    _start(turn, seeded, event.seed)
+
+
+def _start(turn: Turn, one: Job, seed: int) -> None:
+    share = ledger.share(turn.settings.beta, one.attempt)
+    radii = one.radius, one.hold_radius
+    turn.emit(StartJob(turn.now, one.id, "verify", one.epoch, one.digest, *radii, one.attempt, seed, share, least_radius=one.least_radius))
 
 
 def _radii(turn: Turn, gap: Gap) -> tuple[float, float, float]:
@@ -127,6 +150,10 @@ def verification_finished(turn: Turn, done: Job, event: JobFinished) -> None:
     reason = problem or (result.reason if result is not None else "") or "every required law passed"
     turn.emit(AttemptEnded(turn.now, done.attempt, not problem, reason))
     gap = usable_gap(turn.state)
+    if turn.settings.rules >= SEEDS and turn.memory.gap is not None and turn.memory.gap.epoch == done.epoch:
+        behaviour = event.behaviour or done.digest
+        others = (one for one in turn.memory.behaviours if one != behaviour)
+        turn.remember(behaviours=(*others, behaviour)[-BEHAVIOURS:])
     if result is None or problem:
         _refuse(turn, done, f"verification attempt {done.attempt} at radius {_least(done):.6g} failed: {reason}")
     elif gap is None or gap.epoch != done.epoch:
@@ -137,7 +164,8 @@ def verification_finished(turn: Turn, done: Job, event: JobFinished) -> None:
         _outgrown(turn, done, gap, result.radius)
     else:
         turn.set(issuing=msgspec.structs.replace(done, least_radius=result.radius))
-        turn.emit(IssueCertificate(turn.now, gap, result, done.request_id, turn.settings.certificate_lifetime_s))
+        lifetime_s = turn.settings.certificate_lifetime_s
+        turn.emit(IssueCertificate(turn.now, gap, result, done.request_id, lifetime_s, _tries(turn, done)))
     reverify_if_due(turn)
 
 
@@ -147,6 +175,8 @@ def _result_problem(turn: Turn, done: Job, v: Verification) -> str:
         return "the result is of another controller, model or task"
     if v.attempt != done.attempt:
         return f"the result is of attempt {v.attempt}"
+    if turn.settings.rules >= SEEDS and v.seed != done.seed:
+        return "the result is of another seed than the one that was drawn for it"
     least, share = _least(done), ledger.share(turn.settings.beta, done.attempt) * (1.0 + ROUNDING)
     hold = done.hold_radius * (least / done.radius if done.radius > 0.0 else 1.0)
     for value, asked in ((v.radius, least), (v.hold_radius, hold)):
@@ -165,6 +195,13 @@ def _result_problem(turn: Turn, done: Job, v: Verification) -> str:
     if any(ledger.binomial_tail(law.n, 0, v.epsilon) > share / v.split for law in required):
         return f"{min(law.n for law in required)} scenarios are too few for the share of attempt {done.attempt}"
     return ""
+
+
+def _tries(turn: Turn, done: Job) -> Tries | None:
+    """What was tried until this job, itself included."""
+    if turn.settings.rules < SEEDS:
+        return None
+    return Tries(done.attempt, turn.memory.gap_attempts, len(turn.memory.behaviours), done.fixed)
 
 
 def _least(done: Job) -> float:

@@ -214,6 +214,7 @@ def _watch_anew(turn: Turn) -> None:
     """The gap in force ends, and its watch with it. What that showed of driving is kept."""
     if turn.settings.rules >= 3:
         turn.remember(driven=driven.kept(turn.memory, turn.settings.alpha))
+    turn.remember(gap_attempts=0, behaviours=())
     turn.remember(watch_n=0, watch_exceedances=0, watch_e_value=1.0, watch_change=0.0, watch_exchange=1.0, watch_counts=())
 
 

@@ -48,6 +48,7 @@ from s2r_runtime.messages import (
     RecorderChanged,
     Requested,
     SampleTaken,
+    SeedDrawn,
     SourceStarted,
     SourceStopped,
     Started,
@@ -165,6 +166,8 @@ def _noted(turn: Turn, event: Event) -> None:
             campaign = turn.state.campaign
             if campaign is not None and not campaign.inputs and campaign.epoch == event.epoch:
                 turn.set(campaign=msgspec.structs.replace(campaign, taken=event.index + 1))
+        case SeedDrawn():
+            certificates.seed_drawn(turn, event)
         case EpisodeEnded():
             turn.set(episodes=turn.state.episodes + 1)
         case CampaignFinished():

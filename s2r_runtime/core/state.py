@@ -87,6 +87,9 @@ class Job(Struct, frozen=True):
     stretch: Stretch = "campaign"
     least_radius: float = 0.0
     retry: bool = False
+    seed: int | None = None
+    """Of a verification, once it is drawn (rules 5). fixed: by a simulation."""
+    fixed: bool = False
 
 
 VERIFYING = ("deploy", "verify", "reverify")

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from s2r_runtime import messages as m
+from s2r_runtime import seeds
 from s2r_runtime.controllers.file import ControllerFile
 from s2r_runtime.core import stream
 from s2r_runtime.core.status import against_sampler
@@ -34,7 +35,7 @@ SAVE_AGAIN_NS = 1_000_000_000
 GAP_TIMEOUT_S = 300.0
 
 
-RESTS = m.StartJob | m.StartCampaign | m.StartInputs | m.StartController | m.IssueCertificate
+RESTS = m.DrawSeed | m.StartJob | m.StartCampaign | m.StartInputs | m.StartController | m.IssueCertificate
 """What rests on the saved state, whichever event saved it."""
 
 
@@ -67,6 +68,7 @@ class Actions:
             m.StopCampaign: self._stop_campaign,
             m.StartController: self._start_controller,
             m.StopController: self._stop_controller,
+            m.DrawSeed: self._draw_seed,
             m.StartJob: self._start_job,
             m.IssueCertificate: self._issue,
             m.Persist: self._persist,
@@ -178,6 +180,12 @@ class Actions:
 
     # ------------------------------------------------------------------ jobs
 
+    def _draw_seed(self, order: m.DrawSeed) -> None:
+        """What pays for the attempt is on the disk by now: until here nobody could know the seed."""
+        simulated = self._d.simulated_seeds
+        seed = seeds.drawn() if simulated is None else next(simulated)
+        self._d.feed(m.SeedDrawn(order.t_ns, order.job_id, order.attempt, seed, fixed=simulated is not None))
+
     def _start_job(self, order: m.StartJob) -> None:
         job = self._job(order)
         self.results.pop(order.kind, None)
@@ -236,11 +244,8 @@ class Actions:
                 f"model/{result.trace['proposal']['digest']}", "application/toml", str(result.trace["model_toml"]).encode()
             )
         self.results[order.kind] = result.trace if order.kind == "trace" else result.gap or result.verification
-        self._d.feed(
-            m.JobFinished(
-                0, order.job_id, order.kind, gap=result.gap, verification=result.verification, trace=result.trace, safety=result.safety
-            )
-        )
+        found = {name: getattr(result, name) for name in ("gap", "verification", "trace", "safety", "behaviour")}
+        self._d.feed(m.JobFinished(0, order.job_id, order.kind, **found))
 
     def _job_progress(self, progress: Progress) -> None:
         self._d.desk.progress(progress.done, progress.total, progress.detail)
@@ -292,6 +297,8 @@ class Actions:
                     self._d.feed(m.SourceStopped(0, "controller", "start_failed", why))
                 case m.StartCampaign() | m.StartInputs():
                     self._d.feed(m.SourceStopped(0, "sampler", "start_failed", why))
+                case m.DrawSeed():
+                    self._d.feed(m.JobFinished(0, output.job_id, "verify", error=why))
                 case m.StartJob():
                     self._d.feed(m.JobFinished(0, output.job_id, output.kind, error=why))
                 case m.IssueCertificate():

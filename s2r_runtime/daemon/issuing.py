@@ -48,6 +48,7 @@ def issue(daemon: Daemon, order: IssueCertificate) -> CertificateStored | Certif
             lifetime_s=order.lifetime_s,
             horizon=daemon.facts.horizon,
             traced_not_adopted=daemon.state.memory.traced,
+            tries=order.tries,
         )
         return _store(daemon, certificates.facts(certificate), certificates.sign(certificate, daemon.key), None, order.request_id)
     except S2RError as error:

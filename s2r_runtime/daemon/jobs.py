@@ -5,7 +5,7 @@ inputs' of their files too), so that an audit can repeat it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +28,7 @@ from s2r_runtime.daemon.worker import (
     TraceJob,
     VerifyJob,
 )
-from s2r_runtime.errors import ConfigError, one_line
+from s2r_runtime.errors import ConfigError, ControllerError, one_line
 from s2r_runtime.messages import Gap
 from s2r_runtime.modelspec import dump_model
 from s2r_runtime.profile import Profile, check_model
@@ -98,6 +98,8 @@ def _certificate(text: str, job: LoadJob, profile: Profile, controller: str) -> 
     problem = certificates.assumption_problem(found, profile)
     if not problem and found.controller_digest != controller:
         problem = f"is of the controller {found.controller_digest}; the one to deploy is {controller}"
+    if not problem and found.tries is not None and found.tries.fixed:
+        problem = "is of a simulation that fixed its seeds beforehand; it certifies nothing for a robot"
     if problem:
         return Brought(signer, problem=f"{where}: {problem}")
     return Brought(signer, text, certificates.facts(found), found.gap)
@@ -152,6 +154,7 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
     """
     import numpy as np
 
+    from s2r_runtime import probe
     from s2r_runtime.controllers.batches import BatchController
     from s2r_runtime.controllers.rehearsal import Kept
     from s2r_runtime.verify import verify_in_detail
@@ -181,9 +184,12 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
     if result.passed:
         with BatchController(job.controller, len(model.inputs), MEMORY_BYTES) as again:
             kept.compare(again)
+    behaviour = ""
+    with suppress(ControllerError), BatchController(job.controller, len(model.inputs), MEMORY_BYTES) as probed:
+        behaviour = probe.behaviour(probed, task, model, [profile.inputs[name] for name in model.inputs])
     lowest = -np.finfo(np.float64).max  # what `verify` counts a value that is no number as
     safety = {one.law: np.nan_to_num(one.rollouts.safety, nan=lowest, neginf=lowest, posinf=-lowest).tolist() for one in details}
-    return Result(verification=result, safety=safety)
+    return Result(verification=result, safety=safety, behaviour=behaviour)
 
 
 def _asked(job: VerifyJob | SynthesisJob) -> tuple[ComposedModel, Task, GapSet]:

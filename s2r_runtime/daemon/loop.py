@@ -17,7 +17,7 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -92,7 +92,7 @@ class Daemon:
     state_dir: counters, certificates, key (default: the user's state folder, by robot). key_path: signing key (default: one in the state
     folder, made when there is none). log_dir: default as the profile says. log_file: one log of this name instead. listen: whether
     there is a control socket. on_tick: called with every tick, for whoever runs a daemon in his own process. analytics: that process,
-    if it was started before this module was loaded.
+    if it was started before this module was loaded. simulated_seeds: of a simulation that is to be repeatable, instead of entropy.
     """
 
     def __init__(
@@ -108,11 +108,12 @@ class Daemon:
         listen: bool = True,
         on_tick: Callable[[Daemon], None] | None = None,
         analytics: Child | None = None,
+        simulated_seeds: Iterator[int] | None = None,
     ) -> None:
         self.profile, self._profile_path, self.seed = profile, profile_path, seed
         self.state_dir = state_dir or control.state_root() / profile.robot.name
         self._key_path, self._log_file, self._listen, self._on_tick = key_path, log_file, listen, on_tick
-        self._analytics = analytics
+        self._analytics, self.simulated_seeds = analytics, simulated_seeds
         self._log_dir = log_file.parent if log_file else log_dir or self.state_dir / profile.recording.directory
         self.selector = selectors.DefaultSelector()
         self.clock = Clock(lockstep=profile.clock == "lockstep")

@@ -26,7 +26,7 @@ import msgspec
 from s2r_runtime.core.gaps import REFUTED
 from s2r_runtime.core.stream import stood
 from s2r_runtime.errors import ConfigError, RecordingError
-from s2r_runtime.messages import Memory, Persist, SampleTaken, Started
+from s2r_runtime.messages import BEHAVIOURS, Memory, Persist, SampleTaken, Started
 from s2r_runtime.recording.glance import glance
 from s2r_runtime.recording.reading import Reading
 
@@ -150,6 +150,8 @@ def _of_one_epoch(before: Memory, now: Memory, epoch: int) -> str:
         return f"what the watch made of the {before.watch_n} discrepancies of epoch {epoch}"
     if (now.model_digest, now.campaign_digest) != (before.model_digest, before.campaign_digest):
         return f"of which model and with which settings the gap of epoch {epoch} was measured"
+    if now.gap_attempts < before.gap_attempts or (not set(before.behaviours) <= set(now.behaviours) and len(now.behaviours) < BEHAVIOURS):
+        return f"controllers that were tried on the gap of epoch {epoch}"
     if before.traced and not now.traced:
         return "that an effect was traced that the model lacks (guarantee G8)"
     return ""

@@ -171,6 +171,7 @@ class Result(msgspec.Struct, frozen=True, tag="result"):
     verification: Verification | None = None
     trace: dict[str, Any] | None = None
     safety: dict[str, list[float]] = {}
+    behaviour: str = ""
     controller: ControllerFile | None = None
     certificate: Brought | None = None
     model: Model | None = None

@@ -216,6 +216,21 @@ class JobFinished(Struct, frozen=True, tag="job_finished"):
     error: str = ""
     safety: dict[str, list[float]] = {}
     """verify: the safety value of every scenario, by law (for the report; the audit recomputes them)."""
+    behaviour: str = ""
+    """verify: digest of the controller's answers on the probe set (`probe`); empty: it gave none."""
+
+
+class SeedDrawn(Struct, frozen=True, tag="seed_drawn"):
+    """The seed of a verification attempt, 0 .. 2^48 - 1: drawn from the operating system's entropy after the attempt was paid for.
+
+    fixed: a simulation fixed it beforehand, so that it can be repeated; every certificate that rests on it says so.
+    """
+
+    t_ns: int
+    job_id: int
+    attempt: int
+    seed: int
+    fixed: bool = False
 
 
 class EpisodeEnded(Struct, frozen=True, tag="episode_ended"):
@@ -281,5 +296,5 @@ class Requested(Struct, frozen=True, tag="requested"):
 Event = (
     Started | Observed | Proposed | Ticked | WallClockRead | LinkChanged | RecorderChanged | AnalyticsChanged | OverrideChanged | Measured
     | EpisodeEnded | SourceStarted | SourceStopped | SampleTaken | CampaignFinished | InputsFinished | JobFinished | CertificateStored
-    | CertificateFailed | CertificatesDistrusted | Requested | Stopping | ObservationRefused | AnswerLate
+    | CertificateFailed | CertificatesDistrusted | Requested | Stopping | ObservationRefused | AnswerLate | SeedDrawn
 )  # fmt: skip

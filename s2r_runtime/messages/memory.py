@@ -79,10 +79,16 @@ instant came 0.9 dt after the last one, and a transition could be 0.2 dt off a s
 """
 RESTARTS = 4
 """Since these rules nothing is measured across a restart of the robot or a lost link, and no command from before acts after it."""
-RULES = 4
-"""1: a campaign that is refused for dependent samples is remembered, and can be traced and repeated. 2: `GRID`. 3: what driving showed is
-kept over epochs (`Driven`). 4: `RESTARTS`.
+SEEDS = 5
+"""Since these rules the seed of a verification is drawn after its attempt was paid for. Before, it was a function of digests and attempt
+number, which anybody could compute beforehand.
 """
+RULES = 5
+"""1: a campaign that is refused for dependent samples is remembered, and can be traced and repeated. 2: `GRID`. 3: what driving showed is
+kept over epochs (`Driven`). 4: `RESTARTS`. 5: `SEEDS`.
+"""
+BEHAVIOURS = 1000
+"""Remembered on one gap: some 20 KB of what is persisted. Beyond that a certificate says *at least*."""
 MEMORY_SCHEMA = 1
 """Of `Memory`: a memory of another schema is refused."""
 
@@ -179,3 +185,7 @@ class Memory(Struct, frozen=True):
     """The newest campaign, if its samples depend on each other; None as soon as a later one found a gap."""
     driven: Driven | None = None
     """What driving showed in the epochs before this one, where it was worst."""
+    gap_attempts: int = 0
+    """Verification attempts on the gap in force, as far as they were counted (rules 5)."""
+    behaviours: tuple[str, ...] = ()
+    """Of the controllers tried on it, each once, the newest `BEHAVIOURS`: `JobFinished.behaviour`, else the controller's digest."""

@@ -6,7 +6,7 @@ from typing import Literal
 
 from s2r_runtime.messages.link import Source, Struct
 from s2r_runtime.messages.memory import Memory, Stretch
-from s2r_runtime.messages.results import CertificateFacts, Gap, Verification
+from s2r_runtime.messages.results import CertificateFacts, Gap, Tries, Verification
 
 # ---------------------------------------------------------------- actions
 
@@ -98,14 +98,23 @@ class StartJob(Struct, frozen=True, tag="start_job"):
     least_radius: float = 0.0
 
 
+class DrawSeed(Struct, frozen=True, tag="draw_seed"):
+    """The attempt is paid for: the daemon is to draw its seed, once that is durable."""
+
+    t_ns: int
+    job_id: int
+    attempt: int
+
+
 class IssueCertificate(Struct, frozen=True, tag="issue_certificate"):
-    """Sign what was shown: the gap in force and this verification."""
+    """Sign what was shown: the gap in force and this verification. tries: None in a log of before (rules < 5)."""
 
     t_ns: int
     gap: Gap
     verification: Verification
     request_id: int
     lifetime_s: int
+    tries: Tries | None = None
 
 
 class Persist(Struct, frozen=True, tag="persist"):
@@ -252,7 +261,7 @@ class ModelAdopted(Struct, frozen=True, tag="model_adopted"):
 
 Action = (
     Ask | Send | StartCampaign | StartInputs | StopCampaign | StartController | StopController | StartJob | IssueCertificate | Persist
-    | Answer
+    | Answer | DrawSeed
 )  # fmt: skip
 Record = (
     Decided | GateChanged | EpochChanged | AttemptSpent | AttemptEnded | RadiusGrew | AlarmRaised | ChangeNoticed | CertificateInstalled

@@ -87,6 +87,19 @@ class Verification(Struct, frozen=True, tag="verification"):
     tried: tuple[RadiusTried, ...] = ()
 
 
+class Tries(Struct, frozen=True):
+    """How much was tried before a certificate was issued (guarantee G4).
+
+    attempts: on any gap, all of which share one budget. on_gap: of these, on this gap. controllers: different ones among
+    those, by their behaviour on the probe set. fixed: a simulation fixed the seed of this attempt.
+    """
+
+    attempts: int
+    on_gap: int
+    controllers: int
+    fixed: bool = False
+
+
 class Trials(Struct, frozen=True):
     """Closed-loop runs of a controller on the robot, from its logs (guarantee G9, `trials`). worst: least safety value.
 
