@@ -17,9 +17,9 @@ from s2r_runtime.models.composed import wrap
 @pytest.mark.parametrize(
     ("reading", "median", "low", "high"),
     [
-        (experiment.Reading("random", False, "literal", True, 0), 0.200, 0.193, 0.206),
-        (experiment.Reading("random", True, "literal", True, 0), 0.194, 0.182, 0.204),
-        (experiment.Reading("stopped", False, "literal", True, 0), 0.104, 0.102, 0.108),
+        (experiment.Reading("random", False, "literal", True, "first"), 0.200, 0.193, 0.206),
+        (experiment.Reading("random", True, "literal", True, "first"), 0.194, 0.182, 0.204),
+        (experiment.Reading("stopped", False, "literal", True, "first"), 0.104, 0.102, 0.108),
     ],
 )
 def test_a_period_of_latency_makes_the_papers_literal_r_and_a_full_stop_half_of_it(
@@ -34,7 +34,7 @@ def test_a_period_of_latency_makes_the_papers_literal_r_and_a_full_stop_half_of_
 
 def test_headings_that_are_not_wrapped_are_wrong_by_a_turn() -> None:
     rng = np.random.default_rng(2)
-    wrapped, raw = (experiment.sampled(experiment.Reading("random", True, "literal", w, 0), 2400, rng).max() for w in (True, False))
+    wrapped, raw = (experiment.sampled(experiment.Reading("random", True, "literal", w, "first"), 2400, rng).max() for w in (True, False))
     assert wrapped < 0.21
     assert raw == pytest.approx(2.0 * np.pi, abs=0.2)
 
@@ -58,7 +58,7 @@ def test_a_robot_that_arrives_is_at_a_waypoint_and_drives() -> None:
 
 
 def test_a_reading_is_five_words_in_order() -> None:
-    assert experiment.reading_of("stopped,free,weighted,unwrapped,all") == experiment.Reading("stopped", False, "weighted", False, -1)
+    assert experiment.reading_of("stopped,free,weighted,unwrapped,all") == experiment.Reading("stopped", False, "weighted", False, "all")
     for wrong in ("stopped", "free,stopped,weighted,wrapped,all", "stopped,free,weighted,wrapped,third"):
         with pytest.raises(argparse.ArgumentTypeError, match="must be one of each, in this order"):
             experiment.reading_of(wrong)

@@ -18,7 +18,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 import robotarium_figures as figures
@@ -63,35 +63,39 @@ CONTROLLERS: tuple[tuple[str, dict[str, float]], ...] = (
 """In the order in which somebody would try them: faults first, then the controller that ships, then more careful ones."""
 
 
+Period = Literal["first", "last", "all", "random"]
+
+
 class Reading(NamedTuple):
-    """One way to read the paper. step: which held period is the sample (-1: each of them is one, 48 holds of 50)."""
+    """One way to read the paper. period: which held one is the sample; `all`: each of them is one, 48 holds of 50."""
 
     before: Before
     saturated: bool
     norm: str
     wrapped: bool
-    step: int
+    period: Period
 
     @property
     def words(self) -> str:
         """For tables."""
-        which = {0: "first period", HOLD - 1: "last period", -1: "all 50 periods"}[self.step]
+        which = {"all": "all 50 periods", "random": "a random period"}.get(self.period, f"{self.period} period")
         wheels, wrapped = "clipped" if self.saturated else "free", "wrapped" if self.wrapped else "not wrapped"
         return f"{self.before}, wheels {wheels}, {self.norm} norm, {wrapped}, {which}"
 
 
 READINGS = (
-    Reading("random", False, "literal", True, 0),
-    Reading("random", True, "literal", True, 0),
-    Reading("arriving", True, "literal", True, 0),
-    Reading("stopped", False, "literal", True, 0),
-    Reading("stopped", True, "literal", True, 0),
-    Reading("random", True, "literal", False, 0),
-    Reading("random", True, "literal", True, HOLD - 1),
-    Reading("random", True, "literal", True, -1),
-    Reading("random", True, "weighted", True, 0),
-    Reading("arriving", True, "weighted", True, 0),
-    Reading("stopped", True, "weighted", True, 0),
+    Reading("random", False, "literal", True, "first"),
+    Reading("random", True, "literal", True, "first"),
+    Reading("arriving", True, "literal", True, "first"),
+    Reading("stopped", False, "literal", True, "first"),
+    Reading("stopped", True, "literal", True, "first"),
+    Reading("random", True, "literal", False, "first"),
+    Reading("random", True, "literal", True, "last"),
+    Reading("random", True, "literal", True, "all"),
+    Reading("random", True, "weighted", True, "first"),
+    Reading("arriving", True, "weighted", True, "first"),
+    Reading("stopped", True, "weighted", True, "first"),
+    Reading("stopped", True, "weighted", True, "random"),
 )
 
 
@@ -100,7 +104,7 @@ WORDS = (
     ("clipped", "free"),
     ("literal", "weighted"),
     ("wrapped", "unwrapped"),
-    ("first", "last", "all"),
+    ("first", "last", "all", "random"),
 )
 
 
@@ -109,8 +113,7 @@ def reading_of(text: str) -> Reading:
     words = text.split(",")
     if len(words) != len(WORDS) or any(word not in known for word, known in zip(words, WORDS, strict=True)):
         raise argparse.ArgumentTypeError(f"{text!r} must be one of each, in this order: " + "; ".join("|".join(known) for known in WORDS))
-    step = {"first": 0, "last": HOLD - 1, "all": -1}[words[4]]
-    return Reading(cast("Before", words[0]), words[1] == "clipped", words[2], words[3] == "wrapped", step)
+    return Reading(cast("Before", words[0]), words[1] == "clipped", words[2], words[3] == "wrapped", cast("Period", words[4]))
 
 
 def discrepancies(errors: Array, norm: str, *, wrapped: bool) -> Array:
@@ -122,12 +125,18 @@ def discrepancies(errors: Array, norm: str, *, wrapped: bool) -> Array:
 
 def sampled(reading: Reading, n: int, rng: np.random.Generator) -> Array:
     """n discrepancies under this reading."""
-    if reading.step < 0:
-        holds = campaign(-(-n // HOLD), reading.before, rng, saturated=reading.saturated)
-        errors = np.concatenate([holds.errors(step)[:, None] for step in range(HOLD)], axis=1).reshape(-1, 3)[:n]
+    holds = campaign(
+        -(-n // HOLD) if reading.period == "all" else n,
+        reading.before,
+        rng,
+        saturated=reading.saturated,
+        periods=1 if reading.period == "first" else HOLD,
+    )
+    if reading.period in ("first", "last"):
+        errors = holds.errors(0 if reading.period == "first" else HOLD - 1)
     else:
-        holds = campaign(n, reading.before, rng, saturated=reading.saturated, periods=reading.step + 1)
-        errors = holds.errors(reading.step)
+        each = np.stack([holds.errors(period) for period in range(HOLD)], axis=1)
+        errors = each.reshape(-1, 3)[:n] if reading.period == "all" else each[np.arange(n), rng.integers(HOLD, size=n)]
     return discrepancies(errors, reading.norm, wrapped=reading.wrapped)
 
 
