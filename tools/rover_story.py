@@ -27,7 +27,7 @@ CAMPAIGN_S = 5400.0
 """The longest that a campaign is waited for, and its permit."""
 CAMPAIGNS_MOST, GOES_ON = 5, "s2r sample goes on with it"
 """So often sampling is begun or resumed: after a stall of the disk, or a refusal of dependent samples (1 of 200 good campaigns)."""
-LOOK_S = 1.0
+LOOK_S = 2.0
 AGAIN_MOST = 3
 """So often a controller that missed its deadline is cleared and deployed again."""
 NOTICED_S = 120.0
