@@ -9,7 +9,7 @@ from pathlib import Path
 
 from daemon_rig import Rig
 
-from s2r_runtime.messages import Measured, Started
+from s2r_runtime.messages import AnalyticsChanged, Measured, Started
 
 
 def test_the_watch_goes_on_over_the_death_of_its_process_and_a_restart_and_the_audit_makes_it_again(tmp_path: Path) -> None:
@@ -50,6 +50,32 @@ def test_the_watch_goes_on_over_the_death_of_its_process_and_a_restart_and_the_a
         assert measured[-1].change > 0.0
         started = [m.memory for m in rig.messages("event/started") if isinstance(m, Started)][-1]
         assert kept == started.watch_n == sum(started.watch_counts)
+        found = json.loads(rig.s2r("audit", *map(str, rig.log_files()), "--key", str(rig.state / "key.pub"), "--json").stdout)
+        assert (found["ok"], found["first_difference"]) == (True, None), found
+    finally:
+        rig.close()
+
+
+def test_a_watch_that_falls_behind_and_catches_up_is_measured_again_by_the_audit(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, clock="realtime", more="[machine]\nwatch_delay = 0.3\nprocess_timeout = 60.0\n")
+    try:
+        rig.start_robot()
+        rig.start()
+        assert rig.deploy(rig.controller())["exit_code"] == 0
+        rig.until(lambda: rig.status()["stream"]["n"] > 20)
+        pid = rig.status()["pids"]["analytics"]
+        os.kill(pid, signal.SIGSTOP)
+        rig.until_status(analytics="down", gate="closed")
+        os.kill(pid, signal.SIGCONT)
+        rig.until_status(analytics="up")
+        seen = rig.status()["stream"]["n"]
+        rig.until(lambda: rig.status()["stream"]["n"] > seen + 10)
+        assert rig.status()["pids"]["analytics"] == pid
+        rig.stop()
+        assert [(m.up, m.late) for m in rig.messages("event/analytics_changed") if isinstance(m, AnalyticsChanged)] == [
+            (False, True),
+            (True, True),
+        ]
         found = json.loads(rig.s2r("audit", *map(str, rig.log_files()), "--key", str(rig.state / "key.pub"), "--json").stdout)
         assert (found["ok"], found["first_difference"]) == (True, None), found
     finally:

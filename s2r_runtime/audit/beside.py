@@ -184,6 +184,8 @@ class _Server:
                 self._watch.measured(entry, event)
             case LinkChanged():
                 self._watch.restarted()
+            case AnalyticsChanged(late=True):
+                self._watch.late(behind=not event.up)
             case AnalyticsChanged():
                 self._watch.analytics(up=event.up)
             case SourceStopped(source="controller", reason="start_failed"):

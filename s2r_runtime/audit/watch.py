@@ -36,6 +36,7 @@ class WatchReplay:
         """t_ns: of the observation."""
         self._lockstep = False
         self._sure = True
+        self._behind = False
         self._rules = 0
 
     def begin(self, model: ComposedModel, gap: Gap, profile: Profile, memory: Memory, *, lockstep: bool, rules: int) -> None:
@@ -56,11 +57,15 @@ class WatchReplay:
 
     def analytics(self, *, up: bool) -> None:
         """The process died, or is there again."""
-        self._stream = None
+        self._stream, self._behind = None, False
         if not up:
             self._due.clear()
         elif self._begun is not None:
             self._start()
+
+    def late(self, *, behind: bool) -> None:
+        """The process is behind the robot, or has caught up: what is due comes, later than else."""
+        self._behind = behind
 
     def observed(self, entry: Entry, observation: Observation, t_ns: int) -> None:
         """The robot was seen there; before the core hears of it."""
@@ -102,7 +107,7 @@ class WatchReplay:
 
     def _demand(self, entry: Entry, t_ns: int) -> None:
         """While a controller is watched, what is due must have come by now."""
-        if self._sure and self._due and (self._lockstep or t_ns - self._due[0].t_ns > OVERDUE_NS):
+        if self._sure and not self._behind and self._due and (self._lockstep or t_ns - self._due[0].t_ns > OVERDUE_NS):
             self._findings.differ(entry.index, entry.channel, "a discrepancy before this is not recorded", None, self._due[0])
             self._due.clear()
 

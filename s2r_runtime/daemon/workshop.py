@@ -216,7 +216,7 @@ class Watcher:
         late = self._analytics.late
         if bool(late) != self._late and self._ready:
             self._late = bool(late)
-            self._emit(AnalyticsChanged(0, up=not late, detail=late))
+            self._emit(AnalyticsChanged(0, up=not late, detail=late, late=True))
 
     def _check_alive(self, now_ns: int) -> None:
         analytics = self._analytics

@@ -67,12 +67,14 @@ class RecorderChanged(Struct, frozen=True, tag="recorder_changed"):
 
 class AnalyticsChanged(Struct, frozen=True, tag="analytics_changed"):
     """The process that measures while a controller drives died (or hung), or is there again. Unwatched, nobody drives: the gate
-    closes with the reason `analytics_down`. Up after start unless this says otherwise.
+    closes with the reason `analytics_down`. Up after start unless this says otherwise. late: it did not die; it fell behind the robot by
+    more than the profile allows, or caught up, and measures on where it was.
     """
 
     t_ns: int
     up: bool
     detail: str = ""
+    late: bool = False
 
 
 class Stopping(Struct, frozen=True, tag="stopping"):
