@@ -19,6 +19,7 @@ ORDER = (
     "fuzz_door.py",
     "bench_crash.py",
     "bench_tamper.py",
+    "bench_fields.py",
     "bench_audit.py",
     "bench_recordings.py",
     "bench_can.py",

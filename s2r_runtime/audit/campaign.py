@@ -220,7 +220,7 @@ class CampaignReplay:
         if campaign is not None and order is not None:
             n = len(self.samples.get(order.epoch, ()))
             rejected = campaign.progress().rejected if self._exact else event.rejected
-            told = CampaignFinished(event.t_ns, order.epoch, n, n >= order.n, rejected, event.detail)
+            told = CampaignFinished(event.t_ns, order.epoch, n, n >= order.n, rejected, "" if n >= order.n else event.detail)
             if told != event:
                 self._findings.differ(entry.index, entry.channel, "the campaign ended otherwise", entry.raw, told)
         self.rejected[event.epoch] = event.rejected

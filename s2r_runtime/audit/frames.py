@@ -20,11 +20,13 @@ from s2r_runtime.messages import (
     Observed,
     OverrideChanged,
     Proposed,
+    RecorderChanged,
     Send,
 )
 from s2r_runtime.recording.reading import Entry
 
-DECODE_FAILED = "transport: decode "
+FAULT = "transport: "
+DECODE_FAILED = f"{FAULT}decode "
 """How the daemon's event of a frame begins whose decoding failed there."""
 
 
@@ -41,10 +43,13 @@ class Frames:
         self._source = 0
         self._sends: deque[Send] = deque()
         self._left: deque[tuple[Entry, Frame]] = deque()
+        self._missing = 0  # commands without a frame, since which no fault of the link was recorded
+        self._at_fault = False  # one was, since a frame left last
 
     def inbound(self, entry: Entry, frame: Frame) -> None:
         """A frame came. Everything that the one before was decoded to must have become an event by now."""
         self.commands_left()
+        self._all_left(entry)
         self._events_are_there(entry)
         self._source = entry.index
         try:
@@ -58,6 +63,8 @@ class Frames:
         """An event: one that only a frame can have brought must be the next that a frame did bring."""
         self.commands_left()
         due = self._due[0] if self._due else None
+        if isinstance(event, RecorderChanged) or (isinstance(event, LinkChanged) and event.detail.startswith(FAULT)):
+            self._missing, self._at_fault = 0, True
         if isinstance(event, LinkChanged):
             if isinstance(due, LinkChanged) and (due.up, due.detail) == (event.up, event.detail):
                 self._due.popleft()
@@ -109,6 +116,13 @@ class Frames:
             self._findings.differ(entry.index, entry.channel, what, None, self._due[0])
             self._due.clear()
 
+    def _all_left(self, entry: Entry) -> None:
+        """The daemon records a fault of the link before it takes the next frame: without one every command left."""
+        if self._missing:
+            what = f"{self._missing} commands before this frame did not leave, and no fault of the link is recorded"
+            self._findings.differ(entry.index, entry.channel, what, None, None)
+            self._missing = 0
+
     def end(self, entry: Entry | None, last_act: Send | None, *, clean: bool) -> None:
         """Nothing follows. last_act: the one command that the daemon gives on its own, when something in it breaks. clean: and
         nothing was cut.
@@ -120,26 +134,35 @@ class Frames:
             self._events_are_there(entry)
 
     def commands_left(self) -> None:
-        """Frames that left since the event before are its commands', in order. A command without a frame could not be sent."""
+        """Frames that left since the event before are its commands', in order. A command without a frame could not be sent: see
+        `_all_left`.
+        """
         while self._sends:
             encoded = self._encoded(self._sends.popleft())
-            if self._left and encoded == self._left[0][1].data:
+            if self._left and _same(encoded, self._left[0][1]):
                 self._left.popleft()
+                self._at_fault = False
                 self._findings.count("frames")
             else:
+                self._missing += not self._at_fault
                 self._findings.count("commands that did not leave")
         if self._left:
             entry, _ = self._left[0]
             self._findings.differ(entry.index, entry.channel, "a frame left that no command of the core makes", entry.raw, None)
             self._left.clear()
 
-    def _encoded(self, send: Send) -> bytes | None:
+    def _encoded(self, send: Send) -> Frame | None:
         """Each command is encoded once, in order, as the daemon did: a transport may count them."""
         command = Command(send.seq, send.t_ns, send.source, send.u, send.obs_seq, send.ttl_ns)
         try:
-            return transport_values.outbound(self._transport.encode(command)).data
+            return transport_values.outbound(self._transport.encode(command))
         except Exception:  # noqa: BLE001 - it refused the command, or a plug-in's defect: nothing left then either
             return None
+
+
+def _same(encoded: Frame | None, left: Frame) -> bool:
+    """Whether these bytes left, to where they belong; when they left is the daemon's word."""
+    return encoded is not None and (encoded.channel, encoded.data) == (left.channel, left.data)
 
 
 def _came_later(message: Inbound) -> bool:

@@ -100,7 +100,7 @@ class InputsReplay:
     def finished(self, entry: Entry, event: InputsFinished) -> None:
         """What it says of itself."""
         if self._given is not None:
-            told = InputsFinished(event.t_ns, self._given.digest, self._row, self._finished, event.detail)
+            told = InputsFinished(event.t_ns, self._given.digest, self._row, self._finished, "" if self._finished else event.detail)
             if told != event:
                 self._findings.differ(entry.index, entry.channel, "the inputs ended otherwise", event, told)
         self._order = self._given = None
