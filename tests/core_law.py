@@ -95,6 +95,7 @@ class Law:
         anew = event.t_ns < self.now or (isinstance(event, m.LinkChanged) and not event.up)
         if event.t_ns < self.now:
             self.permit = None
+            self.unix = (self.unix[0], min(self.unix[1], event.t_ns))
         if anew:
             self._forget()
         idle = event.t_ns - self.now > self.settings.observation_timeout_ns and not self.settings.lockstep
@@ -116,13 +117,13 @@ class Law:
         match event:
             case m.Started():
                 self.started, self.settings = True, event.settings
-                self.model, self.unix = event.settings.model_digest, (event.unix_s, event.t_ns)
+                self.model, self.unix = event.settings.model_digest, (max(event.unix_s, event.memory.latest_unix_s), event.t_ns)
                 self.up = frozenset({"recorder", "analytics"})
                 self.running, self.sampling, self.permit, self.asked = None, False, None, None
                 self.gate, self.answered, self.last = False, True, None
                 self._forget()
             case m.WallClockRead():
-                self.unix = (event.unix_s, event.t_ns)
+                self.unix = (max(event.unix_s, self._wall()), event.t_ns)
             case m.LinkChanged():
                 self._up("link", event.up)
             case m.RecorderChanged():
@@ -252,10 +253,14 @@ class Law:
 
     # ------------------------------------------------------------------ what may drive
 
+    def _wall(self) -> int:
+        """The time of day: never earlier than before, and carried on by the host's clock."""
+        return self.unix[0] + (0 if self.settings.lockstep else max(0, self.now - self.unix[1]) // S)
+
     def _against_controller(self) -> str:
         """Why no controller may drive now, or empty."""
         s, x = self.settings, self.good.x if self.good else ()
-        wall = self.unix[0] + (0 if s.lockstep else max(0, self.now - self.unix[1]) // S)
+        wall = self._wall()
         covers = [
             c
             for c in self.stored

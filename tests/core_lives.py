@@ -22,9 +22,16 @@ FILE = Path(__file__).parent / "replay" / "core_lives.msgpack.gz"
 WALKS, STEPS = 12, 420
 CASES = 260
 """Random walks and their steps, and seeded cases of faults: enough that every line of the core is run many times over."""
-LATER: dict[str, object] = {"refused_campaign": None, "driven": None, "gap_attempts": 0, "behaviours": (), "tries": None}
+LATER: dict[str, object] = {
+    "refused_campaign": None,
+    "driven": None,
+    "gap_attempts": 0,
+    "behaviours": (),
+    "tries": None,
+    "latest_unix_s": 0,
+}
 """Fields of memory and outputs that came after the lives were recorded: at their defaults they say nothing else than before."""
-LATER_STATUS = ("refused_campaign", "next_campaign", "next_attempt", "driven")
+LATER_STATUS = ("refused_campaign", "next_campaign", "next_attempt", "driven", "clock_behind_s")
 
 
 class Life(msgspec.Struct, frozen=True):

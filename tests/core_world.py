@@ -14,6 +14,7 @@ from core_rig import GAP, S
 
 from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
+from s2r_runtime.core.state import unix_now
 from s2r_runtime.headroom import grid
 from s2r_runtime.messages import (
     MEMORY_SCHEMA,
@@ -290,8 +291,8 @@ class World:
                     duty.gap.epoch,
                     duty.gap.radius,
                     v.radius,
-                    1500,
-                    1600,
+                    unix_now(self.state),
+                    unix_now(self.state) + 100,
                     v.attempt,
                 )
                 self.feed(

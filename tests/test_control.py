@@ -300,7 +300,7 @@ def test_a_client_says_nothing_to_a_third_user_who_listens_in_the_daemons_place(
     ("request_line", "words"),
     [
         (b'{"verb": "clear", "text": "\\udcff"}', "surrogate"),
-        (b'{"verb": "clear", "text": "a\\u0000b"}', "control characters"),
+        (b'{"verb": "clear", "text": "a\\u0000b"}', "cannot be printed"),
         (b'{"verb": "clear", "text": "' + b"x" * 201 + b'"}', "longer than 200 bytes"),
         (b'{"verb": "deploy", "path": "\xff"}', "UTF-8"),
         (b'{"verb": "permit", "duration_s": ' + b"9" * 10_000 + b"}", "must be >= 0 and finite"),

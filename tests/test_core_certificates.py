@@ -13,6 +13,7 @@ from core_rig import GAP, Rig, answers, kinds, memory, of, one
 from s2r_runtime import bounds
 from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
+from s2r_runtime.core.state import unix_now
 from s2r_runtime.messages import (
     SEEDS,
     Answer,
@@ -489,3 +490,43 @@ def test_revoking_another_controllers_certificate_stops_nobody() -> None:
     rig.stored()
     assert kinds(rig.request("revoke", text="c2")) == ["Revoked", "Persist", "Answer"]
     assert rig.state.gate_open
+
+
+def driving_rig() -> Rig:
+    rig = Rig()
+    rig.driving()
+    return rig
+
+
+@pytest.mark.parametrize("back_to", [0, 1500, 2499])
+def test_a_certificate_that_expired_drives_no_more_when_the_clock_steps_back_not_even_after_a_restart(back_to: int) -> None:
+    rig = driving_rig()
+    rig.feed(WallClockRead(rig.t, 2500))
+    assert rig.state.gate_reason == "certificate_expired"
+    rig.feed(WallClockRead(rig.t, back_to))
+    assert (rig.state.gate_open, rig.state.gate_reason) == (False, "certificate_expired")
+    assert rig.state.clock_behind_s == (2500 - back_to if back_to < 2499 else 0), "one second is rounding"
+    again = Rig(rig.state.memory)
+    assert unix_now(again.state) == 2500
+    again.feed(WallClockRead(again.t, back_to))
+    again.request("deploy", digest="controller")
+    assert again.state.deployment is None or not again.state.deployment.certificate_id
+
+
+def test_the_monotonic_clock_bounds_a_certificates_life_while_the_wall_clock_stands() -> None:
+    rig = driving_rig()
+    for _ in range(11):
+        rig.t += 100_000_000_000
+        rig.feed(WallClockRead(rig.t, 1500))
+    assert rig.state.gate_reason == "certificate_expired"
+
+
+def test_a_clock_that_was_ahead_by_mistake_is_believed_again_by_a_person_and_what_had_expired_is_revoked() -> None:
+    rig = driving_rig()
+    identity = rig.state.memory.certificates[0].id
+    assert "not behind" in one(rig.request("clear", text="wall_clock"), Answer).text
+    rig.feed(WallClockRead(rig.t, 10**9))
+    rig.feed(WallClockRead(rig.t, 1501))
+    assert "1 certificates had expired" in one(rig.request("clear", text="wall_clock"), Answer).text
+    assert (unix_now(rig.state), rig.state.memory.latest_unix_s) == (1501, 1501)
+    assert rig.state.memory.revoked == {identity: "expired"}

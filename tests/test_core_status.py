@@ -20,6 +20,7 @@ NOTHING: dict[str, Any] = {
     "controller": None,
     "stage": None,
     "certificate": None,
+    "clock_behind_s": 0,
     "certificate_left_s": None,
     "radius": None,
     "gap_radius": None,

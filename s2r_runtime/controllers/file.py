@@ -92,7 +92,10 @@ def load(path: Path, parameters: Mapping[str, Any] | None = None) -> ControllerF
     _check_entry(tree, path)
     values = _parameters(tree, path, dict(parameters or {}))
     imports = Imports(path.resolve().parent)
-    imports.follow(tree, path, package="")
+    try:
+        imports.follow(tree, path, package="")
+    except OSError as error:  # a name that no file can have
+        raise ConfigError(f"{path}: what it imports cannot be looked for: {error.strerror}") from None
     return ControllerFile(
         path=str(path),
         source=source,

@@ -14,14 +14,14 @@ the campaign must be told. Everything that happens comes as an event, in the ord
 The parts: `state`, `drive` (instants, sends, the gate opening and closing), `faults` (of observations, counted), `sources` (who may
 command), `gaps` (campaigns, gap, watch), `excitation` (given inputs), `repair` (traces, proposed models), `certificates` (attempts,
 certificates), `requests` (what a person asks for), `gate` (the verdict on a command), `ledger` (what is spent), `stream` (what is kept of
-the discrepancies), `status`.
+the discrepancies), `wall_clock` (the time of day, for expiry), `status`.
 """
 
 from __future__ import annotations
 
 import msgspec
 
-from s2r_runtime.core import certificates, drive, excitation, faults, gaps, repair, sources
+from s2r_runtime.core import certificates, drive, excitation, faults, gaps, repair, sources, wall_clock
 from s2r_runtime.core.requests import requested
 from s2r_runtime.core.state import State, Turn
 from s2r_runtime.core.status import status
@@ -102,6 +102,7 @@ def _started(state: State, event: Started) -> tuple[State, tuple[Output, ...]]:
     settings, memory = event.settings, event.memory
     turn = Turn(state, settings, event.t_ns)
     turn.set(settings=settings, memory=memory, now_ns=event.t_ns, unix_s=event.unix_s, unix_ns=event.t_ns)
+    wall_clock.begin(turn, event.unix_s)
     if memory.robot != settings.robot:
         sources.memory_refused(turn, f"the memory is of robot {memory.robot!r}, this is {settings.robot!r}")
     elif memory.schema != MEMORY_SCHEMA:
@@ -157,7 +158,7 @@ def _noted(turn: Turn, event: Event) -> None:
     """Events that come now and then."""
     match event:
         case WallClockRead():
-            turn.set(unix_s=event.unix_s, unix_ns=event.t_ns)
+            wall_clock.read(turn, event.unix_s)
         case RecorderChanged():
             turn.set(recorder_ok=event.ok, recorder_late=event.late and not event.ok)
         case AnalyticsChanged():
@@ -211,6 +212,7 @@ def _stopping(turn: Turn, event: Stopping) -> None:
         if one.purpose == "trace":
             turn.emit(TraceEnded(turn.now, one.id, one.stretch, one.epoch, "", "the daemon stopped before it was done"))
     turn.set(jobs=(), issuing=None)
+    wall_clock.end(turn)
     turn.remember()
 
 

@@ -11,7 +11,7 @@ import math
 import msgspec
 
 from s2r_runtime import gate
-from s2r_runtime.core import driven, faults
+from s2r_runtime.core import driven, faults, wall_clock
 from s2r_runtime.core.certificates import begin_verification, refusal_to_verify, revoke, start_controller, valid_certificate
 from s2r_runtime.core.drive import recover_now, regate
 from s2r_runtime.core.excitation import begin_inputs
@@ -81,7 +81,7 @@ def _deploy(turn: Turn, request: Requested) -> None:
     elif state.deployment is not None and state.deployment.stage == "running" and state.deployment.digest == digest:
         turn.answer(request.request_id, 0, "this controller is deployed already")
     elif state.deployment is not None:
-        turn.answer(request.request_id, 2, "another deployment is in force or under way; first: s2r deploy --undeploy")
+        turn.answer(request.request_id, 2, "another deployment is in force or under way; first: s2r undeploy")
     elif stopped:
         turn.answer(request.request_id, 1, f"refused: {_hinted(turn, stopped)}")
     elif state.campaign is not None or job(state, "gap") is not None:
@@ -130,6 +130,10 @@ def _revoke(turn: Turn, request: Requested) -> None:
 
 def _clear(turn: Turn, request: Requested) -> None:
     reason, latched = request.text.removeprefix("latched:"), turn.memory.latched
+    if reason == wall_clock.REASON:
+        wall_clock.clear(turn, request.request_id)
+        regate(turn)
+        return
     if reason == driven.REASON and turn.memory.driven is not None:
         turn.remember(driven=None)
         turn.persist()

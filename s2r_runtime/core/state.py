@@ -95,10 +95,15 @@ class Job(Struct, frozen=True):
 VERIFYING = ("deploy", "verify", "reverify")
 
 
+CLOCK_ROUNDING_S = 2
+"""Readings are whole seconds, and come now and then."""
+
+
 class State(Struct, frozen=True):
     """All that the core knows.
 
-    unix_s was read at unix_ns. `observation`, `observation_ns`: newest usable one and when it came; `trouble`: why the newest is
+    unix_s was believed at unix_ns, when read_unix_s was read (`core.wall_clock`).
+    `observation`, `observation_ns`: newest usable one and when it came; `trouble`: why the newest is
     not usable, or empty; seen_seq: of the newest, usable or not; odd_seq: of one that came out of order. control_seq,
     control_stamp_ns: of the newest control instant; due_ns: grid point of the next one; report_ns: between the last two observations (both
     by the robot's stamps); `answered`: whether the newest instant has its Send. `idle`: recovery instants since a source
@@ -117,6 +122,7 @@ class State(Struct, frozen=True):
     now_ns: int = 0
     unix_s: int = 0
     unix_ns: int = 0
+    read_unix_s: int = -1
     link_up: bool = False
     recorder_ok: bool = True
     recorder_late: bool = False
@@ -171,6 +177,12 @@ class State(Struct, frozen=True):
     def measured(self) -> int:
         """Discrepancies that the watch counted in this epoch."""
         return self.memory.watch_n
+
+    @property
+    def clock_behind_s(self) -> int:
+        """How far the clock is behind the time that is believed, s; 0 for what its own rounding makes."""
+        behind = self.unix_s - self.read_unix_s if self.read_unix_s >= 0 else 0
+        return behind if behind > CLOCK_ROUNDING_S else 0
 
 
 def certificate(state: State) -> CertificateFacts | None:

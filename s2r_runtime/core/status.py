@@ -24,6 +24,7 @@ def status(state: State) -> dict[str, object]:
         "controller": None if deployment is None else deployment.digest,
         "stage": None if deployment is None else deployment.stage,
         "certificate": None if facts is None else facts.id,
+        "clock_behind_s": state.clock_behind_s,
         "certificate_left_s": None if facts is None else facts.expires_unix_s - unix_now(state),
         "radius": None if memory.gap is None else memory.radius,
         "gap_radius": None if memory.gap is None else memory.gap.radius,

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
+from s2r_runtime.core.state import unix_now
 from s2r_runtime.daemon import issuing
 from s2r_runtime.daemon.control import Connection, ControlServer
 from s2r_runtime.daemon.door import NO_TEXT, Request
@@ -225,7 +226,8 @@ class Desk:
                 self.request("deploy", connection, digest=digest, text=request.path)
 
         d = self._d
-        job = LoadJob(request.path, request.parameters, request.certificate, d.trust.keys(), d.profile, int(time.time()))
+        now = max(int(time.time()), unix_now(d.state))
+        job = LoadJob(request.path, request.parameters, request.certificate, d.trust.keys(), d.profile, now)
         d.workshop.start(job, LOAD_TIMEOUT_S, loaded)
 
     def _install(self, connection: Connection, brought: Brought) -> bool:

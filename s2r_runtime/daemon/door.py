@@ -96,8 +96,8 @@ def _text(raw: msgspec.Raw, where: str, most: int) -> str:
         raise UsageError(f"{where}: is no UTF-8 text: {one_line(str(error))}") from None
     if len(data) > ESCAPED * most + 2 or len(value.encode()) > most:
         raise UsageError(f"{where}: is longer than {most} bytes")
-    if any(c < " " or "\x7f" <= c <= "\x9f" for c in value):
-        raise UsageError(f"{where}: holds control characters: {one_line(value, 60)!r}")
+    if any(c < " " or "\x7f" <= c <= "\x9f" for c in value) or (most == TEXT_MAX and not value.isprintable()):
+        raise UsageError(f"{where}: holds characters that cannot be printed: {one_line(value, 60)!r}")
     return value
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from s2r_runtime import certificate as certificates
 from s2r_runtime import keys
+from s2r_runtime.core.state import unix_now
 from s2r_runtime.daemon.persistence import replace
 from s2r_runtime.daemon.trust import certificate_file
 from s2r_runtime.daemon.worker import Brought
@@ -44,7 +45,7 @@ def issue(daemon: Daemon, order: IssueCertificate) -> CertificateStored | Certif
             controller=file,
             gap=order.gap,
             verification=order.verification,
-            issued_unix_s=int(time.time()),
+            issued_unix_s=max(int(time.time()), unix_now(daemon.state)),
             lifetime_s=order.lifetime_s,
             horizon=daemon.facts.horizon,
             traced_not_adopted=daemon.state.memory.traced,

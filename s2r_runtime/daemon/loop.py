@@ -346,12 +346,23 @@ class Daemon:
         self._look_at_log(now_ns)
         self.actions.tick(now_ns)
         if self._wall_clock.due(now_ns):
-            self.feed(WallClockRead(0, int(time.time())), *self.trust.look(self.state.memory))
+            self._read_wall_clock()
+            self.feed(*self.trust.look(self.state.memory))
         self.desk.tick(now_ns)
         self.notifier.alive(now_ns)
         self._heads.tick(now_ns, self.logbook.anchor(), self.link.anchor)
         self._retain(now_ns)
         self.notifier.status(f"gate {'open' if self.state.gate_open else 'closed'} ({self.state.gate_reason})")
+
+    def _read_wall_clock(self) -> None:
+        """For expiry; a clock that is behind the latest time is reported once."""
+        behind = self.state.clock_behind_s
+        self.feed(WallClockRead(0, int(time.time())))
+        if self.state.clock_behind_s and not behind:
+            self.say(
+                f"the wall clock is {self.state.clock_behind_s} s behind the latest time that was seen; certificates expire by that time: "
+                "set the clock, or, if it was ahead then by mistake: s2r clear wall_clock"
+            )
 
     def _robot_ready(self, _mask: int) -> None:
         if self.clock.lockstep and self._recorder_ok and self.logbook.behind:

@@ -52,8 +52,10 @@ def runs(folder: Path, robot: str) -> list[list[Path]]:
 def reconciled(state: Memory, folder: Path, keys: Collection[bytes], say: Callable[[str], None]) -> Memory:
     """The memory to start with. keys: public ones, whose logs count. Raises ConfigError if state and logs cannot both be true."""
     latest: tuple[str, ...] | None = None
+    seen = 0
     for told, path in islice(_told(folder, state.robot), RUNS):
-        latest = told.latched if latest is None else latest
+        if latest is None:
+            latest, seen = told.latched, told.latest_unix_s
         if what := forgotten(told, state):
             if gained := forgotten(state, told):
                 raise ConfigError(
@@ -62,6 +64,9 @@ def reconciled(state: Memory, folder: Path, keys: Collection[bytes], say: Callab
                 )
             say(f"the saved state forgets {what}; going on from what {path.name} ends with")
             state = msgspec.structs.replace(_in_full(path, told, keys, what), latched=_both(told.latched, state.latched))
+    if seen > state.latest_unix_s:
+        say(f"the saved state does not know of the time {seen} s that the newest log ends with; certificates expire by that")
+        state = msgspec.structs.replace(state, latest_unix_s=seen)
     if missing := [reason for reason in latest or () if reason not in state.latched]:
         say(f"the saved state does not know that {', '.join(missing)} is latched, as the newest log ends with; it is latched")
         state = msgspec.structs.replace(state, latched=_both(state.latched, tuple(missing)))

@@ -83,9 +83,11 @@ SEEDS = 5
 """Since these rules the seed of a verification is drawn after its attempt was paid for. Before, it was a function of digests and attempt
 number, which anybody could compute beforehand.
 """
-RULES = 5
+LATEST_TIME = 6
+"""Since these rules the wall clock never goes back: `core.wall_clock`."""
+RULES = 6
 """1: a campaign that is refused for dependent samples is remembered, and can be traced and repeated. 2: `GRID`. 3: what driving showed is
-kept over epochs (`Driven`). 4: `RESTARTS`. 5: `SEEDS`.
+kept over epochs (`Driven`). 4: `RESTARTS`. 5: `SEEDS`. 6: `LATEST_TIME`.
 """
 BEHAVIOURS = 1000
 """Remembered on one gap: some 20 KB of what is persisted. Beyond that a certificate says *at least*."""
@@ -189,3 +191,5 @@ class Memory(Struct, frozen=True):
     """Verification attempts on the gap in force, as far as they were counted (rules 5)."""
     behaviours: tuple[str, ...] = ()
     """Of the controllers tried on it, each once, the newest `BEHAVIOURS`: `JobFinished.behaviour`, else the controller's digest."""
+    latest_unix_s: int = 0
+    """The latest time of day that was ever believed, s since 1970 (0: not said). An earlier clock is not: see `core.wall_clock`."""
