@@ -26,6 +26,7 @@ from s2r_runtime.audit.findings import CertificateFinding, Difference, Findings,
 from s2r_runtime.audit.run import Across, RunAudit
 from s2r_runtime.audit.traces import SECONDS, Traces
 from s2r_runtime.errors import NotEnoughEvidence, RecordingError
+from s2r_runtime.printable import printable
 from s2r_runtime.recording.blocks import find
 from s2r_runtime.recording.channels import DELETED, UNRECORDED
 from s2r_runtime.recording.layout import ABOUT
@@ -93,7 +94,7 @@ class AuditResult(msgspec.Struct, frozen=True):
         lines += [f"model        {one.digest}: adopted by {one.adopted_by}: {one.origin}" for one in self.models]
         lines += [f"certificate  {one.id}: {'valid' if one.valid else 'NOT VALID'}: {one.reason}" for one in self.certificates]
         lines.append("recomputed   " + (", ".join(f"{count} {what}" for what, count in self.recomputed.items()) or "nothing"))
-        return "\n".join(lines)
+        return "\n".join(map(printable, lines))
 
 
 def audit(

@@ -187,7 +187,7 @@ def run_sample(args: argparse.Namespace) -> int:
     if args.json:
         output.result_json(result)
     else:
-        output.out(str(result["text"]))
+        output.out_lines(str(result["text"]))
     return int(result["exit_code"])
 
 
@@ -234,7 +234,7 @@ def run_live_trace(args: argparse.Namespace) -> int:
     elif answer["exit_code"]:
         output.err(f"s2r: {answer['text']}")
     else:
-        output.out(f"{answer['text']}\n{(found or {}).get('text', '')}")
+        output.out_lines(f"{answer['text']}\n{(found or {}).get('text', '')}")
     if trouble:
         output.err(f"s2r: {trouble}")
     return UsageError.exit_code if trouble else int(answer["exit_code"])

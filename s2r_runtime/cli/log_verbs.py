@@ -79,7 +79,7 @@ def run_audit(args: argparse.Namespace) -> int:
     if args.json:
         output.result_json(result.to_json())
     else:
-        output.out(result.text())
+        output.out_lines(result.text())
     if result.only_incomplete:
         return NotEnoughEvidence.exit_code
     return 0 if result.ok else 1

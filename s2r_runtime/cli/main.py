@@ -97,7 +97,8 @@ def main(argv: Sequence[str] | None = None, run: Callable[[argparse.Namespace], 
         return 130
     except Exception as error:  # noqa: BLE001 - a defect of ours: said as one, with its code
         if os.environ.get("S2R_TRACEBACK"):
-            traceback.print_exc()
+            for line in traceback.format_exc().splitlines():
+                output.err(line)
         output.fail(
             f"internal error: {type(error).__name__}: {error} (set S2R_TRACEBACK=1 to see where)", 70, as_json=getattr(args, "json", False)
         )

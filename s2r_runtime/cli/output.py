@@ -6,6 +6,8 @@ import contextlib
 import errno
 import json
 import os
+import re
+import secrets
 import shutil
 import stat
 import sys
@@ -18,7 +20,10 @@ from typing import Any, TextIO
 import msgspec
 
 from s2r_runtime.errors import UsageError
+from s2r_runtime.printable import printable
 
+_STYLE = f"\x1b{secrets.token_hex(8)}["
+"""Begins a terminal style until `_shown` lets it through: no file can hold this, so no file can style."""
 _STYLES = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33"}
 
 
@@ -30,8 +35,23 @@ def stand_in_for_closed_streams() -> None:
 
 
 def out(text: str = "") -> None:
-    """A line of the result. Raises UsageError if stdout does not take it (a full disk); a reader who has gone (`| head`) does not mind."""
-    _to_stdout(text + "\n")
+    """A line of the result. Raises UsageError if stdout does not take it (a full disk); a reader who has gone (`| head`) does not mind.
+
+    What is not printable is shown as an escape (`printable`).
+    """
+    _to_stdout(_shown(text) + "\n")
+
+
+def out_lines(text: str) -> None:
+    """As `out`, of a text of several lines."""
+    for line in text.split("\n"):
+        out(line)
+
+
+def _shown(text: str) -> str:
+    """Printable, with the styles that `styled` put in."""
+    parts = re.split(re.escape(_STYLE) + r"(\d+)m", text)
+    return "".join(f"\x1b[{part}m" if k % 2 else printable(part) for k, part in enumerate(parts))
 
 
 def flush() -> None:
@@ -42,7 +62,7 @@ def flush() -> None:
 def err(text: str = "") -> None:
     """A line about it. Nobody who reads it any more is no reason to end otherwise."""
     with contextlib.suppress(OSError):
-        sys.stderr.write(text + "\n")
+        sys.stderr.write(_shown(" ".join(text.split("\n"))) + "\n")
         sys.stderr.flush()
 
 
@@ -114,7 +134,7 @@ def styled(text: str, style: str, stream: TextIO | None = None) -> str:
     stream = stream or sys.stdout
     if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or not stream.isatty():
         return text
-    return f"\x1b[{_STYLES[style]}m{text}\x1b[0m"
+    return f"{_STYLE}{_STYLES[style]}m{text}{_STYLE}0m"
 
 
 class Progress:
@@ -137,7 +157,7 @@ class Progress:
         share = min(max(done / total, 0.0), 1.0) if total else 0.0
         bar = "█" * int(24 * share) + "░" * (24 - int(24 * share))
         left = "" if seconds_left is None else f" · {_duration(seconds_left)} left"
-        _draw(f"\r\x1b[2K{self._label} {bar} {int(done)}/{int(total)}{left}{' · ' + detail if detail else ''}")
+        _draw(f"\r\x1b[2K{self._label} {bar} {int(done)}/{int(total)}{left}{' · ' + printable(detail) if detail else ''}")
 
     def close(self) -> None:
         """Clears the line."""

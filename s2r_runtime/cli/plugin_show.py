@@ -53,7 +53,7 @@ def plugin_show(args: argparse.Namespace) -> int:
     if args.json:
         output.result_json({"offers": found})
     else:
-        output.out("\n\n".join("\n".join(_lines(one)) for one in found))
+        output.out_lines("\n\n".join("\n".join(_lines(one)) for one in found))
     return 0
 
 

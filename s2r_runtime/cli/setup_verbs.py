@@ -20,6 +20,7 @@ import msgspec
 
 from s2r_runtime.cli import output
 from s2r_runtime.errors import S2RError
+from s2r_runtime.printable import printable
 from s2r_runtime.profile import Gate, Machine, Recording, load_profile
 
 MINIMUM_FREE_BYTES = 1_000_000_000
@@ -98,7 +99,7 @@ def doctor_run(args: argparse.Namespace) -> int:
                 False: output.styled("missing", "red"),
                 None: output.styled("note   ", "yellow"),
             }[f.ok]
-            output.out(f"{mark} {f.what}: {f.detail}" + (f"\n        → {f.mend}" if f.mend else ""))
+            output.out_lines(f"{mark} {f.what}: {printable(f.detail)}" + (f"\n        → {f.mend}" if f.mend else ""))
     return 1 if any(f.ok is False for f in findings) else 0
 
 

@@ -199,7 +199,7 @@ def _files(args: argparse.Namespace, result: TraceResult, suggested: Suggestion 
 
 
 def _tell(args: argparse.Namespace, result: TraceResult, suggested: Suggestion | None, written: Set[Path], *, changed: bool) -> None:
-    output.out(result.text())
+    output.out_lines(result.text())
     if suggested:
         _tell_drive(args.suggest if args.suggest in written else None, suggested)
     if args.output in written:

@@ -73,6 +73,7 @@ from s2r_runtime.messages import (
 )
 from s2r_runtime.modelspec import dump_model
 from s2r_runtime.plugins import registry
+from s2r_runtime.printable import printable_lines
 from s2r_runtime.profile import Profile
 
 TICK_NS = 20_000_000
@@ -160,7 +161,7 @@ class Daemon:
     def say(self, text: str) -> None:
         """A line for the journal, if anybody takes it: stderr may be a file on the disk that is full."""
         with contextlib.suppress(OSError):
-            sys.stderr.write(f"s2r: {text}\n")
+            sys.stderr.write(f"s2r: {printable_lines(text)}\n")
             sys.stderr.flush()
 
     def _open(self, stack: ExitStack) -> None:

@@ -23,6 +23,7 @@ from s2r_runtime.daemon.settings import ModelFacts
 from s2r_runtime.errors import S2RError, one_line
 from s2r_runtime.messages import CertificateFacts, Gap, SampleTaken, Stretch, Verification
 from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.printable import printable_lines
 from s2r_runtime.processor import family, used
 from s2r_runtime.profile import Profile
 from s2r_runtime.recording.stretches import Cut
@@ -283,7 +284,7 @@ def main(arguments: list[str]) -> int:
         line = _ENCODE(Failed(one_line(str(error), SAID_MAX)))
     except Exception as error:  # noqa: BLE001 - whatever a job raises is its result; a verification that failed to run is a refusal
         with contextlib.suppress(OSError):  # confined, it may not write to a file
-            traceback.print_exc()
+            sys.stderr.write(printable_lines(traceback.format_exc()))
         line = _ENCODE(Failed(one_line(f"{type(error).__name__}: {error}", SAID_MAX)))
     say(channel, line)
     return 0

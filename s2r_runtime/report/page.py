@@ -6,6 +6,8 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from importlib import resources
 
+from s2r_runtime.printable import printable_lines
+
 _STYLE = resources.files("s2r_runtime").joinpath("data/page.css").read_text(encoding="utf-8")
 
 
@@ -76,7 +78,7 @@ class Page:
         head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(self._title)}</title>'
         kind = ' class="wide"' if self._wide else ""
         body = f"<body><main{kind}>{''.join(self._parts)}</main></body>"
-        return f'<!doctype html><html lang="en"><head>{head}<style>{_STYLE}</style></head>{body}</html>\n'
+        return printable_lines(f'<!doctype html><html lang="en"><head>{head}<style>{_STYLE}</style></head>{body}</html>\n')
 
 
 def _cell(text: str) -> str:
