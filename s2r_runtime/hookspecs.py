@@ -378,6 +378,9 @@ def s2r_formats() -> list[Offer]:
     `formats.recognise`, which recognises files by their content. The attribute is a function `open(path) -> Opened`
     (`formats.series.Opened`: its topics, and samples of the fields that are wanted). Raises RecordingError for a file that can't be read,
     ImportError where its library is not installed.
+
+    An offer with the name of one of `s2r_recordings` reads the same logs by named signals, where the user names them. Its `files` are
+    options that name a file which describes the messages: `open(path, dbc=...)`.
     """
     return []
 

@@ -6,7 +6,7 @@ import argparse
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -47,8 +47,23 @@ def add_limit(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--max-gb", type=positive, metavar="GB", help="largest table that is read, as text, unpacked (default 4)")
 
 
+def add_dbc(verb: argparse.ArgumentParser) -> None:
+    """--dbc."""
+    verb.add_argument(
+        "--dbc", type=Path, metavar="FILE", help="of a CAN log: the file that says what its frames mean (DBC, KCD, SYM, ARXML)"
+    )
+
+
+def transport_of(args: argparse.Namespace, profile: Profile | None) -> dict[str, Any] | None:
+    """The profile's transport; with --dbc that file alone, by which a CAN log has named signals."""
+    if args.dbc is not None:
+        return {"name": "can", "dbc": str(args.dbc)}
+    return profile.transport if profile else None
+
+
 def add_signal_options(verb: argparse.ArgumentParser) -> None:
-    """--state, --input: which signal of a recording is what."""
+    """--state, --input: which signal of a recording is what; --dbc."""
+    add_dbc(verb)
     for option, what in (("--state", "state"), ("--input", "input")):
         verb.add_argument(
             option,

@@ -23,6 +23,7 @@ from s2r_runtime.cli.choices import (
     positive,
     probability,
     signals_of,
+    transport_of,
     weights_of,
 )
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
@@ -106,7 +107,7 @@ def run_gap(args: argparse.Namespace) -> int:
 
     model, profile = chosen_model(args)
     columns, signals = columns_of(args, model, profile, *args.recording), signals_of(args, model)
-    transport, bar = profile.transport if profile else None, output.Progress("reading")
+    transport, bar = transport_of(args, profile), output.Progress("reading")
     limits = limits_of(args.max_gb)
     try:
         found = load_transitions(args.recording, model, columns, transport=transport, signals=signals, limits=limits, progress=bar)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from s2r_runtime.cli import output
+from s2r_runtime.cli.choices import add_dbc, transport_of
 from s2r_runtime.errors import ConfigError, UsageError
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     verb = verbs.add_parser("topics", help="what a recording holds: topics, rates, spans, and signals for --state and --input")
     verb.add_argument("recording", type=Path, metavar="FILE", help="a bag (file or folder), a flight log, a measurement file, a table, ...")
     verb.add_argument("--model", metavar="M", default="", help="say which signals would be taken for this model's states and inputs")
+    add_dbc(verb)
     verb.add_argument("--all", action="store_true", help=f"all signals of each topic (else the first {FIELDS_SHOWN})")
     verb.add_argument("--json", action="store_true", help="print one JSON object")
     verb.set_defaults(run=run)
@@ -35,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     from s2r_runtime.formats.signals import paths_of
 
     model = _model(args.model) if args.model else None
-    kind, topics, notes = _listed(args.recording)
+    kind, topics, notes = _listed(args.recording, transport_of(args, None))
     topics = sorted(topics, key=lambda topic: (not topic.fields or topic.n == 0, not _moves(topic), topic.name))
     taken = guessed(model, topics) if model else {}
     usable = [topic for topic in topics if topic.fields and topic.n]
@@ -61,14 +63,20 @@ def run(args: argparse.Namespace) -> int:
     return 0 if usable else 3
 
 
-def _listed(path: Path) -> tuple[str, Sequence[Topic], list[str]]:
-    """What the file is, its topics, and what the user should know of how it was read. Raises UsageError, RecordingError."""
-    from s2r_runtime.formats.recognise import open_recording, recognised
+def _listed(path: Path, described: dict[str, Any] | None) -> tuple[str, Sequence[Topic], list[str]]:
+    """What the file is, its topics, and what the user should know of how it was read. described: by which file. Raises UsageError,
+    RecordingError.
+    """
+    from s2r_runtime.formats.recognise import open_recording
+    from s2r_runtime.formats.routes import Named, form_of, signals_of_log
     from s2r_runtime.robot_logs import is_mcap, is_robot_log
 
-    form = recognised(path)
-    if form is not None:
-        opened = open_recording(path, form)
+    form = form_of(path)
+    named = Named(form, {}) if form else None if is_mcap(path) else signals_of_log(path, described)
+    if described and not (named and named.options):
+        raise UsageError(f"{path}: --dbc: is no log of a CAN bus")
+    if named is not None:
+        opened = open_recording(path, *named)
         return opened.kind, opened.topics(), opened.notes
     if is_mcap(path):
         raise UsageError(

@@ -19,6 +19,7 @@ from s2r_runtime.cli.choices import (
     own_file,
     positive,
     signals_of,
+    transport_of,
     weights_of,
     writable,
 )
@@ -119,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--suggest-duration {args.suggest_duration:g}: must be at most {most:g} s, {MOST_SUGGESTED} steps of the model")
     if args.horizon and args.horizon < model.dt:
         raise UsageError(f"--horizon {args.horizon:g}: must be at least the model's step, {model.dt:g} s")
-    columns, transport = columns_of(args, model, profile, *args.recording, args.test), profile.transport if profile else None
+    columns, transport = columns_of(args, model, profile, *args.recording, args.test), transport_of(args, profile)
     reading = output.Progress("reading")
     read = partial(load_dataset, model=model, columns=columns, transport=transport, signals=signals_of(args, model))
     read = partial(read, limits=limits_of(args.max_gb), progress=reading)

@@ -1,6 +1,6 @@
 """Readers whose libraries take in a file at once, in a process of their own: a damaged file may crash a library or fill the memory.
 
-    parent -> child   one JSON line: {"reader", "path", "wanted"} (wanted: topic -> fields, or null: the topics)
+    parent -> child   one JSON line: {"reader", "path", "options", "wanted"} (wanted: topic -> fields, or null: the topics)
     child -> parent   u64 length, JSON header, then the arrays of its runs as little-endian float64, in the order of the header
 
 The process is started with the first such file and serves all that follow. One that crashes, or takes longer than TIMEOUT_S, is a file that
@@ -39,8 +39,8 @@ BLOCK = 1 << 20
 class IsolatedFile:
     """`Opened`, of a reader in the other process. what: the form in words, for errors. Raises ImportError as the reader does."""
 
-    def __init__(self, path: Path, reader: str, what: str) -> None:
-        self._path, self._reader, self._what = path, reader, what
+    def __init__(self, path: Path, reader: str, what: str, options: Mapping[str, Any] | None = None) -> None:
+        self._path, self._reader, self._what, self._options = path, reader, what, dict(options or {})
         answer, _ = self._asked(None)
         self.kind: str = answer["kind"]
         self.drawn: bool = answer["drawn"]
@@ -69,7 +69,8 @@ class IsolatedFile:
         return runs
 
     def _asked(self, wanted: Mapping[str, list[str]] | None) -> tuple[Any, list[Array]]:
-        request = {"reader": self._reader, "path": str(self._path.absolute()), "name": str(self._path), "wanted": wanted}
+        request: dict[str, Any] = {"reader": self._reader, "path": str(self._path.absolute()), "name": str(self._path)}
+        request |= {"options": self._options, "wanted": wanted}
         try:
             answer, arrays = _process().ask(request)
         except (OSError, EOFError, ValueError) as error:
@@ -171,7 +172,7 @@ def stop() -> None:
 
 
 def _serve(requests: IO[bytes], answers: IO[bytes]) -> None:
-    opened: dict[tuple[str, str, int], Opened] = {}
+    opened: dict[tuple[str, str, int, str], Opened] = {}
     for line in requests:
         header, arrays = _answer(json.loads(line), opened)
         data = json.dumps(header).encode()
@@ -181,16 +182,16 @@ def _serve(requests: IO[bytes], answers: IO[bytes]) -> None:
         answers.flush()
 
 
-def _answer(request: Any, opened: dict[tuple[str, str, int], Opened]) -> tuple[dict[str, Any], list[Array]]:
+def _answer(request: Any, opened: dict[tuple[str, str, int, str], Opened]) -> tuple[dict[str, Any], list[Array]]:
     """Header and arrays. One file stays open between its topics and its samples."""
     from s2r_runtime.plugins import registry
 
     path = Path(request["path"])
     try:
-        key = (request["reader"], str(path), path.stat().st_mtime_ns)
+        key = (request["reader"], str(path), path.stat().st_mtime_ns, json.dumps(request["options"], sort_keys=True))
         if key not in opened:
             opened.clear()
-            opened[key] = registry().get("formats", request["reader"])(path)
+            opened[key] = registry().get("formats", request["reader"])(path, **request["options"])
         file = opened[key]
         if request["wanted"] is None:
             topics = [

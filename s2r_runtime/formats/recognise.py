@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import sqlite3
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from s2r_runtime.errors import RecordingError, UsageError
 from s2r_runtime.formats.isolated import IsolatedFile
@@ -103,15 +103,20 @@ def recognised(path: Path) -> Form | None:
     return None
 
 
-def open_recording(path: Path, form: Form | None = None) -> Opened:
-    """The file, opened by its reader. Raises UsageError with the command that helps where the reader or its library is missing."""
+def open_recording(path: Path, form: Form | None = None, options: Mapping[str, Any] | None = None) -> Opened:
+    """The file, opened by its reader. options: of the reader, such as the file that describes the messages (`Offer.files`).
+
+    Raises UsageError with the command that helps where the reader or its library is missing.
+    """
     form = form or recognised(path)
     if form is None:
         raise UsageError(f"{path}: is none of the formats that have named signals; a table and a robot's own log are read as they are")
     if form.name not in registry().names("formats"):
         raise not_installed(path, form)
     try:
-        found: Opened = registry().get("formats", form.name)(path) if form.name == BAG else IsolatedFile(path, form.name, form.what)
+        found: Opened = (
+            registry().get("formats", form.name)(path) if form.name == BAG else IsolatedFile(path, form.name, form.what, options)
+        )
     except ImportError as error:
         raise not_installed(path, form, error) from None
     return found

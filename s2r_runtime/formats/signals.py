@@ -113,6 +113,11 @@ def _wraps(wanted: str, topic: str, path: str) -> bool:
     return path.endswith("." + rest) or rest.endswith("." + path)
 
 
+def _why_none(topics: Sequence[Topic]) -> str:
+    """Why a file has no signal at all, as its reader says."""
+    return next((f": {topic.name} has no numbers: {topic.note}" for topic in topics if topic.note), "")
+
+
 def _near(wanted: str, topics: Sequence[Topic]) -> str:
     own = [topic for topic in topics if topic.name and wanted.lstrip("/").startswith(topic.name.lstrip("/") + ".")]
     names = [full_name(topic.name, path) for topic in (own or topics) for path in paths_of(topic)]
@@ -122,5 +127,5 @@ def _near(wanted: str, topics: Sequence[Topic]) -> str:
             f": that is a topic; its signals: {', '.join(names[:8])}" if names else f": that is a topic {named.note or 'without numbers'}"
         )
     near = difflib.get_close_matches(wanted, names, NEAREST, 0.5)
-    listed = f"; nearest: {', '.join(near)}" if near else f"; there are: {', '.join(names[:8])}" if names else ""
+    listed = f"; nearest: {', '.join(near)}" if near else f"; there are: {', '.join(names[:8])}" if names else _why_none(topics)
     return f"{listed} (s2r topics lists all)"

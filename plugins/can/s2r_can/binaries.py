@@ -40,7 +40,7 @@ def blf(path: Path, file: IO[bytes], tally: Tally) -> Iterator[LogFrame]:
                 frame = frame_of(message, message.timestamp)
                 tally.frames += frame is not None
                 if frame is None:
-                    tally.left_out["frames that are damaged"] += 1
+                    tally.left_out["frames that are damaged or have no time"] += 1
                 else:
                     yield frame
     except Exception as error:  # noqa: BLE001 - its reader raises what it likes at bytes that are none of its own
@@ -50,7 +50,7 @@ def blf(path: Path, file: IO[bytes], tally: Tally) -> Iterator[LogFrame]:
     if not whole:
         tally.said.append(f"ends in the middle of an object: read up to there, {tally.frames} frames")
     if not tally.frames:
-        raise RecordingError(f"{path}: holds no CAN frame")
+        raise RecordingError(f"{path}: holds no CAN frame{''.join(f'; {note}' for note in tally.notes())}")
 
 
 def _looked_through(path: Path, file: IO[bytes], tally: Tally) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 import logging
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -33,6 +34,41 @@ class Named(NamedTuple):
         return f"{self.message.name}.{self.signal.name}"
 
 
+def looked_up(option: Any) -> tuple[dict[int, tuple[Database, Message]], dict[int, str]]:
+    """(messages by key, why others cannot be used by key), of a whole file: a message that is wrong does not refuse the rest.
+
+    Raises ConfigError for a file that cannot be read as a whole.
+    """
+    whole = Database(option, (set(), set()))  # of a DBC the outline alone
+    refused = dict(whole.wrong)
+    parts = [whole] if whole.messages else list(_halves(option, sorted({name for _, name in whole.keys} - set(refused)), refused))
+    having = {message.name: database for database in parts for message in database.messages.values()}
+    found, why = {}, {}
+    for key, name in whole.keys:
+        try:
+            if name in having:
+                found[key] = having[name], having[name].message(name, "DBC")
+        except ConfigError as error:
+            refused[name] = str(error)
+        if name in refused:
+            why[key] = refused[name]
+    return found, why
+
+
+def _halves(option: Any, names: list[str], refused: dict[str, str]) -> Iterator[Database]:
+    """The messages of these names; what is wrong with those that cantools refuses goes into `refused`."""
+    if not names:
+        return
+    try:
+        yield Database(option, (set(names), set()))
+    except ConfigError as error:
+        if len(names) == 1:
+            refused[names[0]] = str(error)
+            return
+        yield from _halves(option, names[: len(names) // 2], refused)
+        yield from _halves(option, names[len(names) // 2 :], refused)
+
+
 def stated(options: dict[str, Any], option: str) -> str:
     """What the DBC states of the messages that these options name (`Offer.normal_form`); of another format, all of its text.
 
@@ -48,6 +84,9 @@ def stated(options: dict[str, Any], option: str) -> str:
 class Database:
     """option: what the user wrote for `transport.dbc`: a path, or the file as the profile holds it. names: of messages, and of signals
     without one, that are looked up (None: all). Raises ConfigError.
+
+    messages: by name, as far as they were looked up. keys: (key, name) of all messages of the file. wrong: name of a message -> its first
+    line that cannot be read.
     """
 
     def __init__(self, option: Any, names: tuple[set[str], set[str]] | None = None) -> None:
@@ -55,11 +94,13 @@ class Database:
         aliases: dict[str, str] = {}
         self._all: dict[str, list[str]] = {}
         keys: list[tuple[int, str]] = []
+        self.wrong: dict[str, str] = {}
         self._branches: dict[int, set[str]] = {}
         if kind_of(self.name) == "dbc":
             outline = Outline(text)
             self._all = {message.called: message.names() for message in outline.messages}
             keys = [(message.number, message.called) for message in outline.messages]
+            self.wrong = {message.called: message.wrong[0] for message in outline.messages if message.wrong}
             self._branches = {message.number: message.branches() for message in outline.messages}
             if not keys:
                 raise ConfigError(f"transport.dbc: {self.name}: has no messages: no line of it begins one (BO_)")
@@ -67,12 +108,13 @@ class Database:
                 text, aliases = outline.cut(*(names or ({*self._all}, set())))
             except ConfigError as error:
                 raise ConfigError(f"transport.dbc: {self.name}: {error}") from None
-        messages = _parsed(self.name, text).messages if not keys or "BO_ " in text else []
+        messages = _parsed(self.name, text).messages if not keys or "\nBO_ " in text else []
         _renamed(messages, aliases)
-        self._messages = {message.name: message for message in messages}
+        self.messages = {message.name: message for message in messages}
         if not keys:
             self._all = {message.name: [signal.name for signal in message.signals] for message in messages}
             keys = [(key_of(message.frame_id, extended=message.is_extended_frame), message.name) for message in messages]
+        self.keys = keys
         self._twice = {name for name, count in Counter(name for _, name in keys).items() if count > 1}
         self._same: dict[int, list[str]] = {}
         for key, name in keys:
@@ -80,7 +122,7 @@ class Database:
 
     def message(self, name: object, where: str) -> Message:
         """The message of that name. Raises ConfigError."""
-        found = self._messages.get(name) if isinstance(name, str) else None
+        found = self.messages.get(name) if isinstance(name, str) else None
         if found is None:
             raise ConfigError(f"{where}: {self.name} has no message {name!r}; {_nearest(str(name), list(self._all))}")
         same = self._same[key_of(found.frame_id, extended=found.is_extended_frame)]
@@ -96,10 +138,10 @@ class Database:
         if not isinstance(name, str) or not name:
             raise ConfigError(f"{where} is {name!r}, must be a signal of {self.name}, as Message.Signal")
         first, dot, second = name.partition(".")
-        if dot and first in self._messages:
+        if dot and first in self.messages:
             return self.signal_in(self.message(first, where), second, where)
         if not dot:
-            having = [m for m in self._messages.values() if any(s.name == name for s in m.signals)]
+            having = [m for m in self.messages.values() if any(s.name == name for s in m.signals)]
             if len(having) == 1:
                 return self.signal_in(self.message(having[0].name, where), name, where)
             if having:

@@ -4,6 +4,16 @@ from __future__ import annotations
 
 from s2r_runtime.hookspecs import Offer, hookimpl
 
+LOGS = {
+    "log": ("candump", "candump"),
+    "asc": ("Vector ASC", "asc"),
+    "blf": ("Vector BLF", "blf"),
+    "trc": ("PCAN TRC", "trc"),
+    "csv": ("python-can CSV", "csv"),
+    "db": ("python-can SQLite", "sqlite"),
+}
+"""Suffix -> (what it is, its recogniser in `kinds`)."""
+
 
 @hookimpl
 def s2r_transports() -> list[Offer]:
@@ -15,17 +25,17 @@ def s2r_transports() -> list[Offer]:
 @hookimpl
 def s2r_recordings() -> list[Offer]:
     """Logs of a CAN bus."""
-    what = {
-        "log": ("candump", "candump"),
-        "asc": ("Vector ASC", "asc"),
-        "blf": ("Vector BLF", "blf"),
-        "trc": ("PCAN TRC", "trc"),
-        "csv": ("python-can CSV", "csv"),
-        "db": ("python-can SQLite", "sqlite"),
-    }
     return [
         Offer(f"can.{suffix}", "s2r_can.recordings:read", f"{name} logs of a bus, by its DBC", recognises=f"s2r_can.kinds:is_{kind}")
-        for suffix, (name, kind) in what.items()
+        for suffix, (name, kind) in LOGS.items()
+    ]
+
+
+@hookimpl
+def s2r_formats() -> list[Offer]:
+    """The same logs, for whom their signals are named."""
+    return [
+        Offer(f"can.{suffix}", "s2r_can.signals:open_log", f"{name} log of a CAN bus", files=("dbc",)) for suffix, (name, _) in LOGS.items()
     ]
 
 

@@ -157,8 +157,9 @@ class _Rows:
         self._end_row()
         nx = len(self._names)
         return [
-            ((np.array(tx), np.array(x).reshape(-1, nx)), (np.array(tu), np.array(u).reshape(-1, self._nu))) for tx, x, tu, u in self._parts
-        ]  # fmt: skip
+            ((np.array(tx), np.array(x).reshape(len(tx), nx)), (np.array(tu), np.array(u).reshape(len(tu), self._nu)))
+            for tx, x, tu, u in self._parts
+        ]
 
     def _begin(self) -> None:
         """The robot started anew: what comes is another stretch."""

@@ -26,8 +26,11 @@ def s2r_recordings() -> list[Offer]:
 
 @hookimpl
 def s2r_formats() -> list[Offer]:
-    """The log that the autopilot itself writes."""
-    return [Offer("dataflash", "s2r_mavlink.dataflash:open_dataflash", "ArduPilot DataFlash logs (.bin, or as text), by pymavlink")]
+    """The log that the autopilot itself writes; and all that a telemetry log holds, for whom its messages are signals."""
+    return [
+        Offer("dataflash", "s2r_mavlink.dataflash:open_dataflash", "ArduPilot DataFlash logs (.bin, or as text), by pymavlink"),
+        Offer("mavlink.tlog", "s2r_mavlink.telemetry:open_tlog", "MAVLink telemetry log (.tlog, .tlog.gz), by pymavlink"),
+    ]
 
 
 @hookimpl

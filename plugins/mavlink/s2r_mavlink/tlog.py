@@ -12,8 +12,6 @@ Where the inputs are sticks or what the actuators got (`logged_commands`), any m
 
 from __future__ import annotations
 
-import gzip
-import zlib
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,20 +21,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_mavlink.dialect import HEARTBEAT, MESSAGES
-from s2r_mavlink.frames import header, length_at, payload, whole
+from s2r_mavlink.frames import length_at, payload, whole
 from s2r_mavlink.logged_commands import NUMBERS, SIGNALS, VELOCITIES, Commands, Raw, Velocity
 from s2r_mavlink.options import DEFAULTS, SIGNALS_ARE, LogInput, log_inputs
 from s2r_mavlink.pose import POSE_ONLY, QUANTITIES, SOURCES, PoseSource
 from s2r_mavlink.robot_state import ARMED, mode_number
+from s2r_mavlink.tlog_records import STAMP, STAMP_MAX_US, Record, records
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.hookspecs import ReadLog
 
 Array = NDArray[np.float64]
 Rows = tuple[Array, Array]
 
-STAMP = 8
-STAMP_MAX_US = 1 << 53
-"""In the year 2255."""
 LAPSE_S = 3.0
 """After so long without a command ArduPilot's Rover stops."""
 REORDERED_S = 1.0
@@ -44,16 +40,6 @@ REORDERED_S = 1.0
 BIN_S = 1.0
 ROVERS = (10, 11)
 """MAV_TYPE of a ground rover and a boat, whose modes have the numbers that are known here."""
-
-
-class Record(NamedTuple):
-    """host_s: the logging computer's clock."""
-
-    host_s: float
-    system: int
-    component: int
-    number: int
-    frame: bytes
 
 
 class Start(NamedTuple):
@@ -70,14 +56,13 @@ class Start(NamedTuple):
 
 def read(path: Path, states: tuple[str, ...], inputs: tuple[str, ...], options: dict[str, Any]) -> ReadLog:
     """Hook `s2r_recordings`: see `hookspecs`. Raises RecordingError, ConfigError."""
-    data = _bytes(path)
     mapped = log_inputs(options.get("log_inputs", {}), inputs)
     skipped: list[int] = []
-    records = list(_records(data, skipped))
-    if not records:
+    logged = list(records(path, skipped))
+    if not logged:
         raise RecordingError(f"{path}: holds no MAVLink frame, must be a telemetry log (.tlog)")
-    chosen = _options(path, records, options, states, mapped)
-    starts, commands = _sorted(records, chosen, states, mapped)
+    chosen = _options(path, logged, options, states, mapped)
+    starts, commands = _sorted(logged, chosen, states, mapped)
     begins = [start.host[0] for start in starts[1:]]
     found: list[tuple[Rows, Rows]] = []
     for start, since, until in zip(starts, [-np.inf, *begins], [*begins, np.inf], strict=True):
@@ -108,40 +93,6 @@ def is_tlog(head: bytes) -> bool:
             return False
         at += STAMP + size
     return True
-
-
-def _bytes(path: Path) -> bytes:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
-    if not data.startswith(b"\x1f\x8b"):
-        return data
-    try:
-        return gzip.decompress(data)
-    except (OSError, EOFError, zlib.error) as error:
-        raise RecordingError(f"{path}: is not a whole gzip file: {error}") from None
-
-
-def _records(data: bytes, skipped: list[int]) -> Iterator[Record]:
-    """In the file's order; what is no record is skipped byte by byte, and a last one that was cut is left out.
-
-    skipped: takes the numbers of bytes.
-    """
-    at, end = 0, len(data) - STAMP
-    while at < end:
-        size = length_at(data, at + STAMP)
-        start = at + STAMP
-        # `whole` can't check a message that it doesn't know by what follows: here that is the next record's stamp
-        if size > 0 and start + size <= len(data) and (whole(data[start : start + size], 0, size)):
-            frame = data[start : start + size]
-            facts = header(frame)
-            yield Record(int.from_bytes(data[at:start], "big") * 1e-6, facts.system, facts.component, facts.number, frame)
-            at = start + size
-        else:
-            at += 1
-            skipped.append(1)
-    skipped += [len(data) - at] if at < len(data) else []
 
 
 # ---------------------------------------------------------------- which robot, which source
