@@ -1,6 +1,6 @@
-"""A controller's answers to whole batches, from a process of its own: for verification and synthesis, which must not believe it either.
+"""A controller's answers, from a process of its own (`answering`): for verification, rehearsal, synthesis and driving alike.
 
-    with BatchController(file, nu) as control:      forks; the child confines itself and executes the file there
+    with BatchController(file, nu) as control:      starts it; the child confines itself and executes the file there
         u = control(x, theta)                       x (n, nx), theta: dict of arrays (n, ...) -> u (n, nu), finite
 
 A controller that ran in the verifying process could change what is computed about it, or write the result itself. So the process that
@@ -9,68 +9,92 @@ verifies runs nothing of it, and takes nothing from the child but n * nu numbers
     parent -> child   8 bytes length, pickle of (x, theta); the numbers of their arrays lie in memory that both have, one after the other
     child -> parent   1 byte kind, 8 bytes length, content: u as float64, rows first; or why there is none (UTF-8)
 
-The parent writes to that memory and never reads it.
+The parent writes to that memory and never reads it. Its size is sealed.
 """
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
+import fcntl
 import mmap
 import os
 import pickle
-import resource
-import signal
 import socket
-import struct
+import subprocess
+import sys
+import threading
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NoReturn, Self
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.child import die_with_parent
-from s2r_runtime.controllers.code import Malformed, Raised, batch_control
-from s2r_runtime.controllers.confinement import confine
+from s2r_runtime.controllers.answering import ANSWER, DETAIL_MAX, LENGTH, MALFORMED, RAISED, READY, REFUSED, Start
+from s2r_runtime.controllers.code import Malformed, Raised
+from s2r_runtime.controllers.confined_process import environment, signal_name
 from s2r_runtime.controllers.file import ControllerFile
-from s2r_runtime.errors import ControllerError, S2RError, one_line
+from s2r_runtime.errors import ControllerError, one_line
 from s2r_runtime.hookspecs import Scenario
 
 Array = NDArray[np.float64]
 
-DETAIL_MAX = 400
-"""Characters of the child's account that are passed on."""
+MEMORY_BYTES = 2 << 30
+"""What a controller may allocate beyond its libraries: the same in verification and in driving, since it can see the limit."""
 SHARED_BYTES = 256 << 20
 """Address space for a question's arrays; what is not written takes no memory. Larger questions go over the socket."""
 _ALIGNED = 64
 """Bytes: a line of the processor's cache."""
-_LENGTH = struct.Struct("<Q")
-_ANSWER, _RAISED, _MALFORMED, _REFUSED, _READY = b"u", b"r", b"m", b"x", b"k"
-_ERRORS: dict[bytes, type[ControllerError]] = {_RAISED: Raised, _MALFORMED: Malformed, _REFUSED: ControllerError}
+_ERRORS: dict[bytes, type[ControllerError]] = {RAISED: Raised, MALFORMED: Malformed, REFUSED: ControllerError}
+_SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL  # else the child could take the memory from under the parent
+
+
+class Died(ControllerError):
+    """Its process ended. how: in a few words."""
+
+    def __init__(self, text: str, how: str) -> None:
+        super().__init__(text)
+        self.how = how
 
 
 class BatchController:
-    """One controller in one forked process. Use as a context manager; then call it. From a process of one thread, or the fork may hang."""
+    """One controller in one process. Use as a context manager; then call it. From the main thread, whose end is the child's.
 
-    def __init__(self, file: ControllerFile, nu: int, memory_bytes: int) -> None:
-        """Raises ControllerError if the file can't be executed there, OSError if there is no process to be had."""
+    contained: what is in force there (`confinement.confine`).
+    """
+
+    def __init__(self, file: ControllerFile, nu: int, memory_bytes: int = MEMORY_BYTES, printed: int | None = None) -> None:
+        """printed: a pipe for what it prints (default: it is thrown away). Raises ControllerError if the file can't be executed there,
+        OSError if there is no process to be had.
+        """
         self._nu, self._path, self._ended = nu, file.path, ""
         self._socket, theirs = socket.socketpair()
-        self._shared = mmap.mmap(-1, SHARED_BYTES)
-        parent = os.getpid()
-        self._pid = os.fork()
-        if self._pid == 0:
-            self._socket.close()
-            _live(theirs, self._shared, parent, file, nu, memory_bytes)
-        theirs.close()
+        memory = os.memfd_create("questions", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         try:
-            kind, content = self._receive(0)
-            if kind != _READY:
-                raise self._error(kind, content)
-        except BaseException:
-            self.close()
-            raise
+            os.ftruncate(memory, SHARED_BYTES)
+            fcntl.fcntl(memory, fcntl.F_ADD_SEALS, _SEALS)
+            self._shared = mmap.mmap(memory, SHARED_BYTES)
+            try:
+                self._process = _started(theirs, printed)
+            finally:
+                theirs.close()  # else its end would not show
+            self._pid = self._process.pid
+            try:
+                self._hand_over(msgspec.json.encode(Start(file, nu, memory_bytes, os.getpid())), memory)
+                kind, content = self._receive(0)
+                if kind != READY:
+                    raise self._error(kind, content)
+                self.contained = tuple(filter(None, content.decode("ascii", "replace").split(",")))
+            except BaseException:
+                self.close()
+                raise
+        finally:
+            os.close(memory)
+
+    @property
+    def pid(self) -> int:
+        """Its process id; 0 once it is gone."""
+        return self._pid
 
     def __enter__(self) -> Self:
         return self
@@ -84,13 +108,13 @@ class BatchController:
             raise ControllerError(self._ended)
         question = self._packed(x, dict(theta))
         try:
-            self._socket.sendall(_LENGTH.pack(len(question)))
+            self._socket.sendall(LENGTH.pack(len(question)))
             self._socket.sendall(question)
         except OSError:
             raise self._gone() from None
         size = len(x) * self._nu * 8
         kind, content = self._receive(size)
-        if kind != _ANSWER:
+        if kind != ANSWER:
             raise self._error(kind, content)
         if len(content) != size:
             raise Malformed(f"{Path(self._path).name}: its process answered {len(content)} bytes, must be {size}")
@@ -99,15 +123,39 @@ class BatchController:
             raise Malformed(f"{Path(self._path).name}: its process answered numbers that are not finite")
         return u
 
+    def fileno(self) -> int:
+        """Of the socket to it: readable while nothing is asked, it ended or says what nobody asked for."""
+        return self._socket.fileno()
+
+    def spoke_unasked(self) -> NoReturn:
+        """Ends it, for that. Raises ControllerError."""
+        try:
+            hung_up = not self._socket.recv(1, socket.MSG_PEEK)
+        except OSError:
+            hung_up = True
+        if hung_up:
+            raise self._gone()
+        self._end()
+        self._ended = f"{Path(self._path).name}: its process sent what nobody asked for"
+        raise Malformed(self._ended)
+
     def close(self) -> None:
         """Kills the process. May be called twice."""
         self._socket.close()
         self._end()
         self._shared.close()
 
+    def _hand_over(self, start: bytes, memory: int) -> None:
+        try:
+            socket.send_fds(self._socket, [LENGTH.pack(len(start))], [memory])
+            self._socket.sendall(start)
+        except OSError:
+            raise self._gone() from None
+
     def _packed(self, x: Array, theta: dict[str, Any]) -> bytes:
         buffers: list[pickle.PickleBuffer] = []
-        packed = pickle.dumps((x, theta), protocol=5, buffer_callback=buffers.append)
+        theta = {name: _contiguous(value) for name, value in theta.items()}  # one form, whatever they were cut out of
+        packed = pickle.dumps((_contiguous(x), theta), protocol=5, buffer_callback=buffers.append)
         spans, end = [], 0
         for buffer in buffers:
             data = buffer.raw()
@@ -120,18 +168,16 @@ class BatchController:
         return pickle.dumps((packed, spans))
 
     def _end(self) -> int:
-        """Kills it, if it still is; its wait status."""
-        if not self._pid:
-            return 0
-        os.kill(self._pid, signal.SIGKILL)  # not waited for yet, so the number is still its own
-        status = os.waitpid(self._pid, 0)[1]
-        self._pid = 0
-        return status
+        """Kills it, if it still is; its return code, negative for a signal."""
+        if self._pid:
+            self._process.kill()
+            self._pid = 0
+        return self._process.wait()
 
     def _receive(self, size: int) -> tuple[bytes, bytes]:
         """The child's next message, of no more content than was asked for, or than a text may have."""
         kind = self._exactly(1)
-        (length,) = _LENGTH.unpack(self._exactly(_LENGTH.size))
+        (length,) = LENGTH.unpack(self._exactly(LENGTH.size))
         if length > max(size, 4 * DETAIL_MAX):
             self._ended = f"{Path(self._path).name}: its process announced {length} bytes, at most {size} were asked for"
             self._end()
@@ -152,74 +198,38 @@ class BatchController:
 
     def _gone(self) -> ControllerError:
         """It hung up. Whether it also ended is seen to."""
-        status = self._end()
-        how = f"killed by signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else f"exit status {os.waitstatus_to_exitcode(status)}"
+        code = self._end()
+        how = f"killed by {signal_name(-code)}" if code < 0 else f"exited with status {code}"
         self._ended = f"{Path(self._path).name}: its process died in the middle of a question ({how})"
-        return ControllerError(self._ended)
+        return Died(self._ended, how)
 
     def _error(self, kind: bytes, content: bytes) -> ControllerError:
         return _ERRORS.get(kind, Malformed)(one_line(content.decode("utf-8", "replace"), DETAIL_MAX))
 
 
-# ---------------------------------------------------------------- in the child
-
-
-def _live(channel: socket.socket, shared: mmap.mmap, parent: int, file: ControllerFile, nu: int, memory_bytes: int) -> NoReturn:
-    """The child's whole life: never returns into what the parent was doing."""
+def _started(channel: socket.socket, printed: int | None) -> subprocess.Popen[bytes]:
+    """The process, with nothing of this one's but what it is given."""
+    sink = printed
+    if sink is None:
+        reading, sink = os.pipe()
+        threading.Thread(target=_drain, args=(reading,), name="printed", daemon=True).start()
     try:
-        _leave_everything(channel, parent)
-        confine(memory_bytes)
-        _answer(channel, shared, file, nu)
-    except BaseException as error:  # noqa: BLE001 - also SystemExit and KeyboardInterrupt must not go up into the parent's frames
-        with contextlib.suppress(BaseException):
-            _send_error(channel, error)
+        # -P: nothing is imported from where this happens to run; -u: what it printed is here when it is killed
+        argv = [sys.executable, "-P", "-B", "-u", "-m", "s2r_runtime.controllers.answering"]
+        return subprocess.Popen(argv, stdin=channel.fileno(), stdout=sink, stderr=sink, cwd="/", env=environment())
     finally:
-        os._exit(0)
+        if printed is None:
+            os.close(sink)
 
 
-def _leave_everything(channel: socket.socket, parent: int) -> None:
-    """No descriptor but the channel, no environment, no folder, no group of the parent's; it ends with the parent."""
-    die_with_parent(parent)
-    os.setsid()
-    os.chdir("/")
-    ctypes.CDLL(None).clearenv()
-    os.environ.clear()
-    nowhere = os.open(os.devnull, os.O_RDWR)
-    for stream in (0, 1, 2):
-        os.dup2(nowhere, stream)
-    keep = channel.fileno()
-    os.closerange(3, keep)
-    os.closerange(keep + 1, resource.getrlimit(resource.RLIMIT_NOFILE)[0])
+def _drain(reading: int) -> None:
+    """Takes what it prints, so that printing doesn't block it."""
+    while os.read(reading, 1 << 16):
+        pass
+    os.close(reading)
 
 
-def _answer(channel: socket.socket, shared: mmap.mmap, file: ControllerFile, nu: int) -> None:
-    """Executes the file, then answers until the parent hangs up."""
-    control = batch_control(file, nu)
-    _send(channel, _READY, b"")
-    with channel.makefile("rb") as stream:
-        while length := stream.read(_LENGTH.size):
-            x, theta = _question(stream.read(_LENGTH.unpack(length)[0]), shared)
-            try:
-                answer = np.ascontiguousarray(control(x, theta)).tobytes()
-            except (Raised, Malformed) as error:  # in other states it may know better
-                _send_error(channel, error)
-            else:
-                _send(channel, _ANSWER, answer)
-
-
-def _question(data: bytes, shared: mmap.mmap) -> tuple[Array, dict[str, Any]]:
-    """theta's arrays are views of the shared memory, valid until the next question; x is this process's own."""
-    packed, spans = pickle.loads(data)  # noqa: S301 - the parent's, which this process was a moment ago
-    view = memoryview(shared)
-    x, theta = pickle.loads(packed, buffers=[view[begin:end] for begin, end in spans])  # noqa: S301 - likewise
-    return x.copy(order="K"), theta
-
-
-def _send_error(channel: socket.socket, error: BaseException) -> None:
-    kind = _MALFORMED if isinstance(error, Malformed) else _RAISED if isinstance(error, Raised) else _REFUSED
-    text = str(error) if isinstance(error, S2RError) else f"{type(error).__name__}: {error}"
-    _send(channel, kind, one_line(text, DETAIL_MAX).encode())
-
-
-def _send(channel: socket.socket, kind: bytes, content: bytes) -> None:
-    channel.sendall(kind + _LENGTH.pack(len(content)) + content)
+def _contiguous(value: Any) -> Any:
+    if not isinstance(value, np.ndarray) or value.flags.c_contiguous or value.flags.f_contiguous:
+        return value
+    return np.ascontiguousarray(value)

@@ -54,7 +54,7 @@ class ConfinedProcess:
                 stderr=writing,
                 pass_fds=(theirs.fileno(),),
                 cwd=self._folder,
-                env=_environment(),
+                env=environment(),
                 start_new_session=True,
             )
         except BaseException:
@@ -123,13 +123,17 @@ class ConfinedProcess:
         deadline = time.monotonic() + ENDS_WITHIN_S
         while (status := self._status()) is None and time.monotonic() < deadline:
             time.sleep(0.0005)
-        self._drain()
         how = "closed its socket"
         if status is not None:
             code = status.si_status
-            how = f"exited with status {code}" if status.si_code == os.CLD_EXITED else f"killed by {_signal_name(code)}"
+            how = f"exited with status {code}" if status.si_code == os.CLD_EXITED else f"killed by {signal_name(code)}"
+        return how + self.last_printed()
+
+    def last_printed(self) -> str:
+        """`; it last printed: ...`, or empty."""
+        self._drain()
         last = self.output.strip().splitlines()[-1:]
-        return how + "".join(f"; it last printed: {one_line(line, 200)}" for line in last)
+        return "".join(f"; it last printed: {one_line(line, 200)}" for line in last)
 
     def kill(self) -> None:
         """Ends it and all of its group, at once. May be called twice."""
@@ -191,8 +195,8 @@ class ConfinedProcess:
                 self._printed = -1
 
 
-def _environment() -> dict[str, str]:
-    """The child's, whole: nothing of the daemon's. One thread for BLAS: more would take time from the gate."""
+def environment() -> dict[str, str]:
+    """A child's, whole: nothing of the daemon's. One thread for BLAS: more would take time from the gate."""
     return {
         "PATH": "/usr/local/bin:/usr/bin:/bin",
         "LANG": "C.UTF-8",
@@ -210,7 +214,8 @@ def _in_user_site() -> bool:
     return Path(__file__).is_relative_to(folder)
 
 
-def _signal_name(number: int) -> str:
+def signal_name(number: int) -> str:
+    """`SIGKILL` for 9."""
     try:
         return signal.Signals(number).name
     except ValueError:

@@ -5,7 +5,7 @@ What it can no longer do, from `confine` on, for good and in every thread:
 - open a file for writing, create, rename, remove or truncate one, or change its mode or owner
 - open a socket, or connect, bind or listen with one: no way to the robot but through the daemon and its gate
 - start a process or replace its own (fork, exec); threads are allowed
-- signal, trace or write into another process; raise its limits; gain privileges
+- signal, trace or write into another process; raise its limits; gain privileges; learn its priority, which is another one while it drives
 - hold more memory than it may, dump core, have more than 64 files open
 - read a file, unless it is code or something that libraries look up (`reading`; where the kernel has Landlock)
 
@@ -55,6 +55,7 @@ _DENIED: dict[str, tuple[int | None, int | None]] = {
     "pidfd_getfd": (438, 438), "pidfd_send_signal": (424, 424), "ptrace": (101, 117), "process_vm_readv": (310, 270),
     "process_vm_writev": (311, 271), "process_madvise": (440, 440), "kcmp": (312, 272), "setpgid": (109, 154), "setsid": (112, 157),
     "ioprio_set": (251, 30), "move_pages": (279, 239), "migrate_pages": (256, 238),
+    "getpriority": (140, 141), "sched_getscheduler": (145, 120), "sched_getparam": (143, 121), "sched_getattr": (315, 275),
     "setpriority": (141, 140), "sched_setaffinity": (203, 122), "sched_setscheduler": (144, 119), "sched_setparam": (142, 118),
     "sched_setattr": (314, 274), "setrlimit": (160, 164), "prctl": (157, 167), "setns": (308, 268), "unshare": (272, 97),
     # files
@@ -87,6 +88,9 @@ _IOCTL_OWNERS = (0x5452, 0x8901, 0x8902)
 _UNKNOWN = {"clone3": (435, 435), "openat2": (437, 437)}
 
 
+_ROUND = 1 << 28
+"""Bytes. So the limit of memory, which a controller can read, is the same in every process of its."""
+
 ALL = ("memory", "files", "privileges", "reading", "system_calls")
 """What is in force where the kernel has it all."""
 
@@ -97,7 +101,7 @@ def confine(memory_bytes: int) -> tuple[str, ...]:
     Returns what is in force: `memory`, `files` (limits), `privileges` (no_new_privs), `reading` (Landlock), `system_calls` (the filter).
     """
     readable = reading.places()
-    _limit(resource.RLIMIT_AS, _address_space() + memory_bytes)
+    _limit(resource.RLIMIT_AS, -(-_address_space() // _ROUND) * _ROUND + memory_bytes)
     _limit(resource.RLIMIT_NOFILE, FILES_MAX)
     _limit(resource.RLIMIT_FSIZE, 0)
     _limit(resource.RLIMIT_CORE, 0)

@@ -37,8 +37,6 @@ __all__ = ["ControllerFile", "HostedController", "Identity", "Ready", "Reply", "
 
 DETAIL_MAX = 400
 """Characters of the child's own account that are passed on."""
-MEMORY_BYTES = 1 << 30
-"""What a controller may allocate, beyond its libraries."""
 START_TIMEOUT_S = 30.0
 """Importing numerical libraries takes seconds on a small computer with a cold disk."""
 
@@ -123,18 +121,20 @@ class HostedController:
         nu: int,
         task: TaskChoice | None,
         seed: int,
-        memory_bytes: int = MEMORY_BYTES,
+        memory_bytes: int = 0,
         start_timeout_s: float = START_TIMEOUT_S,
         patience_s: float = 0.0,
     ) -> None:
-        """patience_s: how long an answer may take in all where the computer is to blame; 0: its deadline, whoever is to blame."""
+        """memory_bytes: what it may allocate (0: as in a verification). patience_s: how long an answer may take in all where the computer
+        is to blame; 0: its deadline, whoever is to blame.
+        """
         self.file, self._nx, self._nu = file, nx, nu
         self._package = Package(file, model, nu, task, seed, memory_bytes)
         self._start_timeout_ns, self._patience_ns = round(start_timeout_s * 1e9), round(patience_s * 1e9)
         self._start_deadline_ns = 0
         self._process: ConfinedProcess | None = None
         self._running = False
-        self._digest, self._ready = "", False
+        self._digest, self._ready, self._controller_pid = "", False, 0
         self._asked: _Asked | None = None
         self._waiting: _Asked | None = None
 
@@ -157,8 +157,8 @@ class HostedController:
 
     @property
     def pid(self) -> int:
-        """The child's process id. Raises ValueError before `start`."""
-        return self._there().pid
+        """The controller's process id; until it is ready, that of the process that starts it. Raises ValueError before `start`."""
+        return self._controller_pid or self._there().pid
 
     @property
     def output(self) -> str:
@@ -257,12 +257,13 @@ class HostedController:
                 self._digest = message.digest
                 return None
             case Up() if self._digest == self.file.digest and not self._ready:
-                self._ready = True
+                self._ready, self._controller_pid = True, message.pid
                 return Ready(self._digest, message.contained)
             case Chosen() if self._asked is not None and message.obs_seq == self._asked.question.obs_seq:
                 return self._reply(message, self._asked)
             case Ended():
-                return self._fault(message.reason, one_line(message.detail, DETAIL_MAX), message.ended)
+                printed = self._there().last_printed() if message.reason == "died" else ""
+                return self._fault(message.reason, one_line(message.detail + printed, DETAIL_MAX), message.ended)
         return self._fault("malformed", f"sent a message out of turn: {line[:60]!r}")
 
     def _reply(self, message: Chosen, asked: _Asked) -> Reply | Stopped:

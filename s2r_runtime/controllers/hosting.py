@@ -1,20 +1,20 @@
-"""The controller's process: `python -m s2r_runtime.controllers.hosting DESCRIPTOR PARENT_PID`, started by `controllers.HostedController`.
+"""Between daemon and controller: `python -m s2r_runtime.controllers.hosting DESCRIPTOR PARENT_PID`, started by `HostedController`.
 
-One JSON line a message over the socket that it was given, and nothing else goes there; what the controller prints goes to another pipe.
+It draws the scenarios, and asks the controller's own process (`batches`), which is of the same kind as in a verification. One JSON line a
+message over the socket that it was given; what the controller prints goes to this process's pipe.
 
     parent: Package                    the bytes to run, the task, the seed
     child:  Loaded(digest)             of the bytes it received, on the versions it has, before any of them ran
-    child:  Up(contained)              the process is confined and the controller's module has run
+    child:  Up(contained, pid)         the controller's process is confined and its module has run
     parent: Question(obs_seq, x)       child: Chosen(obs_seq, u, ...)      and so on
     child:  Ended(reason, detail)      the last message: raised, malformed, finished
-
-Whoever reads this side's messages must not trust them: after `Loaded`, code runs here that nobody has read.
 """
 
 from __future__ import annotations
 
 import faulthandler
 import gc
+import select
 import socket
 import sys
 from typing import TYPE_CHECKING, BinaryIO, Literal
@@ -27,6 +27,7 @@ from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import TaskChoice
 
 if TYPE_CHECKING:
+    from s2r_runtime.controllers.batches import BatchController
     from s2r_runtime.controllers.code import Control
 
 
@@ -59,9 +60,10 @@ class Loaded(_Message, frozen=True, tag="loaded"):
 
 
 class Up(_Message, frozen=True, tag="up"):
-    """Ready for questions. contained: see `confinement.confine`."""
+    """Ready for questions. contained: see `confinement.confine`. pid: of the controller's process."""
 
     contained: tuple[str, ...]
+    pid: int
 
 
 class Chosen(_Message, frozen=True, tag="chosen"):
@@ -76,7 +78,7 @@ class Chosen(_Message, frozen=True, tag="chosen"):
 class Ended(_Message, frozen=True, tag="ended"):
     """No more answers."""
 
-    reason: Literal["raised", "malformed", "finished"]
+    reason: Literal["raised", "malformed", "died", "finished"]
     detail: str
     ended: Episode | None = None
 
@@ -107,29 +109,38 @@ def _send(channel: socket.socket, message: Message) -> None:
 
 def _host(channel: socket.socket, lines: BinaryIO) -> Ended:
     """Loads, confines, and answers until there is a reason to end."""
-    from s2r_runtime.controllers.code import Malformed, batch_control
-    from s2r_runtime.controllers.confinement import confine
+    from s2r_runtime.controllers.batches import MEMORY_BYTES, BatchController, Died
+    from s2r_runtime.controllers.code import Malformed
     from s2r_runtime.errors import S2RError
 
     package = msgspec.json.decode(lines.readline(), type=Package)
     _send(channel, Loaded(package.file.as_found_here().digest))
     try:
         episodes = _episodes(package)
-        contained = confine(package.memory_bytes)
-        control = batch_control(package.file, package.nu)
-        gc.collect()
-        gc.freeze()  # what is there now stays; collections while driving have little to look at
-        _send(channel, Up(contained))
-        for line in lines:
-            answer = _answer(msgspec.json.decode(line, type=Question), episodes, control)
-            if isinstance(answer, Ended):
-                return answer
-            _send(channel, answer)
+        with BatchController(package.file, package.nu, package.memory_bytes or MEMORY_BYTES, printed=1) as control:
+            gc.collect()
+            gc.freeze()  # what is there now stays; collections while driving have little to look at
+            _send(channel, Up(control.contained, control.pid))
+            while line := _question(channel, lines, control):
+                answer = _answer(msgspec.json.decode(line, type=Question), episodes, control)
+                if isinstance(answer, Ended):
+                    return answer
+                _send(channel, answer)
+    except Died as error:
+        return Ended("died", error.how)
     except Malformed as error:
         return Ended("malformed", str(error))
     except S2RError as error:
         return Ended("raised", str(error))
     return Ended("finished", "no more questions")
+
+
+def _question(channel: socket.socket, lines: BinaryIO, control: BatchController) -> bytes:
+    """The next line; empty where there is none any more. Raises ControllerError if the controller's process ends, or speaks, unasked."""
+    ready = select.select([channel.fileno(), control.fileno()], [], [])[0]
+    if channel.fileno() not in ready:
+        control.spoke_unasked()
+    return lines.readline()
 
 
 def _episodes(package: Package) -> Episodes | None:

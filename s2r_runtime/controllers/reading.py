@@ -29,7 +29,7 @@ SYSTEM = (
     "/lib", "/lib32", "/lib64", "/usr/lib", "/usr/lib64", "/usr/local/lib", "/etc/ld.so.cache",
     "/usr/share/zoneinfo", "/etc/localtime", "/dev/null", "/dev/zero", "/dev/urandom", "/dev/random",
     "/proc/cpuinfo", "/proc/meminfo", "/proc/stat", "/proc/sys/vm/overcommit_memory", "/sys/devices/system/cpu", "/sys/fs/cgroup",
-    "/proc/self/maps", "/proc/self/statm", "/proc/self/stat", "/proc/self/status", "/proc/self/cgroup",
+    "/proc/self/maps", "/proc/self/statm", "/proc/self/status", "/proc/self/cgroup",
 )  # fmt: skip
 """What libraries look at besides code: how many processors and how much memory there are, where their own memory is, what time it is."""
 

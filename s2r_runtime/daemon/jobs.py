@@ -40,9 +40,6 @@ if TYPE_CHECKING:
 
 Progress = Callable[[float, float, str], None]
 
-MEMORY_BYTES = 4 << 30
-"""What a controller may use in a verification: thousands of rollouts at once need more than driving, and less than a small computer has."""
-
 
 def run(job: Job, progress: Progress) -> Result:
     """Does it. Raises S2RError with the reason where it can't be done."""
@@ -161,7 +158,7 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
 
     profile, settings = job.profile, job.profile.verification
     model, task, gap_set = _asked(job)
-    with BatchController(job.controller, len(model.inputs), MEMORY_BYTES) as control:
+    with BatchController(job.controller, len(model.inputs)) as control:
         kept = Kept(control)
         result, details = verify_in_detail(
             kept,
@@ -182,10 +179,10 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
             progress=progress,
         )
     if result.passed:
-        with BatchController(job.controller, len(model.inputs), MEMORY_BYTES) as again:
+        with BatchController(job.controller, len(model.inputs)) as again:
             kept.compare(again)
     behaviour = ""
-    with suppress(ControllerError), BatchController(job.controller, len(model.inputs), MEMORY_BYTES) as probed:
+    with suppress(ControllerError), BatchController(job.controller, len(model.inputs)) as probed:
         behaviour = probe.behaviour(probed, task, model, [profile.inputs[name] for name in model.inputs])
     lowest = -np.finfo(np.float64).max  # what `verify` counts a value that is no number as
     safety = {one.law: np.nan_to_num(one.rollouts.safety, nan=lowest, neginf=lowest, posinf=-lowest).tolist() for one in details}
@@ -214,7 +211,7 @@ def synthesize(job: SynthesisJob, progress: Progress) -> Result:
 
         def answering(file: ControllerFile) -> BatchController:
             running.close()  # one candidate after the other
-            return running.enter_context(BatchController(file, len(model.inputs), MEMORY_BYTES))
+            return running.enter_context(BatchController(file, len(model.inputs)))
 
         found = search(
             job.controller,
