@@ -204,6 +204,18 @@ def test_a_certificate_is_told_how_many_attempts_and_controllers_its_gap_has_see
     assert one(rig.verified(), IssueCertificate).tries == Tries(6, 1, 1)
 
 
+def test_a_controller_that_answers_otherwise_when_asked_again_loses_its_certificates_for_good() -> None:
+    rig = Rig()
+    rig.driving()
+    outputs = rig.feed(SourceStopped(rig.t, "controller", "inconsistent", "it answers [1] and not [2]"))
+    assert kinds(outputs)[:2] == ["GateChanged", "Send"]
+    assert one(outputs, Revoked).reason == "controller_inconsistent"
+    assert rig.state.memory.certificates == ()
+    assert rig.state.memory.latched == ("controller_fault",)
+    rig.request("clear", text="controller_fault")
+    assert one(rig.request("deploy", digest="controller"), StartJob).attempt == 2, "it is verified anew, and that is paid for"
+
+
 def test_a_failed_verification_is_a_refusal_that_was_paid_for() -> None:
     rig = Rig()
     rig.gap()

@@ -40,7 +40,7 @@ DETAIL_MAX = 400
 START_TIMEOUT_S = 30.0
 """Importing numerical libraries takes seconds on a small computer with a cold disk."""
 
-Reason = Literal["finished", "raised", "died", "deadline", "malformed", "start_failed"]
+Reason = Literal["finished", "raised", "died", "deadline", "malformed", "inconsistent", "start_failed"]
 
 
 class Ready(NamedTuple):

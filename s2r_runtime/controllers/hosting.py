@@ -78,7 +78,7 @@ class Chosen(_Message, frozen=True, tag="chosen"):
 class Ended(_Message, frozen=True, tag="ended"):
     """No more answers."""
 
-    reason: Literal["raised", "malformed", "died", "finished"]
+    reason: Literal["raised", "malformed", "died", "inconsistent", "finished"]
     detail: str
     ended: Episode | None = None
 
@@ -109,6 +109,7 @@ def _send(channel: socket.socket, message: Message) -> None:
 
 def _host(channel: socket.socket, lines: BinaryIO) -> Ended:
     """Loads, confines, and answers until there is a reason to end."""
+    from s2r_runtime.controllers.asked_again import AskedAgain, Inconsistent
     from s2r_runtime.controllers.batches import MEMORY_BYTES, BatchController, Died
     from s2r_runtime.controllers.code import Malformed
     from s2r_runtime.errors import S2RError
@@ -117,15 +118,23 @@ def _host(channel: socket.socket, lines: BinaryIO) -> Ended:
     _send(channel, Loaded(package.file.as_found_here().digest))
     try:
         episodes = _episodes(package)
-        with BatchController(package.file, package.nu, package.memory_bytes or MEMORY_BYTES, printed=1) as control:
+        memory_bytes = package.memory_bytes or MEMORY_BYTES
+        with (
+            BatchController(package.file, package.nu, memory_bytes, printed=1) as control,
+            BatchController(package.file, package.nu, memory_bytes) as witness,
+        ):
+            asked = AskedAgain(control, witness)
             gc.collect()
             gc.freeze()  # what is there now stays; collections while driving have little to look at
             _send(channel, Up(control.contained, control.pid))
             while line := _question(channel, lines, control):
-                answer = _answer(msgspec.json.decode(line, type=Question), episodes, control)
+                answer = _answer(msgspec.json.decode(line, type=Question), episodes, asked)
                 if isinstance(answer, Ended):
                     return answer
                 _send(channel, answer)
+                asked.check()
+    except Inconsistent as error:
+        return Ended("inconsistent", str(error))
     except Died as error:
         return Ended("died", error.how)
     except Malformed as error:

@@ -361,6 +361,11 @@ def distrusted(turn: Turn, event: CertificatesDistrusted) -> None:
             revoke(turn, [facts.id], f"key: {event.reasons[facts.id]}")
 
 
+def revoke_controller(turn: Turn, digest: str, reason: str) -> None:
+    """Ends all certificates of a controller."""
+    revoke(turn, [facts.id for facts in turn.memory.certificates if facts.controller_digest == digest], reason)
+
+
 def revoke(turn: Turn, ids: Sequence[str], reason: str) -> None:
     """Ends certificates for good. Closes the gate first, if one of them drives, and stops that controller last."""
     fresh = {identity: reason for identity in ids if identity not in turn.memory.revoked}

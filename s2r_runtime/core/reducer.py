@@ -141,7 +141,10 @@ def _dispatch(turn: Turn, event: Event) -> None:
         case SourceStarted():
             sources.source_started(turn, event)
         case SourceStopped():
+            deployment = turn.state.deployment
             sources.source_stopped(turn, event)
+            if event.source == "controller" and event.reason == "inconsistent" and deployment is not None:
+                certificates.revoke_controller(turn, deployment.digest, "controller_inconsistent")
         case OverrideChanged():
             sources.override(turn, event)
         case ObservationRefused():

@@ -24,7 +24,7 @@ from s2r_runtime.messages import (
 
 INTERRUPTS = ("stopping", *gate.ALWAYS_LATCHING, "recorder_down", "no_permit", "permit_expired")
 """What ends a campaign for the moment; anything else only refuses its commands one by one."""
-FAULTS = ("raised", "died", "deadline", "malformed")
+FAULTS = ("raised", "died", "deadline", "malformed", "inconsistent")
 
 
 # ---------------------------------------------------------------- ends

@@ -131,11 +131,14 @@ class SourceStarted(Struct, frozen=True, tag="source_started"):
 
 
 class SourceStopped(Struct, frozen=True, tag="source_stopped"):
-    """A source is gone. `reason`: finished, raised, died, deadline, malformed, stopped, start_failed."""
+    """A source is gone. `reason`: finished, raised, died, deadline, malformed, inconsistent, stopped, start_failed.
+
+    inconsistent: a controller that answered the same question otherwise when it was asked again; its certificates are revoked.
+    """
 
     t_ns: int
     source: Source
-    reason: Literal["finished", "raised", "died", "deadline", "malformed", "stopped", "start_failed"]
+    reason: Literal["finished", "raised", "died", "deadline", "malformed", "inconsistent", "stopped", "start_failed"]
     detail: str = ""
 
 
