@@ -83,7 +83,7 @@ name = "bench"
 [transport]
 name = "bench"
 """
-CONTROLLER = "def control(x, theta, parameters):\n    return 0.0 * x[:, :2] + 0.1\n"
+CONTROLLER = "def control(x, theta, parameters):\n    return 0.0 * x[:, :2] + [0.1, 0.8]\n"
 
 
 TRACED: dict[str, dict[str, Any]] = {}
@@ -356,7 +356,8 @@ class Bench:
                 self.feed(*self._sampler(output))
             case m.Ask():
                 self.numbers += 1
-                self.feed(m.Proposed(0, m.Command(self.numbers, self.t_ns, "controller", (0.1, 0.8), output.obs_seq, 100_000_000)))
+                u = self._told("another face", (0.1, 0.8), lambda _: (0.15, 0.0))
+                self.feed(m.Proposed(0, m.Command(self.numbers, self.t_ns, "controller", u, output.obs_seq, 100_000_000)))
             case m.StartCampaign():
                 self.order = output
                 self.campaign = Campaign.from_settings(

@@ -505,3 +505,19 @@ def test_a_verification_that_was_made_up_is_named_when_the_controller_is_run_aga
             assert result.first_difference is not None
             assert "verification attempt 1 ends otherwise" in result.first_difference.what
             assert not result.certificates[0].valid
+
+
+def test_what_was_driven_is_what_the_controller_answers_when_it_is_asked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bench's verification is made up, which is the first difference here; what was driven is looked at all the same."""
+    monkeypatch.setattr(audit_bench, "PROFILE", audit_bench.PROFILE.replace('[task]\nname = "bench"', '[task]\nname = "keep_out"'))
+    plain = Bench(tmp_path).model
+    horizon = registry().get("tasks", "keep_out")({}, plain.nominal, plain.dt).horizon
+    monkeypatch.setattr(audit_bench.BenchTask, "horizon", horizon)
+    again = "driving commands that their controller gives again"
+    for lie in ("", "another face"):
+        bench = whole(Bench(tmp_path, lie))
+        path = bench.write(tmp_path / f"{lie or 'honest'}.mcap")
+        driven = sum(isinstance(item, m.Proposed) and item.command.source == "controller" for item in bench.items)
+        assert driven > 10
+        assert audit([path], PUBLIC).ok, "nothing shows as long as the controller is not asked"
+        assert audit([path], PUBLIC, rerun_controllers=True).recomputed.get(again, 0) == (0 if lie else driven)

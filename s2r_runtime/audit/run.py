@@ -11,7 +11,8 @@ from s2r_runtime.audit.beside import Beside
 from s2r_runtime.audit.campaign import CampaignReplay
 from s2r_runtime.audit.certificates import Certificates
 from s2r_runtime.audit.core import CoreReplay, in_effect_order
-from s2r_runtime.audit.evidence import Evidence
+from s2r_runtime.audit.driven import DrivenAgain
+from s2r_runtime.audit.evidence import Evidence, attached_controller
 from s2r_runtime.audit.findings import Findings
 from s2r_runtime.audit.inputs import InputsReplay
 from s2r_runtime.audit.older import as_recorded
@@ -26,6 +27,7 @@ from s2r_runtime.messages import (
     GRID,
     RULES,
     SEEDS,
+    AnswerLate,
     Ask,
     AttemptSpent,
     CampaignFinished,
@@ -104,7 +106,7 @@ class RunAudit:
         )
         self._traces = across.traces
         self._trusted, self._rerun = across.trusted, across.rerun
-        self._inputs = InputsReplay(across.findings)
+        self._inputs, self._driven = InputsReplay(across.findings), DrivenAgain(across.findings)
         self._observation: Observation | None = None
         self._core = CoreReplay(across.findings)
         self._beside, self._begun = across.beside, False
@@ -154,6 +156,7 @@ class RunAudit:
     def end(self, *, clean: bool) -> None:
         """Nothing follows. clean: the log was closed and lacks nothing, so neither may its last event, if that is an orderly end."""
         stopped = isinstance(self._event, Stopping)
+        self._driven.stop()
         if self._begun:
             last_act = None if stopped else self._last_act()
             self._beside.finish(self._entry, last_act, self._core.state.now_ns, clean=clean, stopped=stopped)
@@ -196,10 +199,17 @@ class RunAudit:
             case Observed(observation=observation):
                 self._seen_seq, self._observation = observation.seq, observation
                 self._campaigns.observed(observation)
+                self._driven.observed(observation)
             case LinkChanged():
                 self._campaigns.restarted()
             case Proposed() if event.command.source == "sampler":
                 (self._inputs if self._inputs.driving else self._campaigns).proposed(entry, event)
+            case Proposed() if event.command.source == "controller":
+                self._driven.proposed(entry, event)
+            case AnswerLate():
+                self._driven.lost_track()
+            case SourceStopped(source="controller"):
+                self._driven.stop()
             case SampleTaken():
                 self._campaigns.sample(entry, event)
             case CampaignFinished():
@@ -310,10 +320,14 @@ class RunAudit:
                 in_force = settings_of(profile, profile.model, facts, settings.seed, settings.rules)
                 self._campaigns.start(output, in_force, profile.sampling)
             case StartController():
-                if state.memory.gap is not None and self._compose(profile.model) is not None:
+                model = self._compose(profile.model)
+                if self._rerun and model is not None:
+                    self._driven.start(attached_controller(self._attached(), output.digest), model, profile.task, settings.seed)
+                if state.memory.gap is not None and model is not None:
                     self._beside.begin(profile, state.memory.gap, state.memory, lockstep=settings.lockstep, rules=settings.rules)
             case StopController():
                 self._beside.stop()
+                self._driven.stop()
             case DrawSeed():
                 self._evidence.paid(output)
             case StartJob():
