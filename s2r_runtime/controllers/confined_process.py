@@ -7,6 +7,7 @@ Nothing here waits, what is read and kept is bounded, and killing it kills its w
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import select
 import shutil
@@ -26,10 +27,27 @@ LINE_MAX = 64 << 10
 """Bytes. A message has a few hundred; who sends more without an end of line sends no message."""
 ENDS_WITHIN_S = 0.02
 """How long the daemon's loop waits to learn how a controller ended: it has commands to send."""
+FOLDER = "s2r-controller-"
+NEW_S = 60.0
+"""A folder that is younger may be about to be locked."""
 READ_MAX = 64 << 10
 """Bytes taken from the child at a time, from the socket and from the pipe: one that floods costs the loop no more than that."""
 OUTPUT_KEPT = 4 << 10
 """Bytes of the last that it printed, for the reader."""
+
+
+def remove_left_folders() -> None:
+    """Folders of controllers whose daemon was killed: nobody holds their lock. Those of other users stay."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{FOLDER}*"):
+        with contextlib.suppress(OSError):
+            number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            try:
+                status = os.fstat(number)
+                if status.st_uid == os.geteuid() and time.time() - status.st_mtime > NEW_S:
+                    fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    shutil.rmtree(folder, ignore_errors=True)
+            finally:
+                os.close(number)
 
 
 class ConfinedProcess:
@@ -42,7 +60,10 @@ class ConfinedProcess:
         """Starts it. From the main thread: the child dies with the thread that made it. Raises OSError if that can't be."""
         self._dying[:] = [process for process in self._dying if not process.reap()]
         self._epoll = select.epoll()
-        self._folder = Path(tempfile.mkdtemp(prefix="s2r-controller-"))
+        remove_left_folders()
+        self._folder = Path(tempfile.mkdtemp(prefix=FOLDER))
+        self._holding = os.open(self._folder, os.O_RDONLY | os.O_CLOEXEC)
+        fcntl.flock(self._holding, fcntl.LOCK_EX)
         self._channel, theirs = socket.socketpair()
         self._printed, writing = os.pipe()
         try:
@@ -62,6 +83,7 @@ class ConfinedProcess:
             os.close(self._printed)
             self._epoll.close()
             self._folder.rmdir()
+            os.close(self._holding)
             raise
         finally:
             theirs.close()
@@ -152,6 +174,9 @@ class ConfinedProcess:
         if self._process.poll() is None:
             return False
         shutil.rmtree(self._folder, ignore_errors=True)
+        if self._holding >= 0:
+            os.close(self._holding)
+            self._holding = -1
         return True
 
     def close(self) -> None:
