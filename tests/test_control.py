@@ -272,7 +272,7 @@ CALLS = """
 import os, sys
 from pathlib import Path
 from s2r_runtime.daemon import control
-os.setuid(65534)
+os.setuid(int(sys.argv[2]))
 try:
     print(control.call(Path(sys.argv[1]), {"verb": "stop"}))
 except Exception as error:
@@ -281,14 +281,15 @@ except Exception as error:
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can be two other people")
-def test_a_client_says_nothing_to_a_third_user_who_listens_in_the_daemons_place() -> None:
+@pytest.mark.parametrize("caller", [65534, 0])
+def test_a_client_says_nothing_to_a_third_user_who_listens_in_the_daemons_place(caller: int) -> None:
     with tempfile.TemporaryDirectory() as name:
         Path(name).chmod(0o777)  # somebody else is to put his socket there
         path = f"{name}/rover.sock"
         theirs = subprocess.Popen([sys.executable, "-c", SOMEBODY_LISTENS, path], stdout=subprocess.PIPE, text=True)
         assert theirs.stdout is not None
         assert theirs.stdout.readline() == "listening\n"
-        said = subprocess.run([sys.executable, "-c", CALLS, path], capture_output=True, text=True, check=True)
+        said = subprocess.run([sys.executable, "-c", CALLS, path, str(caller)], capture_output=True, text=True, check=True)
         assert "UsageError" in said.stdout
         assert "whoever listens there is user 12345, and no daemon of yours" in said.stdout
         assert theirs.stdout.read().strip() == ""

@@ -263,6 +263,13 @@ def _peer(sock: socket.socket) -> int:
     return int(struct.unpack("3i", sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i")))[1])
 
 
+def _placed_by_root(path: Path, whose: int) -> bool:
+    """Whether only root can have given that user the folder of this socket, as for a service: then root believes who listens there."""
+    folder = path.resolve().parent
+    status, above = folder.stat(), [parent.stat() for parent in folder.parents]
+    return status.st_uid == whose and not any(one.st_uid or one.st_mode & 0o022 for one in above) and not status.st_mode & 0o022
+
+
 def _check_owner(folder: Path) -> None:
     """Refuses a folder that somebody else owns or may write to. Raises ConfigError."""
     status = folder.stat()
@@ -319,8 +326,9 @@ def call(path: Path, request: Request, on_progress: Callable[[Request], None] | 
         sock.settimeout(FIRST_LINE_WITHIN_S)
         try:
             sock.connect(str(path))
-            if (whose := _peer(sock)) not in (0, os.geteuid()) and os.geteuid() != 0:
-                raise UsageError(f"{path}: whoever listens there is user {whose}, and no daemon of yours; nothing was said to him")
+            if (whose := _peer(sock)) not in (0, os.geteuid()) and not (os.geteuid() == 0 and _placed_by_root(path, whose)):
+                hint = f"; if it is his daemon that you mean: sudo -u '#{whose}' s2r ..." if os.geteuid() == 0 else ""
+                raise UsageError(f"{path}: whoever listens there is user {whose}, and no daemon of yours; nothing was said to him{hint}")
             sock.sendall(line)
             for answer in _answers(sock, presence):
                 if "exit_code" in answer:

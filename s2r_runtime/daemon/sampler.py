@@ -226,13 +226,13 @@ class Sampler:
         if told and len(samples) > len(told) + AHEAD:
             raise ConfigError(
                 f"{self._folder.path / 'campaign.json'}: has {len(samples)} samples of epoch {order.epoch}, its logs have {len(told)}; "
-                "cancel the campaign (s2r cancel), its share of beta is spent"
+                "cancel the campaign (s2r sample PROFILE --cancel), its share of beta is spent"
             )
         for one, other in zip(samples, told, strict=False):
             if msgspec.structs.replace(other, t_ns=one.t_ns, again=one.again) != one:
                 raise ConfigError(
                     f"{self._folder.path / 'campaign.json'}: sample {one.index} of epoch {order.epoch} is not the one that was logged; "
-                    "cancel the campaign (s2r cancel), its share of beta is spent"
+                    "cancel the campaign (s2r sample PROFILE --cancel), its share of beta is spent"
                 )
         return told[len(samples) :]
 
@@ -253,6 +253,6 @@ class Sampler:
         if kept.campaign.get("index") != len(kept.samples):
             raise ConfigError(
                 f"{self._folder.path / 'campaign.json'}: has {len(kept.samples)} samples and goes on at {kept.campaign.get('index')}; "
-                "cancel the campaign (s2r cancel), its share of beta is spent"
+                "cancel the campaign (s2r sample PROFILE --cancel), its share of beta is spent"
             )
         return kept
