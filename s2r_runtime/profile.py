@@ -181,7 +181,9 @@ class Watch(_Table, frozen=True):
     """What is made of discrepancies while a controller drives (guarantee G5)."""
 
     fault_jump: float = 0.0
-    """In the norm's unit; a discrepancy above it is a fault of measurement, not motion. 0: there is no such rule."""
+    """In the norm's unit; a discrepancy above it is a fault of measurement, not motion. 0: twice the norm of the geofence's extent, which
+    no motion reaches.
+    """
     max_faults: int = 20
     """More of these in a deployment close the gate."""
     run_length: float = 1e5

@@ -164,7 +164,7 @@ def _home(p: Profile) -> Iterator[Check]:
 
 def _watch(w: Watch) -> Iterator[Check]:
     yield 1.0 <= w.run_length <= 1e12, "watch.run_length", w.run_length, "1 to 1e12 discrepancies"
-    yield w.fault_jump >= 0.0, "watch.fault_jump", w.fault_jump, ">= 0 (0: no such rule)"
+    yield w.fault_jump >= 0.0, "watch.fault_jump", w.fault_jump, ">= 0 (0: it follows from the geofence)"
     yield w.max_faults >= 0, "watch.max_faults", w.max_faults, ">= 0"
 
 

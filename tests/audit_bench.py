@@ -32,7 +32,7 @@ from s2r_runtime.daemon import jobs, trace_job
 from s2r_runtime.daemon.excitation import Excitation
 from s2r_runtime.daemon.given_inputs import parse_inputs
 from s2r_runtime.daemon.model_store import parse_model
-from s2r_runtime.daemon.settings import facts_of, settings_of
+from s2r_runtime.daemon.settings import facts_of, fault_jump_of, settings_of
 from s2r_runtime.daemon.worker import GapJob, TraceJob
 from s2r_runtime.headroom import grid
 from s2r_runtime.hookspecs import Offer, hookimpl
@@ -402,7 +402,8 @@ class Bench:
                 assert gap is not None
                 self.epoch = gap.epoch
                 memory = self.state.memory
-                self.stream = Stream(self.model, gap, **msgspec.structs.asdict(stood(memory)))
+                jump = fault_jump_of(self.profile, self.model.states, tuple(self.model.nominal.angles), gap)
+                self.stream = Stream(self.model, gap, fault_jump=jump, **msgspec.structs.asdict(stood(memory)))
                 self.feed(m.SourceStarted(0, "controller", output.digest))
             case m.StopController():
                 self.stream = None

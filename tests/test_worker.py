@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import random
 import signal
@@ -20,10 +21,12 @@ from s2r_runtime.controllers.file import load
 from s2r_runtime.core.ledger import share
 from s2r_runtime.daemon import jobs
 from s2r_runtime.daemon.analytics import Analytics, Ready, Refused, Reply, Watching
+from s2r_runtime.daemon.settings import fault_jump_of
 from s2r_runtime.daemon.worker import Failed, GapJob, Job, LoadJob, Progress, Result, Upward, VerifyJob, Worker
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.messages import Gap, Observation, SampleTaken, Send
+from s2r_runtime.messages import IMPLAUSIBLE, Gap, Observation, SampleTaken, Send
 from s2r_runtime.profile import Profile, parse_profile
+from s2r_runtime.watch import measurement_fault
 
 WITHIN_S = 60.0
 GRID = Path(__file__).parent.parent / "controllers" / "grid.py"
@@ -263,3 +266,20 @@ def test_analytics_that_died_or_froze_is_down(analytics: Analytics, how: signal.
     analytics.observed(step(0, 0.0)[0])
     assert replies(analytics.wait()) == []
     assert words in analytics.down
+
+
+def test_a_glitch_that_no_motion_makes_is_a_fault_by_default_and_not_under_the_rules_of_before() -> None:
+    """Twice the extent of the geofence, in the norm: a discrepancy of 1e9 is none, one of half the region is."""
+    robot = profile()
+    plain = msgspec.structs.replace(robot, watch=msgspec.structs.replace(robot.watch, fault_jump=0.0))
+    states, angles = ("x", "y", "theta"), ("theta",)
+    fence = {**plain.region, **plain.geofence}
+    extent = math.hypot(*(w * (math.pi if s == "theta" else fence[s][1] - fence[s][0]) for s, w in zip(states, gap().weights, strict=True)))
+    jump = fault_jump_of(plain, states, angles, gap())
+    assert jump == pytest.approx(2.0 * extent)
+    assert measurement_fault(1e9, jump) == "jump"
+    assert measurement_fault(0.5 * extent, jump) == ""
+    assert fault_jump_of(plain, states, angles, gap(), IMPLAUSIBLE - 1) == 0.0
+    own = msgspec.structs.replace(robot, watch=msgspec.structs.replace(robot.watch, fault_jump=0.3))
+    assert fault_jump_of(own, states, angles, gap()) == 0.3
+    assert plain.digest() == msgspec.structs.replace(plain, watch=type(plain.watch)()).digest()

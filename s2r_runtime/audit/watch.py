@@ -9,6 +9,7 @@ import msgspec
 
 from s2r_runtime.audit.findings import Findings, alike
 from s2r_runtime.core import stream
+from s2r_runtime.daemon.settings import fault_jump_of
 from s2r_runtime.messages import Gap, Measured, Memory, Observation, Send, WatchStood
 from s2r_runtime.profile import Profile
 from s2r_runtime.recording.reading import Entry
@@ -117,4 +118,5 @@ class WatchReplay:
         model, gap, profile = self._begun
         stood = msgspec.structs.asdict(self._stood[1])
         alpha, watch = profile.guarantee.alpha, profile.watch
-        self._stream = Stream(model, gap, fault_jump=watch.fault_jump, alpha=alpha, run_length=watch.run_length, rules=self._rules, **stood)
+        jump = fault_jump_of(profile, model.states, tuple(model.nominal.angles), gap, self._rules)
+        self._stream = Stream(model, gap, fault_jump=jump, alpha=alpha, run_length=watch.run_length, rules=self._rules, **stood)

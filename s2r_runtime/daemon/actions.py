@@ -23,6 +23,7 @@ from s2r_runtime.core import stream
 from s2r_runtime.core.status import against_sampler
 from s2r_runtime.daemon.analytics import Watching
 from s2r_runtime.daemon.console import campaign_line
+from s2r_runtime.daemon.settings import fault_jump_of
 from s2r_runtime.daemon.worker import Failed, GapJob, Progress, Result, TraceJob, VerifyJob
 
 if TYPE_CHECKING:
@@ -168,7 +169,8 @@ class Actions:
         memory, profile = self._d.state.memory, self._d.profile
         if memory.gap is not None:
             stood, settings = msgspec.structs.asdict(stream.stood(memory)), self._d.settings
-            jump, alpha, run_length = profile.watch.fault_jump, settings.alpha, settings.run_length
+            jump = fault_jump_of(profile, settings.states, settings.angles, memory.gap)
+            alpha, run_length = settings.alpha, settings.run_length
             watching = Watching(profile.model, memory.gap, jump, alpha=alpha, run_length=run_length, **stood)
             self._d.watcher.begin(watching)
         self.episodes.clear()

@@ -12,12 +12,16 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from s2r_runtime.canonical import digest_of
-from s2r_runtime.messages import GRID, RULES, Settings
+from s2r_runtime.messages import GRID, IMPLAUSIBLE, RULES, Gap, Settings
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Profile, plain_table
 
 if TYPE_CHECKING:
     from s2r_runtime.models.composed import ComposedModel
+
+
+FENCES = 2.0
+"""A robot may be a little outside, and so may the prediction."""
 
 
 class ModelFacts(msgspec.Struct, frozen=True):
@@ -39,6 +43,25 @@ def facts_of(model: ComposedModel, horizon: int = 0) -> ModelFacts:
     return ModelFacts(model.states, model.inputs, tuple(model.nominal.angles), horizon, model.any_step)
 
 
+def fence_of(profile: Profile, angles: tuple[str, ...]) -> dict[str, tuple[float, float]]:
+    """By state. An angle without bounds may be anything in its circle; a state that the geofence doesn't name is fenced by the region."""
+    return {**dict.fromkeys(angles, (-math.pi, math.pi)), **profile.region, **profile.geofence}
+
+
+def fault_jump_of(profile: Profile, states: tuple[str, ...], angles: tuple[str, ...], gap: Gap, rules: int = RULES) -> float:
+    """Above which a discrepancy is a fault of measurement, in the gap's norm; 0: nothing is.
+
+    The profile's `watch.fault_jump`; where that is 0, `FENCES` times the norm of the geofence's extent: a robot inside it, and a model that
+    predicts from there, are no farther apart.
+    """
+    if profile.watch.fault_jump > 0.0 or rules < IMPLAUSIBLE:
+        return profile.watch.fault_jump
+    fence = fence_of(profile, angles)
+    apart = [min(high - low, math.pi) if name in angles else high - low for name in states for low, high in (fence[name],)]
+    weighted = [w * d for w, d in zip(gap.weights, apart, strict=True)]
+    return FENCES * (max(weighted) if gap.set == "box" else math.hypot(*weighted))
+
+
 def settings_of(profile: Profile, model: ModelSpec, facts: ModelFacts, seed: int | None = None, rules: int = RULES) -> Settings:
     """What the profile fixes for the core. model: the one in force (the profile's, or one adopted since). seed: instead of the
     profile's. rules: those that the run was made under.
@@ -48,7 +71,7 @@ def settings_of(profile: Profile, model: ModelSpec, facts: ModelFacts, seed: int
     gate, recovery = profile.gate, profile.recovery
     circle = dict.fromkeys(facts.angles, (-math.pi, math.pi))
     region = {**circle, **profile.region}
-    fence = {**region, **profile.geofence}
+    fence = fence_of(profile, facts.angles)
     held = recovery.input if recovery.kind == "hold" else {}
     return Settings(
         robot=profile.robot.name,

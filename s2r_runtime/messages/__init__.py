@@ -49,6 +49,7 @@ from s2r_runtime.messages.link import (
 from s2r_runtime.messages.memory import (
     BEHAVIOURS,
     GRID,
+    IMPLAUSIBLE,
     LATEST_TIME,
     MEMORY_SCHEMA,
     RESTARTS,
@@ -105,13 +106,14 @@ from s2r_runtime.messages.results import (
 )
 
 __all__ = [
-    "BEHAVIOURS", "GRID", "LATEST_TIME", "MEMORY_SCHEMA", "NOT_INDEPENDENT", "REPEATED", "RESTARTS", "RULES", "SEEDS", "SERIAL", "Action",
-    "AlarmRaised", "AnalyticsChanged", "Answer", "AnswerLate", "Ask", "AttemptEnded", "AttemptSpent", "CampaignFinished",
-    "CertificateFacts", "CertificateFailed", "CertificateInstalled", "CertificateStored", "CertificatesDistrusted", "ChangeNoticed",
-    "Command", "Decided", "DrawSeed", "Driven", "EpisodeEnded", "EpochChanged", "Event", "Frame", "Gap", "GateChanged", "InputsFinished",
-    "IssueCertificate", "JobFinished", "LawResult", "LinkChanged", "LogHead", "Measured", "Memory", "ModelAdopted", "Observation",
-    "ObservationRefused", "Observed", "Output", "OverrideChanged", "Persist", "Proposal", "Proposed", "RadiusGrew", "RadiusTried", "Record",
-    "RecorderChanged", "RefusedCampaign", "Requested", "Revoked", "SampleTaken", "SeedDrawn", "Send", "Settings", "Source", "SourceStarted",
-    "SourceStopped", "StartCampaign", "StartController", "StartInputs", "StartJob", "Started", "StopCampaign", "StopController", "Stopping",
-    "Stretch", "Struct", "Ticked", "TraceEnded", "Trials", "Tries", "Verification", "WallClockRead", "WatchStood",
+    "BEHAVIOURS", "GRID", "IMPLAUSIBLE", "LATEST_TIME", "MEMORY_SCHEMA", "NOT_INDEPENDENT", "REPEATED", "RESTARTS", "RULES", "SEEDS",
+    "SERIAL", "Action", "AlarmRaised", "AnalyticsChanged", "Answer", "AnswerLate", "Ask", "AttemptEnded", "AttemptSpent",
+    "CampaignFinished", "CertificateFacts", "CertificateFailed", "CertificateInstalled", "CertificateStored", "CertificatesDistrusted",
+    "ChangeNoticed", "Command", "Decided", "DrawSeed", "Driven", "EpisodeEnded", "EpochChanged", "Event", "Frame", "Gap", "GateChanged",
+    "InputsFinished", "IssueCertificate", "JobFinished", "LawResult", "LinkChanged", "LogHead", "Measured", "Memory", "ModelAdopted",
+    "Observation", "ObservationRefused", "Observed", "Output", "OverrideChanged", "Persist", "Proposal", "Proposed", "RadiusGrew",
+    "RadiusTried", "Record", "RecorderChanged", "RefusedCampaign", "Requested", "Revoked", "SampleTaken", "SeedDrawn", "Send", "Settings",
+    "Source", "SourceStarted", "SourceStopped", "StartCampaign", "StartController", "StartInputs", "StartJob", "Started", "StopCampaign",
+    "StopController", "Stopping", "Stretch", "Struct", "Ticked", "TraceEnded", "Trials", "Tries", "Verification", "WallClockRead",
+    "WatchStood",
 ]  # fmt: skip

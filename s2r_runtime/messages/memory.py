@@ -85,9 +85,11 @@ number, which anybody could compute beforehand.
 """
 LATEST_TIME = 6
 """Since these rules the wall clock never goes back: `core.wall_clock`."""
-RULES = 6
+IMPLAUSIBLE = 7
+"""Since these rules `watch.fault_jump = 0` is a bound that follows from the geofence. Before, it was none."""
+RULES = 7
 """1: a campaign that is refused for dependent samples is remembered, and can be traced and repeated. 2: `GRID`. 3: what driving showed is
-kept over epochs (`Driven`). 4: `RESTARTS`. 5: `SEEDS`. 6: `LATEST_TIME`.
+kept over epochs (`Driven`). 4: `RESTARTS`. 5: `SEEDS`. 6: `LATEST_TIME`. 7: `IMPLAUSIBLE`.
 """
 BEHAVIOURS = 1000
 """Remembered on one gap: some 20 KB of what is persisted. Beyond that a certificate says *at least*."""
