@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,11 @@ def digest_of_path(path: Path) -> str:
 def digest_of(value: Any) -> str:
     """Digest of a value's canonical bytes."""
     return digest(canonical(value))
+
+
+def digest_of_all(digests: Sequence[str]) -> str:
+    """One digest of several, whatever their order; of one, itself."""
+    return digests[0] if len(digests) == 1 else digest_of(sorted(digests))
 
 
 def _refuse_non_finite(value: Any, where: str) -> None:

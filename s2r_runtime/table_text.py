@@ -105,7 +105,7 @@ class TextLines:
         for block in self._blocks():
             if (place := block.find(b"\0")) >= 0:
                 line = self._newlines + block.count(b"\n", 0, place) + 1
-                raise RecordingError(f"{self.path}: line {line}: holds a zero byte, is not a CSV file")
+                raise RecordingError(f"{self.path}: line {line}: holds a zero byte, is no table, and of no format that is known here")
             try:
                 text = block.decode(encoding)
             except UnicodeDecodeError as error:

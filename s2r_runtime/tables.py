@@ -1,6 +1,7 @@
 """Recordings in table form: CSV, or CSV.gz (docs/recordings.md).
 
-A header row; the stamps (`t`, s); one column for each measured state and each input, by the model's name, a usual other one
+A header row (comments with # or % may stand before it, or be it); the
+stamps (`t`, s); one column for each measured state and each input, by the model's name, a usual other one
 (`column_names`) or one that the person stated; an optional `segment` column for runs that are not contiguous (any labels; the rows of
 one run stand together). A blank cell, or a word for "no value" (`MISSING`), means *not received at this stamp*. Stamps do not run backwards
 within a run; equal stamps are allowed (two streams, two rows). Columns that nobody asked for are not looked at.
@@ -31,7 +32,7 @@ from s2r_runtime.table_text import Limits, Progress, TextLines
 if TYPE_CHECKING:
     from _csv import Reader
 
-__all__ = ["LARGEST", "MISSING", "SEGMENT", "TIME", "Limits", "Subset", "Table", "header_of", "places_of", "read_csv"]
+__all__ = ["LARGEST", "MISSING", "SEGMENT", "TIME", "Limits", "Subset", "Table", "header_of", "missing_columns", "places_of", "read_csv"]
 
 Array = NDArray[np.float64]
 
@@ -42,6 +43,10 @@ LARGEST = 1e30
 MISSING = frozenset(("nan", "+nan", "-nan", "na", "n/a", "<na>", "null", "none", "nil"))
 """Cells, in small letters, that hold no value: what pandas, NumPy, R, MATLAB and databases write where there is none."""
 
+COMMENT, MAX_COMMENTS = ("#", "%"), 10_000
+"""What begins a comment before the table, and the most such lines."""
+LATEST_S = 1e11
+"""No clock is beyond that, so stamps that are have another unit: since 1970 there are 1.8e9 s, 1.8e12 ms."""
 BLOCK_ROWS, BLOCK_CELLS = 8192, 400_000
 """Rows that are Python objects at a time; fewer of a wide table."""
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(inf|infinity)", re.ASCII | re.IGNORECASE)
@@ -151,13 +156,33 @@ def places_of(path: Path | str, wanted: Sequence[str], columns: Mapping[str, str
 
 def _opened(path: Path, text: TextLines) -> tuple[list[str], Reader]:
     """The header, and the rows after it."""
-    rows = csv.reader(iter(text), strict=True)
+    rows = csv.reader(_without_comments(iter(text)), strict=True)
     try:
-        return [name.strip() for name in next(rows)], rows
+        while not (header := next(rows)) and rows.line_num < MAX_COMMENTS:
+            pass
+        return [name.strip() for name in header], rows
     except StopIteration:
         raise RecordingError(f"{path}: is empty, must start with a header row") from None
     except csv.Error as error:
         raise RecordingError(f"{path}: line 1: not CSV: {error}") from None
+
+
+def _without_comments(lines: Iterator[str]) -> Iterator[str]:
+    """Lines behind comments (# or %), which become empty ones; the last comment is the header if a number begins the line after it."""
+    last = ""
+    for line in lines:
+        if line.lstrip()[:1] in COMMENT:
+            if last:
+                yield "\n"
+            last = line.lstrip(" \t" + "".join(COMMENT))
+            continue
+        if last:
+            yield last if _is_number(re.split(r"[,;\s]", line.lstrip(), maxsplit=1)[0]) else "\n"
+        yield line
+        break
+    else:
+        yield last
+    yield from lines
 
 
 def _places(
@@ -182,7 +207,7 @@ def _places(
             raise RecordingError(f"{path}: column {column!r} is there {header.count(column)} times, must be there once")
     found = places(header, [*asked, *(name for name in optional if name not in asked)], columns, str(path), angles)
     if absent := [columns.get(name, name) for name in asked if name not in found]:
-        raise RecordingError(f"{path}: {_missing(absent, header)}")
+        raise RecordingError(f"{path}: {missing_columns(absent, header)}")
     for name, place in found.items():
         if header.count(place.column) > 1:
             raise RecordingError(
@@ -191,10 +216,15 @@ def _places(
     return found
 
 
-def _missing(absent: list[str], header: list[str]) -> str:
-    if len(header) == 1 and (other := [sign for sign in (";", "\t", "|") if sign in header[0]]):
+def missing_columns(absent: list[str], header: list[str]) -> str:
+    """What is wrong with a table that lacks these columns, or is none, in words."""
+    if len(header) == 1 and (other := [sign for sign in (";", "\t", "|", " ") if len(header[0].split(sign)) > (1 if sign != " " else 2)]):
         names = ", ".join(map(repr, absent))
-        return f"lacks {names}; are its columns separated by commas? {other[0]!r} seems to stand between them; decimal numbers need a point"
+        first = "" if not all(map(_is_number, header[0].split())) else "; it starts with numbers, must start with a header row"
+        return (
+            f"lacks {names}; are its columns separated by commas? {other[0]!r} seems to stand between them; "
+            f"decimal numbers need a point{first}"
+        )
     if all(_is_number(name) for name in header):
         return f"starts with numbers, must start with a header row that names the columns: {', '.join(absent)}, ..."
     return missing(absent, header)
@@ -218,6 +248,14 @@ class _Reading:
         if blank := np.flatnonzero(np.isnan(t)).tolist():
             raise RecordingError(
                 f"{self._path}: line {lines[blank[0]]}: column {self._columns[0][0].column!r} is blank, every row needs its stamp"
+            )
+        if far := np.flatnonzero(np.abs(t) > LATEST_S).tolist():
+            t_far = float(np.abs(t[far[0]]))
+            unit = "ms" if t_far < 1e3 * LATEST_S else "us" if t_far < 1e6 * LATEST_S else "ns"
+            column = self._columns[0][0].column
+            raise RecordingError(
+                f"{self._path}: line {lines[far[0]]}: column {column!r} has a stamp of {t_far:.3g} s; "
+                f"if it is in {unit}, name it t_{unit} in the header"
             )
         segment = None if self._segment is None else self._numbered(cells[self._segment], lines)
         self._check_time(t, segment, lines)

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.canonical import digest_of, digest_of_path
+from s2r_runtime.canonical import digest_of, digest_of_all, digest_of_path
 from s2r_runtime.driving import MAX_GAP, Streams, drive_transitions, resolution, state_at, streams_noise
 from s2r_runtime.errors import RecordingError, UsageError
 from s2r_runtime.formats.mapping import Recorded
@@ -142,7 +142,7 @@ def _together(model: ComposedModel, reads: Sequence[_Read]) -> Transitions:
             )
     streams = [one for read in reads for one in read.streams]
     source = ", ".join(read.source for read in reads)
-    recording = reads[0].recording if len(reads) == 1 else digest_of(sorted(read.recording for read in reads))
+    recording = digest_of_all([read.recording for read in reads])
     if reads[0].drawn:
         found = _segment_transitions(model, streams, recording, source)
         found = replace(found, noise=streams_noise(model, streams))

@@ -13,7 +13,7 @@ from scipy.special import erf
 
 from s2r_runtime import blocked, certificate, statements
 from s2r_runtime.bounds import clopper_pearson_lower, sample_size
-from s2r_runtime.cli.evidence import gap_of
+from s2r_runtime.cli.evidence import gap_of, in_fixed_order
 from s2r_runtime.core import ledger
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
 from s2r_runtime.gap import Drive, Transitions
@@ -101,11 +101,11 @@ def test_an_assumption_is_whole_or_refused(text: str, told: str) -> None:
         parse_profile(f"{ROBOTARIUM.read_text()}\n[driving]\n{text}\n", "p.toml", ROBOTARIUM.parent)
 
 
-def driven_table(path: Path, seconds: int, dt: float) -> Path:
-    """A drive of an exact unicycle whose heading is measured with noise."""
-    rng = np.random.default_rng(6)
+def driven_table(path: Path, seconds: int, dt: float, begin: float = 0.0) -> Path:
+    """A drive of an exact unicycle whose heading is measured with noise. begin: its first stamp, s."""
+    rng = np.random.default_rng(6 + int(begin))
     rows = ["t,x,y,theta,v,w"]
-    rows += [f"{i * dt!r},{0.1 * i * dt!r},0.0,{rng.normal(scale=1e-3)!r},0.1,0.0" for i in range(round(seconds / dt))]
+    rows += [f"{begin + i * dt!r},{0.1 * i * dt!r},0.0,{rng.normal(scale=1e-3)!r},0.1,0.0" for i in range(round(seconds / dt))]
     path.write_text("\n".join(rows) + "\n")
     return path
 
@@ -143,3 +143,23 @@ def test_a_certificate_that_rests_on_driving_needs_the_profile_that_says_so() ->
     assert "the profile makes none" in problem(load_profile(ROBOTARIUM), statements.assumption(vouching.driving))
     assert "another assumption" in problem(with_driving(block=5.0, because=BECAUSE), statements.assumption(vouching.driving))
     assert vouching.digest() != load_profile(ROBOTARIUM).digest()
+
+
+def test_several_drives_found_one_gap_in_whatever_order_they_are_named(tmp_path: Path) -> None:
+    plain = load_profile(ROBOTARIUM)
+    plain = msgspec.structs.replace(plain, model=ModelSpec("unicycle", plain.model.dt))
+    model = compose(plain.model)
+    share = ledger.share(plain.guarantee.beta, 1)
+    n = sample_size(plain.guarantee.epsilon, share / 2.0, plain.guarantee.discard)
+    vouching = msgspec.structs.replace(plain, driving=Driving(block=1.0, mixing=1e-9, because=BECAUSE))
+    drives = [driven_table(tmp_path / f"{k}.csv", n // 2 + 3 + k, plain.model.dt, begin=1e6 * k) for k in range(2)]
+    with pytest.raises(NotEnoughEvidence, match="more"):
+        gap_of(drives[:1], model, vouching, beta=share)
+    found = []
+    for named in (drives, drives[::-1]):
+        paths, digest = in_fixed_order(named)
+        gap, _, _ = gap_of(paths, model, vouching, beta=share)
+        assert gap.n == n
+        found.append((gap, digest))
+    assert found[0] == found[1]
+    assert in_fixed_order(drives[:1])[1] != found[0][1]

@@ -235,6 +235,10 @@ def test_damaged_files_are_one_line_or_read_as_far_as_they_hold(kind: str, tmp_p
         (b"SQLite format 3\0" + bytes(600), "is an SQLite database, and no ROS 2 bag"),
         (b"PK\x03\x04" + bytes(600), "is a ZIP archive"),
         (b"\x93NUMPY\x01\x00" + bytes(600), "is a NumPy array"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "is a pointer of Git LFS"),
+        (b"\n<!DOCTYPE html>\n<html>sign in</html>", "is a web page"),
+        (b'{"t": [0, 1],\n "x": [0, 1]}\n', "is JSON, which is not read"),
+        ("t,x\n0,1\n".encode("utf-16"), "is text in UTF-16"),
         (b"ULog\x01\x12\x35" + bytes(9), "this PX4 ULog holds no logged message"),
         (b"\xa3\x95\x80\x80\x59FMT\0BBnNZ\0", "this ArduPilot DataFlash log"),
         (b"PAR1" + bytes(20), "this Parquet file cannot be read"),
@@ -249,6 +253,36 @@ def test_what_is_known_and_not_read_is_said_by_its_name(content: bytes, why: str
         with pytest.raises(UsageError, match=why) as caught:
             load(path, MODEL)
         assert "\n" not in str(caught.value)
+
+
+def test_objects_of_a_matlab_class_cost_no_other_variable(tmp_path: Path) -> None:
+    """As MATLAB writes a string or a table: class 17 (opaque), its name, MCOS, the class, and a matrix of references."""
+    from scipy.io import savemat
+
+    def element(kind: int, data: bytes) -> bytes:
+        return struct.pack("<II", kind, len(data)) + data + bytes(-len(data) % 8)
+
+    path, other = tmp_path / "a.mat", tmp_path / "b.mat"
+    savemat(path, {"t": np.arange(9.0), "x": np.arange(9.0) ** 2})
+    savemat(other, {"s": np.arange(6, dtype=np.uint32)})
+    texts = b"".join(element(1, text) for text in (b"label", b"MCOS", b"string"))
+    opaque = element(6, struct.pack("<II", 17, 0)) + texts + other.read_bytes()[128:]
+    path.write_bytes(path.read_bytes() + element(14, opaque))
+    opened = open_recording(path)
+    assert [topic.fields for topic in opened.topics()] == [{"x": ""}]
+    assert any("objects of MATLAB classes" in note for note in opened.notes)
+    assert opened.read({"": ["x"]})[0].samples[""].values["x"].tolist() == [k * k for k in range(9)]
+
+
+def test_topics_of_a_table_know_its_stamps_by_their_usual_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("%time_ms,x\n0,1\n500,2\n")
+    assert main(["topics", str(path)]) == 0
+    assert "n 2  2 Hz" in capsys.readouterr().out
+    for text in ("some notes\nof a day\n", "timestamp x y\n0 1 2\n"):
+        path.write_text(text)
+        assert main(["topics", str(path)]) == 2
+        assert "is no table" in capsys.readouterr().err
 
 
 def test_dataflash_that_describes_a_message_without_a_length_is_refused(tmp_path: Path) -> None:

@@ -99,6 +99,11 @@ def test_segments_are_numbered_as_they_appear_and_time_may_start_again(write) ->
         (b"t,x\n0,\0\n", "line 2: holds a zero byte"),
         ("t;x\n0,5;1\n", "';' seems to stand between them; decimal numbers need a point"),
         ("t\tx\n0\t1\n", "'\\t' seems to stand between them"),
+        ("# a trajectory\n# timestamp tx ty qw\n0.1 1 2 1\n", "' ' seems to stand between them"),
+        ("1 0 0 0.1\n1 0 0 0.2\n", "it starts with numbers, must start with a header row"),
+        ("# only\n# comments\n", "lacks the columns 't', 'x'"),
+        ("t,x\n1403636580838555648,1\n", "column 't' has a stamp of 1.4e+18 s; if it is in ns, name it t_ns in the header"),
+        ("t,x\n1403636580838,1\n", "if it is in ms, name it t_ms"),
         ("t,x\n0,0,1,5\n", "line 2: has 4 cells, the header has 2; are there commas in decimal numbers? They need a point"),
         ('t,x\n0,"1,5"\n', "line 2: column 'x' is '1,5', must have a decimal point"),
         ("0,1\n0.1,2\n", "starts with numbers, must start with a header row that names the columns: t, x"),
@@ -113,6 +118,23 @@ def test_what_is_wrong_is_named_on_one_line(write, text: str | bytes, message: s
     assert told.startswith(str(path))
     assert "\n" not in told
     assert caught.value.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "#t_ns, x [m]\n0,1\n500000000,2\n",
+        "% time,x\n0,1\n0.5,2\n",
+        "# a drive in the hall\n#\n# t,x\n0,1\n0.5,2\n",
+        "# a drive in the hall, by hand\nt,x\n0,1\n0.5,2\n",
+    ],
+)
+def test_comments_before_the_table_are_no_rows_and_the_last_may_be_its_header(write, text: str) -> None:
+    table = read_csv(write(text), ("x",))
+    assert (table.t.tolist(), table.columns["x"].tolist()) == ([0.0, 0.5], [1.0, 2.0])
+    assert table.content == read_csv(write("t,x\n0,1\n0.5,2\n", "plain.csv"), ("x",)).content
+    with pytest.raises(RecordingError, match=f"line {text.count(chr(10)) + 1}: "):
+        read_csv(write(text + "1,zwei\n"), ("x",))
 
 
 def test_all_missing_columns_are_named_with_the_nearest(write) -> None:

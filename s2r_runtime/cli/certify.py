@@ -30,9 +30,11 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     verb.add_argument(
         "--recording",
         type=Path,
+        nargs="+",
+        action="extend",
         required=True,
         metavar="REC",
-        help="a campaign's MCAP; or a drive, if the profile vouches for blocks of it ([driving])",
+        help="a campaign's MCAP; or a drive, if the profile vouches for blocks of it ([driving]): a file, a bag's folder, or several",
     )
     verb.add_argument("-o", "--output", type=Path, required=True, metavar="CERT", help="where the certificate goes")
     verb.add_argument(
@@ -50,12 +52,12 @@ def run(args: argparse.Namespace) -> int:
     """Exit 0 with a certificate written, 1 if the controller did not pass (the attempt is spent all the same)."""
     from s2r_runtime import keys, offline_ledger
     from s2r_runtime.bounds import attempt_beta, epoch_beta
-    from s2r_runtime.cli.evidence import gap_of, profile_model, run_verification
+    from s2r_runtime.cli.evidence import gap_of, in_fixed_order, profile_model, run_verification
     from s2r_runtime.cli.trials_verb import trials_of
-    from s2r_runtime.table_text import file_digest
 
     writable(args.output, replaced=True)  # now, because what is spent below stays spent, whatever becomes of the certificate
-    inputs = {"the controller": args.controller, "the profile": args.profile, "the recording": args.recording, "the model": args.model}
+    inputs = {"the controller": args.controller, "the profile": args.profile, "the model": args.model}
+    inputs |= {f"the recording {path}": path for path in args.recording}
     apart({"-o": args.output}, {**inputs, "the key": args.key or keys.default_path()})
     profile = load_checked(args.profile)
     model = profile_model(args, profile)
@@ -63,11 +65,11 @@ def run(args: argparse.Namespace) -> int:
     key_path = args.key or keys.default_path()
     key = keys.load(key_path)
     controller = controller_at(args.controller, args.param)
-    recording = file_digest(args.recording)
+    recordings, recording = in_fixed_order(args.recording)
     trials = trials_of(args.trials, controller, model, profile) if args.trials else None
     ledger, beta = offline_ledger.open_ledger(key_path, profile.robot.name), profile.guarantee.beta
     epoch = ledger.epoch_for(recording, model.spec.digest(), profile.digest())
-    gap, assumption, period = gap_of(args.recording, model, profile, beta=epoch_beta(beta, epoch), epoch=epoch, max_gb=args.max_gb)
+    gap, assumption, period = gap_of(recordings, model, profile, beta=epoch_beta(beta, epoch), epoch=epoch, max_gb=args.max_gb)
     attempt = ledger.spend_attempt(controller.digest, epoch=epoch)
     result, behaviour = run_verification(
         controller,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +27,7 @@ from s2r_runtime.cli.choices import (
     transport_of,
     weights_of,
 )
-from s2r_runtime.errors import NotEnoughEvidence, UsageError
+from s2r_runtime.errors import NotEnoughEvidence, RecordingError, UsageError
 
 if TYPE_CHECKING:
     from s2r_runtime.controllers.hosted import ControllerFile
@@ -71,7 +72,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     verify.add_argument("--model", metavar="MODEL.toml", help="a repaired model instead of the profile's")
     size = verify.add_mutually_exclusive_group(required=True)
     size.add_argument("--radius", type=not_negative, metavar="R", help="radius of the gap set (0: the model as it is)")
-    size.add_argument("--recording", type=Path, metavar="REC", help="take radius and hold gap from this campaign")
+    size.add_argument(
+        "--recording", type=Path, nargs="+", action="extend", metavar="REC", help="take radius and hold gap from this campaign"
+    )
     verify.add_argument(
         "--hold-radius",
         type=positive,
@@ -158,7 +161,7 @@ def run_verify(args: argparse.Namespace) -> int:
 
     profile = load_checked(args.profile)
     model = profile_model(args, profile)
-    epoch_gap = gap_of(args.recording, model, profile, max_gb=args.max_gb)[0] if args.recording else None
+    epoch_gap = gap_of(in_fixed_order(args.recording)[0], model, profile, max_gb=args.max_gb)[0] if args.recording else None
     laws = tuple(args.law) if args.law else profile.verification.laws
     gap = epoch_gap or gap_at(args.radius, args.hold_radius, model, profile)
     headroom = args.headroom or (profile.verification.headroom if epoch_gap else 1.0)
@@ -209,8 +212,32 @@ def profile_model(args: argparse.Namespace, profile: Profile) -> ComposedModel:
     return compose(profile.model, f"{args.profile}: model")
 
 
+def in_fixed_order(paths: Sequence[Path]) -> tuple[list[Path], str]:
+    """The recordings by their digests, and the digest of all. Of several drives the first blocks count: which ones those are may not depend
+    on the order in which a person names them. Raises RecordingError.
+    """
+    from s2r_runtime.canonical import digest_of_all, digest_of_path
+    from s2r_runtime.table_text import refuse_special
+
+    found = []
+    for path in paths:
+        refuse_special(path)
+        try:
+            found.append((digest_of_path(path), path))
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+    found.sort()
+    return [path for _, path in found], digest_of_all([digest for digest, _ in found])
+
+
 def gap_of(
-    recording: Path, model: ComposedModel, profile: Profile, *, beta: float | None = None, epoch: int = 1, max_gb: float | None = None
+    recordings: Sequence[Path],
+    model: ComposedModel,
+    profile: Profile,
+    *,
+    beta: float | None = None,
+    epoch: int = 1,
+    max_gb: float | None = None,
 ) -> tuple[Gap, str, str]:
     """The gap that a campaign shows under the profile's settings, or driving that the profile vouches for; the assumption that it rests on;
     and which period of each hold gave the sample. beta: the epoch's share; without one the gap founds no certificate. Raises
@@ -221,7 +248,7 @@ def gap_of(
     from s2r_runtime.table_text import limits_of
     from s2r_runtime.transitions import load_transitions
 
-    found = load_transitions(recording, model, dict(profile.columns), transport=profile.transport, limits=limits_of(max_gb))
+    found = load_transitions(recordings, model, dict(profile.columns), transport=profile.transport, limits=limits_of(max_gb))
     output.notes(found.source, found.notes)
     share = beta or profile.guarantee.beta
     if found.drive is not None and profile.driving.block > 0.0:
@@ -231,7 +258,7 @@ def gap_of(
         found = blocked.founding(found, profile.driving, model.dt, epsilon=epsilon, share=share, discard=discard)
     if not found.independent:
         raise NotEnoughEvidence(
-            f"{recording}: is ordinary driving, not a campaign; its transitions are not independent, so its gap carries no statement, "
+            f"{found.source}: is ordinary driving, not a campaign; its transitions are not independent, so its gap carries no statement, "
             "unless the profile vouches for blocks of it: [driving]"
         )
     gap = gaps.estimate_gap(
@@ -246,7 +273,7 @@ def gap_of(
     )
     told = gaps.doubted(gap, found, (REPEATED,) if beta is None else NOT_INDEPENDENT)
     if told is not found:
-        raise NotEnoughEvidence(f"{recording}: {told.doubt}; its gap carries no statement")
+        raise NotEnoughEvidence(f"{found.source}: {told.doubt}; its gap carries no statement")
     return gap, found.assumption, "first" if found.holds is None else found.holds.law
 
 

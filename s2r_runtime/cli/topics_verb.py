@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import add_dbc, transport_of
-from s2r_runtime.errors import ConfigError, UsageError
+from s2r_runtime.errors import ConfigError, RecordingError, UsageError
 
 if TYPE_CHECKING:
     from s2r_runtime.formats.series import Topic
@@ -92,13 +92,16 @@ def _table(path: Path) -> Topic:
     import numpy as np
 
     from s2r_runtime.formats.series import Topic
-    from s2r_runtime.tables import SEGMENT, TIME, header_of, read_csv
+    from s2r_runtime.tables import SEGMENT, TIME, header_of, missing_columns, places_of, read_csv
 
     header = [name for name in header_of(path) if name and name != SEGMENT]
-    if TIME not in header:
-        return Topic("", "table", 0, math.nan, math.nan, dict.fromkeys(header, ""), "no column t (the stamps): --column t=NAME")
+    if len(header) <= 1:
+        raise RecordingError(f"{path}: is no table, and nothing else that is known here: {missing_columns([TIME], header)}")
+    stamps = places_of(path, [TIME], {}).get(TIME)
+    if stamps is None:
+        return Topic("", "table", 0, math.nan, math.nan, dict.fromkeys(header, ""), f"no column t (the stamps): --column {TIME}=NAME")
     table = read_csv(path, [])
-    fields = {name: "" for name in header if name != TIME}
+    fields = {name: "" for name in header if name != stamps.column}
     if table.segment is None:
         return Topic("", "table", len(table.t), float(table.t.min()), float(table.t.max()), fields)
     lasts = sum(float(np.ptp(table.t[table.segment == k])) for k in range(len(table.segments)))

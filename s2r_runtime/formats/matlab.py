@@ -9,7 +9,7 @@ Version 7.3 is HDF5 and is not read. The library takes in a variable at once, so
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,14 +30,14 @@ NEWEST = b"MATLAB 7.3"
 def open_matlab(path: Path) -> InMemory:
     """`Opened` for a MAT-file. Raises RecordingError."""
     from scipy import io
+    from scipy.io.matlab import MatlabOpaque
 
     check_size(path)
     with path.open("rb") as file:
         if file.read(len(NEWEST)) == NEWEST:
             raise RecordingError(f"{path}: this is a MATLAB file of version 7.3 (HDF5), which is not read; in MATLAB: save(FILE, '-v7')")
     try:
-        listed = io.whosmat(path)
-        check_values(path, sum(int(np.prod(shape, dtype=np.float64)) for _, shape, _ in listed))
+        check_values(path, sum(int(np.prod(shape, dtype=np.float64)) for _, shape, _ in _listed(path)))
         found = io.loadmat(path, struct_as_record=False, squeeze_me=True, chars_as_strings=True)
     except RecordingError:
         raise
@@ -57,9 +57,23 @@ def open_matlab(path: Path) -> InMemory:
         fields = {field: values for one, array in table.items() for field, values in _columns(one, array, len(t))}
         if fields:
             samples[name] = Samples(t, fields)
+    objects = any(isinstance(value, MatlabOpaque) for value in found.values())
+    note = "objects of MATLAB classes (string, datetime, table, timetable) are not read; save numbers: x = tab.x" if objects else ""
     if not samples and not unusable:
-        raise RecordingError(f"{path}: this MATLAB file holds no series: neither vectors nor structures of them")
-    return InMemory(KIND, [Run(samples)], unusable=unusable)
+        raise RecordingError(f"{path}: this MATLAB file holds no series: neither vectors nor structures of them" + (note and f"; {note}"))
+    return InMemory(KIND, [Run(samples)], unusable=unusable, notes=[note] if note else [])
+
+
+def _listed(path: Path) -> Sequence[tuple[str, tuple[int, ...], str]]:
+    """(name, shape, class) of the variables; none where SciPy cannot list them, as with objects of a class: then the memory of the
+    reader's process is what bounds them.
+    """
+    from scipy import io
+
+    try:
+        return io.whosmat(path)  # type: ignore[no-any-return]
+    except TypeError:
+        return ()
 
 
 def _tables(values: dict[str, Any], name: str, depth: int) -> Iterator[tuple[str, dict[str, Array]]]:

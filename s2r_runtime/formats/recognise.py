@@ -13,6 +13,7 @@ A file that is none of these is a table, or a log that a transport's plug-in rea
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import struct
 from collections.abc import Callable, Mapping
@@ -64,6 +65,8 @@ _MAGIC: tuple[tuple[bytes, Form], ...] = (
     (b"MATLAB 7.3 MAT-file", MATLAB),
 )
 
+_MARKUP = re.compile(rb"(\xef\xbb\xbf)?\s*<(!doctype|html|head|\?xml)\b", re.IGNORECASE)
+_JSON = re.compile(rb"(\xef\xbb\xbf)?\s*(\{\s*[\"}]|\[\s*[\[{\"])")
 _UNREAD: tuple[tuple[Callable[[bytes], bool], str], ...] = (
     (lambda head: head.startswith(HDF5), "is an HDF5 file, which is not read; write its series as CSV, Parquet or a MATLAB file (-v7)"),
     (lambda head: head.startswith(SQLITE), "is an SQLite database, and no ROS 2 bag (it lacks the tables topics and messages)"),
@@ -72,6 +75,10 @@ _UNREAD: tuple[tuple[Callable[[bytes], bool], str], ...] = (
     (lambda head: head.startswith(b"ARROW1"), "is an Arrow IPC (Feather) file, which is not read; write it as Parquet"),
     (lambda head: head.startswith((b"7z\xbc\xaf", b"BZh", b"\xfd7zXZ")), "is compressed; unpack it first"),
     (lambda head: head.startswith(b"%PDF"), "is a PDF document, no recording"),
+    (lambda head: head.startswith(b"version https://git-lfs"), "is a pointer of Git LFS, not the file itself; git lfs pull fetches that"),
+    (lambda head: _MARKUP.match(head) is not None, "is a web page (or XML), no recording; was the file itself downloaded?"),
+    (lambda head: _JSON.match(head) is not None, "is JSON, which is not read; write its series as CSV with a header row"),
+    (lambda head: head.startswith((b"\xff\xfe", b"\xfe\xff")) and b"\0" in head, "is text in UTF-16, must be UTF-8; save it as CSV UTF-8"),
 )
 
 

@@ -188,6 +188,17 @@ def test_parts_of_a_split_bag_are_read_in_order_and_a_missing_one_is_said(tmp_pa
     assert len(load_transitions(folder, MODEL).x0) == 58, "a recorder that died writes no metadata.yaml"
 
 
+def test_certify_reads_the_folder_of_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = Path(__file__).parents[3]
+    bags = [str(rosbag2(tmp_path / f"bag{seed}", driven(seed), StoragePlugin.MCAP)) for seed in (1, 2)]
+    key, cert = str(tmp_path / "key.pem"), str(tmp_path / "a.cert")
+    assert main(["keys", "new", key]) == 0
+    profile = ["--profile", str(root / "profiles" / "robotarium.toml")]
+    given = ["certify", str(root / "controllers" / "grid.py"), *profile, "--recording", *bags, "--key", key, "-o", cert]
+    assert main(given) == 3
+    assert f"{bags[0]}, {bags[1]}: is ordinary driving" in capsys.readouterr().err.replace(f"{bags[1]}, {bags[0]}", f"{bags[0]}, {bags[1]}")
+
+
 def test_decoding_agrees_with_an_independent_reader(tmp_path: Path) -> None:
     from rosbags.highlevel import AnyReader
 
