@@ -177,12 +177,19 @@ def _without_comments(lines: Iterator[str]) -> Iterator[str]:
             last = line.lstrip(" \t" + "".join(COMMENT))
             continue
         if last:
-            yield last if _is_number(re.split(r"[,;\s]", line.lstrip(), maxsplit=1)[0]) else "\n"
+            yield last if _names(last, line) else "\n"
         yield line
         break
     else:
         yield last
     yield from lines
+
+
+def _names(comment: str, row: str) -> bool:
+    """Whether a comment names the columns of the row of numbers behind it."""
+    sign = next((sign for sign in ",;" if sign in row), None)
+    cells = row.split(sign)
+    return len(cells) == len(comment.split(sign)) and bool(cells) and _is_number(cells[0])
 
 
 def _places(
@@ -220,11 +227,11 @@ def missing_columns(absent: list[str], header: list[str]) -> str:
     """What is wrong with a table that lacks these columns, or is none, in words."""
     if len(header) == 1 and (other := [sign for sign in (";", "\t", "|", " ") if len(header[0].split(sign)) > (1 if sign != " " else 2)]):
         names = ", ".join(map(repr, absent))
-        first = "" if not all(map(_is_number, header[0].split())) else "; it starts with numbers, must start with a header row"
-        return (
-            f"lacks {names}; are its columns separated by commas? {other[0]!r} seems to stand between them; "
-            f"decimal numbers need a point{first}"
-        )
+        said = f"lacks {names}; are its columns separated by commas? {other[0]!r} seems to stand between them; decimal numbers need a point"
+        if all(map(_is_number, header[0].split())):
+            said += "; it starts with numbers, must start with a header row"
+        blank = "; (echo NAME,NAME,...; grep -v '^#' FILE | tr -s '[:blank:]' ',') > FILE.csv writes it so"
+        return said + (blank if other[0] in "\t " else "")
     if all(_is_number(name) for name in header):
         return f"starts with numbers, must start with a header row that names the columns: {', '.join(absent)}, ..."
     return missing(absent, header)

@@ -432,7 +432,7 @@ def test_a_radius_may_be_zero_and_what_is_said_of_others_allows_for_that() -> No
 def test_stamps_that_tell_no_step_are_one_line(tmp_path: Path) -> None:
     path = tmp_path / "late.csv"
     path.write_text("t,x,y,theta,v,w\n" + "".join(f"{10**18 + 200 * k},0,0,0,0.1,0\n" for k in range(100)))
-    refused(s2r("gap", path, *MODEL), 2, "stamps are so large", "128 s")
+    refused(s2r("gap", path, *MODEL), 2, "has a stamp of 1e+18 s", "t_ns")
     path.write_text("t,x,y,theta,v,w\n" + "".join(f"5,{k},0,0,0.1,0\n" for k in range(100)))
     refused(s2r("gap", path, *MODEL), 3, "holds no transition")
 

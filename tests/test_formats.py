@@ -231,6 +231,7 @@ def test_damaged_files_are_one_line_or_read_as_far_as_they_hold(kind: str, tmp_p
             b"MATLAB 7.3 MAT-file, Platform: GLNXA64" + bytes(600),
             r"version 7.3 \(HDF5\), which is not read; in MATLAB: save\(FILE, '-v7'\)",
         ),
+        (b"MATLAB 7.0 MAT-file, HDF5 schema 0.05" + bytes(600), "is a MATLAB file of version 7.3"),
         (b"\x89HDF\r\n\x1a\n" + bytes(600), "is an HDF5 file, which is not read"),
         (b"SQLite format 3\0" + bytes(600), "is an SQLite database, and no ROS 2 bag"),
         (b"PK\x03\x04" + bytes(600), "is a ZIP archive"),

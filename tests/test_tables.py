@@ -101,6 +101,7 @@ def test_segments_are_numbered_as_they_appear_and_time_may_start_again(write) ->
         ("t\tx\n0\t1\n", "'\\t' seems to stand between them"),
         ("# a trajectory\n# timestamp tx ty qw\n0.1 1 2 1\n", "' ' seems to stand between them"),
         ("1 0 0 0.1\n1 0 0 0.2\n", "it starts with numbers, must start with a header row"),
+        ("# thanks to all\n# https://example.org/a\n0.1 1 2 1\n", "it starts with numbers, must start with a header row"),
         ("# only\n# comments\n", "lacks the columns 't', 'x'"),
         ("t,x\n1403636580838555648,1\n", "column 't' has a stamp of 1.4e+18 s; if it is in ns, name it t_ns in the header"),
         ("t,x\n1403636580838,1\n", "if it is in ms, name it t_ms"),

@@ -24,7 +24,8 @@ TIMES = ("t", "time", "Time", "tout", "timestamp", "stamp", "T")
 MAX_COLUMNS = 64
 """Of a matrix; a wider one is an image or a table of something else."""
 MAX_DEPTH = 4
-NEWEST = b"MATLAB 7.3"
+NEWEST = b"MATLAB 7."
+"""The first words of an HDF5 file by MATLAB: 7.3, and 7.0 before it."""
 
 
 def open_matlab(path: Path) -> InMemory:

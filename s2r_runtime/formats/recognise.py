@@ -5,7 +5,7 @@
     ROS 1 bag  "#ROSBAG V"                                   wiki.ros.org/Bags/Format/2.0
     MF4, MDF   "MDF     ", "UnFinMF "                        ASAM MDF 3 and 4, identification block
     Parquet    "PAR1"                                        parquet.apache.org
-    MATLAB     "MATLAB 5.0 MAT-file", "MATLAB 7.3 MAT-file" (which is HDF5), or the header of version 4
+    MATLAB     "MATLAB 5.0 MAT-file", "MATLAB 7.3 MAT-file" (which is HDF5, as 7.0 is), or the header of version 4
     rosbag2    an MCAP file of others, or SQLite with the tables `topics` and `messages`; or a folder of them
 
 A file that is none of these is a table, or a log that a transport's plug-in reads (`robot_logs`).
@@ -62,7 +62,7 @@ _MAGIC: tuple[tuple[bytes, Form], ...] = (
     (b"UnFinMF ", MDF),
     (b"PAR1", PARQUET),
     (b"MATLAB 5.0 MAT-file", MATLAB),
-    (b"MATLAB 7.3 MAT-file", MATLAB),
+    (b"MATLAB 7.", MATLAB),
 )
 
 _MARKUP = re.compile(rb"(\xef\xbb\xbf)?\s*<(!doctype|html|head|\?xml)\b", re.IGNORECASE)
