@@ -30,11 +30,10 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     verb.add_argument(
         "--recording",
         type=Path,
-        nargs="+",
-        action="extend",
+        action="append",
         required=True,
         metavar="REC",
-        help="a campaign's MCAP; or a drive, if the profile vouches for blocks of it ([driving]): a file, a bag's folder, or several",
+        help="a campaign's MCAP; or drives, also folders of bags, if the profile vouches for blocks of them ([driving]); may be repeated",
     )
     verb.add_argument("-o", "--output", type=Path, required=True, metavar="CERT", help="where the certificate goes")
     verb.add_argument(

@@ -73,7 +73,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     size = verify.add_mutually_exclusive_group(required=True)
     size.add_argument("--radius", type=not_negative, metavar="R", help="radius of the gap set (0: the model as it is)")
     size.add_argument(
-        "--recording", type=Path, nargs="+", action="extend", metavar="REC", help="take radius and hold gap from this campaign"
+        "--recording", type=Path, action="append", metavar="REC", help="take radius and hold gap from this campaign; may be repeated"
     )
     verify.add_argument(
         "--hold-radius",

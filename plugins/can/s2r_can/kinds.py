@@ -5,6 +5,7 @@ ASC       a line `base hex` or `base dec`, or the beginning of a trigger block (
 BLF       "LOGG" (Vector)
 TRC       comments with `;`, among them the file's version, its start time or its ruler (PCAN)
 CSV       the header row of python-can's writer
+SavvyCAN  a header row with the columns that SavvyCAN and GVRET loggers write
 SQLite    a database whose schema has python-can's table
 """
 
@@ -12,7 +13,9 @@ from __future__ import annotations
 
 import re
 
-CANDUMP, ASC, BLF, TRC, CSV, SQLITE = "candump", "ASC", "BLF", "TRC", "CSV", "SQLite"
+from s2r_can import savvycan
+
+CANDUMP, ASC, BLF, TRC, CSV, SAVVYCAN, SQLITE = "candump", "ASC", "BLF", "TRC", "CSV", "SavvyCAN", "SQLite"
 LINES = 40
 """So many lines of a text are looked at."""
 SHARE = 0.5
@@ -57,12 +60,17 @@ def is_csv(head: bytes) -> bool:
     return first.strip().lower() == HEADER
 
 
+def is_savvycan(head: bytes) -> bool:
+    """Whether it is a table of frames by SavvyCAN."""
+    return savvycan.is_header(head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 1)[0].decode("latin-1"))
+
+
 def is_sqlite(head: bytes) -> bool:
     """Whether it is a database of frames by python-can."""
     return head.startswith(b"SQLite format 3\0") and _SCHEMA.search(head) is not None
 
 
-KINDS = {CANDUMP: is_candump, ASC: is_asc, BLF: is_blf, TRC: is_trc, CSV: is_csv, SQLITE: is_sqlite}
+KINDS = {CANDUMP: is_candump, ASC: is_asc, BLF: is_blf, TRC: is_trc, CSV: is_csv, SAVVYCAN: is_savvycan, SQLITE: is_sqlite}
 SUFFIXES = {".log": CANDUMP, ".asc": ASC, ".blf": BLF, ".trc": TRC, ".csv": CSV, ".db": SQLITE}
 
 

@@ -1,4 +1,5 @@
-"""CAN logs as others write them: candump, Vector ASC and BLF, PCAN TRC, python-can's CSV, each also packed with gzip; its SQLite.
+"""CAN logs as others write them: candump, Vector ASC and BLF, PCAN TRC, the CSV of python-can and of SavvyCAN, each also packed with
+gzip; python-can's SQLite.
 
 Their content shows which kind it is (`kinds`). A log that ends in the middle of a frame, as where power failed, is read up to there.
 A few lines that cannot be read are left out and counted (`tally`); many refuse the log.
@@ -14,8 +15,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
-from s2r_can import binaries, candump, texts
-from s2r_can.kinds import BLF, CANDUMP, SQLITE, kind_of
+from s2r_can import binaries, candump, savvycan, texts
+from s2r_can.kinds import BLF, CANDUMP, SAVVYCAN, SQLITE, kind_of
 from s2r_can.records import LogFrame
 from s2r_can.tally import Tally
 from s2r_runtime.errors import RecordingError
@@ -38,6 +39,8 @@ def read_frames(path: Path, tally: Tally | None = None) -> Iterator[LogFrame]:
                 yield from binaries.blf(path, file, tally)
             elif kind == CANDUMP:
                 yield from candump.frames(path, _lines(file), tally)
+            elif kind == SAVVYCAN:
+                yield from savvycan.frames(path, _lines(file), tally)
             else:
                 logging.getLogger("can.io").setLevel(logging.CRITICAL)  # what it would print about lines is counted here
                 yield from texts.frames(path, kind, _lines(file), tally)

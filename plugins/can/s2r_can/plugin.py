@@ -10,6 +10,7 @@ LOGS = {
     "blf": ("Vector BLF", "blf"),
     "trc": ("PCAN TRC", "trc"),
     "csv": ("python-can CSV", "csv"),
+    "savvycan": ("SavvyCAN CSV", "savvycan"),
     "db": ("python-can SQLite", "sqlite"),
 }
 """Suffix -> (what it is, its recogniser in `kinds`)."""

@@ -143,6 +143,31 @@ def printed(style: str) -> Any:
     return write
 
 
+def savvycan(style: str) -> Any:
+    """As SavvyCAN exports its frames; loggers leave columns out, or write seconds and 0x."""
+
+    def write(path: Path, messages: list[can.Message]) -> None:
+        width = max(8, *(len(m.data) for m in messages))
+        columns = [
+            "Time Stamp",
+            "ID",
+            "Extended",
+            *(["Dir", "Bus"] if style == "whole" else []),
+            "LEN",
+            *(f"D{k + 1}" for k in range(width)),
+        ]
+        lines = [",".join(columns)]
+        for m in messages:
+            stamp = f"{round(m.timestamp * 1e6)}" if style == "whole" else f"{m.timestamp:.6f}"
+            name = f"{m.arbitration_id:08X}" if style == "whole" else f"0x{m.arbitration_id:x}"
+            data = [f"{b:02X}" for b in m.data] + [""] * (width - len(m.data))
+            side = ["Rx", str(m.channel)] if style == "whole" else []
+            lines.append(",".join([stamp, name, str(m.is_extended_id).lower(), *side, str(len(m.data)), *data]))
+        path.write_text("\n".join(lines) + "\n")
+
+    return write
+
+
 def line_1(rest: str) -> str:
     return "{k:>6})   {ms:10.1f}  " + rest
 
@@ -156,6 +181,8 @@ FORMS: dict[str, tuple[str, Any, str, float]] = {
     "asc without events line": ("a.asc", asc("bare"), "", MICRO),
     "blf": ("a.blf", lambda p, m: by(can.BLFWriter, p, m), "frec", 1.1e-3),  # python-can: the start is in ms, and may be rounded
     "csv": ("a.csv", lambda p, m: by(can.CSVWriter, p, m), "re", MICRO),
+    "savvycan": ("s.csv", savvycan("whole"), "fc", MICRO),
+    "savvycan of a logger": ("a.csv", savvycan("bare"), "f", MICRO),
     "sqlite": ("a.db", lambda p, m: by(can.SqliteWriter, p, m), "re", MICRO),
     "trc 2.1": ("a.trc", lambda p, m: by(can.TRCWriter, p, m), "c", 1.1e-6),
     "trc 1.0": ("a.trc", trc_1_0, "", 0.51e-3),
@@ -220,6 +247,7 @@ def test_every_form_gives_the_frames_that_were_written(tmp_path: Path, form: str
         ("a.asc", "   9.000000 1  Statistic: D 0 R 0 XD 0 XR 0 E 0 O 0 B 0.00%\n", "left out: 1 events that are no CAN frame"),
         ("a.asc", "   9.000000 1  201             Rx   d 8 E8 FB 00\n", "1 line could not be read and is left out, the first is line"),
         ("a.asc", "   9.000000 1  201             TxRq d 1 E8\n", "left out: 1 requests to send"),
+        ("s.csv", "12,1FF,false,Rx,0,2,0A,xx,,,,,,\n", "1 line could not be read and is left out, the first is line"),
         ("a.csv", "1700000099.0,0x1,0,0,0,2,====x\n", "1 line could not be read and is left out, the first is line"),
         ("a.log", "(1700000099.0) can0 12#00\n", "1 line could not be read and is left out, the first is line"),
         ("a.log", "(1700000099.0) can0 123#0011", ""),
@@ -227,7 +255,7 @@ def test_every_form_gives_the_frames_that_were_written(tmp_path: Path, form: str
     ],
 )
 def test_what_cannot_be_used_is_counted_and_the_rest_is_read(tmp_path: Path, name: str, extra: str, note: str) -> None:
-    form = next(key for key in ("trc 2.1", "asc", "csv", "log") if FORMS[key][0] == name)
+    form = next(key for key in ("trc 2.1", "asc", "csv", "savvycan", "log") if FORMS[key][0] == name)
     messages, path, tally = frames(1), tmp_path / name, Tally()
     FORMS[form][1](path, messages)
     lines = path.read_bytes().splitlines(keepends=True)

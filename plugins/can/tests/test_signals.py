@@ -14,6 +14,9 @@ from s2r_can.signals import open_log
 
 from s2r_runtime.cli.main import main
 from s2r_runtime.errors import RecordingError
+from s2r_runtime.models.composed import compose
+from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.transitions import load_transitions
 
 SPEC = importlib.util.spec_from_file_location("random_dbc", Path(__file__).with_name("random_dbc.py"))
 assert SPEC is not None
@@ -137,6 +140,13 @@ def test_gap_takes_signals_of_a_can_log_without_a_profile(tmp_path: Path, capsys
     assert "--dbc" in capsys.readouterr().err
     assert main(["gap", str(log), *model, "--dbc", str(dbc), "--state", "q=State.Position"]) == 2
     assert "nearest: State.Pos" in capsys.readouterr().err
+
+
+def test_signals_that_are_named_go_before_a_profile_whose_dbc_names_them(tmp_path: Path) -> None:
+    log = joint_log(tmp_path / "drive.log")
+    transport = {"name": "can", "dbc": {"file": "joint.dbc", "text": JOINT}, "states": {"q": "State.Pos"}, "trigger": "State"}
+    named = {"q": "State.Pos", "qd": "State.Speed", "force": "Cmd.Force"}
+    assert len(load_transitions(log, compose(ModelSpec("joint", 0.01)), transport=transport, signals=named).x0) > 1900
 
 
 def test_values_that_are_no_measurement_are_missing_and_counted(tmp_path: Path) -> None:

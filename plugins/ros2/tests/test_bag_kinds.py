@@ -194,7 +194,19 @@ def test_certify_reads_the_folder_of_a_bag(tmp_path: Path, capsys: pytest.Captur
     key, cert = str(tmp_path / "key.pem"), str(tmp_path / "a.cert")
     assert main(["keys", "new", key]) == 0
     profile = ["--profile", str(root / "profiles" / "robotarium.toml")]
-    given = ["certify", str(root / "controllers" / "grid.py"), *profile, "--recording", *bags, "--key", key, "-o", cert]
+    given = [
+        "certify",
+        str(root / "controllers" / "grid.py"),
+        *profile,
+        "--recording",
+        bags[0],
+        "--recording",
+        bags[1],
+        "--key",
+        key,
+        "-o",
+        cert,
+    ]
     assert main(given) == 3
     assert f"{bags[0]}, {bags[1]}: is ordinary driving" in capsys.readouterr().err.replace(f"{bags[1]}, {bags[0]}", f"{bags[0]}, {bags[1]}")
 
