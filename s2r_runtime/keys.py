@@ -23,6 +23,7 @@ from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
+from s2r_runtime.bounded_file import read_bounded
 from s2r_runtime.errors import ConfigError
 
 FILE_MAX = 16 << 10
@@ -111,11 +112,7 @@ def _parsed(pem: bytes, path: Path) -> Ed25519PrivateKey:
 
 def load_public(path: Path) -> bytes:
     """The public key's 32 bytes. Raises ConfigError if it can't be read or is no Ed25519 public key."""
-    try:
-        with path.open("rb") as file:
-            pem = file.read(FILE_MAX)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    pem = read_bounded(path, FILE_MAX)
     try:
         key = serialization.load_pem_public_key(pem)
     except (ValueError, UnsupportedAlgorithm):

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 
+from s2r_runtime.bounded_file import MB, read_bounded
 from s2r_runtime.canonical import canonical, digest_of
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.modelspec import ModelSpec
@@ -405,9 +406,9 @@ def _read_files(
             options[option] = {"file": name, "text": given[name]}
             continue
         try:
-            data = (base / name).read_bytes()
-        except OSError as error:
-            raise ConfigError(f"{where}: transport.{option}: {base / name}: cannot be read: {error.strerror}") from None
+            data = read_bounded(base / name, 16 * MB)
+        except ConfigError as error:
+            raise ConfigError(f"{where}: transport.{option}: {error}") from None
         try:
             options[option] = {"file": name, "text": data.decode("utf-8-sig")}
         except UnicodeDecodeError:  # older tools on Windows

@@ -11,6 +11,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from s2r_runtime.bounded_file import read_bounded
 from s2r_runtime.errors import ConfigError, one_line
 
 TEXT_MAX = 4 << 20
@@ -28,16 +29,8 @@ def load_toml(path: Path) -> dict[str, Any]:
 
 
 def read_text(path: Path) -> str:
-    """A file's text. Raises ConfigError for what cannot be read, is too long (a device has no end), or is not UTF-8."""
-    try:
-        with path.open("rb") as file:
-            data = file.read(TEXT_MAX + 1)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:  # a NUL in its name
-        raise ConfigError(f"{path}: is no path: {error}") from None
-    if len(data) > TEXT_MAX:
-        raise ConfigError(f"{path}: has more than {TEXT_MAX} bytes")
+    """A file's text. Raises ConfigError for what cannot be read, is no regular file, is too long, or is not UTF-8."""
+    data = read_bounded(path, TEXT_MAX)
     try:
         return data.decode()
     except UnicodeDecodeError as error:

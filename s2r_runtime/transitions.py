@@ -16,6 +16,7 @@ CSV without segments, a log in a robot's own format (`robot_logs`), and a file w
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -309,7 +310,7 @@ def _rows(rows: Sequence[Array], width: int) -> Array:
 def from_mcap(path: Path, model: ComposedModel, *, epoch: int | None = None) -> Transitions:
     """Samples of a log's campaign: the last complete one, or `epoch`. Raises RecordingError."""
     log = _read_log(path, model)
-    recording = digest_of_path(path)
+    recording = digest_of_path(path) if log.samples or any(log.rows) else ""
     if epoch is not None and epoch not in log.samples:
         there = ", ".join(str(e) for e in log.samples) or "none"
         raise RecordingError(f"{path}: has no samples of epoch {epoch}; it has samples of: {there}")
@@ -382,24 +383,24 @@ def _standing_noise(samples: Sequence[SampleTaken]) -> Array | None:
 class _Log:
     """What a log holds of states, inputs and samples (by epoch and index), in its order.
 
-    rows: a list a stretch (a new one wherever the robot's clock went back or its link changed: it may have been restarted) of (stamp s,
-    x or (), u or ()). identity: of the run, which a model remembers that was fitted on its driving (guarantee G6).
+    rows: of each stretch (a new one wherever the robot's clock went back or its link changed: it may have been restarted) stamp in s, x and
+    u, one number after the other, NaN where there is none: a long log is millions of them. identity: of the run, which a model remembers
+    that was fitted on its driving (guarantee G6).
     """
 
     samples: dict[int, dict[int, SampleTaken]]
     finished: dict[int, CampaignFinished]
-    rows: list[list[tuple[float, tuple[float, ...], tuple[float, ...]]]]
+    rows: list[array[float]]
     identity: str = ""
 
     def stretches(self, model: ComposedModel) -> list[Streams]:
         """Measured states and inputs sent, by the robot's stamps."""
-        no_x, no_u = (np.nan,) * len(model.states), (np.nan,) * len(model.inputs)
-        found = []
+        nx, found = len(model.states), []
         for rows in self.rows:
-            rows.sort(key=lambda row: row[0])
-            if rows:
-                t, x, u = zip(*((t, x or no_x, u or no_u) for t, x, u in rows), strict=True)
-                found.append(Streams(np.array(t), np.array(x), np.array(u)))
+            table = np.frombuffer(rows, dtype=np.float64).reshape(-1, 1 + nx + len(model.inputs))
+            table = table[np.argsort(table[:, 0], kind="stable")]
+            if len(table):
+                found.append(Streams(table[:, 0], table[:, 1 : 1 + nx], table[:, 1 + nx :]))
         return found
 
 
@@ -407,7 +408,8 @@ def _read_log(path: Path, model: ComposedModel) -> _Log:
     from s2r_runtime.recording.stretches import log_identity
     from s2r_runtime.recording.writer import read
 
-    log = _Log({}, {}, [[]])
+    log = _Log({}, {}, [array("d")])
+    no_x, no_u = (np.nan,) * len(model.states), (np.nan,) * len(model.inputs)
     reading = read(path, CHANNELS)
     log.identity = log_identity(reading.run, reading.public_key)
     seen: dict[int, tuple[int, int]] = {}  # seq -> (daemon's clock, robot's clock), both ns: when the last observation came
@@ -417,15 +419,17 @@ def _read_log(path: Path, model: ComposedModel) -> _Log:
                 _check_robot(path, model, started)
             case LinkChanged():
                 seen.clear()
-                log.rows.append([])
+                log.rows.append(array("d"))
             case Observed(t_ns, observation) if not observation.fault:
                 if seen and observation.stamp_ns < next(iter(seen.values()))[1]:
-                    log.rows.append([])
+                    log.rows.append(array("d"))
                 seen = {observation.seq: (t_ns, observation.stamp_ns)}
-                log.rows[-1].append((observation.stamp_ns * 1e-9, observation.x, ()))
+                _check_width(path, "observations", observation.x, model.states)
+                log.rows[-1].extend((observation.stamp_ns * 1e-9, *observation.x, *no_u))
             case Send() as send if send.obs_seq in seen:
                 heard_ns, stamp_ns = seen[send.obs_seq]
-                log.rows[-1].append(((stamp_ns + max(0, send.t_ns - heard_ns)) * 1e-9, (), send.u))
+                _check_width(path, "commands", send.u, model.inputs)
+                log.rows[-1].extend(((stamp_ns + max(0, send.t_ns - heard_ns)) * 1e-9, *no_x, *send.u))
             case SampleTaken() as sample:
                 log.samples.setdefault(sample.epoch, {}).setdefault(sample.index, sample)  # one logged once more is the same
             case CampaignFinished() as finished:
@@ -433,6 +437,11 @@ def _read_log(path: Path, model: ComposedModel) -> _Log:
     if reading.ending is not None and reading.ending.kind == "broken":
         raise RecordingError(f"{path}: is damaged {reading.ending.detail}")
     return log
+
+
+def _check_width(path: Path, what: str, values: tuple[float, ...], names: tuple[str, ...]) -> None:
+    if len(values) != len(names):
+        raise RecordingError(f"{path}: has {what} of {len(values)} numbers, the model has {', '.join(names)}")
 
 
 def _check_robot(path: Path, model: ComposedModel, started: Started) -> None:

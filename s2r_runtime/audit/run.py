@@ -17,6 +17,7 @@ from s2r_runtime.audit.findings import Findings
 from s2r_runtime.audit.inputs import InputsReplay
 from s2r_runtime.audit.older import as_recorded
 from s2r_runtime.audit.traces import RELEVANT, Traces
+from s2r_runtime.bounded_file import read_bounded
 from s2r_runtime.canonical import digest
 from s2r_runtime.core.state import unix_now
 from s2r_runtime.core.status import against_sampler
@@ -383,7 +384,7 @@ class RunAudit:
 
         if spec.name.endswith(".py"):
             path = Path(spec.name)
-            same = self._rerun and path.is_file() and digest(path.read_bytes()) == spec.source_digest
+            same = self._rerun and path.is_file() and digest(read_bounded(path)) == spec.source_digest
             if not same:
                 self._findings.cannot(f"the model is the file {spec.name}, which runs only with --rerun-controllers and unchanged")
                 return None

@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from s2r_runtime.bounded_file import read_bounded
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import count, positive
 from s2r_runtime.cli.presence import Presence
-from s2r_runtime.errors import UsageError
+from s2r_runtime.errors import ConfigError, UsageError
 
 WAITING = ("sample", "excite", "deploy", "trace", "verify")
 """Requests whose answer takes long. A person who leaves before it stops what drives for it."""
@@ -198,9 +199,9 @@ def run_deploy(args: argparse.Namespace) -> int:
     request: dict[str, Any] = {"verb": "deploy", "path": str(args.controller.resolve()), "parameters": _parameters(args.param)}
     if args.certificate:
         try:
-            request["certificate"] = args.certificate.read_text(encoding="utf-8")
-        except OSError as error:
-            raise UsageError(f"{args.certificate}: cannot be read: {error.strerror}") from None
+            request["certificate"] = read_bounded(args.certificate).decode()
+        except ConfigError as error:
+            raise UsageError(str(error)) from None
         except UnicodeDecodeError:
             raise UsageError(f"{args.certificate}: is no certificate: not UTF-8 text") from None
     code = _say(args, request)
@@ -212,11 +213,12 @@ def run_deploy(args: argparse.Namespace) -> int:
 def run_adopt(args: argparse.Namespace) -> int:
     """Exit 0 if the model is in force."""
     from s2r_runtime.modelspec import load_model
+    from s2r_runtime.toml_text import read_text
 
     if args.model is None:
         return _say(args, {"verb": "adopt"})
     load_model(args.model)
-    return _say(args, {"verb": "adopt", "text": args.model.read_text(encoding="utf-8"), "base": str(args.model.resolve().parent)})
+    return _say(args, {"verb": "adopt", "text": read_text(args.model), "base": str(args.model.resolve().parent)})
 
 
 def run_live_trace(args: argparse.Namespace) -> int:

@@ -70,7 +70,9 @@ def _listed(path: Path, described: dict[str, Any] | None) -> tuple[str, Sequence
     from s2r_runtime.formats.recognise import open_recording
     from s2r_runtime.formats.routes import Named, form_of, signals_of_log
     from s2r_runtime.robot_logs import is_mcap, is_robot_log
+    from s2r_runtime.table_text import refuse_special
 
+    refuse_special(path)
     form = form_of(path)
     named = Named(form, {}) if form else None if is_mcap(path) else signals_of_log(path, described)
     if described and not (named and named.options):

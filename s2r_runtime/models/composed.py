@@ -30,6 +30,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.bounded_file import read_bounded
 from s2r_runtime.canonical import digest
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import Effect, NominalModel, Parameter
@@ -408,8 +409,4 @@ def resolve_source(spec: ModelSpec, base: Path) -> ModelSpec:
     if not spec.name.endswith(".py"):
         return spec
     path = (base / spec.name).resolve()
-    try:
-        source = path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{path}: model file cannot be read: {error.strerror}") from None
-    return msgspec.structs.replace(spec, name=str(path), source_digest=digest(source))
+    return msgspec.structs.replace(spec, name=str(path), source_digest=digest(read_bounded(path)))

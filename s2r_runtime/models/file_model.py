@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.bounded_file import read_bounded
 from s2r_runtime.canonical import digest
 from s2r_runtime.errors import ConfigError, one_line
 from s2r_runtime.hookspecs import Follows, NominalModel
@@ -188,9 +189,9 @@ def load_file_model(spec: ModelSpec, where: str) -> NominalModel:
     """The model in the file that `spec` names. Raises ConfigError saying what is wrong, and in which line."""
     path = Path(spec.name)
     try:
-        source = path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{where}.name: {path} cannot be read: {error.strerror}") from None
+        source = read_bounded(path)
+    except ConfigError as error:
+        raise ConfigError(f"{where}.name: {error}") from None
     module = _run(path)
     if spec.source_digest and spec.source_digest != digest(source):
         raise ConfigError(f"{path}: has changed since the model was saved (digest {digest(source)}, saved {spec.source_digest})")

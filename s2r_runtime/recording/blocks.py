@@ -6,6 +6,8 @@ writer would have written; otherwise `Damage` says where it isn't.
 
 from __future__ import annotations
 
+import errno
+import os
 import zlib
 from array import array
 from typing import BinaryIO, NamedTuple
@@ -13,7 +15,19 @@ from typing import BinaryIO, NamedTuple
 import zstandard
 from mcap.opcode import Opcode
 
-from s2r_runtime.recording.layout import CHUNK, CHUNK_FIELDS, MAX_CHUNK, MESSAGE, MESSAGE_FIELDS, RECORD, declared, index_records, stored
+from s2r_runtime.recording.layout import (
+    ATTACHED_MAX,
+    CHUNK,
+    CHUNK_FIELDS,
+    MAX_CHUNK,
+    MAX_MESSAGES,
+    MESSAGE,
+    MESSAGE_FIELDS,
+    RECORD,
+    declared,
+    index_records,
+    stored,
+)
 
 _DECOMPRESSOR = zstandard.ZstdDecompressor()
 _MARK = (4).to_bytes(4, "little") + b"zstd"
@@ -81,6 +95,8 @@ def take(file: BinaryIO, offset: int, size: int, start: bytes = b"", *, strict: 
             return block
         if at + RECORD.size + length > size:
             raise Damage(at, "the file ends inside an attachment", cut=True)
+        if at + RECORD.size + length - offset > ATTACHED_MAX:  # before memory is taken for what a length claims
+            raise Damage(at, f"attachments of more than {ATTACHED_MAX >> 20} MB in a row")
         prefix.append(head + file.read(length))
         at += RECORD.size + length
 
@@ -91,7 +107,7 @@ def _chunk_block(file: BinaryIO, offset: int, at: int, size: int, prefix: list[b
         raise Damage(at, "the file ends inside a chunk", cut=True)
     head += file.read(CHUNK_FIELDS)
     _, length, first, last, content_size, crc, name_size, name, data_size = CHUNK.unpack(head)
-    if (name_size, name, data_size + CHUNK_FIELDS) != (4, b"zstd", length) or content_size > MAX_CHUNK:
+    if (name_size, name, data_size + CHUNK_FIELDS) != (4, b"zstd", length) or max(content_size, data_size) > MAX_CHUNK:
         raise Damage(at, "a chunk's head contradicts itself")
     if at + CHUNK.size + data_size > size:
         raise Damage(at, "the file ends inside a chunk", cut=True)
@@ -142,6 +158,8 @@ def _walk(content: bytes, at: int) -> tuple[list[bytes], list[Part], dict[int, a
         else:
             if publish_time != log_time:
                 raise Damage(at, "a message has two times")
+            if len(messages) == MAX_MESSAGES:
+                raise Damage(at, f"a chunk holds more than {MAX_MESSAGES} messages")
             messages.append((channel, sequence, log_time, position + step, stop))
             if (pairs := index.get(channel)) is None:
                 pairs = index[channel] = array("Q")
@@ -162,7 +180,7 @@ def extent(file: BinaryIO, size: int) -> int:
 
     Fewer than ZEROS may be its own.
     """
-    end = size
+    end = _after_data(file, size)
     while end > 0:
         start = max(0, end - (1 << 20))
         file.seek(start)
@@ -174,11 +192,36 @@ def extent(file: BinaryIO, size: int) -> int:
     return end if size - end >= ZEROS else size
 
 
+def _after_data(file: BinaryIO, size: int) -> int:
+    """Where the hole begins that a sparse file ends with, by bisection; `size` if there is none."""
+    low, high = 0, size
+    while low < high:
+        middle = (low + high) // 2
+        if _next_data(file, middle) is None:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+def _next_data(file: BinaryIO, offset: int) -> int | None:
+    """Where a sparse file has data at or after an offset; None for nowhere, and the offset itself where a file system cannot say."""
+    descriptor = file.fileno()
+    before = os.lseek(descriptor, 0, os.SEEK_CUR)  # the file object counts on it
+    try:
+        return os.lseek(descriptor, offset, os.SEEK_DATA)
+    except OSError as error:
+        return None if error.errno == errno.ENXIO else offset
+    finally:
+        os.lseek(descriptor, before, os.SEEK_SET)
+
+
 def find(file: BinaryIO, offset: int, size: int) -> int | None:
     """Offset of the next sound chunk at or after `offset`, however bad what lies before it; None if there is none."""
     window = 1 << 20
     at = offset
-    while at < size:
+    while at < size and (there := _next_data(file, at)) is not None:
+        at = max(at, there - _MARK_AT - len(_MARK))  # a hole holds no chunk
         file.seek(at)
         data = file.read(window + _MARK_AT + len(_MARK))
         position = data.find(_MARK, _MARK_AT)

@@ -33,6 +33,7 @@ from s2r_runtime.recording.layout import (
 )
 from s2r_runtime.recording.start import read_start
 from s2r_runtime.recording.summary import tail
+from s2r_runtime.table_text import refuse_special
 
 
 class Ending(msgspec.Struct, frozen=True):
@@ -66,6 +67,7 @@ class Reading:
     def __init__(self, path: Path, channels: Iterable[str] | None = None) -> None:
         self.path = path
         self.wanted = frozenset(CHANNELS) - {CHAIN} if channels is None else frozenset(channels)
+        refuse_special(path)
         try:
             with path.open("rb") as file:
                 self.size = os.fstat(file.fileno()).st_size

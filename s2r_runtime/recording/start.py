@@ -12,7 +12,7 @@ from mcap.records import Header
 
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.recording.chain import GENESIS
-from s2r_runtime.recording.layout import ABOUT, LIBRARY, MAGIC, RECORD, metadata_fields, metadata_record, pack
+from s2r_runtime.recording.layout import ABOUT, LIBRARY, MAGIC, RECORD, START_MAX, metadata_fields, metadata_record, pack
 from s2r_runtime.recording.origin import other_writer
 
 FIRST = MAGIC + pack(Header("", LIBRARY))
@@ -54,6 +54,8 @@ def read_start(file: BinaryIO, path: Path, size: int) -> Start:
     head = file.read(RECORD.size)
     if len(FIRST) + RECORD.size > size or len(FIRST) + RECORD.size + RECORD.unpack(head)[1] > size:
         return Start()
+    if RECORD.unpack(head)[1] > START_MAX:
+        raise RecordingError(f"{path}: its metadata is damaged: it claims {RECORD.unpack(head)[1]} bytes, at most {START_MAX} are read")
     record = head + file.read(RECORD.unpack(head)[1])
     try:
         name, fields = metadata_fields(record)

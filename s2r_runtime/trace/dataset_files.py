@@ -8,6 +8,7 @@ that it answers, plus what the daemon took to answer (`obs_seq` ties the two clo
 from __future__ import annotations
 
 import difflib
+from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -35,6 +36,8 @@ from s2r_runtime.trace.residual import check_steps
 from s2r_runtime.trace.unseen import unneeded, without
 
 Row = tuple[float, ...]
+RECENT = 4096
+"""Observations to which a command may still answer."""
 
 MAX_ROWS = 262_144
 """Rows of a table that are traced: a search takes as much longer as there are more, and a fit uses 4000 of them."""
@@ -71,17 +74,19 @@ def load_dataset(
     paths = tuple(Path(p) for p in ([path] if isinstance(path, str | Path) else path))
     for one in paths:
         refuse_special(one)
-    digests = tuple(_digest(p) for p in paths)
     source = ", ".join(str(p) for p in paths)
     own = [one for one in paths if _is_own_log(one)]
     if own and len(own) < len(paths):
         raise UsageError(f"{own[0]}: is a log of this software, other recordings are none; trace one kind at a time")
-    _once(paths, digests)
+    segments = _log_segments(paths, model, epoch) if own else []  # first: what is no log is refused before all of it is digested
     if own:
-        segments = _log_segments(paths, model, epoch)
+        digests = tuple(_digest(p) for p in paths) if any(len(states.t) for states, _ in segments) else ()
+        _once(paths, digests)
         return replace(from_streams(model, segments, source, (*digests, *row_sketch(model, segments)), paths), commanded=True)
     tables = _Tables(columns or {}, not bandwidth, MAX_ROWS // len(paths), limits, progress)
     parts = [_read_one(one, model, tables, transport, signals) for one in paths]
+    digests = tuple(_digest(p) for p in paths)
+    _once(paths, digests)
     _once(paths, [part.content for part in parts])
     segments, missing, called = _joined(paths, parts)
     rows: tuple[str, ...] = ()
@@ -279,7 +284,7 @@ class _Log:
     """Collects segments of (stamp, state) and (stamp, input) rows from a log's messages, in their order. epoch: as in `load_dataset`."""
 
     def __init__(self, model: ComposedModel, epoch: int | None) -> None:
-        self.segments: list[tuple[list[Row], list[Row]]] = [([], [])]
+        self.segments: list[tuple[array[float], array[float]]] = [_rows()]
         self._model, self._epoch = model, epoch
         self._inside = epoch is None
         self._stamps: dict[int, tuple[float, int]] = {}
@@ -298,10 +303,10 @@ class _Log:
             stamp, asked_ns = self._stamps[message.obs_seq]
             nu = len(self._model.inputs)
             _expect(len(message.u) == nu, path, f"commands of {len(message.u)} inputs, the model has {nu}")
-            self.segments[-1][1].append((stamp + max(message.t_ns - asked_ns, 0) * 1e-9, *message.u))
+            self.segments[-1][1].extend((stamp + max(message.t_ns - asked_ns, 0) * 1e-9, *message.u))
         elif isinstance(message, StartCampaign) and message.epoch == self._epoch:
             self._inside = True
-            self.segments.append(([self._row] if self._row else [], []))  # what the campaign is asked first is about this observation
+            self.segments.append((array("d", self._row), array("d")))  # what the campaign is asked first is about this observation
         elif isinstance(message, CampaignFinished) and message.epoch == self._epoch:
             self._inside = False
 
@@ -309,16 +314,23 @@ class _Log:
         o, (last_seq, last) = message.observation, self._last
         stamp, nx = o.stamp_ns * 1e-9, len(self._model.states)
         if o.seq < last_seq and stamp < last:  # both go back: the robot was started anew
-            self.segments.append(([], []))
+            self.segments.append(_rows())
             self._stamps.clear()
         elif stamp <= last:
             return
         self._last = o.seq, stamp
         self._stamps[o.seq] = stamp, message.t_ns
+        if len(self._stamps) > RECENT:
+            del self._stamps[next(iter(self._stamps))]
         _expect(len(o.x) == nx, path, f"observations of {len(o.x)} states, the model has {nx}")
         self._row = (stamp, *o.x)
         if self._inside:
-            self.segments[-1][0].append(self._row)
+            self.segments[-1][0].extend(self._row)
+
+
+def _rows() -> tuple[array[float], array[float]]:
+    """Rows of states, and of inputs, one number after the other: a long log is millions of them."""
+    return array("d"), array("d")
 
 
 def _expect(ok: bool, path: Path, what: str) -> None:
@@ -326,8 +338,8 @@ def _expect(ok: bool, path: Path, what: str) -> None:
         raise RecordingError(f"{path}: has {what}")
 
 
-def _stream(rows: list[Row], width: int) -> Stream:
+def _stream(rows: array[float], width: int) -> Stream:
     """Sorted by stamp; equal stamps keep their order."""
-    table: Array = np.array(rows, dtype=np.float64).reshape(-1, 1 + width)
+    table: Array = np.frombuffer(rows, dtype=np.float64).reshape(-1, 1 + width)
     table = table[np.argsort(table[:, 0], kind="stable")]
     return Stream(table[:, 0], table[:, 1:])
