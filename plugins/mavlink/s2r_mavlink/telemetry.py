@@ -2,13 +2,14 @@
 
 Each message is a topic. One with several senders is a topic a sender (`ATTITUDE[1:1]`: system, component), one with instances a topic an
 instance (`BATTERY_STATUS[0]`, `NAMED_VALUE_FLOAT[volts]`). Layouts and units are those of pymavlink's dialect `ardupilotmega`, which has
-`common` in it. Stamps are the logging computer's; a message with `time_boot_ms` has its sender's, too. Two passes: what there is, then the
-numbers that are wanted.
+`common` in it. So are the values that mean that there is none (65535 for `hdg`): they are missing. Stamps are the logging computer's; a
+message with `time_boot_ms` has its sender's, too. Two passes: what there is, then the numbers that are wanted.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import struct
 from array import array
 from collections import Counter
@@ -24,12 +25,15 @@ from fastcrc.crc16 import mcrf4xx as crc16
 from s2r_mavlink.frames import header, payload
 from s2r_mavlink.tlog_records import Record, checked, records
 from s2r_runtime.errors import RecordingError
-from s2r_runtime.formats.series import Run, Samples, Topic
+from s2r_runtime.formats.series import Array, Run, Samples, Topic
 from s2r_runtime.formats.sizes import check_values
 
 KIND = "MAVLink telemetry log"
 TIMES = ("time_boot_ms", "time_usec", "time_unix_usec")
 BOOT = "time_boot_ms"
+DEFINITIONS = ("minimal", "standard", "common", "ardupilotmega")
+NO_VALUE = re.compile(r"\[?(U?)INT(\d+)_MAX\]?")
+"""How a definition writes that a number is none, of a field or of each element of one."""
 Sender = tuple[str, int, int, str]
 """(message, system, component, instance)."""
 
@@ -110,9 +114,10 @@ class TelemetryLog:
             for column, value in zip(columns[name], row, strict=True):
                 column.append(value)
         found = {}
+        messages = {name: sender[0] for sender, name in sought.items()}
         for name, (host, boot, *series) in columns.items():
             stamps = np.array(boot)
-            fields = {field: np.array(one) for field, one in zip(wanted[name], series, strict=True)}
+            fields = {field: _known(messages[name], field, np.array(one)) for field, one in zip(wanted[name], series, strict=True)}
             found[name] = Samples(
                 np.array(host), fields, stamps if len(stamps) and np.ptp(stamps) > 0.0 else None
             )  # senders without a clock say 0
@@ -125,6 +130,31 @@ def layouts() -> dict[int, Layout]:
     from pymavlink.dialects.v20 import ardupilotmega
 
     return {number: _layout(message) for number, message in ardupilotmega.mavlink_map.items()}
+
+
+def _known(message: str, field: str, values: Array) -> Array:
+    """NaN where the dialect says that a value is none."""
+    none = _no_values().get((message, field.partition("[")[0]))
+    return values if none is None else np.where(values == none, math.nan, values)
+
+
+@cache
+def _no_values() -> dict[tuple[str, str], float]:
+    """(message, field) -> the value that means that there is none, by the definitions that pymavlink is made from."""
+    from xml.etree import ElementTree
+
+    from pymavlink.dialects import v20
+
+    found = {}
+    for name in DEFINITIONS:
+        path = Path(v20.__path__[0]) / f"{name}.xml"
+        for message in ElementTree.parse(path).iter("message") if path.exists() else ():  # noqa: S314 - of an installed package
+            for field in message.iter("field"):
+                none = NO_VALUE.fullmatch(field.get("invalid", ""))
+                if none is not None:
+                    sign, bits = none.groups()
+                    found[message.get("name", ""), field.get("name", "")] = float(2 ** (int(bits) - (not sign)) - 1)
+    return found
 
 
 def _layout(message: Any) -> Layout:

@@ -74,6 +74,19 @@ def test_every_number_is_what_pymavlink_packed(tmp_path: Path) -> None:
             assert np.array_equal(values, np.float32([getattr(one, field) for _, one in wrote]).astype(float)), field
 
 
+def test_what_means_that_there_is_none_is_missing(tmp_path: Path) -> None:
+    log = Station()
+    for k in range(4):
+        heading = 65535 if k % 2 else 9000
+        log.take(log.vehicle, 0.1 * k, log.vehicle.global_position_int_encode(100 * k, 0, 0, 0, 0, 0, 0, 0, heading))
+    path = tmp_path / "a.tlog"
+    path.write_bytes(log.data)
+    (run,) = open_tlog(path).read({"GLOBAL_POSITION_INT": ["hdg", "vx"]})
+    values = run.samples["GLOBAL_POSITION_INT"].values
+    assert [math.isnan(one) for one in values["hdg"]] == [False, True, False, True]
+    assert values["vx"].tolist() == [0.0] * 4
+
+
 def test_what_is_no_record_is_counted_and_costs_no_other(tmp_path: Path) -> None:
     log = drive(1.0)
     path = tmp_path / "a.tlog"
