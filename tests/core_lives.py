@@ -24,7 +24,7 @@ CASES = 260
 """Random walks and their steps, and seeded cases of faults: enough that every line of the core is run many times over."""
 LATER: dict[str, object] = {
     "refused_campaign": None,
-    "driven": None,
+    "driven": (),
     "gap_attempts": 0,
     "behaviours": (),
     "tries": None,

@@ -60,7 +60,7 @@ def test_it_is_remembered_over_a_restart_and_forgotten_when_a_person_clears_it()
     assert not verifies(rig)
     rig.request("deploy", digest="controller")
     assert verifies(rig)
-    assert of(rig.outputs, Persist)[-1].memory.driven is None
+    assert of(rig.outputs, Persist)[-1].memory.driven == ()
 
 
 def verifies(rig: Rig) -> bool:
@@ -99,14 +99,25 @@ def test_of_several_epochs_the_worst_is_kept() -> None:
     drive(rig, [0.004] * 300)
     rig.request("undeploy")
     rig.gap()
-    assert rig.state.memory.driven is not None
-    assert rig.state.memory.driven.epoch == 2
+    assert [one.epoch for one in rig.state.memory.driven] == [2]
     rig.deploying()
     drive(rig, [0.014] * 8)
     rig.request("undeploy")
     rig.gap()
     rig.gap(radius=0.012)
-    assert rig.state.memory.driven.epoch == 3
+    assert [one.epoch for one in rig.state.memory.driven] == [3]
+
+
+def test_an_epoch_of_another_model_between_them_forgets_nothing() -> None:
+    rig = driven_twice([0.014] * 8)
+    memory, settings = rig.state.memory, rig.settings
+    assert memory.gap is not None
+    for number in range(3):  # each drove a step, which establishes no limit
+        other = msgspec.structs.replace(memory.gap, model_digest=f"other {number % 2}")
+        drove = msgspec.structs.replace(memory, gap=other, watch_counts=(1,) + (0,) * (BINS - 1))
+        memory = msgspec.structs.replace(memory, driven=driven.kept(drove, settings.alpha))
+    assert len(memory.driven) == 3
+    assert driven.refusal(memory, settings)
 
 
 def test_an_audit_of_before_remembers_nothing() -> None:
@@ -115,7 +126,7 @@ def test_an_audit_of_before_remembers_nothing() -> None:
     drive(rig, [0.014] * 8)
     rig.request("undeploy")
     rig.gap()
-    assert rig.state.memory.driven is None
+    assert rig.state.memory.driven == ()
 
 
 @pytest.mark.parametrize("epsilon", [0.03, 0.3])

@@ -15,6 +15,8 @@ from s2r_runtime.core import stream
 from s2r_runtime.messages import Driven, Gap, Memory, Settings
 
 REASON = "driving_exceeds_sampling"
+KINDS = 8
+"""Models, norms and quantiles of which driving is remembered: to adopt another model and this one again forgets nothing."""
 
 
 def of_watch(memory: Memory, gap: Gap, alpha: float) -> Driven | None:
@@ -26,19 +28,22 @@ def of_watch(memory: Memory, gap: Gap, alpha: float) -> Driven | None:
     return Driven(gap.model_digest, gap.set, gap.weights, gap.epsilon, gap.epoch, n, lower, upper)
 
 
-def kept(memory: Memory, alpha: float) -> Driven | None:
-    """What is remembered when the watch in force ends: of epochs that compare, the one that drove worst."""
-    before, gap = memory.driven, memory.gap
+def kept(memory: Memory, alpha: float) -> tuple[Driven, ...]:
+    """What is remembered when the watch in force ends: of each model, norm and quantile the epoch that drove worst, the newest `KINDS`."""
+    gap = memory.gap
     now = None if gap is None else of_watch(memory, gap, alpha)
-    if before is None or now is None or gap is None:
-        return now or before
-    return before if _comparable(before, gap) and _level(before) >= _level(now) else now
+    if gap is None or now is None:
+        return memory.driven
+    before = _comparable(memory.driven, gap)
+    worst = before if before is not None and _level(before) >= _level(now) else now
+    return (*(one for one in memory.driven if one is not before), worst)[-KINDS:]
 
 
 def refusal(memory: Memory, settings: Settings) -> str:
     """Why the gap in force carries no deployment, or empty: earlier driving exceeded it, by the lower limit."""
-    gap, driven = memory.gap, memory.driven
-    if gap is None or driven is None or not _comparable(driven, gap) or driven.lower is None or driven.lower < gap.radius:
+    gap = memory.gap
+    driven = None if gap is None else _comparable(memory.driven, gap)
+    if gap is None or driven is None or driven.lower is None or driven.lower < gap.radius:
         return ""
     times = f"{driven.lower / gap.radius:.3g} times" if gap.radius > 0.0 else "beyond"
     return (
@@ -53,8 +58,9 @@ def status(memory: Memory, settings: Settings | None) -> dict[str, object] | Non
 
     None where nothing was driven that compares with that gap. A ratio is None where its limit is not established, or the gap is 0.
     """
-    gap, driven = memory.gap, None if settings is None else kept(memory, settings.alpha)
-    if gap is None or driven is None or not _comparable(driven, gap):
+    gap = memory.gap
+    driven = None if gap is None or settings is None else _comparable(kept(memory, settings.alpha), gap)
+    if gap is None or driven is None:
         return None
 
     def ratio(limit: float | None) -> float | None:
@@ -63,9 +69,10 @@ def status(memory: Memory, settings: Settings | None) -> dict[str, object] | Non
     return {**msgspec.structs.asdict(driven), "ratio_lower": ratio(driven.lower), "ratio_upper": ratio(driven.upper)}
 
 
-def _comparable(driven: Driven, gap: Gap) -> bool:
-    """Whether both are of one model, norm and quantile."""
-    return (driven.model_digest, driven.set, driven.weights, driven.epsilon) == (gap.model_digest, gap.set, gap.weights, gap.epsilon)
+def _comparable(driven: tuple[Driven, ...], gap: Gap) -> Driven | None:
+    """The one of the gap's model, norm and quantile."""
+    key = gap.model_digest, gap.set, gap.weights, gap.epsilon
+    return next((one for one in driven if (one.model_digest, one.set, one.weights, one.epsilon) == key), None)
 
 
 def _level(driven: Driven) -> float:

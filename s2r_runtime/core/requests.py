@@ -134,8 +134,8 @@ def _clear(turn: Turn, request: Requested) -> None:
         wall_clock.clear(turn, request.request_id)
         regate(turn)
         return
-    if reason == driven.REASON and turn.memory.driven is not None:
-        turn.remember(driven=None)
+    if reason == driven.REASON and turn.memory.driven:
+        turn.remember(driven=())
         turn.persist()
         turn.answer(request.request_id, 0, "what earlier driving showed is forgotten; the watch goes on")
         return

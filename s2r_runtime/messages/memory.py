@@ -187,8 +187,8 @@ class Memory(Struct, frozen=True):
     """Digests of the transitions whose gaps ended refuted or outgrown: they found no later epoch."""
     refused_campaign: RefusedCampaign | None = None
     """The newest campaign, if its samples depend on each other; None as soon as a later one found a gap."""
-    driven: Driven | None = None
-    """What driving showed in the epochs before this one, where it was worst."""
+    driven: tuple[Driven, ...] = ()
+    """What driving showed in the epochs before this one: of each model, norm and quantile the epoch where it was worst."""
     gap_attempts: int = 0
     """Verification attempts on the gap in force, as far as they were counted (rules 5)."""
     behaviours: tuple[str, ...] = ()
