@@ -29,6 +29,7 @@ LATER: dict[str, object] = {
     "behaviours": (),
     "tries": None,
     "latest_unix_s": 0,
+    "clock_cleared": 0,
 }
 """Fields of memory and outputs that came after the lives were recorded: at their defaults they say nothing else than before."""
 LATER_STATUS = ("refused_campaign", "next_campaign", "next_attempt", "driven", "clock_behind_s")

@@ -541,4 +541,5 @@ def test_a_clock_that_was_ahead_by_mistake_is_believed_again_by_a_person_and_wha
     rig.feed(WallClockRead(rig.t, 1501))
     assert "1 certificates had expired" in one(rig.request("clear", text="wall_clock"), Answer).text
     assert (unix_now(rig.state), rig.state.memory.latest_unix_s) == (1501, 1501)
+    assert rig.state.memory.clock_cleared == 1
     assert rig.state.memory.revoked == {identity: "expired"}

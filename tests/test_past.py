@@ -148,6 +148,14 @@ def test_what_is_latched_in_the_log_or_in_an_older_state_stays_latched(tmp_path:
     assert reconciled(changed(attempts=1, latched=("watch_alarm",)), tmp_path)[0].latched == ("emergency_stop", "watch_alarm")
 
 
+def test_a_run_whose_clock_was_ahead_is_not_believed_again_once_a_person_cleared_it(tmp_path: Path) -> None:
+    log(tmp_path, changed(latest_unix_s=4_000_000_000), stamp="20961002T070640Z")
+    assert reconciled(changed(latest_unix_s=1_800_000_000), tmp_path)[0].latest_unix_s == 4_000_000_000
+    right = changed(latest_unix_s=1_800_000_000, clock_cleared=1)
+    log(tmp_path, right, stamp="20270115T080000Z")
+    assert reconciled(right, tmp_path) == (right, "")
+
+
 def test_only_a_log_that_is_sound_and_this_robots_own_is_believed(tmp_path: Path) -> None:
     path = log(tmp_path, NOW, key=OTHER)
     with pytest.raises(ConfigError, match="does not trust"):

@@ -51,6 +51,6 @@ def clear(turn: Turn, request_id: int) -> None:
     expired = [facts.id for facts in turn.memory.certificates if facts.expires_unix_s <= now]
     revoke(turn, expired, "expired")
     turn.set(unix_s=reading, unix_ns=turn.now)
-    turn.remember(latest_unix_s=reading)
+    turn.remember(latest_unix_s=reading, clock_cleared=turn.memory.clock_cleared + 1)
     turn.persist()
     turn.answer(request_id, 0, f"the clock is believed as it is, {now - reading} s back; {len(expired)} certificates had expired")

@@ -55,7 +55,9 @@ def reconciled(state: Memory, folder: Path, keys: Collection[bytes], say: Callab
     seen = 0
     for told, path in islice(_told(folder, state.robot), RUNS):
         if latest is None:
-            latest, seen = told.latched, told.latest_unix_s
+            latest = told.latched
+            # a run whose clock was ahead has the newest name for long; since then a person may have said so
+            seen = told.latest_unix_s if told.clock_cleared >= state.clock_cleared else 0
         if what := forgotten(told, state):
             if gained := forgotten(state, told):
                 raise ConfigError(

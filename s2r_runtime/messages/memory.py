@@ -193,5 +193,7 @@ class Memory(Struct, frozen=True):
     """Verification attempts on the gap in force, as far as they were counted (rules 5)."""
     behaviours: tuple[str, ...] = ()
     """Of the controllers tried on it, each once, the newest `BEHAVIOURS`: `JobFinished.behaviour`, else the controller's digest."""
+    clock_cleared: int = 0
+    """How often a person said that the clock is right although it is behind the latest time."""
     latest_unix_s: int = 0
     """The latest time of day that was ever believed, s since 1970 (0: not said). An earlier clock is not: see `core.wall_clock`."""
