@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from s2r_runtime.bounds import clopper_pearson_lower
-from s2r_runtime.messages import Gap, Measured, Observation, Send
+from s2r_runtime.messages import IMPLAUSIBLE, RULES, Gap, Measured, Observation, Send
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.watch import LARGEST, EProcess, Stream, measurement_fault
@@ -317,6 +317,18 @@ def test_a_rejected_discrepancy_does_not_count_and_an_exceedance_does() -> None:
     assert by_seq[5].n == by_seq[4].n
     assert by_seq[5].e_value == by_seq[4].e_value
     assert (by_seq[9].fault, by_seq[9].exceedances) == ("", 1)
+
+
+@pytest.mark.parametrize(("rules", "fault"), [(RULES, ""), (IMPLAUSIBLE - 1, "jump")])
+def test_a_model_that_breaks_down_exceeds_the_gap_and_is_no_fault_of_measurement(rules: int, fault: str) -> None:
+    model = compose(ModelSpec("unicycle", 0.033))
+    stream = Stream(model, gap(0.01, model), fault_jump=20.0, rules=rules)
+    stream.observed(Observation(0, 0, (1.7e308, 0.0, 0.0)))
+    stream.sent(send(0, (1.7e308, 0.0)))
+    with np.errstate(all="ignore"):  # as in the process that measures, where this is no error
+        measured = stream.observed(Observation(1, DT_NS, (-1.7e308, 0.0, 0.0)))
+    assert measured is not None
+    assert (measured.fault, measured.exceedances) == (fault, 0 if fault else 1)
 
 
 def test_a_stream_replayed_is_the_same_to_the_last_bit() -> None:

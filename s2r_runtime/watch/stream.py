@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from s2r_runtime.comparison import EARLY, LATE
 from s2r_runtime.core.ledger import seed
 from s2r_runtime.core.stream import bin_of
-from s2r_runtime.messages import GRID, RESTARTS, RULES, Gap, Measured, Observation, Send
+from s2r_runtime.messages import GRID, IMPLAUSIBLE, RESTARTS, RULES, Gap, Measured, Observation, Send
 from s2r_runtime.watch.change import ChangeDetector
 from s2r_runtime.watch.exceedance import EProcess
 from s2r_runtime.watch.exchangeability import ConformalTest
@@ -70,7 +70,7 @@ class Stream:
         run_length: float = 1e5,
         rules: int = RULES,
     ) -> None:
-        self._on_grid, self._notes_restarts = rules >= GRID, rules >= RESTARTS
+        self._on_grid, self._notes_restarts, self._rules = rules >= GRID, rules >= RESTARTS, rules
         self._early, self._late = (EARLY, LATE if model.any_step else EARLY) if rules >= GRID else (EARLY_BEFORE, EARLY_BEFORE)
         self._model, self._radius, self._kind = model, gap.radius, gap.set
         self._weights, self._fault_jump = gap.weights, fault_jump
@@ -167,7 +167,8 @@ class Stream:
         return lasts, np.array([u for _, u in rows]).reshape(len(rows), len(self._model.inputs))
 
     def _measured(self, observation: Observation, d: float) -> Measured:
-        fault = measurement_fault(d, self._fault_jump)
+        broke_down = self._rules >= IMPLAUSIBLE and d == sys.float_info.max  # the model: that is no fault of measurement
+        fault = "" if broke_down else measurement_fault(d, self._fault_jump)
         if not fault:
             exceeds = d > self._radius
             self.watch.update(exceeds)
