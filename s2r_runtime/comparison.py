@@ -144,7 +144,7 @@ class Campaign:
         self._guard = min(0.05, 0.5 * settings.waypoint_margin)
         self._zero = (0.0,) * len(input_bounds)
         law = [model_name, states, region, geofence, input_bounds, dt, plain_table("sampling", settings), n, epoch, seed, self._gains]
-        self.digest = digest_of([*law, rules, any_step] if rules >= GRID else law)
+        self.digest = digest_of([*law, GRID, any_step] if rules >= GRID else law)  # rules since draw no otherwise: it goes on under them
         self._index = self._run = self._try = 0
         self._rejected: dict[str, int] = {}
         self._elapsed_ns, self._last_ns, self._last_seq = 0, -1, -1

@@ -14,7 +14,7 @@ import pytest
 
 from s2r_runtime.comparison import ATTEMPTS, JITTER_PERIODS, Campaign, CampaignStep
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.messages import Observation, SampleTaken
+from s2r_runtime.messages import GRID, RULES, Observation, SampleTaken
 from s2r_runtime.profile import Sampling
 
 DT = 0.033
@@ -367,6 +367,23 @@ def test_snapshot_of_other_settings_is_refused() -> None:
         campaign(7).restore(saved)
     with pytest.raises(ConfigError, match="campaign snapshot"):
         campaign(6).restore({**saved, "index": "three"})
+
+
+def test_a_campaign_goes_on_after_an_upgrade_whose_rules_draw_no_otherwise() -> None:
+    names = ("x", "y", "theta")
+    before, now = (
+        Campaign("unicycle", names, ("theta",), REGION, WIDE, BOUNDS, DT, SHORT, n=6, epoch=1, seed=1, rules=rules)
+        for rules in (GRID, RULES)
+    )
+    samples, robot = [], Robot()
+    while len(samples) < 3:
+        step = before.step(robot.observe())
+        samples += [step.sample] if step.sample else []
+        robot.move(step.u)
+    now.restore(before.snapshot())
+    rest, last = drive(now, robot)
+    assert last.done
+    assert [s.index for s in rest] == [3, 4, 5]
 
 
 def test_stop_lasts_as_long_as_asked_and_varies() -> None:
