@@ -60,6 +60,18 @@ def test_what_it_raises_in_one_state_keeps_it_from_no_other(tmp_path: Path) -> N
         np.testing.assert_array_equal(control(np.zeros((2, 3)), {}), np.zeros((2, 2)))
 
 
+@pytest.mark.parametrize("wait", ["pass", "time.sleep(1.0); os.write(3, b'x')"], ids=["silent", "byte by byte"])
+def test_one_that_never_answers_ends_where_nobody_else_watches_it(tmp_path: Path, wait: str) -> None:
+    head = f"import time\ndef wait():\n    os.write(3, b'u' + (16).to_bytes(8, 'little'))\n    while True: {wait}"
+    path = write(tmp_path, f"{HOLD} if not x.any() else wait()", head)
+    with BatchController(load(path), 2, within_s=20.0) as control:
+        np.testing.assert_array_equal(control(np.zeros((1, 3)), {}), np.zeros((1, 2)))
+        control._within_s = 2.0
+        with pytest.raises(ControllerError, match="no answer within 2 s"):
+            control(np.ones((1, 3)), {})
+        assert control.pid == 0
+
+
 @pytest.mark.parametrize(
     ("body", "words"),
     [

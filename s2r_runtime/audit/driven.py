@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 KEPT = 1000
 """Observations that an answer may lag behind."""
+WITHIN_S = 30.0
+"""For its start and for each answer: a controller that answered in time on the robot and never here would hold up the audit for good."""
 
 
 class DrivenAgain:
@@ -46,7 +48,7 @@ class DrivenAgain:
         task = registry().get("tasks", choice.name)(choice.parameters, model.nominal, model.dt)
         self._largest, self._episodes = 0.0, Episodes(task, seed, choice.episodes)
         try:
-            self._control = BatchController(file, len(model.inputs))
+            self._control = BatchController(file, len(model.inputs), within_s=WITHIN_S)
         except (S2RError, OSError) as error:
             self._findings.cannot(f"what a controller drove: {error}")
 

@@ -22,6 +22,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NoReturn, Self
@@ -63,10 +64,13 @@ class BatchController:
     contained: what is in force there (`confinement.confine`).
     """
 
-    def __init__(self, file: ControllerFile, nu: int, memory_bytes: int = MEMORY_BYTES, printed: int | None = None) -> None:
-        """printed: a pipe for what it prints (default: it is thrown away). Raises ControllerError if the file can't be executed there,
-        OSError if there is no process to be had.
+    def __init__(
+        self, file: ControllerFile, nu: int, memory_bytes: int = MEMORY_BYTES, printed: int | None = None, within_s: float = 0.0
+    ) -> None:
+        """printed: a pipe for what it prints (default: it is thrown away). within_s: how long its start and each answer may take (0:
+        somebody else sees to that). Raises ControllerError if the file can't be executed there, OSError if no process can be had.
         """
+        self._within_s, self._until_s = within_s, time.monotonic() + within_s
         self._nu, self._path, self._ended = nu, file.path, ""
         self._socket, theirs = socket.socketpair()
         memory = os.memfd_create("questions", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
@@ -107,6 +111,7 @@ class BatchController:
         if self._ended:
             raise ControllerError(self._ended)
         question = self._packed(x, dict(theta))
+        self._until_s = time.monotonic() + self._within_s
         try:
             self._socket.sendall(LENGTH.pack(len(question)))
             self._socket.sendall(question)
@@ -188,7 +193,13 @@ class BatchController:
         data = bytearray()
         while len(data) < size:
             try:
+                if self._within_s:
+                    self._socket.settimeout(max(self._until_s - time.monotonic(), 1e-3))
                 part = self._socket.recv(min(size - len(data), 1 << 20))
+            except TimeoutError:
+                self._end()
+                self._ended = f"{Path(self._path).name}: its process gave no answer within {self._within_s:g} s"
+                raise ControllerError(self._ended) from None
             except OSError:
                 part = b""
             if not part:
