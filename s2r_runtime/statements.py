@@ -57,7 +57,8 @@ def shown(
 
 def _tried(tries: Tries, v: Verification) -> str:
     """How much was tried, and where the seed came from (G2, G4)."""
-    least = "at least " if tries.controllers >= BEHAVIOURS else ""
+    # an attempt that was interrupted is counted, its controller's behaviour is not known
+    least = "at least " if tries.controllers < tries.on_gap or tries.controllers >= BEHAVIOURS else ""
     seed = (
         "was fixed beforehand, in a simulation that is to be repeatable, so retries were free: this certifies nothing for a robot"
         if tries.fixed

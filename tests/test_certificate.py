@@ -165,6 +165,9 @@ def test_a_certificate_of_before_seeds_were_drawn_is_the_same_bytes_and_loads(go
     assert certificate.load(certificate.sign(after, KEY), [PUBLIC], NOW + 1) == after
     (told,) = (line for line in after.shown if line not in before.shown)
     assert told.startswith("Tries (G4).")
+    assert "they were of 1 controllers" in told
+    interrupted = good.issue(tries=Tries(2, 2, 1))  # of the other attempt nobody knows how its controller behaves
+    assert any("they were of at least 1 controllers" in line for line in interrupted.shown)
 
 
 def test_a_certificate_says_that_a_simulation_fixed_its_seed_and_counts_its_own_attempt(good: Evidence) -> None:
