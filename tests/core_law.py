@@ -45,6 +45,7 @@ class Law:
     started: bool = False
     now: int = 0
     unix: tuple[int, int] = (0, 0)
+    read: int = 0
     up: frozenset[str] = frozenset()
     latched: frozenset[str] = frozenset()
     model: str = ""
@@ -117,13 +118,14 @@ class Law:
         match event:
             case m.Started():
                 self.started, self.settings = True, event.settings
+                self.read = event.unix_s
                 self.model, self.unix = event.settings.model_digest, (max(event.unix_s, event.memory.latest_unix_s), event.t_ns)
                 self.up = frozenset({"recorder", "analytics"})
                 self.running, self.sampling, self.permit, self.asked = None, False, None, None
                 self.gate, self.answered, self.last = False, True, None
                 self._forget()
             case m.WallClockRead():
-                self.unix = (max(event.unix_s, self._wall()), event.t_ns)
+                self.read, self.unix = event.unix_s, (max(event.unix_s, self._wall()), event.t_ns)
             case m.LinkChanged():
                 self._up("link", event.up)
             case m.RecorderChanged():
@@ -246,6 +248,9 @@ class Law:
             self.latched -= {event.text}
             if event.text == "measurement_faults":
                 self.faults = 0
+            elif event.text == "wall_clock" and self.unix[0] - self.read > 2:  # the time goes back for who says so
+                self.revoked |= {facts.id for facts in self.stored if facts.expires_unix_s <= self._wall()}
+                self.unix = (self.read, event.t_ns)
         elif event.verb == "permit" and math.isfinite(event.duration_s) and 0.0 <= event.duration_s <= 86_400.0:
             self.permit = event.t_ns + round(event.duration_s * S) if event.duration_s else None
         elif event.verb == "revoke":

@@ -12,7 +12,7 @@ import msgspec
 from core_law import DT, FAULTS, WALK, Law
 from core_rig import GAP, S
 
-from s2r_runtime.core import ledger
+from s2r_runtime.core import driven, ledger, wall_clock
 from s2r_runtime.core import reducer as core
 from s2r_runtime.core.state import unix_now
 from s2r_runtime.headroom import grid
@@ -217,6 +217,10 @@ class World:
             self.request(verb, digest="model", text=rng.choice(["", "drive", "inputs"]) if verb == "trace" else "")
         elif state.memory.latched:
             self.request("clear", text=rng.choice(state.memory.latched))
+        elif state.clock_behind_s and rng.random() < 0.5:
+            self.request("clear", text=wall_clock.REASON)
+        elif state.settings is not None and driven.refusal(state.memory, state.settings) and rng.random() < 0.5:
+            self.request("clear", text=driven.REASON)
         elif state.permit_until_ns is None or state.permit_until_ns <= self.t:
             self.request("permit", duration_s=rng.choice([0.0, 1.0, 3.0, 60.0, math.nan]))
         elif state.memory.gap is None or state.memory.alarm_epoch or state.memory.campaign_epoch:
