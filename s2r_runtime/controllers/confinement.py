@@ -92,8 +92,10 @@ _ALLOWED: dict[str, tuple[int | None, int | None]] = {
 
 _NEWER = 463
 """The first system call that is newer than this list (setxattrat, Linux 6.13); the same number on both processors."""
-_OWNERS = (8, 10, 15)
-"""fcntl(2): F_SETOWN, F_SETSIG, F_SETOWN_EX. A pipe that has data for somebody sends him a signal of one's choice."""
+_REACHING = (8, 10, 15, 1024, 1026)
+"""fcntl(2): F_SETOWN, F_SETSIG, F_SETOWN_EX: a pipe that has data for somebody sends him a signal of one's choice. F_SETLEASE: whoever
+opens the file for writing waits for its holder, 45 s. F_NOTIFY: watches a folder.
+"""
 _IOCTL_OWNERS = (0x5452, 0x8901, 0x8902)
 """ioctl(2): FIOASYNC, FIOSETOWN, SIOCSPGRP, which do the same."""
 
@@ -189,7 +191,7 @@ def _filter(machine: str) -> bytes | None:
     if machine == "x86_64":
         code += _when(2, _low(1), [_op(_JUMP_BITS, _WRITING, 0, 1), _op(_RETURN, deny)])
     code += _when((257, 56)[column], _low(2), [_op(_JUMP_BITS, _WRITING, 0, 1), _op(_RETURN, deny)])
-    code += _when((72, 25)[column], _low(1), _none_of(_OWNERS, deny))
+    code += _when((72, 25)[column], _low(1), _none_of(_REACHING, deny))
     code += _when((16, 29)[column], _low(1), _none_of(_IOCTL_OWNERS, deny))
     zero = [_op(_JUMP_EQUAL, 0, 1, 0), _op(_RETURN, deny)]
     code += _when((302, 261)[column], _low(2), [*zero, _op(_LOAD, _low(2) + 4), *zero])
