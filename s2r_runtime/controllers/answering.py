@@ -1,8 +1,9 @@
 """The controller's process, wherever it is asked: `python -P -B -u -m s2r_runtime.controllers.answering`, started by `batches`.
 
 Verification, rehearsal, driving and re-asking all start this, with the same command line, environment, folder, descriptors, limits and
-modules, and the same messages in the same form. So nothing that a controller finds here tells it what it is asked for, but what it is
-asked: how many rows, and which. `tests/test_examined.py` compares all that.
+modules, and the same messages in the same form. So a controller can tell what it is asked for only by what it is asked (how many rows,
+and which) and by when. `tests/test_examined.py` compares all that; the threat model lists what differs where the kernel lacks seccomp or
+Landlock.
 
     descriptors   0 nothing, 1 and 2 a pipe for what it prints, 3 the socket, 4 the memory for arrays
     parent        one descriptor (the memory for arrays) with 8 bytes length, Start as JSON; then questions, see `batches`
