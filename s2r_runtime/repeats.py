@@ -15,7 +15,7 @@ A law of few values in all columns has no density. Where states and inputs both 
 rows, as independent draws would be, give as many such pairs (permutation test; exact if input and state are independent).
 
 *Mixtures* (convex combinations of two rows): three rows stand on a line along which every column of x0 and u changes. Independent rows with
-d >= 3 such columns do so within an angle STRAIGHT with probability STRAIGHT^(d-1) a triple.
+d >= 3 such columns do so within an angle STRAIGHT with probability STRAIGHT^(d-1) a triple. Rows within WINDOW of each other do not count.
 """
 
 from __future__ import annotations
@@ -177,6 +177,7 @@ def _on_lines(z: Array, width: int, rng: np.random.Generator) -> int:
     i, k = np.nonzero(np.diff(np.take_along_axis(place, order, axis=1), axis=1) < 10.0 * STRAIGHT)
     a, b = order[i, k], order[i, k + 1]
     straight = np.all(np.abs(way[i, a] - way[i, b]) < STRAIGHT, axis=1) & np.all(np.abs(way[i, a][:, :d]) > 100.0 * STRAIGHT, axis=1)
+    straight &= np.max(np.abs(z[a] - z[b]), axis=1) > WINDOW  # two draws of a law's atom are in one direction from anywhere
     return len(np.unique(np.concatenate([a[straight], b[straight]])))
 
 

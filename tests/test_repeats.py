@@ -90,6 +90,16 @@ def test_independent_draws_of_coarse_laws_are_refused_no_more_often_than_said() 
     assert clopper_pearson_lower(found, 5 * count, SURE) <= 2.0 * ALPHA
 
 
+def test_a_robot_that_often_begins_at_home_and_at_rest_draws_all_the_same() -> None:
+    """A law with an atom: rows that are there and elsewhere make many lines that are nearly one."""
+    rng, n = np.random.default_rng(7), 300
+    for _ in range(10):
+        x0 = np.where(rng.random((n, 1)) < 0.3, 0.0, rng.uniform(-1.0, 1.0, (n, 3)))
+        u = np.where(rng.random((n, 1)) < 0.3, 0.0, rng.uniform(-1.0, 1.0, (n, 2)))
+        found = repeats(x0, u, x0 + 0.05 * u[:, [0, 1, 1]] + 1e-4 * rng.normal(size=(n, 3)))
+        assert found == (n, "")
+
+
 def test_equal_draws_of_a_law_of_few_values_count_once() -> None:
     rng = np.random.default_rng(5)
     stations = ended(rng, np.round(rng.uniform(-1, 1, (400, 3)), 0), np.round(rng.uniform(-1, 1, (400, 2)), 0), 0.0)
