@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -86,6 +87,10 @@ def seen(text: str, runs: Sequence[Array]) -> Seen:
     try:
         made = msgspec.msgpack.decode(base64.b64decode(text.removeprefix(PREFIX), validate=True), type=_Sketch)
         grids = [_unpacked(grid) for grid in made.grids]
+        if not (0.0 <= made.chance <= 1.0 and all(0.0 < cell < math.inf for cell in made.cells)):
+            raise ValueError("its numbers are out of range")
+        if any(not 0 <= a < run.shape[1] for run in runs for a in made.angles):
+            raise ValueError("its angles are of another model")
     except (binascii.Error, ValueError, msgspec.MsgspecError) as error:
         raise ConfigError(f"model: fitted_on: a sketch of rows is damaged: {error}") from None
     cells, parts = np.array(made.cells), [_plain(run, made.angles) for run in runs]

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import base64
+import math
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -15,7 +19,7 @@ from s2r_runtime.errors import ConfigError, NotEnoughEvidence
 from s2r_runtime.gap import refuse_fitted
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec, dump_model
-from s2r_runtime.seen_rows import ALPHA, KEPT, seen, sketch
+from s2r_runtime.seen_rows import ALPHA, KEPT, PREFIX, seen, sketch
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.transitions import load_transitions
 
@@ -168,3 +172,16 @@ def test_the_command_line_refuses_a_test_and_a_gap_on_seen_rows(fit: Path, tmp_p
     trace = subprocess.run(argv, capture_output=True, text=True, timeout=100, check=False)
     assert trace.returncode == 2
     assert "has rows of it" in trace.stderr
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"angles": (99,)}, {"angles": (-1,)}, {"cells": (0.0,) * 4}, {"cells": (math.nan,) * 4}, {"chance": math.nan}, {"chance": -1.0}],
+)
+def test_a_sketch_whose_numbers_are_none_is_one_clear_error_too(change: dict[str, Any]) -> None:
+    runs = [np.random.default_rng(1).normal(size=(50, 3))]
+    (text,) = sketch(runs, (2,))
+    made = msgspec.msgpack.decode(base64.b64decode(text.removeprefix(PREFIX)))
+    damaged = PREFIX + base64.b64encode(msgspec.msgpack.encode({**made, **change})).decode()
+    with pytest.raises(ConfigError, match="sketch of rows is damaged"):
+        seen(damaged, runs)
