@@ -55,7 +55,7 @@ def test_before_anything_happened_nothing_is_so() -> None:
     assert state.pop("memory") == msgspec.to_builtins(Memory("", 0))
     said = {"gate_reason": "not_started", "gate_said": "not_started"}
     true = {"recorder_ok": True, "analytics_up": True, "answered": True}
-    numbers = {"controller_seq": -1, "sampler_seq": -1, "next_job": 1, "saved_e_value": 1.0}
+    numbers = {"controller_seq": -1, "sampler_seq": -1, "next_job": 1, "saved_e_value": 1.0, "read_unix_s": -1}
     assert {key: value for key, value in state.items() if value} == said | true | numbers
     assert {repr(value) for key, value in state.items() if not value} == {"None", "''", "False", "0", "0.0", "()"}
     assert Deployment("c", 1, "starting") == Deployment("c", 1, "starting", certificate_id="", running="")
@@ -70,7 +70,7 @@ def test_the_constants_of_the_core_are_these() -> None:
     assert repair.STRETCHES == {"": "campaign", "campaign": "campaign", "drive": "drive", "inputs": "inputs"}
     assert set(requests.HINTS) <= {*gate.REASONS}
     assert set(sources_of.INTERRUPTS) <= {*gate.REASONS}
-    assert sources_of.FAULTS == ("raised", "died", "deadline", "malformed")
+    assert sources_of.FAULTS == ("raised", "died", "deadline", "malformed", "inconsistent")
     assert (stream.BINS, stream.EXACT_TERMS, stream.EDGES[:3], stream.EDGES[16:18]) == (33, 30, (0.0, 0.0625, 0.125), (1.0, 1.25))
 
 

@@ -28,7 +28,6 @@ from s2r_runtime.messages import (
     StopController,
     Stopping,
     Ticked,
-    WallClockRead,
 )
 
 # ---------------------------------------------------------------- stops
@@ -120,7 +119,6 @@ def test_stopping_in_every_other_chapter_leaves_no_request_unanswered() -> None:
         (RecorderChanged(1, ok=False), RecorderChanged(1, ok=True), "recorder_down"),
         (AnalyticsChanged(1, up=False), AnalyticsChanged(1, up=True), "analytics_down"),
         (LinkChanged(1, up=False), LinkChanged(1, up=True), "link_down"),
-        (WallClockRead(1, 2500), WallClockRead(1, 2000), "certificate_expired"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

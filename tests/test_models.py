@@ -127,10 +127,14 @@ def test_bad_parameters_of_an_effect_are_named(effect, said):
     [
         ("differential_drive", "wheel_radius", 0.0),
         ("differential_drive", "track", -0.5),
-        ("bicycle", "wheel_base", math.inf),
         ("joint", "mass", 0.0),
     ],
 )
 def test_a_size_that_no_body_has_is_refused(name, parameter, value):
     with pytest.raises(ConfigError, match=f"{parameter} is .*, must be > 0"):
         _model(name, **{parameter: value})
+
+
+def test_a_size_that_is_no_number_is_refused():
+    with pytest.raises(ValueError, match=r"parameters\.wheel_base must be finite"):
+        _model("bicycle", wheel_base=math.inf)

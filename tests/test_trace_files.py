@@ -68,7 +68,10 @@ def _swapped(name, t, y, u):
 
 REFUSED = {
     "ms": (lambda name, t, y, u: _csv(name, 1e3 * t, y, u), "t seems to be in ms, must be in s"),
-    "ns since 1970": (lambda name, t, y, u: _csv(name, 1e9 * (1.76e9 + t), y, u, stamp="{:.0f}"), "t seems to be in ns, must be in s"),
+    "ns since 1970": (
+        lambda name, t, y, u: _csv(name, 1e9 * (1.76e9 + t), y, u, stamp="{:.0f}"),
+        "if it is in ns, name it t_ns in the header",
+    ),
     "dates": (lambda name, t, y, u: _csv(name, t, y, u, stamp="2026-11-21T10:00:{:09.6f}"), "line 2: column 't' is '2026-11-21T10:00:0"),
     "units": (
         lambda name, t, y, u: _csv(name, t, y, u, [f"{s} [SI]" for s in ("t", *STATES[name], *INPUTS[name])]),
@@ -152,8 +155,9 @@ def test_a_column_under_another_writing_is_not_taken_for_one_that_was_not_measur
 
 def test_a_recording_to_judge_on_must_be_long_enough_to_judge(tmp_path, capsys, recorded):
     t, y, u = recorded["unicycle"]
-    for name, rows in (("run.csv", len(t)), ("test.csv", 12)):
-        (tmp_path / name).write_text(_csv("unicycle", t[:rows], y[:rows], u[:rows]), encoding="utf-8")
+    other = y[:12] + np.random.default_rng(4).normal(0.0, 1e-3, (12, 3))  # another drive: its rows were not seen
+    (tmp_path / "run.csv").write_text(_csv("unicycle", t, y, u), encoding="utf-8")
+    (tmp_path / "test.csv").write_text(_csv("unicycle", t[:12], other, u[:12]), encoding="utf-8")
     code = main(["trace", str(tmp_path / "run.csv"), "--model", "unicycle", "--dt", str(DT), "--test", str(tmp_path / "test.csv")])
     said = capsys.readouterr().err.strip()
     assert code == 3
