@@ -77,7 +77,10 @@ class Base:
                 parameters[key] = float(value)
             except ValueError:
                 parameters[key] = value
-        spec = EffectSpec(name, channel or "*", parameters)
+        try:
+            spec = EffectSpec(name, channel or "*", parameters)
+        except ValueError as error:
+            raise ConfigError(f"effect {text!r}: {error}") from None
         self._use({**self._specs, f"{name}:{spec.channel}": spec})
         return f"{name}:{spec.channel}"
 

@@ -48,7 +48,10 @@ def parse_effect(text: str) -> ParsedEffect:
             parameters[key] = json.loads(value) if value.startswith("[") else float(value)
         except ValueError:
             parameters[key] = value
-    spec = EffectSpec(name, channel or "*", parameters)
+    try:
+        spec = EffectSpec(name, channel or "*", parameters)
+    except ValueError as error:
+        raise ConfigError(f"effect {text!r}: {error}") from None
     fault = _own(name, parameters, text) if name in _OWN else None
     if fault is None:
         Library({text: spec}, 1.0, arcs=True)  # says at once what is wrong with it

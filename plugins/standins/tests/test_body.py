@@ -168,7 +168,7 @@ def test_heading_ripple_needs_speed() -> None:
         ("input_gain:w gain", "must be PARAMETER=VALUE"),
         ("input_gain:w factor=1", "has no parameter 'factor'"),
         ("slip_patch x=0 y=0 radius=1", "takes the numbers x, y, radius, gain"),
-        ("slip_patch x=0 y=0 radius=1 gain=nan", "takes the numbers"),
+        ("slip_patch x=0 y=0 radius=1 gain=nan", "gain must be finite"),
         ("slip_patch x=0 y=0 radius=much gain=1", "takes the numbers"),
     ],
 )
