@@ -26,6 +26,13 @@ FACTORS: dict[str, float] = {
 """SI units per unit, by its lower-case name without blanks."""
 
 
+def number_of(text: str) -> float:
+    """The number that a text writes. Raises ValueError, also for `1_0` and for digits of other scripts, which Python alone would read."""
+    if "_" in text or not text.isascii():
+        raise ValueError(f"{text!r} is not a number")
+    return float(text)
+
+
 def factor_of(unit: str) -> float | None:
     """SI units per unit; None for one that is not known. `mA` and `MA` differ by more than letters' case, so neither is here."""
     return FACTORS.get(unit.replace(" ", "").replace("²", "2").replace("μ", "µ").lower())

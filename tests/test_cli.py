@@ -167,6 +167,21 @@ def test_every_verb_has_help() -> None:
         assert s2r(verb, "--help").returncode == 0
 
 
+@pytest.mark.parametrize("argv", [["--help"], ["--version"], ["trace", "--help"]])
+def test_what_is_only_shown_loads_no_numerics(argv: list[str]) -> None:
+    code = "import sys; from s2r_runtime.cli.main import main\ntry: main(sys.argv[1:])\nfinally: print('numpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code, *argv], capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines()[-1] == "False", done
+
+
+@pytest.mark.parametrize(
+    "option", [["--epsilon", "0_1.0"], ["--dt", "1_0"], ["--param", "wheel_base=1_0"], ["--seed", "1_0"], ["--seed", "\u0663"]]
+)
+def test_a_number_is_what_every_language_reads_as_one(option: list[str]) -> None:
+    verb = ["gap", "run.csv", "--model", "bicycle"] if option[0] == "--epsilon" else ["trace", "run.csv", "--model", "bicycle"]
+    refused(s2r(*verb, *(() if option[0] == "--dt" else ("--dt", "0.1")), *option), 2, option[1].rpartition("=")[2])
+
+
 def test_every_verb_and_every_option_is_explained_where_it_is_asked_for() -> None:
     pages = [(name, verb) for name, verb, _ in verbs(parser(), "s2r")]
     assert len(pages) > 25

@@ -14,6 +14,7 @@ from s2r_runtime.errors import ConfigError, UsageError
 from s2r_runtime.modelspec import ModelSpec, load_model
 from s2r_runtime.profile import Profile, check_names, load_profile
 from s2r_runtime.profile_checks import HEAVIEST, LIGHTEST
+from s2r_runtime.units import number_of
 
 if TYPE_CHECKING:
     from s2r_runtime.controllers.hosted import ControllerFile
@@ -243,7 +244,7 @@ def weights_of(states: tuple[str, ...], given: list[str], profile: Profile | Non
 def probability(text: str) -> float:
     """argparse type: a number strictly between 0 and 1."""
     try:
-        value = float(text)
+        value = number_of(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
     if not 0.0 < value < 1.0:
@@ -254,7 +255,7 @@ def probability(text: str) -> float:
 def positive(text: str) -> float:
     """argparse type: a finite number > 0."""
     try:
-        value = float(text)
+        value = number_of(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
     if not 0.0 < value < float("inf"):
@@ -272,7 +273,7 @@ def not_negative(text: str) -> float:
 
 def count(text: str) -> int:
     """argparse type: a whole number >= 0."""
-    if not text.isdecimal():
+    if not (text.isdecimal() and text.isascii()):
         raise argparse.ArgumentTypeError(f"{text!r} must be a whole number >= 0")
     return int(text)
 
@@ -294,7 +295,7 @@ def pair(item: str, option: str) -> tuple[str, float]:
     """NAME=NUMBER. Raises UsageError naming the option."""
     name, sign, value = item.partition("=")
     try:
-        number = float(value)
+        number = number_of(value)
     except ValueError:
         number = float("nan")
     if not sign or not name or not abs(number) < float("inf"):

@@ -20,21 +20,6 @@ ANY_STEP_S = 1.0
 """A model file's step, which nothing that is told of it depends on."""
 
 
-def add(what: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Adds the verb."""
-    show = what.add_parser("show", help="what an offer is: its numbers with units and bounds, and on what it acts", description=_SHOW)
-    show.add_argument("name", metavar="NAME", help="a model, an effect, a task or another offer; or a model's file (.py, .toml)")
-    show.add_argument("--model", metavar="M", help="of an effect: on this model alone (a name, a Python file, or a model TOML)")
-    show.add_argument("--json", action="store_true", help="print one JSON object")
-    show.set_defaults(run=plugin_show)
-
-
-_SHOW = (
-    "What an offer of a plug-in is. Of an effect, its parameters with their bounds, and its channels and units on each model; of a model, "
-    "its states, inputs and parameters, and the effects that make sense on it; of a task or transport, its options."
-)
-
-
 def plugin_show(args: argparse.Namespace) -> int:
     """Exit 0. Raises PluginError if nothing of that name is offered, ConfigError if a model's file is none."""
     if args.name.endswith((".py", ".toml")):

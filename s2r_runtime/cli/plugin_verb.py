@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from s2r_runtime.cli import output, plugin_files, plugin_show
+from s2r_runtime.cli import output, plugin_files
 from s2r_runtime.errors import PluginError, UsageError, one_line
 
 TEST_FILE = """
@@ -31,7 +31,11 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     listing.add_argument("--json", action="store_true", help="print one JSON object")
     listing.set_defaults(run=plugin_list)
 
-    plugin_show.add(what)
+    show = what.add_parser("show", help="what an offer is: its numbers with units and bounds, and on what it acts", description=_SHOW)
+    show.add_argument("name", metavar="NAME", help="a model, an effect, a task or another offer; or a model's file (.py, .toml)")
+    show.add_argument("--model", metavar="M", help="of an effect: on this model alone (a name, a Python file, or a model TOML)")
+    show.add_argument("--json", action="store_true", help="print one JSON object")
+    show.set_defaults(run=_shown)
 
     check = what.add_parser("check", help="run the kit of everything that a plug-in offers", description=_CHECK)
     check.add_argument("name", metavar="NAME", help="plug-in, as s2r plugin list names it")
@@ -45,8 +49,18 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     new.set_defaults(run=plugin_new)
 
 
+_SHOW = (
+    "What an offer of a plug-in is. Of an effect, its parameters with their bounds, and its channels and units on each model; of a model, "
+    "its states, inputs and parameters, and the effects that make sense on it; of a task or transport, its options."
+)
 _CHECK = "Runs the conformance kit of everything that a plug-in offers, in a process of its own. Exit 0 if all of it passed. Needs pytest."
 _NEW = "Writes a package that installs (pip install -e NAME), passes its kit (s2r plugin check NAME), and works: change it bit by bit."
+
+
+def _shown(args: argparse.Namespace) -> int:
+    from s2r_runtime.cli.plugin_show import plugin_show  # numpy, which no page of --help needs
+
+    return plugin_show(args)
 
 
 def plugin_list(args: argparse.Namespace) -> int:

@@ -11,6 +11,7 @@ import msgspec
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import add_limit, apart, controller_at, count, load_checked, own_file, positive, writable
 from s2r_runtime.errors import ControllerError, UsageError
+from s2r_runtime.units import number_of
 
 if TYPE_CHECKING:
     from s2r_runtime.controllers.candidates import Candidate, Synthesis
@@ -112,7 +113,7 @@ def _bound(item: str) -> tuple[str, tuple[float, float]]:
     name, sign, span = item.partition("=")
     low, colon, high = span.partition(":")
     try:
-        return name, (float(low), float(high)) if name and sign and colon else (float("nan"), float("nan"))
+        return name, (number_of(low), number_of(high)) if name and sign and colon else (float("nan"), float("nan"))
     except ValueError:
         raise UsageError(f"--bound {item}: must be NAME=LOW:HIGH") from None
 

@@ -16,6 +16,7 @@ import msgspec
 
 from s2r_runtime.canonical import digest
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.units import number_of
 
 BYTES_MAX = 8 << 20
 ROWS_MAX = 100_000
@@ -87,7 +88,7 @@ def _places(header: list[str], where: str, inputs: Sequence[str], columns: Mappi
 
 def _number(cell: str, at: str, name: str) -> float:
     try:
-        value = float(cell)
+        value = number_of(cell)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
