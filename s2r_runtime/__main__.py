@@ -2,6 +2,6 @@
 
 import sys
 
-from s2r_runtime.cli.main import main
+from s2r_runtime.cli.main import entry
 
-sys.exit(main())
+sys.exit(entry())

@@ -9,13 +9,14 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import sys
 import traceback
 from collections.abc import Callable, Sequence
 from importlib import metadata
 from typing import Any
 
-from s2r_runtime.cli import output
-from s2r_runtime.errors import NotEnoughEvidence, S2RError
+from s2r_runtime.cli import output, supervised
+from s2r_runtime.errors import NotEnoughEvidence, PluginError, S2RError
 
 for _library in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_library, "1")  # the matrices here are small: threads of a linear algebra library only wait for each other
@@ -85,7 +86,10 @@ def main(argv: Sequence[str] | None = None, run: Callable[[argparse.Namespace], 
         try:
             args = parser().parse_args(argv)
             run = run or args.run
-            return run(args)
+            try:
+                return run(args)
+            except SystemExit:
+                raise PluginError("code of a model or an effect ended the program (sys.exit?) before there was an answer") from None
         finally:
             output.flush()  # also after --help, which ends by SystemExit
     except S2RError as error:
@@ -103,6 +107,14 @@ def main(argv: Sequence[str] | None = None, run: Callable[[argparse.Namespace], 
             f"internal error: {type(error).__name__}: {error} (set S2R_TRACEBACK=1 to see where)", 70, as_json=getattr(args, "json", False)
         )
         return 70
+
+
+def entry() -> int:
+    """The command: `main`, whose end is seen whatever others' code does (see `supervised`)."""
+    argv = sys.argv[1:]
+    if argv and argv[0] in supervised.VERBS and "--live" not in argv:
+        return supervised.run(main)
+    return main()
 
 
 def _version() -> str:

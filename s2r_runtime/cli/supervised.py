@@ -1,0 +1,64 @@
+"""Code of others, a model or an effect, runs in the process of the verb that needs it, and can end that without a word: `os._exit(0)`.
+
+So the verb runs in a process of its own, and this one waits for its end. A verb that ends with exit code 0 and did not come to its own end
+has no answer.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+
+from s2r_runtime.child import die_with_parent
+from s2r_runtime.cli import output
+from s2r_runtime.errors import PluginError
+
+VERBS = frozenset({"gap", "trace", "verify", "certify", "synthesize", "audit", "trials", "report", "topics"})
+"""Those that compute with models of others here. The daemon has processes of its own for them."""
+_PASSED_ON = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+
+
+def run(verb: Callable[[], int]) -> int:
+    """verb(), in a process of its own; returns (or raises) there, and ends this process with the same exit code or signal."""
+    output.flush()
+    reading, writing = os.pipe()
+    waited = {*_PASSED_ON, signal.SIGCHLD}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, waited)
+    waiting, child = os.getpid(), os.fork()
+    if child == 0:
+        os.close(reading)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        die_with_parent(waiting)
+        try:
+            return verb()
+        finally:
+            output.flush()
+            os.write(writing, b"k")
+    os.close(writing)
+    os._exit(_waited_for(child, reading, waited))
+
+
+def _waited_for(child: int, reading: int, waited: set[signal.Signals]) -> int:
+    """The exit code for that of the child."""
+    while True:
+        told = signal.sigwaitinfo(waited)
+        if told.si_signo != signal.SIGCHLD:
+            if told.si_code <= 0:  # of a process; what the terminal sends, the child gets itself
+                os.kill(child, told.si_signo)
+            continue
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if ended:
+            break
+    code = os.waitstatus_to_exitcode(status)
+    if code < 0:
+        signal.signal(-code, signal.SIG_DFL) if -code not in (signal.SIGKILL, signal.SIGSTOP) else None
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, waited)
+        os.kill(os.getpid(), -code)
+        return 128 - code
+    if code == 0 and not os.read(reading, 1):
+        error = PluginError("code of a model or an effect ended the program (os._exit?) before there was an answer")
+        output.fail(str(error), error.exit_code, as_json=False)
+        output.flush()
+        return error.exit_code
+    return code

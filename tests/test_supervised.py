@@ -1,0 +1,78 @@
+"""Whatever code of others does, a verb that has no answer is no success; and its end is that of the command."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+MODEL = """import os, sys, time
+import numpy as np
+
+STATES, INPUTS, PARAMS = ("x",), ("u",), {{}}
+
+
+def step(x, u, dt, params):
+    {ending}
+    return x + dt * u
+"""
+S2R = [sys.executable, "-m", "s2r_runtime"]
+
+
+def files(folder: Path, ending: str) -> list[str]:
+    (folder / "model.py").write_text(MODEL.format(ending=ending))
+    rows = "".join(f"{0.1 * k:.1f},{0.01 * k},{(-1) ** k}\n" for k in range(200))
+    (folder / "run.csv").write_text("t,x,u\n" + rows)
+    return [str(folder / "run.csv"), "--model", str(folder / "model.py"), "--dt", "0.1"]
+
+
+@pytest.mark.parametrize("verb", ["gap", "trace"])
+@pytest.mark.parametrize("ending", ["os._exit(0)", "sys.exit(0)", "raise SystemExit"])
+def test_a_model_that_ends_the_program_is_no_success(verb: str, ending: str, tmp_path: Path) -> None:
+    done = subprocess.run([*S2R, verb, *files(tmp_path, ending)], capture_output=True, text=True, check=False, timeout=100)
+    assert done.returncode == 78, done
+    (line,) = done.stderr.splitlines()
+    assert "model" in line
+    assert "ended the program" in line
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_the_verb_and_what_waits_for_it(number: signal.Signals, tmp_path: Path) -> None:
+    process = subprocess.Popen([*S2R, "gap", *files(tmp_path, f"open({str(tmp_path / 'there')!r}, 'w').close(); time.sleep(60)")])
+    limit = time.monotonic() + 60.0
+    while not (tmp_path / "there").exists():
+        assert process.poll() is None
+        assert time.monotonic() < limit
+        time.sleep(0.05)
+    (child,) = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    process.send_signal(number)
+    assert process.wait(30) == (130 if number == signal.SIGINT else -number)
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(child), 0)
+
+
+def test_the_verb_ends_with_what_waits_for_it(tmp_path: Path) -> None:
+    process = subprocess.Popen([*S2R, "gap", *files(tmp_path, f"open({str(tmp_path / 'there')!r}, 'w').close(); time.sleep(60)")])
+    limit = time.monotonic() + 60.0
+    while not (tmp_path / "there").exists():
+        assert process.poll() is None
+        assert time.monotonic() < limit
+        time.sleep(0.05)
+    (child,) = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    process.kill()
+    process.wait(30)
+    while Path(f"/proc/{child}").exists() and "Z" not in Path(f"/proc/{child}/stat").read_text().split()[2:3]:
+        assert time.monotonic() < limit
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("argv", [["gap", "--help"], ["gap"], ["gap", "nothing.csv", "--model", "unicycle"]])
+def test_other_ends_are_as_before(argv: list[str]) -> None:
+    done = subprocess.run([*S2R, *argv], capture_output=True, text=True, check=False)
+    assert done.returncode == (0 if "--help" in argv else 2)
+    assert "Traceback" not in done.stderr
