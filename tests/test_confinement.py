@@ -100,6 +100,8 @@ def target(tmp_path: Path) -> Path:
         "import fcntl, os; fcntl.ioctl(os.pipe()[0], 0x5452, bytes(4))",  # FIOASYNC
         "import fcntl, os; fcntl.fcntl(os.open(os.__file__, os.O_RDONLY), fcntl.F_SETLEASE, fcntl.F_RDLCK)",
         "import fcntl, os; fcntl.fcntl(os.open(os.path.dirname(os.__file__), os.O_RDONLY), fcntl.F_NOTIFY, fcntl.DN_MODIFY)",
+        "import fcntl, os; fcntl.flock(os.open(os.__file__, os.O_RDONLY), fcntl.LOCK_SH)",
+        "import fcntl, os; fcntl.lockf(os.open(os.__file__, os.O_RDONLY), fcntl.LOCK_SH)",
         "call(30 if ARM else 251, 1, os.getppid(), 0)",  # ioprio_set
         "call(463, 0, 0, 0, 0, 0, 0)",  # setxattrat: newer than the list
         "call(511, 0)",  # a system call that is yet to be invented

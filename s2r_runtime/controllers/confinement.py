@@ -56,7 +56,6 @@ _ALLOWED: dict[str, tuple[int | None, int | None]] = {
     "getsockopt": (55, 209), "poll": (7, None), "ppoll": (271, 73), "select": (23, None), "pselect6": (270, 72),
     "epoll_create": (213, None), "epoll_create1": (291, 20), "epoll_ctl": (233, 21), "epoll_wait": (232, None), "epoll_pwait": (281, 22),
     "epoll_pwait2": (441, 441), "eventfd": (284, None), "eventfd2": (290, 19), "signalfd": (282, None), "signalfd4": (289, 74),
-    "flock": (73, 32),
     # memory
     "brk": (12, 214), "mmap": (9, 222), "munmap": (11, 215), "mremap": (25, 216), "mprotect": (10, 226), "madvise": (28, 233),
     "msync": (26, 227), "mincore": (27, 232), "mlock": (149, 228), "munlock": (150, 229), "mlock2": (325, 284), "membarrier": (324, 283),
@@ -92,9 +91,10 @@ _ALLOWED: dict[str, tuple[int | None, int | None]] = {
 
 _NEWER = 463
 """The first system call that is newer than this list (setxattrat, Linux 6.13); the same number on both processors."""
-_REACHING = (8, 10, 15, 1024, 1026)
+_REACHING = (6, 7, 8, 10, 15, 37, 38, 1024, 1026)
 """fcntl(2): F_SETOWN, F_SETSIG, F_SETOWN_EX: a pipe that has data for somebody sends him a signal of one's choice. F_SETLEASE: whoever
-opens the file for writing waits for its holder, 45 s. F_NOTIFY: watches a folder.
+opens the file for writing waits for its holder, 45 s. F_NOTIFY: watches a folder. F_SETLK, F_SETLKW, F_OFD_SETLK, F_OFD_SETLKW (and
+flock, which is not on the list): others wait for whoever locks their files.
 """
 _IOCTL_OWNERS = (0x5452, 0x8901, 0x8902)
 """ioctl(2): FIOASYNC, FIOSETOWN, SIOCSPGRP, which do the same."""
