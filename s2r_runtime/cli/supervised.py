@@ -21,7 +21,7 @@ _PASSED_ON = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
 def run(verb: Callable[[], int]) -> int:
     """verb(), in a process of its own; returns (or raises) there, and ends this process with the same exit code or signal."""
-    output.flush()
+    output.stand_in_for_closed_streams()  # or the pipe would take their place
     reading, writing = os.pipe()
     waited = {*_PASSED_ON, signal.SIGCHLD}
     before = signal.pthread_sigmask(signal.SIG_BLOCK, waited)
