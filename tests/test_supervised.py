@@ -31,6 +31,18 @@ def files(folder: Path, ending: str) -> list[str]:
     return [str(folder / "run.csv"), "--model", str(folder / "model.py"), "--dt", "0.1"]
 
 
+def computing(folder: Path) -> tuple[subprocess.Popen[bytes], int]:
+    """A verb that computes with a model that takes its time, and the process that does."""
+    process = subprocess.Popen([*S2R, "gap", *files(folder, f"open({str(folder / 'there')!r}, 'w').close(); time.sleep(60)")])
+    limit = time.monotonic() + 60.0
+    while not (folder / "there").exists():
+        assert process.poll() is None
+        assert time.monotonic() < limit
+        time.sleep(0.05)
+    (child,) = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    return process, int(child)
+
+
 @pytest.mark.parametrize("verb", ["gap", "trace"])
 @pytest.mark.parametrize("ending", ["os._exit(0)", "sys.exit(0)", "raise SystemExit"])
 def test_a_model_that_ends_the_program_is_no_success(verb: str, ending: str, tmp_path: Path) -> None:
@@ -41,31 +53,26 @@ def test_a_model_that_ends_the_program_is_no_success(verb: str, ending: str, tmp
     assert "ended the program" in line
 
 
+def test_a_process_that_a_model_leaves_behind_is_not_waited_for(tmp_path: Path) -> None:
+    argv = files(tmp_path, "os.fork() or time.sleep(60); os._exit(0)")
+    with (tmp_path / "said").open("wb") as said:
+        assert subprocess.run([*S2R, "gap", *argv], stdout=said, stderr=said, check=False, timeout=50).returncode == 78
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_the_verb_and_what_waits_for_it(number: signal.Signals, tmp_path: Path) -> None:
-    process = subprocess.Popen([*S2R, "gap", *files(tmp_path, f"open({str(tmp_path / 'there')!r}, 'w').close(); time.sleep(60)")])
-    limit = time.monotonic() + 60.0
-    while not (tmp_path / "there").exists():
-        assert process.poll() is None
-        assert time.monotonic() < limit
-        time.sleep(0.05)
-    (child,) = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    process, child = computing(tmp_path)
     process.send_signal(number)
     assert process.wait(30) == (130 if number == signal.SIGINT else -number)
     with pytest.raises(ProcessLookupError):
-        os.kill(int(child), 0)
+        os.kill(child, 0)
 
 
 def test_the_verb_ends_with_what_waits_for_it(tmp_path: Path) -> None:
-    process = subprocess.Popen([*S2R, "gap", *files(tmp_path, f"open({str(tmp_path / 'there')!r}, 'w').close(); time.sleep(60)")])
-    limit = time.monotonic() + 60.0
-    while not (tmp_path / "there").exists():
-        assert process.poll() is None
-        assert time.monotonic() < limit
-        time.sleep(0.05)
-    (child,) = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    process, child = computing(tmp_path)
     process.kill()
     process.wait(30)
+    limit = time.monotonic() + 60.0
     while Path(f"/proc/{child}").exists() and "Z" not in Path(f"/proc/{child}/stat").read_text().split()[2:3]:
         assert time.monotonic() < limit
         time.sleep(0.05)

@@ -52,13 +52,22 @@ def _waited_for(child: int, reading: int, waited: set[signal.Signals]) -> int:
             break
     code = os.waitstatus_to_exitcode(status)
     if code < 0:
-        signal.signal(-code, signal.SIG_DFL) if -code not in (signal.SIGKILL, signal.SIGSTOP) else None
+        if -code != signal.SIGKILL:
+            signal.signal(-code, signal.SIG_DFL)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, waited)
         os.kill(os.getpid(), -code)
         return 128 - code
-    if code == 0 and not os.read(reading, 1):
+    if code == 0 and not _came_to_its_end(reading):
         error = PluginError("code of a model or an effect ended the program (os._exit?) before there was an answer")
         output.fail(str(error), error.exit_code, as_json=False)
         output.flush()
         return error.exit_code
     return code
+
+
+def _came_to_its_end(reading: int) -> bool:
+    os.set_blocking(reading, False)  # a process that it left behind may still have the other end
+    try:
+        return bool(os.read(reading, 1))
+    except BlockingIOError:
+        return False
