@@ -70,7 +70,7 @@ def test_it_walks_stops_holds_and_founds_a_gap(campaign: tuple[Path, Path, dict[
     assert all(abs(s.u[0]) <= 0.15 and abs(s.u[1]) <= 0.3 and s.periods == 10 for s in samples)
     # it walked: a second under the fastest of the inputs goes somewhere, and a tenth of a second is off by less than three of its steps
     fastest = max(samples, key=lambda s: abs(s.u[0]))
-    gone = sum((b - a) ** 2 for a, b in zip(fastest.x0[:2], fastest.held[:2], strict=True)) ** 0.5
+    gone = sum((b - a) ** 2 for a, b in zip(fastest.start[:2], fastest.held[:2], strict=True)) ** 0.5
     assert gone > 0.5 * abs(fastest.u[0])
     assert 0.0 < gap["radius"] < 0.048
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from s2r_runtime.cli import output
+from s2r_runtime.cli.supervised import EndedBySignal
 from s2r_runtime.daemon import control
 from s2r_runtime.errors import ConfigError, S2RError, UsageError
 from s2r_runtime.hookspecs import Story
@@ -367,7 +368,7 @@ def _unwound_by(*numbers: signal.Signals) -> Iterator[None]:
     def leave(number: int, _frame: object) -> None:
         for other in numbers:
             signal.signal(other, signal.SIG_IGN)  # once is enough, and what ends them is not to be cut short
-        raise SystemExit(128 + number)
+        raise EndedBySignal(number)
 
     heard = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]  # `nohup` has it go on
     before = {number: signal.signal(number, leave) for number in heard}

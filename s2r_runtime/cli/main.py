@@ -88,6 +88,8 @@ def main(argv: Sequence[str] | None = None, run: Callable[[argparse.Namespace], 
             run = run or args.run
             try:
                 return run(args)
+            except supervised.EndedBySignal:
+                raise
             except SystemExit:
                 raise PluginError("code of a model or an effect ended the program (sys.exit?) before there was an answer") from None
         finally:

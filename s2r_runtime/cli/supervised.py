@@ -19,6 +19,13 @@ VERBS = frozenset({"gap", "trace", "verify", "certify", "synthesize", "audit", "
 _PASSED_ON = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
 
+class EndedBySignal(SystemExit):
+    """What a verb's own handler of a signal raises: main takes any other SystemExit for one of others' code."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(128 + number)
+
+
 def run(verb: Callable[[], int]) -> int:
     """verb(), in a process of its own; returns (or raises) there, and ends this process with the same exit code or signal."""
     output.stand_in_for_closed_streams()  # or the pipe would take their place
