@@ -17,6 +17,7 @@ import hashlib
 import os
 import stat
 from collections.abc import Iterable
+from glob import escape
 from pathlib import Path
 
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
@@ -188,7 +189,7 @@ def rotate(path: Path) -> tuple[Path, Path]:
     if not offline_ledger.path_beside(path).exists():
         raise ConfigError(f"{offline_ledger.path_beside(path)}: is missing, so nobody knows what this key has spent; put it back first")
     public = public_path(path)
-    kept = public.with_name(f"{public.name}.{fingerprint(public_bytes(old)).partition(':')[2][:8]}")
+    kept = _former_path(public, public_bytes(old))
     private_pem, public_pem = _pems(Ed25519PrivateKey.generate())
     try:
         replace(kept, _pems(old)[1], 0o644)
@@ -197,6 +198,17 @@ def rotate(path: Path) -> tuple[Path, Path]:
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
     return public, kept
+
+
+def _former_path(public: Path, key: bytes) -> Path:
+    return public.with_name(f"{public.name}.{fingerprint(key).partition(':')[2][:8]}")
+
+
+def former(path: Path) -> tuple[bytes, ...]:
+    """Public keys that were in the place of this private key before `rotate`. Raises ConfigError as `load_trusted`."""
+    public = public_path(path)
+    found = ((file, load_trusted_file(file)) for file in sorted(public.parent.glob(f"{escape(public.name)}.????????")))
+    return tuple(key for file, key in found if file == _former_path(public, key))
 
 
 def trust(public: Path, folder: Path) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import socket
 from collections.abc import Iterator
@@ -18,7 +19,7 @@ from s2r_runtime.daemon import past, persistence
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import MEMORY_SCHEMA, Gap, Memory, Persist, SampleTaken, Ticked
 from s2r_runtime.recording.glance import glance
-from s2r_runtime.recording.reading import read
+from s2r_runtime.recording.reading import Reading, read
 from s2r_runtime.recording.writer import Writer
 
 KEY = Ed25519PrivateKey.from_private_bytes(bytes(32))
@@ -71,10 +72,18 @@ NEWER = {
 }
 
 
-def log(folder: Path, *memories: Memory, stamp: str = "20260101T000000Z", key: Ed25519PrivateKey = KEY, closed: bool = True) -> Path:
-    """A log that ends with the last of these memories, and a little more."""
+def log(
+    folder: Path,
+    *memories: Memory,
+    stamp: str = "20260101T000000Z",
+    key: Ed25519PrivateKey | None = KEY,
+    closed: bool = True,
+    number: int | None = None,
+) -> Path:
+    """A log that ends with the last of these memories, and a little more. number: as the daemon counts its logs; None: as before it did."""
     path = folder / f"rig-{stamp}.mcap"
-    writer = Writer(path, run=path.stem, signer=key, timed=False)
+    metadata = {} if number is None else {past.NUMBER: str(number)}
+    writer = Writer(path, run=path.stem, signer=key, metadata=metadata, timed=False)
     for number, memory in enumerate(memories):
         writer.write(Persist(number + 1, memory), number + 1)
         for tick in range(50):
@@ -86,7 +95,7 @@ def log(folder: Path, *memories: Memory, stamp: str = "20260101T000000Z", key: E
 
 def reconciled(state: Memory, folder: Path) -> tuple[Memory, str]:
     said: list[str] = []
-    return past.reconciled(state, folder, [PUBLIC], said.append), "\n".join(said)
+    return past.reconciled(state, past.Logs(folder, "rig", [PUBLIC]), [PUBLIC], said.append), "\n".join(said)
 
 
 @pytest.mark.parametrize("closed", [True, False], ids=["closed", "cut"])
@@ -156,17 +165,114 @@ def test_a_run_whose_clock_was_ahead_is_not_believed_again_once_a_person_cleared
     assert reconciled(right, tmp_path) == (right, "")
 
 
-def test_only_a_log_that_is_sound_and_this_robots_own_is_believed(tmp_path: Path) -> None:
-    path = log(tmp_path, NOW, key=OTHER)
-    with pytest.raises(ConfigError, match="does not trust"):
-        reconciled(OLDER["an attempt"], tmp_path)
-    path.unlink()
-    data = bytearray((path := log(tmp_path, NOW, NOW)).read_bytes())
-    data[data.index(b"zstd") + 40] ^= 1  # in the first chunk: what the log ends with can be seen, but rests on what is damaged
+def spoilt(path: Path, chunk: int) -> Path:
+    """The log with a bit flipped in that chunk (0: the first)."""
+    data = bytearray(path.read_bytes())
+    at = -1
+    for _ in range(chunk + 1):
+        at = data.index(b"\x28\xb5\x2f\xfd", at + 1)
+    data[at + 40] ^= 1
     path.write_bytes(data)
-    with pytest.raises(ConfigError, match="is damaged"):
-        reconciled(OLDER["an attempt"], tmp_path)
+    return path
+
+
+@pytest.mark.parametrize(
+    "says", [*({"state": OLDER[lost]} for lost in OLDER), {"latched": ("emergency_stop",)}, {"latest_unix_s": 2**33}], ids=str
+)
+def test_an_own_log_that_is_damaged_and_knows_more_than_the_state_starts_nothing(tmp_path: Path, says: dict[str, Any]) -> None:
+    state = says.get("state", NOW)
+    path = spoilt(log(tmp_path, NOW, NOW, msgspec.structs.replace(NOW, **{k: v for k, v in says.items() if k != "state"})), 1)
+    with pytest.raises(ConfigError, match="is damaged") as refused:
+        reconciled(state, tmp_path)
+    assert str(path) in str(refused.value)
+    spoilt(log(tmp_path, NOW, NOW, stamp="20260102T000000Z"), 1)
+    path.unlink()
     assert reconciled(NOW, tmp_path) == (NOW, "")
+
+
+def forged(folder: Path, how: str, memory: Memory) -> Path:
+    """A log that somebody without this robot's key put into its folder, with the newest name and number."""
+    stamp, number = "22000101T000000Z", 10**12
+    if how == "another key":
+        return log(folder, memory, stamp=stamp, key=OTHER, number=number)
+    if how == "no key":
+        return log(folder, memory, stamp=stamp, key=None, number=number)
+    if how == "this robot's public key":
+        path = log(folder, memory, stamp=stamp, key=OTHER, number=number)
+        path.write_bytes(path.read_bytes().replace(OTHER.public_key().public_bytes_raw().hex().encode(), PUBLIC.hex().encode()))
+        return path
+    if how == "a later part":
+        path = forged(folder, "this robot's public key", memory)
+        return path.rename(folder / "rig-20260101T000000Z.002.mcap")
+    assert how == "a copy under another name"
+    elsewhere = folder / "elsewhere"
+    elsewhere.mkdir(exist_ok=True)
+    return log(elsewhere, memory, number=number).rename(folder / f"rig-{stamp}.mcap")
+
+
+FORGED = ["another key", "no key", "this robot's public key", "a later part", "a copy under another name"]
+
+
+@pytest.mark.parametrize("how", FORGED)
+@pytest.mark.parametrize(
+    "claim",
+    [
+        {"latched": ("emergency_stop", "two_robots")},
+        {"latest_unix_s": 7_258_118_400},
+        {"attempts": 10**9, "epochs": 10**9},
+        {"attempts": 1, "revoked": {"sha256:ff": "nobody"}},
+        {"revoked": {}, "latched": ("watch_alarm",), "attempts": 99},
+    ],
+    ids=lambda claim: "+".join(claim),
+)
+def test_a_forged_log_neither_latches_nor_expires_nor_stops_a_start(tmp_path: Path, how: str, claim: dict[str, Any]) -> None:
+    log(tmp_path, NOW, number=7)
+    path = forged(tmp_path, how, changed(**claim))
+    memory, said = reconciled(NOW, tmp_path)
+    assert memory == NOW
+    assert path.name in said
+    assert "\n" not in said
+
+
+@pytest.mark.parametrize("how", FORGED)
+def test_forged_logs_hide_none_of_the_robots_own(tmp_path: Path, how: str) -> None:
+    log(tmp_path, NOW, number=7)
+    path = forged(tmp_path, how, OLDER["an attempt"])
+    for copy in range(past.RUNS + 1) if how != "a later part" else ():
+        shutil.copy2(path, tmp_path / f"rig-2200010{copy + 2}T000000Z.mcap")
+    logs = past.Logs(tmp_path, "rig", [PUBLIC])
+    assert logs.next_number == 8
+    assert reconciled(OLDER["an attempt"], tmp_path)[0] == NOW
+    assert [path.name for path in past.campaign_logs(logs, "rig", 1)] == ["rig-20260101T000000Z.mcap"]
+
+
+def test_runs_whose_clock_was_ahead_hide_none_that_came_after_them(tmp_path: Path) -> None:
+    for number in range(past.RUNS + 1):
+        log(tmp_path, OLDER["the whole budget"], stamp=f"2096010{number + 1}T000000Z", number=number + 1)
+    log(tmp_path, NOW, stamp="20260101T000000Z", number=past.RUNS + 2)
+    log(tmp_path, OLDER["the whole budget"], stamp="19700101T000000Z", number=past.RUNS)
+    assert reconciled(OLDER["an attempt"], tmp_path)[0] == NOW
+    assert past.Logs(tmp_path, "rig", [PUBLIC]).next_number == past.RUNS + 3
+
+
+def test_a_log_with_a_number_is_newer_than_one_of_before_they_had_any(tmp_path: Path) -> None:
+    for number in range(past.RUNS + 1):
+        log(tmp_path, OLDER["an attempt"], stamp=f"2096010{number + 1}T000000Z")
+    assert past.Logs(tmp_path, "rig", [PUBLIC]).next_number == 1
+    log(tmp_path, NOW, number=1)
+    assert reconciled(OLDER["an attempt"], tmp_path)[0] == NOW
+
+
+def test_what_lies_beside_the_logs_holds_up_no_start(tmp_path: Path) -> None:
+    """Opening a FIFO waits for whoever writes to it."""
+    log(tmp_path, NOW)
+    os.mkfifo(tmp_path / "rig-20270101T000000Z.mcap")
+    (tmp_path / "rig-20270102T000000Z.mcap").symlink_to("/dev/zero")
+    (tmp_path / "rig-20270103T000000Z.mcap").mkdir()
+    (tmp_path / f"rig-20270104T000000Z-{'9' * 9}.mcap").write_bytes(b"\x89MCAP0\r\n" + b"\xff" * 4096)
+    (tmp_path / f"rig-20270104T000000Z-{'9' * 99}.mcap").write_bytes(b"")
+    assert reconciled(OLDER["an attempt"], tmp_path)[0] == NOW
+    assert list(glance(tmp_path / "rig-20270101T000000Z.mcap", past.SAID)) == []
 
 
 def test_only_logs_of_this_robot_are_looked_at_and_an_unreadable_one_hides_none_before_it(tmp_path: Path) -> None:
@@ -232,7 +338,7 @@ def test_samples_are_looked_for_in_all_runs_since_their_campaign_began(tmp_path:
     under_way = changed(epochs=2, campaign_epoch=2, campaign_n=200)
     before = [log(tmp_path, NOW, stamp=f"2026010{day}T000000Z") for day in range(1, 6)]
     since = [log(tmp_path, under_way, stamp=f"2026020{day}T000000Z") for day in range(1, 6)]
-    assert past.campaign_logs(tmp_path, "rig", 2) == [*since[::-1], *before[:1:-1]]
+    assert past.campaign_logs(past.Logs(tmp_path, "rig", [PUBLIC]), "rig", 2) == [*since[::-1], *before[:1:-1]]
 
 
 # ---------------------------------------------------------------- in a running daemon
@@ -281,6 +387,32 @@ def test_an_old_copy_of_the_state_gives_back_no_attempt_no_revocation_and_no_sto
     assert rig.s2r("audit", *map(str, rig.log_files()), "--key", str(rig.state / "key.pub")).returncode == 0
     assert rig.s2r("keys", "new", str(rig.state / "other.pem")).returncode == 0
     assert rig.s2r("audit", *map(str, rig.log_files()), "--key", str(rig.state / "other.pub")).returncode == 1
+
+
+def test_a_log_of_a_key_that_was_rotated_still_counts_and_a_forged_one_stops_no_daemon(rig: Rig) -> None:
+    """What was spent with the old key stays spent; and of two runs the later has the higher number, whatever its name says."""
+    rig.start_robot()
+    rig.start()
+    assert rig.deploy()["exit_code"] == 0
+    kept = rig.folder / "kept"
+    kept.mkdir()
+    shutil.copy2(rig.state / "state.json", kept)
+    assert rig.ask("undeploy")["exit_code"] == 0
+    assert rig.ask("deploy", path=str(rig.controller("    raise ValueError('no')\n", "bad.py")))["exit_code"] == 1
+    assert rig.stop() == 0
+    (rig.logs / "rig-22000101T000000Z.mcap").write_bytes(
+        forged(rig.folder, "this robot's public key", changed(latched=("x",))).read_bytes()
+    )
+    assert rig.s2r("keys", "rotate", str(rig.state / "key.pem")).returncode == 0
+    put_back(rig, kept, "state.json")
+    rig.start()
+    status = rig.status()
+    assert (status["attempts"], status["latched"]) == (2, [])
+    assert "going on from what" in rig.said()
+    assert "rig-22000101T000000Z.mcap; nothing that they hold counts" in rig.said()
+    assert rig.stop() == 0
+    own = [path for path in rig.log_files() if not path.name.startswith("rig-22")]
+    assert [Reading(path).metadata["s2r"][past.NUMBER] for path in own] == ["1", "2"]
 
 
 def interrupted(rig: Rig) -> tuple[Path, Path]:

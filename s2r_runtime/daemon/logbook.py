@@ -8,10 +8,12 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
+from itertools import count
 from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+from s2r_runtime.daemon.past import NUMBER
 from s2r_runtime.daemon.retention import Retention
 from s2r_runtime.errors import ConfigError, RecordingError
 from s2r_runtime.messages import LogHead, Struct
@@ -35,16 +37,19 @@ class Logbook:
         *,
         lockstep: bool,
         file: Path | None,
+        number: int = 1,
         retention: Retention | None = None,
         disk_timeout_s: float = 5.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """file: the log's path, if it isn't to have a name of its own in `folder`. retention: notes what the logs are evidence of.
+        """file: the log's path, if it isn't to have a name of its own in `folder`. number: the first log's, among all of this robot's.
+        retention: notes what the logs are evidence of.
         disk_timeout_s: how long the disk is waited for. clock: s, of the time for which messages wait to be written.
         """
         self._folder, self._robot, self._file = folder, robot, file
         self._settings, self._signer, self._lockstep = settings, signer, lockstep
         self._disk_timeout_s, self._clock = disk_timeout_s, clock
+        self._numbers = count(number)
         self._writer: Writer | None = None
         self._recorder: Recorder | None = None
         self._next: Writer | None = None
@@ -104,7 +109,7 @@ class Logbook:
             path,
             run=path.stem,
             signer=self._signer,
-            metadata={"robot": self._robot},
+            metadata={"robot": self._robot, NUMBER: str(next(self._numbers))},
             attachments=list(self._attached.values()),
             rotate_bytes=self._settings.rotate_bytes,
             rotate_s=self._settings.rotate_after,

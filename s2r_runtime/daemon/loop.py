@@ -199,7 +199,8 @@ class Daemon:
         self.folder = stack.enter_context(StateFolder(self.state_dir, robot))
         self.memory = self.folder.memory(self._log_dir.glob(f"{robot}-*.mcap") if self._log_file is None else ())
         self.key = issuing.signing_key(self._key_path, self.folder.path, self.say)
-        self.trust = Trust(self.folder.path, keys.public_bytes(self.key))
+        former = keys.former(self._key_path or self.folder.path / "key.pem")
+        self.trust = Trust(self.folder.path, keys.public_bytes(self.key), former)
         self.trust.check_own()
         self.memory, taken = self._held_against_the_logs(self.memory)
         self.models = ModelStore(self.folder.path, self.profile.model.digest())
@@ -231,6 +232,7 @@ class Daemon:
             self.key,
             lockstep=lockstep,
             file=self._log_file,
+            number=self._log_number,
             retention=self.retention,
             disk_timeout_s=disk_timeout_s(self.profile),
             clock=self.awake.now_s,
@@ -263,13 +265,16 @@ class Daemon:
     def _held_against_the_logs(self, memory: Memory) -> tuple[Memory, list[SampleTaken]]:
         """The memory to start with, and the samples of its unfinished campaign that were logged."""
         folder = self._log_dir if self._log_file is None else self.state_dir / self.profile.recording.directory
-        memory = past.reconciled(memory, folder, self.trust.keys(), self.say)
+        keys = self.trust.log_keys()
+        logs = past.Logs(folder, memory.robot, keys)
+        memory = past.reconciled(memory, logs, keys, self.say)
+        self._log_number = logs.next_number
         if not memory.campaign_epoch:
             return memory, []
-        logs = past.campaign_logs(folder, memory.robot, memory.campaign_epoch)
+        paths = past.campaign_logs(logs, memory.robot, memory.campaign_epoch)
         with contextlib.suppress(ConfigError):  # said when the campaign is to go on
-            logs += map(Path, (self.folder.campaign() or {}).get("logs", ()))
-        return memory, past.samples(dict.fromkeys(logs), memory.campaign_epoch, self.trust.keys())
+            paths += map(Path, (self.folder.campaign() or {}).get("logs", ()))
+        return memory, past.samples(dict.fromkeys(paths), memory.campaign_epoch, keys)
 
     def _recall_proposal(self) -> None:
         """A model that waits to be adopted belongs into this log too. One that is not there any more, or not this profile's, can't be."""

@@ -6,8 +6,11 @@
     S forgets something, L nothing that S knows          L counts: S is an older copy, was edited, or did not reach the disk
     each forgets something that the other knows          nobody knows what was spent: the daemon does not start
 
-What is latched in either is latched. L counts only after its log was read in full, and under a key that this robot signs with or trusts.
-The samples of an unfinished campaign are held against the logs in the same way: who takes them once more may choose.
+What is latched in either is latched. A log counts only if its first seal, and the name in it, are this robot's own: by a key that it
+signs with, signed with before, or trusts. What any other file in the folder claims is reported, and changes nothing. Before anything
+rests on a log it is read in full; an own one that is damaged starts nothing. The newest log is the one with the highest number in its
+metadata: a name has the time of a wall clock, which may have been wrong. The samples of an unfinished campaign are held against the logs
+in the same way: who takes them once more may choose.
 
 What no log shows that is still there, this can't: a whole folder that was put back, logs included, or logs that were deleted. Then the
 heads that were published elsewhere tell (docs/log-format.md), and the audit over the logs that somebody kept.
@@ -28,36 +31,84 @@ from s2r_runtime.core.stream import stood
 from s2r_runtime.errors import ConfigError, RecordingError
 from s2r_runtime.messages import BEHAVIOURS, Memory, Persist, SampleTaken, Started
 from s2r_runtime.recording.glance import glance
+from s2r_runtime.recording.layout import ABOUT
 from s2r_runtime.recording.reading import Reading
 
 SAID = ("event/started", "out/persist")
 TAKEN = ("event/sample_taken",)
 RUNS = 3
-"""Newest runs that say something and are looked into: another may be older than its name. One that ended before its first event says
-nothing, and does not count.
+"""Newest runs that say something and are looked into: logs of before they were numbered may be older than their names. One that ended
+before its first event says nothing, and does not count.
 """
-_NAME = re.compile(r"-(\d{8}T\d{6}Z)(?:-(\d+))?(?:\.(\d{3,}))?\.mcap")
+NUMBER = "number"
+"""Of a log among all of its robot's, in its first metadata record."""
+_NAME = re.compile(r"-(\d{8}T\d{6}Z)(?:-(\d{1,9}))?(?:\.(\d{3,9}))?\.mcap")
 """What follows the robot in a log's name: when the run began, which of several in that second, which part of it."""
+_DIGITS = re.compile(r"[0-9]{1,15}")
+SHOWN = 3
+"""Names of logs that do not count, said in the one line about them."""
 
 
-def runs(folder: Path, robot: str) -> list[list[Path]]:
-    """The files of each run of that robot in the folder, part by part; the newest run first."""
-    found: dict[tuple[str, int], list[tuple[int, Path]]] = {}
-    for path in folder.glob(f"{robot}-*.mcap"):
-        if name := _NAME.fullmatch(path.name.removeprefix(robot)):
-            found.setdefault((name[1], int(name[2] or 1)), []).append((int(name[3] or 1), path))
-    return [[path for _, path in sorted(found[run])] for run in sorted(found, reverse=True)]
+class Logs:
+    """The logs of one robot in a folder. keys: public ones; a log counts if it is sealed with one of them."""
+
+    def __init__(self, folder: Path, robot: str, keys: Collection[bytes]) -> None:
+        self._robot, self._keys = robot, keys
+        self.foreign: list[Path] = []
+        """Files that were looked at, and are not this robot's own."""
+        found: dict[tuple[str, int], list[tuple[int, Path]]] = {}
+        for path in folder.glob(f"{robot}-*.mcap"):
+            if name := _NAME.fullmatch(path.name.removeprefix(robot)):
+                found.setdefault((name[1], int(name[2] or 1)), []).append((int(name[3] or 1), path))
+        runs = [(began, [path for _, path in sorted(parts)]) for began, parts in found.items()]
+        self._runs = sorted(((_number(parts[0]), began, parts) for began, parts in runs), reverse=True)
+
+    @property
+    def next_number(self) -> int:
+        """One more than the highest of those that count."""
+        return next((number + 1 for number, _, parts in self._runs if any(map(self._counts, parts))), 1)
+
+    def runs(self) -> Iterator[list[Path]]:
+        """The files of each run that are this robot's own, part by part; the newest run first."""
+        for _, _, parts in self._runs:
+            if own := list(filter(self._counts, parts)):
+                yield own
+
+    def ends(self) -> Iterator[tuple[Memory, Path]]:
+        """What each run ends with, and where it says so, the newest first."""
+        for _, _, parts in self._runs:
+            found = _last_memory(filter(self._counts, reversed(parts)))
+            if found is not None and found[0].robot == self._robot:
+                yield found
+
+    def _counts(self, path: Path) -> bool:
+        """Whether the file begins with a seal by one of the keys, and is of the run that its name says. Nothing else in it is checked."""
+        try:
+            reading = Reading(path)
+            own = reading.public_key in self._keys and path.stem in {reading.run, f"{reading.run}.{reading.part:03}"}
+            if own and next(iter(reading), None) is not None:
+                return reading.signed
+            if not own or reading.ending.kind == "broken":  # else a crash cut it before its first seal
+                self.foreign.append(path)
+        except RecordingError:  # no log at all
+            pass
+        return False
 
 
-def reconciled(state: Memory, folder: Path, keys: Collection[bytes], say: Callable[[str], None]) -> Memory:
+def _number(path: Path) -> int:
+    """A log's number as its beginning claims; 0 if it has none."""
+    try:
+        text = Reading(path).metadata[ABOUT].get(NUMBER, "")
+    except RecordingError:
+        return 0
+    return int(text) if _DIGITS.fullmatch(text) else 0
+
+
+def reconciled(state: Memory, logs: Logs, keys: Collection[bytes], say: Callable[[str], None]) -> Memory:
     """The memory to start with. keys: public ones, whose logs count. Raises ConfigError if state and logs cannot both be true."""
-    latest: tuple[str, ...] | None = None
-    seen = 0
-    for told, path in islice(_told(folder, state.robot), RUNS):
-        if latest is None:
-            latest = told.latched
-            # a run whose clock was ahead has the newest name for long; since then a person may have said so
-            seen = told.latest_unix_s if told.clock_cleared >= state.clock_cleared else 0
+    newest: tuple[Memory, Path] | None = None
+    for told, path in islice(logs.ends(), RUNS):
+        newest = newest or (told, path)
         if what := forgotten(told, state):
             if gained := forgotten(state, told):
                 raise ConfigError(
@@ -66,12 +117,27 @@ def reconciled(state: Memory, folder: Path, keys: Collection[bytes], say: Callab
                 )
             say(f"the saved state forgets {what}; going on from what {path.name} ends with")
             state = msgspec.structs.replace(_in_full(path, told, keys, what), latched=_both(told.latched, state.latched))
-    if seen > state.latest_unix_s:
+    if logs.foreign:
+        names = ", ".join(path.name for path in logs.foreign[:SHOWN])
+        more = f" and {len(logs.foreign) - SHOWN} more" if len(logs.foreign) > SHOWN else ""
+        say(f"logs that no key of this robot sealed under their name: {names}{more}; nothing that they hold counts")
+    return state if newest is None else _with_latches(state, *newest, keys, say)
+
+
+def _with_latches(state: Memory, told: Memory, path: Path, keys: Collection[bytes], say: Callable[[str], None]) -> Memory:
+    """The state with what the newest log, at `path`, ends with as latched, and with its latest time."""
+    # a run whose clock was ahead may be the newest; since then a person may have cleared it
+    seen = told.latest_unix_s if told.clock_cleared >= state.clock_cleared else 0
+    later = seen > state.latest_unix_s
+    missing = tuple(reason for reason in told.latched if reason not in state.latched)
+    if later or missing:
+        _in_full(path, told, keys, f"the time {seen} s" if later else f"that {', '.join(missing)} is latched")
+    if later:
         say(f"the saved state does not know of the time {seen} s that the newest log ends with; certificates expire by that")
         state = msgspec.structs.replace(state, latest_unix_s=seen)
-    if missing := [reason for reason in latest or () if reason not in state.latched]:
+    if missing:
         say(f"the saved state does not know that {', '.join(missing)} is latched, as the newest log ends with; it is latched")
-        state = msgspec.structs.replace(state, latched=_both(state.latched, tuple(missing)))
+        state = msgspec.structs.replace(state, latched=_both(state.latched, missing))
     return state
 
 
@@ -79,20 +145,12 @@ def _both(one: tuple[str, ...], other: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*one, *other)))
 
 
-def _told(folder: Path, robot: str) -> Iterator[tuple[Memory, Path]]:
-    """What each run ends with, and where it says so, the newest first."""
-    for parts in runs(folder, robot):
-        told, path = _last_memory(parts)
-        if told is not None and told.robot == robot:
-            yield told, path
-
-
-def _last_memory(parts: list[Path]) -> tuple[Memory | None, Path]:
-    for path in reversed(parts):
+def _last_memory(newest_first: Iterable[Path]) -> tuple[Memory, Path] | None:
+    for path in newest_first:
         for message in glance(path, SAID, newest_first=True):
             if isinstance(message, Persist | Started):
                 return message.memory, path
-    return None, parts[-1]
+    return None
 
 
 def _in_full(path: Path, told: Memory, keys: Collection[bytes], lost: str) -> Memory:
@@ -164,14 +222,14 @@ def _of_one_epoch(before: Memory, now: Memory, epoch: int) -> str:
     return ""
 
 
-def campaign_logs(folder: Path, robot: str, epoch: int) -> list[Path]:
+def campaign_logs(logs: Logs, robot: str, epoch: int) -> list[Path]:
     """Logs that may hold samples of that epoch's campaign, the newest run first: back to `RUNS` that ended before it began."""
     found: list[Path] = []
     before = 0
-    for parts in runs(folder, robot):
+    for parts in logs.runs():
         found += parts
-        told, _ = _last_memory(parts)
-        before += told is not None and told.robot == robot and told.epochs < epoch
+        ending = _last_memory(reversed(parts))
+        before += ending is not None and ending[0].robot == robot and ending[0].epochs < epoch
         if before == RUNS:
             break
     return found

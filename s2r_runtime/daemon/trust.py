@@ -25,10 +25,11 @@ _Seen = tuple[tuple[str, int, int, int], ...]
 
 
 class Trust:
-    """folder: the robot's state. own: the public half of the key that the daemon signs with."""
+    """folder: the robot's state. own: the public half of the key that the daemon signs with; former: of those that it signed with before."""
 
-    def __init__(self, folder: Path, own: bytes) -> None:
+    def __init__(self, folder: Path, own: bytes, former: tuple[bytes, ...] = ()) -> None:
         """Raises ConfigError if a list of revoked keys or a trusted key can't be read, or could be somebody else's work."""
+        self._former = former
         self._own, self._trusted, self._certificates = own, folder / "trusted", folder / "certificates"
         self._lists = revocations.places(folder)
         self._revoked: dict[str, revocations.Revocation] = {}
@@ -41,6 +42,13 @@ class Trust:
     def keys(self) -> tuple[bytes, ...]:
         """Public keys whose signature counts. Raises ConfigError as above."""
         return self._read()[0]
+
+    def log_keys(self) -> tuple[bytes, ...]:
+        """Public keys whose logs are this robot's past: also those that were rotated, as what they show as spent stays spent. Raises as
+        above.
+        """
+        believed, revoked = self._read()
+        return tuple(dict.fromkeys((*believed, *(key for key in self._former if keys.fingerprint(key) not in revoked))))
 
     def _read(self) -> tuple[tuple[bytes, ...], dict[str, revocations.Revocation]]:
         """Public keys whose signature counts, and the revoked ones."""

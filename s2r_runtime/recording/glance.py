@@ -27,6 +27,8 @@ _DECOMPRESSOR = zstandard.ZstdDecompressor()
 def glance(path: Path, channels: Collection[str], *, newest_first: bool = False) -> Iterator[Struct]:
     """The messages on these channels, in order. Nothing, if the file can't be read or is no log: never raises for what is in it."""
     names = {NUMBERS[name]: name for name in channels}
+    if not path.is_file():  # opening a FIFO waits for whoever writes to it
+        return
     try:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             if data[: len(MAGIC)] != MAGIC:
