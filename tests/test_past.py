@@ -84,10 +84,10 @@ def log(
     path = folder / f"rig-{stamp}.mcap"
     metadata = {} if number is None else {past.NUMBER: str(number)}
     writer = Writer(path, run=path.stem, signer=key, metadata=metadata, timed=False)
-    for number, memory in enumerate(memories):
-        writer.write(Persist(number + 1, memory), number + 1)
-        for tick in range(50):
-            writer.write(Ticked(number + 1 + tick // 50), number + 1 + tick // 50)
+    for second, memory in enumerate(memories, 1):
+        writer.write(Persist(second, memory), second)
+        for _ in range(50):
+            writer.write(Ticked(second), second)
         writer.durable()
     writer.close() if closed else writer.abandon()
     return path
@@ -223,7 +223,7 @@ FORGED = ["another key", "no key", "this robot's public key", "a later part", "a
         {"attempts": 1, "revoked": {"sha256:ff": "nobody"}},
         {"revoked": {}, "latched": ("watch_alarm",), "attempts": 99},
     ],
-    ids=lambda claim: "+".join(claim),
+    ids="+".join,
 )
 def test_a_forged_log_neither_latches_nor_expires_nor_stops_a_start(tmp_path: Path, how: str, claim: dict[str, Any]) -> None:
     log(tmp_path, NOW, number=7)

@@ -25,7 +25,7 @@ _Seen = tuple[tuple[str, int, int, int], ...]
 
 
 class Trust:
-    """folder: the robot's state. own: the public half of the key that the daemon signs with; former: of those that it signed with before."""
+    """folder: the robot's state. own: the public half of the key that the daemon signs with. former: of those before it."""
 
     def __init__(self, folder: Path, own: bytes, former: tuple[bytes, ...] = ()) -> None:
         """Raises ConfigError if a list of revoked keys or a trusted key can't be read, or could be somebody else's work."""
