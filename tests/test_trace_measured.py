@@ -8,29 +8,31 @@ systems, 2022. D. Baril et al., DRIVE: data-driven robot input vector exploratio
 tests run where S2R_DATA, or a folder beside the repository, holds them.
 """
 
-import csv
-import gzip
 import os
 from pathlib import Path
 
 import pytest
-
-from s2r_runtime.models.composed import compose
-from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.trace.tracer import load_dataset, trace
+from trace_sets.measured import RECORDINGS, trace_measured
 
 FOLDER = Path(os.environ.get("S2R_DATA", Path(__file__).parents[2] / "shared" / "data"))
-RECORDING = FOLDER / "mrclam_ds4_robot3.csv.gz"
 
 
-@pytest.mark.skipif(not RECORDING.exists(), reason="the measured recordings are not here")
-@pytest.mark.long
-def test_the_delay_of_a_real_robot_is_found_and_its_heading_is_foretold_as_well_as_others_found():
+def recorded(name):
+    """Marks of a test on one of them."""
+
+    def marked(test):
+        there = (FOLDER / RECORDINGS[name].fit).exists()
+        return pytest.mark.long(pytest.mark.skipif(not there, reason="the measured recordings are not here")(test))
+
+    return marked
+
+
+@recorded("mrclam")
+def test_the_delay_of_a_real_robot_is_found_and_its_heading_is_foretold_as_well_as_others_found(tmp_path):
     """Published for this recording at 10 Hz: a transport delay or lag of 0.17 s in w and 0.21 s in v dominates; the one-step heading error
     on held-out data falls from .0133 to .0079 rad by the delay alone.
     """
-    model = compose(ModelSpec("unicycle", 0.1))
-    found = trace(load_dataset(RECORDING, model), model)
+    found = trace_measured(RECORDINGS["mrclam"], FOLDER, tmp_path)
     delays = [e for e in found.effects if e.name == "input_delay"]
     assert found.verdict in {"traced", "ambiguous"}
     assert {e.channel for e in delays} & {"*", "w"}
@@ -43,13 +45,10 @@ def test_the_delay_of_a_real_robot_is_found_and_its_heading_is_foretold_as_well_
     assert len(found.spec.fitted_on) == 3  # the bytes, what they say, and the rows
 
 
-@pytest.mark.skipif(not (FOLDER / "emps_pulses.csv.gz").exists(), reason="the measured recordings are not here")
-@pytest.mark.long
-def test_the_friction_of_a_real_joint_is_named_with_the_published_numbers():
+@recorded("emps")
+def test_the_friction_of_a_real_joint_is_named_with_the_published_numbers(tmp_path):
     """Published: Coulomb 20.14 and 20.63 N, viscous 166.7 and 240.4 N s/m by direction; relative force error 5.98 % on the pulses."""
-    model = compose(ModelSpec("joint", 0.01, {"mass": 95.1}))
-    fitted, pulses = (load_dataset(FOLDER / f"emps_{name}.csv.gz", model) for name in ("estimation", "pulses"))
-    found = trace(fitted, model, test=pulses)
+    found = trace_measured(RECORDINGS["emps"], FOLDER, tmp_path)
     assert found.verdict == "traced"
     values = {e.name: {name: value[0] for name, value in e.parameters.items()} for e in found.effects}
     assert set(values) == {"coulomb_friction", "viscous_friction"}
@@ -60,12 +59,10 @@ def test_the_friction_of_a_real_joint_is_named_with_the_published_numbers():
     assert error["after"]["input_relative"] < 0.0598
 
 
-@pytest.mark.skipif(not (FOLDER / "f1tenth.csv.gz").exists(), reason="the measured recordings are not here")
-@pytest.mark.long
-def test_a_real_car_is_foretold_three_seconds_ahead():
+@recorded("f1tenth")
+def test_a_real_car_is_foretold_three_seconds_ahead(tmp_path):
     """By others, on another split: 0.036 m over rollouts of 3 s, with a speed lag of 0.14 s and a steering delay of 0.10 s."""
-    model = compose(ModelSpec("bicycle", 0.025, {"wheel_base": 0.33}))
-    found = trace(load_dataset(FOLDER / "f1tenth.csv.gz", model), model, horizon=3.0)
+    found = trace_measured(RECORDINGS["f1tenth"], FOLDER, tmp_path)
     values = {(e.name, e.channel): {name: value[0] for name, value in e.parameters.items()} for e in found.effects}
     assert values["input_lag", "speed_cmd"]["time_constant"] == pytest.approx(0.14, abs=0.03)
     assert values["input_delay", "steer_cmd"]["delay"] == pytest.approx(0.10, abs=0.02)
@@ -73,24 +70,10 @@ def test_a_real_car_is_foretold_three_seconds_ahead():
     assert (after["x"] ** 2 + after["y"] ** 2) ** 0.5 < 0.036
 
 
-def _wheels(source, to, held_out):
-    """The windows of every third 6 s step, or those of the others, with the wheels' measured speeds for inputs."""
-    with gzip.open(source, "rt") as read, to.open("w") as write:
-        out = csv.writer(write)
-        out.writerow(["segment", "t", "x", "y", "theta", "cmd_left", "cmd_right"])
-        for row in csv.DictReader(read):
-            if (int(row["segment"]) // 3 % 3 == 2) == held_out:
-                out.writerow([row[name] for name in ("segment", "t", "x", "y", "theta", "wheel_left", "wheel_right")])
-    return to
-
-
-@pytest.mark.skipif(not (FOLDER / "husky_drive.csv.gz").exists(), reason="the measured recordings are not here")
-@pytest.mark.long
+@recorded("husky")
 def test_what_a_skid_steer_robot_slips_is_found_from_its_wheels(tmp_path):
     """By others, every third step held out: after 2 s 0.554 to 0.261 m, heading 1.51 to 0.24 rad; gains: yaw 0.38, forward 0.80."""
-    model = compose(ModelSpec("differential_drive", 0.05, {"wheel_radius": 0.165, "track": 0.55}))
-    files = [_wheels(FOLDER / "husky_drive.csv.gz", tmp_path / f"{held_out}.csv", held_out) for held_out in (False, True)]
-    found = trace(load_dataset(files[0], model), model, test=load_dataset(files[1], model), horizon=2.0)
+    found = trace_measured(RECORDINGS["husky"], FOLDER, tmp_path)
     values = {e.name: {name: value[0] for name, value in e.parameters.items()} for e in found.effects}
     assert values["track_scale"]["gain"] == pytest.approx(0.38, abs=0.03)
     assert values["longitudinal_slip"]["ratio"] == pytest.approx(0.20, abs=0.03)
@@ -99,12 +82,10 @@ def test_what_a_skid_steer_robot_slips_is_found_from_its_wheels(tmp_path):
     assert after["theta"] < 0.245
 
 
-@pytest.mark.skipif(not (FOLDER / "rover_sitl.tlog.gz").exists(), reason="the measured recordings are not here")
-@pytest.mark.long
-def test_the_ramps_of_a_rover_are_found_in_its_telemetry_log():
+@recorded("rover")
+def test_the_ramps_of_a_rover_are_found_in_its_telemetry_log(tmp_path):
     """Measured on it by other means: v follows as a ramp of 1 m/s² with a delay of 0.20 s, w as one of 2.09 rad/s² with 0.06 s."""
-    model = compose(ModelSpec("unicycle", 0.1))
-    found = trace(load_dataset(FOLDER / "rover_sitl.tlog.gz", model), model)
+    found = trace_measured(RECORDINGS["rover"], FOLDER, tmp_path)
     assert found.verdict in {"traced", "ambiguous"}
     rates = {e.channel: e.parameters["rate"][0] for e in found.effects if e.name == "input_rate_limit"}
     assert rates["v"] == pytest.approx(1.0, rel=0.06)

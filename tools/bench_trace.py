@@ -9,13 +9,14 @@ a set goes to --json FILE (a line each, as it is done), which --from reads again
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import multiprocessing
 import os
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
@@ -69,12 +70,14 @@ def _answer(given: TraceSet, path: Path) -> Record:
     except S2RError as error:
         text = str(error).replace(f"{path.parent}/", "")
         word = "refused" if given.truth["expect"] != "bad" else "honest" if "\n" not in text else "long_error"
-        return {"outcome": word, "verdict": "", "cpu_s": time.process_time() - begin, "error": text}
+        return {"outcome": word, "verdict": "", "cpu_s": time.process_time() - begin, "error": text, "digest": _digest(text)}
     except Exception as error:  # noqa: BLE001  a bench reports whatever the tracer does
-        return {"outcome": "crash", "verdict": "", "cpu_s": time.process_time() - begin, "error": f"{type(error).__name__}: {error}"}
+        text = f"{type(error).__name__}: {error}"
+        return {"outcome": "crash", "verdict": "", "cpu_s": time.process_time() - begin, "error": text, "digest": _digest(text)}
     cpu_s = time.process_time() - begin
     answer = json.loads(json.dumps(result.to_json(), default=float))
     told = {k: answer[k] for k in ("verdict", "effects", "ambiguous_with", "depends_on", "faults", "error", "suggested_excitation")}
+    told["digest"] = digest(answer, result.spec, path.parent)
     truth = given.truth | {"unreached": _unreached(given)}
     told |= {"partial": answer.get("partial", []), "cpu_s": cpu_s, "outcome": outcome(truth, answer), "covered": covered(truth, answer)}
     told["located"] = "true_faults" in truth and located(truth, answer)
@@ -88,6 +91,15 @@ def _answer(given: TraceSet, path: Path) -> Record:
         repaired = compose(ModelSpec(spec.name, spec.dt, result.spec.parameters, result.spec.effects))  # at the step of the truth
         told["again"] = errors_again(given.draft, given.seed, nominal, repaired, truth["oracle"])
     return told
+
+
+def digest(answer: dict[str, Any], spec: Any, folder: Path) -> str:
+    """Of a whole answer, as `s2r trace --json` prints it, and of the model that it made. folder: of the recording, which is no part."""
+    return _digest(json.dumps([answer, spec.digest()], sort_keys=True).replace(str(folder), ""))
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _sindy_right(given: TraceSet) -> set[str]:
@@ -158,6 +170,12 @@ def run_all(tasks: list[tuple[str, int]], jobs: int, file: Path | None) -> Itera
             yield record
 
 
+def tasks(families: Iterable[str], seeds: Iterable[int]) -> list[tuple[str, int]]:
+    """(family, seed) of every set, seed by seed; of SELDOM families some."""
+    each = [*families]
+    return [(family, seed) for seed in seeds for family in each if seed % SELDOM.get(family, 1) == 0]
+
+
 def seeds(text: str) -> range:
     """argparse type: A:B, or one seed."""
     first, sign, last = text.partition(":")
@@ -186,9 +204,9 @@ def main() -> int:
         records = [json.loads(line) for line in args.source.read_text(encoding="utf-8").splitlines()]
         records = [r for r in records if not args.family or r["family"] in args.family]
     else:
-        tasks = [(f, seed) for seed in args.seeds for f in args.family or FAMILIES if args.family or seed % SELDOM.get(f, 1) == 0]
+        every = [(f, seed) for seed in args.seeds for f in args.family] if args.family else tasks(FAMILIES, args.seeds)
         records = []
-        for record in run_all(tasks, args.jobs, args.json):
+        for record in run_all(every, args.jobs, args.json):
             records.append(record)
             if args.all or (args.failures and went_wrong(record)):
                 print(failure(record), flush=True)
