@@ -6,7 +6,7 @@ UNTOUCHED seeds that nobody looks at set by set; a bench on them is what the doc
 clean...        nothing is missing: white noise, closed loop, poor excitation; coloured, heavy-tailed, quantised noise; odd stamps
 one, weak       one effect of the library that matters (ratio >= 1.5), or hardly does (1.1 to 1.5)
 pair            two effects, each of which matters beside the other
-outside         an effect that the library does not have
+outside         an effect that the library does not name, of a kind that the tracer's unnamed nonlinearities know (in-sample by kind)
 unmeasured      one effect that matters, and no speed is measured
 tie             not separable, by how the robot was driven
 fault, bad      measurements that are wrong in places; input from which nothing can be traced

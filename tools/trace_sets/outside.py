@@ -1,4 +1,8 @@
-"""Effects that no library here has, by name: what they are stands with each one."""
+"""Effects that the library does not name, of kinds that the tracer's library of unnamed nonlinearities knows.
+
+For each of them the tracer has the same equation, a basis or a Gaussian-process disturbance. Their seeds are untouched, their kinds are
+not: figures on them are in-sample. What each one is stands with it.
+"""
 
 from __future__ import annotations
 

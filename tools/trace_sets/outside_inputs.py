@@ -1,4 +1,4 @@
-"""Actuators that no library effect is like: kinds that change what acts."""
+"""Actuators that no effect of the library names (the tracer knows them as unnamed nonlinearities): kinds that change what acts."""
 
 from __future__ import annotations
 

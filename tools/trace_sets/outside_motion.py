@@ -1,4 +1,4 @@
-"""Floors, winds and sensors that no library effect is like: kinds that change the motion, or how it is seen."""
+"""Floors, winds and sensors that no effect of the library names, though the tracer knows them unnamed: they change motion or readings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Effects as plain functions, and the draws that kinds outside the library share."""
+"""Effects as plain functions, and the draws that kinds without a name share."""
 
 from __future__ import annotations
 

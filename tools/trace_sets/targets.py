@@ -120,8 +120,8 @@ def rows(records: list[Record]) -> list[Row]:
         _share("one weak effect (1.1 to 1.5): right, honest tie or none", words(weak, *NOT_WRONG), 0.85),
         _share("one effect: wrong name", words(one, "wrong"), 0.03, at_most=True),
         _share("two effects: exact pair", words(pairs, "right"), 0.75),
-        _share("outside the library: unflagged false name", words(outside, "false_name"), 0.10, at_most=True),
-        _share("outside the library: right depends_on", [r["depends_right"] for r in outside], 0.70),
+        _share("known unnamed kinds: unflagged false name", words(outside, "false_name"), 0.10, at_most=True),
+        _share("known unnamed kinds: right depends_on", [r["depends_right"] for r in outside], 0.70),
         replace(_share("  said that nothing is left, or noise", words(outside, "none"), 0.0), target="", met=None),
         _share("not separable by construction: tie reported", words(of("tie"), "tie"), 0.90),
         _figure("error reduction reached, median (matters, pairs)", share, lambda v: float(np.median(v)), 0.97),
@@ -158,7 +158,7 @@ def beside(records: list[Record]) -> list[Row]:
         share(
             "STLSQ: one weak effect: top term of the right kind", [r["sindy"]["right"] for r in one if WEAK <= (r["ratio"] or 0) < STRONG]
         ),
-        share("STLSQ: outside the library: top term is one it depends on", [r["sindy"]["right"] for r in told if r["family"] == "outside"]),
+        share("STLSQ: known unnamed kinds: top term is one it depends on", [r["sindy"]["right"] for r in told if r["family"] == "outside"]),
     ]
     return [row for row in rows_of if row.n]
 
