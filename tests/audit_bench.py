@@ -116,6 +116,9 @@ TRACE_LIES: dict[str, Any] = {
     "proposed digest": lambda t: {"proposal": {**t["proposal"], "digest": "sha256:" + "1" * 64}},
     "other model": _other_model,
     "error": lambda t: {"error": {**t["error"], "noise_floor": {}}},
+    "another tracer": lambda t: {"tracer": t["tracer"] + 1, "error": {**t["error"], "noise_floor": {}}},
+    "another tracer, rows": lambda t: {"tracer": t["tracer"] + 1, "seed": 7},
+    "no tracer": lambda _: {"tracer": None},
 }
 """What a trace may say of itself that isn't so."""
 

@@ -21,12 +21,13 @@ from s2r_runtime import messages as m
 from s2r_runtime.audit import traces
 from s2r_runtime.audit.findings import Findings
 from s2r_runtime.audit.log import audit
-from s2r_runtime.audit.traces import Traces, near, unlike
+from s2r_runtime.audit.traces import FIRST, Traces, near, unlike
 from s2r_runtime.daemon.worker import Failed, Progress, TraceJob, Worker
 from s2r_runtime.modelspec import EffectSpec
 from s2r_runtime.profile import parse_profile
 from s2r_runtime.recording.stretches import Cut, Part, Recorded, Segment
 from s2r_runtime.recording.writer import read
+from s2r_runtime.trace import VERSION
 
 
 def slow_robot(folder: Path, lie: str = "", memory: m.Memory | None = None) -> Any:
@@ -156,6 +157,8 @@ def test_a_trace_on_an_earlier_log_is_missing_without_it_and_run_again_with_it(t
         ("proposed digest", "the model that it proposes is not the one that it made"),
         ("forgetful model", "does not say what it was fitted on (guarantee G6)"),
         ("no model", "the model that it made is not attached"),
+        ("no tracer", "it does not say which tracer made it"),
+        ("another tracer, rows", "it had another seed, or other options, than it was ordered with"),
     ],
 )
 def test_a_lie_about_a_trace_is_named_where_it_stands(tmp_path: Path, lie: str, what: str) -> None:
@@ -168,6 +171,39 @@ def test_a_lie_about_a_trace_is_named_where_it_stands(tmp_path: Path, lie: str, 
     assert result.first_difference.channel == "event/job_finished"
     (at,) = [entry.index for entry in entries(tmp_path / "a.mcap") if isinstance(entry.message, m.JobFinished) and entry.message.trace]
     assert result.first_difference.index == at
+
+
+def test_a_trace_by_another_tracer_has_its_rows_checked_and_its_answer_left(tmp_path: Path) -> None:
+    result = audited(slow_robot(tmp_path, "another tracer").trace().stop(), tmp_path / "a.mcap")
+    assert result.ok, result.text()
+    by = f"by another tracer (version {VERSION + 1}, here {VERSION})"
+    assert result.skipped == [f"trace 2 (the campaign of epoch 1) was made {by}: its rows were checked, its answer was not recomputed"]
+    assert result.recomputed["traces checked against their rows"] == 1
+    assert "traces run again" not in result.recomputed
+    assert "made by another tracer" in result.text()
+
+
+def test_what_another_tracer_made_and_a_person_adopted_is_said_to_be_that(tmp_path: Path) -> None:
+    result = audited(slow_robot(tmp_path, "another tracer").trace().adopt().stop(), tmp_path / "a.mcap")
+    assert "made by another tracer" in result.models[0].origin
+
+
+def test_a_trace_that_states_no_tracer_is_of_the_first_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    honest = audit_bench.trace_job.trace
+
+    def unstated(*given: Any) -> dict[str, Any]:
+        return {key: value for key, value in honest(*given).items() if key != "tracer"}
+
+    monkeypatch.setattr(audit_bench, "TRACED", {})
+    monkeypatch.setattr(audit_bench.trace_job, "trace", unstated)
+    bench = slow_robot(tmp_path).trace().stop()
+    monkeypatch.undo()
+    result = audited(bench, tmp_path / "a.mcap")
+    assert result.ok, result.text()
+    if VERSION == FIRST:
+        assert result.recomputed["traces run again"] == 1
+    else:
+        assert f"(version {FIRST}, here {VERSION})" in result.skipped[0]
 
 
 def test_a_gap_on_what_the_fit_has_seen_is_named(tmp_path: Path) -> None:

@@ -94,8 +94,9 @@ def _answer(given: TraceSet, path: Path) -> Record:
 
 
 def digest(answer: dict[str, Any], spec: Any, folder: Path) -> str:
-    """Of a whole answer, as `s2r trace --json` prints it, and of the model that it made. folder: of the recording, which is no part."""
-    return _digest(json.dumps([answer, spec.digest()], sort_keys=True).replace(str(folder), ""))
+    """Of a whole answer, as `s2r trace --json` prints it, and of the model that it made, whatever the tracer's version and the folder."""
+    said = {key: value for key, value in answer.items() if key != "tracer"}
+    return _digest(json.dumps([said, spec.digest()], sort_keys=True).replace(str(folder), ""))
 
 
 def _digest(text: str) -> str:

@@ -5,6 +5,7 @@ model that it made is the one that is attached and remembers what it was fitted 
 
     the same machine (versions, platform, processor)   identical
     another one                                        the same verdict and effects, every number within 1e-6
+    another version of the tracer                      its rows are checked, its answer is not recomputed; that is said, and is no pass
 
 A trace that takes longer than `seconds` of the processor is not run again unless that was asked for; that is said, and is no pass. No
 sample of a repaired model's gap may be a transition of the rows that it was fitted on.
@@ -29,6 +30,7 @@ from s2r_runtime.recording.layout import Attached
 from s2r_runtime.recording.reading import Entry
 from s2r_runtime.recording.stretches import CHANNELS, Cut, Stretches, log_identity
 from s2r_runtime.seen_rows import PREFIX
+from s2r_runtime.trace import VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -38,6 +40,8 @@ if TYPE_CHECKING:
 
 ELSEWHERE = 1e-6
 """How far a number of a trace may be off on another machine: a fit takes many steps of arithmetic that differ in their last digits."""
+FIRST = 1
+"""Version of the tracer of an answer that states none."""
 SECONDS = 60.0
 """Of the processor, for one trace, if nothing else was asked for."""
 PATIENCE = 20.0
@@ -130,6 +134,12 @@ class Traces:
             self._findings.differ(entry.index, entry.channel, f"{name}: {problem}", _facts(event.trace), told)
             return
         self._findings.count("traces checked against their rows")
+        version = event.trace.get("tracer", FIRST)
+        if version != VERSION:
+            by = f"by another tracer (version {version}, here {VERSION})"
+            self._findings.skip(f"{name} was made {by}: its rows were checked, its answer was not recomputed")
+            self._note(event.trace, name, f"made {by}, it was not run again", cut)
+            return
         how = self._again(entry, event.trace, order, cut, profile, name) if runnable else "it was not run again"
         if how:
             self._note(event.trace, name, how, cut)
@@ -240,6 +250,8 @@ def _told_wrong(trace: dict[str, Any], told: dict[str, Any], profile: Profile) -
         return "it was not made on what the log holds"
     if trace.get("model") != told["model"] or told["model"] != profile.model.digest():
         return "it is of another model than the one in force"
+    if type(trace.get("tracer", FIRST)) is not int:
+        return "it does not say which tracer made it"
     if trace.get("seed") != told["seed"] or trace.get("options") != told["options"]:
         return "it had another seed, or other options, than it was ordered with"
     return ""
@@ -290,7 +302,7 @@ def unlike(recorded: dict[str, Any], again: dict[str, Any], *, exact: bool) -> s
         if not (one == other if exact else near(one, other)):
             return f"it ends with {'another verdict' if key == 'verdict' else f'other {key}'} when it is run again"
     if exact:
-        for key in sorted((recorded.keys() | again.keys()) - set(VOLATILE)):
+        for key in sorted((recorded.keys() | again.keys()) - {*VOLATILE, "tracer"}):  # of one version, stated or not
             if recorded.get(key) != again.get(key):
                 return f"it ends with another {key} when it is run again"
         return ""

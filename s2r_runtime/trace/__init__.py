@@ -1,1 +1,6 @@
 """From the residual to the effect that a model lacks, and the error before and after."""
+
+VERSION = 1
+"""Of the tracer. It rises with every change after which the same rows, model, seed and options can give another answer: an audit recomputes
+the answers of this version only. An answer that states no version is of version 1.
+"""

@@ -14,6 +14,7 @@ from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.table_rows import Subset
+from s2r_runtime.trace import VERSION
 from s2r_runtime.trace.account import account
 from s2r_runtime.trace.domain import Range
 from s2r_runtime.trace.domain import told as domain_told
@@ -222,6 +223,7 @@ class TraceResult:
         units: dict[str, str] = getattr(self.nominal.nominal, "units", {})
         return {
             "verdict": self.verdict,
+            "tracer": VERSION,
             "effects": [e.to_json() for e in self.effects],
             "candidates": [{"name": n, "channel": c, "score": round(s, 3)} for n, c, s in self.candidates],
             "left_as_given": self.left_as_given,
