@@ -233,7 +233,7 @@ class CanTransport:
         return {name: past + counts.get(name, 0) for name, past in self._past.items()}
 
     def counters(self) -> dict[str, int]:
-        """Since construction; explained in docs/can.md."""
+        """Since construction; explained in docs/can-reference.md."""
         totals = self._totals()
         counts = dict(self._observer.counts)
         counts["foreign"] += self._unheard
