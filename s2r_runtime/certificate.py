@@ -316,7 +316,9 @@ def _evidence(c: Certificate, *, traced_not_adopted: bool) -> list[tuple[str, bo
     slack = 1.0 + 1e-9  # of the last digits in which a share is computed
     holds = gap.hold_periods > 1
     least_n = min((law.n for law in required), default=0)
-    wanted_n = campaign_size(gap.epsilon, gap.beta, gap.discarded) if holds else sample_size(gap.epsilon, gap.beta, gap.discarded)
+    assumed = any(statements.ASSUMED in line for line in c.shown)  # half of the share pays for the mixing (`blocked`)
+    halved = holds or assumed
+    wanted_n = campaign_size(gap.epsilon, gap.beta, gap.discarded) if halved else sample_size(gap.epsilon, gap.beta, gap.discarded)
     return [
         ("the controller did not pass verification" + (f": {v.reason}" if v.reason else ""), v.passed, 0),
         ("no disturbance law was required", bool(required), 0),
@@ -327,7 +329,7 @@ def _evidence(c: Certificate, *, traced_not_adopted: bool) -> list[tuple[str, bo
         (f"the samples were not drawn independently: {gap.white_reason}", not gap.white_reason.startswith(NOT_INDEPENDENT), 0),
         (
             f"{gap.n} samples do not carry the gap's statement",
-            binomial_tail(gap.n, gap.discarded, gap.epsilon) <= gap.beta / (2.0 if holds else 1.0) * slack,
+            binomial_tail(gap.n, gap.discarded, gap.epsilon) <= gap.beta / (2.0 if halved else 1.0) * slack,
             wanted_n - gap.n,
         ),
         (

@@ -52,18 +52,13 @@ class Repeats(NamedTuple):
 
 def repeats(x0: Array, u: Array, x1: Array, angles: Sequence[int] = ()) -> Repeats:
     """x0, x1: (n, nx); u: (n, nu); angles: columns of a state that are angles, rad."""
-    n = len(x0)
-    if n < 2:
-        return Repeats(n, "")
-    before, after = _on_circles(x0, angles), _on_circles(x1, angles)
-    z = np.column_stack([before, u, after])
-    column = np.arange(z.shape[1])
-    state, inputs = column < before.shape[1], (column >= before.shape[1]) & (column < before.shape[1] + u.shape[1])
-    varies = _spread(z) > 0.0
-    if not np.any(varies):
-        return Repeats(1, "")
-    z = z[:, varies] / _spread(z)[varies]
-    number = _copies(z, max(ROUNDING, MERGED / n**2))
+    n, (z, varies) = len(x0), _scaled(x0, u, x1, angles)
+    if n < 2 or not np.any(varies):
+        return Repeats(min(n, 1), "")
+    width = x0.shape[1] + len(angles)
+    column = np.arange(len(varies))
+    state, inputs = column < width, (column >= width) & (column < width + u.shape[1])
+    number = _copies(z)
     distinct = int(number.max()) + 1
     rng = np.random.default_rng(0)  # which rows are looked at, and the shuffles: alike in an audit
     some = z if n <= ROWS else z[rng.choice(n, ROWS, replace=False)]
@@ -74,6 +69,19 @@ def repeats(x0: Array, u: Array, x1: Array, angles: Sequence[int] = ()) -> Repea
     first = np.unique(number, return_index=True)[1]
     on_lines = _on_lines(np.column_stack([x0, u, x1])[first], x0.shape[1] + u.shape[1], rng)
     return Repeats(distinct, f"{REPEATED}: {on_lines} stand on lines through two others, as mixtures do" if on_lines else "")
+
+
+def distinct(x0: Array, u: Array, x1: Array, angles: Sequence[int] = ()) -> int:
+    """`Repeats.distinct` alone."""
+    z, varies = _scaled(x0, u, x1, angles)
+    return int(_copies(z).max()) + 1 if len(x0) > 1 and np.any(varies) else min(len(x0), 1)
+
+
+def _scaled(x0: Array, u: Array, x1: Array, angles: Sequence[int]) -> tuple[Array, NDArray[np.bool_]]:
+    """(n, c) columns that vary, divided by their spread; (c',) which columns of state, input and next state those are."""
+    z = np.column_stack([_on_circles(x0, angles), u, _on_circles(x1, angles)])
+    spread = _spread(z) if len(z) else np.zeros(z.shape[1])
+    return z[:, spread > 0.0] / spread[spread > 0.0], spread > 0.0
 
 
 def _on_circles(x: Array, angles: Sequence[int]) -> Array:
@@ -89,11 +97,12 @@ def _spread(z: Array) -> Array:
     return np.asarray(np.where(high - low > 1e-3 * whole, high - low, whole))
 
 
-def _copies(z: Array, cell: float) -> NDArray[np.int64]:
+def _copies(z: Array) -> NDArray[np.int64]:
     """(n,) number of each row's group: rows that share a cell of either grid are of one."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
+    cell = max(ROUNDING, MERGED / len(z) ** 2)
     rows, cells, found = np.arange(len(z)), [], 0
     for shift in (0.0, 0.5):
         number = _cells(np.floor(z / cell + shift))

@@ -16,7 +16,7 @@ from s2r_runtime.bounds import clopper_pearson_lower, sample_size
 from s2r_runtime.cli.evidence import gap_of, in_fixed_order
 from s2r_runtime.core import ledger
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
-from s2r_runtime.gap import Drive, Transitions
+from s2r_runtime.gap import Drive, Transitions, estimate_gap
 from s2r_runtime.gap import blocked as in_blocks
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
@@ -30,9 +30,11 @@ ROBOTARIUM = Path(__file__).parent.parent / "profiles" / "robotarium.toml"
 BECAUSE = "the floor's slip is another one after half a metre"
 
 
-def drive(t0_s: np.ndarray) -> Transitions:
+def drive(t0_s: np.ndarray, stands: slice = slice(0)) -> Transitions:
+    """stands: which rows are of a robot that stands still."""
     n = len(t0_s)
-    x0, u = np.zeros((n, 3)), np.full((n, 2), 0.1)
+    x0, u = np.random.default_rng(0).normal(size=(n, 3)), np.full((n, 2), 0.1)
+    x0[stands], u[stands] = 0.0, 0.0
     x1, _ = MODEL.step(x0, u, MODEL.at_rest(n))
     steps = Drive((u,), np.arange(n))
     return Transitions(x0, u, x1, None, 1, False, {}, "sha256:0", t0_s, "drive.csv", doubt="ordinary driving", drive=steps)
@@ -44,9 +46,32 @@ def test_the_first_blocks_count_and_no_more_so_that_nobody_stops_when_r_looks_go
     assert (len(long.x0), long.independent, long.rejected["later_blocks"]) == (N, True, 50)
     assert long.t0_s[-1] == pytest.approx(N - 1)
     assert len(long.drive.step) == N
-    with pytest.raises(NotEnoughEvidence, match=f"{N} are needed: 3 more") as caught:
+    with pytest.raises(NotEnoughEvidence, match=f"{N} different ones are needed: 3 more") as caught:
         blocked.founding(drive(np.arange(10 * (N - 3)) * DT), vouched, DT, **SETTINGS)
     assert caught.value.missing == 3
+
+
+def test_copies_are_counted_before_the_blocks_are_taken_so_that_half_of_the_share_pays_for_the_bound() -> None:
+    """A robot that stood still for 40 blocks of the first N: 40 blocks more, less the one that it is; without them, 39 are missing."""
+    vouched = Driving(block=1.0, because=BECAUSE)
+    stands = slice(100, 500)
+    found = blocked.founding(drive(np.arange(10 * (N + 300)) * DT, stands), vouched, DT, **SETTINGS)
+    gap = estimate_gap(MODEL, found, epsilon=0.05, beta=SETTINGS["share"], weights=(1.0, 1.0, 1.0))
+    assert N <= gap.n <= N + N // blocked.STEP + 1
+    assert gap.rejected["copies"] == 39
+    with pytest.raises(NotEnoughEvidence, match=rf"39 of them copies of others; {N} different ones are needed: 39 more") as caught:
+        blocked.founding(drive(np.arange(10 * N) * DT, stands), vouched, DT, **SETTINGS)
+    assert caught.value.missing == 39
+    enough = 0.5 * SETTINGS["share"] / (N + 38)
+    long = drive(np.arange(10 * (N + 300)) * DT, stands)
+    assert blocked.founding(long, Driving(1.0, 0.99 * enough, BECAUSE), DT, **SETTINGS).independent
+    with pytest.raises(NotEnoughEvidence, match="take longer blocks"):
+        blocked.founding(long, Driving(1.0, 1.01 * enough, BECAUSE), DT, **SETTINGS)
+
+
+def test_an_endless_stop_is_read_in_a_few_passes() -> None:
+    with pytest.raises(NotEnoughEvidence, match="1 more"):
+        blocked.founding(drive(np.arange(10 * 20_000) * DT, slice(10 * (N - 2), None)), Driving(block=1.0, because=BECAUSE), DT, **SETTINGS)
 
 
 def test_weak_mixing_is_paid_for_out_of_half_of_the_share() -> None:

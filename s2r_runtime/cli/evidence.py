@@ -255,7 +255,8 @@ def gap_of(
         from s2r_runtime import blocked
 
         epsilon, discard = profile.guarantee.epsilon, profile.guarantee.discard
-        found = blocked.founding(found, profile.driving, model.dt, epsilon=epsilon, share=share, discard=discard)
+        angles = model.angle_columns
+        found = blocked.founding(found, profile.driving, model.dt, epsilon=epsilon, share=share, discard=discard, angles=angles)
     if not found.independent:
         raise NotEnoughEvidence(
             f"{found.source}: is ordinary driving, not a campaign; its transitions are not independent, so its gap carries no statement, "
