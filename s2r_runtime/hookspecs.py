@@ -12,7 +12,7 @@ heavy is imported until it is used. Built-in models, effects and tasks come thro
     format of files                    `s2r_formats`: named time series, whatever robot they are of
     kit                                `s2r_kits`: how `s2r plugin check` tries what is offered
     controller                         no hook: a Python file, named where it is used (its bytes are what a certificate is about)
-    recorder, dashboard                no hook: the log can be read while it is written, by a process of one's own (docs/plugin-author.md)
+    recorder, dashboard                no hook: a separate process reads the log while it is written (docs/plugin-reference.md)
 
     from s2r_runtime.hookspecs import Offer, hookimpl
 

@@ -95,7 +95,7 @@ def test_every_verb_that_prints_json_says_what() -> None:
 
 
 def test_every_hook_is_documented() -> None:
-    page = (ROOT / "docs" / "plugin-author.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "plugin-reference.md").read_text(encoding="utf-8")
     hooks = [name for name in vars(hookspecs) if name.startswith("s2r_")]
     assert hooks
     assert [name for name in hooks if f"`{name}`" not in page] == []
