@@ -19,7 +19,7 @@ pytest.importorskip("s2r_zenoh")
 pytest.importorskip("s2r_standins")
 
 STOPPED_WITHIN_S = 0.5
-"""From the moment that a person is gone to the stop, as docs/robot-owner.md says; on an idle machine it is some 10 ms."""
+"""From the moment that a person is gone to the stop, as docs/operating.md says; on an idle machine it is some 10 ms."""
 LEADS_A_TERMINAL = "import fcntl, os, sys, termios; os.setsid(); fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv(sys.argv[1], sys.argv[1:])"
 """What a shell is to its terminal, then the command: so the kernel tells it when the terminal closes."""
 LOADED_S = 5.0

@@ -1,4 +1,4 @@
-"""Stop what a request drives when the person who gave the command stops it, or is gone (docs/robot-owner.md).
+"""Stop what a request drives when the person who gave the command stops it, or is gone (docs/operating.md).
 
 A campaign is interrupted: its samples are kept, and `s2r sample` goes on with it. Given inputs end for good. A controller that does not
 drive yet is not deployed; one that drives was answered, and drives on. Work that moves nothing (gap, trace, verification) goes on.
