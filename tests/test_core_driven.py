@@ -17,7 +17,7 @@ from s2r_runtime.bounds import anytime_evidence, clopper_pearson_lower
 from s2r_runtime.core import driven, stream
 from s2r_runtime.core import reducer as core
 from s2r_runtime.core.stream import BINS, bin_of
-from s2r_runtime.messages import Measured, Persist, StartController, StartJob
+from s2r_runtime.messages import REFUSED_FIRST, AttemptSpent, Measured, Persist, StartController, StartJob
 
 
 def drive(rig: Rig, discrepancies: list[float]) -> None:
@@ -48,6 +48,26 @@ def test_a_gap_below_what_driving_showed_carries_no_deployment_and_costs_nothing
     assert (shown["epoch"], shown["n"]) == (1, 48)
     assert 1.0 <= shown["ratio_lower"] <= 1.4
     assert shown["ratio_upper"] is None or shown["ratio_upper"] >= shown["ratio_lower"]
+
+
+def test_no_attempt_is_spent_on_a_certificate_that_may_not_be_deployed() -> None:
+    rig = driven_twice([0.014] * 8)
+    spent = rig.state.memory.attempts
+    outputs = rig.request("verify", digest="controller")
+    (answer,) = answers(rig)[max(answers(rig))]
+    assert (answer.exit_code, of(outputs, AttemptSpent), rig.state.memory.attempts) == (1, [], spent)
+    assert answer.text.startswith("refused: driving_exceeds_sampling: ")
+    rig.request("clear", text=driven.REASON)
+    assert of(rig.request("verify", digest="controller"), AttemptSpent)
+
+
+def test_an_audit_of_before_verifies_it_as_it_was() -> None:
+    rig = Rig(rules=REFUSED_FIRST - 1)
+    rig.driving()
+    drive(rig, [0.014] * 8)
+    rig.request("undeploy")
+    rig.gap()
+    assert of(rig.request("verify", digest="controller"), AttemptSpent)
 
 
 def test_it_is_remembered_over_a_restart_and_forgotten_when_a_person_clears_it() -> None:

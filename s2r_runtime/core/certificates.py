@@ -12,13 +12,14 @@ from typing import Literal, cast
 import msgspec
 
 from s2r_runtime import gate
-from s2r_runtime.core import ledger
+from s2r_runtime.core import driven, ledger
 from s2r_runtime.core.drive import regate
 from s2r_runtime.core.sources import end_deployment
 from s2r_runtime.core.state import VERIFYING, Deployment, Job, Turn, certificate, job, situation, usable_gap
 from s2r_runtime.headroom import grid
 from s2r_runtime.messages import (
     BEHAVIOURS,
+    REFUSED_FIRST,
     SEEDS,
     AttemptEnded,
     AttemptSpent,
@@ -56,6 +57,8 @@ def refusal_to_verify(turn: Turn) -> str:
         return f"watch_alarm: the watch refuted the gap of epoch {gap.epoch}; sample anew: s2r sample"
     if job(turn.state, *VERIFYING) is not None:
         return "a verification is under way; wait for its end"
+    if turn.settings.rules >= REFUSED_FIRST and (exceeded := driven.refusal(turn.memory, turn.settings)):
+        return exceeded
     if boundless := _boundless(turn, gap):
         return boundless
     return _needs_more_laws(turn, gap, turn.settings.required_laws)

@@ -52,6 +52,7 @@ from s2r_runtime.messages.memory import (
     IMPLAUSIBLE,
     LATEST_TIME,
     MEMORY_SCHEMA,
+    REFUSED_FIRST,
     RESTARTS,
     RULES,
     SEEDS,
@@ -106,7 +107,8 @@ from s2r_runtime.messages.results import (
 )
 
 __all__ = [
-    "BEHAVIOURS", "GRID", "IMPLAUSIBLE", "LATEST_TIME", "MEMORY_SCHEMA", "NOT_INDEPENDENT", "REPEATED", "RESTARTS", "RULES", "SEEDS",
+    "BEHAVIOURS", "GRID", "IMPLAUSIBLE", "LATEST_TIME", "MEMORY_SCHEMA", "NOT_INDEPENDENT", "REFUSED_FIRST", "REPEATED", "RESTARTS",
+    "RULES", "SEEDS",
     "SERIAL", "Action", "AlarmRaised", "AnalyticsChanged", "Answer", "AnswerLate", "Ask", "AttemptEnded", "AttemptSpent",
     "CampaignFinished", "CertificateFacts", "CertificateFailed", "CertificateInstalled", "CertificateStored", "CertificatesDistrusted",
     "ChangeNoticed", "Command", "Decided", "DrawSeed", "Driven", "EpisodeEnded", "EpochChanged", "Event", "Frame", "Gap", "GateChanged",

@@ -87,9 +87,11 @@ LATEST_TIME = 6
 """Since these rules the wall clock never goes back: `core.wall_clock`."""
 IMPLAUSIBLE = 7
 """Since these rules `watch.fault_jump = 0` is a bound that follows from the geofence. Before, it was none."""
-RULES = 7
+REFUSED_FIRST = 8
+"""Since these rules no attempt is spent on a certificate that `deploy` would refuse for what driving showed (`core.driven`)."""
+RULES = 8
 """1: a campaign that is refused for dependent samples is remembered, and can be traced and repeated. 2: `GRID`. 3: what driving showed is
-kept over epochs (`Driven`). 4: `RESTARTS`. 5: `SEEDS`. 6: `LATEST_TIME`. 7: `IMPLAUSIBLE`.
+kept over epochs (`Driven`). 4: `RESTARTS`. 5: `SEEDS`. 6: `LATEST_TIME`. 7: `IMPLAUSIBLE`. 8: `REFUSED_FIRST`.
 """
 BEHAVIOURS = 1000
 """Remembered on one gap: some 20 KB of what is persisted. Beyond that a certificate says *at least*."""
