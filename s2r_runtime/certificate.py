@@ -191,6 +191,11 @@ def signer(data: bytes) -> bytes:
         return b""
 
 
+def fixed_seed_problem(facts: CertificateFacts) -> str:
+    """Why these certify nothing for a robot, or empty."""
+    return "is of a simulation that fixed its seeds beforehand; it certifies nothing for a robot" if facts.fixed_seed else ""
+
+
 def assumption_problem(certificate: Certificate, profile: Profile) -> str:
     """Why this profile does not vouch for what the certificate's gap rests on, or empty. (Its key vouches for the rest.)"""
     rests = [line for line in certificate.shown if statements.ASSUMED in line]
@@ -220,6 +225,7 @@ def facts(certificate: Certificate) -> CertificateFacts:
         issued_unix_s=certificate.issued_unix_s,
         expires_unix_s=certificate.expires_unix_s,
         attempt=certificate.verification.attempt,
+        fixed_seed=certificate.tries is not None and certificate.tries.fixed,
     )
 
 

@@ -30,6 +30,7 @@ LATER: dict[str, object] = {
     "tries": None,
     "latest_unix_s": 0,
     "clock_cleared": 0,
+    "fixed_seed": False,
 }
 """Fields of memory and outputs that came after the lives were recorded: at their defaults they say nothing else than before."""
 LATER_STATUS = ("refused_campaign", "next_campaign", "next_attempt", "driven", "clock_behind_s")
@@ -57,7 +58,9 @@ def replayed(events: list[Event]) -> list[bytes]:
 def _digest(outputs: tuple[Output, ...], status: dict[str, object]) -> bytes:
     plain = [msgspec.to_builtins(output) for output in outputs]
     for output in plain:
-        for table in (output, output.get("memory", {})):
+        memory = output.get("memory", {})
+        certificates = [one for one in (output.get("facts"), *memory.get("certificates", ())) if one]
+        for table in (output, memory, *certificates):
             for name, before in LATER.items():
                 if name in table and table[name] == before:
                     del table[name]

@@ -21,7 +21,7 @@ from s2r_runtime.controllers.file import load
 from s2r_runtime.core.ledger import campaign_size, sample_size, share
 from s2r_runtime.daemon import control
 from s2r_runtime.errors import S2RError
-from s2r_runtime.messages import Gap, LawResult, Struct, Verification
+from s2r_runtime.messages import Gap, LawResult, Struct, Tries, Verification
 from s2r_runtime.profile import load_profile
 from s2r_runtime.recording.reading import read
 
@@ -263,6 +263,7 @@ def made_up_certificate(
     verified: float,
     epoch: int,
     weights: tuple[float, ...] | None = None,
+    tries: Tries | None = None,
 ) -> str:
     """A certificate for a controller. Its evidence is made up: nothing was sampled or verified, and every epoch has samples of its own.
 
@@ -304,6 +305,6 @@ def made_up_certificate(
         task_digest=profile.task_digest(),
     )
     issued = certificate.issue(
-        profile=profile, controller=file, gap=gap, verification=verification, issued_unix_s=int(time.time()), lifetime_s=3600
+        profile=profile, controller=file, gap=gap, verification=verification, issued_unix_s=int(time.time()), lifetime_s=3600, tries=tries
     )
     return certificate.sign(issued, keys.load(key)).decode()

@@ -7,10 +7,12 @@ import re
 import sys
 from pathlib import Path
 
+import msgspec
 import pytest
 from audit_bench import PUBLIC
 
 from s2r_runtime.audit.log import audit
+from s2r_runtime.messages import Started
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tools"))
 
@@ -46,6 +48,15 @@ def test_a_command_that_left_elsewhere_or_not_at_all_is_seen(bench: bench_fields
         assert not result.ok
         assert result.first_difference is not None
         assert "leave" in result.first_difference.what or "left" in result.first_difference.what
+
+
+def test_a_run_that_draws_its_seeds_is_no_simulation(bench: bench_fields.audit_bench.Bench, tmp_path: Path) -> None:
+    number, started = next((n, item) for n, item in enumerate(bench.items) if isinstance(item, Started))
+    bench.items[number] = msgspec.structs.replace(started, settings=msgspec.structs.replace(started.settings, simulated=True))
+    result = audit([bench.write(tmp_path / "simulated.mcap")], PUBLIC)
+    bench.items[number] = started
+    assert result.first_difference is not None
+    assert "a simulation fixes its seeds" in result.first_difference.what
 
 
 def test_the_docs_name_what_nothing_recomputes() -> None:

@@ -19,7 +19,7 @@ from daemon_rig import Rig, made_up_certificate
 from s2r_runtime import certificate, keys, revocations
 from s2r_runtime.controllers.file import load
 from s2r_runtime.daemon import persistence
-from s2r_runtime.messages import Memory, Revoked
+from s2r_runtime.messages import Memory, Revoked, Tries
 
 RECKLESS = "    return np.tile([0.2, 0.0], (len(x), 1))\n"
 PAST_S = 1_700_000_000.0
@@ -170,20 +170,36 @@ def rig_certificate_by_force(rig: Rig, controller: Path) -> str:
         return rig.certificate(controller)
 
 
-def forged(rig: Rig, controller: Path, key: Path, verified: float = 0.02) -> str:
+def forged(rig: Rig, controller: Path, key: Path, verified: float = 0.02, *, tries: Tries | None = None, told: bool = True) -> str:
     """A state in which a certificate is in force, sealed as the daemon seals it, its file beside it; the certificate's id.
 
-    verified: another radius makes another certificate, also within the same second.
+    verified: another radius makes another certificate, also within the same second. told: whether the memory knows of a fixed seed.
     """
-    text = made_up_certificate(rig.profile, key, controller, radius=0.01, verified=verified, epoch=1).encode()
+    text = made_up_certificate(rig.profile, key, controller, radius=0.01, verified=verified, epoch=1, tries=tries).encode()
     one = certificate.load(text, [keys.load_public(key.with_suffix(".pub"))])
     memory = persistence.unseal((rig.state / "state.json").read_bytes(), "state", Memory, "state")
     facts = certificate.facts(one)
+    facts = msgspec.structs.replace(facts, fixed_seed=facts.fixed_seed and told)
     persistence.replace(
         rig.state / "state.json", persistence.seal("state", msgspec.structs.replace(memory, certificates=(facts,), gap=one.gap))
     )
     persistence.replace(rig.state / "certificates" / f"{facts.id.removeprefix('sha256:')}.json", text)
     return facts.id
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_the_state_of_a_simulation_that_fixed_its_seeds_carries_no_certificate(rig: Rig, told: bool) -> None:
+    """Also one of an earlier version, whose memory does not say so: the certificate does."""
+    good = rig.controller()
+    rig.start_robot()
+    rig.start()
+    assert rig.deploy(good)["exit_code"] == 0
+    rig.stop()
+    identity = forged(rig, good, rig.state / "key.pem", 0.03, tries=Tries(1, 1, 1, fixed=True), told=told)
+    rig.start()
+    status = rig.status()
+    assert (status["certificate"], list(status["revoked"])) == (None, [identity])
+    assert "is of a simulation that fixed its seeds beforehand" in status["revoked"][identity]
 
 
 def test_a_state_that_somebody_wrote_carries_no_certificate_that_nobody_signed(rig: Rig) -> None:

@@ -15,6 +15,7 @@ from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
 from s2r_runtime.core.state import unix_now
 from s2r_runtime.messages import (
+    FIXED_SEEDS,
     SEEDS,
     Answer,
     AttemptEnded,
@@ -52,6 +53,24 @@ def test_without_a_gap_nothing_is_verified() -> None:
         assert "no gap" in answer.text
         assert one(rig.request(verb), Answer).exit_code == 2
         assert rig.state.memory.attempts == 0
+
+
+def test_a_certificate_whose_seed_was_fixed_drives_in_a_simulation_only() -> None:
+    for simulated in (False, True):
+        rig = Rig(simulated=simulated)
+        rig.gap()
+        rig.request("deploy", digest="controller")
+        rig.verified()
+        rig.stored(fixed_seed=True)
+        assert bool(of(rig.outputs, StartController)) == simulated
+
+
+@pytest.mark.parametrize(("changes", "drives"), [({}, False), ({"simulated": True}, True), ({"rules": FIXED_SEEDS - 1}, True)])
+def test_a_memory_of_a_simulation_certifies_nothing_for_a_robot(changes: dict[str, Any], drives: bool) -> None:
+    (facts,) = memory().certificates
+    rig = Rig(memory(certificates=(msgspec.structs.replace(facts, fixed_seed=True),)), **changes)
+    rig.observe()
+    assert bool(of(rig.request("deploy", digest="controller"), StartController)) == drives
 
 
 def test_an_attempt_is_on_disk_before_it_begins_and_runs_at_the_headroom() -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from s2r_runtime import certificate as certificates
 from s2r_runtime import keys
 from s2r_runtime.audit.evidence import Evidence, attached_controller
 from s2r_runtime.audit.findings import CertificateFinding, Findings
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
-from s2r_runtime.messages import CertificateFacts, CertificateStored, IssueCertificate, Memory, Revoked, Settings
+from s2r_runtime.messages import FIXED_SEEDS, CertificateFacts, CertificateStored, IssueCertificate, Memory, Revoked, Settings
 from s2r_runtime.profile import Profile
 from s2r_runtime.recording.layout import Attached
 from s2r_runtime.recording.reading import Entry
@@ -92,7 +94,7 @@ class Certificates:
         unix_s: int,
     ) -> str:
         """Why it stands. Raises ConfigError with why it doesn't."""
-        certificate, signer = self._signed(event, attachments, trusted)
+        certificate, signer = self._signed(event, attachments, trusted, settings.rules)
         if problem := certificates.assumption_problem(certificate, profile):
             raise ConfigError(problem)
         if event.gap is not None:
@@ -110,7 +112,7 @@ class Certificates:
         return self._evidence.support(order)
 
     def _signed(
-        self, event: CertificateStored, attachments: Mapping[str, Attached], trusted: tuple[bytes, ...]
+        self, event: CertificateStored, attachments: Mapping[str, Attached], trusted: tuple[bytes, ...], rules: int
     ) -> tuple[Certificate, bytes]:
         """The attached certificate, which says what the gate was told, and the public key that signed it. Raises ConfigError.
 
@@ -124,7 +126,10 @@ class Certificates:
             raise ConfigError(f"is signed with the key {keys.fingerprint(signer)}, which was {revocation}")
         believed = {*trusted, signer} if event.gap is not None else trusted[:1]
         certificate = certificates.load(data.data, believed, None, "certificate")
-        if certificates.facts(certificate) != event.facts or event.gap not in (None, certificate.gap):
+        facts = certificates.facts(certificate)
+        if rules < FIXED_SEEDS:  # the gate was told less then
+            facts = msgspec.structs.replace(facts, fixed_seed=False)
+        if facts != event.facts or event.gap not in (None, certificate.gap):
             raise ConfigError("what the gate was told is not what it says")
         return certificate, signer
 

@@ -19,6 +19,7 @@ from s2r_runtime.daemon.worker import Failed, GapJob, Progress, Result, VerifyJo
 from s2r_runtime.errors import S2RError
 from s2r_runtime.headroom import follows, grid
 from s2r_runtime.messages import (
+    FIXED_SEEDS,
     AttemptSpent,
     DrawSeed,
     EpochChanged,
@@ -29,6 +30,7 @@ from s2r_runtime.messages import (
     Memory,
     SampleTaken,
     SeedDrawn,
+    Settings,
     StartJob,
     Verification,
 )
@@ -117,12 +119,14 @@ class Evidence:
         """An attempt is paid for, and its seed is to be drawn."""
         self._undrawn.add((order.job_id, order.attempt))
 
-    def seed_drawn(self, entry: Entry, event: SeedDrawn) -> None:
-        """Once for each attempt, after it was paid for. What is drawn from 2^48 does not come twice."""
+    def seed_drawn(self, entry: Entry, event: SeedDrawn, settings: Settings | None) -> None:
+        """Once for each attempt, after it was paid for; fixed in a simulation only. What is drawn from 2^48 does not come twice."""
         if (event.job_id, event.attempt) not in self._undrawn:
             self._differ(entry, "a seed is drawn for an attempt that waits for none", event, None)
         elif (other := self._seeds.setdefault(event.seed, event.attempt)) != event.attempt:
             self._differ(entry, f"attempt {event.attempt} has the seed of attempt {other}", event, None)
+        elif settings is not None and settings.rules >= FIXED_SEEDS and event.fixed != settings.simulated:
+            self._differ(entry, "a simulation fixes its seeds, and nothing else does", event, settings.simulated)
         self._undrawn.discard((event.job_id, event.attempt))
         self._findings.count("seeds fixed by a simulation" if event.fixed else "seeds drawn after their attempt was paid for")
 

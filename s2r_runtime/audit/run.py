@@ -222,7 +222,7 @@ class RunAudit:
             case SourceStopped(source="sampler"):
                 (self._inputs if self._inputs.driving else self._campaigns).stopped(entry, event)
             case SeedDrawn():
-                self._evidence.seed_drawn(entry, event)
+                self._evidence.seed_drawn(entry, event, self._core.state.settings)
             case RecorderChanged(ok=False):
                 self._campaigns.doubted()
                 self._evidence.doubted()
@@ -248,7 +248,7 @@ class RunAudit:
         if model is not None:
             facts = facts_of(model)
         rules = settings.rules if 0 <= settings.rules <= RULES else RULES  # an earlier version's rules are run again as they were
-        told = settings_of(self._profile, self._profile.model, facts, settings.seed, rules)
+        told = settings_of(self._profile, self._profile.model, facts, settings.seed, rules, simulated=settings.simulated)
         if told != settings:
             self._findings.differ(
                 entry.index, entry.channel, "the settings are not those of the attached profile and model", settings, told
@@ -318,7 +318,7 @@ class RunAudit:
                 model = self._compose(profile.model)
                 any_step = settings.any_step if model is None else model.any_step
                 facts = ModelFacts(settings.states, settings.inputs, settings.angles, any_step=any_step)
-                in_force = settings_of(profile, profile.model, facts, settings.seed, settings.rules)
+                in_force = settings_of(profile, profile.model, facts, settings.seed, settings.rules, simulated=settings.simulated)
                 self._campaigns.start(output, in_force, profile.sampling)
             case StartController():
                 model = self._compose(profile.model)

@@ -19,6 +19,7 @@ from s2r_runtime.core.state import VERIFYING, Deployment, Job, Turn, certificate
 from s2r_runtime.headroom import grid
 from s2r_runtime.messages import (
     BEHAVIOURS,
+    FIXED_SEEDS,
     REFUSED_FIRST,
     SEEDS,
     AttemptEnded,
@@ -266,6 +267,8 @@ def valid_certificate(turn: Turn, digest: str) -> CertificateFacts | None:
     """The newest certificate under which this controller could drive now."""
     now = situation(turn.state)
     for facts in reversed(turn.memory.certificates):
+        if _of_simulation(turn, facts):
+            continue
         seen = msgspec.structs.replace(now, certificate=facts, controller_digest=digest, revoked=facts.id in turn.memory.revoked)
         if usable_gap(turn.state) is not None and gate.about_certificate(turn.settings, seen) is None:
             return facts
@@ -305,6 +308,8 @@ def facts_problem(turn: Turn, facts: CertificateFacts, digest: str, epoch: int, 
     """Why these facts do not certify this controller here, on the gap of that epoch, to this radius, or empty."""
     if facts.id in turn.memory.revoked:
         return f"it was revoked: {turn.memory.revoked[facts.id]}"
+    if _of_simulation(turn, facts):
+        return "a simulation fixed its seed beforehand"
     if any(other.id == facts.id and other != facts for other in turn.memory.certificates):
         return "another certificate in force has its id"
     for name, value, wanted in (
@@ -319,6 +324,11 @@ def facts_problem(turn: Turn, facts: CertificateFacts, digest: str, epoch: int, 
     if not (gate.finite(facts.verified_radius) and facts.verified_radius >= radius * (1.0 - ROUNDING)):
         return f"it is verified to {facts.verified_radius}, less than {radius}"
     return ""
+
+
+def _of_simulation(turn: Turn, facts: CertificateFacts) -> bool:
+    """Whether it certifies nothing here, since its seed could be known beforehand."""
+    return turn.settings.rules >= FIXED_SEEDS and facts.fixed_seed and not turn.settings.simulated
 
 
 def install(turn: Turn, facts: CertificateFacts) -> None:

@@ -95,8 +95,7 @@ def _certificate(text: str, job: LoadJob, profile: Profile, controller: str) -> 
     problem = certificates.assumption_problem(found, profile)
     if not problem and found.controller_digest != controller:
         problem = f"is of the controller {found.controller_digest}; the one to deploy is {controller}"
-    if not problem and found.tries is not None and found.tries.fixed:
-        problem = "is of a simulation that fixed its seeds beforehand; it certifies nothing for a robot"
+    problem = problem or certificates.fixed_seed_problem(certificates.facts(found))
     if problem:
         return Brought(signer, problem=f"{where}: {problem}")
     return Brought(signer, text, certificates.facts(found), found.gap)

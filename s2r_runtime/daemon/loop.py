@@ -200,7 +200,7 @@ class Daemon:
         self.memory = self.folder.memory(self._log_dir.glob(f"{robot}-*.mcap") if self._log_file is None else ())
         self.key = issuing.signing_key(self._key_path, self.folder.path, self.say)
         former = keys.former(self._key_path or self.folder.path / "key.pem")
-        self.trust = Trust(self.folder.path, keys.public_bytes(self.key), former)
+        self.trust = Trust(self.folder.path, keys.public_bytes(self.key), former, simulated=self.simulated_seeds is not None)
         self.trust.check_own()
         self.memory, taken = self._held_against_the_logs(self.memory)
         self.models = ModelStore(self.folder.path, self.profile.model.digest())
@@ -238,7 +238,7 @@ class Daemon:
             clock=self.awake.now_s,
         )
         self.facts: ModelFacts = self.watcher.facts()
-        self.settings = settings_of(self.profile, self.profile.model, self.facts, self.seed)
+        self.settings = settings_of(self.profile, self.profile.model, self.facts, self.seed, simulated=self.simulated_seeds is not None)
         self.link = link_of(self.profile, self.facts, self._record_frame, self.guard)
         self.logbook.begin(self._profile_path, self.profile.model, self.profile.files)
         self._recall_proposal()
@@ -427,7 +427,7 @@ class Daemon:
             profile = msgspec.structs.replace(self.profile, model=spec)
         self.profile = profile
         self.facts = facts or msgspec.structs.replace(self.facts, any_step=False)  # until a restart: the stricter tolerance is never wrong
-        self.settings = settings_of(profile, profile.model, self.facts, self.seed)
+        self.settings = settings_of(profile, profile.model, self.facts, self.seed, simulated=self.simulated_seeds is not None)
         self.driver.use(profile)
         self.watcher.use(profile)
 

@@ -62,9 +62,17 @@ def fault_jump_of(profile: Profile, states: tuple[str, ...], angles: tuple[str, 
     return FENCES * (max(weighted) if gap.set == "box" else math.hypot(*weighted))
 
 
-def settings_of(profile: Profile, model: ModelSpec, facts: ModelFacts, seed: int | None = None, rules: int = RULES) -> Settings:
+def settings_of(
+    profile: Profile,
+    model: ModelSpec,
+    facts: ModelFacts,
+    seed: int | None = None,
+    rules: int = RULES,
+    *,
+    simulated: bool = False,
+) -> Settings:
     """What the profile fixes for the core. model: the one in force (the profile's, or one adopted since). seed: instead of the
-    profile's. rules: those that the run was made under.
+    profile's. rules: those that the run was made under. simulated: whether seeds of verifications are fixed.
 
     An angle without bounds may be anything in its circle. A state that the geofence doesn't name is fenced by the region.
     """
@@ -119,6 +127,7 @@ def settings_of(profile: Profile, model: ModelSpec, facts: ModelFacts, seed: int
         fault_burst=gate.fault_burst,
         rules=rules,
         any_step=facts.any_step and rules >= GRID,
+        simulated=simulated,
     )
 
 

@@ -15,6 +15,8 @@ import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 
+import msgspec
+
 from s2r_runtime import certificate as certificates
 from s2r_runtime import keys, revocations
 from s2r_runtime.daemon.persistence import read
@@ -25,11 +27,13 @@ _Seen = tuple[tuple[str, int, int, int], ...]
 
 
 class Trust:
-    """folder: the robot's state. own: the public half of the key that the daemon signs with. former: of those before it."""
+    """folder: the robot's state. own: the public half of the key that the daemon signs with. former: of those before it. simulated:
+    whether certificates whose seed was fixed count.
+    """
 
-    def __init__(self, folder: Path, own: bytes, former: tuple[bytes, ...] = ()) -> None:
+    def __init__(self, folder: Path, own: bytes, former: tuple[bytes, ...] = (), *, simulated: bool = False) -> None:
         """Raises ConfigError if a list of revoked keys or a trusted key can't be read, or could be somebody else's work."""
-        self._former = former
+        self._former, self._simulated = former, simulated
         self._own, self._trusted, self._certificates = own, folder / "trusted", folder / "certificates"
         self._lists = revocations.places(folder)
         self._revoked: dict[str, revocations.Revocation] = {}
@@ -95,7 +99,10 @@ class Trust:
             found = certificates.facts(certificates.load(data, trusted, None, str(file)))
         except ConfigError as error:
             return str(error)
-        return "" if found == facts else f"{file}: says something else than the robot's state"
+        if not self._simulated and (why := certificates.fixed_seed_problem(found)):
+            return why
+        known = msgspec.structs.replace(facts, fixed_seed=found.fixed_seed)  # an earlier version's memory does not have it: the file counts
+        return "" if found == known else f"{file}: says something else than the robot's state"
 
     def _state(self) -> _Seen:
         files = [*self._lists, self._trusted]

@@ -48,6 +48,7 @@ from s2r_runtime.messages.link import (
 )
 from s2r_runtime.messages.memory import (
     BEHAVIOURS,
+    FIXED_SEEDS,
     GRID,
     IMPLAUSIBLE,
     LATEST_TIME,
@@ -107,8 +108,8 @@ from s2r_runtime.messages.results import (
 )
 
 __all__ = [
-    "BEHAVIOURS", "GRID", "IMPLAUSIBLE", "LATEST_TIME", "MEMORY_SCHEMA", "NOT_INDEPENDENT", "REFUSED_FIRST", "REPEATED", "RESTARTS",
-    "RULES", "SEEDS",
+    "BEHAVIOURS", "FIXED_SEEDS", "GRID", "IMPLAUSIBLE", "LATEST_TIME", "MEMORY_SCHEMA", "NOT_INDEPENDENT", "REFUSED_FIRST",
+    "REPEATED", "RESTARTS", "RULES", "SEEDS",
     "SERIAL", "Action", "AlarmRaised", "AnalyticsChanged", "Answer", "AnswerLate", "Ask", "AttemptEnded", "AttemptSpent",
     "CampaignFinished", "CertificateFacts", "CertificateFailed", "CertificateInstalled", "CertificateStored", "CertificatesDistrusted",
     "ChangeNoticed", "Command", "Decided", "DrawSeed", "Driven", "EpisodeEnded", "EpochChanged", "Event", "Frame", "Gap", "GateChanged",

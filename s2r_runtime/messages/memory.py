@@ -71,6 +71,8 @@ class Settings(Struct, frozen=True):
     """Of the core's rules, those that the run was made by; a log of before has 0 and is audited by them. See `RULES`."""
     any_step: bool = False
     """Whether the model and its effects step exactly at any length, so that a transition may last longer than one step (rules 2)."""
+    simulated: bool = False
+    """Whether the seeds of verifications are fixed, so that a simulation can be repeated (rules 9)."""
 
 
 GRID = 2
@@ -89,9 +91,11 @@ IMPLAUSIBLE = 7
 """Since these rules `watch.fault_jump = 0` is a bound that follows from the geofence. Before, it was none."""
 REFUSED_FIRST = 8
 """Since these rules no attempt is spent on a certificate that `deploy` would refuse for what driving showed (`core.driven`)."""
-RULES = 8
+FIXED_SEEDS = 9
+"""Since these rules a certificate whose seed a simulation fixed says so, and drives only in a simulation."""
+RULES = 9
 """1: a campaign that is refused for dependent samples is remembered, and can be traced and repeated. 2: `GRID`. 3: what driving showed is
-kept over epochs (`Driven`). 4: `RESTARTS`. 5: `SEEDS`. 6: `LATEST_TIME`. 7: `IMPLAUSIBLE`. 8: `REFUSED_FIRST`.
+kept over epochs (`Driven`). 4: `RESTARTS`. 5: `SEEDS`. 6: `LATEST_TIME`. 7: `IMPLAUSIBLE`. 8: `REFUSED_FIRST`. 9: `FIXED_SEEDS`.
 """
 BEHAVIOURS = 1000
 """Remembered on one gap: some 20 KB of what is persisted. Beyond that a certificate says *at least*."""

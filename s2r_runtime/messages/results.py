@@ -138,3 +138,5 @@ class CertificateFacts(Struct, frozen=True):
     expires_unix_s: int
     attempt: int = 0
     """Verification attempt that it rests on, so that a loaded certificate counts as spent."""
+    fixed_seed: bool = False
+    """Whether a simulation fixed the attempt's seed beforehand. Then it certifies nothing for a robot."""
