@@ -6,8 +6,8 @@ The robot's frames go to everybody, as they came. The other way:
                 A person drives by changing the mode first, which the runtime sees and which stops it.
     companion   nothing but what is listed here: a sensor's pose, time, questions. A controller's place is behind the gate.
 
-What would have moved the robot is kept for the log, up to so many a second. Nobody passes with the robot's or the runtime's own ids. Frames
-pass unchanged, signature and all: the robot judges them itself.
+What would have moved the robot is kept for the log, up to so many a second. Nobody passes with the robot's or the runtime's own ids, and
+nobody faster than a robot's line can be. Frames pass unchanged, signature and all: the robot judges them itself.
 """
 
 from __future__ import annotations
@@ -15,11 +15,13 @@ from __future__ import annotations
 import select
 
 from s2r_mavlink.dialect import COMMAND_INT, COMMAND_LONG, MESSAGES, SET_MESSAGE_INTERVAL
-from s2r_mavlink.endpoints import Endpoint
+from s2r_mavlink.endpoints import OTHERS_MOST, Endpoint
 from s2r_mavlink.frames import header, payload
 from s2r_runtime.messages import Frame
 
 KEPT_PER_SECOND = 32
+BYTES_PER_SECOND = 92_160
+"""Passed on to the robot at most: what a serial line at 921 600 baud, the fastest in common use, carries. More only crowds out commands."""
 SECOND = 1_000_000_000
 
 MANUAL_CONTROL, RC_CHANNELS_OVERRIDE, SET_MODE = 69, 70, 11
@@ -51,6 +53,7 @@ class Relay:
     def __init__(self, channel: str, line: Endpoint, reserved: frozenset[tuple[int, int]]) -> None:
         self.channel, self.line, self._reserved = channel, line, reserved
         self._second = self._kept = 0
+        self._passing = self._bytes = 0
         self.passed = self.refused = self.blocked = self.unlogged = 0
         self.disturbed = False
 
@@ -62,7 +65,7 @@ class Relay:
         """What came from there: (frames for the robot, refused ones for the log)."""
         through: list[bytes] = []
         kept: list[Frame] = []
-        for source, arrival_ns, frames in self.line.read():
+        for source, arrival_ns, frames in self.line.read(OTHERS_MOST):
             self.line.accept(source, arrival_ns)
             for data in frames:
                 facts = header(data)
@@ -72,7 +75,7 @@ class Relay:
                     self.refused += 1
                     if self._room(arrival_ns):
                         kept.append(Frame(arrival_ns, self.channel, data))
-                elif self.channel == "ground" or self._listed(facts.number, data):
+                elif (self.channel == "ground" or self._listed(facts.number, data)) and self._carried(data, arrival_ns):
                     self.passed += 1
                     through.append(data)
                 else:
@@ -94,6 +97,12 @@ class Relay:
 
     def _listed(self, number: int, data: bytes) -> bool:
         return number in COMPANION_MAY or _command(number, data) in COMPANION_MAY_ASK
+
+    def _carried(self, data: bytes, now_ns: int) -> bool:
+        if now_ns // SECOND != self._passing:
+            self._passing, self._bytes = now_ns // SECOND, 0
+        self._bytes += len(data)
+        return self._bytes <= BYTES_PER_SECOND
 
     def _room(self, now_ns: int) -> bool:
         """So many a second, so that a stranger can't fill the log."""

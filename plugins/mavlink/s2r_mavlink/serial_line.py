@@ -10,7 +10,7 @@ import struct
 import termios
 import time
 
-from s2r_mavlink.endpoints import READ_MOST, RETRY_NS, Address, Piece, Source
+from s2r_mavlink.endpoints import RETRY_NS, Address, Piece, Source
 from s2r_mavlink.frames import Framer
 from s2r_runtime.errors import ConfigError
 
@@ -78,13 +78,13 @@ class SerialLine:
         """The line's."""
         return [] if self._line < 0 else [self._line]
 
-    def read(self) -> list[Piece]:
+    def read(self, most: int) -> list[Piece]:
         """What came; closes a line that is gone."""
         frames: list[bytes] = []
         taken = 0
-        while self._line >= 0 and taken < READ_MOST:
+        while self._line >= 0 and taken < most:
             try:
-                data = os.read(self._line, 65_536)
+                data = os.read(self._line, most)
             except BlockingIOError:
                 break
             except OSError:
@@ -114,6 +114,10 @@ class SerialLine:
     def accept(self, source: Source, now_ns: int) -> bool:
         """There is nobody else at a cable's end."""
         return True
+
+    def is_other(self, source: Source) -> bool:
+        """As `accept`: never."""
+        return False
 
     def hear(self, source: Source) -> None:
         """As `accept`."""

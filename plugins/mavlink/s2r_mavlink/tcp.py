@@ -15,8 +15,8 @@ import termios
 import time
 from contextlib import suppress
 
-from s2r_mavlink.endpoints import READ_MOST, RETRY_NS, Address, Piece, Source, resolved
-from s2r_mavlink.frames import Framer
+from s2r_mavlink.endpoints import RETRY_NS, Address, Piece, Source, resolved
+from s2r_mavlink.frames import LONGEST, Framer
 from s2r_runtime.errors import ConfigError
 
 CONNECT_NS = 2_000_000_000
@@ -39,23 +39,26 @@ class Connection:
         self.heard_ns = time.monotonic_ns()
         self._unfinished = b""
 
-    def read(self) -> tuple[list[bytes], bool]:
-        """Frames that came, and whether the connection still stands."""
+    def read(self, most: int) -> tuple[list[bytes], bool]:
+        """Frames that came, and whether the connection still stands. most: bytes."""
         frames: list[bytes] = []
         taken = 0
-        while taken < READ_MOST:
+        stands = True
+        while taken < most:
             try:
-                data = self.socket.recv(65_536)
+                data = self.socket.recv(most - taken)
             except BlockingIOError:
-                return frames, True
+                break
             except OSError:
-                return frames, False
+                data = b""
             if not data:
-                return frames, False
+                stands = False
+                break
             taken += len(data)
-            self.heard_ns = time.monotonic_ns()
             frames += self.framer.feed(data)
-        return frames, True
+        if frames:
+            self.heard_ns = time.monotonic_ns()
+        return frames, stands
 
     def write(self, frame: bytes) -> bool:
         """False if it was dropped."""
@@ -140,11 +143,11 @@ class TcpClient:
         """The connection's."""
         return [] if self._connection is None else [self._connection.socket.fileno()]
 
-    def read(self) -> list[Piece]:
+    def read(self, most: int) -> list[Piece]:
         """What came; drops a connection that ended."""
         if self._connection is None:
             return []
-        frames, stands = self._connection.read()
+        frames, stands = self._connection.read(most)
         self.malformed += self._connection.framer.malformed
         self._connection.framer.malformed = 0
         if not stands:
@@ -159,6 +162,10 @@ class TcpClient:
         """There is nobody else at this line's end."""
         return True
 
+    def is_other(self, source: Source) -> bool:
+        """As `accept`: never."""
+        return False
+
     def hear(self, source: Source) -> None:
         """As `accept`."""
 
@@ -171,7 +178,7 @@ class TcpClient:
 
 
 class TcpServer:
-    """Interface: `endpoints.Endpoint`. Serves several at once; one too many is sent away."""
+    """Interface: `endpoints.Endpoint`. Serves several at once; one too many is sent away, unless another has long been silent."""
 
     def __init__(self, text: str, address: Address) -> None:
         self.text, self._address = text, address
@@ -201,12 +208,13 @@ class TcpServer:
         """The listener's and each connection's."""
         return ([] if self._listener is None else [self._listener.fileno()]) + list(self._connections)
 
-    def read(self) -> list[Piece]:
-        """Takes in who came, and what came."""
+    def read(self, most: int) -> list[Piece]:
+        """Takes in who came, and what came: from each its share."""
         self._welcome()
         pieces = []
+        share = max(LONGEST, most // max(len(self._connections), 1))
         for number, connection in list(self._connections.items()):
-            frames, stands = connection.read()
+            frames, stands = connection.read(share)
             self.malformed += connection.framer.malformed
             connection.framer.malformed = 0
             if frames:
@@ -222,12 +230,21 @@ class TcpServer:
                 came, _ = self._listener.accept()
             except OSError:
                 return
-            if len(self._connections) >= OTHERS or self._poller is None:
+            if self._poller is None or not self._has_room():
                 came.close()
                 continue
             self._connections[came.fileno()] = Connection(came)
             self._poller.register(came.fileno(), select.EPOLLIN)
             self.opened += 1
+
+    def _has_room(self) -> bool:
+        """Whether one more may come; of those that say nothing the one that was silent longest gives way."""
+        if len(self._connections) >= OTHERS:
+            number = min(self._connections, key=lambda one: self._connections[one].heard_ns)
+            if time.monotonic_ns() - self._connections[number].heard_ns <= SILENT_NS:
+                return False
+            self._connections.pop(number).socket.close()
+        return True
 
     def write(self, frame: bytes, source: Source | None = None) -> bool:
         """To all, or to one."""
@@ -237,6 +254,10 @@ class TcpServer:
     def accept(self, source: Source, now_ns: int) -> bool:
         """Everybody may connect."""
         return True
+
+    def is_other(self, source: Source) -> bool:
+        """As `accept`: never."""
+        return False
 
     def hear(self, source: Source) -> None:
         """As `accept`."""

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 from s2r_mavlink import dialect
 from s2r_mavlink.asking import STOPS, Asking
 from s2r_mavlink.door import Door
-from s2r_mavlink.endpoints import endpoint
+from s2r_mavlink.endpoints import ROBOT_MOST, endpoint
 from s2r_mavlink.frames import build, payload
 from s2r_mavlink.options import MEANINGS, checked
 from s2r_mavlink.pose import SOURCES
@@ -108,9 +108,9 @@ class MavlinkTransport:
         ready = {number for number, _ in self._poller.poll(0)}
         frames: list[Frame] = []
         if not ready.isdisjoint(self._line.descriptors()):
-            pieces = self._line.read()
-            self._show(pieces)
+            pieces = self._line.read(ROBOT_MOST)
             frames = self._door.come_in(self._line, pieces)
+            self._show([piece for piece in pieces if not self._line.is_other(piece.source)])
             frames += self._overflow()
         for relay in self._relays:
             if not ready.isdisjoint(relay.line.descriptors()):

@@ -11,7 +11,7 @@ import socket
 import struct
 import time
 
-from s2r_mavlink.endpoints import READ_MOST, RETRY_NS, Address, Piece, Source, resolved
+from s2r_mavlink.endpoints import RETRY_NS, Address, Piece, Source, resolved
 from s2r_mavlink.frames import Framer
 from s2r_runtime.errors import ConfigError
 
@@ -19,7 +19,10 @@ SILENT_NS = 500_000_000
 OTHERS = 8
 """Addresses served at an endpoint for many; the one that was silent longest gives way."""
 RECEIVE_BUFFER = 1 << 20
-DATAGRAM = 65_536
+DATAGRAM = 9216
+"""Bytes of the longest that is read whole: a jumbo frame of Ethernet."""
+DATAGRAM_COST = 64
+"""Bytes that each one counts as, at least: taking an empty one costs as much."""
 SO_RXQ_OVFL = getattr(socket, "SO_RXQ_OVFL", 40)
 """Linux: a datagram comes with the number of those that were dropped before it (socket(7)); Python has no name for it."""
 
@@ -88,22 +91,22 @@ class Udp:
         """The socket's."""
         return [] if self._socket is None else [self._socket.fileno()]
 
-    def read(self) -> list[Piece]:
-        """All datagrams that wait, up to a bound."""
+    def read(self, most: int) -> list[Piece]:
+        """The datagrams that wait."""
         pieces: list[Piece] = []
         if self._socket is None:
             return pieces
         receive, feed, clock = self._socket.recvfrom, self._framer.feed, time.monotonic_ns
         taken = self._count_overflow(pieces)
-        while taken and taken < READ_MOST:
+        while taken and taken < most:
             try:
                 data, source = receive(DATAGRAM)
             except BlockingIOError:
                 break
             except OSError:  # nobody listens there: an answer to something that was sent
-                taken += 1
+                taken += DATAGRAM_COST
                 continue
-            taken += len(data) or 1
+            taken += max(len(data), DATAGRAM_COST)
             frames = feed(data)
             if frames:
                 pieces.append(Piece(source, clock(), frames))
@@ -117,14 +120,14 @@ class Udp:
         except BlockingIOError:
             return 0
         except OSError:
-            return 1
+            return DATAGRAM_COST
         for level, kind, value in extra:
             if level == socket.SOL_SOCKET and kind == SO_RXQ_OVFL:
                 self.overflowed = max(self.overflowed, struct.unpack_from("I", value)[0])
         frames = self._framer.feed(data)
         if frames:
             pieces.append(Piece(source, time.monotonic_ns(), frames))
-        return len(data) or 1
+        return max(len(data), DATAGRAM_COST)
 
     def write(self, frame: bytes, source: Source | None = None) -> bool:
         """To the robot, or to all others, or to one of them."""
@@ -153,6 +156,10 @@ class Udp:
             del self._others[min(self._others, key=lambda other: self._others[other])]
         self._others[source] = now_ns
         return True
+
+    def is_other(self, source: Source) -> bool:
+        """Whether one was accepted, and this is none."""
+        return self._address.kind != "udpout" and not self._many and bool(self._others) and source not in self._others
 
     def hear(self, source: Source) -> None:
         """Somebody who holds the key is there, but what came is old."""

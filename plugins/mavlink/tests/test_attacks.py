@@ -16,11 +16,13 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from s2r_mavlink.dialect import MESSAGES
+from s2r_mavlink.endpoints import ROBOT_MOST
 from s2r_mavlink.frames import build, header, is_frame
 from s2r_mavlink.rover_lines import TcpServerLine, UdpLine
 from s2r_mavlink.signing import stamp_of
 from s2r_mavlink.testing import HOLD, INPUTS, STATES, Robot, Runtime, free_port, fuzzed
 from s2r_mavlink.transport import MavlinkTransport
+from s2r_mavlink.udp import DATAGRAM
 
 from s2r_runtime.messages import Command, Frame, LinkChanged, Observation
 
@@ -170,6 +172,25 @@ def test_frames_of_other_systems_mean_nothing_here(truth: Truth) -> None:
     assert truth.heard()
     assert truth.runtime.counters["rejected_foreign"] >= 5 * 60
     assert not any(frame.channel == "door" for frame in truth.runtime.frames), "others on the line are no incident"
+
+
+def test_flood_from_another_address_holds_no_call_up(truth: Truth, stranger: Robot) -> None:
+    """What waits in the kernel is taken in shares, also where a datagram is full of frames, or empty."""
+    frame = stranger.pack(stranger.heartbeat())
+    for data in (b"", frame, frame * 400):
+        for _ in range(2000):
+            stranger.line.write(data)
+        most = 0
+        for _ in range(20):
+            before = truth.runtime.counters["received"]
+            truth.runtime.transport.receive()
+            most = max(most, truth.runtime.counters["received"] - before)
+        assert most <= (ROBOT_MOST + DATAGRAM) // len(frame) + 1
+    while truth.runtime.transport.receive() or truth.runtime.counters["received"] != before:
+        before = truth.runtime.counters["received"]
+    time.sleep(0.6)  # the robot was silent meanwhile, and the stranger was taken for it: until it is silent
+    truth.tell(5)
+    assert truth.heard()
 
 
 # ---------------------------------------------------------------- the robot's own line

@@ -10,6 +10,9 @@ from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
+from s2r_mavlink import tcp
+from s2r_mavlink.endpoints import OTHERS_MOST
+from s2r_mavlink.relay import BYTES_PER_SECOND
 from s2r_mavlink.rover_lines import TcpServerLine, UdpLine
 from s2r_mavlink.testing import Robot, Runtime, free_port
 
@@ -225,6 +228,72 @@ def test_flood_of_commands_does_not_fill_the_log(house: House) -> None:
         assert counters["companion_refused"] == 1200
         assert counters["companion_unlogged"] == 1200 - len(logged)
         assert house.of(195) == []
+
+
+@pytest.mark.parametrize("side", WAYS)
+def test_flood_from_all_connections_holds_no_call_up_and_crowds_nobody_out(house: House, side: str) -> None:
+    """Eight at once: each call takes a bounded share of each, and the robot gets no more than its line can carry."""
+    guests = [Guest(house.ports[side], 255, 100 + k) for k in range(tcp.OTHERS)]
+    house.turn(3)
+    data = b"".join(g.mav.heartbeat_encode(6, 8, 0, 0, 4).pack(g.mav) for g in guests for _ in range(50))
+    begin, most, calls = time.monotonic(), 0, 0
+    while time.monotonic() - begin < 1.0:
+        for one in guests:
+            with contextlib.suppress(BlockingIOError):
+                one._socket.send(data)
+        before = house.runtime.counters
+        house.turn()
+        after = house.runtime.counters
+        most = max(most, sum(after[f"{side}_{name}"] - before[f"{side}_{name}"] for name in ("passed", "refused", "blocked")))
+        calls += 1
+    assert 0 < most <= 2 * (OTHERS_MOST // 21 + tcp.OTHERS)  # `turn` receives twice at most; such a frame has 21 bytes
+    assert 21 * house.runtime.counters[f"{side}_passed"] <= 3 * BYTES_PER_SECOND
+    good = len(house.runtime.good)
+    house.turn(10)
+    assert len(house.runtime.good) >= good + 8
+    assert calls > 20
+    for one in guests:
+        one.close()
+
+
+@pytest.mark.parametrize("side", WAYS)
+def test_connections_that_say_nothing_lock_nobody_out(house: House, side: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No whole frame ever comes from them: one is never begun, one never finished."""
+    monkeypatch.setattr(tcp, "SILENT_NS", 300_000_000)
+    idle = [Guest(house.ports[side], 255, 100 + k) for k in range(tcp.OTHERS)]
+    house.turn(3)
+    deadline = time.monotonic() + 0.4
+    while time.monotonic() < deadline:
+        for one in idle[1::2]:
+            with contextlib.suppress(OSError):
+                one._socket.send(b"\xfd")
+        house.turn()
+    with guest(house, side) as somebody:
+        somebody.send(somebody.mav.heartbeat_encode(6, 8, 0, 0, 4))
+        house.turn(10)
+        assert "LOCAL_POSITION_NED" in {m.get_type() for m in somebody.listen()}
+        assert house.of(255 if side == "ground" else 1)
+        late = Guest(house.ports[side], 255, 99)
+        house.turn(3)
+        somebody.send(somebody.mav.heartbeat_encode(6, 8, 0, 0, 4))
+        house.turn(3)
+        assert somebody.listen(), "who speaks is not sent away"
+        late.close()
+    for one in idle:
+        one.close()
+
+
+def test_nobody_but_the_robot_is_shown_as_the_robot(house: House) -> None:
+    """Whoever reaches the runtime's port for the robot does not reach the ground station's screen by that."""
+    stranger = Robot(UdpLine("127.0.0.1", int(house.runtime.options["robot"].rpartition(":")[2])))
+    with guest(house, "ground") as station:
+        for _ in range(20):
+            stranger.line.write(stranger.pack(stranger.mav.statustext_encode(0, b"drop the load")))
+            house.turn()
+        kinds = {m.get_type() for m in station.listen()}
+        assert "LOCAL_POSITION_NED" in kinds
+        assert "STATUSTEXT" not in kinds
+    stranger.line.close()
 
 
 def test_refusal_is_told_to_whoever_was_refused(house: House) -> None:
