@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import datetime
+import ipaddress
+import socket
 import time
 import tomllib
 from collections.abc import Callable, Iterator
@@ -10,6 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
 
 zenoh = pytest.importorskip("zenoh")
 from s2r_zenoh.testing import INPUTS, STATES, free_endpoint, session  # noqa: E402 - only where Zenoh is
@@ -199,6 +206,116 @@ def test_a_private_key_that_others_can_read_is_refused(tmp_path: Path, stack: Ex
     (tmp_path / "loose" / "runtime.key").chmod(0o644)
     with pytest.raises(ConfigError, match="others than its owner can use"):
         Site(tmp_path, stack, tls_key=str(tmp_path / "loose" / "runtime.key"))
+
+
+def issued(folder: Path, name: str, *, common_name: str, from_s: float, to_s: float) -> None:
+    """A certificate of the site's authority in the place of that one, valid from and to so many seconds from now."""
+    ca, signer = tls._authority(folder)
+    key, now = ec.generate_private_key(ec.SECP256R1()), datetime.datetime.now(datetime.UTC)
+    made = (
+        x509.CertificateBuilder()
+        .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)]))
+        .issuer_name(ca.subject)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now + datetime.timedelta(seconds=from_s))
+        .not_valid_after(now + datetime.timedelta(seconds=to_s))
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]), critical=False)
+        .sign(signer, hashes.SHA256())
+    )
+    for suffix in (".pem", ".key"):
+        (folder / f"{name}{suffix}").unlink(missing_ok=True)
+    tls._write(folder, name, made, key)
+
+
+HOUR, DAY = 3600.0, 86_400.0
+
+
+def test_a_name_counts_only_while_its_certificate_does_and_letter_by_letter(tmp_path: Path, stack: ExitStack) -> None:
+    site = Site(tmp_path, stack)
+    folder = tmp_path / "site"
+    issued(folder, "expired", common_name="robot", from_s=-2 * DAY, to_s=-DAY)
+    issued(folder, "early", common_name="robot", from_s=DAY, to_s=2 * DAY)
+    issued(folder, "wild", common_name="rob*", from_s=-HOUR, to_s=HOUR)
+    issued(folder, "capital", common_name="Robot", from_s=-HOUR, to_s=HOUR)
+    issued(folder, "longer", common_name="robot.site", from_s=-HOUR, to_s=HOUR)
+    wrong = [site.link(f"site/{name}", site.robot_side) for name in ("expired", "early", "wild", "capital", "longer")]
+    assert site.frames(4.0, lambda: [one.put(f"{PREFIX}/observation", observation(site)) for one in wrong] and None) == []
+    robot = site.link("site/robot", site.robot_side)
+    assert site.frames(WITHIN_S, lambda: robot.put(f"{PREFIX}/observation", observation(site)), bool)
+
+
+def test_a_link_ends_when_the_certificate_of_its_other_end_expires(tmp_path: Path, stack: ExitStack) -> None:
+    site = Site(tmp_path, stack)
+    issued(tmp_path / "site", "short", common_name="robot", from_s=-HOUR, to_s=4.0)
+    robot = site.link("site/short", site.robot_side)
+    speak = lambda: robot.put(f"{PREFIX}/observation", observation(site))  # noqa: E731 - said three times
+    assert site.frames(3.0, speak, bool)
+    site.frames(4.0, speak)
+    assert site.frames(2.0, speak) == []
+
+
+@pytest.mark.parametrize("sent", [b"", b"\x16\x03\x01\x02\x00\x01", b"GET / HTTP/1.1\r\n\r\n", b"\x16\x03\x03\xff\xff"])
+def test_peers_that_never_finish_their_handshake_keep_nobody_out(tmp_path: Path, stack: ExitStack, sent: bytes) -> None:
+    site = Site(tmp_path, stack)
+    for side in (site.robot_side, site.other_side):
+        for _ in range(30):
+            one = stack.enter_context(socket.create_connection(("127.0.0.1", int(side.rpartition(":")[2])), timeout=2.0))
+            one.sendall(sent)
+    robot = site.link("site/robot", site.robot_side)
+    assert site.frames(WITHIN_S, lambda: robot.put(f"{PREFIX}/observation", observation(site)), bool)
+
+
+def cut(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def foreign(file: Path) -> None:
+    name = "site" if file.stem == "site" else "robot"
+    file.write_bytes((file.parent.parent / "other" / f"{name}{file.suffix}").read_bytes())
+
+
+@pytest.mark.parametrize("connects", [False, True], ids=["listens", "connects"])
+@pytest.mark.parametrize(
+    ("name", "spoil", "words"),
+    [
+        ("runtime.pem", cut, r"tls_certificate: .*runtime\.pem: holds no whole certificate"),
+        ("runtime.pem", lambda file: file.write_bytes(b""), "holds no whole certificate"),
+        ("runtime.key", cut, r"tls_key: .*runtime\.key: is no private key"),
+        ("runtime.key", lambda file: file.write_bytes(bytes(range(256))), "is no private key"),
+        ("runtime.key", foreign, r"is not the key of .*runtime\.pem"),
+        ("site.pem", cut, r"tls_ca: .*site\.pem: holds no whole certificate"),
+        ("site.pem", foreign, r"is not signed by an authority in .*site\.pem"),
+        ("site.pem", lambda file: file.write_bytes(file.read_bytes() * 3000), "has more than 1048576 bytes"),
+    ],
+)
+def test_certificates_that_do_not_fit_together_are_one_line_whoever_connects(
+    tmp_path: Path, stack: ExitStack, connects: bool, name: str, spoil: Callable[[Path], object], words: str
+) -> None:
+    """Where the runtime connects, Zenoh would try for ever and never say why."""
+    Site(tmp_path, stack)
+    spoil(tmp_path / "site" / name)
+    options = {"robot_connect": "tls/127.0.0.1:1"} if connects else {"robot_listen": free_endpoint().replace("tcp/", "tls/")}
+    options |= {f"tls_{what}": str(tmp_path / "site" / file) for what, file in (("ca", "site.pem"), ("certificate", "runtime.pem"))}
+    transport = ZenohTransport(options | {"tls_key": str(tmp_path / "site" / "runtime.key")}, STATES, INPUTS)
+    stack.callback(transport.close)
+    with pytest.raises(ConfigError, match=words) as refused:
+        transport.open()
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(("from_s", "to_s", "words"), [(-2 * DAY, -DAY, "expired at 20"), (DAY, 2 * DAY, "is the clock right?")])
+def test_an_own_certificate_that_is_out_of_date_is_named_where_nobody_is_heard(
+    tmp_path: Path, stack: ExitStack, from_s: float, to_s: float, words: str
+) -> None:
+    """It starts all the same: a computer without a clock of its own learns the time later."""
+    site = Site(tmp_path, stack)
+    issued(tmp_path / "site", "runtime", common_name="runtime", from_s=from_s, to_s=to_s)
+    site.transport.close()
+    site.transport.open()
+    (down,) = site.transport.poll(time.monotonic_ns() + 10**10)
+    assert words in down.detail
 
 
 def test_certificates_are_added_to_an_authority_and_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,6 +12,7 @@ import stat
 from pathlib import Path
 from typing import Any
 
+from s2r_runtime.bounded_file import read_bounded
 from s2r_runtime.errors import ConfigError
 
 OPTIONS = {
@@ -22,6 +23,8 @@ OPTIONS = {
     "controller_names": "the same on the controllers' side",
 }
 ENCRYPTED = ("tls/", "quic/")
+FILE_MAX = 1 << 20
+"""Bytes of a file of certificates at most: all authorities of a browser take 0.25 MB."""
 
 
 def check(options: dict[str, Any]) -> None:
@@ -49,8 +52,9 @@ def settings(options: dict[str, Any]) -> dict[str, Any]:
     """What the options mean for a session's configuration; empty without certificates. Raises ConfigError for a file that can't be used."""
     if not options["tls_ca"]:
         return {}
-    for name in ("tls_ca", "tls_certificate", "tls_key"):
-        _check_file(name, Path(options[name]))
+    from s2r_zenoh.own_certificate import check_pair  # which takes a library: for those who use certificates
+
+    check_pair(options, *(content(name, Path(options[name])) for name in ("tls_ca", "tls_certificate", "tls_key")))
     certificate, key = options["tls_certificate"], options["tls_key"]
     return {
         "transport/link/tls/root_ca_certificate": options["tls_ca"],
@@ -69,7 +73,8 @@ def subject(names: list[str]) -> dict[str, Any]:
     return {"id": "named", "cert_common_names": names} if names else {"id": "every_link"}
 
 
-def _check_file(name: str, path: Path) -> None:
+def content(name: str, path: Path) -> bytes:
+    """The file's bytes. Raises ConfigError if it can't be read, or if others can use a private key."""
     try:
         status = path.stat()
     except OSError as error:
@@ -80,3 +85,4 @@ def _check_file(name: str, path: Path) -> None:
         raise ConfigError(
             f"transport.{name}: others than its owner can use {path} (mode {stat.S_IMODE(status.st_mode):o}); chmod 600 {path}"
         )
+    return read_bounded(path, FILE_MAX)

@@ -194,7 +194,17 @@ class ZenohTransport:
         self._up = False
         where = self._options["robot_listen"] or self._options["robot_connect"]
         since = f"for {silent_ns * 1e-9:.2f} s" if self._newest else "yet"
-        return [LinkChanged(now_ns, up=False, detail=f"no observation {since} on {self._options['key_prefix']}/observation over {where}")]
+        detail = f"no observation {since} on {self._options['key_prefix']}/observation over {where}"
+        return [LinkChanged(now_ns, up=False, detail=detail + self._own_certificate())]
+
+    def _own_certificate(self) -> str:
+        """What of it explains that nobody is heard."""
+        if not self._options["tls_ca"]:
+            return ""
+        from s2r_zenoh.own_certificate import invalidity
+
+        invalid = invalidity(self._options, time.time())
+        return f"; {invalid}" if invalid else ""
 
     # ------------------------------------------------------------------ out
 
