@@ -1,7 +1,7 @@
 # make run    sets everything up and runs the whole loop on the built-in robot over real Zenoh
 # make test   sets everything up and runs the tests
 # make test-long  the tests that take long: measured recordings, ties broken by suggested drives, further seeds
-# make check  format, lint, types, import walls, docs
+# make check  format, lint, types, import walls, language, docs
 # make bench  the figures that the docs state, as ratios in one run
 # make mutation  does a test notice every small change of the gate, the certificate and the core, and is every line of them run
 # make robotarium-experiment  the paper's experiment, reading by reading, with its figures on one page (robotarium-experiment.html)
@@ -39,6 +39,7 @@ check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
+	$(BIN)/python tools/vocabulary.py
 	$(BIN)/mypy & $(BIN)/pytest tests/test_docs.py; docs=$$?; wait $$! || { echo "mypy failed, see above" >&2; exit 1; }; exit $$docs
 
 mutation: $(STAMP)
