@@ -78,34 +78,34 @@ class Demonstration:
     def _loop(self, robot: subprocess.Popen[str], profile: Path) -> bool:
         """Up to the last refusal. True if what was expected of the runtime happened."""
         controller = self._robot.controller("good")
-        wrong = ", ".join(self._effects) or "nothing"
-        self._tell(f"robot {self._name!r} runs in its own process; what is wrong with it: {wrong} (the daemon isn't told)")
+        fault = ", ".join(self._effects) or "none"
+        self._tell(f"simulated robot {self._name!r} in its own process; injected fault: {fault} (hidden from the daemon)")
         self._await_robot(robot)
         if not self._campaign():
             return False
-        self._step(f"s2r deploy {controller.name}", "verify the controller against that gap")
+        self._step(f"s2r deploy {controller.name}", "certify the controller against this gap, else it may not drive")
         if self._ask({"verb": "deploy", "path": str(controller), "parameters": {}})["exit_code"] == 0:
-            self._say("the controller is covered as it is: there is nothing to repair", "green")
+            self._say("certified without a repair of the model", "green")
             return self._drive(robot, controller, running=True)
         if not self._repair():
-            self._say("no effect can be named with confidence, so nothing is repaired and the robot stays parked", "yellow")
+            self._say("no effect was identified with confidence: the model stays as it is, and the robot stays parked", "yellow")
             return True
         return self._campaign() and self._drive(robot, controller, running=False)
 
     def _campaign(self) -> bool:
         command = f"s2r permit {self._story.permit_s:.0f} && s2r sample"
-        self._step(command, "drive to random states, apply random inputs, measure the gap")
+        self._step(command, "measure the gap between robot and model, at random states and inputs")
         answer = self._sample()
         if answer["exit_code"] != 0 and SERIAL in str(answer["text"]):
             one_in = round(1.0 / SERIAL_ALPHA)
-            self._say(f"of campaigns that are independent the test refuses 1 in {one_in} at most; two in a row would tell of a drift")
-            self._step(command, "once more, with a share of beta of its own")
+            self._say(f"at most 1 in {one_in} campaigns of independent samples fails this test; two in a row indicate a drift")
+            self._step(command, "repeat, with the next share of the error budget beta")
             answer = self._sample()
         gap = answer.get("data") or {}
         if gap and answer["exit_code"] == 0:
             hold, before = gap["hold_radius"], self._hold_gap
             self._say(
-                f"after one step {1e3 * gap['radius']:.3g} mm, after {gap['hold_periods']} held steps {1e3 * hold:.3g} mm"
+                f"model error after one step {1e3 * gap['radius']:.3g} mm, after {gap['hold_periods']} steps {1e3 * hold:.3g} mm"
                 + (f" (before the repair {1e3 * before:.3g} mm)" if before else "")
             )
             self._hold_gap = hold
@@ -113,40 +113,40 @@ class Demonstration:
 
     def _sample(self) -> dict[str, Any]:
         """One campaign, with a permit of its own: it lasts for one."""
-        self._ask({"verb": "permit", "duration_s": self._story.permit_s})
+        permitted = self._call({"verb": "permit", "duration_s": self._story.permit_s})
+        if permitted["exit_code"] != 0:
+            self._report(permitted)
         return self._ask({"verb": "sample", "count": 0})
 
     def _repair(self) -> bool:
-        self._step("s2r trace --live campaign", "what does the model lack?")
+        self._step("s2r trace --live campaign", "find the effect that the model lacks")
         answer = self._ask({"verb": "trace", "text": "campaign"})
         data = answer.get("data") or {}
-        if data.get("text"):
-            self._say(str(data["text"]))
+        headline, *others = str(data.get("text", "")).split("\n\n")
+        for part in (headline, *(one for one in others if one.startswith("error"))):
+            self._say(part)
         if answer["exit_code"] != 0 or data.get("verdict") not in {"traced", "ambiguous"} or not data.get("effects"):
             return False
         if data["proposal"]["proposed"]:
-            self._step("s2r adopt", "use the model that is proposed; its gap comes from a fresh campaign")
+            self._step("s2r adopt", "use the repaired model; the old gap does not apply to it")
             return bool(self._ask({"verb": "adopt"})["exit_code"] == 0)
         model = Path(str(data["model_path"]))
-        self._step(f"s2r adopt {model.name}", "use the repaired model; its gap comes from a fresh campaign")
+        self._step(f"s2r adopt {model.name}", "use the repaired model; the old gap does not apply to it")
         text = model.read_text(encoding="utf-8")
         return bool(self._ask({"verb": "adopt", "text": text, "base": str(model.parent)})["exit_code"] == 0)
 
     def _drive(self, robot: subprocess.Popen[str], controller: Path, *, running: bool) -> bool:
         if self._change:
             seconds = self._story.change_after_s
-            self._say(f"(in {seconds:.0f} s of its own time the robot will change: {self._change}; nobody is told)", "dim")
+            self._say(f"(hidden fault at t = {seconds:.0f} s of simulated time: {self._change})", "dim")
             self._to_robot(robot, f"effect {self._change} @+{seconds}")
         if not running:
-            self._step(f"s2r deploy {controller.name}", "verify at the new gap; a certificate lets it drive")
+            self._step(f"s2r deploy {controller.name}", "certify it at the smaller gap, then drive")
             answer = self._ask({"verb": "deploy", "path": str(controller), "parameters": {}})
             if answer["exit_code"] != 0 and not _by_evidence(answer):
-                return self._otherwise("it was not refused for what it does on the model")
+                return self._otherwise("the refusal has another reason than its behaviour on the model")
             if answer["exit_code"] != 0:
-                self._say(
-                    "still refused: on the repaired model, with the gap that is left, this controller does not do its task safely enough",
-                    "yellow",
-                )
+                self._say("still refused: with the remaining gap this controller is not safe enough on the repaired model", "yellow")
                 return True
         return self._watch_it(robot)
 
@@ -165,27 +165,31 @@ class Demonstration:
             if status.get("controller") or status.get("job"):
                 return self._otherwise("the robot's process has ended" if robot.poll() is not None else f"{CAMPAIGN_S:.0f} s are over")
             if status.get("gate") != "closed" or latched not in ([], ["controller_fault"], ["watch_alarm"]):
-                return self._otherwise("it was not stopped for how the robot differs from its model")
+                return self._otherwise("the gate closed for another reason than the gap")
             if status.get("reason") == "no_controller" or latched == ["watch_alarm"]:
                 return self._stopped()
             if drive == DRIVES:
                 break
             if latched:
-                self._step("s2r clear controller_fault", "it failed; on a busy machine an answer may be late")
+                self._step("s2r clear controller_fault", "the controller failed; on a busy machine its answer may be late")
                 self._ask({"verb": "clear", "text": "controller_fault"})
-            self._step("s2r deploy", "may it drive again?")
+            self._step("s2r deploy", "try again at the gap that it was stopped for")
             answer = self._ask({"verb": "deploy", "path": str(self._robot.controller("good")), "parameters": {}})
             if answer["exit_code"] != 0:
-                return self._stopped() if _by_evidence(answer) else self._otherwise("it was not refused for what it does on the model")
+                return (
+                    self._stopped()
+                    if _by_evidence(answer)
+                    else self._otherwise("the refusal has another reason than its behaviour on the model")
+                )
         return self._otherwise(f"it was stopped {DRIVES} times")
 
     def _stopped(self) -> bool:
-        self._say("the gate is closed and the recovery controller has stopped the robot", "green")
+        self._say("the gate is closed; the fallback controller has stopped the robot", "green")
         return True
 
     def _otherwise(self, how: str) -> bool:
-        """Not the end that the story is about; False."""
-        self._say(f"this was to end otherwise: {how}", "red")
+        """Reports an end that the demo did not expect; False."""
+        self._say(f"unexpected end: {how}", "red")
         return False
 
     def _follow(self, robot: subprocess.Popen[str], limit: float) -> dict[str, Any]:
@@ -203,21 +207,24 @@ class Demonstration:
 
     def _show(self, status: dict[str, Any]) -> None:
         self._step("s2r status", "")
-        for key in ("gate", "reason", "radius", "verified_radius", "e_value", "epoch", "attempts", "beta_spent", "latched", "revoked"):
-            if status.get(key) not in (None, [], {}, ""):
-                self._say(f"{key.replace('_', ' ')}: {status[key]}")
+        for key in ("gate", "reason", "radius", "latched"):
+            if (value := status.get(key)) not in (None, [], {}, ""):
+                self._say(f"{key}: {value:.3g}" if isinstance(value, float) else f"{key}: {value}")
 
     def _afterwards(self, held: bool) -> int:
         log, public = sorted((self._out / "logs").glob("*.mcap")), self._out / "state" / "key.pub"
         names = " ".join(str(path) for path in log)
-        self._step(f"s2r audit {names} --key {public} --rerun-controllers", "recompute everything from the log alone")
-        audited = _s2r("audit", *map(str, log), "--key", str(public), "--rerun-controllers")
+        self._step(f"s2r audit {names} --key {public} --rerun-controllers", "recompute every decision from the log alone")
+        audited, lines = _s2r("audit", *map(str, log), "--key", str(public), "--rerun-controllers")
+        for line in lines if audited else (one for one in lines if one.startswith(("holds", "certificate"))):
+            self._say(line)
         report = self._out / "report.html"
-        self._step(f"s2r report {names} -o {report}", "")
-        reported = _s2r("report", *map(str, log), "-o", str(report))
+        reported, lines = _s2r("report", *map(str, log), "-o", str(report))
+        for line in lines if reported else ():
+            self._say(line)
         seconds = time.monotonic() - self._begin
         output.out()
-        output.out(f"{'done' if held and not audited else 'NOT as it should be'} in {seconds:.0f} s.  log: {names}  report: {report}")
+        output.out(f"{'done' if held and not audited else 'demo FAILED'} after {seconds:.0f} s.  log: {names}  report: {report}")
         output.out(
             f"next: open {report};  s2r log info {log[-1] if log else ''};  s2r demo --effect none;  docs/robot-owner.md for your own robot"
         )
@@ -285,14 +292,14 @@ class Demonstration:
         said = (self._out / "robot.txt").read_text(encoding="utf-8").strip()
         if robot.poll() == ConfigError.exit_code and said:  # it says itself what was wrong with what it was given
             raise ConfigError(said.splitlines()[-1])
-        raise S2RError(f"the robot did not answer: {said[-300:]}")
+        raise S2RError(f"no observations from the robot: {said[-300:]}")
 
     def _end_daemon(self, process: subprocess.Popen[str]) -> None:
         process.terminate()
         try:
             process.wait(STOP_S)
         except subprocess.TimeoutExpired:
-            self._say("the daemon did not end when asked to", "red")
+            self._say("the daemon did not end on SIGTERM", "red")
 
     def _to_robot(self, robot: subprocess.Popen[str], line: str) -> None:
         if robot.stdin is not None:
@@ -304,11 +311,12 @@ class Demonstration:
 
     def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
         answer = self._call(request)
-        good = answer["exit_code"] == 0
-        self._say(str(answer["text"]), "green" if good else "red")
-        if not good:
-            self._say(f"exit code {answer['exit_code']}", "red")
+        self._report(answer)
         return answer
+
+    def _report(self, answer: dict[str, Any]) -> None:
+        code = answer["exit_code"]
+        self._say(str(answer["text"]) + (f" (exit code {code})" if code else ""), "red" if code else "green")
 
     def _call(self, request: dict[str, Any]) -> dict[str, Any]:
         bar = output.Progress("   " + str(request["verb"]))
@@ -392,9 +400,10 @@ def _free_ports(number: int) -> list[int]:
         return [int(s.getsockname()[1]) for s in sockets]
 
 
-def _s2r(*argv: str) -> int:
-    output.flush()
-    return subprocess.call([sys.executable, "-m", "s2r_runtime.cli.main", *argv])
+def _s2r(*argv: str) -> tuple[int, list[str]]:
+    """(exit code, lines printed)."""
+    done = subprocess.run([sys.executable, "-m", "s2r_runtime.cli.main", *argv], capture_output=True, text=True, check=False)
+    return done.returncode, (done.stdout + done.stderr).splitlines()
 
 
 def _answers(path: Path) -> bool:
