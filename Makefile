@@ -1,6 +1,6 @@
 # make run    sets everything up and runs the whole loop on the built-in robot over real Zenoh
-# make test   sets everything up and runs the tests
-# make test-long  the tests that take long: measured recordings, ties broken by suggested drives, further seeds
+# make test   sets everything up and runs the quick tests, in some minutes
+# make test-all  every test: also whole stories, all traces, measured recordings, further seeds
 # make check  format, lint, types, import walls, language, docs
 # make bench  the figures that the docs state, as ratios in one run
 # make mutation  does a test notice every small change of the gate, the certificate and the core, and is every line of them run
@@ -14,26 +14,22 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+RUNS := $(VENV)/.runs
 
-.PHONY: bench-endurance run test test-long check quadruped-experiment mutation bench bench-trace bench-quadruped robotarium-experiment rover-experiment format clean wheels setup
+.PHONY: bench-endurance run test test-all check quadruped-experiment mutation bench bench-trace bench-quadruped robotarium-experiment rover-experiment format clean wheels setup
 
-run: $(STAMP)
+run: $(RUNS)
 	$(BIN)/s2r demo
 
 # Some tests compute, most wait for robots: side by side they keep two cores busy. All of it at the lowest priority, since the daemon's
 # worker runs at that: beside tests of a higher one it would hardly run at all.
-TESTS := PYTHONHASHSEED=0 nice -n 19 $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
-
-# A test that fails beside two others may have waited in vain for its share of a busy machine. Up to five such run once more, alone, and
-# both runs are shown: what fails then, fails.
-FEW := $(BIN)/python -c 'import json, sys; sys.exit(len(json.load(open(".pytest_cache/v/cache/lastfailed"))) > 5)'
+TESTS := PYTHONHASHSEED=0 nice -n 19 $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder --durations 10
 
 test: $(STAMP)
-	@$(TESTS) || { test $$? -eq 1 && $(FEW) && echo "--- once more, alone" && \
-	    PYTHONHASHSEED=0 nice -n 19 $(BIN)/pytest --last-failed --last-failed-no-failures none; }
+	$(TESTS)
 
-test-long: $(STAMP)
-	$(BIN)/pytest -m long
+test-all: $(STAMP)
+	$(TESTS) -m ""
 
 check: $(STAMP)
 	$(BIN)/ruff format --check .
@@ -87,14 +83,22 @@ wheels: $(STAMP)
 
 setup: $(STAMP)
 
-$(STAMP): pyproject.toml constraints.txt plugins/zenoh/pyproject.toml plugins/can/pyproject.toml plugins/mavlink/pyproject.toml plugins/standins/pyproject.toml plugins/ros2/pyproject.toml
+PROJECTS := pyproject.toml constraints.txt $(addprefix plugins/,$(addsuffix /pyproject.toml,zenoh can mavlink standins ros2))
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+
+# What the built-in robot's whole loop needs, and no more.
+$(RUNS): $(PROJECTS)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed; this is $$($(PYTHON) --version). Set PYTHON=..." >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || { echo "the venv module is missing: sudo apt-get install python3-venv" >&2; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-	    --editable '.[report,formats,dev]' --editable plugins/zenoh --editable plugins/can --editable plugins/mavlink --editable 'plugins/standins[sim]' \
-	    --editable 'plugins/ros2[formats]'
+	$(INSTALL) --editable '.[report]' --editable plugins/zenoh --editable plugins/standins
 	@$(BIN)/python -m compileall -q s2r_runtime plugins  # else each start does it again where PYTHONDONTWRITEBYTECODE is set
+	@touch $(RUNS)
+
+# What developers need besides.
+$(STAMP): $(RUNS)
+	$(INSTALL) --editable '.[report,formats,dev]' --editable plugins/zenoh --editable plugins/can --editable plugins/mavlink \
+	    --editable 'plugins/standins[sim]' --editable 'plugins/ros2[formats]'
 	@touch $(STAMP)
 
 clean:
