@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_controllers import Hosted
+from controllers_rig import Hosted
 
 from s2r_runtime.controllers import asked_again
 from s2r_runtime.controllers.asked_again import AskedAgain, Inconsistent

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_worker import finished, verify_job
+from worker_rig import finished, verify_job
 
 from s2r_runtime.controllers.batches import BatchController
 from s2r_runtime.controllers.code import Malformed, Raised, batch_control

@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from test_certificate import KEY, NOW, PROFILE, PUBLIC, Evidence, evidence, law
+from certificate_rig import KEY, NOW, PROFILE, PUBLIC, Evidence, evidence, law
 
 from s2r_runtime import certificate, keys, statements
 from s2r_runtime.canonical import canonical

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import fcntl
 import os
 import platform
@@ -13,13 +12,13 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from confinement_rig import LANDLOCK
 
 from s2r_runtime.controllers import confinement
 from s2r_runtime.controllers.confined_process import remove_left_folders
 
 pytestmark = pytest.mark.skipif(platform.machine() not in {"x86_64", "aarch64"}, reason="system calls are filtered on these processors")
 
-LANDLOCK = ctypes.CDLL(None).syscall(444, None, ctypes.c_size_t(0), 1) >= 1
 
 IPC = {
     "msgget": (68, 186), "msgsnd": (69, 189), "msgrcv": (70, 188), "msgctl": (71, 187), "semget": (64, 190), "semctl": (66, 191),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import platform
 import select
@@ -12,12 +11,12 @@ import sys
 import textwrap
 import time
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+from controllers_rig import MODEL, PATIENT_NS, Hosted, hosted
 
 from s2r_runtime.controllers import confined_process
 from s2r_runtime.controllers.code import batch_control
@@ -25,19 +24,15 @@ from s2r_runtime.controllers.episodes import Episodes
 from s2r_runtime.controllers.hosted import ControllerFile, HostedController, Late, Ready, Reply, Stopped, load
 from s2r_runtime.messages import Observation
 from s2r_runtime.models.composed import compose
-from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import TaskChoice
 
-MODEL = ModelSpec("unicycle", 0.033)
 GOOD = """
 import numpy as np
 PARAMETERS = {"gain": 1.5, "steps": 3}
 def control(x, theta, parameters):
     return np.stack([parameters["gain"] * x[:, 0], x[:, 1]], axis=1)
 """
-PATIENT_NS = 20_000_000_000
-"""A deadline for those that answer: far above what a busy machine takes."""
 
 
 @pytest.fixture(autouse=True)
@@ -57,60 +52,6 @@ def loaded(folder: Path, body: str, head: str = "") -> ControllerFile:
     """A controller whose `control` has this body."""
     function = "def control(x, theta, parameters):\n" + textwrap.indent(textwrap.dedent(body).strip(), "    ")
     return load(write(folder, f"import numpy as np\n{textwrap.dedent(head)}\n{function}\n"))
-
-
-class Hosted:
-    """A hosted controller and a loop like the daemon's."""
-
-    def __init__(
-        self,
-        file: ControllerFile,
-        task: TaskChoice | None = None,
-        start_timeout_s: float = 60.0,
-        patience_s: float = 0.0,
-        memory_bytes: int = 1 << 28,
-    ) -> None:
-        self.host = HostedController(
-            file,
-            model=MODEL,
-            nx=3,
-            nu=2,
-            task=task,
-            seed=7,
-            memory_bytes=memory_bytes,
-            start_timeout_s=start_timeout_s,
-            patience_s=patience_s,
-        )
-        self.host.start()
-        self.seq = 0
-
-    def next(self) -> Ready | Reply | Late | Stopped:
-        """The next event, however long it takes: the deadlines are the controller's."""
-        while True:
-            due = self.host.deadline_ns
-            left_s = 0.02 if due is None else min(0.02, max(0.0, (due - time.monotonic_ns()) / 1e9))
-            select.select([self.host], [], [], left_s)
-            if events := self.host.poll(time.monotonic_ns()):
-                assert len(events) == 1
-                return events[0]
-
-    def ask(self, x: tuple[float, ...] = (0.5, 0.25, 0.0), deadline_ns: int = PATIENT_NS) -> Ready | Reply | Late | Stopped:
-        self.seq += 1
-        self.host.ask(Observation(self.seq, 0, x), time.monotonic_ns() + deadline_ns)
-        return self.next()
-
-
-@contextlib.contextmanager
-def hosted(file: ControllerFile, task: TaskChoice | None = None, patience_s: float = 0.0) -> Iterator[Hosted]:
-    """Started and ready."""
-    it = Hosted(file, task, patience_s=patience_s)
-    try:
-        ready = it.next()
-        assert isinstance(ready, Ready), ready
-        assert ready.digest == file.digest
-        yield it
-    finally:
-        it.host.close()
 
 
 def is_gone(pid: int) -> bool:

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import pytest
 from core_rig import Rig, kinds, memory, of, one, sources
-from test_core_loaded import loaded
+from loaded_rig import loaded
 
 from s2r_runtime.core import reducer as core
 from s2r_runtime.messages import (

@@ -8,28 +8,17 @@ from typing import Any
 
 import msgspec
 import pytest
-from core_rig import GAP, Rig, S, kinds, memory, of, one
+from core_rig import GAP, Rig, kinds, memory, of, one
+from loaded_rig import loaded
 
-from s2r_runtime.core import ledger
 from s2r_runtime.core.gaps import REFUTED
 from s2r_runtime.messages import (
     Answer,
-    CertificateFacts,
     CertificateInstalled,
     CertificateStored,
     Memory,
     StartController,
 )
-
-
-def loaded(epoch: int = 1, transitions: str = "", **changes: Any) -> CertificateStored:
-    """Of the gap in force in `memory()`, or of one from a later campaign."""
-    transitions = transitions or ("transitions" if epoch == 1 else f"transitions-{epoch}")
-    facts = CertificateFacts("offline", "controller", "model", "task", "profile", epoch, 0.01, 0.02, 1500, 2500, 7)
-    gap = msgspec.structs.replace(
-        GAP, epoch=epoch, transitions_digest=transitions, n=ledger.campaign_size(0.03, ledger.share(0.05, epoch), 0)
-    )
-    return CertificateStored(S, msgspec.structs.replace(facts, **changes), gap, 5)
 
 
 def test_a_loaded_certificate_brings_its_gap_if_it_founds_a_later_epoch() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 from core_rig import GAP, Rig, answers, of, one
-from test_report_watch import Told
+from report_rig import Told
 
 from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core

@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 from core_rig import Rig, S, answers, kinds, lockstep, memory, of, one, sources
+from repair_rig import FOUND, PROPOSED, traced
 
 from s2r_runtime.core import reducer as core
 from s2r_runtime.messages import (
@@ -14,13 +15,11 @@ from s2r_runtime.messages import (
     CampaignFinished,
     Decided,
     InputsFinished,
-    JobFinished,
     LinkChanged,
     ModelAdopted,
     Output,
     OverrideChanged,
     Persist,
-    Proposal,
     RecorderChanged,
     SourceStarted,
     SourceStopped,
@@ -32,16 +31,6 @@ from s2r_runtime.messages import (
     Ticked,
     TraceEnded,
 )
-
-FOUND: dict[str, Any] = {"verdict": "traced", "proposal": {"digest": "better", "proposed": True, "effects": ["input_gain on w"]}}
-PROPOSED = Proposal("better", "model", "campaign", 1, ("input_gain on w",))
-
-
-def traced(rig: Rig, trace: dict[str, Any] | None = None, error: str = "") -> list[Output]:
-    """The running trace ends."""
-    order = [job for job in of(rig.outputs, StartJob) if job.kind == "trace"][-1]
-    return rig.feed(JobFinished(rig.t, order.job_id, "trace", trace=None if error else trace or FOUND, error=error))
-
 
 # ---------------------------------------------------------------- when
 

@@ -7,8 +7,8 @@ from typing import Any
 import msgspec
 import pytest
 from core_rig import DT, Rig, S, memory, of, one
-from test_core_loaded import loaded
-from test_core_repair import FOUND, PROPOSED, traced
+from loaded_rig import loaded
+from repair_rig import FOUND, PROPOSED, traced
 
 from s2r_runtime.messages import (
     Answer,

@@ -27,12 +27,12 @@ pytest.importorskip("s2r_ros2")
 pytest.importorskip("s2r_mavlink")
 pytest.importorskip("s2r_can")
 
+from can_rig import CanRig
+from mavlink_rig import MavlinkRig
+from ros2_rig import Ros2Rig
 from s2r_mavlink.testing import RoverProcess
 from s2r_ros2.testing import Node
 from s2r_zenoh.testing import Robot, free_endpoint
-from test_daemon_can import CanRig
-from test_daemon_mavlink import MavlinkRig
-from test_daemon_ros2 import Ros2Rig
 
 PERIOD_S = 0.05
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_confinement import LANDLOCK
-from test_controllers import Hosted, hosted
+from confinement_rig import LANDLOCK
+from controllers_rig import Hosted, hosted
 
 from s2r_runtime.controllers.code import batch_control
 from s2r_runtime.controllers.file import ControllerFile, load

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_effects_kit import VALUES
+from effects_rig import VALUES
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec

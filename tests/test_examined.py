@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_controllers import MODEL, Hosted
-from test_worker import finished, verify_job
+from controllers_rig import MODEL, Hosted
+from worker_rig import finished, verify_job
 
 from s2r_runtime.controllers.batches import BatchController
 from s2r_runtime.controllers.code import Raised

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_daemon_zenoh import ZenohRig
+from zenoh_rig import ZenohRig
 
 pytest.importorskip("s2r_zenoh")
 pytest.importorskip("s2r_standins")
@@ -31,7 +31,7 @@ class PeopleRig(ZenohRig):
 
     def start_robot(self, *options: str) -> None:
         told = {"kind": "zenoh", "endpoint": self.endpoint}
-        argv = [sys.executable, str(Path(__file__).with_name("link_robot.py")), str(self.folder), json.dumps(told), *options]
+        argv = [sys.executable, str(Path(__file__).parent / "rigs" / "link_robot.py"), str(self.folder), json.dumps(told), *options]
         with (self.folder / "robot.txt").open("ab") as sink:
             self.robot = subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=sink, stderr=sink)
 

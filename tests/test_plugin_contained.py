@@ -279,7 +279,7 @@ def test_a_hang_that_cannot_be_interrupted_ends_the_process_and_says_where(how: 
 
 @pytest.fixture
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
-    monkeypatch.setattr(daemon_rig, "PROGRAM", Path(__file__).with_name("odd_robot.py"))
+    monkeypatch.setattr(daemon_rig, "PROGRAM", Path(__file__).parent / "rigs" / "odd_robot.py")
     opened = Rig(tmp_path, clock="realtime")
     yield opened
     opened.close()

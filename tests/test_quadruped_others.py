@@ -119,7 +119,7 @@ def test_a_fall_over_the_link_ends_with_an_answer(tmp_path: Path, how: float, co
     profile = tmp_path / "quadruped.toml"
     profile.write_text(text, encoding="utf-8")
     (tmp_path / "run").mkdir(mode=0o700)
-    robot = [sys.executable, str(Path(__file__).with_name("other_walker.py")), f"tcp/127.0.0.1:{ports[0]}", "falls=30", f"how={how}"]
+    robot = [sys.executable, str(Path(__file__).parent / "rigs" / "other_walker.py"), f"tcp/127.0.0.1:{ports[0]}", "falls=30", f"how={how}"]
     sample = [sys.executable, "-m", "s2r_runtime.cli.main", "sample", str(profile), "-o", str(tmp_path / "walk.mcap"), "--json"]
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path / "run"), "XDG_STATE_HOME": str(tmp_path / "state")}
     walking = subprocess.Popen(robot, stdin=subprocess.DEVNULL)

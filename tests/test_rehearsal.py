@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_worker import GRID, finished, verify_job
+from worker_rig import GRID, finished, verify_job
 
 from s2r_runtime.controllers.rehearsal import CALLS, Kept
 from s2r_runtime.daemon.worker import Failed

@@ -4,25 +4,14 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-from core_rig import Rig
+from report_rig import Told
 
 from s2r_runtime.bounds import anytime_upper
 from s2r_runtime.core import reducer as core
-from s2r_runtime.messages import Event, Measured, Output
+from s2r_runtime.messages import Measured
 from s2r_runtime.report.page import Page
 from s2r_runtime.report.run_page import _watched
 from s2r_runtime.report.story import tell
-
-
-class Told(Rig):
-    """A rig that keeps events and outputs in the log's order."""
-
-    log: list[Event | Output]
-
-    def feed(self, event: Event) -> list[Output]:
-        outputs = super().feed(event)
-        self.log = [*getattr(self, "log", []), event, *outputs]
-        return outputs
 
 
 def test_the_report_shows_what_driving_shows_under_each_gap() -> None:

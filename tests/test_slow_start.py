@@ -8,7 +8,7 @@ import signal
 import time
 from collections.abc import Callable
 
-from test_worker import gap, profile, step
+from worker_rig import gap, profile, step
 
 from s2r_runtime.daemon.analytics import Watching
 from s2r_runtime.daemon.awake import TURN_S, AwakeClock

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_pages import needs_chromium, rendered, self_contained
+from pages_rig import needs_chromium, rendered, self_contained
 from trace_robots import GEOMETRY, commands, drive
 
 from s2r_runtime.models.composed import compose

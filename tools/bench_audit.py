@@ -19,7 +19,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "rigs"))
 
 import audit_bench
 
@@ -107,7 +107,7 @@ def make(path: Path, observations: int) -> None:
 def audited(path: Path) -> dict[str, Any]:
     """The log, all parts of it, by a process of its own."""
     parts = [path, *sorted(path.parent.glob(f"{path.stem}.*.mcap"))]
-    tests = str(Path(__file__).resolve().parent.parent / "tests")
+    tests = str(Path(__file__).resolve().parent.parent / "tests" / "rigs")
     done = subprocess.run([sys.executable, "-c", AUDIT, tests, *map(str, parts)], capture_output=True, text=True, check=True)
     found: dict[str, Any] = json.loads(done.stdout)
     return {**found, "file_megabytes": sum(one.stat().st_size for one in parts) / 1e6}

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parent.parent
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tools")]
+sys.path[:0] = [str(ROOT / "tests" / "rigs"), str(ROOT / "tools")]
 
 DT = 0.01
 ENTER = ["unshare", "--map-root-user", "--net", "sh", "-ec"]

@@ -25,7 +25,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path.insert(0, str(ROOT / "tests" / "rigs"))
 
 import daemon_rig  # noqa: E402
 import link_faults  # noqa: E402

@@ -36,7 +36,7 @@ from typing import Any
 from bench_daemon import Bench, cpu_s, percentiles, resident_mb
 
 ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path.insert(0, str(ROOT / "tests" / "rigs"))
 
 ANSWERED_WITHIN = 10
 """Periods after which an observation counts as unanswered."""

@@ -19,7 +19,7 @@ from collections import Counter
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path.insert(0, str(ROOT / "tests" / "rigs"))
 
 from core_faults import run_case  # noqa: E402
 from gate_law import case, reason  # noqa: E402

@@ -33,7 +33,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parent.parent
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tools")]
+sys.path[:0] = [str(ROOT / "tests" / "rigs"), str(ROOT / "tools")]
 
 DT = 0.01
 TIMEOUT_S = 0.1
@@ -287,7 +287,7 @@ def inside(call: str) -> dict[str, Any]:
     """A call of bench_can, in a network namespace of its own, where the bus is multicast and a cut takes the interface down."""
     import bench_can
 
-    tools = {"PYTHONPATH": os.pathsep.join([str(ROOT / "tools"), str(ROOT / "tests")]), bench_can.INSIDE: "1"}
+    tools = {"PYTHONPATH": os.pathsep.join([str(ROOT / "tools"), str(ROOT / "tests" / "rigs")]), bench_can.INSIDE: "1"}
     code = f"import bench_can, json; print(json.dumps(bench_can.{call}))"
     argv = [*bench_can.ENTER, f'{bench_can.LO_UP}; exec "$0" "$@"', sys.executable, "-c", code]
     ran = subprocess.run(argv, env={**os.environ, **tools}, stdout=subprocess.PIPE, text=True, check=False)

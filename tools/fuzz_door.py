@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path.insert(0, str(ROOT / "tests" / "rigs"))
 
 import daemon_rig  # noqa: E402
 

@@ -20,7 +20,7 @@ from s2r_runtime.messages import CertificateFacts, Command, Observation, Setting
 
 S = 1_000_000_000
 NOW = 100 * S
-DOCUMENT = Path(__file__).parent.parent / "docs" / "gate.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "gate.md"
 
 SETTINGS = Settings(
     robot="r",

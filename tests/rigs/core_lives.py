@@ -18,7 +18,7 @@ import msgspec
 from s2r_runtime.core import reducer as core
 from s2r_runtime.messages import Event, Output, Started
 
-FILE = Path(__file__).parent / "replay" / "core_lives.msgpack.gz"
+FILE = Path(__file__).parent.parent / "replay" / "core_lives.msgpack.gz"
 WALKS, STEPS = 12, 420
 CASES = 260
 """Random walks and their steps, and seeded cases of faults: enough that every line of the core is run many times over."""
