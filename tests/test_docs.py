@@ -107,6 +107,23 @@ def test_links_lead_somewhere() -> None:
     assert broken == []
 
 
+def _anchors(page: Path) -> set[str]:
+    """The anchors that a Markdown page has on its host: headings in lower case, words joined by hyphens, without punctuation."""
+    prose = FENCE.sub("", page.read_text(encoding="utf-8"))
+    return {re.sub(r"[^\w\- ]", "", title.strip().lower()).replace(" ", "-") for title in re.findall(r"^#+ (.*)$", prose, re.MULTILINE)}
+
+
+def test_links_into_a_page_lead_to_a_heading() -> None:
+    links = [
+        (page, page.parent / target if target else page, anchor)
+        for page in (*PAGES, ROOT / "CHANGELOG.md")
+        for target, anchor in re.findall(r"\]\(([^)#:]*)#([^)]+)\)", page.read_text(encoding="utf-8"))
+    ]
+    assert links
+    broken = [f"{page.relative_to(ROOT)} -> {target.name}#{anchor}" for page, target, anchor in links if anchor not in _anchors(target)]
+    assert broken == []
+
+
 def test_the_map_of_files_names_every_module() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     root = ROOT / "s2r_runtime"
