@@ -14,7 +14,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "plugin-author.md").read_text(encoding="utf-8")
-SECTION = PAGE[PAGE.index("## An effect, whole") : PAGE.index("## A model of your own")]
+SECTION = PAGE[PAGE.index("## A complete effect") : PAGE.index("## A model of your own")]
 EFFECT, KIT, ON_A_BASE, *_OTHERS = re.findall(r"^```python[^\n]*\n(.*?)^```$", SECTION, re.MULTILINE | re.DOTALL)
 
 

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "plugin-author.md").read_text(encoding="utf-8")
 REFERENCE = (ROOT / "docs" / "plugin-reference.md").read_text(encoding="utf-8")
 FOLLOWS = re.findall(
-    r"^```python[^\n]*\n(.*?)^```$", REFERENCE[REFERENCE.index("## Something that follows the log") :], re.MULTILINE | re.DOTALL
+    r"^```python[^\n]*\n(.*?)^```$", REFERENCE[REFERENCE.index("## A program that follows the log") :], re.MULTILINE | re.DOTALL
 )[0]
 PACKAGES = [kind for kind in KINDS if kind != "controller"]
 
