@@ -21,10 +21,11 @@ from s2r_runtime.bounds import check_probability, sample_size, scenario_confiden
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.messages import NOT_INDEPENDENT, SERIAL, Gap
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.modelspec import is_sketch
 from s2r_runtime.prediction import Holds, acting_over, hold_residuals, residuals
 from s2r_runtime.profile_checks import HEAVIEST, LIGHTEST
 from s2r_runtime.repeats import Repeats, repeats
-from s2r_runtime.seen_rows import PREFIX, seen
+from s2r_runtime.seen_rows import seen
 from s2r_runtime.table_rows import Subset
 from s2r_runtime.whiteness import DEPENDENT, SERIAL_ALPHA, Whiteness, body_axes, serial_p, whiteness
 
@@ -206,7 +207,7 @@ def refuse_fitted(model: ComposedModel, tr: Transitions) -> None:
             f"{tr.source}: the model was fitted on this recording, which therefore can't bound its gap; take one that the fit never saw"
         )
     for text in model.spec.fitted_on:
-        if text.startswith(PREFIX) and (found := seen(text, tr.measured or (tr.x0, tr.x1))).refused:
+        if is_sketch(text) and (found := seen(text, tr.measured or (tr.x0, tr.x1))).refused:
             raise NotEnoughEvidence(
                 f"{tr.source}: the model was fitted on {found.rows / found.of:.3g} of its rows ({found.rows} of {found.of}), so it can't "
                 "bound its gap; take a recording that the fit never saw"

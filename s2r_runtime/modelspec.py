@@ -5,7 +5,7 @@ repaired model's TOML hold, and what a model digest is taken of.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -13,6 +13,11 @@ import msgspec
 from s2r_runtime.canonical import digest_of
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.toml_text import load_toml
+
+PREFIX = "rows:"
+"""A sketch of rows stands among `ModelSpec.fitted_on` with this before it: 40 bits a hash, as earlier versions wrote it (`seen_rows`)."""
+COMPACT = "rows2:"
+"""The same, as it is written now."""
 
 
 class EffectSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -55,6 +60,16 @@ class ModelSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Digest of what the model computes: two specs with the same digest step alike. `fitted_on` is no part of it."""
         name = "file" if self.source_digest else self.name
         return digest_of(msgspec.structs.replace(self, name=name, fitted_on=()))
+
+
+def is_sketch(text: str) -> bool:
+    """Whether this one of `ModelSpec.fitted_on` is a sketch of rows; else it is a digest."""
+    return text.startswith((PREFIX, COMPACT))
+
+
+def form_of(fitted_on: Sequence[str]) -> str:
+    """The newest form of the sketches that a model has: COMPACT or PREFIX; empty without any."""
+    return next((form for form in (COMPACT, PREFIX) if any(text.startswith(form) for text in fitted_on)), "")
 
 
 def load_model(path: Path) -> ModelSpec:

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
+import numpy as np
 import pytest
 from daemon_rig import Rig
 
+from s2r_runtime.daemon import control, door
 from s2r_runtime.messages import (
     LinkChanged,
     Observed,
     Send,
     Stopping,
 )
+from s2r_runtime.modelspec import EffectSpec, dump_model, load_model
+from s2r_runtime.profile import load_profile
 from s2r_runtime.recording.reading import read
+from s2r_runtime.seen_rows import sketch, united
+from s2r_runtime.toml_text import TEXT_MAX
 
 
 @pytest.fixture
@@ -170,6 +179,35 @@ def test_stop_latches_until_it_is_cleared(rig: Rig) -> None:
     assert "emergency_stop" in rig.ask("sample")["text"]
     assert rig.ask("clear", text="emergency_stop")["exit_code"] == 0
     assert rig.sample()["exit_code"] == 0
+
+
+def test_a_model_of_twenty_fits_is_adopted_without_holding_up_the_loop(rig: Rig) -> None:
+    """Each fit saw more rows than a sketch holds."""
+    rig.start_robot()
+    rig.start()
+    rig.until(lambda: rig.status()["observation"])
+    fits = [sketch([np.random.default_rng(seed).uniform(-1, 1, (20_000, 3))], (2,)) for seed in range(20)]
+    fitted = msgspec.structs.replace(load_profile(rig.profile).model, fitted_on=united(*fits))
+    spec = msgspec.structs.replace(fitted, effects=(EffectSpec("input_gain", "v", {"gain": 0.9}),))
+    model = rig.folder / "twenty.toml"
+    model.write_text(dump_model(spec))
+    assert model.stat().st_size > 20 * 130_000
+    answer = rig.s2r("adopt", str(model), "--socket", str(rig.socket))
+    assert answer.returncode == 0, answer.stderr
+    assert rig.status()["model"] == spec.digest()
+    (kept,) = (rig.state / "models").glob("*.toml")
+    assert load_model(kept).fitted_on == spec.fitted_on
+
+
+def test_the_longest_request_is_scanned_in_a_fraction_of_what_the_loop_may_be_held() -> None:
+    line = json.dumps({"verb": "adopt", "text": "x" * TEXT_MAX}).encode()
+    assert len(line) < control.REQUEST_MAX
+    times = []
+    for _ in range(5):
+        begun = time.thread_time()
+        door.decode_request(line)
+        times.append(time.thread_time() - begun)
+    assert min(times) < 0.01
 
 
 def test_adopted_model_is_in_force_after_a_restart_and_the_profiles_own_change_ends_that(rig: Rig) -> None:

@@ -18,8 +18,8 @@ from s2r_runtime.bounds import clopper_pearson_lower
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
 from s2r_runtime.gap import refuse_fitted
 from s2r_runtime.models.composed import compose
-from s2r_runtime.modelspec import ModelSpec, dump_model
-from s2r_runtime.seen_rows import ALPHA, KEPT, PREFIX, seen, sketch
+from s2r_runtime.modelspec import COMPACT, PREFIX, ModelSpec, dump_model, form_of, load_model
+from s2r_runtime.seen_rows import ALPHA, FALSE_BITS, KEPT, TEXT_MAX, seen, sketch, united
 from s2r_runtime.trace.dataset_files import load_dataset
 from s2r_runtime.transitions import load_transitions
 
@@ -146,7 +146,7 @@ def test_of_a_long_recording_a_bounded_sketch_finds_a_few_hundred_transitions() 
     rng = np.random.default_rng(3)
     rows = rng.uniform(-1, 1, (500_000, 3))
     (text,) = sketch([rows], (2,))
-    assert len(text) < 250_000
+    assert len(text) < 150_000
     part = rows[rng.choice(len(rows), 1200, replace=False)]
     found = seen(text, [part + 1e-9])
     assert found.refused
@@ -155,10 +155,11 @@ def test_of_a_long_recording_a_bounded_sketch_finds_a_few_hundred_transitions() 
 
 
 def test_a_damaged_sketch_is_one_clear_error() -> None:
-    (text,) = sketch([np.random.default_rng(4).normal(size=(100, 2))], ())
-    for bad in (text[:-7], "rows:!!", "rows:"):
-        with pytest.raises(ConfigError, match="sketch of rows is damaged"):
-            seen(bad, [np.zeros((3, 2))])
+    for form in (PREFIX, COMPACT):
+        (text,) = sketch([np.random.default_rng(4).normal(size=(100, 2))], (), form)
+        for bad in (text[:-7], f"{form}!!", form):
+            with pytest.raises(ConfigError, match="sketch of rows is damaged"):
+                seen(bad, [np.zeros((3, 2))])
 
 
 def test_the_command_line_refuses_a_test_and_a_gap_on_seen_rows(fit: Path, tmp_path: Path) -> None:
@@ -180,8 +181,78 @@ def test_the_command_line_refuses_a_test_and_a_gap_on_seen_rows(fit: Path, tmp_p
 )
 def test_a_sketch_whose_numbers_are_none_is_one_clear_error_too(change: dict[str, Any]) -> None:
     runs = [np.random.default_rng(1).normal(size=(50, 3))]
+    for form in (PREFIX, COMPACT):
+        (text,) = sketch(runs, (2,), form)
+        made = msgspec.msgpack.decode(base64.b64decode(text.removeprefix(form)))
+        damaged = form + base64.b64encode(msgspec.msgpack.encode({**made, **change})).decode()
+        with pytest.raises(ConfigError, match="sketch of rows is damaged"):
+            seen(damaged, runs)
+
+
+@pytest.mark.parametrize(
+    "change", [{"n": 10**9}, {"n": -1}, {"n": 7}, {"low": 64}, {"low": -1}, {"shift": 64}, {"code": b""}, {"code": bytes(99)}]
+)
+def test_a_list_of_hashes_that_is_none_is_one_clear_error_too(change: dict[str, Any]) -> None:
+    runs = [np.random.default_rng(1).normal(size=(50, 3))]
     (text,) = sketch(runs, (2,))
-    made = msgspec.msgpack.decode(base64.b64decode(text.removeprefix(PREFIX)))
-    damaged = PREFIX + base64.b64encode(msgspec.msgpack.encode({**made, **change})).decode()
+    made = msgspec.msgpack.decode(base64.b64decode(text.removeprefix(COMPACT)))
+    made["grids"][1] |= change
     with pytest.raises(ConfigError, match="sketch of rows is damaged"):
-        seen(damaged, runs)
+        seen(COMPACT + base64.b64encode(msgspec.msgpack.encode(made)).decode(), runs)
+
+
+# ---------------------------------------------------------------- as text
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("rows", [50, 6000])
+def test_the_compact_form_finds_the_rows_that_the_former_one_finds(fit: Path, change: Callable[[Rows], Rows], rows: int) -> None:
+    def runs(table: Rows) -> list[np.ndarray]:
+        return [np.array([row[2:5] for row in part], dtype=np.float64) for part in by_segment(table)]
+
+    table = [line.split(",") for line in fit.read_text().splitlines()[1:]][:rows]
+    (former,), (compact,) = (sketch(runs(table), (2,), form) for form in (PREFIX, COMPACT))
+    again = runs(change(table))
+    assert seen(compact, again) == seen(former, again)
+    assert seen(compact, again).refused
+
+
+def test_a_model_of_twenty_fits_has_all_that_each_of_them_saw(tmp_path: Path) -> None:
+    fits = [np.random.default_rng(seed).uniform(-1, 1, (20_000, 3)) for seed in range(20)]
+    every: tuple[str, ...] = ("sha256:0",)
+    for rows in fits:
+        every = united(every, sketch([rows], (2,)))
+    assert every == ("sha256:0", *(sketch([rows], (2,))[0] for rows in fits))
+    (tmp_path / "model.toml").write_text(dump_model(ModelSpec("unicycle", DT, fitted_on=every)))
+    assert load_model(tmp_path / "model.toml").fitted_on == every
+    fresh = [np.random.default_rng(99).uniform(-1, 1, (20_000, 3))]
+    assert not any(seen(text, fresh).refused for text in every[1:])
+
+
+def test_of_a_hundred_fits_each_is_thinner_and_together_they_stay_within_their_bound() -> None:
+    fits = [np.random.default_rng(seed).uniform(-1, 1, (20_000, 3)) for seed in range(100)]
+    texts = united(*(sketch([rows], (2,)) for rows in fits))
+    assert 0.8 * TEXT_MAX < sum(map(len, texts)) <= TEXT_MAX
+    for text, rows in zip(texts, fits, strict=True):
+        assert seen(text, [rows[:200] + 1e-9]).refused
+        assert not seen(text, [fits[0][:200] if rows is not fits[0] else fits[1][:200]]).refused
+    assert united(texts, texts[:3]) == texts
+
+
+def test_sketches_of_earlier_versions_are_thinned_like_those_of_now() -> None:
+    fits = [np.random.default_rng(seed).uniform(-1, 1, (20_000, 3)) for seed in range(30)]
+    texts = united(*(sketch([rows], (2,), PREFIX) for rows in fits))
+    assert form_of(texts) == COMPACT
+    assert sum(map(len, texts)) <= TEXT_MAX
+    assert all(seen(text, [rows[:200]]).refused for text, rows in zip(texts, fits, strict=True))
+
+
+def test_hashes_agree_by_chance_no_more_often_than_said() -> None:
+    rng = np.random.default_rng(5)
+    (text,) = sketch([rng.uniform(-1, 1, (KEPT - 1, 6))], ())
+    found, looked = 0, 0
+    for _ in range(20):
+        result = seen(text, [rng.uniform(-1, 1, (100_000, 6))])
+        found, looked = found + result.rows, looked + result.of
+        assert not result.refused
+    assert clopper_pearson_lower(found, looked, SURE) <= 2.0 * 2.0**-FALSE_BITS

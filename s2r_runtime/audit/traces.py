@@ -26,10 +26,10 @@ from s2r_runtime.daemon.trace_job import VOLATILE, options
 from s2r_runtime.daemon.worker import Failed, Progress, Result, TraceJob, Worker
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import JobFinished, Memory, ModelAdopted, SampleTaken, StartCampaign, StartJob, Struct
+from s2r_runtime.modelspec import COMPACT, form_of
 from s2r_runtime.recording.layout import Attached
 from s2r_runtime.recording.reading import Entry
 from s2r_runtime.recording.stretches import CHANNELS, Cut, Stretches, log_identity
-from s2r_runtime.seen_rows import PREFIX
 from s2r_runtime.trace import VERSION
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ class Traces:
             cut=cut,
             identities=identities,
             cpu_s=self._seconds or 0.0,
-            row_sketch=any(text.startswith(PREFIX) for text in spec.fitted_on) if (spec := _spec(trace)) else True,
+            row_sketch=form_of(spec.fitted_on) if (spec := _spec(trace)) else COMPACT,
         )
         done = _work(
             job, math.inf if self._seconds is None else PATIENCE * self._seconds, lambda share: self._progress(f"{name}: {share:.0f} %")

@@ -175,12 +175,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _seen_by_the_fit(data: Dataset, test: Dataset) -> bool:
     """Whether the fit would see rows of the test (guarantee G6)."""
-    from s2r_runtime.seen_rows import PREFIX, seen
+    from s2r_runtime.modelspec import is_sketch
+    from s2r_runtime.seen_rows import seen
 
     if set(test.digests) & set(data.digests):
         return True
     rows = [states.values for states, _ in test.segments]
-    return any(seen(text, rows).refused for text in data.digests if text.startswith(PREFIX))
+    return any(seen(text, rows).refused for text in data.digests if is_sketch(text))
 
 
 def _files(args: argparse.Namespace, result: TraceResult, suggested: Suggestion | None) -> dict[Path, str]:

@@ -23,8 +23,10 @@ from typing import Any, Protocol
 
 from s2r_runtime.daemon import door
 from s2r_runtime.errors import ConfigError, S2RError, UsageError, one_line
+from s2r_runtime.toml_text import TEXT_MAX
 
-REQUEST_MAX = 1 << 20
+REQUEST_MAX = TEXT_MAX + (1 << 20)
+"""Of a line: the text of the largest model that is read, and what JSON adds. It is scanned in a millisecond or two (`door`)."""
 ANSWER_MAX = 8 << 20
 CLIENTS_MAX = 32
 REQUEST_WITHIN_NS = 5_000_000_000
@@ -111,11 +113,11 @@ class Connection:
         if not data:
             self.close()
         elif not self._asked:
-            self._in += data
-            line, end, _ = self._in.partition(b"\n")
-            if end:
+            first, ended, _ = data.partition(b"\n")
+            self._in += first
+            if ended:
                 self._asked = True
-                self._server.handle(self, bytes(line))
+                self._server.handle(self, bytes(self._in))
                 self._in.clear()
             elif len(self._in) > REQUEST_MAX:
                 self._asked = True

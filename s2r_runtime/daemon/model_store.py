@@ -55,9 +55,11 @@ class ModelStore:
 
     def keep(self, spec: ModelSpec, comments: Sequence[str] = ()) -> ModelSpec:
         """Puts the model there, durably, before any memory names it; gives it back with all that it was fitted on. Raises OSError."""
+        from s2r_runtime.seen_rows import united
+
         digest, file = spec.digest(), self.file(spec.digest())
         if file.exists() and _of_base(file, self.base) and (known := load_model(file)).digest() == digest:
-            spec = msgspec.structs.replace(spec, fitted_on=tuple(dict.fromkeys((*known.fitted_on, *spec.fitted_on))))
+            spec = msgspec.structs.replace(spec, fitted_on=united(known.fitted_on, spec.fitted_on))
         file.parent.mkdir(mode=0o700, exist_ok=True)
         replace(file, (f'base = "{self.base}"\n' + dump_model(spec, tuple(comments))).encode())
         return spec

@@ -22,6 +22,7 @@ from s2r_runtime.daemon.model_store import ModelStore
 from s2r_runtime.daemon.worker import TraceJob
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.messages import StartJob
+from s2r_runtime.modelspec import COMPACT
 from s2r_runtime.recording.logs import runs
 from s2r_runtime.recording.stretches import CHANNELS, Cut, Rows, Stretches, log_identity
 
@@ -63,10 +64,11 @@ def traced(
     seed: int,
     progress: Callable[[float, float, str], None],
     *,
-    row_sketch: bool = True,
+    row_sketch: str = COMPACT,
 ) -> tuple[TraceResult, Any]:
     """What the tracer says; and the repaired model, which remembers what it was fitted on (guarantee G6): the stretch, its rows
-    one by one (`row_sketch`), a campaign's samples in whatever log they stand, and for anything else the whole log.
+    one by one (`row_sketch`: in which form, none if empty), a campaign's samples in whatever log they stand, and for anything else the
+    whole log.
     """
     from s2r_runtime.models.composed import compose
     from s2r_runtime.trace.tracer import trace as tracer
@@ -77,7 +79,7 @@ def traced(
     source = f"{about.stretch} of epoch {about.epoch}"
     samples = from_samples(cut.samples, source=source) if cut.samples else None
     more = identities if samples is None else (samples.digest,)
-    data = replace(dataset(model, cut, source, (about.digest,), sketched=row_sketch), campaign=samples)
+    data = replace(dataset(model, cut, source, (about.digest,), form=row_sketch), campaign=samples)
     found = tracer(data, model, seed=seed, progress=progress, weights=weights(profile, model.states), kind=profile.norm.set)
     fitted = found.spec
     if fitted.effects != profile.model.effects:
@@ -129,7 +131,7 @@ def weights(profile: Profile, states: Sequence[str]) -> tuple[float, ...]:
     return tuple(profile.norm.weights.get(name, 1.0) for name in states)
 
 
-def dataset(model: ComposedModel, cut: Cut, source: str, digests: tuple[str, ...], *, sketched: bool = True) -> Dataset:
+def dataset(model: ComposedModel, cut: Cut, source: str, digests: tuple[str, ...], *, form: str = COMPACT) -> Dataset:
     """The stretch on the model's grid. Raises RecordingError if its rows are not of this model, or too far apart,
     NotEnoughEvidence if it is of one moment only.
     """
@@ -141,7 +143,7 @@ def dataset(model: ComposedModel, cut: Cut, source: str, digests: tuple[str, ...
             if any(len(values) != len(names) for _, values in rows):
                 raise RecordingError(f"{source}: its rows are not of {', '.join(names)}")
     segments = [(_stream(one.states, len(model.states)), _stream(one.inputs, len(model.inputs))) for one in cut.segments]
-    seen = row_sketch(model, segments) if sketched else ()
+    seen = row_sketch(model, segments, form) if form else ()
     return replace(from_streams(model, segments, source, (*digests, *seen)), commanded=True)
 
 

@@ -22,7 +22,7 @@ from s2r_runtime.daemon.given_inputs import GivenInputs
 from s2r_runtime.daemon.settings import ModelFacts
 from s2r_runtime.errors import S2RError, one_line
 from s2r_runtime.messages import CertificateFacts, Gap, SampleTaken, Stretch, Verification
-from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.modelspec import COMPACT, ModelSpec
 from s2r_runtime.printable import printable_lines
 from s2r_runtime.processor import family, used
 from s2r_runtime.profile import Profile
@@ -106,7 +106,7 @@ class TraceJob(msgspec.Struct, frozen=True, tag="trace"):
     out: str = ""
     base: str = ""
     cpu_s: float = 0.0
-    row_sketch: bool = True
+    row_sketch: str = COMPACT
     """Whether the model remembers the rows that it was fitted on; an audit of a log from before does not ask for it."""
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.seen_rows import united
 from s2r_runtime.trace.any_shape import any_shape_of
 from s2r_runtime.trace.dataset import Dataset
 from s2r_runtime.trace.domain import domain_of
@@ -220,5 +221,4 @@ def _spec(model: ComposedModel, final: Fit, data: Dataset) -> ModelSpec:
     if not final.added and len(model.effects) == len(model.spec.effects):
         return model.spec
     effects = tuple(EffectSpec(a.effect.name, a.channel, a.p) for a in final.model.effects)
-    fitted_on = tuple(dict.fromkeys((*model.spec.fitted_on, *data.digests)))
-    return msgspec.structs.replace(model.spec, effects=effects, fitted_on=fitted_on)
+    return msgspec.structs.replace(model.spec, effects=effects, fitted_on=united(model.spec.fitted_on, data.digests))

@@ -23,6 +23,7 @@ from s2r_runtime.formats.mapping import Recorded
 from s2r_runtime.formats.routes import read_recording
 from s2r_runtime.messages import CampaignFinished, Observed, Send, StartCampaign, Started
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.modelspec import COMPACT
 from s2r_runtime.recording.origin import other_writer
 from s2r_runtime.robot_logs import content_digest, is_mcap, is_robot_log
 from s2r_runtime.seen_rows import sketch
@@ -125,9 +126,9 @@ def _check_steps(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]]
         check_steps(model, *(e[[0, len(e) // 2, -1]] for e in (x, u)))
 
 
-def row_sketch(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]]) -> tuple[str, ...]:
+def row_sketch(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], form: str = COMPACT) -> tuple[str, ...]:
     """What stands for the rows of states that were measured (guarantee G6), as text."""
-    return sketch([states.values for states, _ in segments], model.angle_columns)
+    return sketch([states.values for states, _ in segments], model.angle_columns, form)
 
 
 def _digest(path: Path) -> str:
