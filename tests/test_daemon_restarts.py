@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +64,43 @@ def test_commands_from_before_a_robots_restart_do_not_make_the_gap_grow(rig: Rig
     assert rig.status()["radius"] == 0.002, "nor do those from before the daemon's own"
     rig.stop()
     assert restarts(rig) == 3
+    assert max(m.discrepancy for m in rig.messages("event/measured") if isinstance(m, Measured)) < 0.002
+    found = audited(rig)
+    assert (found["ok"], found["first_difference"]) == (True, None), found
+
+
+LATENCY = 12
+"""Periods: 0.4 s, four times the hysteresis of the gate."""
+
+
+def fall_silent(rig: Rig) -> None:
+    """It is not heard for longer than the link allows, and goes on with all commands that were under way."""
+    assert rig.robot is not None
+    rig.robot.send_signal(signal.SIGSTOP)
+    rig.until_status(reason="link_down")
+    rig.robot.send_signal(signal.SIGCONT)
+
+
+@pytest.mark.parametrize("event", [fall_silent, restart_robot], ids=["link lost", "robot restarted"])
+def test_a_delay_longer_than_the_hysteresis_makes_no_gap_grow_over_a_break(rig: Rig, event: Callable[[Rig], None]) -> None:
+    """Whether the commands under way before it still act, nobody knows: nothing is measured until it cannot matter."""
+    rig.profile.write_text(rig.profile.read_text().replace("delay = 0.033", f"delay = {0.033 * LATENCY:.3f}"))
+    path = rig.controller("    return np.tile([0.15, 1.0], (len(x), 1))\n")
+    latency = ("--latency", str(LATENCY))
+    rig.start_robot(*latency)
+    start, rig.start_robot = rig.start_robot, lambda *options: start(*latency, *options)  # type: ignore[method-assign]
+    rig.start()
+    rig.until(lambda: rig.status()["observation"])
+    certificate = rig.certificate(path, radius=0.002, verified=0.02)
+    assert rig.ask("deploy", path=str(path), certificate=certificate)["exit_code"] == 0
+    for _ in range(3):
+        seen = rig.until_status(gate="open", driving="controller")["stream"]["n"]
+        rig.until(lambda seen=seen: rig.status()["stream"]["n"] > seen + 30)
+        event(rig)
+    seen = rig.until_status(gate="open")["stream"]["n"]
+    rig.until(lambda: rig.status()["stream"]["n"] > seen + 30)
+    assert rig.status()["radius"] == 0.002
+    rig.stop()
     assert max(m.discrepancy for m in rig.messages("event/measured") if isinstance(m, Measured)) < 0.002
     found = audited(rig)
     assert (found["ok"], found["first_difference"]) == (True, None), found

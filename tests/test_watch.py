@@ -309,6 +309,41 @@ def test_faulty_and_repeated_observations_are_no_measurements_and_a_restarted_ro
     assert measured.discrepancy < 1e-12
 
 
+@pytest.mark.parametrize("still", [True, False], ids=["commands still act", "begins at rest"])
+@pytest.mark.parametrize(
+    ("effect", "blind"),
+    [
+        (EffectSpec("input_delay", "v", {"delay": 0.033 * 12}), range(5, 14)),
+        (EffectSpec("input_lag", "v", {"time_constant": 0.15}), range(15, 25)),
+        (EffectSpec("input_rate_limit", "v", {"rate": 0.5}), range(10, 20)),
+        (EffectSpec("input_backlash", "v", {"width": 0.3}), range(195, 201)),
+    ],
+    ids=lambda given: given.name if isinstance(given, EffectSpec) else "",
+)
+def test_after_a_lost_link_nothing_is_measured_until_it_cannot_matter_what_still_acts(
+    effect: EffectSpec, blind: range, still: bool
+) -> None:
+    """Four recovery commands, as the gate's hysteresis has them, then a controller. 200 commands are the longest past that counts."""
+    model = compose(ModelSpec("unicycle", 0.033, effects=(effect,)))
+    stream, x, hidden, found = Stream(model, gap(0.01, model)), np.zeros((1, 3)), model.at_rest(1), []
+    for k in range(300):
+        if k == 40:
+            stream.restarted()
+            stream.restarted()  # lost, and found
+            hidden = hidden if still else model.at_rest(1)
+        measured = stream.observed(Observation(k, k * DT_NS, tuple(map(float, x[0]))))
+        found += [measured] if measured is not None else []
+        recovers = 40 <= k < 44
+        u = (0.0, 0.0) if recovers else (0.4 if k < 40 else 0.1, 0.3)
+        stream.sent(Send(k * DT_NS, k, "recovery" if recovers else "controller", u, k, DT_NS))
+        x, hidden = model.step(x, np.array([u]), hidden)
+    after = [m for m in found if m.obs_seq > 40]
+    assert after[0].obs_seq - 45 in blind
+    assert [m.obs_seq for m in after] == list(range(after[0].obs_seq, 300))
+    if effect.name != "input_backlash":
+        assert max(m.discrepancy for m in found) < 0.01 * 0.4 * 0.033
+
+
 def test_a_rejected_discrepancy_does_not_count_and_an_exceedance_does() -> None:
     stream = Stream(DELAYED, gap(0.01, DELAYED), fault_jump=1.0)
     found = drive(stream, Robot(DELAYED, {5: 5.0, 9: 0.5}), 12)

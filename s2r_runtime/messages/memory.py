@@ -93,9 +93,12 @@ REFUSED_FIRST = 8
 """Since these rules no attempt is spent on a certificate that `deploy` would refuse for what driving showed (`core.driven`)."""
 FIXED_SEEDS = 9
 """Since these rules a certificate whose seed a simulation fixed says so, and drives only in a simulation."""
-RULES = 9
+UNKNOWN_PAST = 10
+"""Since these rules nothing is measured after that until commands from before it cannot matter any more, however long effects remember."""
+RULES = 10
 """1: a campaign that is refused for dependent samples is remembered, and can be traced and repeated. 2: `GRID`. 3: what driving showed is
 kept over epochs (`Driven`). 4: `RESTARTS`. 5: `SEEDS`. 6: `LATEST_TIME`. 7: `IMPLAUSIBLE`. 8: `REFUSED_FIRST`. 9: `FIXED_SEEDS`.
+10: `UNKNOWN_PAST`.
 """
 BEHAVIOURS = 1000
 """Remembered on one gap: some 20 KB of what is persisted. Beyond that a certificate says *at least*."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from s2r_runtime.comparison import EARLY, LATE
 from s2r_runtime.core.ledger import seed
 from s2r_runtime.core.stream import bin_of
-from s2r_runtime.messages import GRID, IMPLAUSIBLE, RESTARTS, RULES, Gap, Measured, Observation, Send
+from s2r_runtime.messages import GRID, IMPLAUSIBLE, RESTARTS, RULES, UNKNOWN_PAST, Gap, Measured, Observation, Send
 from s2r_runtime.watch.change import ChangeDetector
 from s2r_runtime.watch.exceedance import EProcess
 from s2r_runtime.watch.exchangeability import ConformalTest
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from s2r_runtime.models.composed import ComposedModel
+    from s2r_runtime.models.composed import ComposedModel, Hidden
 
     Array = NDArray[np.float64]
 
@@ -28,7 +28,14 @@ EARLY_BEFORE = 0.2
 """Of dt: how far two observations might be from dt apart under rules before `GRID`. Since then a campaign's limits hold here, too."""
 
 PAST_ROWS = 200
-"""Commands that a transition of another length than a step is given as its past: some 20 s at 10 Hz."""
+"""Commands that a transition of another length than a step is given as its past: some 20 s at 10 Hz. After so many none from before a
+restart counts, whatever an effect remembers.
+"""
+
+FORGOTTEN = 0.01
+"""Of what the memory of before a restart differs from rest: what is left of it when it does not matter any more. A delay forgets all at
+once, a lag by e a time constant.
+"""
 
 LONGEST_HOLD = 2000
 """Periods for which a held input is carried into an effect's memory; after more of them nothing changes any more."""
@@ -48,10 +55,10 @@ class Stream:
     A transition is an observation, the one command that answered it, and the first observation that is one step later by the stamps, with a
     campaign's tolerance (`comparison`). It is compared with a step of its own length. Where an observation is lost, stands at another
     time, or another command was sent in between, there is none: `lost` counts those. The effects' memory goes on by the commands sent,
-    whatever is observed; it begins at rest, and anew when the robot started anew or its link was lost (`restarted`). Since the commands
-    before that are not known to act or not, nothing is measured until the gate lets a controller command again, after recovery commands
-    for as long as its hysteresis. fault_jump: see `measurement_fault`. alpha, run_length: bars of the notices. rules: see
-    `Settings`. The rest is where an earlier one stood: see the three tests.
+    whatever is observed; it begins at rest, and anew when the robot started anew or its link was lost (`restarted`). Whether commands
+    from before that act is unknown. So nothing is measured until the gate lets a controller command again, and until the memory is the
+    same either way (`FORGOTTEN`). fault_jump: see `measurement_fault`. alpha, run_length: bars of the notices. rules: see `Settings`. The
+    rest is where an earlier one stood: see the three tests.
     """
 
     def __init__(
@@ -79,17 +86,22 @@ class Stream:
         self.change = ChangeDetector(gap.epsilon, run_length, value=change)
         self.exchange = ConformalTest(seed("ties", gap.transitions_digest, gap.epoch), alpha, counts=counts, value=exchange)
         self.lost = 0
+        self._before: Hidden | None = None
         self._begin()
 
     def restarted(self) -> None:
         """The robot started anew, or the link to it was lost or found: what it was commanded before says nothing about what acts."""
         if self._notes_restarts:
             self.lost += self._open is not None
-            self._begin()
+            self._begin(self._before or self._hidden)  # lost, and found again: what was known before the first of them
 
-    def _begin(self) -> None:
+    def _begin(self, before: Hidden | None = None) -> None:
+        """At rest. before: the effects' memory, if the robot may still have it."""
         self._settled = not self._notes_restarts
         self._hidden = self._model.at_rest(1)
+        self._before = before if self._rules >= UNKNOWN_PAST else None
+        self._apart = self._differences()
+        self._since = 0
         self._seen: Observation | None = None
         self._open: tuple[Observation, Send] | None = None
         self._last: Send | None = None
@@ -111,7 +123,7 @@ class Stream:
             self._clock_ns += periods * self._dt_ns
         if fresh and seen is not None:
             self._clock_ns = float(seen.stamp_ns)
-            self._open = (seen, send) if self._settled else None
+            self._open = (seen, send) if self._settled and self._is_known() else None
         self._last = send
         self._commands.append((self._clock_ns, send.u))
 
@@ -121,9 +133,9 @@ class Stream:
         if observation.fault:
             return None
         if seen is not None and observation.stamp_ns < seen.stamp_ns:
-            self._begin()  # the robot's clock began anew
+            self._begin(self._before or self._hidden)  # the robot's clock began anew
         elif seen is not None and observation.seq < seen.seq and self._notes_restarts:
-            self._begin()  # its numbers did
+            self._begin(self._before or self._hidden)  # its numbers did
         elif seen is not None and observation.seq <= seen.seq:
             return None
         self._seen = observation
@@ -193,3 +205,20 @@ class Stream:
         command = np.array([u])
         for _ in range(periods):
             _, _, self._hidden = self._model.act(command, self._hidden)
+            if self._before:
+                _, _, self._before = self._model.act(command, self._before)
+
+    def _is_known(self) -> bool:
+        """Whether what acts is the same, whether the robot began at rest or still had the commands from before its restart."""
+        if self._before:
+            self._since += 1
+            if self._since >= PAST_ROWS or all(
+                now <= FORGOTTEN * first for now, first in zip(self._differences(), self._apart, strict=True)
+            ):
+                self._before = None
+        return not self._before
+
+    def _differences(self) -> list[float]:
+        """The largest one in each effect's memory; clocks aside."""
+        pairs = zip(self._model.effects, self._before, self._hidden, strict=True) if self._before else ()
+        return [float(abs(a - b).max(initial=0.0)) for one, a, b in pairs if not getattr(one.effect, "timed", False)]

@@ -24,6 +24,7 @@ import signal
 import socket
 import sys
 import time
+from collections import deque
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -169,11 +170,11 @@ SWAY_S = 200.0
 
 
 class Robot:
-    """A unicycle with arcs, one period of latency, wheels that saturate, a gain on w, and a little noise."""
+    """A unicycle with arcs, one period of latency or more, wheels that saturate, a gain on w, and a little noise."""
 
     def __init__(self, folder: Path, args: argparse.Namespace) -> None:
         self.folder, self.dt, self.gain, self.args = folder, args.dt, args.gain, args
-        self.x, self.acting = [0.0, 0.0, 0.0], (0.0, 0.0)
+        self.x, self.under_way = [0.0, 0.0, 0.0], deque([(0.0, 0.0)] * args.latency)
         self.seq, self.stamp_ns = args.since, round(args.since * args.dt * 1e9)
         self.random = random.Random(args.seed)
         self.measured = (-1, b"")
@@ -193,8 +194,8 @@ class Robot:
             self.socket.sendto(self.measured[1], str(self.folder / DAEMON))
 
     def step(self, u: tuple[float, ...]) -> None:
-        v, w = self.acting
-        self.acting = saturated(u[0], u[1] * self.gain)
+        self.under_way.append(saturated(u[0], u[1] * self.gain))
+        v, w = self.under_way.popleft()
         x, y, theta = self.x
         middle = theta + 0.5 * w * self.dt
         v *= 1.0 + self.args.sway * (self.stamp_ns * 1e-9 % SWAY_S > 0.5 * SWAY_S)
@@ -238,6 +239,7 @@ def main() -> int:
     robot.add_argument("--realtime", action="store_true")
     robot.add_argument("--dt", type=float, default=0.033)
     robot.add_argument("--gain", type=float, default=1.0)
+    robot.add_argument("--latency", type=int, default=1, help="periods after which a command acts")
     robot.add_argument("--seed", type=int, default=1)
     robot.add_argument("--since", type=int, default=0, help="it was restarted: its numbers and stamps go on from this period")
     robot.add_argument("--sway", type=float, default=0.0, help="its speed is wrong by this share for half of the time")
