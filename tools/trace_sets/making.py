@@ -60,7 +60,7 @@ class Draft:
     euler: bool = False
     runs: int = 1
     declared: tuple[dict[str, Any], ...] = ()
-    asked: Callable[[Rng, Array], Array] | None = None
+    asked: Callable[[Rng, Array], Array | Controller] | None = None
     together: bool = True
     whole: bool = False
     extra: dict[str, Any] = field(default_factory=dict)
@@ -82,7 +82,7 @@ class Draft:
     def model(self) -> dict[str, Any]:
         """As a model TOML has it."""
         return {
-            "name": self.scale.plant.name,
+            "name": self.scale.plant.file or self.scale.plant.name,
             "dt": self.scale.dt,
             "parameters": dict(self.scale.plant.parameters),
             "effects": [*self.declared],
@@ -143,8 +143,8 @@ def realise(rng: Rng, draft: Draft) -> tuple[Recording, Rollouts | None]:
     return recording_of(rng, draft, runs), rollout_errors(starts, draft.nominal()) if starts else None
 
 
-def drive(rng: Rng, draft: Draft) -> tuple[list[Run], list[Start]]:
-    """Runs as measured, and begins of rollouts."""
+def drive(rng: Rng, draft: Draft, *, ahead: int | None = None, rollouts: int = 30) -> tuple[list[Run], list[Start]]:
+    """Runs as measured, and begins of rollouts. ahead: rows of each, by default those of HORIZON_S."""
     s, world = draft.scale, draft.world()
     origin, runs, starts = 0.0, [], []
     for _ in range(draft.runs):
@@ -152,8 +152,9 @@ def drive(rng: Rng, draft: Draft) -> tuple[list[Run], list[Start]]:
         rows, orders = stamps(rng, draft.layout, s, n)
         commands = draft.asked(rng, s.dt / s.parts * orders) if draft.asked else asked(rng, draft, s.dt / s.parts * orders)
         x0 = _begin(rng, s)
-        ahead = max(1, min(round(HORIZON_S / (world.h * float(np.median(np.diff(rows))))), n // 4))
-        run = record(world, rows, orders, commands, draft.noise, x0, rng, origin=origin, ahead=ahead, rollouts=max(30 // draft.runs, 6))
+        usual = max(1, min(round(HORIZON_S / (world.h * float(np.median(np.diff(rows))))), n // 4))
+        how: dict[str, Any] = {"origin": origin, "ahead": ahead or usual, "rollouts": max(rollouts // draft.runs, 6)}
+        run = record(world, rows, orders, commands, draft.noise, x0, rng, **how)
         origin += round(s.dt * n + rng.uniform(*PAUSE_S), 3)
         starts += run.starts
         runs.append(run)

@@ -13,6 +13,7 @@ States, inputs and parameters are named as in docs/tracing.md; the formulas are 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -24,7 +25,10 @@ Numbers = list[float]
 
 @dataclass(frozen=True)
 class Plant:
-    """`reached`: states that follow an input at once, state index -> input index. velocity: indices of velocity states."""
+    """`reached`: states that follow an input at once, state index -> input index. velocity: indices of velocity states.
+
+    move: moves the state in place by (plant, x, a, h, moment), of a robot that is neither of the two; file: its nominal model.
+    """
 
     name: str
     states: tuple[str, ...]
@@ -32,6 +36,8 @@ class Plant:
     parameters: dict[str, float] = field(default_factory=dict)
     reached: dict[int, int] = field(default_factory=dict)
     velocity: tuple[int, ...] = ()
+    move: Callable[[Plant, Numbers, Numbers, float, Moment], None] | None = None
+    file: str = ""
 
     @property
     def pose(self) -> bool:

@@ -145,7 +145,9 @@ class Moment:
         plant = world.plant
         a = self.chain()
         self.acting = a
-        if plant.pose:
+        if plant.move is not None:
+            plant.move(plant, x, a, self.h, self)
+        elif plant.pose:
             if world.euler and self.i % world.parts == 0:
                 self.frozen = x[2]
             for state, channel in plant.reached.items():
