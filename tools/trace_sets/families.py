@@ -11,6 +11,7 @@ unmeasured      one effect that matters, and no speed is measured
 tie             not separable, by how the robot was driven
 fault, bad      measurements that are wrong in places; input from which nothing can be traced
 tiny, long      20 to 120 steps; 50 000 to 100 000 steps
+unopened_...    effects of no library, and another robot; not to be opened by whoever changes the tracer (unopened.py)
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ from trace_sets.recording import TraceSet
 from trace_sets.same import accepted, alternatives, share_a_name
 from trace_sets.scale import PLANTS, Scale, draw_scale, log_uniform
 from trace_sets.sizing import HARDLY, MATTERS, STRONG, Band, sized
+from trace_sets.unopened import UNOPENED
 from trace_sets.world import World, rollout_errors
 
 Rng = np.random.Generator
@@ -250,4 +252,5 @@ FAMILIES: dict[str, Family] = {
     "tiny_clean": _clean("white", most=120),
     "long": _one(MATTERS, least=50_000, most=100_000),
     "long_clean": _clean("white", closed=0.0, least=50_000, most=100_000),
+    **UNOPENED,
 }

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import betaincinv
 
 from trace_sets.sizing import STRONG, WEAK
+from trace_sets.unopened import KINDS, ROBOT_CLEAN, ROBOT_KINDS, ROBOT_NAMED
 
 Record = dict[str, Any]
 
@@ -103,7 +104,7 @@ def rows(records: list[Record]) -> list[Row]:
     changed = [r for r in done if r.get("again") and r["verdict"] in {"traced", "ambiguous"}]
     worse, worse_of_library = (
         [r["again"]["noisy"][1] > 1.02 * r["again"]["noisy"][0] for r in some]
-        for some in (changed, [r for r in changed if r["family"] != "outside"])
+        for some in (changed, [r for r in changed if r["family"] not in {"outside", *KINDS, *ROBOT_KINDS}])
     )
     short = [r["cpu_s"] for r in done if 1000 <= r["n"] <= 1500]
     tiny = [r for r in records if r["family"] in {"tiny", "tiny_clean"} and r["outcome"] not in {"refused", "crash"}]
@@ -123,6 +124,7 @@ def rows(records: list[Record]) -> list[Row]:
         _share("known unnamed kinds: unflagged false name", words(outside, "false_name"), 0.10, at_most=True),
         _share("known unnamed kinds: right depends_on", [r["depends_right"] for r in outside], 0.70),
         replace(_share("  said that nothing is left, or noise", words(outside, "none"), 0.0), target="", met=None),
+        *_unopened(done),
         _share("not separable by construction: tie reported", words(of("tie"), "tie"), 0.90),
         _figure("error reduction reached, median (matters, pairs)", share, lambda v: float(np.median(v)), 0.97),
         _figure("error reduction reached, 10th percentile", share, lambda v: float(np.quantile(v, 0.1)), 0.85),
@@ -137,6 +139,28 @@ def rows(records: list[Record]) -> list[Row]:
         _share("20 to 120 steps: false alarm or wrong name", words(tiny, "alarm", "wrong"), 0.05, at_most=True),
         _share("bad input: refused in a line, or no name", words([r for r in records if r["family"] == "bad"], "honest"), 0.95),
         _share("crashed, or refused 120 steps or more", lost, 0.0, at_most=True),
+    ]
+
+
+def _unopened(done: list[Record]) -> list[Row]:
+    """Kinds and a robot that whoever changes the tracer has not seen."""
+
+    def words(families: Iterable[str], *wanted: str) -> list[bool]:
+        return [r["outcome"] in wanted for r in done if r["family"] in {*families}]
+
+    def kinds(what: str, families: Iterable[str]) -> list[Row]:
+        return [
+            _share(f"{what}: unflagged false name", words(families, "false_name"), 0.10, at_most=True),
+            _share(f"{what}: right depends_on", [r["depends_right"] for r in done if r["family"] in {*families}], 0.70),
+            replace(_share("  said that nothing is left, or noise", words(families, "none"), 0.0), target="", met=None),
+        ]
+
+    return [
+        *kinds("unopened kinds", KINDS),
+        _share("unopened robot: false alarms, clean", words(ROBOT_CLEAN, "alarm"), 0.05, at_most=True),
+        _share("unopened robot, one effect: right name", words(ROBOT_NAMED, *RIGHT), 0.90),
+        _share("unopened robot, one effect: wrong name", words(ROBOT_NAMED, "wrong"), 0.03, at_most=True),
+        *kinds("unopened robot, unopened kinds", ROBOT_KINDS),
     ]
 
 
