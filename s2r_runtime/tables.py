@@ -144,9 +144,9 @@ def read_csv(
     )
 
 
-def header_of(path: Path | str) -> list[str]:
+def header_of(path: Path | str, limits: Limits | None = None) -> list[str]:
     """Names of the columns. Raises RecordingError as `read_csv`."""
-    return _opened(Path(path), TextLines(Path(path)))[0]
+    return _opened(Path(path), TextLines(Path(path), limits))[0]
 
 
 def places_of(path: Path | str, wanted: Sequence[str], columns: Mapping[str, str], angles: Sequence[str] = ()) -> dict[str, Place]:

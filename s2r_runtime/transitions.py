@@ -30,6 +30,7 @@ from s2r_runtime.canonical import digest_of, digest_of_all, digest_of_path
 from s2r_runtime.driving import MAX_GAP, Streams, drive_transitions, resolution, state_at, streams_noise
 from s2r_runtime.errors import RecordingError, UsageError
 from s2r_runtime.formats.mapping import Recorded
+from s2r_runtime.formats.recognise import recognised
 from s2r_runtime.formats.routes import read_recording
 from s2r_runtime.gap import Transitions
 from s2r_runtime.messages import CampaignFinished, LinkChanged, Observed, SampleTaken, Send, Started
@@ -40,8 +41,8 @@ from s2r_runtime.recording.origin import other_writer
 from s2r_runtime.robot_logs import content_digest, is_mcap, is_robot_log, merged_rows
 from s2r_runtime.sensor_noise import FEWEST, NORMAL_MAD
 from s2r_runtime.table_rows import Subset, joined
-from s2r_runtime.table_text import Limits, Progress, refuse_special
-from s2r_runtime.tables import read_csv
+from s2r_runtime.table_text import GB, Limits, Progress, check_regular, refuse_special
+from s2r_runtime.tables import header_of, read_csv
 
 Array = NDArray[np.float64]
 
@@ -92,6 +93,24 @@ def load_transitions(
         raise UsageError(f"{paths[0]}: a CSV has no epochs, nor has a log that is not of the daemon")
     tables = _Tables(columns or {}, MAX_VALUES // len(paths), limits, progress)
     return _together(model, [_read_one(one, model, tables, transport, signals) for one in paths])
+
+
+def look_at(path: Path, limits: Limits) -> None:
+    """Raises RecordingError for what cannot be a recording, by its size and its beginning: before its bytes are digested.
+
+    limits: of a table its text, of anything else all bytes, of a folder those of all its files.
+    """
+    from s2r_runtime.recording.writer import read
+
+    files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
+    size = sum(check_regular(file) for file in files)
+    if size > limits.text_bytes:
+        raise RecordingError(f"{path}: has {size / GB:.4g} GB, at most {limits.text_bytes / GB:g} GB are read; to read more: --max-gb GB")
+    if _is_own_log(path):
+        if not read(path, ()).start:
+            raise RecordingError(f"{path}: is no log of this software: it ends before its first record")
+    elif recognised(path) is None and not is_robot_log(path):
+        header_of(path, limits)
 
 
 def _is_own_log(path: Path) -> bool:

@@ -13,7 +13,8 @@ from scipy.special import erf
 
 from s2r_runtime import blocked, certificate, statements
 from s2r_runtime.bounds import clopper_pearson_lower, sample_size
-from s2r_runtime.cli.evidence import gap_of, in_fixed_order
+from s2r_runtime.canonical import digest_of_all, digest_of_path
+from s2r_runtime.cli.evidence import gap_of, load_recordings
 from s2r_runtime.core import ledger
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
 from s2r_runtime.gap import Drive, Transitions, estimate_gap
@@ -21,6 +22,7 @@ from s2r_runtime.gap import blocked as in_blocks
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Driving, Profile, load_profile, parse_profile
+from s2r_runtime.transitions import load_transitions
 
 DT = 0.1
 SETTINGS = {"epsilon": 0.05, "share": 0.0152, "discard": 0}
@@ -143,9 +145,9 @@ def test_driving_founds_a_gap_only_where_the_profile_vouches_for_blocks(tmp_path
     n = sample_size(plain.guarantee.epsilon, share / 2.0, plain.guarantee.discard)
     table = driven_table(tmp_path / "drive.csv", n + 2, plain.model.dt)
     with pytest.raises(NotEnoughEvidence, match=r"unless the profile vouches for blocks of it: \[driving\]"):
-        gap_of(table, model, plain, beta=share)
+        gap_of(load_transitions(table, model), model, plain, beta=share)
     vouching = msgspec.structs.replace(plain, driving=Driving(block=1.0, mixing=1e-9, because=BECAUSE))
-    gap, assumption, _ = gap_of(table, model, vouching, beta=share)
+    gap, assumption, _ = gap_of(load_transitions(table, model), model, vouching, beta=share)
     assert (gap.n, gap.hold_periods, gap.beta) == (n, 1, share)
     assert gap.radius > 0.0
     assert "different blocks of 1 s" in assumption
@@ -179,12 +181,12 @@ def test_several_drives_found_one_gap_in_whatever_order_they_are_named(tmp_path:
     vouching = msgspec.structs.replace(plain, driving=Driving(block=1.0, mixing=1e-9, because=BECAUSE))
     drives = [driven_table(tmp_path / f"{k}.csv", n // 2 + 3 + k, plain.model.dt, begin=1e6 * k) for k in range(2)]
     with pytest.raises(NotEnoughEvidence, match="more"):
-        gap_of(drives[:1], model, vouching, beta=share)
+        gap_of(load_transitions(drives[0], model), model, vouching, beta=share)
     found = []
     for named in (drives, drives[::-1]):
-        paths, digest = in_fixed_order(named)
-        gap, _, _ = gap_of(paths, model, vouching, beta=share)
+        recorded, digest = load_recordings(named, model, vouching)
+        gap, _, _ = gap_of(recorded, model, vouching, beta=share)
         assert gap.n == n
         found.append((gap, digest))
     assert found[0] == found[1]
-    assert in_fixed_order(drives[:1])[1] != found[0][1]
+    assert load_recordings(drives[:1], model, vouching)[1] == digest_of_all([digest_of_path(drives[0])]) != found[0][1]

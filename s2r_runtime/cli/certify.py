@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     """Exit 0 with a certificate written, 1 if the controller did not pass (the attempt is spent all the same)."""
     from s2r_runtime import keys, offline_ledger
     from s2r_runtime.bounds import attempt_beta, epoch_beta
-    from s2r_runtime.cli.evidence import gap_of, in_fixed_order, profile_model, run_verification
+    from s2r_runtime.cli.evidence import gap_of, load_recordings, profile_model, run_verification
     from s2r_runtime.cli.trials_verb import trials_of
 
     writable(args.output, replaced=True)  # now, because what is spent below stays spent, whatever becomes of the certificate
@@ -64,11 +64,11 @@ def run(args: argparse.Namespace) -> int:
     key_path = args.key or keys.default_path()
     key = keys.load(key_path)
     controller = controller_at(args.controller, args.param)
-    recordings, recording = in_fixed_order(args.recording)
+    found, recording = load_recordings(args.recording, model, profile, args.max_gb)
     trials = trials_of(args.trials, controller, model, profile) if args.trials else None
     ledger, beta = offline_ledger.open_ledger(key_path, profile.robot.name), profile.guarantee.beta
     epoch = ledger.epoch_for(recording, model.spec.digest(), profile.digest())
-    gap, assumption, period = gap_of(recordings, model, profile, beta=epoch_beta(beta, epoch), epoch=epoch, max_gb=args.max_gb)
+    gap, assumption, period = gap_of(found, model, profile, beta=epoch_beta(beta, epoch), epoch=epoch)
     attempt = ledger.spend_attempt(controller.digest, epoch=epoch)
     result, behaviour = run_verification(
         controller,

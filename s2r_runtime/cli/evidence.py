@@ -32,6 +32,7 @@ from s2r_runtime.errors import NotEnoughEvidence, RecordingError, UsageError
 if TYPE_CHECKING:
     from s2r_runtime.controllers.hosted import ControllerFile
     from s2r_runtime.daemon.worker import Failed, Job, Result
+    from s2r_runtime.gap import Transitions
     from s2r_runtime.messages import Gap, Verification
     from s2r_runtime.models.composed import ComposedModel
     from s2r_runtime.profile import Profile
@@ -161,7 +162,7 @@ def run_verify(args: argparse.Namespace) -> int:
 
     profile = load_checked(args.profile)
     model = profile_model(args, profile)
-    epoch_gap = gap_of(in_fixed_order(args.recording)[0], model, profile, max_gb=args.max_gb)[0] if args.recording else None
+    epoch_gap = gap_of(load_recordings(args.recording, model, profile, args.max_gb)[0], model, profile)[0] if args.recording else None
     laws = tuple(args.law) if args.law else profile.verification.laws
     gap = epoch_gap or gap_at(args.radius, args.hold_radius, model, profile)
     headroom = args.headroom or (profile.verification.headroom if epoch_gap else 1.0)
@@ -212,32 +213,41 @@ def profile_model(args: argparse.Namespace, profile: Profile) -> ComposedModel:
     return compose(profile.model, f"{args.profile}: model")
 
 
-def in_fixed_order(paths: Sequence[Path]) -> tuple[list[Path], str]:
-    """The recordings by their digests, and the digest of all. Of several drives the first blocks count: which ones those are may not depend
-    on the order in which a person names them. Raises RecordingError.
+def load_recordings(
+    paths: Sequence[Path],
+    model: ComposedModel,
+    profile: Profile,
+    max_gb: float | None = None,
+) -> tuple[Transitions, str]:
+    """The transitions of the recordings, and the digest of all. Of several drives the first blocks count: which ones those are may not
+    depend on the order in which a person names them, so several are digested first. max_gb: of one recording. Raises as
+    `load_transitions`.
     """
     from s2r_runtime.canonical import digest_of_all, digest_of_path
-    from s2r_runtime.table_text import refuse_special
+    from s2r_runtime.table_text import limits_of
+    from s2r_runtime.transitions import load_transitions, look_at
 
-    found = []
+    limits, digests, ordered = limits_of(max_gb), [], list(paths)
     for path in paths:
-        refuse_special(path)
+        look_at(path, limits)
+    if len(paths) > 1:
         try:
-            found.append((digest_of_path(path), path))
+            digested = sorted((digest_of_path(path), path) for path in paths)
         except OSError as error:
-            raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
-    found.sort()
-    return [path for _, path in found], digest_of_all([digest for digest, _ in found])
+            raise RecordingError(f"{error.filename}: cannot be read: {error.strerror}") from None
+        digests, ordered = [digest for digest, _ in digested], [path for _, path in digested]
+    found = load_transitions(ordered, model, dict(profile.columns), transport=profile.transport, limits=limits)
+    output.notes(found.source, found.notes)
+    return found, digest_of_all(digests or [found.digest])
 
 
 def gap_of(
-    recordings: Sequence[Path],
+    found: Transitions,
     model: ComposedModel,
     profile: Profile,
     *,
     beta: float | None = None,
     epoch: int = 1,
-    max_gb: float | None = None,
 ) -> tuple[Gap, str, str]:
     """The gap that a campaign shows under the profile's settings, or driving that the profile vouches for; the assumption that it rests on;
     and which period of each hold gave the sample. beta: the epoch's share; without one the gap founds no certificate. Raises
@@ -245,11 +255,7 @@ def gap_of(
     """
     from s2r_runtime import gap as gaps
     from s2r_runtime.messages import NOT_INDEPENDENT, REPEATED
-    from s2r_runtime.table_text import limits_of
-    from s2r_runtime.transitions import load_transitions
 
-    found = load_transitions(recordings, model, dict(profile.columns), transport=profile.transport, limits=limits_of(max_gb))
-    output.notes(found.source, found.notes)
     share = beta or profile.guarantee.beta
     if found.drive is not None and profile.driving.block > 0.0:
         from s2r_runtime import blocked

@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     from s2r_runtime import keys, offline_ledger
     from s2r_runtime import verify as verification
     from s2r_runtime.bounds import attempt_beta
-    from s2r_runtime.cli.evidence import gap_at, gap_of, print_verification, profile_model, run_verification, work
+    from s2r_runtime.cli.evidence import gap_at, gap_of, load_recordings, print_verification, profile_model, run_verification, work
     from s2r_runtime.controllers import candidates
     from s2r_runtime.daemon import persistence
     from s2r_runtime.daemon.worker import Failed, SynthesisJob
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     bounds = candidates.declared_bounds(controller, dict(_bound(item) for item in args.bound))
     ledger = offline_ledger.open_ledger(args.key or keys.default_path(), profile.robot.name)
     if args.recording:
-        gap = gap_of(args.recording, model, profile, max_gb=args.max_gb)[0]
+        gap = gap_of(load_recordings([args.recording], model, profile, args.max_gb)[0], model, profile)[0]
     else:
         gap = gap_at(args.radius, args.hold_radius, model, profile)
     headroom = profile.verification.headroom if args.recording else 1.0

@@ -48,9 +48,12 @@ class Account(msgspec.Struct, frozen=True):
 
 
 def info(path: Path) -> dict[str, Any]:
-    """What a log holds and how it ended. Reads and checks all of it; raises RecordingError if it is none."""
+    """What a log holds and how it ended. Reads and checks all of it; raises RecordingError if it is none, or holds no message."""
     reading = read(path, ())
     ending = reading.to_the_end()
+    if not reading.counts:
+        more = "; s2r log recover looks for sound ones behind the damage" if ending.kind == "broken" else ""
+        raise RecordingError(f"{path}: holds no message that could be read: {ending.detail}{more}")
     start = reading.first_ns or 0
     return {
         "file": str(path),
@@ -88,10 +91,14 @@ def recover(path: Path, out: Path) -> dict[str, Any]:
             account = _copy(good, source, target, str(out))
             target.flush()
             os.fsync(target.fileno())
-        partial.rename(out)
+        if account.records:
+            partial.rename(out)
     except OSError as error:
         partial.unlink(missing_ok=True)
         raise UsageError(f"{out}: cannot be written: {error.strerror}") from None
+    if not account.records:
+        partial.unlink(missing_ok=True)
+        raise RecordingError(f"{path}: holds no message that could be recovered: {good.ending.detail}")
     plain: dict[str, Any] = msgspec.to_builtins(account)
     return plain
 

@@ -13,6 +13,7 @@ import numpy as np
 from s2r_runtime.bounds import anytime_upper
 from s2r_runtime.core import stream
 from s2r_runtime.core.gaps import GOOD_REFUSED
+from s2r_runtime.errors import NotEnoughEvidence
 from s2r_runtime.gap import discrepancy, residuals, statement
 from s2r_runtime.messages import REPEATED, Gap, Settings
 from s2r_runtime.modelspec import ModelSpec
@@ -29,9 +30,13 @@ GATE = {"open": (plots.GREEN, "open"), "closed": (plots.QUIET, "closed")}
 
 
 def log_page(paths: Sequence[Path]) -> str:
-    """The page of a run's files, in order. Raises RecordingError if they are no log, ConfigError without matplotlib."""
+    """The page of a run's files, in order. Raises RecordingError if they are no log, NotEnoughEvidence if they hold no record,
+    ConfigError without matplotlib.
+    """
     log = read_all(paths)
     story = tell(log.entries())
+    if not story.records:
+        raise NotEnoughEvidence(f"{', '.join(map(str, paths))}: no record could be read, so there is nothing to report: {log.ending()}")
     name = story.settings.robot if story.settings else "unknown robot"
     when = datetime.fromtimestamp(story.started_unix_s, UTC).strftime("%Y-%m-%d %H:%M UTC")
     length = f"{story.seconds(story.last_ns):.0f} s on the robot's clock"
