@@ -46,6 +46,7 @@ def driven(path: Path) -> Stopped | None:
         it.host.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("face", TWO_FACED)
 def test_a_second_face_is_seen_when_it_shows(tmp_path: Path, face: str) -> None:
     head = "import time\nimport numpy as np\nCALLS, MEMORY, LAST, LATER = [], {}, [0.0], time.monotonic() + 2.0\n"
@@ -59,6 +60,7 @@ def test_a_second_face_is_seen_when_it_shows(tmp_path: Path, face: str) -> None:
     assert "asked again about a state of this drive, it answers [0." in stopped.detail
 
 
+@pytest.mark.slow
 def test_a_function_of_its_arguments_drives_on(tmp_path: Path) -> None:
     path = tmp_path / "controller.py"
     path.write_text("import numpy as np\ndef control(x, theta, parameters):\n    return np.sin(x[:, :2])\n", encoding="utf-8")

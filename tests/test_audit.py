@@ -51,6 +51,7 @@ def test_a_log_without_a_record_proves_nothing(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- honest logs
 
 
+@pytest.mark.slow
 def test_an_honest_run_holds_and_everything_in_it_was_recomputed(run: Any, tmp_path: Path) -> None:
     path = run.write(tmp_path / "a.mcap")
     result = audit([path], PUBLIC)
@@ -75,6 +76,7 @@ def read_head(path: Path) -> str:
     return reading.head.hex()
 
 
+@pytest.mark.slow
 def test_the_result_has_the_keys_that_are_promised_and_is_plain_data(run: Any, tmp_path: Path) -> None:
     plain = audit([run.write(tmp_path / "a.mcap")]).to_json()
     assert {"ok", "records", "certificates", "first_difference", "missing", "chain"} <= plain.keys()
@@ -82,6 +84,7 @@ def test_the_result_has_the_keys_that_are_promised_and_is_plain_data(run: Any, t
     assert msgspec.json.decode(msgspec.json.encode(plain)) == plain
 
 
+@pytest.mark.slow
 def test_parts_of_a_rotated_log_are_audited_as_one_in_any_order(run: Any, tmp_path: Path) -> None:
     run.write(tmp_path / "a.mcap", rotate_bytes=30_000)
     parts = sorted(tmp_path.glob("*.mcap"), key=lambda path: read(path).part, reverse=True)
@@ -148,6 +151,7 @@ def test_a_campaign_that_was_interrupted_and_went_on_holds_over_both_logs(tmp_pa
     assert result.recomputed["samples"] == 14
 
 
+@pytest.mark.slow
 def test_a_log_that_ran_out_of_disk_holds_and_counts_what_it_lacks(run: Any, tmp_path: Path) -> None:
     writer = Writer(tmp_path / "a.mcap", run="bench", signer=KEY, timed=False)
     recorder = Recorder(writer, limit_bytes=100_000)
@@ -175,6 +179,7 @@ def test_a_log_that_the_daemon_deleted_is_missing_and_said_to_be(tmp_path: Path)
 # ---------------------------------------------------------------- keys
 
 
+@pytest.mark.slow
 def test_whose_key_it_is_decides_only_if_one_is_asked_for(run: Any, tmp_path: Path) -> None:
     path = run.write(tmp_path / "a.mcap")
     told = audit([path])
@@ -188,6 +193,7 @@ def test_whose_key_it_is_decides_only_if_one_is_asked_for(run: Any, tmp_path: Pa
     assert unsigned.chain == "unsigned tail"
 
 
+@pytest.mark.slow
 def test_a_head_that_was_published_must_be_reached(run: Any, tmp_path: Path) -> None:
     path = run.write(tmp_path / "a.mcap")
     head = bytes.fromhex(read_head(path))
@@ -274,6 +280,7 @@ def misrecorded(run: Any, path: Path, monkeypatch: pytest.MonkeyPatch, change: C
 CHANNELS_OF = {kind: [name for name, one in CHANNELS.items() if one is kind] for kind in CHANNELS.values()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("raw", [b'{"type":"frame"}', b"\xff"])
 def test_a_frame_that_is_none_is_refused_as_any_message_is(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, raw: bytes) -> None:
     path = misrecorded(
@@ -289,6 +296,7 @@ def test_a_frame_that_is_none_is_refused_as_any_message_is(run: Any, tmp_path: P
 MOVED = [(m.GateChanged, "out/decided", "another output"), (m.Frame, "frame/out", "the other direction")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "channel", "what"), MOVED, ids=["output", "frame"])
 def test_a_record_on_another_channel_is_no_record_of_its_own(
     run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: type, channel: str, what: str
@@ -303,6 +311,7 @@ def test_a_record_on_another_channel_is_no_record_of_its_own(
     assert result.first_difference.channel == channel
 
 
+@pytest.mark.slow
 def test_an_output_that_can_be_read_in_two_ways_passes_on_no_platform(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     environment = writer_module.environment
     monkeypatch.setattr(writer_module, "environment", lambda: {**environment(), "python": "another"})
@@ -346,6 +355,7 @@ def test_a_record_that_was_left_out_is_missed(run: Any, tmp_path: Path, kind: ty
     assert index - 1 <= result.first_difference.index <= index + late
 
 
+@pytest.mark.slow
 def test_a_watch_that_falls_silent_is_noticed(run: Any, tmp_path: Path) -> None:
     def silence(items: list[Any]) -> int:
         at = nth(items, m.Measured, 30)
@@ -358,6 +368,7 @@ def test_a_watch_that_falls_silent_is_noticed(run: Any, tmp_path: Path) -> None:
     assert index <= result.first_difference.index <= index + 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [m.Ticked, m.Send, m.Revoked])
 def test_a_record_that_was_put_in_is_noticed(run: Any, tmp_path: Path, kind: type) -> None:
     extra = {
@@ -377,6 +388,7 @@ def test_a_record_that_was_put_in_is_noticed(run: Any, tmp_path: Path, kind: typ
     assert result.first_difference.index == index
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["event before", "frame before", "begins twice"])
 def test_a_run_begins_once_and_with_nothing_before(run: Any, tmp_path: Path, what: str) -> None:
     def change(items: list[Any]) -> int:
@@ -397,6 +409,7 @@ def test_a_run_begins_once_and_with_nothing_before(run: Any, tmp_path: Path, wha
     assert "begin" in result.first_difference.what
 
 
+@pytest.mark.slow
 def test_evidence_that_is_not_attached_is_missed(run: Any, tmp_path: Path) -> None:
     for name in ("controller/", "certificate/"):
         bench = Bench.__new__(Bench)
@@ -410,6 +423,7 @@ def test_evidence_that_is_not_attached_is_missed(run: Any, tmp_path: Path) -> No
         audit([bench.write(tmp_path / "profile.mcap")])
 
 
+@pytest.mark.slow
 def test_a_profile_that_an_earlier_version_took_and_this_one_does_not_is_told_as_that(run: Any, tmp_path: Path) -> None:
     bench = Bench.__new__(Bench)
     loose = b'[recovery]\nkind = "hold"\ninput = { v = 500.0 }\n'
@@ -421,6 +435,7 @@ def test_a_profile_that_an_earlier_version_took_and_this_one_does_not_is_told_as
     assert "\n" not in str(told.value)
 
 
+@pytest.mark.slow
 def test_a_later_run_cannot_forget_what_an_earlier_one_spent(run: Any, tmp_path: Path) -> None:
     first = run.write(tmp_path / "a.mcap", run="first")
     memory = run.state.memory
@@ -450,6 +465,7 @@ def test_a_run_that_rests_on_an_earlier_one_holds_with_it_and_alone(tmp_path: Pa
     assert "the memory has another gap of epoch 1" in result.first_difference.what
 
 
+@pytest.mark.slow
 def test_damage_is_named_and_nothing_behind_it_is_believed(run: Any, tmp_path: Path) -> None:
     data = bytearray(run.write(tmp_path / "a.mcap").read_bytes())
     data[len(data) // 2] ^= 4
@@ -461,6 +477,7 @@ def test_damage_is_named_and_nothing_behind_it_is_believed(run: Any, tmp_path: P
     assert result.records == result.first_difference.index
 
 
+@pytest.mark.slow
 def test_no_flipped_bit_passes_an_audit(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.steps(12)

@@ -40,6 +40,7 @@ def both_ways(monkeypatch: pytest.MonkeyPatch, paths: Sequence[Path], **options:
     return said
 
 
+@pytest.mark.slow
 def test_the_verdict_is_the_same_on_logs_whole_cut_recovered_rotated_and_damaged(
     run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -69,6 +70,7 @@ def test_the_verdict_is_the_same_on_logs_whole_cut_recovered_rotated_and_damaged
     assert '"ok":true' in both_ways(monkeypatch, parts)[1]
 
 
+@pytest.mark.slow
 def test_published_heads_are_looked_for_there_as_well(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = run.write(tmp_path / "a.mcap")
     reading = read(path)
@@ -79,6 +81,7 @@ def test_published_heads_are_looked_for_there_as_well(run: Any, tmp_path: Path, 
         assert ('"published heads":1' in here) == (heads == [reading.head])
 
 
+@pytest.mark.slow
 def test_afterwards_the_reading_knows_what_it_would_know_had_it_been_read_here(
     run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -92,6 +95,7 @@ def test_afterwards_the_reading_knows_what_it_would_know_had_it_been_read_here(
         assert getattr(there, name) == getattr(here, name), name
 
 
+@pytest.mark.slow
 def test_an_audit_that_is_given_up_ends_the_process(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ahead, "WORTH_BYTES", 0)
     path = run.write(tmp_path / "a.mcap")
@@ -104,6 +108,7 @@ def test_an_audit_that_is_given_up_ends_the_process(run: Any, tmp_path: Path, mo
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_fails_the_audit_and_passes_nothing(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ahead, "WORTH_BYTES", 0)
     monkeypatch.setattr(ahead, "SENT_BYTES", 1)
@@ -119,6 +124,7 @@ def test_a_process_that_dies_fails_the_audit_and_passes_nothing(run: Any, tmp_pa
     process.close()
 
 
+@pytest.mark.slow
 def test_a_channel_that_is_not_known_is_refused_at_the_same_message(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = run.write(tmp_path / "a.mcap")
     fewer = {name: kind for name, kind in CHANNELS.items() if name != "event/link_changed"}

@@ -156,6 +156,7 @@ CORES: dict[str, Lie] = {  # the module and function that the liar replaces, by 
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lie", CORES)
 def test_what_another_core_concluded_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lie: str) -> None:
     module, name, instead, story, said = CORES[lie]
@@ -360,6 +361,7 @@ def longer(memory: m.Memory) -> m.Memory:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("story", "forget", "what"),
     [
@@ -476,6 +478,7 @@ def test_a_certificate_from_elsewhere_is_said_to_have_its_evidence_elsewhere(tmp
 # ---------------------------------------------------------------- a controller that is run again
 
 
+@pytest.mark.slow
 def test_a_verification_that_was_made_up_is_named_when_the_controller_is_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Safety values, verdict and certificate fit each other to the last digit; only they are not what the controller gives."""
     monkeypatch.setattr(audit_bench, "PROFILE", audit_bench.PROFILE.replace('[task]\nname = "bench"', '[task]\nname = "keep_out"'))
@@ -507,6 +510,7 @@ def test_a_verification_that_was_made_up_is_named_when_the_controller_is_run_aga
             assert not result.certificates[0].valid
 
 
+@pytest.mark.slow
 def test_what_was_driven_is_what_the_controller_answers_when_it_is_asked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The bench's verification is made up, which is the first difference here; what was driven is looked at all the same."""
     monkeypatch.setattr(audit_bench, "PROFILE", audit_bench.PROFILE.replace('[task]\nname = "bench"', '[task]\nname = "keep_out"'))

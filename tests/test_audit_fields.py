@@ -26,6 +26,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> bench_fields.audit_bench.
     return bench_fields.run(tmp_path_factory.mktemp("fields") / "run", traced=False)
 
 
+@pytest.mark.slow
 def test_a_changed_field_is_seen_or_named_in_the_docs(bench: bench_fields.audit_bench.Bench, tmp_path: Path) -> None:
     assert audit([bench.write(tmp_path / "sound.mcap")], PUBLIC).ok
     rng, fields = random.Random(5), bench_fields.places(bench.items)
@@ -36,6 +37,7 @@ def test_a_changed_field_is_seen_or_named_in_the_docs(bench: bench_fields.audit_
             assert bench_fields.seen(bench, number, made, tmp_path / "changed.mcap"), (name, bench.items[number], made)
 
 
+@pytest.mark.slow
 def test_a_command_that_left_elsewhere_or_not_at_all_is_seen(bench: bench_fields.audit_bench.Bench, tmp_path: Path) -> None:
     number = max(n for n, item in enumerate(bench.items) if getattr(item, "inbound", True) is False) - 40
     number = max(n for n, item in enumerate(bench.items[:number]) if getattr(item, "inbound", True) is False)
@@ -50,6 +52,7 @@ def test_a_command_that_left_elsewhere_or_not_at_all_is_seen(bench: bench_fields
         assert "leave" in result.first_difference.what or "left" in result.first_difference.what
 
 
+@pytest.mark.slow
 def test_a_run_that_draws_its_seeds_is_no_simulation(bench: bench_fields.audit_bench.Bench, tmp_path: Path) -> None:
     number, started = next((n, item) for n, item in enumerate(bench.items) if isinstance(item, Started))
     bench.items[number] = msgspec.structs.replace(started, settings=msgspec.structs.replace(started.settings, simulated=True))

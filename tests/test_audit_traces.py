@@ -49,6 +49,7 @@ def repaired(folder: Path, lie: str = "") -> Any:
 # ---------------------------------------------------------------- honest logs
 
 
+@pytest.mark.slow
 def test_traces_are_run_again_and_the_adopted_model_is_the_one_that_was_proposed(tmp_path: Path) -> None:
     result = audited(repaired(tmp_path), tmp_path / "a.mcap")
     assert result.ok, result.text()
@@ -69,6 +70,7 @@ def test_a_persons_own_model_is_said_to_be_that(tmp_path: Path) -> None:
     assert [one.origin for one in result.models] == ["a person's own file: no trace in these logs made it"]
 
 
+@pytest.mark.slow
 def test_a_trace_that_takes_long_is_skipped_and_said_so_unless_it_was_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = slow_robot(tmp_path).trace().adopt().stop().write(tmp_path / "a.mcap")
     monkeypatch.setattr("s2r_runtime.audit.log.SECONDS", 1e-9)
@@ -82,6 +84,7 @@ def test_a_trace_that_takes_long_is_skipped_and_said_so_unless_it_was_asked_for(
     assert (asked.ok, asked.skipped, asked.recomputed["traces run again"]) == (True, [], 1)
 
 
+@pytest.mark.slow
 def test_a_trace_is_given_up_after_its_time_of_the_processor() -> None:
     rng = random.Random(1)
     walks = [accumulate(rng.uniform(-0.01, 0.01) for _ in range(20_000)) for _ in range(3)]
@@ -108,6 +111,7 @@ def test_a_trace_without_a_result_is_counted_as_that(tmp_path: Path) -> None:
     assert "traces run again" not in result.recomputed
 
 
+@pytest.mark.slow
 def test_a_trace_on_an_earlier_log_is_missing_without_it_and_run_again_with_it(tmp_path: Path) -> None:
     """A campaign that was interrupted by the end of one run, and went on in the next."""
     first = Bench(tmp_path)
@@ -139,6 +143,7 @@ def test_a_trace_on_an_earlier_log_is_missing_without_it_and_run_again_with_it(t
 # ---------------------------------------------------------------- lies
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lie", "what"),
     [
@@ -206,6 +211,7 @@ def test_a_trace_that_states_no_tracer_is_of_the_first_one(tmp_path: Path, monke
         assert f"(version {FIRST}, here {VERSION})" in result.skipped[0]
 
 
+@pytest.mark.slow
 def test_a_gap_on_what_the_fit_has_seen_is_named(tmp_path: Path) -> None:
     """The samples of the first campaign are logged once more, as if an interruption of the second had cut them off."""
     bench = slow_robot(tmp_path, "old samples").trace().adopt()

@@ -60,6 +60,7 @@ def test_what_it_raises_in_one_state_keeps_it_from_no_other(tmp_path: Path) -> N
         np.testing.assert_array_equal(control(np.zeros((2, 3)), {}), np.zeros((2, 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wait", ["pass", "time.sleep(1.0); os.write(3, b'x')"], ids=["silent", "byte by byte"])
 def test_one_that_never_answers_ends_where_nobody_else_watches_it(tmp_path: Path, wait: str) -> None:
     head = f"import time\ndef wait():\n    os.write(3, b'u' + (16).to_bytes(8, 'little'))\n    while True: {wait}"
@@ -107,6 +108,7 @@ def test_once_gone_it_stays_gone_and_nobody_else_is_killed_for_it(tmp_path: Path
     control.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "attack",
     [

@@ -76,6 +76,7 @@ def refused_certificates(rig: Rig, good: Path, reckless: Path, monkeypatch: pyte
     }
 
 
+@pytest.mark.slow
 def test_nothing_but_a_certificate_of_its_own_makes_a_controller_drive(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     good, reckless = rig.controller(), rig.controller(RECKLESS, "reckless.py")
     rig.start_robot()
@@ -244,6 +245,7 @@ def test_a_state_that_somebody_wrote_carries_no_certificate_that_nobody_signed(r
     assert moved_by(rig) <= {"recovery", "controller"}
 
 
+@pytest.mark.slow
 def test_a_state_folder_that_others_can_reach_into_starts_no_daemon(rig: Rig) -> None:
     rig.start_robot()
     rig.start()
@@ -288,6 +290,7 @@ def _held_open(pid: int) -> set[str]:
     return found
 
 
+@pytest.mark.slow
 def test_what_is_no_file_of_a_controller_holds_nobody_up_and_no_process_inherits_a_way_to_the_robot(rig: Rig) -> None:
     """A named pipe that nobody writes into, a device without end, a file of 20 GB: deployed and adopted while a controller drives."""
     rig.start_robot()

@@ -30,6 +30,7 @@ def good() -> Evidence:
 # ---------------------------------------------------------------- signing and loading
 
 
+@pytest.mark.slow
 def test_a_signed_certificate_loads_equal_and_states_its_facts(good: Evidence) -> None:
     issued = good.issue()
     loaded = certificate.load(certificate.sign(issued, KEY), [keys.public_bytes(OTHER), PUBLIC], NOW + 1)
@@ -42,6 +43,7 @@ def test_a_signed_certificate_loads_equal_and_states_its_facts(good: Evidence) -
     assert (facts.issued_unix_s, facts.expires_unix_s) == (NOW, NOW + 3600)
 
 
+@pytest.mark.slow
 def test_a_certificate_of_before_seeds_were_drawn_is_the_same_bytes_and_loads(good: Evidence) -> None:
     before = good.issue()
     data = certificate.sign(before, KEY)
@@ -56,6 +58,7 @@ def test_a_certificate_of_before_seeds_were_drawn_is_the_same_bytes_and_loads(go
     assert any("they were of at least 1 controllers" in line for line in interrupted.shown)
 
 
+@pytest.mark.slow
 def test_a_certificate_says_that_a_simulation_fixed_its_seed_and_counts_its_own_attempt(good: Evidence) -> None:
     simulated = good.issue(tries=Tries(2, 1, 1, fixed=True))
     assert any("certifies nothing for a robot" in line for line in simulated.shown)
@@ -77,6 +80,7 @@ def test_every_single_flipped_bit_is_refused(good: Evidence) -> None:
     assert taken == []
 
 
+@pytest.mark.slow
 def test_a_file_cut_anywhere_or_longer_is_refused(good: Evidence) -> None:
     data = certificate.sign(good.issue(), KEY)
     for length in range(len(data)):
@@ -87,6 +91,7 @@ def test_a_file_cut_anywhere_or_longer_is_refused(good: Evidence) -> None:
             certificate.load(data + more, [PUBLIC])
 
 
+@pytest.mark.slow
 def test_the_same_content_in_another_form_is_refused(good: Evidence) -> None:
     data = certificate.sign(good.issue(), KEY)
     plain = json.loads(data)
@@ -103,6 +108,7 @@ def test_the_same_content_in_another_form_is_refused(good: Evidence) -> None:
             certificate.load(form, [PUBLIC])
 
 
+@pytest.mark.slow
 def test_signatures_with_other_spare_bits_are_refused(good: Evidence) -> None:
     """64 bytes end in a base64 letter with two spare bits: four spellings of one signature, and one is right."""
     data = certificate.sign(good.issue(), KEY)
@@ -120,6 +126,7 @@ def test_signatures_with_other_spare_bits_are_refused(good: Evidence) -> None:
     assert refused == 15
 
 
+@pytest.mark.slow
 def test_a_key_that_is_not_trusted_is_named(good: Evidence) -> None:
     data = certificate.sign(good.issue(), OTHER)
     with pytest.raises(ConfigError, match=rf"signed with the key {keys.fingerprint(keys.public_bytes(OTHER))}.*{keys.fingerprint(PUBLIC)}"):
@@ -128,6 +135,7 @@ def test_a_key_that_is_not_trusted_is_named(good: Evidence) -> None:
         certificate.load(data, [])
 
 
+@pytest.mark.slow
 def test_a_trusted_name_over_somebody_elses_signature_is_refused(good: Evidence) -> None:
     by_other = certificate.sign(good.issue(), OTHER)
     as_ours = by_other.replace(base64.b64encode(keys.public_bytes(OTHER)), base64.b64encode(PUBLIC))
@@ -136,6 +144,7 @@ def test_a_trusted_name_over_somebody_elses_signature_is_refused(good: Evidence)
         certificate.load(as_ours, [PUBLIC])
 
 
+@pytest.mark.slow
 def test_content_that_was_changed_with_its_id_is_refused(good: Evidence) -> None:
     issued = good.issue()
     longer = msgspec.structs.replace(issued, expires_unix_s=issued.expires_unix_s + 1)
@@ -146,6 +155,7 @@ def test_content_that_was_changed_with_its_id_is_refused(good: Evidence) -> None
         certificate.load(msgspec.json.encode(forged, order="deterministic"), [PUBLIC])
 
 
+@pytest.mark.slow
 def test_expired_and_not_yet_issued_are_refused_with_the_seconds(good: Evidence) -> None:
     data = certificate.sign(good.issue(), KEY)
     certificate.load(data, [PUBLIC], NOW + 3599)
@@ -156,6 +166,7 @@ def test_expired_and_not_yet_issued_are_refused_with_the_seconds(good: Evidence)
         certificate.load(data, [PUBLIC], NOW - certificate.CLOCKS_APART_S - 1)
 
 
+@pytest.mark.slow
 def test_another_schema_is_said_to_be_one(good: Evidence) -> None:
     newer = certificate.sign(msgspec.structs.replace(good.issue(), schema=3), KEY)
     with pytest.raises(ConfigError, match="certificate schema 3, this version reads 2"):
@@ -178,12 +189,14 @@ def test_deeply_nested_json_is_refused() -> None:
         certificate.load(b'{"certificate":{"controller":{"parameters":' + b"[" * 100_000, [PUBLIC])
 
 
+@pytest.mark.slow
 def test_whole_numbers_in_places_for_fractions_do_not_spoil_a_certificate(good: Evidence) -> None:
     whole = good.with_gap(radius_literal=1, weights=(1, 1, 0.0525)).issue()
     data = certificate.sign(whole, KEY)
     assert certificate.load(data, [PUBLIC]).id == whole.id
 
 
+@pytest.mark.slow
 def test_parts_of_different_certificates_do_not_load_even_when_signed(good: Evidence) -> None:
     issued = good.issue()
     changes: list[tuple[str, dict[str, Any]]] = [
@@ -202,6 +215,7 @@ def test_parts_of_different_certificates_do_not_load_even_when_signed(good: Evid
 # ---------------------------------------------------------------- issuing
 
 
+@pytest.mark.slow
 def test_what_the_evidence_does_not_carry_is_not_certified(good: Evidence) -> None:
     first = good.verification.laws[0]
     short = msgspec.structs.replace(first, n=first.n - 1)
@@ -228,6 +242,7 @@ def test_what_the_evidence_does_not_carry_is_not_certified(good: Evidence) -> No
     assert refused.value.missing == 61
 
 
+@pytest.mark.slow
 def test_what_belongs_to_something_else_is_not_certified(good: Evidence) -> None:
     cases: list[tuple[str, Evidence]] = [
         ("verification is of another controller", good.with_verification(controller_digest="sha256:00")),
@@ -245,6 +260,7 @@ def test_what_belongs_to_something_else_is_not_certified(good: Evidence) -> None
             case.issue()
 
 
+@pytest.mark.slow
 def test_uniform_alone_is_said_and_refused_where_structure_remains(good: Evidence) -> None:
     n = sample_size(0.03, good.verification.beta)
     alone = good.with_laws("uniform", "persistent", required=("uniform",), n=n)
@@ -260,6 +276,7 @@ def test_uniform_alone_is_said_and_refused_where_structure_remains(good: Evidenc
 # ---------------------------------------------------------------- the sentences
 
 
+@pytest.mark.slow
 def test_the_sentences_say_what_the_numbers_say_and_carry_both_lists(good: Evidence) -> None:
     issued = good.issue()
     shown, hidden = "\n".join(issued.shown), "\n".join(issued.not_shown)
@@ -283,6 +300,7 @@ def test_the_sentences_say_what_the_numbers_say_and_carry_both_lists(good: Evide
         assert part in hidden
 
 
+@pytest.mark.slow
 def test_an_assumption_of_the_users_stands_in_the_statement(good: Evidence) -> None:
     shown = "\n".join(good.issue(assumption="blocks of 10 s are independent").shown)
     assert "their independence rests on an assumption that the user made: blocks of 10 s are independent" in shown
@@ -303,6 +321,7 @@ def test_printed_confidence_is_never_above_the_true_one(beta: float) -> None:
     assert float(statements.confidence(beta).split()[0]) <= 100.0 * (1.0 - beta) + 1e-12
 
 
+@pytest.mark.slow
 def test_the_counts_that_pass_are_the_least_that_carry_the_statement(good: Evidence) -> None:
     assert binomial_tail(good.gap.n, 0, 0.03) <= good.gap.beta / 2 < binomial_tail(good.gap.n - 1, 0, 0.03)
     good.with_gap(hold_periods=1, n=sample_size(0.03, good.gap.beta)).issue()  # without a hold gap r has the whole share
@@ -310,6 +329,7 @@ def test_the_counts_that_pass_are_the_least_that_carry_the_statement(good: Evide
         good.with_gap(hold_periods=1, n=sample_size(0.03, good.gap.beta) - 1).issue()
 
 
+@pytest.mark.slow
 def test_a_certificate_carries_trials_of_its_own_controller_only_and_says_them(good: Evidence) -> None:
     without = good.issue()
     digests = {"controller_digest": without.controller_digest, "task_digest": without.task_digest, "model_digest": without.model_digest}

@@ -75,6 +75,7 @@ def test_gap_of_a_table_is_the_largest_discrepancy(table: Path) -> None:
     assert "0.01" in answer["statement"] or "1 %" in answer["statement"]
 
 
+@pytest.mark.slow
 def test_gzip_tells_the_same(table: Path, tmp_path: Path) -> None:
     packed = tmp_path / "holds.csv.gz"
     packed.write_bytes(gzip.compress(table.read_bytes()))
@@ -157,6 +158,7 @@ def test_json_errors_are_one_object(tmp_path: Path) -> None:
     assert json.loads(done.stdout)["exit_code"] == 2
 
 
+@pytest.mark.slow
 def test_every_verb_has_help() -> None:
     done = s2r("--help")
     assert done.returncode == 0
@@ -204,6 +206,7 @@ def test_doctor_and_plugins_say_what_is_here() -> None:
     assert {p["name"] for p in listed} >= {"builtin", "zenoh", "standins"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("code", "reason"),
     [
@@ -227,6 +230,7 @@ def test_a_controller_that_fails_never_passes(tmp_path: Path, code: str, reason:
     assert reason in answer["reason"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["-o", "--report"])
 def test_trace_checks_where_its_output_goes_before_it_works(table: Path, tmp_path: Path, option: str) -> None:
     refused(s2r("trace", table, *MODEL, option, tmp_path / "none" / "a.toml"), 2, "a.toml", "no folder")
@@ -234,6 +238,7 @@ def test_trace_checks_where_its_output_goes_before_it_works(table: Path, tmp_pat
     refused(s2r("trace", "--live", "campaign", option, tmp_path), 2, "is a folder")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", [("report",), ("log", "recover")])
 def test_verbs_about_logs_check_where_their_output_goes_before_they_work(table: Path, tmp_path: Path, verb: tuple[str, ...]) -> None:
     refused(s2r(*verb, table, "-o", tmp_path / "none" / "a.out"), 2, "a.out", "no folder")
@@ -272,6 +277,7 @@ def drive(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["-o", "--report", "--suggest"])
 def test_no_output_of_a_trace_takes_the_place_of_what_it_reads(drive: Path, tmp_path: Path, option: str) -> None:
     before, link = drive.read_bytes(), tmp_path / "link.csv"
@@ -313,6 +319,7 @@ def test_no_output_takes_the_place_of_the_file_behind_a_model(drive: Path, tmp_p
     assert own.read_text() == text
 
 
+@pytest.mark.slow
 def test_a_model_may_be_written_into_a_pipe(drive: Path) -> None:
     done = piped("{} | cat", "trace", drive, *MODEL, "-o", "/dev/stdout")
     assert "[model]" in done.stdout, done.stderr
@@ -338,6 +345,7 @@ def test_a_file_that_cannot_be_written_leaves_what_was_there_and_loses_no_result
     assert sorted(path.name for path in tmp_path.iterdir()) == ["drive.csv", "model.toml"]
 
 
+@pytest.mark.slow
 def test_a_certificate_that_cannot_be_written_tells_what_the_spent_attempt_showed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -379,6 +387,7 @@ def piped(code: str, *argv: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["bash", "-c", code.format(command)], capture_output=True, text=True, timeout=100, check=False, env=environment)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["{} | true; exit ${{PIPESTATUS[0]}}", "{} >&-", "{} 2>&- >/dev/null"])
 def test_who_does_not_listen_changes_no_exit_code(table: Path, how: str) -> None:
     few = table.with_name("few.csv")
@@ -389,12 +398,14 @@ def test_who_does_not_listen_changes_no_exit_code(table: Path, how: str) -> None
         assert all(line.startswith("s2r: ") for line in done.stderr.splitlines() if argv != ("--help",)), done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
 @pytest.mark.parametrize("options", [(), ("--json",)])
 def test_a_result_that_nobody_gets_is_no_success(table: Path, options: tuple[str, ...]) -> None:
     refused(piped("{} >/dev/full", "gap", table, *MODEL, *options), 2, "cannot be written to stdout: No space left on device")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
@@ -421,6 +432,7 @@ def test_a_model_file_that_cannot_be_meant_is_one_line(
     refused(s2r(verb, drive, "--model", model, "--dt", "0.1"), 78, "model.py", *words)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("argv", "code", "words"),
     [

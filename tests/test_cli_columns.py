@@ -43,6 +43,7 @@ def _answer(capsys, verb, *argv):
     return json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", ["gap", "trace"])
 def test_a_table_by_other_names_says_the_same(table, renamed, verb, capsys):
     plain = _answer(capsys, verb, table, *MODEL, "--json")
@@ -51,6 +52,7 @@ def test_a_table_by_other_names_says_the_same(table, renamed, verb, capsys):
     assert {key for key in differ if not re.search("digest|source|recording", key)} == set()
 
 
+@pytest.mark.slow
 def test_the_recording_that_is_judged_on_has_the_same_columns(renamed, capsys):
     other = renamed.with_name("other.csv")
     other.write_text(renamed.read_text() + f"{RUNS},0.0,0,0,0,0.2,0\n{RUNS},0.1,0.02,0,0,0.2,0\n")
@@ -99,6 +101,7 @@ def test_two_columns_may_be_exchanged(table, capsys):
     assert right == plain < wrong
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", ["gap", "trace"])
 def test_the_stamps_may_have_another_name_too(table, verb, capsys):
     stamped = table.with_name("stamped.csv")

@@ -104,6 +104,7 @@ def test_sample_is_one_period_of_a_hold_from_rest_and_the_holds_end(settings: Sa
     assert all((s.period == 0) for s in samples) is (settings is FIRST)
 
 
+@pytest.mark.slow
 def test_the_period_of_a_hold_is_drawn_uniformly() -> None:
     """Chi-square with 9 degrees of freedom against its 1 - 1e-4 quantile, 33.7."""
     samples, last = drive(campaign(400), Robot(), periods=200_000)
@@ -128,6 +129,7 @@ def test_the_commands_before_a_hold_are_recorded_with_how_long_each_lasted() -> 
         assert sum(s.past_ns) == len(told) * DT_NS
 
 
+@pytest.mark.slow
 def test_law_is_uniform_over_inputs_and_region_and_independent_of_the_sample_before() -> None:
     """Quarters of each input, and of (this, the one before), are hit alike: chi-square with 3 and 15 degrees of freedom against the
     1 - 1e-4 quantiles, 21.1 and 44.3. x0 lies up to 0.1 m before its waypoint, so for it only coverage is asked: 16 fields, of which

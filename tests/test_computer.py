@@ -62,6 +62,7 @@ def test_the_daemon_says_at_its_start_what_this_computer_cannot_hold(tmp_path: P
         rig.close()
 
 
+@pytest.mark.slow
 def test_doctor_tries_the_computer_beside_busy_loops() -> None:
     argv = [sys.executable, "-m", "s2r_runtime.cli.main", "doctor", "--load", "--json"]
     found = json.loads(subprocess.run(argv, capture_output=True, text=True, check=False, timeout=100).stdout)
@@ -70,6 +71,7 @@ def test_doctor_tries_the_computer_beside_busy_loops() -> None:
     assert all(finding["ok"] is None for finding in lines[1:])
 
 
+@pytest.mark.slow
 def test_what_a_process_waits_for_a_processor_is_counted() -> None:
     """Five want one processor: it waits four times as long as it runs."""
     program = "import os, time\nos.sched_setaffinity(0, {0})\nwhile True: pass"

@@ -60,6 +60,7 @@ def target(tmp_path: Path) -> Path:
     return tmp_path / "target.txt"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "code",
     [

@@ -42,6 +42,7 @@ def test_every_reason_of_the_gate_has_plain_words() -> None:
     assert in_words("latched:link_down") == "the robot is not heard (link_down), until: s2r clear link_down"
 
 
+@pytest.mark.slow
 def test_a_short_story_on_the_console_line_by_line(rig: Rig) -> None:
     rig.start_robot()
     rig.start()
@@ -100,6 +101,7 @@ def test_what_repeats_is_counted_and_an_alarm_is_never_held_back() -> None:
     assert said[2:] == [alarm, alarm]
 
 
+@pytest.mark.slow
 def test_a_refused_campaign_is_repeated_traced_reported_and_audited(tmp_path: Path) -> None:
     """A robot that changes slowly: both campaigns are refused, and their data are there, also after a restart."""
     rig = Rig(tmp_path, more="[repair]\nrows = 600\n")

@@ -81,6 +81,7 @@ def test_a_controller_answers_what_it_would_answer_in_a_batch(tmp_path: Path) ->
     assert is_gone(pid)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("body", "detail"),
     [
@@ -98,6 +99,7 @@ def test_an_answer_that_is_no_finite_input_stops_it_as_malformed(tmp_path: Path,
         assert is_gone(it.host.pid)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("body", "reason", "detail"),
     [
@@ -131,6 +133,7 @@ def test_a_controller_that_hangs_is_stopped_at_its_deadline(tmp_path: Path) -> N
         assert is_gone(it.host.pid)
 
 
+@pytest.mark.slow
 def test_a_controller_that_waits_for_a_processor_is_late_and_not_at_fault(tmp_path: Path) -> None:
     """Nine processes want one processor, each with a ninth of it: 40 ms of work take 0.36 s."""
     file = loaded(
@@ -235,6 +238,7 @@ ANSWER = '{"type":"chosen","obs_seq":%s,"u":[%s,1],"episode":null,"ended":null}\
 """As the child itself would write it; in the source of a controller."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "body",
     [

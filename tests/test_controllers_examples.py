@@ -98,6 +98,7 @@ def verified(name: str, gap: Gap, attempt: int = 1) -> Verification:
 # ---------------------------------------------------------------- the loop's promise
 
 
+@pytest.mark.slow
 def test_on_the_robot_as_declared_the_good_controller_passes_and_the_reckless_one_does_not() -> None:
     for seed in range(3):
         gap = campaign(seed=seed)
@@ -138,6 +139,7 @@ def gap_set(times: float) -> GapSet:
     return GapSet("ball", WEIGHTS, times * gap.radius, times * gap.hold_radius, gap.hold_periods)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["uniform", "persistent"])
 def test_the_grid_controller_fails_less_than_once_in_a_thousand_at_the_headroom(law: str) -> None:
     task = GridWorld(PROFILE.task.parameters, MODEL.nominal, MODEL.dt)
@@ -147,6 +149,7 @@ def test_the_grid_controller_fails_less_than_once_in_a_thousand_at_the_headroom(
     assert np.median(done.progress) >= 0.79
 
 
+@pytest.mark.slow
 def test_the_grid_controller_holds_out_against_the_adversary_too() -> None:
     task = GridWorld(PROFILE.task.parameters, MODEL.nominal, MODEL.dt)
     done = roll_out(controller("grid"), task, MODEL, gap_set(1.5), "adversarial", np.random.default_rng(32), 5000)

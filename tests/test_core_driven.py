@@ -160,6 +160,7 @@ def test_the_lower_limit_is_the_mirror_of_the_bound_from_above(epsilon: float) -
         assert (found is not None and found >= 1.0) == (anytime_evidence(n - above, n, 1.0 - epsilon) >= -math.log(alpha)), above
 
 
+@pytest.mark.slow
 def test_it_lies_above_the_quantile_at_any_time_no_more_often_than_alpha() -> None:
     """500 drives of 300 steps, looked at after each: the true quantile is below the lower limit in at most alpha of them."""
     rng, epsilon, alpha, runs = np.random.default_rng(5), 0.1, 0.05, 500

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
 from core_lives import recorded, replayed
 
 
+@pytest.mark.slow
 def test_recorded_lives_are_answered_as_they_were() -> None:
     lives = recorded()
     assert len(lives) > 200

@@ -57,6 +57,7 @@ def test_a_logged_walk_replays_to_the_same_bytes(lockstep: bool) -> None:
 # ---------------------------------------------------------------- exhaustive
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "lockstep"), CHAPTERS, ids=[f"{name}-{'lockstep' if lock else 'realtime'}" for name, lock in CHAPTERS])
 def test_no_three_events_in_any_order_break_the_law(name: str, lockstep: bool) -> None:
     """From each chapter, every sequence of three letters (33 000 of them), and then a peaceful end in which much may come to light."""

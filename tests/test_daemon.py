@@ -68,6 +68,7 @@ def test_daemon_serves_ends_on_sigterm_with_the_recovery_command_and_leaves_a_cl
     assert rig.applied()[-1]["u"] == [0.0, 0.0]
 
 
+@pytest.mark.slow
 def test_key_is_made_once_for_its_owner_alone(rig: Rig) -> None:
     rig.start()
     rig.stop()
@@ -146,6 +147,7 @@ def test_defect_in_the_core_ends_with_the_recovery_command_and_exit_70(rig: Rig)
 # ---------------------------------------------------------------- requests
 
 
+@pytest.mark.slow
 def test_requests_that_make_no_sense_are_answered_with_their_code(rig: Rig) -> None:
     rig.start()
     for request, code, words in (
@@ -165,6 +167,7 @@ def test_requests_that_make_no_sense_are_answered_with_their_code(rig: Rig) -> N
         assert (answer["exit_code"], words in answer["text"]) == (code, True), (request, answer)
 
 
+@pytest.mark.slow
 def test_stop_latches_until_it_is_cleared(rig: Rig) -> None:
     rig.start_robot()
     rig.start()
@@ -210,6 +213,7 @@ def test_the_longest_request_is_scanned_in_a_fraction_of_what_the_loop_may_be_he
     assert min(times) < 0.01
 
 
+@pytest.mark.slow
 def test_adopted_model_is_in_force_after_a_restart_and_the_profiles_own_change_ends_that(rig: Rig) -> None:
     rig.start()
     profiles = rig.status()["model"]
@@ -250,6 +254,7 @@ def test_robots_own_stop_button_latches(rig: Rig) -> None:
     rig.until_status(latched=["emergency_stop"])
 
 
+@pytest.mark.slow
 def test_bytes_that_are_no_observation_do_nothing_but_count(rig: Rig) -> None:
     rig.start_robot()
     rig.start()

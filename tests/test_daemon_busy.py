@@ -31,6 +31,7 @@ def realtime(tmp_path: Path) -> Iterator[Rig]:
     opened.close()
 
 
+@pytest.mark.slow
 def test_in_lockstep_the_robot_waits_for_a_slow_disk_and_the_campaign_ends_as_it_would(rig: Rig) -> None:
     rig.start_robot()
     rig.start()
@@ -46,6 +47,7 @@ def test_in_lockstep_the_robot_waits_for_a_slow_disk_and_the_campaign_ends_as_it
     assert "relied on" not in rig.said()
 
 
+@pytest.mark.slow
 def test_in_lockstep_a_disk_that_hangs_keeps_the_robot_waiting_so_that_a_kill_costs_no_more(rig: Rig) -> None:
     """The robot is told nothing after `recording.max_delay`, so nothing later can be lost. What was told is in the log up to there."""
     rig.start_robot()
@@ -85,6 +87,7 @@ def test_in_real_time_a_slow_disk_closes_the_gate_and_the_campaign_waits_for_it(
     assert all("recorder" not in detail for detail in stopped), stopped
 
 
+@pytest.mark.slow
 def test_a_machine_that_stands_still_for_a_second_drives_on_without_a_person(realtime: Rig) -> None:
     rig = realtime
     rig.start_robot()
@@ -107,6 +110,7 @@ def test_a_machine_that_stands_still_for_a_second_drives_on_without_a_person(rea
     assert "recorder_down" not in closed
 
 
+@pytest.mark.slow
 def test_a_controller_that_stands_still_alone_is_at_fault(realtime: Rig) -> None:
     rig = realtime
     rig.start_robot()

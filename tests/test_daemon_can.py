@@ -76,7 +76,6 @@ def test_campaign_certificate_drive_and_audit_over_can(rig: CanRig) -> None:
     assert [certificate["valid"] for certificate in found["certificates"]]
 
 
-@pytest.mark.slow
 def test_campaign_outlives_a_robot_that_falls_silent_reboots_and_loses_frames(tmp_path: Path) -> None:
     with contextlib.closing(CanRig(tmp_path, copies=True)) as rig:
         survive(rig)
@@ -117,6 +116,7 @@ def survive(rig: CanRig) -> None:
     assert (found["ok"], found["first_difference"]) == (True, None), found
 
 
+@pytest.mark.slow
 def test_commands_from_the_controllers_side_are_logged_and_never_obeyed(rig: CanRig) -> None:
     rig.start_robot()
     rig.start()
@@ -155,6 +155,7 @@ def test_another_node_that_commands_on_the_robots_bus_closes_the_gate_until_a_pe
     assert told.detail == "another node sends WheelCommand on the robot's bus"
 
 
+@pytest.mark.slow
 def test_the_robots_red_button_stops_everything_and_a_held_button_cannot_be_cleared_away(rig: CanRig) -> None:
     rig.start_robot()
     rig.start()

@@ -78,6 +78,7 @@ def test_controller_without_a_certificate_and_without_a_gap_is_refused(rig: Rig)
     assert rig.status()["attempts"] == 0
 
 
+@pytest.mark.slow
 def test_certificate_with_one_bit_changed_is_refused_and_nothing_is_spent(rig: Rig) -> None:
     rig.start_robot()
     rig.start()
@@ -96,6 +97,7 @@ def test_certificate_with_one_bit_changed_is_refused_and_nothing_is_spent(rig: R
     assert {command["source"] for command in rig.applied()} == {"recovery"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("body", "reason"),
     [
@@ -191,6 +193,7 @@ def test_killed_daemon_takes_its_processes_along_and_nothing_drives_after_the_re
     rig.until_status(gate="closed", controller=None, driving="recovery")
 
 
+@pytest.mark.slow
 def test_verification_of_a_real_gap_decides_who_drives(rig: Rig) -> None:
     rig.start_robot()
     rig.start()
@@ -226,6 +229,7 @@ def test_certificate_signed_elsewhere_counts_only_if_its_key_is_trusted(rig: Rig
     rig.until_status(gate="open")
 
 
+@pytest.mark.slow
 def test_effect_that_was_traced_and_adopted_makes_a_smaller_gap_and_its_own_samples_never_bound_it(rig: Rig) -> None:
     rig.start_robot("--gain", "0.7")
     rig.start()

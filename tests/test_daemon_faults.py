@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 from daemon_faults import FAULTS, Drill, judged
 
 SHARE = {
@@ -22,7 +21,6 @@ SHARE = {
 """What the gate must have said of each, at least; the others have their own ways to be noticed."""
 
 
-@pytest.mark.slow
 def test_seven_faults_in_one_robots_life_are_noticed_move_nothing_and_mend(tmp_path: Path) -> None:
     drill = Drill(tmp_path)
     try:

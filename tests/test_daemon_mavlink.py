@@ -76,6 +76,7 @@ def test_no_sample_is_taken_from_a_robot_that_does_not_obey(tmp_path: Path) -> N
         rig.close()
 
 
+@pytest.mark.slow
 def test_controller_of_somebody_else_is_refused_and_told_so_while_ours_drives(rig: MavlinkRig) -> None:
     rig.start()
     rig.ready()
@@ -105,6 +106,7 @@ def test_controller_of_somebody_else_is_refused_and_told_so_while_ours_drives(ri
     assert rig.audit()["ok"]
 
 
+@pytest.mark.slow
 def test_signed_robot_is_driven_and_the_audit_needs_no_key(tmp_path: Path) -> None:
     key = tmp_path / "key"
     key.write_text(os.urandom(32).hex())
@@ -124,7 +126,6 @@ def test_signed_robot_is_driven_and_the_audit_needs_no_key(tmp_path: Path) -> No
         rig.close()
 
 
-@pytest.mark.slow
 def test_robot_that_starts_anew_in_a_campaign_is_not_sampled_across_it(rig: MavlinkRig) -> None:
     rig.start()
     rig.ready()

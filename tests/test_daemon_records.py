@@ -49,6 +49,7 @@ def realtime(tmp_path: Path) -> Iterator[Rig]:
 # ---------------------------------------------------------------- campaigns
 
 
+@pytest.mark.slow
 def test_campaign_founds_a_gap_and_one_seed_gives_one_campaign(tmp_path: Path) -> None:
     (gap, samples), again = (seeded_campaign(tmp_path / name, "7") for name in ("a", "b"))
     assert (gap, samples) == again
@@ -88,6 +89,7 @@ def test_sampling_needs_a_permit_and_ends_with_it(rig: Rig) -> None:
     assert rig.status()["epoch"] == 1
 
 
+@pytest.mark.slow
 def test_campaign_that_was_killed_goes_on_without_a_new_epoch_and_its_log_is_complete(rig: Rig) -> None:
     rig.start_robot()
     rig.start()
@@ -138,6 +140,7 @@ def test_a_campaign_is_kept_only_as_far_as_the_log_has_it(tmp_path: Path) -> Non
         assert folder.campaign() is not None
 
 
+@pytest.mark.slow
 def test_robot_that_freezes_is_a_lost_link_and_the_campaign_goes_on_when_it_is_back(rig: Rig) -> None:
     rig.start_robot()
     rig.start()
@@ -156,6 +159,7 @@ def test_robot_that_freezes_is_a_lost_link_and_the_campaign_goes_on_when_it_is_b
     assert changes == [True, False, True]
 
 
+@pytest.mark.slow
 def test_one_campaign_runs_without_a_daemon_and_goes_on_after_an_interruption(rig: Rig) -> None:
     rig.start_robot()
     out = rig.folder / "campaign.mcap"
@@ -207,6 +211,7 @@ def test_full_disk_closes_the_gate_and_room_opens_the_way_again(realtime: Rig) -
     assert observed == list(range(observed[0], observed[-1] + 1))  # nothing recorded was lost meanwhile
 
 
+@pytest.mark.slow
 def test_log_that_had_to_leave_something_out_ends_there_and_a_new_one_begins_when_there_is_room(realtime: Rig) -> None:
     realtime.start_robot()
     realtime.start()
@@ -232,6 +237,7 @@ def test_log_that_had_to_leave_something_out_ends_there_and_a_new_one_begins_whe
         assert found["ok"], found
 
 
+@pytest.mark.slow
 def test_memory_that_the_disk_refuses_closes_the_gate_and_is_saved_when_there_is_room(realtime: Rig) -> None:
     realtime.start_robot()
     realtime.start()
@@ -254,6 +260,7 @@ def limit_files(pid: int, size: int) -> None:
     resource.prlimit(pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
 
 
+@pytest.mark.slow
 def test_log_is_the_events_in_the_order_in_which_they_were_handled(rig: Rig) -> None:
     from s2r_runtime.core import reducer as core
 

@@ -72,6 +72,7 @@ def sample_inputs(rig: Rig, path: Path) -> tuple[int, dict[str, Any]]:
 # ---------------------------------------------------------------- the stream
 
 
+@pytest.mark.slow
 def test_a_drive_is_traced_on_demand_and_the_log_says_on_which_rows(rigs: Any) -> None:
     rig = rigs("", "--gain", "0.7")
     nothing = rig.ask("trace", text="drive")
@@ -121,6 +122,7 @@ def test_a_drive_is_traced_on_demand_and_the_log_says_on_which_rows(rigs: Any) -
     assert "the proposed model adopted by user" in text
 
 
+@pytest.mark.slow
 def test_given_inputs_are_driven_recorded_and_traced(rigs: Any) -> None:
     rig = rigs("[repair]\nafter_inputs = true\n", "--gain", "0.7")
     path = inputs_file(rig, 250)
@@ -152,6 +154,7 @@ def test_given_inputs_are_driven_recorded_and_traced(rigs: Any) -> None:
     assert (gap.returncode, json.loads(gap.stdout)["independent"]) == (3, False), "it bounds nothing"
 
 
+@pytest.mark.slow
 def test_inputs_stop_with_everything_that_stops_the_sampler_and_never_leave_their_bounds(rigs: Any) -> None:
     rig = rigs("[geofence]\nx = [-0.5, 0.5]\ny = [-0.5, 0.5]\n")
     rig.ask("permit", duration_s=3600.0)
@@ -185,6 +188,7 @@ def test_inputs_stop_with_everything_that_stops_the_sampler_and_never_leave_thei
 # ---------------------------------------------------------------- when the gap grows
 
 
+@pytest.mark.slow
 def test_a_gap_that_grows_while_a_controller_drives_is_traced(rigs: Any) -> None:
     rig = rigs("[repair]\non_growth = true\ndelay = 12.0\n", "--gain", "0.7")
     controller = rig.controller(TWITCHING)
@@ -203,6 +207,7 @@ def test_a_gap_that_grows_while_a_controller_drives_is_traced(rigs: Any) -> None
 # ---------------------------------------------------------------- nobody waits for it
 
 
+@pytest.mark.slow
 def test_a_trace_steps_back_and_stands_still_while_somebody_waits_for_other_work(rigs: Any) -> None:
     rig = rigs("", "--gain", "0.7")
     assert rig.sample()["exit_code"] == 0
@@ -229,6 +234,7 @@ def test_a_trace_that_takes_too_long_is_ended_and_the_log_says_so(rigs: Any) -> 
     assert [m.error for m in traces(rig)] == [ended.reason]
 
 
+@pytest.mark.slow
 def test_a_daemon_that_ends_takes_its_trace_along(rigs: Any) -> None:
     rig = rigs()
     assert rig.sample()["exit_code"] == 0
@@ -259,6 +265,7 @@ def fields(pid: int) -> list[str]:
 # ---------------------------------------------------------------- who decides
 
 
+@pytest.mark.slow
 def test_the_profile_may_decide_and_the_log_says_that_it_did(rigs: Any) -> None:
     rig = rigs('[repair]\nafter_campaign = true\nadopt = "always"\n', "--gain", "0.7")
     before = rig.status()["model"]
@@ -275,6 +282,7 @@ def test_the_profile_may_decide_and_the_log_says_that_it_did(rigs: Any) -> None:
     assert rig.status()["model"] == status["model"]
 
 
+@pytest.mark.slow
 def test_a_proposal_outlives_the_daemon_and_is_adopted_by_a_person(rigs: Any) -> None:
     rig = rigs("", "--gain", "0.7")
     assert (rig.ask("adopt")["exit_code"], "no model is proposed" in rig.ask("adopt")["text"]) == (2, True)
@@ -305,6 +313,7 @@ def test_a_proposal_outlives_the_daemon_and_is_adopted_by_a_person(rigs: Any) ->
     assert "traces run again" not in alone["recomputed"]
 
 
+@pytest.mark.slow
 def test_a_model_that_was_refused_is_not_the_one_in_force_after_a_restart(rigs: Any) -> None:
     rig = rigs("", "--gain", "0.7")
     assert rig.sample()["exit_code"] == 0
@@ -326,6 +335,7 @@ def test_a_model_that_was_refused_is_not_the_one_in_force_after_a_restart(rigs: 
 # ---------------------------------------------------------------- the command line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("argv", "said"),
     [
@@ -345,6 +355,7 @@ def test_what_makes_no_sense_is_one_line(tmp_path: Path, argv: list[str], said: 
     assert (done.returncode, said in done.stderr, done.stderr.count("\n")) == (2, True, 1), done.stderr
 
 
+@pytest.mark.slow
 def test_beside_a_file_of_inputs_nothing_else_is_asked_for(rigs: Any) -> None:
     rig = rigs()
     path = inputs_file(rig, 3)

@@ -40,6 +40,7 @@ def audited(rig: Rig) -> dict[str, Any]:
     return dict(json.loads(said.stdout))
 
 
+@pytest.mark.slow
 def test_commands_from_before_a_robots_restart_do_not_make_the_gap_grow(rig: Rig) -> None:
     """Each leaves one period of motion in the model's delay line: 5 mm, beside a radius of 2 mm."""
     path = rig.controller("    return np.tile([0.15, 1.0], (len(x), 1))\n")
@@ -106,6 +107,7 @@ def test_a_delay_longer_than_the_hysteresis_makes_no_gap_grow_over_a_break(rig: 
     assert (found["ok"], found["first_difference"]) == (True, None), found
 
 
+@pytest.mark.slow
 def test_no_sample_spans_a_robots_restart(rig: Rig) -> None:
     rig.start_robot()
     rig.start()

@@ -51,7 +51,6 @@ def test_campaign_certificate_drive_and_audit_over_ros2(rig: Ros2Rig) -> None:
     assert [certificate["valid"] for certificate in found["certificates"]]
 
 
-@pytest.mark.slow
 def test_campaign_outlives_a_robot_that_falls_silent_starts_anew_and_sets_its_clock(tmp_path: Path) -> None:
     """And nobody else gets to command it: not from the controllers' side, and from its own side only with the gate closed."""
     with contextlib.closing(Ros2Rig(tmp_path, "rmw", "twist_stamped", 0.25)) as rig:

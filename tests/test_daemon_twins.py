@@ -203,6 +203,7 @@ def test_second_base_on_a_can_bus_closes_the_gate(tmp_path: Path, opened: contex
 # ---------------------------------------------------------------- one robot
 
 
+@pytest.mark.slow
 def test_robot_that_restarts_is_no_twin_and_is_sampled_again(tmp_path: Path, opened: contextlib.ExitStack) -> None:
     """Another session and another count, after the old one was silent for longer than the time-outs."""
     endpoint = free_endpoint()
@@ -226,6 +227,7 @@ def test_robot_that_restarts_is_no_twin_and_is_sampled_again(tmp_path: Path, ope
     holds(rig)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("every", "latched"), [(0, False), (20, False), (2, True)])
 def test_malformed_observations_latch_above_the_bound_and_not_below(
     tmp_path: Path, opened: contextlib.ExitStack, every: int, latched: bool
@@ -251,6 +253,7 @@ def test_malformed_observations_latch_above_the_bound_and_not_below(
     holds(rig)
 
 
+@pytest.mark.slow
 def test_echo_of_the_robot_latches_as_faults_and_not_as_a_twin(tmp_path: Path, opened: contextlib.ExitStack) -> None:
     endpoint = free_endpoint()
     rig = quick(tmp_path, f'name = "zenoh"\nrobot_listen = "{endpoint}"\n')

@@ -7,11 +7,13 @@ import os
 import signal
 from pathlib import Path
 
+import pytest
 from daemon_rig import Rig
 
 from s2r_runtime.messages import AnalyticsChanged, Measured, Started
 
 
+@pytest.mark.slow
 def test_the_watch_goes_on_over_the_death_of_its_process_and_a_restart_and_the_audit_makes_it_again(tmp_path: Path) -> None:
     rig = Rig(tmp_path)
     try:
@@ -56,6 +58,7 @@ def test_the_watch_goes_on_over_the_death_of_its_process_and_a_restart_and_the_a
         rig.close()
 
 
+@pytest.mark.slow
 def test_a_watch_that_falls_behind_and_catches_up_is_measured_again_by_the_audit(tmp_path: Path) -> None:
     rig = Rig(tmp_path, clock="realtime", more="[machine]\nwatch_delay = 0.3\nprocess_timeout = 60.0\n")
     try:

@@ -69,6 +69,7 @@ def test_campaign_outlives_a_robot_that_freezes_dies_and_loses_messages(rig: Zen
     assert [m.up for m in rig.messages("event/link_changed") if isinstance(m, LinkChanged)].count(False) >= 2
 
 
+@pytest.mark.slow
 def test_given_inputs_reach_the_robot_over_zenoh_row_by_row(rig: ZenohRig) -> None:
     rig.start()
     rig.start_robot()
@@ -117,6 +118,7 @@ def test_a_suggested_drive_is_driven_and_tells_apart_what_the_first_one_could_no
     assert found["recomputed"]["commands of given inputs"] == 160 + len(suggested.read_text().splitlines()) - 1
 
 
+@pytest.mark.slow
 def test_uninvited_commands_are_logged_and_never_obeyed(rig: ZenohRig) -> None:
     rig.start()
     rig.start_robot()

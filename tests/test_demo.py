@@ -117,7 +117,7 @@ def test_its_report_is_one_page_with_the_plots(story: tuple[Path, str]) -> None:
     assert re.findall(r"""(?:src|href)\s*=\s*["'](?!#|data:)[^"']+""", page) == []
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.timeout(480)
 def test_a_campaign_that_is_refused_for_its_order_is_drawn_once_more_and_no_oftener(tmp_path: Path) -> None:
     """The robot's speed swings once in 500 s, so that a sample's error is like that of the one before."""
@@ -138,7 +138,6 @@ def test_an_effect_that_the_robot_does_not_have_is_one_line(tmp_path: Path) -> N
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.slow
 def test_a_demo_that_is_ended_takes_its_robot_and_its_daemon_with_it(tmp_path: Path) -> None:
     out = tmp_path / "run"
     argv = [sys.executable, "-m", "s2r_runtime.cli.main", "demo", "--out", str(out)]

@@ -95,6 +95,7 @@ def test_a_module_that_no_statement_names_is_not_there(folder: Path) -> None:
         assert "No module named 'hidden'" in stopped.detail
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not LANDLOCK, reason="this kernel has no Landlock")
 def test_parameters_that_it_would_read_from_a_file_end_it(folder: Path) -> None:
     (folder / "gains.txt").write_text("0.25")

@@ -54,6 +54,7 @@ def matches(expected: str, got: str) -> bool:
     return re.fullmatch(pattern, got.strip(), re.DOTALL) is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("where", "block"), blocks("console"), ids=[w for w, _ in blocks("console")])
 def test_console_block_shows_what_happens(where: str, block: str, tmp_path: Path) -> None:
     for folder in ("profiles", "controllers", "examples"):
@@ -72,6 +73,7 @@ def test_console_block_shows_what_happens(where: str, block: str, tmp_path: Path
         assert matches(expected, done.stdout + done.stderr), f"{where}: {command}\nshown:\n{expected}\ngot:\n{done.stdout}{done.stderr}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("where", "block"), blocks("python"), ids=[w for w, _ in blocks("python")])
 def test_python_block_runs(where: str, block: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

@@ -42,6 +42,7 @@ def _values(effect, data, model, channel):
     return {k: v * factor if isinstance(v, float) else v for k, v in start.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "model_name", "channel"), _places())
 @given(data=st.data())
 @settings(max_examples=15, deadline=None)

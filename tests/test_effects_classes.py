@@ -221,6 +221,7 @@ def test_what_an_effect_of_others_says_of_itself_counts(monkeypatch):
     assert ("track_scale", "theta", {"gain": 0.75}) in same(model, "weakness", "w", {"lost": 0.25})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_no_two_effects_are_the_same_that_the_table_does_not_know(name):
     """Every effect is fitted, from two sets of values, to what every other one does: what fits to a ten-millionth must be in the table."""

@@ -127,6 +127,7 @@ def test_a_model_leaves_nothing_of_what_it_made():
     assert np.max(np.abs(residual(model, steps_of(data), acting(model, data)))) < 1e-10
 
 
+@pytest.mark.slow
 def test_the_tracer_names_friction_on_a_joint_and_measures_it():
     u = held(5, 900, (8.0,))
     y = driven("joint", u, DT, [0.0005, 0.005], 6, mass=2.0, viscous=3.0, dry=1.5)
@@ -142,6 +143,7 @@ def test_the_tracer_names_friction_on_a_joint_and_measures_it():
         assert unit == {"coefficient": "N s/m", "force": "N"}[key]
 
 
+@pytest.mark.slow
 def test_the_tracer_tells_wind_from_a_lever_arm():
     u = held(7, 700, (0.5, 2.0))
     model = composed("unicycle", ARC)

@@ -126,12 +126,14 @@ def verified(path: Path) -> dict[str, str]:
     return told(said.verification.reason)
 
 
+@pytest.mark.slow
 def test_driving_and_rehearsal_look_the_same_in_every_respect(tmp_path: Path) -> None:
     path = probe(tmp_path)
     drives = driven(path)
     assert rehearsed(path, 1) == rehearsed(path, 4) == drives
 
 
+@pytest.mark.slow
 def test_verification_differs_from_driving_in_the_number_of_rows_alone(tmp_path: Path) -> None:
     path = probe(tmp_path)
     verification, drives = verified(path), driven(path)

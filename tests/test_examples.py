@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
@@ -34,6 +35,7 @@ def test_the_page_shows_the_model_that_is_there():
     assert source.split('"""', 2)[2].strip() in page
 
 
+@pytest.mark.slow
 def test_what_the_motors_data_sheet_does_not_tell_is_found():
     model = compose(ModelSpec(str(MOTOR / "motor.py"), 0.02))
     result = trace(load_dataset(MOTOR / "drive.csv", model), model)

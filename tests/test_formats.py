@@ -194,6 +194,7 @@ def test_samples_and_driving_do_not_count_together(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- what cannot be read
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_damaged_files_are_one_line_or_read_as_far_as_they_hold(kind: str, tmp_path: Path) -> None:
     suffix, _, signals, _ = KINDS[kind]
@@ -304,6 +305,7 @@ def test_matlab_file_that_claims_too_much_is_refused_before_it_is_read(tmp_path:
         load_transitions(tmp_path / "a.mat", MODEL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "module", "command"),
     [

@@ -96,6 +96,7 @@ def test_hold_gap_is_bounded_over_the_hold_and_takes_half_of_beta() -> None:
         assert ("held periods" in statement(gap, True)) == (periods == 10)
 
 
+@pytest.mark.slow
 def test_repetition_one_shows_its_share_of_missing_coverage_and_no_more() -> None:
     """G1 with and without discards: P[V(r) > eps] is the binomial sum for a continuous law."""
     rng = np.random.default_rng(3)
@@ -112,6 +113,7 @@ def test_repetition_one_shows_its_share_of_missing_coverage_and_no_more() -> Non
         assert clopper_pearson_lower(missed, repetitions, SURE) <= exact <= clopper_pearson_upper(missed, repetitions, SURE)
 
 
+@pytest.mark.slow
 def test_gap_and_hold_gap_hold_together_with_the_confidence_stated() -> None:
     rng = np.random.default_rng(4)
     repetitions, eps, beta = 1000, 0.05, 0.1
@@ -290,6 +292,7 @@ def test_memory_of_an_effect_is_carried_along_a_drive() -> None:
     assert np.abs(residuals(UNICYCLE, tr)).max() > 0.01
 
 
+@pytest.mark.slow
 def test_noise_alone_makes_what_is_said_of_it() -> None:
     """An exact model and noisy measurements: half of the campaigns have a larger radius than `radius_noise`, half a smaller one."""
     rng = np.random.default_rng(14)
@@ -308,6 +311,7 @@ def test_noise_alone_makes_what_is_said_of_it() -> None:
 # ---------------------------------------------------------------- whiteness
 
 
+@pytest.mark.slow
 def test_white_noise_is_called_structured_no_more_often_than_said() -> None:
     rng = np.random.default_rng(15)
     wrong = 0

@@ -70,6 +70,7 @@ def one_line(*argv: str | Path) -> int:
     return process.returncode
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_profiles_and_models_of_a_hostile_kind_are_bad_configuration(tmp_path: Path, kind: str) -> None:
     toml, code = made(kind, tmp_path / "a.toml"), made(kind, tmp_path / "a.py")
@@ -80,6 +81,7 @@ def test_profiles_and_models_of_a_hostile_kind_are_bad_configuration(tmp_path: P
     assert one_line("adopt", toml) == 78
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_certificates_controllers_and_logs_of_a_hostile_kind_are_refused(tmp_path: Path, kind: str) -> None:
     cert, code, log = (made(kind, tmp_path / name) for name in ("a.cert", "a.py", "a.mcap"))
@@ -90,6 +92,7 @@ def test_certificates_controllers_and_logs_of_a_hostile_kind_are_refused(tmp_pat
         assert one_line(*verb, "--profile", PROFILE) in (2, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("claim", ["attachment", "attachment with an end", "metadata"])
 def test_lengths_that_a_log_claims_take_no_memory(tmp_path: Path, claim: str) -> None:
     path = tmp_path / "a.mcap"

@@ -19,8 +19,7 @@ SHARE = {
 """What the gate must have said of each, at least; what else it may say depends on the link."""
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["mavlink", *(pytest.param(kind, marks=pytest.mark.long) for kind in KINDS if kind != "mavlink")])
+@pytest.mark.parametrize("kind", ["mavlink", *(pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS if kind != "mavlink")])
 def test_faults_of_a_real_link_move_nothing_and_mend(tmp_path: Path, kind: str) -> None:
     pytest.importorskip(f"s2r_{kind}")
     drill = LinkDrill(tmp_path, kind)

@@ -28,6 +28,7 @@ def audit(rig: Rig, path: Path, *heads: str) -> tuple[int, dict[str, Any]]:
     return done.returncode, json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_a_killed_daemons_log_reaches_every_head_that_it_published_and_a_shortened_one_does_not(rig: Rig) -> None:
     rig.start_robot()
     rig.start()
@@ -56,6 +57,7 @@ def test_a_killed_daemons_log_reaches_every_head_that_it_published_and_a_shorten
     assert "head that was published" in short["first_difference"]["what"]
 
 
+@pytest.mark.slow
 def test_the_last_head_in_the_journal_is_that_of_the_closed_log(rig: Rig) -> None:
     rig.start_robot()
     rig.start()

@@ -95,6 +95,7 @@ def test_dry_friction_of_a_motor_is_named(motor, seed):
     assert low < 0.2 / 0.5 < high
 
 
+@pytest.mark.slow
 def test_drag_with_the_square_of_each_speed_of_a_flying_robot_is_named(flying):
     rng = np.random.default_rng(1)
     held = [np.repeat(rng.uniform(-a, a, 60), 20) for a in (0.2, 0.2, 1.0)]
@@ -235,6 +236,7 @@ def test_a_loss_that_is_another_one_slows_pushes_down_as_if_it_stood_in_the_file
     assert np.allclose(changed.advance(v, u, u), said.advance(v, u, u), rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_dry_friction_of_a_motor_with_losses_of_its_own_is_named(tmp_path, seed):
     (tmp_path / "losing.py").write_text(LOSING)

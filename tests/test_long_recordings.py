@@ -49,6 +49,7 @@ def refused(path: Path, *more: str) -> str:
     return line
 
 
+@pytest.mark.slow
 def test_a_bomb_of_zeros_and_one_of_rows_are_refused(tmp_path: Path) -> None:
     zeros, rows = tmp_path / "zeros.csv.gz", tmp_path / "rows.csv.gz"
     packer = zlib.compressobj(6, wbits=31)
@@ -65,6 +66,7 @@ def test_a_bomb_of_zeros_and_one_of_rows_are_refused(tmp_path: Path) -> None:
             pass
 
 
+@pytest.mark.slow
 def test_a_file_of_20_gb_and_a_line_without_an_end_are_refused(tmp_path: Path) -> None:
     large, line = tmp_path / "large.csv", tmp_path / "line.csv"
     with large.open("wb") as file:
@@ -116,6 +118,7 @@ def table(path: Path, rows: int, segments: int = 0) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_reading_stores_eight_bytes_a_number(tmp_path: Path) -> None:
     """A table of 300 000 rows as text, packed: 7 columns of which 6 are read take 14 MB, where objects took some 200 MB."""
     path = table(tmp_path / "run.csv", 300_000)
@@ -132,6 +135,7 @@ def test_reading_stores_eight_bytes_a_number(tmp_path: Path) -> None:
         assert kilobytes < 70_000, one
 
 
+@pytest.mark.slow
 def test_a_thinned_table_is_spread_over_the_recording_and_keeps_its_digest(tmp_path: Path) -> None:
     path = table(tmp_path / "run.csv", 100_000)
     whole, part = read_csv(path), read_csv(path, max_rows=6400)

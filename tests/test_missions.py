@@ -14,6 +14,7 @@ SURE = 1e-3
 MISSIONS, SAMPLES = 100, 1500
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rho", "change"), [(0.0, False), (0.0, True), (0.3, False), (0.98, False)])
 def test_missions_issue_false_certificates_no_more_often_than_beta(rho: float, change: bool) -> None:
     row = missions(MISSIONS, SAMPLES, rho, 3, change=change)

@@ -60,6 +60,7 @@ def wrong(text: str) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 def test_what_is_named_is_there() -> None:
     assert [f"{where}: {one}" for where, text in texts() for one in wrong(text)] == []
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from pages_rig import needs_chromium, rendered, self_contained
 
 from s2r_runtime.report import plots
@@ -33,6 +34,7 @@ def sample_page() -> str:
     return page.html()
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_a_page_renders_with_its_figures_and_fetches_nothing(tmp_path: Path) -> None:
     path = tmp_path / "page.html"

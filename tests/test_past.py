@@ -356,6 +356,7 @@ def put_back(rig: Rig, kept: Path, *names: str) -> None:
         shutil.copy2(kept / name, rig.state / name)
 
 
+@pytest.mark.slow
 def test_an_old_copy_of_the_state_gives_back_no_attempt_no_revocation_and_no_stop(rig: Rig) -> None:
     rig.start_robot()
     rig.start()
@@ -431,7 +432,8 @@ def interrupted(rig: Rig) -> tuple[Path, Path]:
     return file, kept
 
 
-@pytest.mark.parametrize("gone", [pytest.param(False, id="older"), pytest.param(True, id="deleted", marks=pytest.mark.long)])
+@pytest.mark.slow
+@pytest.mark.parametrize("gone", [pytest.param(False, id="older"), pytest.param(True, id="deleted", marks=pytest.mark.slow)])
 def test_samples_that_were_seen_are_not_drawn_once_more_by_putting_an_old_campaign_back(rig: Rig, gone: bool) -> None:
     rig.start_robot()
     rig.start()
@@ -449,7 +451,7 @@ def test_samples_that_were_seen_are_not_drawn_once_more_by_putting_an_old_campai
     assert told["ok"], told
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_audit_tells_of_samples_that_were_drawn_again_where_the_daemon_could_not_know(rig: Rig) -> None:
     """The logs of before are somewhere else when the campaign goes on with an old copy of what was kept."""
     rig.start_robot()
@@ -465,6 +467,7 @@ def test_an_audit_tells_of_samples_that_were_drawn_again_where_the_daemon_could_
     assert "it drew some again" in told["first_difference"]["what"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("edit", ["added", "skipped"])
 def test_an_edited_campaign_does_not_go_on(rig: Rig, edit: str) -> None:
     """Samples that nobody took would make a gap smaller; samples that are skipped would rest it on fewer."""

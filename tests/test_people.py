@@ -77,6 +77,7 @@ def stopped(rig: PeopleRig, gone: float) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP])
 def test_a_signal_to_the_command_stops_the_robot_keeps_the_campaign_and_says_how_it_goes_on(rig: PeopleRig, number: signal.Signals) -> None:
     command = rig.command("sample", str(rig.profile), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
@@ -91,6 +92,7 @@ def test_a_signal_to_the_command_stops_the_robot_keeps_the_campaign_and_says_how
     stopped(rig, gone)
 
 
+@pytest.mark.slow
 def test_a_command_that_is_killed_stops_the_robot(rig: PeopleRig) -> None:
     command = rig.command("sample", str(rig.profile))
     rig.sampling()
@@ -100,6 +102,7 @@ def test_a_command_that_is_killed_stops_the_robot(rig: PeopleRig) -> None:
     stopped(rig, gone)
 
 
+@pytest.mark.slow
 def test_a_terminal_that_closes_stops_the_robot(rig: PeopleRig) -> None:
     terminal, side = os.openpty()
     argv = [
@@ -152,11 +155,13 @@ def _ssh_without_terminal(rig: PeopleRig) -> float:
     return gone
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("leave", [_reader_gone, _ssh_without_terminal])
 def test_streams_that_nobody_is_at_stop_the_robot(rig: PeopleRig, leave: Callable[[PeopleRig], float]) -> None:
     stopped(rig, leave(rig))
 
 
+@pytest.mark.slow
 def test_a_detached_campaign_goes_on_until_it_is_paused_and_under_nohup_too(rig: PeopleRig) -> None:
     done = rig.s2r("sample", str(rig.profile), "--detach")
     assert done.returncode == 0
@@ -182,6 +187,7 @@ def test_a_detached_campaign_goes_on_until_it_is_paused_and_under_nohup_too(rig:
     stopped(rig, gone)
 
 
+@pytest.mark.slow
 def test_whoever_leaves_before_the_controller_drives_withdraws_it(rig: PeopleRig) -> None:
     """Its file is being read: a pipe that nobody writes to."""
     pipe = rig.folder / "controller.py"

@@ -129,6 +129,7 @@ def test_motion_that_comes_before_its_cause_is_of_another_clock(name):
         check_plausible(_model(name), _data(_model(name), *_driven(name), early=0.25))
 
 
+@pytest.mark.slow
 def test_a_fast_recording_shows_it_too():
     """In one step of 5 ms nothing moves beyond noise."""
     dt, steps = 0.005, 2700
@@ -175,6 +176,7 @@ def test_commands_that_repeat_themselves_come_before_and_after_what_they_cause(d
     check_plausible(_model("unicycle"), _data(_model("unicycle"), y[:-1], u))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOUNDS)
 def test_a_strong_effect_is_no_mistake_of_the_columns(name):
     channels = INPUTS[name]

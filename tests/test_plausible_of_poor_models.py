@@ -63,6 +63,7 @@ MISTAKES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", MISTAKES)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_mistake_is_told_although_the_model_is_a_poor_one(case, seed):
@@ -73,6 +74,7 @@ def test_a_mistake_is_told_although_the_model_is_a_poor_one(case, seed):
     assert len(str(told.value).splitlines()) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_poor_model_is_no_mistake(name):
     """It foretells little as it is, and nearly all if states may be off in size: nothing is wrong with the columns."""
@@ -93,6 +95,7 @@ OTHERWISE = {  # what a mistake of the columns would look like
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", OTHERWISE)
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
 def test_what_looks_like_exchanged_columns_and_is_an_effect_is_not_refused(case, seed):

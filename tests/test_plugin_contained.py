@@ -295,6 +295,7 @@ def odd(rig: Rig, text: str) -> None:
     (rig.folder / "odd.new").replace(file)
 
 
+@pytest.mark.slow
 def test_daemon_outlives_whatever_its_transport_does_and_the_audit_agrees(rig: Rig) -> None:
     rig.start_robot()
     rig.start()
@@ -330,6 +331,7 @@ def audited(rig: Rig) -> Any:
     return json.loads(rig.s2r("audit", str(rig.log_files()[-1]), "--key", str(rig.state / "key.pub"), "--json").stdout)
 
 
+@pytest.mark.slow
 def test_input_that_was_dropped_latches_a_stop_and_the_audit_agrees(rig: Rig) -> None:
     rig.start_robot()
     rig.start()
@@ -353,6 +355,7 @@ def test_input_that_was_dropped_latches_a_stop_and_the_audit_agrees(rig: Rig) ->
     assert (found["ok"], found["first_difference"], found["chain"]) == (True, None, "intact"), found
 
 
+@pytest.mark.slow
 def test_what_could_not_be_decoded_then_and_can_be_now_is_no_pass(rig: Rig) -> None:
     rig.start_robot()
     rig.start()
@@ -384,6 +387,7 @@ def test_a_log_cannot_claim_that_a_stop_was_not_to_be_read(data: bytes, differen
     assert (findings.differences, len(findings.unchecked)) == (differences, unchecked)
 
 
+@pytest.mark.slow
 def test_daemon_whose_transport_cannot_be_opened_serves_and_one_whose_send_cannot_be_ended_ends(rig: Rig) -> None:
     odd(rig, "fileno -1")
     rig.start()

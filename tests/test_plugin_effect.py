@@ -51,12 +51,14 @@ def test_an_effect_takes_less_than_forty_lines() -> None:
     assert len(EFFECT.splitlines()) < 40
 
 
+@pytest.mark.slow
 def test_the_example_passes_the_kit_in_the_lines_that_the_page_shows(installed: Path) -> None:
     done = _run(installed, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_mine.py")
     assert done.returncode == 0, done.stdout
     assert " passed" in done.stdout
 
 
+@pytest.mark.slow
 def test_an_effect_on_a_base_passes_the_kit_as_the_page_shows_it(installed: Path) -> None:
     kit = (
         "from s2r_runtime.testing import EffectKit\n\n\nclass TestSoftLimit(EffectKit):\n    effect, parameters = SoftLimit(), {'k': 0.5}\n"
@@ -67,6 +69,7 @@ def test_an_effect_on_a_base_passes_the_kit_as_the_page_shows_it(installed: Path
     assert " passed" in done.stdout
 
 
+@pytest.mark.slow
 def test_an_installed_effect_is_listed_and_found_by_the_tracer_by_its_name(installed: Path, tmp_path: Path) -> None:
     rng, dt = np.random.default_rng(3), 0.05
     u = np.repeat(rng.uniform(-2.0, 2.0, (60, 2)), 15, axis=0)

@@ -74,6 +74,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
     return site
 
 
+@pytest.mark.slow
 def test_every_kind_can_be_written_and_its_own_tests_pass(site: Site) -> None:
     folders = [str(site.folder / f"a_{kind}") for kind in KINDS if kind != "transport"]
     done = site.run("-m", "pytest", "-q", "-p", "no:cacheprovider", "--import-mode=importlib", "-W", "error", *folders)
@@ -84,12 +85,14 @@ def test_every_kind_can_be_written_and_its_own_tests_pass(site: Site) -> None:
         assert Path(folder, "README.md").exists()
 
 
+@pytest.mark.slow
 def test_transport_is_a_hundred_lines_at_most_and_its_tests_are_the_kit(site: Site) -> None:
     listed = site.run("-m", "pytest", "-q", "-p", "no:cacheprovider", "--collect-only", str(site.folder / "a_transport"))
     assert "test_lost_robot_is_reported_and_its_return_too" in listed.stdout
     assert len((TEMPLATES / "transport" / "my_thing" / "transport.py").read_text().splitlines()) <= 100
 
 
+@pytest.mark.slow
 def test_list_says_where_each_comes_from(site: Site) -> None:
     listed = site.s2r("plugin", "list")
     assert listed.returncode == 0, listed.stdout
@@ -99,6 +102,7 @@ def test_list_says_where_each_comes_from(site: Site) -> None:
     assert found["a_task"]["offers"] == {"tasks": ["a_task"], "kits": ["tasks.a_task"]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["transport", "effect", "recording"])
 def test_check_runs_the_kit_of_what_is_offered(site: Site, kind: str) -> None:
     done = site.s2r("plugin", "check", f"a_{kind}", "--json")
@@ -117,6 +121,7 @@ def port() -> int:
         return int(s.getsockname()[1])
 
 
+@pytest.mark.slow
 def test_the_new_transport_is_sampled_with_the_robot_that_comes_with_it_and_its_log_followed(site: Site) -> None:
     project, (ours, robots) = site.folder / "a_transport", (port(), port())
     profile = project / "a_transport.toml"
@@ -154,12 +159,14 @@ def test_the_new_transport_is_sampled_with_the_robot_that_comes_with_it_and_its_
     assert 0.0003 < status["gap_radius"] < 0.1 * 3.1 * 0.033 * 0.0525 + 0.001
 
 
+@pytest.mark.slow
 def test_controller_is_verified_on_the_profile_that_comes_with_it(site: Site) -> None:
     project = site.folder / "a_controller"
     done = site.s2r("verify", "a_controller.py", "--profile", "a_controller.toml", "--radius", "0.001", "--json", cwd=project)
     assert (done.returncode, json.loads(done.stdout)["passed"]) == (0, True), done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_log_reader_is_used_for_its_files(site: Site) -> None:
     lines = [
         f"{k * 0.1:.1f} x {0.02 * k}\n{k * 0.1:.1f} y 0\n{k * 0.1:.1f} theta 0\n{k * 0.1:.1f} v 0.2\n{k * 0.1:.1f} w 0\n"

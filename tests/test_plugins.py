@@ -158,6 +158,7 @@ def s2r(site: Path, *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(argv, env=environment, capture_output=True, text=True, timeout=100, check=False)
 
 
+@pytest.mark.slow
 def test_list_says_what_is_wrong_with_each_and_the_others_are_in_use(site: Path) -> None:
     done = s2r(site, "plugin", "list", "--json")
     assert done.returncode == 1
@@ -174,6 +175,7 @@ def test_list_says_what_is_wrong_with_each_and_the_others_are_in_use(site: Path)
     assert found["builtin"]["error"] == found["zenoh"]["error"] == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "code", "words"),
     [
@@ -193,6 +195,7 @@ def test_check_of_what_cannot_pass_says_why(site: Path, name: str, code: int, wo
     assert "keeps its interface" not in done.stdout
 
 
+@pytest.mark.slow
 def test_daemon_says_which_plug_ins_are_broken_and_in_one_line_that_a_transport_is_none(site: Path) -> None:
     text = (ROOT / "profiles" / "robotarium.toml").read_text()
     (site / "p.toml").write_text(text[: text.index("[transport]")] + '[transport]\nname = "bare"\n')

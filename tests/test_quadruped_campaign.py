@@ -19,7 +19,6 @@ from s2r_runtime.recording.writer import read_all
 
 pytestmark = [
     pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="the robot's physics are an extra: s2r-standins[sim]"),
-    pytest.mark.slow,
     pytest.mark.timeout(480),
 ]
 

@@ -244,6 +244,7 @@ def test_readings_alone_need_no_campaign(capsys: pytest.CaptureFixture[str]) -> 
     assert [line.split("%   ")[1] for line in told[1:]] == [r.words for r in READINGS]
 
 
+@pytest.mark.slow
 def test_coverage_holds_on_a_robot_and_is_broken_where_radii_are_too_small(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--campaigns", "60", "--law", "4000", "--starts", "40", "--json"]
     coverage.main(arguments, lambda _: SwayingWalker())

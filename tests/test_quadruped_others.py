@@ -99,6 +99,7 @@ def test_a_campaign_whose_robot_went_away_is_kept_and_says_so(monkeypatch: pytes
 # ---------------------------------------------------------------- over real Zenoh
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     ("how", "code", "says"),

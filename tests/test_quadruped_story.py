@@ -1,4 +1,4 @@
-"""`s2r demo --robot quadruped`, whole, in rigid-body physics: minutes of the processor, so it belongs to `make test-long`.
+"""`s2r demo --robot quadruped`, whole, in rigid-body physics: minutes of the processor, so it belongs to `make test-all`.
 
 What its evidence demands differs with the effect and the seed: a controller that is refused for good is a story too. What may never
 differ is held here: what was refused did not drive, a repair made the gap smaller, and the log passes the audit, controllers run again.
@@ -18,7 +18,7 @@ from s2r_runtime.recording.writer import read_all
 
 pytestmark = [
     pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="the robot's physics are an extra: s2r-standins[sim]"),
-    pytest.mark.long,
+    pytest.mark.slow,
     pytest.mark.timeout(5400),
 ]
 

@@ -105,6 +105,7 @@ def test_steps_that_share_a_filter_are_not_fitted_as_if_they_were_independent(tm
     assert found.to_json()["step_s"] == longer.dt
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["joint", "double_integrator"])
 def test_a_reconstructed_state_makes_no_effect(tmp_path, name):
     for seed in range(3):
@@ -112,6 +113,7 @@ def test_a_reconstructed_state_makes_no_effect(tmp_path, name):
         assert trace(load_dataset(path, model), model).verdict == "none"
 
 
+@pytest.mark.slow
 def test_an_effect_is_found_without_its_velocity(tmp_path):
     model, _, path = _driven(tmp_path / "run.csv", "joint", 4, effects=[("input_lag", "force", {"time_constant": 0.1})])
     found = trace(load_dataset(path, model), model)

@@ -216,6 +216,7 @@ def test_a_folder_that_cannot_be_written_is_named(folder: str) -> None:
         Writer(Path(folder) / "a.mcap", run="test")
 
 
+@pytest.mark.slow
 def test_a_log_cut_anywhere_reads_to_its_last_sealed_message(tmp_path: Path) -> None:
     what = messages(300)
     record(tmp_path / "a.mcap", what)
@@ -242,6 +243,7 @@ def outcome(path: Path) -> tuple[str, list[Struct], int]:
     return reading.ending.kind, found, reading.ending.index
 
 
+@pytest.mark.slow
 def test_every_flipped_bit_in_a_closed_log_is_detected(tmp_path: Path) -> None:
     what = messages(24)
     record(tmp_path / "small.mcap", what, every=10)
@@ -256,6 +258,7 @@ def test_every_flipped_bit_in_a_closed_log_is_detected(tmp_path: Path) -> None:
         assert found == what[: len(found)], place
 
 
+@pytest.mark.slow
 def test_flipped_bits_anywhere_in_a_longer_log_are_detected(tmp_path: Path) -> None:
     what = messages(300)
     record(tmp_path / "a.mcap", what)
@@ -273,6 +276,7 @@ def test_flipped_bits_anywhere_in_a_longer_log_are_detected(tmp_path: Path) -> N
         assert found == what[: len(found)]
 
 
+@pytest.mark.slow
 def test_a_flipped_bit_in_a_cut_log_is_detected_or_changes_nothing_that_is_read(tmp_path: Path) -> None:
     what = messages(300)
     record(tmp_path / "a.mcap", what)
@@ -621,6 +625,7 @@ LOSS_S = 0.1
 """What a kill may cost."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hz", [100, 1000])
 def test_a_kill_costs_at_most_100_ms_and_nothing_that_was_durable(tmp_path: Path, hz: int) -> None:
     rng = random.Random(hz)

@@ -20,6 +20,7 @@ CHEATS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cheat", CHEATS)
 def test_a_controller_that_answers_otherwise_alone_gets_no_verdict(tmp_path: Path, cheat: str) -> None:
     honest = GRID.read_text()

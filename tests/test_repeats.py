@@ -75,6 +75,7 @@ def test_mixtures_of_rows_are_no_draws() -> None:
     assert refused(joined(tr, mixed))
 
 
+@pytest.mark.slow
 def test_independent_draws_of_coarse_laws_are_refused_no_more_often_than_said() -> None:
     """A quantised sensor, few inputs, few places, inputs that follow the state, one dimension only."""
     rng, count = np.random.default_rng(4), 60
@@ -131,6 +132,7 @@ def test_a_robot_that_stands_still_repeats_itself_and_counts_once(tmp_path: Path
     assert doubted(gap, tr, (REPEATED,)) is tr
 
 
+@pytest.mark.slow
 def test_the_command_line_refuses_a_table_of_copies_and_says_how_many_rows_differ(tmp_path: Path) -> None:
     tr = drawn(np.random.default_rng(7), 20)
     lines = ["segment,t,x,y,theta,v,w"]

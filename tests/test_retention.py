@@ -337,6 +337,7 @@ def test_a_limit_below_zero_is_refused(tmp_path: Path, field: str) -> None:
         load_profile(tmp_path / "p.toml")
 
 
+@pytest.mark.slow
 def test_a_daemon_deletes_what_its_profile_does_not_keep_and_its_log_says_so_to_the_end(tmp_path: Path) -> None:
     rig = Rig(tmp_path, more="[recording]\nkeep_bytes = 1\n")
     try:

@@ -64,6 +64,7 @@ def test_a_reading_is_five_words_in_order() -> None:
             experiment.reading_of(wrong)
 
 
+@pytest.mark.slow
 def test_the_whole_experiment_runs_and_tells_what_came_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page, numbers = tmp_path / "page.html", tmp_path / "numbers.json"
     assert experiment.main(["--quick", "-o", str(page), "--json", str(numbers)]) == 0

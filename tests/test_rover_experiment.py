@@ -60,6 +60,7 @@ def test_page_and_lines_of_a_story_that_ended_early_say_so(tmp_path: Path) -> No
     assert "s2r sample rover.toml" in page
 
 
+@pytest.mark.slow
 def test_shipped_controller_passes_at_three_times_the_gap_of_a_real_campaign() -> None:
     """0.0076 m in one step, 0.118 m over a hold: a campaign on ArduPilot's simulator."""
     options = ["--profile", str(PROFILE), "--radius", str(3 * 0.0076), "--hold-radius", str(3 * 0.118)]

@@ -87,7 +87,7 @@ def test_link_arm_three_samples_stop_and_audit_on_a_real_autopilot(rig: SitlRig)
     assert len(samples) >= 3
 
 
-@pytest.mark.long  # two minutes of real time, in which the autopilot must get its share of the processor
+@pytest.mark.slow  # two minutes of real time, in which the autopilot must get its share of the processor
 def test_second_ground_station_mode_change_and_restart_of_a_real_autopilot(rig: SitlRig, simulator: Simulator) -> None:
     rig.start()
     rig.ready()

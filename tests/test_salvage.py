@@ -46,6 +46,7 @@ def as_mcap(path: Path) -> list[tuple[str, bytes]]:
     return [(topic, data) for topic, data in found if topic != "log/chain"]
 
 
+@pytest.mark.slow
 def test_a_log_cut_anywhere_is_recovered_to_its_last_sealed_message(tmp_path: Path) -> None:
     made = record(tmp_path / "a.mcap")
     data = (tmp_path / "a.mcap").read_bytes()
@@ -84,6 +85,7 @@ def test_recovering_twice_gives_the_same_file(tmp_path: Path) -> None:
     assert (tmp_path / "c.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
 
 
+@pytest.mark.slow
 def test_damage_in_the_middle_costs_its_own_chunk_and_is_accounted_for(tmp_path: Path) -> None:
     made = record(tmp_path / "a.mcap")
     data = (tmp_path / "a.mcap").read_bytes()

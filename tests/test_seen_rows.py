@@ -103,6 +103,7 @@ def changed(path: Path, change: Callable[[Rows], Rows], to: Path) -> Path:
     return to
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_table_of_rows_that_the_fit_saw_is_refused_whatever_was_done_to_it(
     fit: Path, tmp_path: Path, change: Callable[[Rows], Rows]
@@ -112,6 +113,7 @@ def test_a_table_of_rows_that_the_fit_saw_is_refused_whatever_was_done_to_it(
         refuse_fitted(model, load_transitions(changed(fit, change, tmp_path / "again.csv"), model))
 
 
+@pytest.mark.slow
 def test_a_merged_table_is_refused_with_the_share_of_seen_rows(fit: Path, tmp_path: Path) -> None:
     model, fresh = compose(fitted_on(fit)), table(tmp_path / "fresh.csv", 2)
     part = changed(fit, one_segment, tmp_path / "part.csv")
@@ -120,6 +122,7 @@ def test_a_merged_table_is_refused_with_the_share_of_seen_rows(fit: Path, tmp_pa
         refuse_fitted(model, load_transitions([fresh, part], model))
 
 
+@pytest.mark.slow
 def test_a_model_that_was_fitted_before_there_were_sketches_is_as_before(fit: Path, tmp_path: Path) -> None:
     spec = fitted_on(fit)
     model = compose(ModelSpec("unicycle", DT, fitted_on=tuple(one for one in spec.fitted_on if one.startswith("sha256:"))))
@@ -142,6 +145,7 @@ def test_a_fresh_recording_is_refused_no_more_often_than_said(step: float, width
     assert clopper_pearson_lower(refused, count, SURE) <= ALPHA
 
 
+@pytest.mark.slow
 def test_of_a_long_recording_a_bounded_sketch_finds_a_few_hundred_transitions() -> None:
     rng = np.random.default_rng(3)
     rows = rng.uniform(-1, 1, (500_000, 3))
@@ -162,6 +166,7 @@ def test_a_damaged_sketch_is_one_clear_error() -> None:
                 seen(bad, [np.zeros((3, 2))])
 
 
+@pytest.mark.slow
 def test_the_command_line_refuses_a_test_and_a_gap_on_seen_rows(fit: Path, tmp_path: Path) -> None:
     again, model = changed(fit, rounded, tmp_path / "again.csv"), tmp_path / "model.toml"
     model.write_text(dump_model(fitted_on(fit)))
@@ -204,6 +209,7 @@ def test_a_list_of_hashes_that_is_none_is_one_clear_error_too(change: dict[str, 
 # ---------------------------------------------------------------- as text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", CHANGES)
 @pytest.mark.parametrize("rows", [50, 6000])
 def test_the_compact_form_finds_the_rows_that_the_former_one_finds(fit: Path, change: Callable[[Rows], Rows], rows: int) -> None:

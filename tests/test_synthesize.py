@@ -166,6 +166,7 @@ def s2r(files: tuple[Path, Path], *arguments: str) -> Any:
     )
 
 
+@pytest.mark.slow
 def test_the_verb_pays_for_the_winners_verification_and_tells_what_was_tried(files: tuple[Path, Path]) -> None:
     assert s2r(files, "keys", "new").returncode == 0
     few = ("--evaluations", "24", "--scenarios", "40")

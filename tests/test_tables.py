@@ -154,6 +154,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
         read_csv(tmp_path / "none.csv")
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_rows_are_read_exactly(write) -> None:
     n = 100_000
     rng = np.random.default_rng(4)

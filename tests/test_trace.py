@@ -41,6 +41,7 @@ def traced():
     }
 
 
+@pytest.mark.slow
 def test_nine_of_ten_undeclared_effects_get_their_names(traced):
     right = [_names(r.effects) == _names_of(name) and r.verdict == "traced" for name, results in traced.items() for r in results]
     assert sum(right) >= 0.9 * len(right), {name: [(r.verdict, _names(r.effects)) for r in found] for name, found in traced.items()}
@@ -50,6 +51,7 @@ def _names_of(name):
     return {(effect, channel) for effect, channel, _ in UNDECLARED[name]}
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_true_values_as_often_as_they_say(traced):
     """95 % of n: fewer than the 0.1 % quantile of the binomial would be no chance."""
     inside = []
@@ -68,6 +70,7 @@ def test_intervals_hold_the_true_values_as_often_as_they_say(traced):
     assert sum(inside) >= least - 1
 
 
+@pytest.mark.slow
 def test_the_repaired_model_foretells_what_the_fit_never_saw_down_to_noise(traced):
     for results in traced.values():
         for r in results:
@@ -77,6 +80,7 @@ def test_the_repaired_model_foretells_what_the_fit_never_saw_down_to_noise(trace
                 assert error["after"]["rollout_rms"][state] < 1.05 * error["before"]["rollout_rms"][state]
 
 
+@pytest.mark.slow
 def test_an_effect_before_the_declared_limit_is_told_from_one_behind_it():
     gain = ("input_gain", "w", {"gain": 0.6})
     for where, place in (("before", 0), ("behind", 2)):
@@ -100,6 +104,7 @@ def test_the_answer_is_the_same_each_time_and_plain_json(traced):
     assert first["gap"]["after"]["radius"] < first["gap"]["before"]["radius"]
 
 
+@pytest.mark.slow
 def test_the_repaired_model_is_one_that_every_verb_takes(tmp_path, traced):
     result = traced["gain"][0]
     path = tmp_path / "model.toml"
@@ -111,6 +116,7 @@ def test_the_repaired_model_is_one_that_every_verb_takes(tmp_path, traced):
     assert np.allclose(x, 0.0)
 
 
+@pytest.mark.slow
 def test_tracing_the_repaired_model_finds_nothing_more():
     data = recordings(UNDECLARED["saturation"], 2, steps=STEPS, seed=34)
     repaired = compose(trace(data[0], declared()).spec)
@@ -143,6 +149,7 @@ def test_a_dataset_of_another_model_is_refused():
         trace(recordings([], 1, steps=100, seed=1)[0], declared(0.1))
 
 
+@pytest.mark.slow
 def test_the_account_and_the_plots_say_what_was_found(traced):
     result = traced["gain"][0]
     text = result.text()

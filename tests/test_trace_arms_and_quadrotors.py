@@ -197,11 +197,13 @@ def _flown(folder, sag, wind, lost=(), lift=0.0) -> TraceResult:
     return trace(from_arrays(model, [(y, np.array(inputs[:-1]))]), model)
 
 
+@pytest.mark.slow
 def test_a_robot_that_moves_up_as_well_is_traced(tmp_path):
     found = _flown(tmp_path, -0.06, (0.0, 0.0, 0.0))
     assert [(e.name, e.channel) for e in found.effects] == [("input_gain", "thrust")]
 
 
+@pytest.mark.slow
 def test_wind_may_blow_downwards(tmp_path):
     (found,) = _flown(tmp_path, 0.0, (0.3, 0.0, -0.2)).effects
     assert (found.name, found.channel) == ("constant_disturbance", "world")
@@ -241,6 +243,7 @@ def test_an_axis_along_which_an_input_pushes_is_no_other_direction(tmp_path, dt)
     assert _directions(tmp_path, ARM, dt)[1] == []  # links that move one another
 
 
+@pytest.mark.slow
 def test_what_depends_on_a_place_is_asked_about_where_inputs_push_as_well(tmp_path):
     (tmp_path / "robot.py").write_text(CART)
     model, rng = compose(ModelSpec(str(tmp_path / "robot.py"), DT_S)), np.random.default_rng(4)
@@ -256,13 +259,14 @@ def test_what_depends_on_a_place_is_asked_about_where_inputs_push_as_well(tmp_pa
     assert "position" in found.depends_on or any(e.name in {"position_field", "cubic_stiffness"} for e in found.effects)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_ground_lifts_what_flies_low_however_it_tilts(tmp_path):
     found = _flown(tmp_path, 0.0, (0.0, 0.0, 0.0), lift=0.15)
     assert found.verdict == "unexplained"
     assert "position" in found.depends_on
 
 
+@pytest.mark.slow
 def test_a_message_that_repeats_is_frozen_in_all_that_it_says(tmp_path):
     found = _flown(tmp_path, 0.0, (0.0, 0.0, 0.0), lost=(300, 700))
     assert found.verdict == "sensor_fault"
@@ -283,6 +287,7 @@ def step(x, u, dt, params):
 """
 
 
+@pytest.mark.slow
 def test_drag_on_speeds_without_positions_is_named(tmp_path):
     model, rng = _model(tmp_path, SPEEDS_ONLY.replace("DRAG", "0.0")), np.random.default_rng(3)
     u = np.repeat(rng.uniform(-0.2, 0.2, (40, 2)), 25, axis=0)

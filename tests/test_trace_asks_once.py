@@ -273,6 +273,7 @@ def test_a_candidate_that_a_round_leaves_far_behind_gets_no_other_one(monkeypatc
     assert found[1][1:] == found[0][1:]
 
 
+@pytest.mark.slow
 def test_what_is_far_from_needed_is_not_asked_how_it_began(monkeypatch):
     given, fit = _given()
     asked, found = [], []
@@ -365,6 +366,7 @@ def test_a_candidate_that_is_fitted_already_is_not_fitted_again(monkeypatch):
     assert {(s.name, s.channel) for s in found} == {(s.name, s.channel) for s in again}
 
 
+@pytest.mark.slow
 def test_a_rival_takes_its_place_at_once_and_only_then_are_the_others_asked_again(monkeypatch):
     """Drag, dry friction in the place of the other axis' drag, and a push."""
     drags = [EffectSpec("viscous_friction", name, {"coefficient": 0.3}) for name in ("vx", "vy")]

@@ -105,6 +105,7 @@ def test_a_joint_has_no_body():
     assert body_noise(_of(model, np.array(rows) + rng.normal(size=(601, 2)) * [1e-4, 1e-3], u)) is None
 
 
+@pytest.mark.slow
 def test_it_makes_no_field(monkeypatch):
     """Of 12 robots that do what they are told. A field has a chance of one in a thousand to have its price; under noise by state alone,
     three have it, of which one in a hundred such tests would have one.

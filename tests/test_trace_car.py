@@ -44,6 +44,7 @@ def _driven(seed):
     return np.array(rows) + rng.normal(size=(STEPS + 1, 4)) * [0.015, 0.015, 0.003, 0.03], u
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, [1, 2]))
 def test_a_car_on_its_tyres_understeers_and_its_rear_gives_way(seed):
     model = compose(ModelSpec("bicycle", DT_S, {"wheel_base": BASE_M}))

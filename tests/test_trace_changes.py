@@ -132,6 +132,7 @@ def _of_a_sine(robots, seed):
 SLOW = EffectSpec("input_lag", "w", {"time_constant": 0.1})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(2)))
 def test_a_sine_at_the_frequency_of_the_drive_is_a_gain_and_a_delay(seed):
     """A gain, a delay and a lag: of a drive of one frequency two numbers can be told, and no sine of its own."""

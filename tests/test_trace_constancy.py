@@ -60,6 +60,7 @@ def test_a_gain_that_is_more_here_and_less_there_is_no_gain(gain, token):
     assert found.judged.token == token
 
 
+@pytest.mark.slow
 def test_a_gain_that_is_one_number_is_not_told_to_vary():
     """The looks of 40 drives together have a chance of 40 ALPHA at most, of being told of 40 TOLD."""
     found = [uneven(_left(np.random.default_rng(seed), 400, lambda x, v, w: 0.75)) for seed in range(40)]
@@ -107,6 +108,7 @@ def test_a_number_that_varies_a_little_is_one_number_for_all_that_matters(by, to
     assert found is None or not found.sure
 
 
+@pytest.mark.slow
 def test_friction_that_is_more_at_some_places_is_not_told_as_friction_alone():
     """A joint on a guide that is dirty at one end."""
     rng, dt = np.random.default_rng(6), 1.0 / 30.0
@@ -123,6 +125,7 @@ def test_friction_that_is_more_at_some_places_is_not_told_as_friction_alone():
     assert "position" in result.depends_on
 
 
+@pytest.mark.slow
 def test_a_heading_that_drifts_goes_with_time():
     """A gyroscope on a robot with wheels: its way turns aside, and it seems to turn."""
     rng = np.random.default_rng(3)

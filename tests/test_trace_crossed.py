@@ -31,6 +31,7 @@ def _joint(friction, rows=1200, seed=4):
     return from_arrays(JOINT, [(y, u[:, None])])
 
 
+@pytest.mark.slow
 def test_friction_that_goes_as_a_bearing_warms_up_depends_on_the_speed():
     found = trace(_joint(lambda t, v: 2.0 * math.exp(-t / 4.0) * v), JOINT)
     assert found.depends_on[0] == "speed"

@@ -66,6 +66,7 @@ def test_a_range_in_words(low, high, said):
     assert Range("x", low, high, "m").text() == said
 
 
+@pytest.mark.slow
 def test_what_was_found_says_where():
     """On the page, in the account, in the model's file and in JSON; of all that was fitted and judged."""
     (data,) = recordings(GAIN, 1, steps=700, seed=45)
@@ -97,6 +98,7 @@ def test_inputs_are_told_as_they_were_asked():
     assert domain_of(replace(model, effects=(*model.effects, gain)), given) == domain_of(model, given)
 
 
+@pytest.mark.slow
 def test_where_nothing_was_found_nothing_is_said_to_be_found():
     (data,) = recordings([], 1, steps=700, seed=44)
     found = trace(data, declared())

@@ -84,6 +84,7 @@ def test_structure_in_wandering_noise_is_beyond_what_sliding_reaches():
         assert margin(terms, z, np.ones_like(z), 5.0) > 8.0
 
 
+@pytest.mark.slow
 def test_a_gain_well_above_the_size_that_could_be_seen_is_named():
     clean = recordings([], 1, steps=700, seed=41)[0]
     could = {(v.name, v.channel): v for v in trace(clean, declared()).could_see}
@@ -215,6 +216,7 @@ def test_a_heading_that_is_rounded_coarser_than_a_step_turns_it_is_noise_and_no_
     assert not found.outliers
 
 
+@pytest.mark.slow
 def test_a_robot_with_a_coarse_compass_is_traced():
     data = recordings([("input_gain", "w", {"gain": 0.6})], 1, steps=1500, seed=71, noise=2.0 * NOISE)[0]
     y = data.runs[0].y
@@ -254,6 +256,7 @@ def test_an_input_is_exactly_what_is_held_where_it_does_not_change_within_a_part
         assert np.count_nonzero(mixed) == (0 if late == 0.0 else apart)
 
 
+@pytest.mark.slow
 def test_what_was_searched_beside_a_model_is_known_when_it_is_searched_again(monkeypatch):
     looked_at = []
     looks = scores.screen

@@ -45,6 +45,7 @@ def _recording(y, u):
     return from_arrays(model, [(y, u)]), model
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, [108, 0, 1, 117]))
 def test_a_floor_on_which_it_turns_now_more_now_less_is_no_noise(seed):
     """Hills of half a metre: step by step what is left looks like noise of some colour."""
@@ -56,7 +57,7 @@ def test_a_floor_on_which_it_turns_now_more_now_less_is_no_noise(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.long
+@pytest.mark.slow
 def test_stripes_that_slip_are_no_slip_of_the_wheels(seed):
     rng = np.random.default_rng(seed)
     u = _held(rng, 600, [-0.5, -1.5], [0.5, 1.5])
@@ -89,6 +90,7 @@ def test_wide_stripes_are_a_field_although_noise_of_some_colour_follows_them(see
     assert (found.token, found.x.shape[2] > 30) == ("position", True)
 
 
+@pytest.mark.slow
 def test_one_input_that_weakens_another_is_told_although_the_residual_is_loud():
     """Beside the wheel that it moves, place and heading are known far better: terms may push that wheel, too."""
     rng = np.random.default_rng(1)
@@ -107,6 +109,7 @@ def test_one_input_that_weakens_another_is_told_although_the_residual_is_loud():
     assert (result.verdict, result.depends_on[:1]) == ("unexplained", ("cmd_left*cmd_right",))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, [200, 201, 203]))
 def test_a_floor_is_seen_beside_a_wind(seed):
     """Both are there: a push that is free to follow time closely follows the hills, too, but not as well as both together do. (It is seen
@@ -130,6 +133,7 @@ def test_a_floor_is_seen_beside_a_wind(seed):
     assert found.tokens[0] == "position"
 
 
+@pytest.mark.slow
 def test_a_wind_is_no_change_of_a_gain():
     """Beside the change, what is left no longer wanders beyond doubt: the change must gain more than the law of what wanders does."""
     rng = np.random.default_rng(9)
@@ -142,6 +146,7 @@ def test_a_wind_is_no_change_of_a_gain():
     assert result.effects == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, [26, 0, 13]))
 def test_winds_on_every_state_are_no_field(seed):
     """Each state is pushed by a wind of its own, half a second long: at first look, under a noise that has all of them in it, none
@@ -162,6 +167,7 @@ def test_winds_on_every_state_are_no_field(seed):
     assert (result.verdict, result.depends_on) == ("none", ("noise",))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("memory", first(1, [0.5, 8.0, 0.1, 2.0]))
 def test_a_push_that_wanders_is_no_field(memory):
     """Within some steps, or within a good part of the recording; whatever the robot does meanwhile, and wherever it is."""
@@ -255,6 +261,7 @@ def test_only_fields_that_stand_out_are_looked_at(monkeypatch):
             assert len(standing) < len(offered) / 2
 
 
+@pytest.mark.slow
 def test_a_wind_below_the_noise_of_a_step_is_not_nothing():
     """It is no more than wanders by itself, which has no name; but the account says that it is there."""
     rng = np.random.default_rng(4)

@@ -106,6 +106,7 @@ REFUSED = {
 TOO_LITTLE = {"twenty rows", "one row", "one moment", "nothing was done", "nothing but noise", "one row again and again"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOUNDS)
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_is_wrong_is_said_in_one_line(tmp_path, capsys, recorded, case, name):
@@ -118,6 +119,7 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path, capsys, recorded, case, nam
     assert len(err) < 400 + len(str(tmp_path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [180.0, 360.0])
 @pytest.mark.parametrize("name", POSES)
 def test_degrees_are_told_wrapped_or_not(tmp_path, capsys, recorded, name, turn):
@@ -139,6 +141,7 @@ WRITTEN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", WRITTEN)
 def test_what_is_only_written_otherwise_is_read(tmp_path, capsys, recorded, case):
     code, answer, _ = _trace(tmp_path, capsys, "joint", WRITTEN[case]("joint", *recorded["joint"]))
@@ -147,12 +150,14 @@ def test_what_is_only_written_otherwise_is_read(tmp_path, capsys, recorded, case
     assert answer["effects"][0]["parameters"]["gain"]["value"] == pytest.approx(0.75, abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_column_under_another_writing_is_not_taken_for_one_that_was_not_measured(tmp_path, capsys, recorded):
     code, _, err = _trace(tmp_path, capsys, "joint", _csv("joint", *recorded["joint"], header=("t", "q", "QD", "force")))
     assert code == 0
     assert "'QD' is read as qd" in err
 
 
+@pytest.mark.slow
 def test_a_recording_to_judge_on_must_be_long_enough_to_judge(tmp_path, capsys, recorded):
     t, y, u = recorded["unicycle"]
     other = y[:12] + np.random.default_rng(4).normal(0.0, 1e-3, (12, 3))  # another drive: its rows were not seen
@@ -164,6 +169,7 @@ def test_a_recording_to_judge_on_must_be_long_enough_to_judge(tmp_path, capsys, 
     assert "test.csv: 11 usable transitions of 0.05 s, at least 24 are needed: 13 more" in said
 
 
+@pytest.mark.slow
 def test_runs_of_two_rows_are_traced_whatever_goes_on_in_between(tmp_path, capsys, recorded):
     """As a campaign's table has them: no rollout is longer than its one step."""
     t, y, u = recorded["unicycle"]
@@ -176,6 +182,7 @@ def test_runs_of_two_rows_are_traced_whatever_goes_on_in_between(tmp_path, capsy
     assert json.loads(capsys.readouterr().out)["verdict"] != "sensor_fault"
 
 
+@pytest.mark.slow
 def test_no_state_is_another_thing_than_one_moment(tmp_path, capsys, recorded):
     t, y, u = recorded["unicycle"]
     code, _, err = _trace(tmp_path, capsys, "unicycle", _csv("unicycle", t, np.nan * y, u))
@@ -185,6 +192,7 @@ def test_no_state_is_another_thing_than_one_moment(tmp_path, capsys, recorded):
     assert (code, "qd cannot be told: fewer than " in err) == (3, True)
 
 
+@pytest.mark.slow
 def test_rollouts_shorter_than_asked_are_said(tmp_path, capsys, recorded):
     t, y, u = recorded["unicycle"]
     (tmp_path / "run.csv").write_text(_csv("unicycle", t, y, u))

@@ -53,6 +53,7 @@ def _on_a_wet_floor():
     return _unicycle(rng, u, lambda k, x: 0.55 if 300 <= k < 340 or 610 <= k < 640 else 1.0, "euler"), u
 
 
+@pytest.mark.slow
 def test_a_stretch_of_wet_floor_is_no_noise():
     result = _traced(*_on_a_wet_floor())
     assert result.verdict == "unexplained"
@@ -90,7 +91,7 @@ def test_a_push_that_wanders_slowly_is_no_episode(seed):
     assert episodes(left_of(given, evaluate(given, model))) is None
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_commands_that_are_lost_for_a_while_are_no_matter_of_another_input():
     """Six times a car's speed is nothing for six steps. These are wild, as it is measured well."""
     rng = np.random.default_rng(6)
@@ -114,7 +115,7 @@ def test_commands_that_are_lost_for_a_while_are_no_matter_of_another_input():
 
 
 @pytest.mark.parametrize("seed", [2, 5])
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_wheel_that_sticks_now_and_then_is_no_noise(seed):
     """It follows its command only where that changes by more than a little: a few commands are not carried out, each time another one."""
     rng = np.random.default_rng(seed)
@@ -135,6 +136,7 @@ def test_a_wheel_that_sticks_now_and_then_is_no_noise(seed):
     assert "time*cmd_left" in result.depends_on
 
 
+@pytest.mark.slow
 def test_commands_that_are_carried_out_in_steps_are_no_limit():
     """The largest command is cut to the last step: a saturation explains that, and nothing else of it."""
     rng = np.random.default_rng(5)
@@ -150,6 +152,7 @@ def test_commands_that_are_carried_out_in_steps_are_no_limit():
     assert result.depends_on[0] == "v"
 
 
+@pytest.mark.slow
 def test_a_push_that_swells_has_no_amplitude():
     """A sine whose amplitude grows threefold in the recording is not the library's sine, although that explains most of it."""
     rng = np.random.default_rng(6)
@@ -162,6 +165,7 @@ def test_a_push_that_swells_has_no_amplitude():
     assert {"time", "time*w"} & set(result.depends_on)
 
 
+@pytest.mark.slow
 def test_arcs_under_a_model_that_goes_straight_have_one_name():
     """A sideways slip of exactly half a step would say the same: that would be a coincidence, and is no tie."""
     rng = np.random.default_rng(7)
@@ -173,6 +177,7 @@ def test_arcs_under_a_model_that_goes_straight_have_one_name():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_of_explanations_that_tie_the_mildest_elsewhere_is_gone_on_with(seed):
     """Its speed was always the same: a gain, a limit at that speed, a deadband. A limit would stop the robot short at any higher speed."""
@@ -186,6 +191,7 @@ def test_of_explanations_that_tie_the_mildest_elsewhere_is_gone_on_with(seed):
     assert moved == pytest.approx(0.85 * 0.75 * DT, rel=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rests", [False, True])
 def test_of_what_ties_at_one_speed_the_one_is_gone_on_with_that_is_wrong_by_least_at_lower_and_at_higher_ones(rests):
     """A deadband is the mildest at three times the speed, and the worst of all at a third of it."""
@@ -215,6 +221,7 @@ def test_what_ties_and_does_little_is_left_out_of_the_model_where_it_may_do_harm
     assert result.to_json()["left_as_given"] is not repaired
 
 
+@pytest.mark.slow
 def test_when_something_broke_is_told_by_what_was_held_out_if_it_happened_there():
     """In the stretch between 30 % and 50 % of the time, which no fit sees: there it stood in the middle, wherever it was."""
     u = _held(np.random.default_rng(20), 1000, [0.1, -1.0], [0.5, 1.0])
@@ -239,6 +246,7 @@ def test_a_heading_that_nobody_steers_takes_no_name_away():
     assert ("input_gain", "v") in {(e.name, e.channel) for e in (*result.effects, *result.ambiguous_with)}
 
 
+@pytest.mark.slow
 def test_two_gains_that_agree_are_one():
     """A gyro's scale that differs by sign in the fourth digit only, and long data: significant, and nothing to anybody."""
     rng = np.random.default_rng(8)

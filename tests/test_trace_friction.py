@@ -41,6 +41,7 @@ def _joint(dt=0.01):
     return compose(ModelSpec("joint", dt, {"mass": INERTIA}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(2)))
 def test_a_joint_led_along_a_smooth_path_has_both_frictions_and_no_deadband(tmp_path, seed):
     rows = _recorded(np.random.default_rng(seed), 12.0)

@@ -89,11 +89,12 @@ def test_a_hidden_state_is_told_as_well_as_it_says_itself(model, what):
     assert found.error < 0.2  # of a level of 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("what", "name", "channel", "values"),
     [
         ({"gain": 0.8}, "input_gain", "pump", {"gain": 0.8}),
-        pytest.param({"k3": 1.15 * 0.055}, "parameter_change", "k3", {"ratio": 1.15}, marks=pytest.mark.long),
+        pytest.param({"k3": 1.15 * 0.055}, "parameter_change", "k3", {"ratio": 1.15}, marks=pytest.mark.slow),
         ({"k1": 0.85 * 0.054}, "parameter_change", "k1", {"ratio": 0.85}),
         ({"delay": 3}, "input_delay", "pump", {"delay": 12.0}),
     ],
@@ -107,12 +108,14 @@ def test_effects_are_named_with_their_numbers_though_one_tank_was_not_measured(t
         assert low - 0.002 * true <= true <= high + 0.002 * true
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_a_model_that_is_right_gets_no_name_though_its_steps_are_coarse(tmp_path, model, seed):
     result = trace(load_dataset(_lower_only(tmp_path, seed), model), model)
     assert result.verdict == "none"
 
 
+@pytest.mark.slow
 def test_the_output_says_what_was_not_measured_and_that_steps_are_taken_in_parts(tmp_path, model, capsys):
     path = _lower_only(tmp_path, gain=0.8)
     repaired = tmp_path / "repaired.toml"
@@ -158,6 +161,7 @@ def test_runs_and_lost_rows_are_told_each_by_itself(tmp_path, model):
     assert np.nanmax(np.abs(told[5:295] - levels[5:295, 0])) < 0.3
 
 
+@pytest.mark.slow
 def test_a_model_that_gives_no_numbers_beside_the_way_is_told_all_the_same(tmp_path):
     file = tmp_path / "strict.py"
     file.write_text(TANKS.replace("np.maximum(x, 0.0)", "np.where(x < 0.0, np.nan, x)"))
@@ -205,6 +209,7 @@ def step(x, u, dt, params):
 """
 
 
+@pytest.mark.slow
 def test_a_model_of_whole_steps_is_not_taken_in_parts(tmp_path):
     """As it was identified, whatever dt is: two of its halves are two of its steps."""
     file = tmp_path / "whole.py"
@@ -223,6 +228,7 @@ def test_a_model_of_whole_steps_is_not_taken_in_parts(tmp_path):
     assert result.effects[0].parameters["gain"][0] == pytest.approx(0.8, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_model_that_is_right_in_parts_is_written_in_parts(tmp_path, model, capsys):
     written = tmp_path / "written.toml"
     assert main(["trace", str(_lower_only(tmp_path)), "--model", model.spec.name, "--dt", "4", "-o", str(written), "--json"]) == 0

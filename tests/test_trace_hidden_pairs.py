@@ -27,6 +27,7 @@ def _followed(seed, effects):
     return model, from_arrays(model, [(np.array(states) + rng.normal(size=(ROWS + 1, 2)) * [0.004, 0.01], np.array(forces))])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, [0, 2]))
 def test_a_change_between_the_parts_that_are_fitted_is_found_beside_a_gain_and_dated(seed):
     effects = (EffectSpec("input_gain", "force", {"gain": 1.4}), EffectSpec("regime_change", "force", {"time": CHANGE_S, "gain": 1.6}))

@@ -3,6 +3,7 @@
 import tracemalloc
 
 import numpy as np
+import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
@@ -75,6 +76,7 @@ def test_inputs_are_known_from_the_beginning_of_a_run_and_measurements_where_the
     assert kept.steps.place.tolist() == [k for k in range(600, 800) if k not in {650, 700}]
 
 
+@pytest.mark.slow
 def test_a_play_as_wide_as_its_input_goes_is_found_with_its_width():
     """Its output moves at the beginning of the drive, and hardly ever again: it never forgets where that was."""
     rng = np.random.default_rng(6)

@@ -43,6 +43,7 @@ def test_clean_data_give_no_alarm(inputs):
     assert [trace(data, declared()).verdict for data in recordings([], 4, steps=STEPS, seed=11, inputs=inputs)] == ["none"] * 4
 
 
+@pytest.mark.slow
 def test_heavy_tails_are_no_effect_and_no_fault():
     rng = np.random.default_rng(5)
     for data in recordings([], 2, steps=STEPS, seed=12, noise=0.0 * NOISE):
@@ -65,6 +66,7 @@ def test_wandering_yaw_noise_gets_no_name():
     assert [trace(data, declared()).verdict for data in recordings([], 4, steps=STEPS, seed=200, outside=wander)] == ["none"] * 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", first(1, range(3)))
 @pytest.mark.parametrize(
     ("effects", "outside", "depends_on"),
@@ -124,6 +126,7 @@ def _driven(steps=STEPS, seed=41):
     return recordings([], 1, steps=steps, seed=seed)[0].runs[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "spoil",
     [
@@ -229,6 +232,7 @@ def test_one_push_that_did_less_is_no_end_stop():
     assert (found.verdict, found.effects) == ("unexplained", ())
 
 
+@pytest.mark.slow
 def test_what_only_the_fit_has_seen_is_said_to_be_unconfirmed():
     """What it is judged on asks for nothing of the kind."""
     rng = np.random.default_rng(1)
@@ -274,6 +278,7 @@ def test_what_is_done_at_two_times_is_not_done_at_one_because_nothing_between_th
     assert not verdict._once(problem(two, steps_of(two)), weak, model)
 
 
+@pytest.mark.slow
 def test_what_was_met_at_one_time_only_and_is_not_asked_for_elsewhere_gets_no_name(monkeypatch):
     """Numbers that were fitted without it foretell a little better or worse by chance, which confirms nothing."""
     data = recordings(GAIN, 1, steps=STEPS, seed=45)[0]
@@ -284,6 +289,7 @@ def test_what_was_met_at_one_time_only_and_is_not_asked_for_elsewhere_gets_no_na
     assert trace(data, declared()).effects == ()
 
 
+@pytest.mark.slow
 def test_measurements_without_noise_are_no_effect():
     for data in recordings([], 3, steps=STEPS, seed=44, noise=0.0 * NOISE):
         assert trace(data, declared()).verdict == "none"
@@ -369,6 +375,7 @@ def test_a_state_that_noise_takes_far_does_not_speak_for_one_that_it_does_not(mo
     assert foretells(judge(declared(), given), given, NOISE) == foretold
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_a_heading_that_is_pushed_about_takes_no_name_from_wheels_that_go_as_they_are_told(seed):
     """In a second, pushes that nobody commands turn the robot farther than its wheels do, and it is seen too coarsely to go anywhere."""
@@ -472,6 +479,7 @@ def test_arrays_that_are_no_recording_are_refused_in_a_line(spoil, error, said):
         trace(from_arrays(declared(), [spoil(y, u)]), declared())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_a_way_that_is_none_of_the_commands_gets_no_name(seed):
     """A random walk: what silences every input leaves noise, step by step, and a robot that goes by itself. No limit does that."""

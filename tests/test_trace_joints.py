@@ -63,6 +63,7 @@ def test_gravity_and_friction_that_hide_each_other_are_told_by_what_both_depend_
     assert set(left.tokens) == {"position", "speed"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 3, 5])
 def test_an_end_stop_is_told_by_the_position_and_not_by_the_force_against_it(seed):
     model = _joint()
@@ -121,6 +122,7 @@ def _from_point_to_point(seed, rows=3000, still=0.0):
     return np.column_stack([q, told]), torques[:, None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("still", [0.0, 0.54], ids=["as it moved", "with an encoder that stood still"])
 @pytest.mark.parametrize("seed", range(2))
 def test_a_filtered_speed_of_a_joint_that_rests_in_turn_is_no_actuator_that_answers_late(tmp_path, seed, still):

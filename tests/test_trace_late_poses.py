@@ -62,6 +62,7 @@ def test_rows_that_are_off_by_themselves_make_no_late_heading():
     assert late_pose(compose(ModelSpec("unicycle", 0.04)), [(Stream(t, pose), Stream(t[:1], np.zeros((1, 2))))], ()) == {}
 
 
+@pytest.mark.slow
 def test_a_short_recording_is_not_cut_down_to_what_a_long_delay_leaves():
     """Half a second at 1000 Hz, and a heading that is 1.2 rad off: one that stands still past the end seemed 0.49 s late."""
     made = make("one", 386005)

@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 from trace_sets.measured import RECORDINGS, trace_measured
 
+pytestmark = pytest.mark.slow
+
 FOLDER = Path(os.environ.get("S2R_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
@@ -22,7 +24,7 @@ def recorded(name):
 
     def marked(test):
         there = (FOLDER / RECORDINGS[name].fit).exists()
-        return pytest.mark.long(pytest.mark.skipif(not there, reason="the measured recordings are not here")(test))
+        return pytest.mark.slow(pytest.mark.skipif(not there, reason="the measured recordings are not here")(test))
 
     return marked
 

@@ -55,6 +55,7 @@ def _commanded(seed: int, *effects: EffectSpec, noise: float = 2e-3, slowly: boo
     return from_arrays(JOINT, [(np.array(states) + rng.normal(size=(rows + 1, 2)) * [1e-5, noise], u)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", first(1, [0.2, 0.5]))
 @pytest.mark.parametrize("seed", first(1, range(4)))
 def test_friction_that_takes_up_the_whole_torque_is_no_motor_that_does_nothing(seed, noise):
@@ -70,12 +71,14 @@ def test_friction_that_takes_up_the_whole_torque_is_no_motor_that_does_nothing(s
     assert not any(about_inputs(JOINT, token) for token in result.depends_on)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(4)))
 def test_a_torque_that_varies_hardly_more_than_its_noise_gets_no_name(seed):
     result = trace(_arm(seed, 1.0), JOINT)
     assert (result.verdict, result.effects) == ("unexplained", ())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(3)))
 def test_a_force_of_something_else_gets_no_name(seed):
     """Another joint's column: the robot goes, and not by this. It is about as large as friction would be, and does not vary like that."""
@@ -85,12 +88,14 @@ def test_a_force_of_something_else_gets_no_name(seed):
     assert (result.verdict, result.effects, result.measured_forces) == ("unexplained", (), False)
 
 
+@pytest.mark.slow
 def test_what_a_log_of_ours_says_was_sent_was_a_command():
     """It is not asked whether a torque was measured; what throttles it by so much is refuted all the same."""
     result = trace(replace(_arm(0, 0.5), commanded=True), JOINT)
     assert (result.verdict, result.effects, result.measured_forces) == ("unexplained", (), False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [2e-3, 0.02, 0.06])
 @pytest.mark.parametrize(
     ("name", "values"),
@@ -105,7 +110,7 @@ def test_what_throttles_a_command_keeps_its_name(name, values, noise):
 
 
 @pytest.mark.parametrize("noise", [0.05, 0.01])
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_weak_motor_with_friction_is_told_from_a_strong_one_with_more(noise, monkeypatch):
     """As a measurement the command would be friction of 6.7 N m s/rad, but for what moves the joint, which is small where it sways.
 
@@ -144,6 +149,7 @@ def test_what_is_left_of_a_command_is_held_against_the_force_that_the_motion_tak
     assert not refuted(evaluate(problem(data, steps), _with("input_gain", "force", gain=0.8)), judged_on)  # no more than a fifth too little
 
 
+@pytest.mark.slow
 def test_what_noise_makes_of_the_force_is_seldom_exceeded_and_not_by_far():
     """The most of 20 draws: exceeded once in 21 times, and near to what the same noise made of the recording. Of 40 recordings more than
     seven beyond it come by chance once in 1900.
@@ -229,6 +235,7 @@ def _led(seed: int, rows: int = 2500) -> Dataset:
     return from_arrays(compose(ModelSpec("joint", dt, {"mass": mass})), [(y, (np.array(torques) + 0.2 * noise)[:-1, None])])
 
 
+@pytest.mark.slow
 def test_noise_that_a_torque_sensor_filters_is_no_memory_of_the_motor():
     """As a command, the torque seems to have a play of 0.6 N m beside the friction, and memory that may be something else."""
     result = trace(_led(1), compose(ModelSpec("joint", 0.002, {"mass": 0.5})))
@@ -237,6 +244,7 @@ def test_noise_that_a_torque_sensor_filters_is_no_memory_of_the_motor():
     assert (result.verdict, result.depends_on, result.measured_forces) == ("traced", ("noise",), True)
 
 
+@pytest.mark.slow
 def test_a_motor_that_rings_under_commands_of_every_row_is_no_noise_of_a_sensor():
     """Nothing in the library does so: that its force was measured would hide it."""
     rng, dt, rows, parts = np.random.default_rng(1), 0.01, 1500, 10

@@ -49,7 +49,8 @@ def _undeclared(name):
     }
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.long) if n == "differential_drive" else n for n in ROBOTS])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "differential_drive" else n for n in ROBOTS])
 def test_effects_get_their_names_on_every_model_and_clean_data_give_none(name):
     dt, bounds, noise = ROBOTS[name]
     model, rng = _model(name), np.random.default_rng(17)
@@ -71,6 +72,7 @@ def test_arcs_are_told_from_an_euler_step():
     assert [(e.name, e.parameters["scheme"][0]) for e in found.effects] == [("integration_scheme", "exact")]
 
 
+@pytest.mark.slow
 def test_many_runs_are_traced_together_and_whole_runs_are_held_out():
     dt, bounds, noise = ROBOTS["bicycle"]
     model, rng = _model("bicycle"), np.random.default_rng(8)
@@ -105,6 +107,7 @@ def test_two_streams_with_stamps_of_their_own_give_the_delay_between_them():
     assert math.isclose(found.faults[0].to_s - found.faults[0].from_s, 2.0, abs_tol=0.06)
 
 
+@pytest.mark.slow
 def test_runs_that_begin_under_way_show_the_same_lag_as_those_from_rest():
     """Each run is cut out of a drive: before its first row the first command had been held for a while."""
     dt, _, noise = ROBOTS["bicycle"]
@@ -118,6 +121,7 @@ def test_runs_that_begin_under_way_show_the_same_lag_as_those_from_rest():
     assert found.effects[0].parameters["time_constant"][0] == pytest.approx(0.3, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_command_before_the_recording_began_that_nobody_recorded_is_let_be_forgotten():
     """A unicycle was on its way when it was asked to turn, a moment before the first row: its lag is still catching up."""
     rng, dt = np.random.default_rng(10), 0.01
@@ -143,6 +147,7 @@ def test_a_command_before_the_recording_began_that_nobody_recorded_is_let_be_for
     assert np.flatnonzero(~np.isnan(known.runs[0].y).any(axis=1))[0] == len(known.runs[0].y) - len(states[50:])
 
 
+@pytest.mark.slow
 def test_a_limit_that_is_met_in_the_first_rows_alone_is_no_command_from_before():
     """Nothing is found that remembers, so these rows count: the model does not explain them. Somebody may have held the robot, once."""
     rng, dt = np.random.default_rng(11), 0.01
@@ -155,6 +160,7 @@ def test_a_limit_that_is_met_in_the_first_rows_alone_is_no_command_from_before()
     assert found.forgetting == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("remembers", [False, True])
 def test_first_rows_count_where_nothing_remembers_and_are_told_where_something_does(tmp_path, remembers):
     """Of files that lack the wheels' speeds, of the one that is fitted and of the one that is judged on."""
@@ -195,6 +201,7 @@ def test_one_delay_of_all_inputs_gives_way_to_as_long_a_lag_of_each():
     assert [a.p["time_constant"] for a in found] == pytest.approx([0.3, 0.3], rel=0.05)
 
 
+@pytest.mark.slow
 def test_an_effect_that_is_hardly_noticed_is_named_where_what_it_leaves_is_noticed():
     """On arcs at 100 Hz rollouts of an Euler step end a twentieth farther off: a little less by the fit's part, a little more by all."""
     rng = np.random.default_rng(0)
@@ -206,6 +213,7 @@ def test_an_effect_that_is_hardly_noticed_is_named_where_what_it_leaves_is_notic
     assert [e.name for e in found.effects] == ["integration_scheme"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(3)))
 def test_a_car_that_is_fast_when_the_recording_begins_had_been_for_longer_than_its_lag(seed):
     """At 14 m/s with a lag of 0.8 s: what is left of it from rest is 0.3 m/s after three seconds, thirty times the speed's noise."""

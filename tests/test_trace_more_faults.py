@@ -111,7 +111,7 @@ def _cart(jump: float, seed: int = 1, other: float = 0.0) -> Dataset:
     return from_arrays(CART, [(y, u)])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_heading_that_jumps_by_what_the_commands_ask_within_a_step_is_seen_under_what_was_found():
     data = _cart(0.15)
     assert check(CART, data).faults == ()
@@ -121,12 +121,13 @@ def test_a_heading_that_jumps_by_what_the_commands_ask_within_a_step_is_seen_und
     assert named == {("input_delay", "*"), ("input_lag", "v"), ("input_lag", "w")}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_jump_that_was_seen_hides_no_other_one():
     result = trace(_cart(0.15, other=1.2), CART)
     assert [(f.kind, f.channel, round(f.from_s)) for f in result.faults] == [("offset_jump", "theta", 30), ("offset_jump", "theta", 60)]
 
 
+@pytest.mark.slow
 def test_a_jump_of_the_recording_that_is_judged_on_is_left_out_of_it():
     """It would be taken for what the repaired model does not foretell."""
     sound, jumped = _cart(0.0), _cart(0.15, seed=2)
@@ -135,7 +136,7 @@ def test_a_jump_of_the_recording_that_is_judged_on_is_left_out_of_it():
     assert rms(result.after.ends)[2] < 0.01
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_hits_its_stops_has_no_sensor_that_jumps():
     """Its speed does, whatever is found of the rest; positions do not."""
     robot = compose(ModelSpec("joint", DT_S, {"mass": 2.0}, (EffectSpec("viscous_friction", "qd", {"coefficient": 3.0}),)))

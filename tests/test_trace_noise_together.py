@@ -68,6 +68,7 @@ def test_where_nothing_is_hidden_states_are_asked_one_by_one():
     assert np.sqrt(fit.noise.r) == pytest.approx([1e-3, 2e-3], rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.02, 0.06])
 @pytest.mark.parametrize(
     ("name", "values"),
@@ -79,6 +80,7 @@ def test_a_loud_speed_hides_no_effect(name, values, noise):
     assert [(e.name, e.values) for e in result.effects] == [(name, {k: pytest.approx(v, rel=0.01) for k, v in values.items()})]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(10, 14)))
 @pytest.mark.parametrize(
     "effects",

@@ -62,6 +62,7 @@ def test_a_spring_is_told_from_pushes_where_positions_are_noisy():
     assert nearer(given, fit, base) > 0.5 * gain(fit, base) > 0.0
 
 
+@pytest.mark.slow
 def test_a_spring_that_noise_hides_is_named(monkeypatch):
     """And would not be, were it asked only where the sensors say that the robot is."""
     y, u = _sled(450.0, steps=260, seed=10, sigma=np.array([0.09, 0.05, 0.005, 0.09]), push=20.0)
@@ -74,6 +75,7 @@ def test_a_spring_that_noise_hides_is_named(monkeypatch):
     assert trace(data, model).verdict == "unexplained"
 
 
+@pytest.mark.slow
 def test_what_is_not_there_explains_no_more_where_the_robot_was():
     """Effects that are not there: what a noisy state adds to the best they do is a sixth of what a name takes, at the most."""
     most = 0.0

@@ -106,6 +106,7 @@ def _lost(data: Dataset, model: ComposedModel) -> tuple[str, ...]:
     return () if found is None else found.tokens
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", first(1, [6, 20]))
 @pytest.mark.parametrize("seed", first(1, range(3)))
 def test_commands_that_are_lost_are_no_delay_and_no_play_and_not_nothing(every: int, seed: int) -> None:
@@ -117,12 +118,14 @@ def test_commands_that_are_lost_are_no_delay_and_no_play_and_not_nothing(every: 
     assert {*_lost(data, CART)} == {"memory(v)", "memory(w)"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(3)))
 def test_commands_in_the_place_of_which_nothing_acts_are_no_weaker_input(seed: int) -> None:
     found = trace(_pushed(seed, 0.25, nothing=True), JOINT)
     assert (found.verdict, found.effects, found.depends_on) == ("unexplained", (), ("force",))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nothing", [False, True])
 def test_an_effect_keeps_its_name_beside_commands_that_are_lost_and_these_are_told(nothing: bool) -> None:
     found = trace(_pushed(1, 0.02, DRAG, nothing=nothing), JOINT)
@@ -131,6 +134,7 @@ def test_an_effect_keeps_its_name_beside_commands_that_are_lost_and_these_are_to
     assert found.depends_on[0] == found.may_depend_on[0] == ("force" if nothing else "memory(force)")
 
 
+@pytest.mark.slow
 def test_commands_that_come_late_within_their_steps_are_a_delay_on_average() -> None:
     late = np.random.default_rng(7).uniform(0.0, 1.0, ROWS)
     data = _driven(1, late)
@@ -175,6 +179,7 @@ def test_outliers_of_a_sensor_know_nothing_of_commands(seed: int) -> None:
     assert _lost(data, CART) == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", first(1, [0.1, 0.06, 0.15]))
 @pytest.mark.parametrize("seed", first(2, range(6)))
 def test_rows_that_are_one_sample_old_are_no_commands_that_are_lost(seed: int, share: float, request: pytest.FixtureRequest) -> None:
@@ -196,6 +201,7 @@ def test_rows_that_are_one_sample_old_are_no_commands_that_are_lost(seed: int, s
     assert (found.verdict in {"none", "sensor_fault"}, {*found.depends_on} - {"noise"}) == (True, set())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(6)))
 def test_nor_are_they_where_every_command_sets_what_is_measured_anew(seed: int) -> None:
     """Of a wheel's speed alone nobody can tell; the pose, which goes on from where it was, can."""
@@ -204,6 +210,7 @@ def test_nor_are_they_where_every_command_sets_what_is_measured_anew(seed: int) 
     assert (lost.verdict, {*lost.depends_on}) == ("unexplained", {"memory(cmd_left)", "memory(cmd_right)"})
 
 
+@pytest.mark.slow
 def test_where_it_cannot_be_told_whether_rows_are_old_or_commands_lost_it_is_a_doubt_and_no_finding() -> None:
     """A pose measured to 20 cm and 0.2 rad does not show where single commands took the vehicle."""
     data = _wheeled(1, BICYCLE, 0.8, lost=0.05, place=0.2)
@@ -216,6 +223,7 @@ def test_where_it_cannot_be_told_whether_rows_are_old_or_commands_lost_it_is_a_d
     assert "memory(speed_cmd)" in result.may_depend_on
 
 
+@pytest.mark.slow
 def test_steps_in_which_rows_are_old_are_asked_no_more_if_commands_were_lost() -> None:
     """Of one wheel's command alone, which is less in the same steps, it cannot be told."""
     data = _wheeled(1, WHEELS, 8.0, old=0.1, loud=3.0)
@@ -272,6 +280,7 @@ def test_losses_do_not_hide_behind_the_noise_that_they_make_themselves(tmp_path:
     assert (found.verdict, found.effects, found.depends_on) == ("unexplained", (), ("volt",))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(6)))
 def test_a_shock_that_rebounds_is_one(seed: int) -> None:
     """Three in a hundred steps: the part that is fitted sees some twenty. (Of two in a hundred, one seed in eight names another drag.)"""

@@ -94,6 +94,7 @@ def test_the_time_of_a_change_leaves_a_peak_that_is_not_the_highest():
     assert retimed(given, fit).model.effects[0].p["time"] == pytest.approx(9.33, abs=0.1)
 
 
+@pytest.mark.slow
 def test_the_time_of_a_change_lies_in_its_interval_as_often_as_that_says():
     covered = 0
     for seed in range(30):
@@ -239,6 +240,7 @@ def _within_steps(**effects):
     return given, fitted(given, evaluate(given, model), model)
 
 
+@pytest.mark.slow
 def test_a_lag_is_told_right_where_commands_come_within_steps():
     """On a clock of their own: a change that counts as a mean over a quarter of a step looks like more delay and less lag."""
     _, fit = _within_steps(input_delay={"delay": 0.094}, input_lag={"time_constant": 0.112})

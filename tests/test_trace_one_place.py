@@ -30,6 +30,7 @@ def _runs(robot, starts, seed=0, steps=1):
     return runs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [1, 2])
 def test_runs_from_one_place_lack_nothing(steps):
     result = trace(from_arrays(_joint(), _runs(_joint(), np.zeros((300, 2)), steps=steps)), _joint())

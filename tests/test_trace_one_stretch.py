@@ -75,6 +75,7 @@ def test_a_change_at_some_time_is_about_time_anyhow():
     assert not in_one_stretch(given, evaluate(given, _named("regime_change", {"time": 39.5, "gain": 0.5})))
 
 
+@pytest.mark.slow
 def test_the_answer_says_that_a_name_may_be_about_that_time(monkeypatch):
     data = _limited((3, 11, 22, 34))
     for once in (False, True):
@@ -84,6 +85,7 @@ def test_the_answer_says_that_a_name_may_be_about_that_time(monkeypatch):
         assert ("time" in found.may_depend_on) == ("time" in found.depends_on) == once
 
 
+@pytest.mark.slow
 def test_what_is_left_beyond_doubt_is_no_less_sure_for_a_name_from_one_stretch():
     found = trace(_limited((3, 11, 22, 34)), UNICYCLE)
     left = replace(found, depends_on=("time",))

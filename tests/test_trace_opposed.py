@@ -58,12 +58,14 @@ def test_a_torque_that_does_less_is_one_in_closed_loop_too(gain):
     assert opposed(given, fit) == ()
 
 
+@pytest.mark.slow
 def test_chance_makes_states_seem_to_push_no_more_often_than_it_is_said():
     """One in a thousand of 100: more than one is a chance of one in 200."""
     wrong = sum(bool(opposed(*_fit(_led(seed, gain=0.7, rows=300), "input_gain", {"gain": 0.7}))) for seed in range(100, 200))
     assert wrong <= 1
 
 
+@pytest.mark.slow
 def test_weight_and_friction_of_a_link_that_is_led_slowly_are_told_as_what_they_depend_on():
     found = trace(_led(2, gravity=8.0, viscous=1.5), JOINT)
     assert (found.verdict, found.effects) == ("unexplained", ())

@@ -66,6 +66,7 @@ def test_slow_actuators_are_no_accelerations(time_constant, seed):
     check_accelerations(UNICYCLE, _driven(rng, _held(rng, [1.0, 0.5]), _lags(time_constant, time_constant)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(2)))
 def test_the_speeds_of_two_wheels_are_not_those_of_a_body(seed):
     """Gains and couplings make up for it, to the last digit: they are another model."""
@@ -76,6 +77,7 @@ def test_the_speeds_of_two_wheels_are_not_those_of_a_body(seed):
     assert len(found.partial) > 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(2)))
 def test_what_crosses_over_from_an_input_is_no_other_model_although_the_one_given_foretells_nothing(seed):
     """Wheels that are slow clip nearly all that is asked, and half of what is left of v comes from w."""
@@ -108,6 +110,7 @@ def test_a_lag_that_may_be_longer_than_any_run_is_an_integral():
     assert endless(short, lambda: pytest.fail("of a short lag no interval is asked"), data) == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(3)))
 def test_what_an_input_does_instead_is_asked_of_the_input_and_not_of_what_is_left_of_it(seed):
     """Of a robot that goes sideways where the model turns, a deadband of w swallows all turning, and with it what goes with w."""
@@ -117,6 +120,7 @@ def test_what_an_input_does_instead_is_asked_of_the_input_and_not_of_what_is_lef
     assert not found.effects
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(2)))
 @pytest.mark.parametrize("late", first(1, [8, 16]))
 def test_a_robot_that_answers_late_and_weakly_by_both_inputs_gets_all_its_names(late, seed):
@@ -133,6 +137,7 @@ def test_a_robot_that_answers_late_and_weakly_by_both_inputs_gets_all_its_names(
     assert [told["input_gain", name]["gain"][0] for name in ("v", "w")] == pytest.approx([0.3, 0.4], abs=0.005)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(3)))
 def test_commands_on_another_clock_from_some_time_on_have_not_lost_their_effect(seed):
     """The robot goes on by what it is told, recorded 2.5 s away: no input that does nothing from then on makes it go there."""
@@ -144,6 +149,7 @@ def test_commands_on_another_clock_from_some_time_on_have_not_lost_their_effect(
     assert not found.effects
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(2)))
 def test_a_wheel_drive_that_failed_on_the_way_is_named(seed):
     rng = np.random.default_rng([54, seed])

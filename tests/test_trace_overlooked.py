@@ -57,6 +57,7 @@ def test_nothing_is_asked_again_where_the_rest_says_too_little(monkeypatch):
     assert scores.overlooked(given, base, [], scores.STRICT, 20.0) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.9, 1.1])
 def test_what_makes_next_to_nothing_of_what_is_looked_for_is_not_gone_on_from(share):
     """A drag that explains so many nats, where something without a name explains a little fewer, or more, than five times as many."""

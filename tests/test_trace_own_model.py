@@ -129,6 +129,7 @@ def test_parameters_that_act_only_far_from_zero_are_not_taken_for_one(tmp_path):
     assert [same(nominal, "parameter_change", name, {"ratio": 0.8}) for name in ("most", "weir", "crest", "spill")] == [[]] * 4
 
 
+@pytest.mark.slow
 def test_a_model_that_fails_at_other_values_is_traced_all_the_same(tmp_path):
     """The right one cannot be tried; what can be lowers the error."""
     model = _model(tmp_path, narrowest=0.041)
@@ -148,6 +149,7 @@ def step(x, u, dt, params):
 """
 
 
+@pytest.mark.slow
 def test_a_robot_that_answers_at_once_and_is_asked_for_something_else_in_every_step_is_traced(tmp_path):
     """It goes no farther in ten steps than in one, and it is not noise that moves it."""
     path = tmp_path / "fan.py"
@@ -199,6 +201,7 @@ def _stuck(model):
     return from_arrays(model, [(np.array(levels)[:, None], np.array(asked)[:, None])])
 
 
+@pytest.mark.slow
 def test_a_valve_that_sticks_and_jumps_is_no_play(tmp_path):
     """A play follows every change but the first part of it."""
     model = _model(tmp_path)
@@ -232,6 +235,7 @@ def step(x, u, dt, params):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("reach", "short", "name"), [(0.08, 0.03, None), (0.04, 0.04, "input_backlash")], ids=["sticks", "play"])
 def test_a_valve_that_jumps_and_stays_short_of_what_is_asked_is_no_play(tmp_path, reach, short, name):
     """It stays until it is asked for something beyond its reach: if it then stays as short as that, it is a play of twice the reach."""
@@ -306,6 +310,7 @@ def step(x, u, dt, params):
 """
 
 
+@pytest.mark.slow
 def test_a_push_on_a_flying_robot_of_which_only_speeds_are_known(tmp_path):
     path = tmp_path / "flying.py"
     path.write_text(FLYING)
@@ -353,6 +358,7 @@ def step(x, u, dt, params):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(4)))
 def test_a_reaction_that_runs_away_under_other_values_ends_no_trace(tmp_path, seed):
     """Rates go with e to the power of what temperature is: in a candidate's steps, and in rollouts, numbers leave what a computer holds."""
@@ -442,6 +448,7 @@ def test_how_an_own_model_integrates_is_asked_of_its_steps_alone(tmp_path):
     assert not steps_coarsely(_pool(tmp_path, nowhere).nominal)
 
 
+@pytest.mark.slow
 def test_a_step_in_parts_is_off_by_a_higher_power_of_its_length(tmp_path):
     """Against a solution in ten thousand steps: a step of Euler's is off by its square, one in parts by its fourth power."""
     model = _pool(tmp_path)

@@ -71,6 +71,7 @@ def test_a_level_beyond_the_range_of_its_sensor_is_a_fault_and_the_pump_is_still
     assert {e.name for e in (*found.effects, *found.ambiguous_with)} & {"input_gain", "parameter_change"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(6)))
 def test_a_tank_that_is_full_under_a_sensor_that_goes_farther_is_none(tmp_path, seed):
     """The sensor's noise goes on."""
@@ -80,6 +81,7 @@ def test_a_tank_that_is_full_under_a_sensor_that_goes_farther_is_none(tmp_path, 
     assert _frozen(from_arrays(model, [(y, u)]), model) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first(1, range(6)))
 def test_an_end_of_range_of_an_angle_is_told_and_an_end_stop_is_not(seed):
     rng = np.random.default_rng(9 + seed)

@@ -21,12 +21,13 @@ def _spiked(q):
     q[6000] += 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "kind", "begins", "ends"),
     [
-        pytest.param(_frozen, "frozen", 4.0, 4.3, marks=pytest.mark.long),
+        pytest.param(_frozen, "frozen", 4.0, 4.3, marks=pytest.mark.slow),
         (_jumped, "offset_jump", 5.0, 10.0),
-        pytest.param(_spiked, "spike", 6.0, 6.0, marks=pytest.mark.long),
+        pytest.param(_spiked, "spike", 6.0, 6.0, marks=pytest.mark.slow),
     ],
 )
 def test_a_fault_of_a_position_alone_is_found_where_it_is_and_takes_no_name_away(tmp_path, wrong, kind, begins, ends):

@@ -54,6 +54,7 @@ def _late(states, rows=3):
     return np.column_stack([np.concatenate([np.full(rows, states[0, 0]), states[:-rows, 0]]), states[:, 1]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "measured",
     [lambda s: s * [1.08, 1.0], lambda s: s * [1.0, 1.08], _late],

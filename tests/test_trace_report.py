@@ -58,6 +58,7 @@ def results():
     return {verdict: trace(_data(verdict), UNICYCLE) for verdict in VERDICTS}
 
 
+@pytest.mark.slow
 def test_what_no_rollout_shows_is_told_beside_a_name_and_takes_nothing_from_it(results):
     r = replace(results["traced"], depends_on=("w",), may_depend_on=("w",))
     assert r.text().splitlines()[0].endswith("explain what was left over")
@@ -85,6 +86,7 @@ def test_a_rival_that_two_explanations_share_is_listed_once():
     assert each_once([delay, again, slip]) == (delay, slip)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_the_account_opens_with_the_verdict_and_fits_a_terminal(results, verdict):
     text = results[verdict].text()
@@ -95,6 +97,7 @@ def test_the_account_opens_with_the_verdict_and_fits_a_terminal(results, verdict
     assert "theta (deg)" in text
 
 
+@pytest.mark.slow
 def test_the_account_says_what_was_left_over_and_what_it_followed(results):
     text = results["traced"].text()
     left = text[text.index("\nleft over") : text.index("error, rms")]
@@ -103,6 +106,7 @@ def test_the_account_says_what_was_left_over_and_what_it_followed(results):
     assert re.search(r"ends [\d.]+ times the noise away\s+after 1 s", left)
 
 
+@pytest.mark.slow
 def test_the_account_says_what_explains_it_with_numbers_units_and_intervals(results):
     text = results["traced"].text()
     assert re.search(r"input_gain on w: gain = 0\.[78]\d+ \(95 %: 0\.\d+ to 0\.8\d+\)", text)
@@ -113,6 +117,7 @@ def test_the_account_says_what_explains_it_with_numbers_units_and_intervals(resu
     assert "still there nothing beyond noise" in text
 
 
+@pytest.mark.slow
 def test_a_tie_lists_its_rivals_and_what_to_drive(results):
     r = results["ambiguous"]
     assert len(r.rivals) >= 1
@@ -122,6 +127,7 @@ def test_a_tie_lists_its_rivals_and_what_to_drive(results):
     assert "--suggest FILE.csv" in text
 
 
+@pytest.mark.slow
 def test_what_has_no_name_gets_none_and_nothing_is_said_to_have_changed(results):
     text = results["unexplained"].text()
     assert "so it gets no name" in text
@@ -130,6 +136,7 @@ def test_what_has_no_name_gets_none_and_nothing_is_said_to_have_changed(results)
     assert re.search(r"\d+ % of it, noise included, is (v|w) times\s+a\s+factor that follows the\s+heading", text)
 
 
+@pytest.mark.slow
 def test_structure_without_a_name_is_not_counted_as_noise(results):
     """The sensors' noise is known here, and nothing pushes the robot: a rollout that begins and ends at measured rows is off by twice
     its variance. The structure's own rollouts end some thirty times as far.
@@ -141,12 +148,14 @@ def test_structure_without_a_name_is_not_counted_as_noise(results):
     assert r.before.ends[:, 2].std() > 10.0 * r.floor[1][2]
 
 
+@pytest.mark.slow
 def test_faults_are_told_with_their_times(results):
     text = results["sensor_fault"].text()
     assert re.search(r"faults +offset_jump of x from 25.000 to 45.000 s", text)
     assert "none: " not in text
 
 
+@pytest.mark.slow
 def test_the_json_tells_every_key_of_its_page_and_no_other(results):
     row = next(line for line in (Path(__file__).parents[1] / "docs" / "json.md").read_text().splitlines() if line.startswith("| `trace` |"))
     words = set(re.findall(r"`([a-z_]+)`", row))
@@ -159,6 +168,7 @@ def test_the_json_tells_every_key_of_its_page_and_no_other(results):
     assert all("same_thing" in e for e in results["ambiguous"].to_json()["ambiguous_with"])
 
 
+@pytest.mark.slow
 def test_the_same_thing_under_another_name_is_no_rival(results):
     """A unicycle's gain of w is its track_scale."""
     gain = Found("input_gain", "w", {"gain": (0.8, 0.79, 0.81, "-")})
@@ -183,6 +193,7 @@ def test_the_same_thing_under_another_name_is_no_rival(results):
         assert page.html().count("the same thing on this model") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("left", [(), ("noise",)])
 def test_a_page_says_of_what_a_name_may_depend_on_no_more_than_that(results, left):
     told = {**results["traced"].to_json(), "depends_on": [*left, "time"], "may_depend_on": ["time"]}
@@ -215,6 +226,7 @@ def test_a_value_is_written_as_exactly_as_it_is_known(value, low, high, unit, te
     assert interval_text(value, low, high, unit) == text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_a_page_is_self_contained_and_of_modest_size(pages, verdict):
     self_contained(pages[verdict])
@@ -222,6 +234,7 @@ def test_a_page_is_self_contained_and_of_modest_size(pages, verdict):
     assert f"{verdict}: " in pages[verdict]
 
 
+@pytest.mark.slow
 def test_a_page_shows_the_residual_against_every_input_and_state_and_time(pages):
     for part in ("along", "across", "theta"):
         for variable in ("v", "w", "x", "y", "theta", "time"):
@@ -235,6 +248,7 @@ def test_a_page_shows_the_residual_against_every_input_and_state_and_time(pages)
     assert "input_gain on w</span>" in pages["traced"]
 
 
+@pytest.mark.slow
 def test_a_page_shows_the_shape_of_what_is_left_and_lends_it_no_name(pages):
     page = pages["unexplained"]
     assert re.search(r'aria-label="what is left of \w+ against theta"', page)
@@ -242,6 +256,7 @@ def test_a_page_shows_the_shape_of_what_is_left_and_lends_it_no_name(pages):
     assert "What is left, and what it depends on" not in pages["traced"]
 
 
+@pytest.mark.slow
 def test_what_hardly_shows_in_single_steps_is_drawn_against_what_it_depends_on_all_the_same(results):
     """Held-out steps are few: what was told by rollouts, or by what was fitted, need not stand out in them."""
     page = trace_page(replace(results["unexplained"], depends_on=("w*v",)))
@@ -253,6 +268,7 @@ def test_what_hardly_shows_in_single_steps_is_drawn_against_what_it_depends_on_a
     assert "mean of what is left, a step" in page
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_a_page_says_what_a_residual_follows_only_where_there_is_more_than_noise(results, pages, verdict):
     told = re.findall(r"<h3>Residual (?:of )?([^<]*)</h3><p class=.?soft.?>[^<]*of what is not noise", pages[verdict])
@@ -262,12 +278,14 @@ def test_a_page_says_what_a_residual_follows_only_where_there_is_more_than_noise
     assert pages[verdict].count("of what is not noise") == len(told)
 
 
+@pytest.mark.slow
 def test_a_page_says_nothing_of_what_goes_along_with_a_residual_within_the_noise(results):
     one_step, end = results["traced"].floor
     for quiet in (replace(results["traced"], floor=(10.0 * one_step, end)), replace(results["traced"], verdict="sensor_fault")):
         assert "of what is not noise" not in trace_page(quiet)
 
 
+@pytest.mark.slow
 def test_the_same_time_stands_at_the_same_place_in_residuals_over_time(pages):
     figures = re.findall(r'<svg role="img" aria-label="residual of \w+ over time".*?</svg>', pages["traced"], re.DOTALL)
     axes = [re.findall(r"[ML] (\S+) (\S+)", re.findall(r'<path d="([^"]*)"', figure)[1]) for figure in figures]  # after the paper
@@ -277,6 +295,7 @@ def test_the_same_time_stands_at_the_same_place_in_residuals_over_time(pages):
     assert (left, right) == pytest.approx((0.085 * 756.0, 0.99 * 756.0))
 
 
+@pytest.mark.slow
 def test_a_page_of_a_name_that_leaves_something_says_that_it_explains_a_part(results):
     for left, said in (
         ((), "the residual is explained by the effects below"),
@@ -287,6 +306,7 @@ def test_a_page_of_a_name_that_leaves_something_says_that_it_explains_a_part(res
         assert f"traced: {said}." in page.html()
 
 
+@pytest.mark.slow
 def test_a_page_marks_the_faults_on_the_time_axis(pages):
     figure = re.search(r'<svg role="img" aria-label="residual of along over time".*?</svg>', pages["sensor_fault"], re.DOTALL)
     assert figure is not None
@@ -295,6 +315,7 @@ def test_a_page_marks_the_faults_on_the_time_axis(pages):
     assert "offset_jump</text>" not in pages["traced"]
 
 
+@pytest.mark.slow
 def test_words_on_axes_keep_their_digits_and_colours_follow_the_window(pages):
     """Coordinates are shortened, numbers that a person reads are not."""
     fig, (ax,) = plots.figure()
@@ -308,6 +329,7 @@ def test_words_on_axes_keep_their_digits_and_colours_follow_the_window(pages):
     assert "prefers-color-scheme:dark" in pages["none"]
 
 
+@pytest.mark.slow
 def test_the_worst_rollout_is_shown(results):
     r = results["traced"]
     worst = stretches(r)[0]
@@ -332,6 +354,7 @@ MEASURE = (
 )
 
 
+@pytest.mark.slow
 @needs_chromium
 @pytest.mark.parametrize("verdict", VERDICTS)
 @pytest.mark.parametrize("width", [500, 1280])
@@ -348,9 +371,10 @@ def test_a_page_fits_narrow_and_wide_windows(pages, verdict, width, tmp_path):
     assert figures >= 25
 
 
-SLOW = [pytest.param(name, marks=pytest.mark.long) for name in ("differential_drive", "bicycle", "double_integrator")]
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("differential_drive", "bicycle", "double_integrator")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["joint", *SLOW])
 def test_other_models_have_their_page_too(name):
     dt, bounds, noise = {
@@ -376,6 +400,7 @@ def test_other_models_have_their_page_too(name):
     assert max(len(line) for line in result.text().splitlines()) <= 100
 
 
+@pytest.mark.slow
 def test_a_suggested_drive_stands_on_the_page(results):
     drive_next = suggest(results["ambiguous"], duration=4.0)
     page = trace_page(results["ambiguous"], drive_next)
@@ -384,7 +409,7 @@ def test_a_suggested_drive_stands_on_the_page(results):
     assert 'aria-label="suggested w over time"' in page
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_page_of_a_hundred_thousand_rows_stays_a_page():
     rng = np.random.default_rng(3)
     u = commands(rng, 1, 100_000, DT, BOUNDS)
@@ -403,6 +428,7 @@ def test_a_gain_that_is_just_that_of_a_unit_is_asked_about(gain, unit):
     assert words.endswith(f"(is it told in {unit}?)" if unit else "commanded")
 
 
+@pytest.mark.slow
 def test_the_account_says_which_numbers_of_the_model_nobody_said(results, tmp_path):
     def of(**parameters):
         return _assumed(replace(results["none"], nominal=compose(ModelSpec("differential_drive", 0.05, parameters))))

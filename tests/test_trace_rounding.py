@@ -29,12 +29,14 @@ def _driven(seed, answers=lambda v: v, rows=1500):
     return model, from_arrays(model, [(y, command)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_what_a_coarse_sensor_rounds_off_after_some_noise_is_no_structure(seed):
     model, data = _driven(seed)
     assert trace(data, model).verdict == "none"
 
 
+@pytest.mark.slow
 def test_what_is_more_than_rounding_is_told():
     model, data = _driven(4, lambda v: v - 0.3 * np.sin(1.3 * v))  # no step of the sensor: it comes again every five metres a second
     result = trace(data, model)

@@ -74,6 +74,7 @@ def test_by_each_name_the_model_does_the_same():
     assert np.allclose(steps[0], steps[1], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_trace_tells_them_and_stays_traced():
     found = trace(recordings([("input_gain", "w", {"gain": 0.8})], 1, steps=700, seed=3)[0], declared())
     assert (found.verdict, found.rivals, found.suggested_excitation) == ("traced", (), None)
@@ -101,6 +102,7 @@ def test_a_point_beside_the_middle_is_a_speed_by_turning_where_the_robot_moves_o
     assert _called(compose(ModelSpec("unicycle", 0.05)), plainly) == ()
 
 
+@pytest.mark.slow
 def test_of_one_input_all_inputs_is_no_other_name_that_a_person_is_told():
     rng = np.random.default_rng(4)
     robot = compose(
@@ -126,6 +128,7 @@ def test_of_one_input_all_inputs_is_no_other_name_that_a_person_is_told():
     assert page.html().count("input_delay") == 1
 
 
+@pytest.mark.slow
 def test_of_two_names_for_one_rival_the_first_is_told_and_none_of_what_was_found():
     """A push ahead that fitted a little to the side, too, is a bias of the speed all the same."""
     found = trace(recordings([("input_gain", "w", {"gain": 0.8})], 1, steps=700, seed=3)[0], declared())
@@ -184,6 +187,7 @@ def test_two_effects_that_share_another_name_both_have_it():
     ]
 
 
+@pytest.mark.slow
 def test_of_several_effects_each_rival_says_which_it_stands_for():
     """A robot that only ever turns at 0 or 1 rad/s does not tell a gain from a limit; what slows its speed is told."""
     rng = np.random.default_rng(4)

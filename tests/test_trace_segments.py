@@ -94,6 +94,7 @@ def test_wild_positions_hide_no_compass_that_jumped(tmp_path):
     assert 15 < found.outliers < 70  # three of a hundred of 1440
 
 
+@pytest.mark.slow
 def test_what_is_found_beside_it_is_what_the_robot_does(tmp_path):
     runs = _drives(effects=[("input_gain", "w", {"gain": 0.8})])
     for k in range(15, RUNS):
@@ -141,6 +142,7 @@ def test_what_holds_a_robot_while_it_is_asked_to_move_is_no_frozen_sensor(tmp_pa
         assert not [f for f in _found(tmp_path, runs).faults if f.kind == "frozen"]
 
 
+@pytest.mark.slow
 def test_runs_that_all_begin_at_the_origin_have_a_noise_floor(tmp_path):
     """Rollouts begin where every window does, and may leave that place: the noise of what they end at is no rounding error."""
     runs = _drives(effects=[("input_gain", "w", {"gain": 0.7})], noise=(0.02, 0.02, 0.02))

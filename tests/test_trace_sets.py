@@ -50,6 +50,7 @@ def constant(steps, *values):
 # ---------------------------------------------------------------- reproducible
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", ["clean_jittered", "one", "outside", "tie", "fault"])
 def test_the_same_seed_makes_the_same_bytes_and_another_one_others(family, tmp_path):
     texts = []
@@ -73,6 +74,7 @@ def test_seeds_to_tune_on_and_untouched_ones_are_disjoint():
     assert TUNING.stop <= UNTOUCHED.start
 
 
+@pytest.mark.slow
 def test_every_family_is_driven_with_a_known_model():
     for family in set(FAMILIES) - {"long", "long_clean"}:
         given = make(family, 2)
@@ -276,6 +278,7 @@ def test_coloured_noise_has_its_time_constant_and_outliers_their_share():
 # ---------------------------------------------------------------- the library's own effects, against this physics
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", PLANTS)
 def test_the_library_means_the_same_by_its_effects(robot):
     """With the true effect and its true values, the project's model reaches what there is to be reached."""
@@ -491,6 +494,7 @@ def test_a_crash_is_never_left_out():
     assert row(records, "false alarms, clean, white").found == "0.0%"
 
 
+@pytest.mark.slow
 def test_the_bench_reads_its_own_records_and_prints_failures_in_a_line_each(tmp_path):
     common = {"robot": "unicycle", "rate": 50.0, "law": "holds", "layout": "grid", "noise": "white", "runs": 1, "euler": False}
     wrong = record_of("one", "wrong", seed=7, verdict="traced", effects=[effect("input_bias", "w", bias=(0.1, 0.0, 0.2))], **common)

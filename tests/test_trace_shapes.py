@@ -198,13 +198,14 @@ def test_runs_side_by_side_are_the_runs_one_by_one(name):
         assert np.array_equal(together[:, i], BY_NAME[name].input_sequence(u[:, i], UNICYCLE.nominal, "w", DT, p))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", first(1, range(2)))
 @pytest.mark.parametrize(
     ("physics", "token"),
     [
         (("ringing", "w", {"rate": 9.0, "damping": 0.2}), "memory(w)"),
         (("warming", "w", {"loss": 2.0, "time_constant": 2.0}), "memory(w)"),
-        pytest.param(("cubic", "w", {"share": -0.5}), "w", marks=pytest.mark.long),
+        pytest.param(("cubic", "w", {"share": -0.5}), "w", marks=pytest.mark.slow),
     ],
     ids=["ringing", "warming", "cubic"],
 )

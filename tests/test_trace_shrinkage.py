@@ -12,6 +12,8 @@ from s2r_runtime.trace.intervals import spread_of
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.shrinkage import _size, drawn_in
 
+pytestmark = pytest.mark.slow
+
 FIELD = [[0.02, 0.04], [-0.03, 0.01]]
 
 

@@ -13,6 +13,8 @@ from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.state_shapes import STATE_SHAPES, starts
 from s2r_runtime.trace.tracer import trace
 
+pytestmark = pytest.mark.slow
+
 DT = 0.02
 JOINT = compose(ModelSpec("joint", DT, {"mass": 0.8}))
 POWER, ABOVE, BELOW = STATE_SHAPES

@@ -18,6 +18,8 @@ from s2r_runtime.trace.straight import ROUNDS, samples_of, straight
 from s2r_runtime.trace.tracer import load_dataset, trace
 from s2r_runtime.trace.ways import Samples, Way
 
+pytestmark = pytest.mark.slow
+
 DT_S, TICKS, NOISE = 0.02, 10, 1e-3
 
 

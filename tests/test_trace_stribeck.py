@@ -9,6 +9,8 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.tracer import trace
 
+pytestmark = pytest.mark.slow
+
 DT, MASS, ROWS, RAMP = 0.02, 2.0, 900, 60
 CURVE = {"force": 0.4, "static_force": 1.0, "velocity": 0.12}
 

@@ -22,6 +22,8 @@ from s2r_runtime.trace.excitation import advice, suggest, suggest_first
 from s2r_runtime.trace.suggestion import ENOUGH
 from s2r_runtime.trace.tracer import trace
 
+pytestmark = pytest.mark.slow
+
 DT, NOISE, STEPS = 0.05, np.array([0.002, 0.002, 0.006]), 1200
 UNICYCLE = compose(ModelSpec("unicycle", DT, {}, (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),)))
 
@@ -72,7 +74,7 @@ def named(found):
 SOON = ("bias at constant speed",)
 
 
-@pytest.mark.parametrize("case", [case if case in SOON else pytest.param(case, marks=pytest.mark.long) for case in TIES])
+@pytest.mark.parametrize("case", [case if case in SOON else pytest.param(case, marks=pytest.mark.slow) for case in TIES])
 def test_the_suggested_drive_breaks_the_tie_and_the_right_effect_is_named(case):
     inputs, effect, rival = TIES[case]
     first = recorded([effect], inputs(np.random.default_rng(5)))

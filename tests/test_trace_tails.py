@@ -8,6 +8,8 @@ from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.faults import check
 
+pytestmark = pytest.mark.slow
+
 NOISE = np.array([0.001, 0.01])
 
 

@@ -11,6 +11,8 @@ from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.dataset import from_arrays
 from s2r_runtime.trace.tracer import trace
 
+pytestmark = pytest.mark.slow
+
 MOTOR = """import numpy as np
 
 STATES, INPUTS, PARAMS = ("speed",), ("volts",), {"gain": 28.0, "tau": 0.2}

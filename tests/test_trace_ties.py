@@ -23,6 +23,8 @@ from s2r_runtime.trace.selection import Selection, doing_something
 from s2r_runtime.trace.tracer import load_dataset, trace
 from s2r_runtime.trace.verdict import confirmed, harms
 
+pytestmark = pytest.mark.slow
+
 UNICYCLE = ModelSpec("unicycle", DT, {}, ())
 
 
@@ -215,7 +217,7 @@ def _traced(folder, family, seed):
     return trace(load_dataset(path, model), model)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_is_named_is_asked_again_where_rollouts_go_astray(tmp_path):
     """A drift of all inputs, and a change that undoes it on one, leave what looks like noise; a drift and a gain leave nothing."""
     found = _traced_pair(tmp_path, 68110)

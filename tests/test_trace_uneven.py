@@ -26,6 +26,8 @@ from s2r_runtime.trace.shapes import SHAPES, Shape
 from s2r_runtime.trace.streams import Stream
 from s2r_runtime.trace.tracer import trace
 
+pytestmark = pytest.mark.slow
+
 Array = NDArray[np.float64]
 
 DT = 0.05

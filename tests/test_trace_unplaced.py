@@ -12,6 +12,8 @@ from s2r_runtime.trace.streams import Stream
 from s2r_runtime.trace.tracer import trace
 from s2r_runtime.trace.unplaced import before_changes
 
+pytestmark = pytest.mark.slow
+
 DT, PARTS, ROWS = 0.05, 20, 700
 NOISE = {"differential_drive": [1e-3, 1e-3, 1e-3, 5e-3, 5e-3], "bicycle": [1e-3, 1e-3, 1e-3, 2e-3], "unicycle": [1e-3, 1e-3, 1e-3]}
 BOUNDS = {"differential_drive": ([-3.0, -3.0], [8.0, 8.0]), "bicycle": ([-0.4, 0.3], [0.4, 1.5]), "unicycle": ([0.1, -1.2], [0.8, 1.2])}
@@ -54,7 +56,7 @@ def test_where_the_motion_says_when_they_came_none_is_left_out():
     assert (found.verdict, found.depends_on, found.unplaced, found.way.within) == ("none", (), 0, True)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_effect_beside_them_is_named_and_the_other_recording_loses_its_changes_too():
     name = "differential_drive"
     model, slow = _model(name), [("input_gain", "cmd_left", {"gain": 0.9})]
@@ -96,7 +98,7 @@ def test_a_push_that_is_answered_by_a_command_is_not_left_out():
     assert found.unplaced == 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_of_commands_that_change_in_every_third_row_none_is_left_out():
     """Rollouts would end after two steps, and say nothing of what a model does in the long run."""
     name = "differential_drive"

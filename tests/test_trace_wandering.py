@@ -16,6 +16,8 @@ from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.residual import rms
 from s2r_runtime.trace.tracer import trace
 
+pytestmark = pytest.mark.slow
+
 Array = NDArray[np.float64]
 
 FORCE = 2.4

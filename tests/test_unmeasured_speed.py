@@ -143,8 +143,8 @@ def test_rollouts_begin_where_the_model_itself_says_that_the_axis_was(tmp_path):
     [
         ("coulomb_friction", "qd", {"force": 0.7}),
         ("viscous_friction", "qd", {"coefficient": 1.5}),
-        pytest.param("stribeck_friction", "qd", {"force": 0.4, "static_force": 1.2, "velocity": 0.15}, marks=pytest.mark.long),
-        pytest.param("input_rate_limit", "force", {"rate": 20.0}, marks=pytest.mark.long),
+        pytest.param("stribeck_friction", "qd", {"force": 0.4, "static_force": 1.2, "velocity": 0.15}, marks=pytest.mark.slow),
+        pytest.param("input_rate_limit", "force", {"rate": 20.0}, marks=pytest.mark.slow),
         ("input_lag", "force", {"time_constant": 0.05}),
         ("input_delay", "force", {"delay": 0.04}),
         ("input_gain", "force", {"gain": 0.85}),

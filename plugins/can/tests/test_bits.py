@@ -80,6 +80,7 @@ def test_every_signal_of_random_frames_is_what_cantools_says(block: int) -> None
     assert nested > 10
 
 
+@pytest.mark.slow
 def test_every_frame_that_is_sent_is_what_cantools_would_send() -> None:
     draw, compared, refused = random.Random(7), 0, 0
     for seed in range(400, 480):

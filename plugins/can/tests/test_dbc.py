@@ -144,6 +144,7 @@ def test_identifier_of_29_bits_without_bit_31_and_names_with_digits_can_be_read(
     assert [s.bits.name for group in layout.groups for s in group.signals] == ["2017_5.0_POS", "2017_5.Vel"]
 
 
+@pytest.mark.slow
 def test_fuzzed_text_about_unread_messages_changes_nothing() -> None:
     """Any byte of what is never read may be any other, as long as it does not come to be about a message that is read."""
     clean, draw, tried = digest_of(WHOLE), random.Random(7), 0

@@ -20,6 +20,7 @@ sys.modules["fuzz_can"] = fuzz_can
 SPEC.loader.exec_module(fuzz_can)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dbc", [CLASSIC, WIDE], ids=["classic", "wide"])
 def test_nothing_is_accepted_that_no_good_frame_said(dbc: str) -> None:
     found = fuzz_can.fuzz(10_000, 7, dbc)

@@ -242,6 +242,7 @@ def test_log_without_a_profile_says_what_it_needs(tmp_path: Path, messages: list
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_gap_reads_a_log_of_a_bus_as_ordinary_driving(tmp_path: Path) -> None:
     path = written(tmp_path / "drive.blf", list(drive(20.0)))
     profile = str(ROOT / "profiles" / "amr-can.toml")

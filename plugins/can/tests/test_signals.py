@@ -123,6 +123,7 @@ def test_identifiers_without_a_dbc_and_messages_with_one(tmp_path: Path, capsys:
     assert found["can1:7F0"]["note"] == "not in the DBC"
 
 
+@pytest.mark.slow
 def test_gap_takes_signals_of_a_can_log_without_a_profile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log, dbc = joint_log(tmp_path / "drive.log"), tmp_path / "joint.dbc"
     dbc.write_text(JOINT)

@@ -222,6 +222,7 @@ def test_verbs_read_it_by_its_suffix(tmp_path: Path) -> None:
     assert not found.independent
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not SITL.exists(), reason="a recording that is not part of the project")
 def test_recording_of_ardupilots_rover_shows_its_ramp_and_its_turn_rate() -> None:
     """Figures found independently: v a 1 m/s^2 ramp with .20 s delay, rmse .045 m/s; w 2.09 rad/s^2 with .06 s, rmse .008 rad/s."""

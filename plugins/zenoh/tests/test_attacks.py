@@ -169,6 +169,7 @@ def test_proposals_of_others_are_seen_and_have_no_way_on(rig: ZenohRig) -> None:
     assert all(b"recovery" in data for data in heard)
 
 
+@pytest.mark.slow
 def test_flood_of_proposals_is_cut_at_the_door_and_observations_still_come(rig: ZenohRig) -> None:
     with at_work(rig) as line, session("client", connect=rig.others) as controller:
         begin = time.monotonic()
