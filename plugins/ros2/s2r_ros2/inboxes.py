@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 PER_SECOND = 32
 """Commands of others that are logged."""
+COMMAND_MAX = 4096
+"""Bytes of one: a stamped twist has a hundred. So strangers put 130 KB a second into the log at most."""
 COMMANDS_KEPT = 4096
 """Sent commands that are known again when the ears hear them: 40 s at 100 Hz, when a link that stalled has long been given up."""
 
@@ -23,17 +25,20 @@ COMMANDS_KEPT = 4096
 class Mail(Inbox):
     """An inbox of frames: attachment and payload; one that is cut is malformed."""
 
+    def __init__(self, bell: Doorbell, capacity: int, per_second: int = 0, longest: int = PAYLOAD_MAX) -> None:
+        super().__init__(bell, capacity, per_second, longest)
+
     def content(self, sample: zenoh.Sample) -> bytes:
         """See `keys.envelope`."""
         extra = sample.attachment
-        return envelope(b"" if extra is None else extra.to_bytes()[:ATTACHMENT_MAX], sample.payload.to_bytes()[: PAYLOAD_MAX + 1])
+        return envelope(b"" if extra is None else extra.to_bytes()[:ATTACHMENT_MAX], sample.payload.to_bytes()[: self._longest + 1])
 
 
 class Ears(Mail):
     """An inbox for others' commands: what left here is known again, and not taken in."""
 
     def __init__(self, bell: Doorbell) -> None:
-        super().__init__(bell, PER_SECOND, PER_SECOND)
+        super().__init__(bell, PER_SECOND, PER_SECOND, COMMAND_MAX)
         self._order: deque[bytes] = deque()
         self._own: Counter[bytes] = Counter()
         self._mutex = threading.Lock()

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from s2r_runtime.errors import ConfigError
+from s2r_zenoh.wire import PAYLOAD_MAX
 
 if TYPE_CHECKING:
     import zenoh
@@ -124,11 +125,12 @@ class Doorbell:
 class Inbox:
     """What a subscription received: at most `capacity` payloads, of which the oldest give way, counted in `dropped`.
 
-    `per_second`: more than that are dropped at the door (0: no such limit), so that a stranger cannot fill the log.
+    `per_second`: more than that are dropped at the door (0: no such limit), so that a stranger cannot fill the log. longest: bytes of a
+    payload; of a longer one so much and a byte is kept, which no decoder takes for a message.
     """
 
-    def __init__(self, bell: Doorbell, capacity: int, per_second: int = 0) -> None:
-        self._bell, self._capacity, self._per_second = bell, capacity, per_second
+    def __init__(self, bell: Doorbell, capacity: int, per_second: int = 0, longest: int = PAYLOAD_MAX) -> None:
+        self._bell, self._capacity, self._per_second, self._longest = bell, capacity, per_second, longest
         self._waiting: deque[tuple[int, bytes]] = deque()
         self._lock = threading.Lock()
         self._second, self._in_second = 0, 0
@@ -153,7 +155,7 @@ class Inbox:
 
     def content(self, sample: zenoh.Sample) -> bytes:
         """What is kept of a sample: its payload. For others to override."""
-        return sample.payload.to_bytes()
+        return sample.payload.to_bytes()[: self._longest + 1]
 
     def take(self) -> list[tuple[int, bytes]]:
         """What waited, oldest first: (arrival on the host's monotonic clock, content)."""

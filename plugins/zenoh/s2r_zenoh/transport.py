@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 _ENDPOINT = re.compile(r"[a-z0-9_-]+/\S+")
 _PREFIX = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*")
 PROPOSALS_PER_SECOND = 32
+PROPOSAL_MAX = 4096
+"""Bytes: ten times what a command of twenty inputs takes. So all strangers together put 130 KB a second into the log at most."""
 OVERRIDES_WAITING = 16
 DEFAULTS: dict[str, Any] = {
     "robot_listen": "",
@@ -74,7 +76,7 @@ class ZenohTransport:
         self._wire = Wire(states, inputs, restart_ns=self._timeout_ns)
         self._bell = Doorbell()
         self._observations = Inbox(self._bell, self._options["queue"])
-        self._proposals = Inbox(self._bell, PROPOSALS_PER_SECOND, PROPOSALS_PER_SECOND)
+        self._proposals = Inbox(self._bell, PROPOSALS_PER_SECOND, PROPOSALS_PER_SECOND, PROPOSAL_MAX)
         self._overrides = Inbox(self._bell, OVERRIDES_WAITING)
         self._sessions: list[zenoh.Session] = []
         self._command: zenoh.Publisher | None = None

@@ -13,9 +13,10 @@ import pytest
 import zenoh
 from s2r_zenoh import transport
 from s2r_zenoh.testing import Robot, ZenohRig, free_endpoint, session
-from s2r_zenoh.transport import PROPOSALS_PER_SECOND
+from s2r_zenoh.transport import PROPOSAL_MAX, PROPOSALS_PER_SECOND
+from s2r_zenoh.wire import PAYLOAD_MAX
 
-from s2r_runtime.messages import Command, Observation
+from s2r_runtime.messages import Command, Frame, Observation, OverrideChanged
 from s2r_runtime.testing.transport_kit import Line
 
 ATTACK = b'{"seq":999999,"t_ns":9000000000000000000,"obs_seq":0,"ttl_ns":1000000000,"source":"attack","input":{"v":0.2,"w":0.0}}'
@@ -184,6 +185,43 @@ def test_flood_of_proposals_is_cut_at_the_door_and_observations_still_come(rig: 
     assert 0 < proposals <= PROPOSALS_PER_SECOND * (seconds + 2)
     assert rig.transport.counters()["proposals_dropped"] > 0
     assert fresh > 10
+
+
+@pytest.mark.parametrize("size", [PROPOSAL_MAX, 70_000, 3_000_000])
+def test_oversized_proposals_fill_no_log_and_are_no_fault_of_the_link(rig: ZenohRig, size: int) -> None:
+    """A daemon stops the robot for a frame of more than a megabyte: whoever only looks on must not be able to send one."""
+    with at_work(rig) as line, session("client", connect=rig.others) as controller:
+        begin, before = time.monotonic(), rig.transport.counters()["malformed"]
+        while time.monotonic() - begin < 10.0 and rig.transport.counters()["malformed"] < before + 3:
+            controller.put("s2r/robot/proposal", b'{"input":{"v":0.1,"w":-0.5},"pad":"%s"}' % (b"A" * size))
+            time.sleep(0.05)
+        fresh = len(line.good)
+        assert rig.transport.counters()["malformed"] >= before + 3
+    assert all(m.fault and not m.u for m in line.messages if isinstance(m, Command)), "malformed, so refused"
+    assert fresh > 0
+
+
+@pytest.mark.parametrize("key", ["observation", "override"])
+def test_what_is_kept_of_an_oversized_payload_is_bounded_and_counts_as_none(rig: ZenohRig, key: str) -> None:
+    """Also from the robot itself: in the place of a stop it stops."""
+    with at_work(rig) as line:
+        kept: list[int] = []
+        receive = rig.transport.receive
+
+        def noted() -> list[Frame]:
+            frames = receive()
+            kept.extend(len(frame.data) for frame in frames)
+            return frames
+
+        rig.transport.receive = noted  # type: ignore[method-assign]
+        deadline = time.monotonic() + 10.0
+        while time.monotonic() < deadline and max(kept, default=0) <= PAYLOAD_MAX:
+            rig.robot._put(key, b"{" + b" " * 3_000_000 + b"}")
+            time.sleep(0.05)
+        time.sleep(0.2)
+        stops = [m for m in line.messages if isinstance(m, OverrideChanged)]
+    assert max(kept) == PAYLOAD_MAX + 1
+    assert bool(stops) is (key == "override")
 
 
 def test_observation_of_somebody_on_the_controllers_side_is_not_heard(rig: ZenohRig) -> None:
