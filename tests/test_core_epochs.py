@@ -102,7 +102,7 @@ def with_profile(rig: Rig) -> None:
 
 STEPS = [
     Step("campaign begun", Rig.driving, lambda rig: (rig.request("undeploy"), rig.sampling()), epochs=1),
-    Step("campaign interrupted, and gone on with", lambda rig: (rig.gap(), interrupted(rig)), lambda rig: rig.sampling(), certificates=0),
+    Step("campaign interrupted and resumed", lambda rig: (rig.gap(), interrupted(rig)), lambda rig: rig.sampling(), certificates=0),
     Step("campaign cancelled", lambda rig: (rig.gap(), rig.sampling()), lambda rig: rig.request("cancel"), certificates=0),
     Step("campaign refused, its samples depend on each other", Rig.gap, dependent, epochs=1, certificates=0),
     Step("gap in force", lambda rig: (rig.driving(), rig.request("undeploy")), Rig.gap, epochs=1, certificates=0),
@@ -134,7 +134,7 @@ STEPS = [
     ),
     Step("certificate expired", Rig.driving, lambda rig: rig.feed(WallClockRead(rig.t, 9000))),
     Step("certificate revoked by a person", Rig.driving, lambda rig: rig.request("revoke", text="c1"), certificates=0),
-    Step("certificate loaded that founds a later epoch", lambda rig: (rig.driving(), rig.request("undeploy")), load, epochs=2, attempts=3),
+    Step("certificate of a later epoch loaded", lambda rig: (rig.driving(), rig.request("undeploy")), load, epochs=2, attempts=3),
     Step("restart", Rig.driving, restart),
     Step("restart with another profile", Rig.driving, with_profile, gap=False, certificates=0),
 ]
