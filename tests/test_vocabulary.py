@@ -88,6 +88,11 @@ def test_sentences_are_those_of_paragraphs_items_and_cells() -> None:
     ]
 
 
+def test_a_list_of_names_in_code_is_no_sentence() -> None:
+    assert vocabulary.sentences("`one`, `two` (a number), `three`.") == []
+    assert len(vocabulary.sentences("The key `one` holds a number.")) == 1
+
+
 def test_words_are_what_holds_letters_or_digits() -> None:
     assert vocabulary.words_of("at 0.5 s - `of` it: (one) = #### …") == 7
 

@@ -250,7 +250,7 @@ def _prose_of_page(text: str) -> str:
 
 
 def sentences(text: str) -> list[str]:
-    """The sentences of a Markdown page: of paragraphs, list items, headings, and cells of tables."""
+    """The sentences of a Markdown page: of paragraphs, list items, headings, and cells of tables; no lists of names in code."""
     blocks: list[str] = []
     for line in _prose_of_page(text).splitlines():
         stripped = line.strip(" >")
@@ -266,7 +266,12 @@ def sentences(text: str) -> list[str]:
     for block in blocks:
         marked = _ABBREVIATION.sub(lambda match: match[0].replace(".", "․"), block)
         found += [" ".join(one.replace("․", ".").split()) for one in _SENTENCE_END.split(marked)]
-    return [one for one in found if words_of(one) > 1]
+    return [one for one in found if words_of(one) > 1 and not _lists_code(one)]
+
+
+def _lists_code(sentence: str) -> bool:
+    """Whether half of the words or more are inline code: a list of names rather than a sentence."""
+    return 2 * len(re.findall(r"#{3,}", sentence)) >= words_of(sentence)
 
 
 def words_of(sentence: str) -> int:
