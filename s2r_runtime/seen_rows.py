@@ -245,14 +245,14 @@ def _text(made: _Read) -> str:
 
 
 def _thinned(text: str, kept: int) -> str:
-    """The compact form with so many hashes of each grid at most."""
+    """The compact form with at most `kept` hashes of each grid."""
     made = _read(text)
     whole = made.whole and all(len(grid) <= kept for grid in made.grids)
     return _text(made._replace(whole=whole, grids=(made.grids[0][:kept], made.grids[1][:kept])))
 
 
 def _code(hashes: Hashes, shift: int) -> _List:
-    """hashes: (n,) sorted, without the lowest `shift` bits; they lose as many more as FALSE_BITS allows."""
+    """hashes: (n,) sorted, without the lowest `shift` bits; they lose further bits as FALSE_BITS allows."""
     n = len(hashes)
     spare = int(hashes[-1]) // n if n else 0  # of it, 2^FALSE_BITS and up to twice as much stays
     more = max(0, spare.bit_length() - 1 - FALSE_BITS)

@@ -94,7 +94,7 @@ WORDS = (
         "parameters",
         where=TRACER,
     ),
-    Word(r"laws?", "distribution, noise model, disturbance model", r"laws?"),
+    Word(r"laws?", "distribution, noise model, disturbance model"),  # as an identifier mostly a control law, or a profile's key
     Word(r"rows?", "sample", where=TRACE),
     Word(
         r"way (?:that )?(?:it|they|the robot|the body) (?:goes|go|went|moved)|goes (?:somewhere|nowhere|along|far)"
@@ -126,7 +126,7 @@ WORDS = (
     Word(r"so many|as many", "the number, n", r"so many|as many"),
     Word(r"beyond chance", "significant (at level ...)", r"beyond chance"),
     Word(
-        r"(?:an?|the|this|each|every|one|another|whole|same|live|new|fresh) drive(?! (?:motor|train|shaft))"
+        r"(?:an?|the|this|each|every|one|another|whole|same|live|new|fresh) drive(?! (?:motor|train|shaft|axle|wheel))"
         r"|(?:the|these|such|two|several|other|of) drives(?! (?:it|the|an?|on)\b)",
         "the excitation, the recording, the run",
     ),
@@ -143,6 +143,7 @@ ALLOWED = (
     (r"as many as", "a comparison of two numbers"),
     (r"bar (?:chart|plot|graph)s?|error bars?", "a figure"),
     (r"play ?back", "replay of a recording"),
+    (r"order of (?:its|their) numbers", "ordinal numbers, not parameters"),
 )
 
 # Not searched: both hold the glossary itself.

@@ -28,7 +28,7 @@ from s2r_runtime.profile import Sampling
 from s2r_runtime.recording.reading import Entry
 
 KEPT = 20_000
-"""Observations and commands that are kept to find a sample in; a hold has some dozens."""
+"""Number of stored observations and commands to find a sample in; a hold has some dozens."""
 
 
 class CampaignReplay:
@@ -131,7 +131,7 @@ class CampaignReplay:
                 self._due.append(Proposed(0, Command(0, ask.t_ns, "sampler", step.u, observation.seq, ttl_ns)))
 
     def restarted(self) -> None:
-        """The robot started anew, or the link to it was lost or found."""
+        """The robot restarted, or the link to it was lost or found."""
         self._settle()
         if self._campaign is not None:
             self._campaign.restarted()

@@ -28,13 +28,13 @@ EARLY_BEFORE = 0.2
 """Of dt: how far two observations might be from dt apart under rules before `GRID`. Since then a campaign's limits hold here, too."""
 
 PAST_ROWS = 200
-"""Commands that a transition of another length than a step is given as its past: some 20 s at 10 Hz. After so many none from before a
-restart counts, whatever an effect remembers.
+"""Commands that a transition of another length than a step is given as its past: some 20 s at 10 Hz. After that number no
+command from before a restart counts, whatever an effect remembers.
 """
 
 FORGOTTEN = 0.01
-"""Of what the memory of before a restart differs from rest: what is left of it when it does not matter any more. A delay forgets all at
-once, a lag by e a time constant.
+"""Largest share of the memory's difference from rest, at a restart, that no longer matters. A delay forgets all at once, a lag by a factor
+of e per time constant.
 """
 
 LONGEST_HOLD = 2000
@@ -55,7 +55,7 @@ class Stream:
     A transition is an observation, the one command that answered it, and the first observation that is one step later by the stamps, with a
     campaign's tolerance (`comparison`). It is compared with a step of its own length. Where an observation is lost, stands at another
     time, or another command was sent in between, there is none: `lost` counts those. The effects' memory goes on by the commands sent,
-    whatever is observed; it begins at rest, and anew when the robot started anew or its link was lost (`restarted`). Whether commands
+    whatever is observed; it begins at rest, and again when the robot restarted or its link was lost (`restarted`). Whether commands
     from before that act is unknown. So nothing is measured until the gate lets a controller command again, and until the memory is the
     same either way (`FORGOTTEN`). fault_jump: see `measurement_fault`. alpha, run_length: bars of the notices. rules: see `Settings`. The
     rest is where an earlier one stood: see the three tests.
@@ -133,7 +133,7 @@ class Stream:
         if observation.fault:
             return None
         if seen is not None and observation.stamp_ns < seen.stamp_ns:
-            self._begin(self._before or self._hidden)  # the robot's clock began anew
+            self._begin(self._before or self._hidden)  # the robot's clock restarted
         elif seen is not None and observation.seq < seen.seq and self._notes_restarts:
             self._begin(self._before or self._hidden)  # its numbers did
         elif seen is not None and observation.seq <= seen.seq:

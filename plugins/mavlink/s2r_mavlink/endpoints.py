@@ -61,7 +61,7 @@ class Endpoint(Protocol):
         """Those that `read` serves at the moment."""
 
     def read(self, most: int) -> list[Piece]:
-        """What came, until it is `most` bytes or a little more; never blocks. What is left comes with the next call."""
+        """What came, until it is `most` bytes or a little more; never blocks. The rest comes with the next call."""
 
     def write(self, frame: bytes, source: Source | None = None) -> bool:
         """Hands a frame to the other side (to one of them only); False if it was dropped."""

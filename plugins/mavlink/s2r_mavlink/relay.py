@@ -6,8 +6,8 @@ The robot's frames go to everybody, as they came. The other way:
                 A person drives by changing the mode first, which the runtime sees and which stops it.
     companion   nothing but what is listed here: a sensor's pose, time, questions. A controller's place is behind the gate.
 
-What would have moved the robot is kept for the log, up to so many a second. Nobody passes with the robot's or the runtime's own ids, and
-nobody faster than a robot's line can be. Frames pass unchanged, signature and all: the robot judges them itself.
+What would have moved the robot is recorded in the log, up to a number per second. Nobody passes with the robot's or the runtime's own
+ids, and nobody faster than a robot's line can be. Frames pass unchanged, signature and all: the robot judges them itself.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class Relay:
         return self._bytes <= BYTES_PER_SECOND
 
     def _room(self, now_ns: int) -> bool:
-        """So many a second, so that a stranger can't fill the log."""
+        """Whether the log takes one more: their number per second is bounded, so that a stranger can't fill the log."""
         if now_ns // SECOND != self._second:
             self._second, self._kept = now_ns // SECOND, 0
         self._kept += 1

@@ -17,7 +17,7 @@ from s2r_runtime.errors import ConfigError
 UNSENT_MOST = 256
 """Bytes in the send queue above which nothing is added: at 57600 baud 45 ms, four commands."""
 NEVER = (errno.EACCES, errno.EPERM, errno.ENOTTY, errno.EISDIR)
-"""Why a device can't be opened, that waiting doesn't mend."""
+"""Errors of opening a device that waiting does not fix."""
 
 
 class SerialLine:

@@ -126,7 +126,7 @@ class Inbox:
     """What a subscription received: at most `capacity` payloads, of which the oldest give way, counted in `dropped`.
 
     `per_second`: more than that are dropped at the door (0: no such limit), so that a stranger cannot fill the log. longest: bytes of a
-    payload; of a longer one so much and a byte is kept, which no decoder takes for a message.
+    payload; a longer one is cut to this length and a byte, which no decoder takes for a message.
     """
 
     def __init__(self, bell: Doorbell, capacity: int, per_second: int = 0, longest: int = PAYLOAD_MAX) -> None:
