@@ -9,13 +9,16 @@ import os
 import stat
 from pathlib import Path
 
+from s2r_runtime import limits
 from s2r_runtime.errors import ConfigError
 
 MB = 1 << 20
 
 
-def read_bounded(path: Path, most: int = 4 * MB) -> bytes:
-    """At most `most` bytes of a regular file. Raises ConfigError, one line, for anything else."""
+def read_bounded(path: Path, most: int | None = None) -> bytes:
+    """At most `most` bytes of a regular file (None: as `limits.TEXT` is set). Raises ConfigError, one line, for anything else."""
+    more = "" if most is not None else f"; {limits.TEXT.more()}"
+    most = round(limits.TEXT.value()) if most is None else most
     try:
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
             status = os.fstat(file.fileno())
@@ -27,5 +30,5 @@ def read_bounded(path: Path, most: int = 4 * MB) -> bytes:
     except ValueError as error:  # a NUL in its name
         raise ConfigError(f"{path}: is no path: {error}") from None
     if len(data) > most:
-        raise ConfigError(f"{path}: has more than {most} bytes, the most that is read of such a file")
+        raise ConfigError(f"{path}: has more than {most} bytes, the most that is read of such a file{more}")
     return data

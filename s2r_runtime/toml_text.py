@@ -11,11 +11,12 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from s2r_runtime import limits
 from s2r_runtime.bounded_file import read_bounded
 from s2r_runtime.errors import ConfigError, one_line
 
 TEXT_MAX = 4 << 20
-"""Characters; a model with a position field of 10 000 values has 200 kB."""
+"""Characters, unless `limits.TEXT` is set; a model with a position field of 10 000 values has 200 kB."""
 DEPTH_MAX = 32
 """Of tables and arrays; a profile has five."""
 DOTS_MAX = 200
@@ -30,7 +31,7 @@ def load_toml(path: Path) -> dict[str, Any]:
 
 def read_text(path: Path) -> str:
     """A file's text. Raises ConfigError for what cannot be read, is no regular file, is too long, or is not UTF-8."""
-    data = read_bounded(path, TEXT_MAX)
+    data = read_bounded(path)
     try:
         return data.decode()
     except UnicodeDecodeError as error:
@@ -39,8 +40,8 @@ def read_text(path: Path) -> str:
 
 def parse_toml(text: str, where: str) -> dict[str, Any]:
     """The tables of a text. Raises ConfigError."""
-    if len(text) > TEXT_MAX:
-        raise ConfigError(f"{where}: has more than {TEXT_MAX} characters")
+    if len(text) > limits.TEXT.value():
+        raise ConfigError(f"{where}: has more than {limits.TEXT.value():.0f} characters; {limits.TEXT.more()}")
     for number, line in enumerate(text.splitlines(), 1):
         if line.count(".") > DOTS_MAX and any(piece.count(".") > DOTS_MAX for piece in re.split("[,=]", line)):
             raise ConfigError(f"{where}: line {number}: has more than {DOTS_MAX} dots in a row; a dotted key has a few parts")

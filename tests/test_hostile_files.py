@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
+import gzip
 import os
+import struct
 import subprocess
 import sys
 import time
+import zlib
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+from s2r_runtime import limits
 from s2r_runtime.bounded_file import read_bounded
-from s2r_runtime.errors import ConfigError
+from s2r_runtime.errors import ConfigError, RecordingError
+from s2r_runtime.formats.sizes import check_size, check_values
 from s2r_runtime.recording.layout import RECORD
 from s2r_runtime.recording.start import FIRST, make_start
+from s2r_runtime.toml_text import load_toml
 
 ROOT = Path(__file__).parent.parent
 PROFILE, GRID = ROOT / "profiles" / "robotarium.toml", ROOT / "controllers" / "grid.py"
 SECONDS, MEMORY = 10.0, 300 << 20
 """Measured within 3 s on an idle machine; the tests share theirs."""
-CLAIM = 20_000_000_000
+CLAIM, GIGABYTES = 20_000_000_000, 1 << 30
 ATTACHMENT, METADATA = 9, 12
 HOSTILE = ("pipe", "zero", "large")
 
@@ -141,6 +150,84 @@ def test_a_recording_is_looked_at_before_it_is_digested(tmp_path: Path, kind: st
         os.truncate(recording, 3_000_000_000)
     assert one_line("certify", GRID, "--profile", PROFILE, "--recording", recording, "-o", tmp_path / "c", "--key", key) in (2, 3)
     assert one_line("verify", GRID, "--profile", PROFILE, "--recording", recording) in (2, 3)
+
+
+def packed(kind: str, path: Path) -> Path:
+    """Some hundred kB that hold gigabytes of zeros, or say so."""
+    if kind == "mat":
+        packer = zlib.compressobj(9)
+        head = struct.pack("<II", 14, 48 + 8 + GIGABYTES) + struct.pack("<IIII", 6, 8, 6, 0) + struct.pack("<IIii", 5, 8, GIGABYTES // 8, 1)
+        data = packer.compress(head + struct.pack("<III", 1 | 1 << 16, ord("x"), 9) + struct.pack("<I", GIGABYTES))
+        data += b"".join(packer.compress(bytes(1 << 24)) for _ in range(GIGABYTES >> 24)) + packer.flush()
+        path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<HH", 0x0100, 0x4D49) + struct.pack("<II", 15, len(data)) + data)
+    elif kind == "parquet":
+        table = pa.table({name: pa.array(np.zeros(10_000_000)) for name in "txy"})
+        pq.write_table(table, path, compression="zstd", row_group_size=1 << 20)
+    elif kind == "page":
+        table = pa.table({"t": pa.array([0.0]), "x": pa.array([0.0]), "segment": pa.array(["0" * 400_000_000])})
+        pq.write_table(table, path, compression="zstd", use_dictionary=False)
+    else:
+        with gzip.open(path, "wb") as file:
+            file.write(b"t,x,y,theta,v,w\n")
+            for _ in range(64):
+                file.write(b"0,0,0,0,0,0\n" * 200_000)
+    return path
+
+
+READER = """
+import sys
+from pathlib import Path
+from s2r_runtime.formats import isolated
+
+header, _ = isolated._answer({"reader": sys.argv[1], "path": sys.argv[2], "name": "it", "options": {}, "wanted": None}, {})
+print(header.get("error"))
+print(open("/proc/self/status").read().partition("VmHWM:")[2].split()[0])
+"""
+"""What the process of the reader does, and its memory (kB)."""
+
+
+PACKED = [("mat", "mat", "matlab"), ("parquet", "parquet", "parquet"), ("page", "parquet", "parquet")]
+
+
+@pytest.mark.parametrize(("kind", "suffix", "reader"), PACKED)
+def test_what_unpacks_to_gigabytes_is_one_line_before_it_is_unpacked(tmp_path: Path, kind: str, suffix: str, reader: str) -> None:
+    path = packed(kind, tmp_path / f"a.{suffix}")
+    assert path.stat().st_size < 4 << 20
+    assert one_line("topics", path) == 2
+    assert one_line("gap", path, "--model", "unicycle", "--dt", "0.1") == 2
+    alone = subprocess.run([sys.executable, "-c", READER, reader, str(path)], capture_output=True, text=True, check=True, timeout=60)
+    error, peak = alone.stdout.splitlines()
+    assert "S2R_MAX_RATIO" in error
+    assert int(peak) << 10 < MEMORY
+
+
+def test_a_packed_table_that_unpacks_for_ever_is_one_line(tmp_path: Path) -> None:
+    assert one_line("gap", packed("csv", tmp_path / "a.csv.gz"), "--model", "unicycle", "--dt", "0.1") == 2
+
+
+def test_limits_are_settings_that_errors_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text("x = 1\n" + "#" * (1 << 20))
+    assert load_toml(path) == {"x": 1}
+    monkeypatch.setenv("S2R_MAX_TEXT_MB", "0.5")
+    with pytest.raises(ConfigError, match=r"set S2R_MAX_TEXT_MB in the environment \(now 0\.5\)"):
+        load_toml(path)
+    monkeypatch.setenv("S2R_MAX_NUMBERS", "10")
+    monkeypatch.setenv("S2R_MAX_FILE_GB", "1e-4")
+    for check in (lambda: check_values(path, 11), lambda: check_size(path)):
+        with pytest.raises(RecordingError, match="S2R_MAX_"):
+            check()
+    for wrong in ("much", "-1", "0", "nan", "inf"):
+        monkeypatch.setenv("S2R_MAX_TEXT_MB", wrong)
+        with pytest.raises(ConfigError, match="must be a number > 0"):
+            load_toml(path)
+
+
+def test_the_docs_name_every_limit_and_its_default() -> None:
+    page = (ROOT / "docs" / "recordings.md").read_text(encoding="utf-8")
+    for limit in limits.ALL:
+        (row,) = [line for line in page.splitlines() if f"`{limit.name}`" in line]
+        assert (f"{limit.default:g} " if limit.default < 1e6 else f"{limit.default / 1e6:g} million") in row.replace(",", " ")
 
 
 def test_a_bounded_read_takes_what_fits_and_nothing_else(tmp_path: Path) -> None:

@@ -9,6 +9,10 @@ Version 7.3 is HDF5 and is not read. The library takes in a variable at once, so
 
 from __future__ import annotations
 
+import contextlib
+import os
+import struct
+import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,13 +21,15 @@ import numpy as np
 
 from s2r_runtime.errors import RecordingError, one_line
 from s2r_runtime.formats.series import Array, InMemory, Run, Samples, Topic
-from s2r_runtime.formats.sizes import check_size, check_values
+from s2r_runtime.formats.sizes import check_packed, check_size, check_values
 
 KIND = "MATLAB file"
 TIMES = ("t", "time", "Time", "tout", "timestamp", "stamp", "T")
 MAX_COLUMNS = 64
 """Of a matrix; a wider one is an image or a table of something else."""
 MAX_DEPTH = 4
+HEADER_BYTES, TAG_BYTES, VARIABLE, PACKED = 128, 8, 14, 15
+"""Of version 5: text, version and byte order; then variables, each after its type (15: packed with zlib) and its size."""
 NEWEST = b"MATLAB 7."
 """The first words of an HDF5 file by MATLAB: 7.3, and 7.0 before it."""
 
@@ -34,6 +40,7 @@ def open_matlab(path: Path) -> InMemory:
     from scipy.io.matlab import MatlabOpaque
 
     check_size(path)
+    check_packed(path, _unpacked_bytes(path))
     with path.open("rb") as file:
         if file.read(len(NEWEST)) == NEWEST:
             raise RecordingError(f"{path}: this is a MATLAB file of version 7.3 (HDF5), which is not read; in MATLAB: save(FILE, '-v7')")
@@ -63,6 +70,26 @@ def open_matlab(path: Path) -> InMemory:
     if not samples and not unusable:
         raise RecordingError(f"{path}: this MATLAB file holds no series: neither vectors nor structures of them" + (note and f"; {note}"))
     return InMemory(KIND, [Run(samples)], unusable=unusable, notes=[note] if note else [])
+
+
+def _unpacked_bytes(path: Path) -> int:
+    """What a version 5 file says of the size of its packed variables: their first tag is unpacked, before the library unpacks more."""
+    total = 0
+    with path.open("rb") as file:
+        head = file.read(HEADER_BYTES)
+        order = "<" if head.endswith(b"IM") else ">"
+        while head.startswith(b"MATLAB 5") and len(tag := file.read(TAG_BYTES)) == TAG_BYTES:
+            kind, size = struct.unpack(f"{order}II", tag)
+            if kind not in (VARIABLE, PACKED) or not size:
+                break
+            if kind == PACKED:
+                after = file.tell() + size
+                with contextlib.suppress(zlib.error, struct.error):  # its reader says what is wrong
+                    total += struct.unpack(f"{order}II", zlib.decompressobj().decompress(file.read(min(size, 1024)), TAG_BYTES))[1]
+                file.seek(after)
+            else:
+                file.seek(size, os.SEEK_CUR)
+    return total
 
 
 def _listed(path: Path) -> Sequence[tuple[str, tuple[int, ...], str]]:

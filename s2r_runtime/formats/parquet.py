@@ -21,7 +21,7 @@ import numpy as np
 
 from s2r_runtime.errors import RecordingError, one_line
 from s2r_runtime.formats.series import Array, Run, Samples, Topic
-from s2r_runtime.formats.sizes import check_values
+from s2r_runtime.formats.sizes import check_packed, check_values
 from s2r_runtime.tables import SEGMENT
 
 KIND = "Parquet table"
@@ -57,6 +57,7 @@ class ParquetTable:
         self._columns: dict[str, _Column] = {}
         with self._guarded(self._files[0]) as first:
             schema, rows = first.schema_arrow, first.metadata.num_rows
+            check_packed(self._files[0], _unpacked_bytes(first, schema.names))
             head = next(first.iter_batches(batch_size=64), None) if rows else None
         for field in schema:
             self._add(field, None if head is None else head.column(schema.get_field_index(field.name)))
@@ -88,6 +89,7 @@ class ParquetTable:
         total = 0
         for path in self._files:
             with self._guarded(path) as file:
+                check_packed(path, _unpacked_bytes(file, needed))
                 total += file.metadata.num_rows * max(1, len(names))
                 check_values(self._path, total)
                 if missing := [name for name in needed if name not in file.schema_arrow.names]:
@@ -198,6 +200,13 @@ class ParquetTable:
 
     def _guarded(self, path: Path) -> _Guarded:
         return _Guarded(self._arrow, path)
+
+
+def _unpacked_bytes(file: Any, columns: Sequence[str]) -> int:
+    """What the file says of these columns' size in memory."""
+    groups = [file.metadata.row_group(index) for index in range(file.metadata.num_row_groups)]
+    parts = [group.column(index) for group in groups for index in range(group.num_columns)]
+    return sum(part.total_uncompressed_size for part in parts if part.path_in_schema.partition(".")[0] in columns)
 
 
 class _Guarded:

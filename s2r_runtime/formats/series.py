@@ -18,12 +18,6 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-MAX_VALUES = 200_000_000
-"""Numbers that a file may hold at most where its reader takes it in at once (1.6 GB): what claims more is refused before it is read."""
-
-MAX_FILE_BYTES = 4_000_000_000
-"""Size of such a file at most."""
-
 
 class Topic(NamedTuple):
     """fields: name -> unit ("" where none is known), numbers only. n: messages; first_s, last_s: their stamps (NaN without any).

@@ -15,8 +15,8 @@ from typing import BinaryIO, NamedTuple
 import zstandard
 from mcap.opcode import Opcode
 
+from s2r_runtime.limits import ATTACHED, MB
 from s2r_runtime.recording.layout import (
-    ATTACHED_MAX,
     CHUNK,
     CHUNK_FIELDS,
     MAX_CHUNK,
@@ -95,8 +95,8 @@ def take(file: BinaryIO, offset: int, size: int, start: bytes = b"", *, strict: 
             return block
         if at + RECORD.size + length > size:
             raise Damage(at, "the file ends inside an attachment", cut=True)
-        if at + RECORD.size + length - offset > ATTACHED_MAX:  # before memory is taken for what a length claims
-            raise Damage(at, f"attachments of more than {ATTACHED_MAX >> 20} MB in a row")
+        if at + RECORD.size + length - offset > ATTACHED.value():  # before memory is taken for what a length claims
+            raise Damage(at, f"attachments of more than {ATTACHED.value() / MB:g} MB in a row; {ATTACHED.more()}")
         prefix.append(head + file.read(length))
         at += RECORD.size + length
 

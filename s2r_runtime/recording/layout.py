@@ -39,8 +39,6 @@ RECOVERED = "s2r.recovered"
 
 MAX_CHUNK = 64 << 20
 """Bytes of a chunk's content at most: what a reader is ready to allocate for a file it doesn't trust."""
-ATTACHED_MAX = 64 << 20
-"""Bytes of the attachments between two chunks at most, as above; the largest that is written has 8 MB."""
 START_MAX = 1 << 20
 """Bytes of the first metadata record at most."""
 MAX_MESSAGES = 1 << 16
