@@ -37,7 +37,7 @@ class Limit(NamedTuple):
         return f"to read more, set {self.name} in the environment (now {self.value() / self.unit:g})"
 
 
-TEXT = Limit("S2R_MAX_TEXT_MB", 4.0, MB, "a profile, model, controller, certificate: MB")
+TEXT = Limit("S2R_MAX_TEXT_MB", 4.0, MB, "a profile, model, controller: MB")
 FILE = Limit("S2R_MAX_FILE_GB", 4.0, GB, "a recording in a format that is read at once: GB")
 NUMBERS = Limit("S2R_MAX_NUMBERS", 200e6, 1, "numbers that such a recording holds, or that are read of it")
 RATIO = Limit("S2R_MAX_RATIO", 100.0, 1, "size of these numbers, over that of the file that packs them")

@@ -9,19 +9,22 @@ import subprocess
 import sys
 import time
 import zlib
+from collections import deque
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import zstandard
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from s2r_runtime import limits
 from s2r_runtime.bounded_file import read_bounded
 from s2r_runtime.errors import ConfigError, RecordingError
-from s2r_runtime.formats.sizes import check_size, check_values
-from s2r_runtime.recording.layout import RECORD
+from s2r_runtime.formats.sizes import check_size, check_values, content_of
+from s2r_runtime.recording.layout import MAGIC, RECORD
 from s2r_runtime.recording.start import FIRST, make_start
 from s2r_runtime.toml_text import load_toml
 
@@ -238,3 +241,18 @@ def test_a_bounded_read_takes_what_fits_and_nothing_else(tmp_path: Path) -> None
     for what, most, words in ((path, len(data) - 1, "has more than"), (tmp_path, 10, "directory"), (tmp_path / "none", 10, "No such file")):
         with pytest.raises(ConfigError, match=words):
             read_bounded(what, most)
+
+
+@pytest.mark.parametrize("packing", ["gz", "zstd"])
+@pytest.mark.parametrize("name", ["a.mcap", "a.db3", "a.tlog", "a.log"])
+def test_recordings_of_plug_ins_that_unpack_for_ever_are_one_line(tmp_path: Path, name: str, packing: str) -> None:
+    starts = {"a.mcap": MAGIC, "a.db3": b"SQLite format 3\0", "a.tlog": bytes(8) + b"\xfd", "a.log": b"(0.0) can0 123#00\n"}
+    path = tmp_path / f"{name}.{packing}"
+    with gzip.open(path, "wb") if packing == "gz" else zstandard.open(path, "wb") as file:
+        file.write(starts[name])
+        for _ in range(GIGABYTES >> 24):
+            file.write(bytes(1 << 24))
+    with content_of(path) as content, pytest.raises(RecordingError, match="S2R_MAX_RATIO"):
+        deque(iter(partial(content.read, 1 << 20), b""), 0)
+    assert one_line("topics", path) == 2
+    assert one_line("gap", path, "--model", "unicycle", "--dt", "0.1") in (2, 3)

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import gzip
+import io
 from pathlib import Path
+from typing import IO, Any, BinaryIO
+
+import zstandard
 
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.limits import FILE, GB, NUMBERS, RATIO
 
 NUMBER_BYTES = 8
+WINDOW_BYTES = 8 << 20
+"""Of what is unpacked: the ratio is checked whenever so much has come."""
+GZIP, ZSTD = b"\x1f\x8b", b"\x28\xb5\x2f\xfd"
 HARMLESS = 8_000_000
 """Numbers that any file may hold, however well it is packed: 64 MB."""
 
@@ -44,3 +52,49 @@ def check_packed(path: Path, claimed: int) -> None:
             f"{path}: unpacks from {packed / 1e6:.3g} MB to {claimed / 1e6:.3g} MB, more than {RATIO.value():g} times as much, as no "
             f"recording does; {RATIO.more()}"
         )
+
+
+def content_of(path: Path) -> BinaryIO:
+    """The file, to be read from its beginning to its end; the content of one that gzip or zstd packed. Reading raises RecordingError where
+    that is more than `limits.RATIO` times its size in any window of WINDOW_BYTES. Raises OSError.
+    """
+    file = path.open("rb")
+    start = file.read(len(ZSTD))
+    file.seek(0)
+    if start.startswith(GZIP):
+        return io.BufferedReader(_Unpacked(path, file, gzip.GzipFile(fileobj=file)), WINDOW_BYTES >> 3)
+    if start == ZSTD:
+        return io.BufferedReader(_Unpacked(path, file, zstandard.ZstdDecompressor().stream_reader(file)), WINDOW_BYTES >> 3)
+    return file
+
+
+class _Unpacked(io.RawIOBase):
+    """source: unpacks `file`."""
+
+    def __init__(self, path: Path, file: IO[bytes], source: Any) -> None:
+        self._path, self._file, self._source = path, file, source
+        self._unpacked, self._window = 0, (0, 0)
+
+    def readable(self) -> bool:
+        """It is."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        """As of any file."""
+        n = int(self._source.readinto(buffer))
+        self._unpacked += n
+        content, packed = self._unpacked - self._window[0], self._file.tell() - self._window[1]
+        if content >= WINDOW_BYTES:
+            if content > RATIO.value() * packed:
+                raise RecordingError(
+                    f"{self._path}: unpacks to more than {RATIO.value():g} times its size, as no recording does; {RATIO.more()}"
+                )
+            self._window = self._unpacked, self._file.tell()
+        return n
+
+    def close(self) -> None:
+        """Closes the file, too."""
+        if not self.closed:
+            self._source.close()
+            self._file.close()
+        super().close()

@@ -7,8 +7,6 @@ A few lines that cannot be read are left out and counted (`tally`); many refuse 
 
 from __future__ import annotations
 
-import gzip
-import io
 import logging
 import zlib
 from collections.abc import Iterator
@@ -20,6 +18,7 @@ from s2r_can.kinds import BLF, CANDUMP, SAVVYCAN, SQLITE, kind_of
 from s2r_can.records import LogFrame
 from s2r_can.tally import Tally
 from s2r_runtime.errors import RecordingError
+from s2r_runtime.formats.sizes import content_of
 from s2r_runtime.robot_logs import head_of, suffix_of
 
 LINE_MAX = 4096
@@ -34,7 +33,7 @@ def read_frames(path: Path, tally: Tally | None = None) -> Iterator[LogFrame]:
         if kind == SQLITE:
             yield from binaries.sqlite(path, tally)
             return
-        with _opened(path) as file:
+        with content_of(path) as file:
             if kind == BLF:
                 yield from binaries.blf(path, file, tally)
             elif kind == CANDUMP:
@@ -48,12 +47,6 @@ def read_frames(path: Path, tally: Tally | None = None) -> Iterator[LogFrame]:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from None
     except (EOFError, zlib.error) as error:
         raise RecordingError(f"{path}: is not a whole gzip file: {error}") from None
-
-
-def _opened(path: Path) -> IO[bytes]:
-    with path.open("rb") as file:
-        packed = file.read(2) == b"\x1f\x8b"
-    return io.BufferedReader(gzip.open(path)) if packed else path.open("rb")
 
 
 def _lines(file: IO[bytes]) -> Iterator[tuple[int, str]]:

@@ -2,12 +2,13 @@
 
     record = stamp (8 bytes, big-endian, microseconds of the logging computer's clock) and one whole frame
 
-What is no record is skipped byte by byte, and a last one that was cut is left out.
+What is no record is skipped up to the next byte that begins a frame, and a last one that was cut is left out.
 """
 
 from __future__ import annotations
 
 import gzip
+import re
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,8 +16,10 @@ from typing import NamedTuple
 
 from s2r_mavlink.frames import LONGEST, V1, V2, header, length_at, whole
 from s2r_runtime.errors import RecordingError
+from s2r_runtime.formats.sizes import content_of
 
 STAMP = 8
+_BEGINS = re.compile(b"[" + re.escape(bytes([V1, V2])) + b"]")
 STAMP_MAX_US = 1 << 53
 """In the year 2255."""
 BLOCK = 1 << 20
@@ -63,8 +66,9 @@ def records(path: Path, skipped: list[int], check: Callable[[bytes], bool | None
             yield Record(int.from_bytes(data[at:start], "big") * 1e-6, facts.system, facts.component, facts.number, frame)
             at = start + size
         else:
-            at += 1
-            lost += 1
+            begins = _BEGINS.search(data, start + 1)
+            place = (begins.start() if begins else len(data)) - STAMP
+            at, lost = place, lost + place - at
     if lost := lost + len(data) - at:
         skipped.append(lost)
 
@@ -75,9 +79,7 @@ def _follows(data: bytes, end: int) -> bool:
 
 def _blocks(path: Path) -> Iterator[bytes]:
     try:
-        with path.open("rb") as file:
-            packed = file.read(2) == b"\x1f\x8b"
-        with gzip.open(path) if packed else path.open("rb") as file:
+        with content_of(path) as file:
             while block := file.read(BLOCK):
                 yield block
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:

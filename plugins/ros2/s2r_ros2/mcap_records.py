@@ -13,19 +13,18 @@ reception).
 
 from __future__ import annotations
 
-import gzip
-import io
 import struct
 import zlib
 from collections.abc import Container, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import lz4.frame
 import zstandard
 
 from s2r_ros2.records import Channel, Definition, Message, kind_of, unpacked
 from s2r_runtime.errors import RecordingError
+from s2r_runtime.formats.sizes import content_of
 
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 3, 4, 5, 6, 15
@@ -54,7 +53,7 @@ class Bag:
         """Messages of these topics (None: of all), in the file's order. Raises RecordingError for what is no MCAP file."""
         self._only = only
         try:
-            with _unpacked(self.path) as file:
+            with content_of(self.path) as file:
                 if file.read(len(MAGIC)) != MAGIC:
                     raise RecordingError(f"{self.path}: is not an MCAP file")
                 yield from self._records(file)
@@ -148,15 +147,3 @@ def _decompressed(compression: str, data: bytes, size: int) -> bytes:
     if compression == "lz4":
         return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size))
     raise ValueError(f"compression {compression!r} is not known")
-
-
-def _unpacked(path: Path) -> Any:
-    """The file, gunzipped or (rosbag2's compression of files) unpacked by zstd."""
-    with path.open("rb") as file:
-        start = file.read(4)
-    if start.startswith(GZIP):
-        return gzip.open(path, "rb")
-    file = path.open("rb")
-    if start == ZSTD:
-        return io.BufferedReader(zstandard.ZstdDecompressor().stream_reader(file, closefd=True))
-    return file

@@ -9,19 +9,18 @@ temporary files first. A file that was cut is read as far as its pages are there
 
 from __future__ import annotations
 
-import gzip
 import shutil
 import sqlite3
 import tempfile
 from collections.abc import Container, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import IO, Any
 
 import zstandard
 
 from s2r_ros2.records import PAYLOAD_BYTES, ZSTD, Channel, Definition, Message, kind_of, unpacked
 from s2r_runtime.errors import RecordingError, one_line
+from s2r_runtime.formats.sizes import content_of
 
 SQLITE = b"SQLite format 3\0"
 GZIP = b"\x1f\x8b"
@@ -104,20 +103,18 @@ class _plain:  # noqa: N801 - a context manager
     """The file itself, or, where it is compressed as a whole, an unpacked copy for as long as it is read."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._folder = path, None if self._packed(path) is None else tempfile.TemporaryDirectory(prefix="s2r-bag-")
+        self._path, self._folder = path, None if not self._packed(path) else tempfile.TemporaryDirectory(prefix="s2r-bag-")
 
     @staticmethod
-    def _packed(path: Path) -> Any:
+    def _packed(path: Path) -> bool:
         with path.open("rb") as file:
-            start = file.read(4)
-        return zstandard.ZstdDecompressor() if start == ZSTD else gzip if start.startswith(GZIP) else None
+            return file.read(4).startswith((GZIP, ZSTD))
 
     def __enter__(self) -> Path:
         if self._folder is None:
             return self._path
         target = Path(self._folder.name) / "bag.db3"
-        with self._path.open("rb") as raw, target.open("wb") as out:
-            packed: IO[bytes] = gzip.open(raw) if self._packed(self._path) is gzip else zstandard.ZstdDecompressor().stream_reader(raw)  # type: ignore[assignment]
+        with content_of(self._path) as packed, target.open("wb") as out:
             room = min(UNPACKED_BYTES, shutil.disk_usage(self._folder.name).free // 2)
             while block := packed.read(1 << 20):
                 room -= len(block)
