@@ -2,7 +2,7 @@
 
 One transition is taken from each block of `block` s, no two nearer than that (up to a step of the model). The first M blocks count, which
 hold N different transitions; N is fixed by the share of beta alone. If the driving is stationary and its beta-mixing coefficient at the
-distance of a block is at most m, these M are independent draws of its law but with probability (M-1) m (Berbee 1979; Yu 1994):
+distance of a block is at most m, these M are independent draws of its distribution but with probability (M-1) m (Berbee 1979; Yu 1994):
 
     P[V(r) > eps] <= P(Bin(N, eps) <= k) + (M-1) m,        each half of the epoch's share at most
 
@@ -40,7 +40,7 @@ def founding(
     discard: int,
     angles: Sequence[int] = (),
 ) -> Transitions:
-    """The M transitions of a drive that the profile vouches for. share: of beta, the epoch's. dt: the model's step, s. angles: of a state.
+    """The M transitions of a recording that the profile vouches for. share: of beta, the epoch's. dt: the model's step, s. angles: of a state.
 
     Raises NotEnoughEvidence: the drive is too short (with how many blocks more would do), or the mixing too weak for the share.
     """

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 from core_rig import GAP, Rig, answers, of, one
-from report_rig import Told
+from report_rig import Answered
 
 from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
@@ -129,7 +129,7 @@ def test_the_report_marks_a_refused_campaign_and_what_it_cost() -> None:
     from s2r_runtime.report.run_page import add_refused
     from s2r_runtime.report.story import tell
 
-    rig = Told(rules=RULES)
+    rig = Answered(rules=RULES)
     ends(rig, campaign(rig))
     story = tell(SimpleNamespace(message=message) for message in rig.log)
     assert [what for _, what, kind in story.marks if kind == "bad"] == ["campaign of epoch 1 refused: its samples depend on each other"]

@@ -75,7 +75,7 @@ LATENCY = 12
 
 
 def fall_silent(rig: Rig) -> None:
-    """It is not heard for longer than the link allows, and goes on with all commands that were under way."""
+    """It is not heard for longer than the link allows, and goes on with all commands in transit."""
     assert rig.robot is not None
     rig.robot.send_signal(signal.SIGSTOP)
     rig.until_status(reason="link_down")
@@ -84,7 +84,7 @@ def fall_silent(rig: Rig) -> None:
 
 @pytest.mark.parametrize("event", [fall_silent, restart_robot], ids=["link lost", "robot restarted"])
 def test_a_delay_longer_than_the_hysteresis_makes_no_gap_grow_over_a_break(rig: Rig, event: Callable[[Rig], None]) -> None:
-    """Whether the commands under way before it still act, nobody knows: nothing is measured until it cannot matter."""
+    """Whether commands from before it still act is unknown: nothing is measured until it cannot matter."""
     rig.profile.write_text(rig.profile.read_text().replace("delay = 0.033", f"delay = {0.033 * LATENCY:.3f}"))
     path = rig.controller("    return np.tile([0.15, 1.0], (len(x), 1))\n")
     latency = ("--latency", str(LATENCY))

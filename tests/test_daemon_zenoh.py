@@ -90,7 +90,7 @@ def test_given_inputs_reach_the_robot_over_zenoh_row_by_row(rig: ZenohRig) -> No
 @pytest.mark.slow
 @pytest.mark.timeout(480)
 def test_a_suggested_drive_is_driven_and_tells_apart_what_the_first_one_could_not(rig: ZenohRig) -> None:
-    """The loop of docs/operating.md: drive something, trace it, drive what the tracer asks for, trace that."""
+    """The loop of docs/operating.md: drive something, trace it, drive what the tracer suggests, trace that."""
     rig.start()
     rig.start_robot("--effect", "input_gain:w gain=0.7")
     rig.until(lambda: rig.status()["observation"])

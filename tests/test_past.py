@@ -263,7 +263,7 @@ def test_a_log_with_a_number_is_newer_than_one_of_before_they_had_any(tmp_path: 
     assert reconciled(OLDER["an attempt"], tmp_path)[0] == NOW
 
 
-def test_what_lies_beside_the_logs_holds_up_no_start(tmp_path: Path) -> None:
+def test_other_files_in_the_log_folder_hold_up_no_start(tmp_path: Path) -> None:
     """Opening a FIFO waits for whoever writes to it."""
     log(tmp_path, NOW)
     os.mkfifo(tmp_path / "rig-20270101T000000Z.mcap")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-from report_rig import Told
+from report_rig import Answered
 
 from s2r_runtime.bounds import anytime_upper
 from s2r_runtime.core import reducer as core
@@ -15,7 +15,7 @@ from s2r_runtime.report.story import tell
 
 
 def test_the_report_shows_what_driving_shows_under_each_gap() -> None:
-    rig = Told()
+    rig = Answered()
     rig.driving()
     for n in range(1, 501):
         d = 0.011 if n % 100 == 0 else 0.004

@@ -450,5 +450,5 @@ def test_the_model_file_is_the_vessel_without_effects() -> None:
 
 
 def test_the_table_has_rows_of_its_own() -> None:
-    told = [row.what for row in rows([])]
-    assert sum("unopened" in what for what in told) == 7
+    shown = [row.what for row in rows([])]
+    assert sum("unopened" in what for what in shown) == 7

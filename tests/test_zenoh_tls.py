@@ -209,7 +209,7 @@ def test_a_private_key_that_others_can_read_is_refused(tmp_path: Path, stack: Ex
 
 
 def issued(folder: Path, name: str, *, common_name: str, from_s: float, to_s: float) -> None:
-    """A certificate of the site's authority in the place of that one, valid from and to so many seconds from now."""
+    """A certificate of the site's authority in the place of that one, valid between two times, in seconds from now."""
     ca, signer = tls._authority(folder)
     key, now = ec.generate_private_key(ec.SECP256R1()), datetime.datetime.now(datetime.UTC)
     made = (
@@ -237,10 +237,10 @@ def test_a_name_counts_only_while_its_certificate_does_and_letter_by_letter(tmp_
     folder = tmp_path / "site"
     issued(folder, "expired", common_name="robot", from_s=-2 * DAY, to_s=-DAY)
     issued(folder, "early", common_name="robot", from_s=DAY, to_s=2 * DAY)
-    issued(folder, "wild", common_name="rob*", from_s=-HOUR, to_s=HOUR)
+    issued(folder, "wildcard", common_name="rob*", from_s=-HOUR, to_s=HOUR)
     issued(folder, "capital", common_name="Robot", from_s=-HOUR, to_s=HOUR)
     issued(folder, "longer", common_name="robot.site", from_s=-HOUR, to_s=HOUR)
-    wrong = [site.link(f"site/{name}", site.robot_side) for name in ("expired", "early", "wild", "capital", "longer")]
+    wrong = [site.link(f"site/{name}", site.robot_side) for name in ("expired", "early", "wildcard", "capital", "longer")]
     assert site.frames(4.0, lambda: [one.put(f"{PREFIX}/observation", observation(site)) for one in wrong] and None) == []
     robot = site.link("site/robot", site.robot_side)
     assert site.frames(WITHIN_S, lambda: robot.put(f"{PREFIX}/observation", observation(site)), bool)

@@ -6,7 +6,7 @@
 `record` appends one JSON line a set to FILE as it is done, seed by seed over all families, and skips what FILE has: a run that was
 stopped goes on where it was. --measured: only the measured recordings in FOLDER (default with an empty FOLDER: $S2R_DATA).
 `compare` takes the sets that both files have (plain or .gz). Of each property it counts the sets that have it in one file only and tests
-whether the two counts differ beyond chance (McNemar, exact, two-sided). Exit 0: no worse; 1: worse, or with --identical any answer differs.
+whether the two counts differ significantly (McNemar, exact, two-sided). Exit 0: no worse; 1: worse, or with --identical any answer differs.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ NET_LOSS = 0.01
 HARM = {"alarm", "wrong", "false_name", "named", "accepted", "overclaimed", "crash", "long_error"}
 """Outcomes in which the answer says something that is not so."""
 WORSE = 1.02
-"""Error of the repaired model over that of the nominal one, in a new drive, from which on the repair did harm."""
+"""Error of the repaired model over that of the nominal one, on a new recording, from which on the repair did harm."""
 
 Key = tuple[str, str]
 """Family; seed, or the name of a measured recording."""
@@ -131,7 +131,7 @@ def read(path: Path) -> dict[Key, Record]:
     return {(r["family"], str(r["seed"])): r for r in records}
 
 
-def _mend_end(path: Path) -> None:
+def _repair_end(path: Path) -> None:
     """Cuts off half a line at the end."""
     if path.exists() and (whole := path.read_bytes()) and not whole.endswith(b"\n"):
         path.write_bytes(whole[: whole.rfind(b"\n") + 1])
@@ -181,7 +181,7 @@ def is_harmful(r: Record) -> bool:
 
 
 def is_worse(r: Record) -> bool:
-    """The repaired model errs more than the nominal one in a new drive."""
+    """The repaired model errs more than the nominal one on a new recording."""
     return bool(r["again"]) and r["verdict"] in {"traced", "ambiguous"} and r["again"][1] > WORSE * r["again"][0]
 
 
@@ -212,8 +212,8 @@ def compare(old: dict[Key, Record], new: dict[Key, Record], *, changed: bool) ->
         worse |= is_bad
         if family == "all" or counts.gained or counts.lost:
             net = 100.0 * (counts.new - counts.old) / counts.n
-            told = f"{counts.old:>5} -> {counts.new:<5} of {counts.n:<5} gained {counts.gained:<4} lost {counts.lost:<4}"
-            lines.append(f"{name:<15} {family:<17} {told} net {net:+.1f} %  p = {counts.p:.3g}{'  WORSE' if is_bad else ''}")
+            line = f"{counts.old:>5} -> {counts.new:<5} of {counts.n:<5} gained {counts.gained:<4} lost {counts.lost:<4}"
+            lines.append(f"{name:<15} {family:<17} {line} net {net:+.1f} %  p = {counts.p:.3g}{'  WORSE' if is_bad else ''}")
     spent = [sum(r["cpu_s"] for r in side) for side in zip(*pairs, strict=True)] if pairs else [0.0, 0.0]
     ratio = f", ratio {spent[1] / spent[0]:.3f}" if spent[0] else ""
     lines.append(f"CPU s {spent[0]:.1f} -> {spent[1]:.1f}{ratio}")
@@ -255,7 +255,7 @@ def main(argv: list[str] | None = None) -> int:
         lines, worse, differ = compare(read(args.old), read(args.new), changed=args.changed)
         print("\n".join(lines))
         return int(worse or (args.identical and differ > 0))
-    _mend_end(args.file)
+    _repair_end(args.file)
     has = read(args.file) if args.file.exists() else {}
     if args.measured is not None:
         folder = Path(args.measured or os.environ.get("S2R_DATA", ""))

@@ -127,7 +127,7 @@ class Certificates:
         believed = {*trusted, signer} if event.gap is not None else trusted[:1]
         certificate = certificates.load(data.data, believed, None, "certificate")
         facts = certificates.facts(certificate)
-        if rules < FIXED_SEEDS:  # the gate was told less then
+        if rules < FIXED_SEEDS:  # the gate received less then
             facts = msgspec.structs.replace(facts, fixed_seed=False)
         if facts != event.facts or event.gap not in (None, certificate.gap):
             raise ConfigError("what the gate was told is not what it says")

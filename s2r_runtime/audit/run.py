@@ -248,10 +248,10 @@ class RunAudit:
         if model is not None:
             facts = facts_of(model)
         rules = settings.rules if 0 <= settings.rules <= RULES else RULES  # an earlier version's rules are run again as they were
-        told = settings_of(self._profile, self._profile.model, facts, settings.seed, rules, simulated=settings.simulated)
-        if told != settings:
+        stated = settings_of(self._profile, self._profile.model, facts, settings.seed, rules, simulated=settings.simulated)
+        if stated != settings:
             self._findings.differ(
-                entry.index, entry.channel, "the settings are not those of the attached profile and model", settings, told
+                entry.index, entry.channel, "the settings are not those of the attached profile and model", settings, stated
             )
         self._evidence.begin_run(entry, event.memory)
         if self._reading is not None:

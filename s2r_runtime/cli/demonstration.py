@@ -79,7 +79,7 @@ class Demonstration:
         """Up to the last refusal. True if what was expected of the runtime happened."""
         controller = self._robot.controller("good")
         fault = ", ".join(self._effects) or "none"
-        self._tell(f"simulated robot {self._name!r} in its own process; injected fault: {fault} (hidden from the daemon)")
+        self._headline(f"simulated robot {self._name!r} in its own process; injected fault: {fault} (hidden from the daemon)")
         self._await_robot(robot)
         if not self._campaign():
             return False
@@ -171,7 +171,7 @@ class Demonstration:
             if drive == DRIVES:
                 break
             if latched:
-                self._step("s2r clear controller_fault", "the controller failed; on a busy machine its answer may be late")
+                self._step("s2r clear controller_fault", "the controller failed; on a busy machine its answer may miss the deadline")
                 self._ask({"verb": "clear", "text": "controller_fault"})
             self._step("s2r deploy", "try again at the gap that it was stopped for")
             answer = self._ask({"verb": "deploy", "path": str(self._robot.controller("good")), "parameters": {}})
@@ -338,7 +338,7 @@ class Demonstration:
         output.out(output.styled(f"$ {command}", "bold") + (f"   # {why}" if why else ""))
         output.flush()
 
-    def _tell(self, text: str) -> None:
+    def _headline(self, text: str) -> None:
         output.out(text)
         output.flush()
 

@@ -9,7 +9,7 @@
 What is latched in either is latched. A log counts only if its first seal, and the name in it, are this robot's own: by a key that it
 signs with, signed with before, or trusts. What any other file in the folder claims is reported, and changes nothing. Before anything
 rests on a log it is read in full; an own one that is damaged starts nothing. The newest log is the one with the highest number in its
-metadata: a name has the time of a wall clock, which may have been wrong. The samples of an unfinished campaign are held against the logs
+metadata: a name has the time of a wall clock, which may have been wrong. The samples of an unfinished campaign are compared with the logs
 in the same way: who takes them once more may choose.
 
 What no log shows that is still there, this can't: a whole folder that was put back, logs included, or logs that were deleted. Then the
@@ -107,16 +107,16 @@ def _number(path: Path) -> int:
 def reconciled(state: Memory, logs: Logs, keys: Collection[bytes], say: Callable[[str], None]) -> Memory:
     """The memory to start with. keys: public ones, whose logs count. Raises ConfigError if state and logs cannot both be true."""
     newest: tuple[Memory, Path] | None = None
-    for told, path in islice(logs.ends(), RUNS):
-        newest = newest or (told, path)
-        if what := forgotten(told, state):
-            if gained := forgotten(state, told):
+    for claimed, path in islice(logs.ends(), RUNS):
+        newest = newest or (claimed, path)
+        if what := forgotten(claimed, state):
+            if gained := forgotten(state, claimed):
                 raise ConfigError(
                     f"the state of robot {state.robot!r} forgets {what}, which {path} knows, and that log does not know {gained}: put the "
                     "newest state.json back, or move state and logs away to begin a new life (earlier certificates are then void)"
                 )
             say(f"the saved state forgets {what}; going on from what {path.name} ends with")
-            state = msgspec.structs.replace(_in_full(path, told, keys, what), latched=_both(told.latched, state.latched))
+            state = msgspec.structs.replace(_in_full(path, claimed, keys, what), latched=_both(claimed.latched, state.latched))
     if logs.foreign:
         names = ", ".join(path.name for path in logs.foreign[:SHOWN])
         more = f" and {len(logs.foreign) - SHOWN} more" if len(logs.foreign) > SHOWN else ""
@@ -124,14 +124,14 @@ def reconciled(state: Memory, logs: Logs, keys: Collection[bytes], say: Callable
     return state if newest is None else _with_latches(state, *newest, keys, say)
 
 
-def _with_latches(state: Memory, told: Memory, path: Path, keys: Collection[bytes], say: Callable[[str], None]) -> Memory:
+def _with_latches(state: Memory, claimed: Memory, path: Path, keys: Collection[bytes], say: Callable[[str], None]) -> Memory:
     """The state with what the newest log, at `path`, ends with as latched, and with its latest time."""
     # a run whose clock was ahead may be the newest; since then a person may have cleared it
-    seen = told.latest_unix_s if told.clock_cleared >= state.clock_cleared else 0
+    seen = claimed.latest_unix_s if claimed.clock_cleared >= state.clock_cleared else 0
     later = seen > state.latest_unix_s
-    missing = tuple(reason for reason in told.latched if reason not in state.latched)
+    missing = tuple(reason for reason in claimed.latched if reason not in state.latched)
     if later or missing:
-        _in_full(path, told, keys, f"the time {seen} s" if later else f"that {', '.join(missing)} is latched")
+        _in_full(path, claimed, keys, f"the time {seen} s" if later else f"that {', '.join(missing)} is latched")
     if later:
         say(f"the saved state does not know of the time {seen} s that the newest log ends with; certificates expire by that")
         state = msgspec.structs.replace(state, latest_unix_s=seen)
@@ -153,7 +153,7 @@ def _last_memory(newest_first: Iterable[Path]) -> tuple[Memory, Path] | None:
     return None
 
 
-def _in_full(path: Path, told: Memory, keys: Collection[bytes], lost: str) -> Memory:
+def _in_full(path: Path, claimed: Memory, keys: Collection[bytes], lost: str) -> Memory:
     """What that log ends with when all that it is sealed with is checked. Raises ConfigError if it doesn't hold."""
     found: Memory | None = None
     where = f"the saved state forgets {lost}, which {path} knows; but that log "
@@ -167,7 +167,7 @@ def _in_full(path: Path, told: Memory, keys: Collection[bytes], lost: str) -> Me
                 found = message.memory
     except RecordingError as error:
         raise ConfigError(f"{where}cannot be read ({error}); put the newest state.json back") from None
-    if reading.ending.kind == "broken" or found is None or forgotten(told, found):
+    if reading.ending.kind == "broken" or found is None or forgotten(claimed, found):
         raise ConfigError(f"{where}is damaged ({reading.ending.detail or 'its end does not hold'}); put the newest state.json back")
     return found
 

@@ -48,7 +48,7 @@ class Account(msgspec.Struct, frozen=True):
 
 
 def info(path: Path) -> dict[str, Any]:
-    """What a log holds and how it ended. Reads and checks all of it; raises RecordingError if it is none, or holds no message."""
+    """What a log holds and how it ended. Reads and checks all of it; raises RecordingError if it is not a log, or holds no message."""
     reading = read(path, ())
     ending = reading.to_the_end()
     if not reading.counts:

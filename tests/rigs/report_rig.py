@@ -7,7 +7,7 @@ from core_rig import Rig
 from s2r_runtime.messages import Event, Output
 
 
-class Told(Rig):
+class Answered(Rig):
     """A rig that keeps events and outputs in the log's order."""
 
     log: list[Event | Output]

@@ -69,5 +69,5 @@ def verify_job(controller: Path = GRID, more: str = "") -> VerifyJob:
 
 
 def step(k: int, x: float) -> tuple[Observation, Send]:
-    """A robot that is at x at period k, and is told to stand still."""
+    """A robot that is at x at period k, and is commanded to stand still."""
     return Observation(k, 33_000_000 * k, (x, 0.0, 0.0)), Send(33_000_000 * k, k, "controller", (0.0, 0.0), k, 100_000_000)

@@ -1,7 +1,7 @@
 """Families whose true effect is in no library: `unopened_NN`, and another robot's, `unopened_robot_...`.
 
 Made from a description of the tracer's task alone (the effects' names, the shape of a recording), by somebody who had not read the tracer.
-NEVER TO BE OPENED by whoever changes the tracer: neither this file, nor unopened_*.py and vessel*.py beside it, nor the sets one by one.
+NEVER TO BE OPENED by whoever changes the tracer: neither this file, nor unopened_*.py and vessel*.py, nor the sets one by one.
 The bench counts them and shows no set of them. Once opened they are in-sample, and others must be made.
 
     unopened_NN             a kind of model error that real robots have, on the bench's own robots
@@ -9,7 +9,7 @@ The bench counts them and shows no set of them. Once opened they are in-sample, 
     unopened_robot_clean    nothing is missing on the vessel: white noise; ..._coloured, ..._closed
     unopened_robot_named_N  an effect that the library has, on the vessel
 
-Sizes are drawn from what is usual on real robots, not until the tracer sees them. A robot and its noise are drawn anew until the nominal
+Sizes are drawn from what is usual on real robots, not until the tracer sees them. A robot and its noise are drawn again until the nominal
 model's error over a second is STRONG times the oracle's: else nothing would be wrong with answering `none`. Each truth has
 
     words       what is true         depends_on   tokens that the missing effect depends on
@@ -53,7 +53,7 @@ ONE_STEP_ROLLOUTS = 300
 """Of which the one-step share is computed."""
 
 NOISES = ("white", "white", "white", "white", "coloured", "student", "outliers", "quantised")
-"""Laws of noise, as often as they stand here."""
+"""Noise models; repeated entries are drawn more often."""
 
 
 def one_step_shares(rng: Rng, draft: Draft) -> dict[str, float]:
@@ -123,7 +123,7 @@ def _of_kind(kind: Kind) -> Family:
 
 
 def _on_vessel(rng: Rng, s: Scale, noise: str, law: str, **more: Any) -> Draft:
-    """law: closed, or one of an open loop."""
+    """excitation: closed loop, or one of an open loop."""
     commands = autopilot(s) if law == "closed" else open_thrusts(s, law)
     return Draft(s, vessel_noise(rng, s, noise), law, asked=commands, **more)
 

@@ -19,7 +19,7 @@ Rng = np.random.Generator
 class Drawn:
     """One draw of a kind. words: what is true; depends_on: tokens on which the missing effect depends; values: its parameters, SI units.
 
-    law: the excitation, where the kind needs a certain one.
+    excitation, where the kind needs a certain one.
     """
 
     effect: TruthEffect

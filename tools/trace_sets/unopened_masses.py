@@ -244,4 +244,4 @@ MASSES: tuple[Kind, ...] = (
     Kind(("joint",), cogging),
     Kind(("double_integrator",), fan_jet),
 )
-"""In the order of their numbers, after those of poses."""
+"""In numerical order, after those of poses."""

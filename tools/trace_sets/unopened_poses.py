@@ -54,12 +54,12 @@ def battery_sag(rng: Rng, s: Scale) -> Drawn:
 
 
 class CastorSwing(TruthEffect):
-    """A passive castor ahead of the drive axle swings round when the robot reverses or turns; its rolling resistance pulls aside.
+    """A passive castor ahead of the driven axle swings round when the robot reverses or turns; its rolling resistance pulls aside.
 
     beta' = (a w cos(beta) - v sin(beta)) / d - w,   q = tanh(roll / v0),   roll = v cos(beta) + a w sin(beta)
     v  -> v - k_v q cos(beta),   w -> w - k_w q sin(beta)
 
-    beta: its rolling direction in the body; a: pivot ahead of the axle, d: trail, m. k_v, k_w: speed droop of the drives under
+    beta: its rolling direction in the body; a: pivot ahead of the axle, d: trail, m. k_v, k_w: speed droop of the motors under
     that load. Source: Campion, Bastin, d'Andréa-Novel, "Structural properties and classification of kinematic and dynamic models of
     wheeled mobile robots", IEEE TRA 12(1), 1996 (castor constraint).
     """
@@ -162,7 +162,7 @@ def compass_deviation(rng: Rng, s: Scale) -> Drawn:
     b, c, d, e = hard * math.cos(where), hard * math.sin(where), soft * math.cos(round_), soft * math.sin(round_)
     return Drawn(
         CompassDeviation(b, c, d, e),
-        "the heading is a compass's beside iron: its error changes with the heading",
+        "the heading is a compass's near iron: its error changes with the heading",
         ("heading",),
         {"B_rad": b, "C_rad": c, "D_rad": d, "E_rad": e},
     )
@@ -289,7 +289,7 @@ def tyre_relaxation(rng: Rng, s: Scale) -> Drawn:
     length = float(rng.uniform(0.15, 0.4)) * s.plant.parameters["wheel_base"]
     return Drawn(
         TyreRelaxation(length),
-        "side force of the front tyres builds up over a distance rolled, so steering comes late, the more so when slow",
+        "side force of the front tyres builds up over a distance rolled, so steering is delayed, the more so at low speed",
         ("memory(steer_cmd)", "steer_cmd", "steer_cmd*speed_cmd"),
         {"relaxation_length_m": length},
     )
@@ -358,4 +358,4 @@ POSES: tuple[Kind, ...] = (
     Kind(("bicycle",), grip_limit),
     Kind(("bicycle",), steering_linkage),
 )
-"""In the order of their numbers."""
+"""In numerical order."""

@@ -300,4 +300,4 @@ def waves(rng: Rng, s: Scale) -> Drawn:
 
 
 VESSEL: tuple[Kind, ...] = tuple(Kind(("vessel",), draw) for draw in (advance_loss, relative_wind, bank_suction, waves))
-"""In the order of their numbers."""
+"""In numerical order."""

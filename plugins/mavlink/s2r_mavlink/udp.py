@@ -158,7 +158,7 @@ class Udp:
         return True
 
     def is_other(self, source: Source) -> bool:
-        """Whether one was accepted, and this is none."""
+        """Whether one was accepted, and this is another."""
         return self._address.kind != "udpout" and not self._many and bool(self._others) and source not in self._others
 
     def hear(self, source: Source) -> None:
