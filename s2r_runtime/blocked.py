@@ -40,7 +40,7 @@ def founding(
     discard: int,
     angles: Sequence[int] = (),
 ) -> Transitions:
-    """The M transitions of a recording that the profile vouches for. share: of beta, the epoch's. dt: the model's step, s. angles: of a state.
+    """The M transitions of a recording that the profile vouches for. share: of beta, the epoch's. dt: model's step, s. angles: of a state.
 
     Raises NotEnoughEvidence: the drive is too short (with how many blocks more would do), or the mixing too weak for the share.
     """

@@ -8,7 +8,7 @@
     MATLAB     "MATLAB 5.0 MAT-file", "MATLAB 7.3 MAT-file" (which is HDF5, as 7.0 is), or the header of version 4
     rosbag2    an MCAP file of others, or SQLite with the tables `topics` and `messages`; or a folder of them
 
-A file that is none of these is a table, or a log that a transport's plug-in reads (`robot_logs`).
+A file that is not one of these is a table, or a log that a transport's plug-in reads (`robot_logs`).
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def open_recording(path: Path, form: Form | None = None, options: Mapping[str, A
     """
     form = form or recognised(path)
     if form is None:
-        raise UsageError(f"{path}: is none of the formats that have named signals; a table and a robot's own log are read as they are")
+        raise UsageError(f"{path}: is not one of the formats that have named signals; a table and a robot's own log are read as they are")
     if form.name not in registry().names("formats"):
         raise not_installed(path, form)
     try:
