@@ -12,9 +12,9 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.models.input_chains import Inputs
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.recording.writer import Writer
-from s2r_runtime.trace.beginning import with_history
-from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams, thinned
-from s2r_runtime.trace.dataset_files import load_dataset
+from s2r_runtime.trace.data.dataset import Stream, from_arrays, from_streams, thinned
+from s2r_runtime.trace.data.initial_conditions import with_history
+from s2r_runtime.trace.data.readers import load_dataset
 from s2r_runtime.trace.residual import acting, first_steps, rollout_starts, steps_of
 
 

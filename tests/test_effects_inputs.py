@@ -9,7 +9,7 @@ from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
+from s2r_runtime.trace.data.dataset import Stream, from_arrays, from_streams
 from s2r_runtime.trace.residual import acting
 
 DT = 0.04

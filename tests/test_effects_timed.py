@@ -8,9 +8,9 @@ import pytest
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
+from s2r_runtime.trace.data.split import part
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
-from s2r_runtime.trace.holdout import part
 from s2r_runtime.trace.residual import acting, first_steps, residual, rms, steps_of
 
 DT = 0.05

@@ -6,8 +6,8 @@ from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recor
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
-from s2r_runtime.trace.faults import check
+from s2r_runtime.trace.data.dataset import Stream, from_arrays, from_streams
+from s2r_runtime.trace.sensor_faults.detect import check
 
 STEPS = 900
 GAIN = (("input_gain", "v", {"gain": 0.6}), ("input_gain", "w", {"gain": 0.6}))

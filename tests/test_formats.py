@@ -22,7 +22,7 @@ from s2r_runtime.formats.series import Topic
 from s2r_runtime.formats.signals import resolve
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.trace.dataset_files import load_dataset
+from s2r_runtime.trace.data.readers import load_dataset
 from s2r_runtime.transitions import load_transitions
 
 MODEL = compose(ModelSpec("unicycle", DT))

@@ -7,7 +7,7 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.models.forces import is_speed, own_rate
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.tracer import trace
 
 DT = 0.02

@@ -20,7 +20,7 @@ from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.table_rows import MAX_SEGMENT_ROWS, UNITS, RowStore
 from s2r_runtime.table_text import Limits, TextLines
 from s2r_runtime.tables import read_csv
-from s2r_runtime.trace import dataset_files
+from s2r_runtime.trace.data import readers
 from s2r_runtime.transitions import load_transitions
 
 MB = 1 << 20
@@ -85,7 +85,7 @@ def test_what_is_no_regular_file_is_refused_before_it_is_opened(tmp_path: Path, 
         os.mkfifo(path)
     else:
         path.symlink_to("/dev/zero")
-    for call in (lambda: load_transitions(path, UNICYCLE), lambda: dataset_files.load_dataset(path, UNICYCLE)):
+    for call in (lambda: load_transitions(path, UNICYCLE), lambda: readers.load_dataset(path, UNICYCLE)):
         with pytest.raises(RecordingError, match=f"is a {what}, must be a"):
             call()
 
@@ -199,8 +199,8 @@ def test_the_gap_of_a_long_drive_says_which_rows_it_is_of(tmp_path: Path, monkey
 
 
 def test_a_long_trace_uses_stretches_and_says_so(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(dataset_files, "MAX_ROWS", 1280)
-    data = dataset_files.load_dataset(table(tmp_path / "run.csv", 5000), UNICYCLE)
+    monkeypatch.setattr(readers, "MAX_ROWS", 1280)
+    data = readers.load_dataset(table(tmp_path / "run.csv", 5000), UNICYCLE)
     assert data.subset is not None
     assert data.rows == data.subset.used <= 1280
     assert len(data.runs) == len(data.subset.stretches)
@@ -208,8 +208,8 @@ def test_a_long_trace_uses_stretches_and_says_so(tmp_path: Path, monkeypatch) ->
 
 
 def test_long_segments_stay_runs_of_their_own(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(dataset_files, "MAX_ROWS", 1280)
-    data = dataset_files.load_dataset(table(tmp_path / "run.csv", 6000, segments=3), UNICYCLE)
+    monkeypatch.setattr(readers, "MAX_ROWS", 1280)
+    data = readers.load_dataset(table(tmp_path / "run.csv", 6000, segments=3), UNICYCLE)
     assert data.subset is not None
     ends = [run.start_s + 0.1 * (len(run.y) - 1) for run in data.runs]
     assert not any(run.start_s < at - 0.05 < end for run, end in zip(data.runs, ends, strict=True) for at in (200.0, 400.0))

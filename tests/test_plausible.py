@@ -9,10 +9,10 @@ from trace_robots import GEOMETRY, INPUTS, commands, drive
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace.dataset import Stream, from_streams
-from s2r_runtime.trace.plausible import _if_each_taken_back, _if_taken_back, _mistake, _mistakes, _scaled, check_plausible
+from s2r_runtime.trace.checks.columns import _if_each_taken_back, _if_taken_back, _mistake, _mistakes, _scaled, check_plausible
+from s2r_runtime.trace.checks.prediction_error import unforetold
+from s2r_runtime.trace.data.dataset import Stream, from_streams
 from s2r_runtime.trace.tracer import trace
-from s2r_runtime.trace.unforetold import unforetold
 
 DT, STEPS = 0.05, 700
 BOUNDS = {

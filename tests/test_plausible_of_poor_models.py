@@ -7,10 +7,10 @@ from trace_robots import GEOMETRY, commands
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace.dataset import Stream, from_streams
-from s2r_runtime.trace.loosely import loosely_unforetold, sizes
-from s2r_runtime.trace.plausible import WELL, check_plausible
-from s2r_runtime.trace.unforetold import unforetold
+from s2r_runtime.trace.checks.columns import WELL, check_plausible
+from s2r_runtime.trace.checks.prediction_error import unforetold
+from s2r_runtime.trace.checks.scale_free_error import loosely_unforetold, sizes
+from s2r_runtime.trace.data.dataset import Stream, from_streams
 
 DT, STEPS = 0.05, 900
 ROBOTS = {  # what each truly is, and its commands

@@ -7,9 +7,9 @@ from trace_sets.families import make
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.trace import plausible
-from s2r_runtime.trace.dataset import Stream, from_streams
-from s2r_runtime.trace.plausible import check_plausible
+from s2r_runtime.trace.checks import columns
+from s2r_runtime.trace.checks.columns import check_plausible
+from s2r_runtime.trace.data.dataset import Stream, from_streams
 from s2r_runtime.trace.tracer import load_dataset
 
 HEADER = "import numpy as np\n\n"
@@ -180,6 +180,6 @@ def test_a_rate_in_another_unit_is_told_where_runs_are_shorter_than_half_a_secon
 
 def test_a_mistake_and_what_else_it_may_be_are_compared_on_the_same_rows(monkeypatch):
     model, data = _short_runs(1.0)
-    monkeypatch.setattr(plausible, "ROWS", 60)
-    few = plausible._few(model, data)
+    monkeypatch.setattr(columns, "ROWS", 60)
+    few = columns._few(model, data)
     assert {len(run.y) for run in few.runs} == {len(states.t) for states, _ in few.segments} == {60}

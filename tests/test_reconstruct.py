@@ -10,13 +10,13 @@ from trace_robots import commands, drive
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace.dataset import from_arrays, thinned
-from s2r_runtime.trace.dataset_files import load_dataset
-from s2r_runtime.trace.differentiation import bandwidth, low_pass, reach
+from s2r_runtime.trace.data.dataset import from_arrays, thinned
+from s2r_runtime.trace.data.differentiation import bandwidth, low_pass, reach
+from s2r_runtime.trace.data.readers import load_dataset
+from s2r_runtime.trace.data.reconstruction import reconstruct
+from s2r_runtime.trace.data.streams import Stream
 from s2r_runtime.trace.inverse import input_relative, inverse
-from s2r_runtime.trace.reconstruct import reconstruct
 from s2r_runtime.trace.residual import steps_of
-from s2r_runtime.trace.streams import Stream
 from s2r_runtime.trace.tracer import trace
 
 DT = 0.01

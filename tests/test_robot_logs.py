@@ -18,7 +18,7 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import Registry
 from s2r_runtime.robot_logs import content_digest, is_robot_log, is_table, read_robot_log, readers_of
-from s2r_runtime.trace.dataset_files import load_dataset
+from s2r_runtime.trace.data.readers import load_dataset
 from s2r_runtime.transitions import load_transitions
 
 MODEL = compose(ModelSpec("unicycle", 0.1))

@@ -20,7 +20,7 @@ from s2r_runtime.gap import refuse_fitted
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import COMPACT, PREFIX, ModelSpec, dump_model, form_of, load_model
 from s2r_runtime.seen_rows import ALPHA, FALSE_BITS, KEPT, TEXT_MAX, seen, sketch, united
-from s2r_runtime.trace.dataset_files import load_dataset
+from s2r_runtime.trace.data.readers import load_dataset
 from s2r_runtime.transitions import load_transitions
 
 DT = 0.1

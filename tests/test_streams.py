@@ -6,9 +6,9 @@ import pytest
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.trace.dataset import from_streams, thinned
-from s2r_runtime.trace.faults import check
-from s2r_runtime.trace.streams import Stream, complete, fresh, nearest, turned
+from s2r_runtime.trace.data.dataset import from_streams, thinned
+from s2r_runtime.trace.data.streams import Stream, complete, fresh, nearest, turned
+from s2r_runtime.trace.sensor_faults.detect import check
 
 
 def _pose(t):

@@ -11,7 +11,7 @@ from trace_robots import declared, recordings
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import dump_model, load_model
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.tracer import trace
 
 SETS, STEPS = 2, 600

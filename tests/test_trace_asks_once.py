@@ -20,13 +20,13 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import exchange, fields, fitting, lack_of_fit, relevance, residual, retimed, scores, selection, whole
 from s2r_runtime.trace.changes import rivals_that_happen
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.errors import Held, noise_floor
-from s2r_runtime.trace.faults import Checked
 from s2r_runtime.trace.fields import Field
 from s2r_runtime.trace.fitting import Problem, evaluate, fitted, foretold, foretold_by, insert, problem, scatter, without
 from s2r_runtime.trace.lack_of_fit import left_of
 from s2r_runtime.trace.residual import acting, state_jacobian, steps_of
+from s2r_runtime.trace.sensor_faults.detect import Checked
 
 DT_S, ROWS = 0.02, 300
 

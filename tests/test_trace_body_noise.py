@@ -9,7 +9,7 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace import fields
 from s2r_runtime.trace.body_noise import body_noise, whitener
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, problem
 from s2r_runtime.trace.lack_of_fit import left_of
 from s2r_runtime.trace.residual import steps_of

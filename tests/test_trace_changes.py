@@ -12,7 +12,7 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.trace import changes
 from s2r_runtime.trace.acceptance import accepted
 from s2r_runtime.trace.changes import from_the_beginning, rivals_that_happen
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.scores import STRICT, Scored, name_of

@@ -8,7 +8,7 @@ import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.lack_of_fit_crossed import bent_product, over_time, overtones
 from s2r_runtime.trace.tracer import trace
 

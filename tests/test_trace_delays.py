@@ -6,8 +6,8 @@ from seeds import first
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace.dataset import from_streams
-from s2r_runtime.trace.streams import Stream
+from s2r_runtime.trace.data.dataset import from_streams
+from s2r_runtime.trace.data.streams import Stream
 from s2r_runtime.trace.tracer import trace
 
 DT_S, TICK_S, TICKS = 0.01, 0.001, 6000

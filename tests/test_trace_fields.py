@@ -12,7 +12,7 @@ from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import fields
 from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.fields import SEEN, field
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
 from s2r_runtime.trace.lack_of_fit import _wanders, left_of

@@ -13,8 +13,8 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.candidates import candidates
-from s2r_runtime.trace.coarse import FEW, coarse, coarser
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
+from s2r_runtime.trace.data.gridding import FEW, coarse, coarser
 from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.hidden_pairs import TAKEN, _nats, _nats_beside, _nats_of_spans, _span, _together, two_together
 from s2r_runtime.trace.leftover import Leftover

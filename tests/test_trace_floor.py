@@ -4,7 +4,7 @@ import numpy as np
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.errors import Held, at_most_seen, held, judge
 from s2r_runtime.trace.residual import first_steps, rms, steps_of
 

@@ -9,7 +9,7 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import lack_of_fit
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.episodes import _staying_wild, episodes
 from s2r_runtime.trace.fitting import evaluate, insert, problem
 from s2r_runtime.trace.lack_of_fit import left_of

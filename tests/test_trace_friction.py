@@ -8,7 +8,7 @@ from seeds import first
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, problem
 from s2r_runtime.trace.friction import with_friction
 from s2r_runtime.trace.residual import steps_of

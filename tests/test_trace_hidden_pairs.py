@@ -6,7 +6,7 @@ from seeds import first
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.tracer import trace
 
 DT_S, ROWS, CHANGE_S = 0.02, 900, 7.2

@@ -7,9 +7,9 @@ import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.trace.dataset import from_arrays
-from s2r_runtime.trace.dataset_files import load_dataset
-from s2r_runtime.trace.faults import check
+from s2r_runtime.trace.data.dataset import from_arrays
+from s2r_runtime.trace.data.readers import load_dataset
+from s2r_runtime.trace.sensor_faults.detect import check
 from s2r_runtime.trace.tracer import trace
 from s2r_runtime.trace.whole import Whole
 

@@ -9,8 +9,8 @@ from trace_sets.families import make
 from s2r_runtime.cli.main import main
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.trace.late_poses import _asked, _turns_sooner, earlier, late_pose
-from s2r_runtime.trace.streams import Stream
+from s2r_runtime.trace.data.streams import Stream
+from s2r_runtime.trace.sensor_faults.pose_latency import _asked, _turns_sooner, earlier, late_pose
 
 PARTS, ROW_S, ROWS = 20, 0.025, 1600
 NOISE = np.array([0.001, 0.001, 0.003])

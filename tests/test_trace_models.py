@@ -11,9 +11,9 @@ from trace_robots import GEOMETRY, INPUTS, POSES, commands, drive
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.beginning import with_history
-from s2r_runtime.trace.dataset import Stream, from_arrays, from_streams
-from s2r_runtime.trace.dataset_files import load_dataset
+from s2r_runtime.trace.data.dataset import Stream, from_arrays, from_streams
+from s2r_runtime.trace.data.initial_conditions import with_history
+from s2r_runtime.trace.data.readers import load_dataset
 from s2r_runtime.trace.exchange import parted
 from s2r_runtime.trace.fitting import evaluate, fitted, problem
 from s2r_runtime.trace.residual import steps_of

@@ -8,9 +8,9 @@ from seeds import first
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace.dataset import Dataset, Stream, from_arrays, from_streams
-from s2r_runtime.trace.faults import check
+from s2r_runtime.trace.data.dataset import Dataset, Stream, from_arrays, from_streams
 from s2r_runtime.trace.residual import rms
+from s2r_runtime.trace.sensor_faults.detect import check
 from s2r_runtime.trace.tracer import trace
 
 DT_S, ROWS, FAST = 0.01, 3000, 1154

@@ -10,9 +10,11 @@ from s2r_runtime.hookspecs import Parameter
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import coarse, grid_errors
+from s2r_runtime.trace import grid_errors
 from s2r_runtime.trace.acceptance import _beyond_rounding
-from s2r_runtime.trace.dataset import Run, from_arrays, from_streams
+from s2r_runtime.trace.data import gridding
+from s2r_runtime.trace.data.dataset import Run, from_arrays, from_streams
+from s2r_runtime.trace.data.streams import Stream
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem, sensitivities, told
 from s2r_runtime.trace.grid_errors import widened
 from s2r_runtime.trace.intervals import intervals
@@ -22,7 +24,6 @@ from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.residual_noise import Colour, no_colour, no_steadier
 from s2r_runtime.trace.retimed import retimed
 from s2r_runtime.trace.slots import Slot, bounds_of, values_of
-from s2r_runtime.trace.streams import Stream
 
 DRY, VISCOUS = 0.5, 0.4
 WIND = 0.05
@@ -322,8 +323,8 @@ def _coarse_speed(step, speeds):
 
 def test_what_changes_within_a_coarse_part_is_over_by_its_end_only_if_the_next_one_holds():
     u = np.array([[0.0, 0.0, 0.0, 1.0], [1.0, 1.0, 1.0, 2.0], [2.0, 3.0, 3.0, 3.0]]).reshape(-1, 1)
-    pairs = coarse._joined(Run(0.0, np.zeros((4, 1)), u), 4, 2)
+    pairs = gridding._joined(Run(0.0, np.zeros((4, 1)), u), 4, 2)
     assert pairs.turned[:, 0].tolist() == [True, False, False]
     fine = Run(0.0, np.zeros((4, 1)), u, turned=np.array([[False], [True], [False]]))
-    assert coarse._joined(fine, 4, 2).turned[:, 0].tolist() == [True, False, False]
+    assert gridding._joined(fine, 4, 2).turned[:, 0].tolist() == [True, False, False]
     assert pairs.u[:, 0].tolist() == [0.0, 0.5, 1.0, 1.5, 2.5, 3.0]

@@ -9,7 +9,7 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace import whole
 from s2r_runtime.trace.answer import with_time
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, problem
 from s2r_runtime.trace.one_stretch import _once, in_one_stretch
 from s2r_runtime.trace.residual import steps_of

@@ -9,7 +9,7 @@ import pytest
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, fitted, problem
 from s2r_runtime.trace.opposed import opposed
 from s2r_runtime.trace.residual import steps_of

@@ -8,8 +8,8 @@ from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.accelerations import check_accelerations
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.checks.model_order import check_accelerations
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.endless import endless
 from s2r_runtime.trace.fitting import evaluate, insert, problem
 from s2r_runtime.trace.residual import steps_of

@@ -6,7 +6,7 @@ import pytest
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace import scores, selection
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.fitting import Problem, evaluate, gain, problem
 from s2r_runtime.trace.residual import steps_of
 

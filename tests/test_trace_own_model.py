@@ -15,7 +15,7 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import screening
 from s2r_runtime.trace.challenge import better_shape
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.errors import held
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
 from s2r_runtime.trace.hidden_pairs import two_together

@@ -9,8 +9,8 @@ from seeds import first
 
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace.dataset import Dataset, from_arrays
-from s2r_runtime.trace.faults import check
+from s2r_runtime.trace.data.dataset import Dataset, from_arrays
+from s2r_runtime.trace.sensor_faults.detect import check
 from s2r_runtime.trace.tracer import trace
 
 Array = NDArray[np.float64]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from test_trace_friction import _joint, _recorded
 
-from s2r_runtime.trace.position_faults import mended
-from s2r_runtime.trace.streams import Stream
+from s2r_runtime.trace.data.streams import Stream
+from s2r_runtime.trace.sensor_faults.position_outliers import mended
 from s2r_runtime.trace.tracer import load_dataset, trace
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, problem
 from s2r_runtime.trace.lack_of_fit import dictionaries_of, left_of
 from s2r_runtime.trace.lack_of_fit_judged import first_look

@@ -19,7 +19,7 @@ from s2r_runtime.report.page import Page
 from s2r_runtime.report.trace_page import trace_page
 from s2r_runtime.report.trace_section import add_trace
 from s2r_runtime.trace.account import _assumed, loud
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.excitation import suggest
 from s2r_runtime.trace.found import Found, each_once, interval_text
 from s2r_runtime.trace.plain_words import in_words

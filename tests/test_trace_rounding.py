@@ -5,7 +5,7 @@ import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.lack_of_fit import beyond_rounding
 from s2r_runtime.trace.tracer import trace
 

@@ -12,7 +12,7 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.report.page import Page
 from s2r_runtime.report.trace_section import add_trace
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.found import Found
 from s2r_runtime.trace.same_thing import other_names
 from s2r_runtime.trace.tracer import trace

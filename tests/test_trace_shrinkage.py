@@ -6,7 +6,7 @@ import pytest
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem, told, values_of
 from s2r_runtime.trace.intervals import spread_of
 from s2r_runtime.trace.residual import steps_of

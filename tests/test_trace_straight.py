@@ -9,14 +9,14 @@ from s2r_runtime.gap import Transitions
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import straight as inputs_straight
-from s2r_runtime.trace.dataset import Stream, from_streams
+from s2r_runtime.trace.data import input_hold as inputs_straight
+from s2r_runtime.trace.data.dataset import Stream, from_streams
+from s2r_runtime.trace.data.input_hold import ROUNDS, samples_of, straight
+from s2r_runtime.trace.data.input_interpolation import Samples, Way
 from s2r_runtime.trace.fitting import evaluate, fitted, problem
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.slots import Added
-from s2r_runtime.trace.straight import ROUNDS, samples_of, straight
 from s2r_runtime.trace.tracer import load_dataset, trace
-from s2r_runtime.trace.ways import Samples, Way
 
 pytestmark = pytest.mark.slow
 

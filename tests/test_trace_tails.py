@@ -5,8 +5,8 @@ import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.trace.dataset import from_arrays
-from s2r_runtime.trace.faults import check
+from s2r_runtime.trace.data.dataset import from_arrays
+from s2r_runtime.trace.sensor_faults.detect import check
 
 pytestmark = pytest.mark.slow
 

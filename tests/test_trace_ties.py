@@ -13,7 +13,7 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.trace import second_look, verdict
 from s2r_runtime.trace.acceptance import _scattered
 from s2r_runtime.trace.any_shape import any_shape_of
-from s2r_runtime.trace.dataset import from_arrays
+from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.errors import Judged, held
 from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.residual import steps_of

@@ -17,13 +17,13 @@ from s2r_runtime.models.file_model import FileModel
 from s2r_runtime.models.forces import coupled
 from s2r_runtime.models.input_chains import Inputs
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace.beginning import with_history
-from s2r_runtime.trace.dataset import from_streams
-from s2r_runtime.trace.holdout import part
-from s2r_runtime.trace.reconstruct import at_step
+from s2r_runtime.trace.data.dataset import from_streams
+from s2r_runtime.trace.data.initial_conditions import with_history
+from s2r_runtime.trace.data.reconstruction import at_step
+from s2r_runtime.trace.data.split import part
+from s2r_runtime.trace.data.streams import Stream
 from s2r_runtime.trace.residual import Acting, acting, advanced, residual, steps_of
 from s2r_runtime.trace.shapes import SHAPES, Shape
-from s2r_runtime.trace.streams import Stream
 from s2r_runtime.trace.tracer import trace
 
 pytestmark = pytest.mark.slow

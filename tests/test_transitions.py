@@ -18,7 +18,7 @@ from s2r_runtime.messages import CampaignFinished, Event, Observation, Observed,
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.recording.writer import Writer
-from s2r_runtime.trace.dataset_files import load_dataset
+from s2r_runtime.trace.data.readers import load_dataset
 from s2r_runtime.transitions import from_samples, load_transitions
 
 DT = 0.1

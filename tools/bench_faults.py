@@ -25,10 +25,10 @@ from trace_sets.targets import clopper_pearson
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace.beginning import with_history
-from s2r_runtime.trace.dataset import thinned
-from s2r_runtime.trace.dataset_files import load_dataset
-from s2r_runtime.trace.faults import Fault, check
+from s2r_runtime.trace.data.dataset import thinned
+from s2r_runtime.trace.data.initial_conditions import with_history
+from s2r_runtime.trace.data.readers import load_dataset
+from s2r_runtime.trace.sensor_faults.detect import Fault, check
 
 CLEAN = (
     "clean",

@@ -36,7 +36,7 @@ from s2r_runtime.modelspec import EffectSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import load_profile
 from s2r_runtime.tasks.grid_world import GridWorld
-from s2r_runtime.trace.dataset import Stream, from_streams
+from s2r_runtime.trace.data.dataset import Stream, from_streams
 from s2r_runtime.trace.found import Found
 from s2r_runtime.trace.tracer import trace
 from s2r_runtime.transitions import from_samples

@@ -29,7 +29,7 @@ from s2r_runtime.errors import NotEnoughEvidence, UsageError
 if TYPE_CHECKING:
     from s2r_runtime.models.composed import ComposedModel
     from s2r_runtime.profile import Profile
-    from s2r_runtime.trace.dataset import Dataset
+    from s2r_runtime.trace.data.dataset import Dataset
     from s2r_runtime.trace.result import TraceResult
     from s2r_runtime.trace.suggestion import Suggestion
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from s2r_runtime.models.composed import ComposedModel
     from s2r_runtime.profile import Profile
-    from s2r_runtime.trace.dataset import Dataset
+    from s2r_runtime.trace.data.dataset import Dataset
     from s2r_runtime.trace.result import TraceResult
 
 WRITTEN_WITHIN_S = 45.0
@@ -135,8 +135,8 @@ def dataset(model: ComposedModel, cut: Cut, source: str, digests: tuple[str, ...
     """The stretch on the model's grid. Raises RecordingError if its rows are not of this model, or too far apart,
     NotEnoughEvidence if it is of one moment only.
     """
-    from s2r_runtime.trace.dataset import from_streams
-    from s2r_runtime.trace.dataset_files import row_sketch
+    from s2r_runtime.trace.data.dataset import from_streams
+    from s2r_runtime.trace.data.readers import row_sketch
 
     for segment in cut.segments:
         for rows, names in ((segment.states, model.states), (segment.inputs, model.inputs)):
@@ -151,7 +151,7 @@ def _stream(rows: Rows, width: int) -> Any:
     """Sorted by stamp; equal stamps keep their order."""
     import numpy as np
 
-    from s2r_runtime.trace.dataset import Stream
+    from s2r_runtime.trace.data.dataset import Stream
 
     t = np.array([stamp for stamp, _ in rows], dtype=np.int64)
     order = np.argsort(t, kind="stable")

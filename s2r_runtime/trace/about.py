@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
-from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.fitting import without
 from s2r_runtime.trace.lack_of_fit_terms import token_of
 from s2r_runtime.trace.residual import Acting, Steps, acting, advanced, rms

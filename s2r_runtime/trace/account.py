@@ -18,8 +18,8 @@ from s2r_runtime.trace.residual import rms
 from s2r_runtime.trace.shape import Component, Shape, components, derived, strongest, variables
 
 if TYPE_CHECKING:
-    from s2r_runtime.trace.fault import Fault
     from s2r_runtime.trace.result import TraceResult
+    from s2r_runtime.trace.sensor_faults.fault import Fault
 
 Array = NDArray[np.float64]
 

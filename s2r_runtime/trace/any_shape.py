@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 from s2r_runtime.effects.classes import same
 from s2r_runtime.trace.about import about
-from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.fitting import Fit
 from s2r_runtime.trace.residual import Steps
 from s2r_runtime.trace.scores import name_of

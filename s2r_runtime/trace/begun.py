@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.residual import Steps
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from s2r_runtime.effects.classes import canonical
 from s2r_runtime.hookspecs import Effect
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.fitting import insert
 from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.measured_forces import on_motion

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.residual import Steps, acting
 
 Array = NDArray[np.float64]

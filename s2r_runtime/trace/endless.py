@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.fitting import Fit
 from s2r_runtime.trace.slots import Slot, values_of
 
 LAG = "input_lag"
 
 QUARTER = 0.25
-"""Of the longest run: a shorter lag is told from an integral, whatever the interval (`accelerations`)."""
+"""Of the longest run: a shorter lag is told from an integral, whatever the interval (`model_order`)."""
 
 
 def endless(fit: Fit, intervals: Callable[[], dict[Slot, tuple[float, float]]], data: Dataset) -> tuple[str, ...]:

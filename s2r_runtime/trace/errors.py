@@ -19,9 +19,9 @@ from s2r_runtime.errors import S2RError
 from s2r_runtime.gap import Transitions, different, discrepancy, hold_residuals, residuals
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.begun import begun, measured, uncertain
-from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.data.dataset import Dataset
+from s2r_runtime.trace.data.split import FEWEST_RUNS
 from s2r_runtime.trace.fitting import Fit, evaluate, gain, problem
-from s2r_runtime.trace.holdout import FEWEST_RUNS
 from s2r_runtime.trace.inverse import Inverse, input_relative, inverse
 from s2r_runtime.trace.residual import (
     Acting,

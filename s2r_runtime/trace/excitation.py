@@ -28,7 +28,7 @@ from s2r_runtime.trace.separation import as_data, between, expected, refitted, t
 from s2r_runtime.trace.suggestion import ENOUGH, Suggestion
 
 if TYPE_CHECKING:
-    from s2r_runtime.trace.dataset import Dataset
+    from s2r_runtime.trace.data.dataset import Dataset
     from s2r_runtime.trace.result import TraceResult
 
 Array = NDArray[np.float64]

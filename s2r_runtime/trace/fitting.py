@@ -23,8 +23,8 @@ from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.answers import Known, kept
 from s2r_runtime.trace.begun import retold
-from s2r_runtime.trace.coarse import coarse
-from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.data.dataset import Dataset
+from s2r_runtime.trace.data.gridding import coarse
 from s2r_runtime.trace.residual import TOGETHER, Steps, acting, advanced, near, predicted, side_by_side, state_jacobian
 from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
 from s2r_runtime.trace.slots import Added, Free, Slot, bounds_of, free_of, inside, values_of, with_values

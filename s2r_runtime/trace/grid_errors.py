@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.forces import axes
 from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.coarse import coarser
-from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.data.dataset import Dataset
+from s2r_runtime.trace.data.gridding import coarser
 from s2r_runtime.trace.fitting import Fit, Problem, foretold, objective, sensitivities
 from s2r_runtime.trace.slots import Slot, bounds_of
 

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace import differentiation
-from s2r_runtime.trace.dataset import Dataset, regridded
-from s2r_runtime.trace.reconstruct import at_step
+from s2r_runtime.trace.data import differentiation
+from s2r_runtime.trace.data.dataset import Dataset, regridded
+from s2r_runtime.trace.data.reconstruction import at_step
 from s2r_runtime.trace.residual import Acting, Steps, acting, rms, steps_of, wherever
 
 Array = NDArray[np.float64]

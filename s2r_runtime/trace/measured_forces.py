@@ -9,7 +9,7 @@ robot by a known amount:
     y_{k+1} (-) f(y_k, u_k) = -B e_k + noise,      B of the nominal model
 
 so only effects on the motion are offered then (and a constant force), and nothing of what is left is asked about the inputs, with which the
-noise goes. `throttled` says when.
+noise goes. `measured_inputs` says when.
 """
 
 from __future__ import annotations

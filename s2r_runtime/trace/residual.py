@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.models.file_model import NoNumbers
-from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.data.dataset import Dataset
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

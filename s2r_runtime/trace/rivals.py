@@ -22,7 +22,7 @@ from s2r_runtime.effects.classes import canonical
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.candidates import candidates
-from s2r_runtime.trace.dataset import Dataset, Run
+from s2r_runtime.trace.data.dataset import Dataset, Run
 from s2r_runtime.trace.fitting import SETTLED, Fit, Problem, evaluate, fitted, foretold, gain, problem, scatter, without
 from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.scores import STRICT, Scored, at_first_look, best_candidates, limited, name_of

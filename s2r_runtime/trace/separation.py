@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.dataset import Dataset, Run
+from s2r_runtime.trace.data.dataset import Dataset, Run
 from s2r_runtime.trace.fitting import Fit, Problem, objective, problem, refine, sensitivities
 from s2r_runtime.trace.residual import acting, predicted, state_jacobian, steps_of
 from s2r_runtime.trace.residual_noise import Noise, Whitener

@@ -31,29 +31,40 @@ from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.about import remembers
 from s2r_runtime.trace.answer import answered, with_time
-from s2r_runtime.trace.beginning import with_history
 from s2r_runtime.trace.begun import begun
-from s2r_runtime.trace.dataset import Dataset, thinned
-from s2r_runtime.trace.dataset_files import load_dataset
+from s2r_runtime.trace.checks.columns import check_plausible
+from s2r_runtime.trace.checks.common_start import from_one_place
+from s2r_runtime.trace.checks.measured_inputs import refuted, says_forces
+from s2r_runtime.trace.data.command_timing import checked_of, only_before_changes
+from s2r_runtime.trace.data.dataset import Dataset, thinned
+from s2r_runtime.trace.data.initial_conditions import with_history
+from s2r_runtime.trace.data.input_hold import (
+    NATS,
+    acted,
+    alike_laid,
+    changed_within,
+    commanded,
+    noisy,
+    sampled,
+    samples_of,
+    straight,
+    way_of,
+)
+from s2r_runtime.trace.data.input_interpolation import MOVING, Way, moving
+from s2r_runtime.trace.data.readers import load_dataset
+from s2r_runtime.trace.data.split import Part, fit_mask, part
+from s2r_runtime.trace.data.unmeasured_states import alike
 from s2r_runtime.trace.errors import Held, Kind, displacement, held, judge
-from s2r_runtime.trace.faults import Checked, check
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, problem
-from s2r_runtime.trace.holdout import Part, fit_mask, part
 from s2r_runtime.trace.lack_of_fit import Structure
-from s2r_runtime.trace.one_place import from_one_place
-from s2r_runtime.trace.plausible import check_plausible
 from s2r_runtime.trace.residual import Mask, acting, first_steps, rms, steps_of
 from s2r_runtime.trace.result import TraceResult
 from s2r_runtime.trace.rivals import CLOSE
 from s2r_runtime.trace.scores import names
 from s2r_runtime.trace.second_look import astray, finer, once_more
 from s2r_runtime.trace.selection import MOST, Selection, all_dated, select
-from s2r_runtime.trace.straight import NATS, acted, alike_laid, changed_within, commanded, noisy, sampled, samples_of, straight, way_of
-from s2r_runtime.trace.throttled import refuted, says_forces
-from s2r_runtime.trace.unplaced import checked_of, only_before_changes
-from s2r_runtime.trace.unseen import alike
+from s2r_runtime.trace.sensor_faults.detect import Checked, check
 from s2r_runtime.trace.verdict import confirmed, foretold_too
-from s2r_runtime.trace.ways import MOVING, Way, moving
 from s2r_runtime.trace.whole import Whole
 
 __all__ = ["Dataset", "TraceResult", "load_dataset", "trace", "usual_horizon"]

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.about import about_states
 from s2r_runtime.trace.changes import rivals_that_happen
+from s2r_runtime.trace.checks.measured_inputs import refuted
 from s2r_runtime.trace.errors import Held, Judged, better, displacement, rollout_starts_of
-from s2r_runtime.trace.fault import Fault
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, foretold, gain, plainly, problem, without
 from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.residual import Mask, acting, first_steps, predicted, rms
@@ -33,8 +33,8 @@ from s2r_runtime.trace.residual_noise import OUTLIER
 from s2r_runtime.trace.rivals import only_in, representative, simplified, tied
 from s2r_runtime.trace.scores import STRICT, Scored, name_of, names
 from s2r_runtime.trace.selection import Selection, doing_something, one_more
+from s2r_runtime.trace.sensor_faults.fault import Fault
 from s2r_runtime.trace.slots import Added, slots_of
-from s2r_runtime.trace.throttled import refuted
 
 Array = NDArray[np.float64]
 

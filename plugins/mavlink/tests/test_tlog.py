@@ -18,7 +18,7 @@ from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.robot_logs import readers_of
-from s2r_runtime.trace.dataset_files import load_dataset
+from s2r_runtime.trace.data.readers import load_dataset
 from s2r_runtime.transitions import load_transitions
 
 STATES, INPUTS = ("x", "y", "theta"), ("v", "w")

@@ -27,7 +27,7 @@ from s2r_runtime.errors import RecordingError, S2RError, UsageError
 from s2r_runtime.formats.recognise import open_recording
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.trace.dataset_files import load_dataset
+from s2r_runtime.trace.data.readers import load_dataset
 from s2r_runtime.transitions import load_transitions
 
 DT = 0.05

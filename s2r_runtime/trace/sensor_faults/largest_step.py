@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.residual import Acting, advanced, first_steps
 from s2r_runtime.trace.residual_noise import quantum
 

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError, RecordingError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
-from s2r_runtime.trace.dataset import Dataset, Run
+from s2r_runtime.trace.checks.prediction_error import FEWEST_STARTS
+from s2r_runtime.trace.data.dataset import Dataset, Run
 from s2r_runtime.trace.residual import Index, acting, first_steps, rollout, rollout_starts
-from s2r_runtime.trace.unforetold import FEWEST_STARTS
 
 Array = NDArray[np.float64]
 

@@ -19,8 +19,8 @@ from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import NominalModel
 from s2r_runtime.models.bound import BoundModel
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.dataset import Dataset, regridded
-from s2r_runtime.trace.streams import Stream
+from s2r_runtime.trace.data.dataset import Dataset, regridded
+from s2r_runtime.trace.data.streams import Stream
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace.dataset import Dataset, Run
-from s2r_runtime.trace.fault import stretches
+from s2r_runtime.trace.data.dataset import Dataset, Run
+from s2r_runtime.trace.sensor_faults.fault import stretches
 
 Array = NDArray[np.float64]
 

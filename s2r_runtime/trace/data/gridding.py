@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from s2r_runtime.trace.dataset import Dataset, Run
+from s2r_runtime.trace.data.dataset import Dataset, Run
 
 FEW = 3
 """Parts of a step that are left at most to look by."""

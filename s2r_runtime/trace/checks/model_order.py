@@ -6,8 +6,8 @@ replaced by
 
     c + g z,      z' = u - z / T        (a first-order lag; T without end: the integral of the input; c, g by least squares)
 
-and E (`unforetold`) is asked of all T. If the integral foretells well, and far better than any T up to a quarter of the recording and the
-input itself do, then that is what the inputs are, and no effect is looked for.
+and E (`prediction_error`) is asked of all T. If the integral foretells well, and far better than any T up to a quarter of the recording and
+the input itself do, then that is what the inputs are, and no effect is looked for.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from s2r_runtime.errors import ConfigError, RecordingError
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.checks.prediction_error import shares, some_starts, steps_ahead, unforetold
+from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.residual import Acting, Index, acting, first_steps, rms, rollout
-from s2r_runtime.trace.unforetold import shares, some_starts, steps_ahead, unforetold
 
 Array = NDArray[np.float64]
 

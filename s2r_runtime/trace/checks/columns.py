@@ -25,15 +25,15 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError, RecordingError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
-from s2r_runtime.trace.accelerations import check_accelerations
-from s2r_runtime.trace.clocks import check_clocks
-from s2r_runtime.trace.dataset import Dataset, regridded
-from s2r_runtime.trace.loosely import heading_off, loosely_unforetold, sizes
-from s2r_runtime.trace.never_measured import check_measured
+from s2r_runtime.trace.checks.clocks import check_clocks
+from s2r_runtime.trace.checks.constant_columns import check_measured
+from s2r_runtime.trace.checks.model_order import check_accelerations
+from s2r_runtime.trace.checks.prediction_error import STARTS, each_unforetold, some_starts, steps_ahead, trimmed, unforetold, ways_of
+from s2r_runtime.trace.checks.scale_free_error import heading_off, loosely_unforetold, sizes
+from s2r_runtime.trace.checks.units import SCALES, Scale, axis_pairs, groups
+from s2r_runtime.trace.data.dataset import Dataset, regridded
+from s2r_runtime.trace.data.streams import Stream
 from s2r_runtime.trace.residual import acting, advanced, predicted, steps_of
-from s2r_runtime.trace.scales import SCALES, Scale, axis_pairs, groups
-from s2r_runtime.trace.streams import Stream
-from s2r_runtime.trace.unforetold import STARTS, each_unforetold, some_starts, steps_ahead, trimmed, unforetold, ways_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -143,7 +143,7 @@ def _check_columns(model: ComposedModel, data: Dataset) -> None:
 
 def _check_loosely(model: ComposedModel, data: Dataset) -> None:
     """The same of a model that lacks so much that it foretells little whatever is taken back: by the states that a mistake changes, each by
-    itself, in whatever size (`loosely`). All that it is in must be foretold then, and nothing worse than it was.
+    itself, in whatever size (`scale_free_error`). All that it is in must be foretold then, and nothing worse than it was.
     """
     few = _few(model, data) if data.segments else data
     as_it_is = loosely_unforetold(model, few) if data.segments else None

@@ -4,7 +4,7 @@ A recording that is slower than the loop it listens to (a joint's torque at 100 
 angle) has samples of an input that moved on, not commands that were held. On average over a row such an input was up to halfway to the
 next one: (m - 1) / (2 m) of the way if the loop set it m times a row, 1/2 if it went straight on. A sample is as noisy as its sensor,
 too: what a smooth curve through its neighbours says of it, the robot may have felt. And a speed that an encoder counted is a mean over
-the row that is over (`ways`).
+the row that is over (`input_interpolation`).
 
     z = C beta + J delta,    C = what each of these does to the prediction, whitened;  J = what the model's own numbers do
 
@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.dataset import Dataset, regridded
+from s2r_runtime.trace.data.dataset import Dataset, regridded
+from s2r_runtime.trace.data.input_interpolation import MOVING, Samples, Way
+from s2r_runtime.trace.data.streams import Stream
 from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, sensitivities, slopes
 from s2r_runtime.trace.residual import Acting, acting, predicted, residual, state_jacobian
 from s2r_runtime.trace.rivals import CLOSE, NEAR
-from s2r_runtime.trace.streams import Stream
-from s2r_runtime.trace.ways import MOVING, Samples, Way
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

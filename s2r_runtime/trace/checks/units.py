@@ -1,6 +1,6 @@
 """Other units or another zero of states that belong together, each with how it is said: y = times * x + zero.
 
-A file of one's own says no units, so that degrees, cm or another sign show only in what the model foretells (`plausible`).
+A file of one's own says no units, so that degrees, cm or another sign show only in what the model foretells (`columns`).
 """
 
 from __future__ import annotations

@@ -21,8 +21,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace.fault import FROZEN_ROWS, QUANTA, SIGMAS, Fault, leaps, springs, stretches
-from s2r_runtime.trace.streams import Stream
+from s2r_runtime.trace.data.streams import Stream
+from s2r_runtime.trace.sensor_faults.fault import FROZEN_ROWS, QUANTA, SIGMAS, Fault, leaps, springs, stretches
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -30,8 +30,9 @@ from s2r_runtime.models.composed import SUBSTEPS, ComposedModel
 from s2r_runtime.models.input_chains import Inputs
 from s2r_runtime.table_rows import Subset
 from s2r_runtime.tables import LARGEST
-from s2r_runtime.trace.reconstruct import Reconstruction, at_step, independent_step, snapped
-from s2r_runtime.trace.streams import (
+from s2r_runtime.trace.data.input_interpolation import Way
+from s2r_runtime.trace.data.reconstruction import Reconstruction, at_step, independent_step, snapped
+from s2r_runtime.trace.data.streams import (
     ALIGNED,
     Stream,
     at_grid,
@@ -46,7 +47,6 @@ from s2r_runtime.trace.streams import (
     turned,
     unwrapped,
 )
-from s2r_runtime.trace.ways import Way
 
 __all__ = ["Dataset", "Pause", "Run", "Stream", "from_arrays", "from_streams", "thinned"]
 
@@ -156,7 +156,7 @@ class Dataset:
     """The model takes each of the S parts of a step by itself: its own steps are that much shorter."""
     campaign: Transitions | None = field(default=None, repr=False)
     way: Way = field(default_factory=Way)
-    """How inputs went that the recording has samples of (`straight`)."""
+    """How inputs went that the recording has samples of (`input_hold`)."""
     noisy: dict[str, float] = field(default_factory=dict)
     """Standard deviations of the noise that was taken out of inputs for that."""
     commanded: bool = False
@@ -164,11 +164,11 @@ class Dataset:
     measured_forces: bool = False
     """The inputs are forces that were measured, with noise of their own, and not commanded (`measured_forces`)."""
     behind: dict[str, float] = field(default_factory=dict)
-    """s by which states came late against others, and were taken earlier (`late_poses`)."""
+    """s by which states came late against others, and were taken earlier (`pose_latency`)."""
     from_first: bool = False
     """The first rows of runs count, whatever the model makes of them: the tracer found nothing that remembers what was before."""
     unplaced: bool = False
-    """Commands changed between rows, nobody knows when: transitions in which one does are left out (`unplaced`)."""
+    """Commands changed between rows, nobody knows when: transitions in which one does are left out (`command_timing`)."""
     called: tuple[str, ...] = ()
     """Names of its segments; empty if it has one, or none has a name."""
     subset: Subset | None = None
@@ -176,7 +176,7 @@ class Dataset:
     notes: tuple[str, ...] = ()
     """What a person should know of how the recording was read, one line each."""
     forgetting: tuple[tuple[float, float], ...] = ()
-    """From and to, s: first rows of runs that are left out, in which something may act on that nobody recorded (`beginning`)."""
+    """From and to, s: first rows of runs that are left out, in which something may act on that nobody recorded (`initial_conditions`)."""
 
     @cached_property
     def chains(self) -> Inputs:
@@ -205,7 +205,7 @@ class Dataset:
 
     @cached_property
     def axes_without_speed(self) -> tuple[tuple[int, int], ...]:
-        """Columns (position, speed) of axes whose speed is no measurement (`reconstruct`)."""
+        """Columns (position, speed) of axes whose speed is no measurement (`reconstruction`)."""
         pairs = self.reconstruction.axes if self.reconstruction else ()
         return tuple((self.states.index(p), self.states.index(v)) for p, v in pairs)
 

@@ -26,14 +26,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.dataset import Dataset, Pause
-from s2r_runtime.trace.fault import Fault, fault_of
-from s2r_runtime.trace.frozen import frozen
-from s2r_runtime.trace.heading import carried, departures
-from s2r_runtime.trace.holes import bridged
-from s2r_runtime.trace.jumps import WILD_SIGMAS, Jumps, jumps_of, tails_of
-from s2r_runtime.trace.reach import Reach, predicted, reach_of
+from s2r_runtime.trace.data.dataset import Dataset, Pause
+from s2r_runtime.trace.data.missing_rows import bridged
 from s2r_runtime.trace.residual import Acting, acting
+from s2r_runtime.trace.sensor_faults.fault import Fault, fault_of
+from s2r_runtime.trace.sensor_faults.frozen import frozen
+from s2r_runtime.trace.sensor_faults.heading import carried, departures
+from s2r_runtime.trace.sensor_faults.largest_step import Reach, predicted, reach_of
+from s2r_runtime.trace.sensor_faults.outliers import WILD_SIGMAS, Jumps, jumps_of, tails_of
 
 __all__ = ["Checked", "Fault", "check"]
 

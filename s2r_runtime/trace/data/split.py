@@ -15,7 +15,7 @@ from itertools import combinations, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace.dataset import Dataset, Run
+from s2r_runtime.trace.data.dataset import Dataset, Run
 from s2r_runtime.trace.residual import Steps, first_steps, steps_of
 
 Array = NDArray[np.float64]

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.trace.data.streams import Stream
 from s2r_runtime.trace.speeds import FEWEST, less_noise
-from s2r_runtime.trace.streams import Stream
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

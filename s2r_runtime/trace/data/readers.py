@@ -29,12 +29,12 @@ from s2r_runtime.robot_logs import content_digest, is_mcap, is_robot_log
 from s2r_runtime.seen_rows import sketch
 from s2r_runtime.table_rows import Subset, joined
 from s2r_runtime.table_text import Limits, Progress, refuse_special
-from s2r_runtime.trace.dataset import Array, Dataset, Stream, from_streams
+from s2r_runtime.trace.data.dataset import Array, Dataset, Stream, from_streams
+from s2r_runtime.trace.data.reconstruction import late_speeds, reconstruct
+from s2r_runtime.trace.data.unmeasured_states import unneeded, without
 from s2r_runtime.trace.hidden import told_through
-from s2r_runtime.trace.late_poses import earlier, late_pose
-from s2r_runtime.trace.reconstruct import late_speeds, reconstruct
 from s2r_runtime.trace.residual import check_steps
-from s2r_runtime.trace.unseen import unneeded, without
+from s2r_runtime.trace.sensor_faults.pose_latency import earlier, late_pose
 
 Row = tuple[float, ...]
 RECENT = 4096
@@ -65,7 +65,7 @@ def load_dataset(
     epoch: of a log, only what was recorded while that campaign was under way. bandwidth: Hz within which states that the table does not
     have are reconstructed from those that it has (None: what the data bear, and only those that the motion
     needs: unseen.py). transport: the profile's, for a log in a robot's own format. behind: s by which states of the pose come late, if that
-    is known from another recording (None: as this one says, `late_poses`). limits, progress: of reading a table; of one with more than
+    is known from another recording (None: as this one says, `pose_latency`). limits, progress: of reading a table; of one with more than
     MAX_ROWS rows stretches that are evenly spread are used (`Dataset.subset`).
 
     Raises RecordingError (unreadable, lacks a column that does not follow from others, too slow for the model's dt), ConfigError if

@@ -2,7 +2,7 @@
 
 A table that was filled up on a clock of its own holds a command from the row after it came. In the row before, a part of the step went by
 the one and the rest by the other, and a wheel's speed at its end is what was asked last. Where the motion tells when each came, it is
-placed (`straight`). Where it does not, structure is left in just these transitions, and of one kind: with r the residual, d what the next
+placed (`input_hold`). Where it does not, structure is left in just these transitions, and of one kind: with r the residual, d what the next
 command would change in the prediction of a whole step, both for each state, over its one-step noise,
 
     e = sum over states of min(r^2, CUT)           s = r less the share of d, from 0 to 1, that comes nearest to it
@@ -22,12 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.beginning import with_history
-from s2r_runtime.trace.clocks import earlier
-from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.faults import Checked, check
+from s2r_runtime.trace.checks.clocks import earlier
+from s2r_runtime.trace.data.dataset import Dataset
+from s2r_runtime.trace.data.initial_conditions import with_history
 from s2r_runtime.trace.fitting import Fit, Problem
 from s2r_runtime.trace.residual import acting, first_steps, predicted
+from s2r_runtime.trace.sensor_faults.detect import Checked, check
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

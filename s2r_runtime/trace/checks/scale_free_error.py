@@ -4,8 +4,8 @@
 
 df: the sum of what the model says of each of the H steps from the states that were measured there, so that a robot that turns a third as
 far as it should still goes where its heading says. Of speeds that forces change, both are taken without what friction of any size would
-do to them (dry, viscous, a steady push): a slow drive's motor fights little else. `unforetold` asks for all of the motion: of a model that
-lacks much it says that it foretells nothing, whether columns are exchanged or not.
+do to them (dry, viscous, a steady push): a slow drive's motor fights little else. `prediction_error` asks for all of the motion: of a model
+that lacks much it says that it foretells nothing, whether columns are exchanged or not.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
-from s2r_runtime.trace.dataset import Dataset
-from s2r_runtime.trace.holes import filled
+from s2r_runtime.trace.checks.prediction_error import FEWEST_STARTS, GOES, bend_noise, some_starts, steps_ahead, trimmed
+from s2r_runtime.trace.data.dataset import Dataset
+from s2r_runtime.trace.data.missing_rows import filled
 from s2r_runtime.trace.residual import acting, advanced, first_steps
-from s2r_runtime.trace.unforetold import FEWEST_STARTS, GOES, bend_noise, some_starts, steps_ahead, trimmed
 
 Array = NDArray[np.float64]
 

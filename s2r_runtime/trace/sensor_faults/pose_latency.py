@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.fault import Fault
+from s2r_runtime.trace.data.streams import Stream, complete, fresh, held, unwrapped
+from s2r_runtime.trace.sensor_faults.fault import Fault
 from s2r_runtime.trace.speeds import less_noise
-from s2r_runtime.trace.streams import Stream, complete, fresh, held, unwrapped
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -23,14 +23,14 @@ from s2r_runtime.hookspecs import Follows
 from s2r_runtime.models.bound import integrating, steps_coarsely
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
-from s2r_runtime.trace import differentiation
-from s2r_runtime.trace.fault import Fault
+from s2r_runtime.trace.data import differentiation
+from s2r_runtime.trace.data.input_interpolation import less_noise_of
+from s2r_runtime.trace.data.streams import Stream, complete, fresh, held_between, held_means, unwrapped
 from s2r_runtime.trace.hidden import smoothed_hidden, told_through
-from s2r_runtime.trace.late_speeds import late, of_differences
-from s2r_runtime.trace.position_faults import mended
+from s2r_runtime.trace.sensor_faults.fault import Fault
+from s2r_runtime.trace.sensor_faults.position_outliers import mended
+from s2r_runtime.trace.sensor_faults.speed_latency import late, of_differences
 from s2r_runtime.trace.speeds import Smoothed, smoothed
-from s2r_runtime.trace.streams import Stream, complete, fresh, held_between, held_means, unwrapped
-from s2r_runtime.trace.ways import less_noise_of
 
 Array = NDArray[np.float64]
 
@@ -83,11 +83,13 @@ class Reconstruction:
     apart: int = 1
     """Of the model's steps, where nothing was filtered that would make neighbours alike."""
     cleaned: tuple[Stream, ...] = field(default=(), repr=False)
-    """Inputs of each segment without the noise of samples (`ways`), where all was filtered: what is left of it then looks smooth."""
+    """Inputs of each segment without the noise of samples (`input_interpolation`), where all was filtered: what is left of it then looks
+    smooth.
+    """
     late: dict[str, float] = field(default_factory=dict)
-    """s by which speeds were late that the recording has (`late_speeds`)."""
+    """s by which speeds were late that the recording has (`speed_latency`)."""
     faults: tuple[Fault, ...] = ()
-    """Of positions, found before anything was done to them (`position_faults`)."""
+    """Of positions, found before anything was done to them (`position_outliers`)."""
     outliers: int = 0
     """Rows of positions that were left out before that, of more than are faults."""
     hidden: bool = False

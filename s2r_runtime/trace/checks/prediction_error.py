@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.dataset import Dataset
+from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.residual import Index, acting, first_steps, rollout, rollout_starts
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from s2r_runtime.trace.dataset import Dataset
+    from s2r_runtime.trace.data.dataset import Dataset
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

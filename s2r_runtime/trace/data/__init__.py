@@ -1,0 +1,1 @@
+"""Recordings as data sets: streams, grids, readers, splits, and how inputs went between samples."""

@@ -1,0 +1,1 @@
+"""Where measurements, not the motion, are wrong: outliers, frozen values, heading, latency."""
