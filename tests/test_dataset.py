@@ -15,7 +15,7 @@ from s2r_runtime.recording.writer import Writer
 from s2r_runtime.trace.data.dataset import Stream, from_arrays, from_streams, thinned
 from s2r_runtime.trace.data.initial_conditions import with_history
 from s2r_runtime.trace.data.readers import load_dataset
-from s2r_runtime.trace.residual import acting, first_steps, rollout_starts, steps_of
+from s2r_runtime.trace.estimation.prediction import acting, first_steps, rollout_starts, steps_of
 
 
 def _model(dt=0.1, name="unicycle", effects=()):

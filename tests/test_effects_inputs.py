@@ -10,7 +10,7 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import Stream, from_arrays, from_streams
-from s2r_runtime.trace.residual import acting
+from s2r_runtime.trace.estimation.prediction import acting
 
 DT = 0.04
 PARTS = 100

@@ -10,8 +10,8 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.data.split import part
-from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
-from s2r_runtime.trace.residual import acting, first_steps, residual, rms, steps_of
+from s2r_runtime.trace.estimation.prediction import acting, first_steps, residual, rms, steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem
 
 DT = 0.05
 TIMED = {

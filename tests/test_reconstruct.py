@@ -15,8 +15,8 @@ from s2r_runtime.trace.data.differentiation import bandwidth, low_pass, reach
 from s2r_runtime.trace.data.readers import load_dataset
 from s2r_runtime.trace.data.reconstruction import reconstruct
 from s2r_runtime.trace.data.streams import Stream
-from s2r_runtime.trace.inverse import input_relative, inverse
-from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.estimation.inverse_dynamics import input_relative, inverse
+from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.tracer import trace
 
 DT = 0.01

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from s2r_runtime.trace.residual_noise import Noise, Whitener, colour, estimate, log_density, no_colour, weight
-from s2r_runtime.trace.state_noise import State, of_state
+from s2r_runtime.trace.estimation.noise import Noise, Whitener, colour, estimate, log_density, no_colour, weight
+from s2r_runtime.trace.estimation.state_noise import State, of_state
 
 
 def _residuals(rng, n, q, r, slope):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from s2r_runtime.trace.shocks import are_shocks
+from s2r_runtime.trace.estimation.innovation_outliers import are_shocks
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.models.forces import coupled
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.fitting import problem
+from s2r_runtime.trace.estimation.prediction import acting, steps_of
+from s2r_runtime.trace.estimation.problem import problem
 from s2r_runtime.trace.lack_of_fit_terms import directions_of
-from s2r_runtime.trace.residual import acting, steps_of
 from s2r_runtime.trace.result import TraceResult
 from s2r_runtime.trace.selection import select
 from s2r_runtime.trace.tracer import trace

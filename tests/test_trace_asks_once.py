@@ -18,14 +18,16 @@ from s2r_runtime.models.file_model import FileModel
 from s2r_runtime.models.input_chains import Inputs
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import exchange, fields, fitting, lack_of_fit, relevance, residual, retimed, scores, selection, whole
+from s2r_runtime.trace import exchange, fields, lack_of_fit, relevance, scores, selection, whole
 from s2r_runtime.trace.changes import rivals_that_happen
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.errors import Held, noise_floor
+from s2r_runtime.trace.estimation import change_times, prediction
+from s2r_runtime.trace.estimation import problem as fitting
+from s2r_runtime.trace.estimation.prediction import acting, state_jacobian, steps_of
+from s2r_runtime.trace.estimation.problem import Problem, evaluate, fitted, foretold, foretold_by, insert, problem, scatter, without
 from s2r_runtime.trace.fields import Field
-from s2r_runtime.trace.fitting import Problem, evaluate, fitted, foretold, foretold_by, insert, problem, scatter, without
 from s2r_runtime.trace.lack_of_fit import left_of
-from s2r_runtime.trace.residual import acting, state_jacobian, steps_of
 from s2r_runtime.trace.sensor_faults.detect import Checked
 
 DT_S, ROWS = 0.02, 300
@@ -64,7 +66,7 @@ def test_rounds_of_a_fit_and_what_follows_ask_for_slopes_once_a_model(monkeypatc
 def test_what_is_known_of_a_model_is_what_it_says():
     given, fit = _given()
     act = acting(fit.model, given.data)
-    assert np.array_equal(given.residual(fit.model), residual.residual(fit.model, given.steps, act))
+    assert np.array_equal(given.residual(fit.model), prediction.residual(fit.model, given.steps, act))
     assert np.array_equal(given.jacobian(fit.model), state_jacobian(fit.model, given.steps, act))
     assert np.array_equal(fitting.slopes(given, fit.model, fit.free), fitting._slopes(given, fit.model, fit.free))
     with pytest.raises(ValueError, match="read-only"):
@@ -85,7 +87,7 @@ def test_a_jacobian_is_one_call_of_a_model_where_rows_are_few(monkeypatch):
     monkeypatch.setattr(DoubleIntegrator, "step", lambda self, x, *rest: (rows.append(len(x)), step(self, x, *rest))[1])
     found = state_jacobian(fit.model, given.steps, acting(fit.model, given.data))
     assert rows == [8 * len(given.steps)]
-    monkeypatch.setattr(residual, "TOGETHER", 1)
+    monkeypatch.setattr(prediction, "TOGETHER", 1)
     assert np.allclose(found, state_jacobian(fit.model, given.steps, acting(fit.model, given.data)), rtol=0.0, atol=1e-9)
     assert rows[1:] == [len(given.steps)] * 8
     assert model.name == "double_integrator"
@@ -139,14 +141,14 @@ def test_times_that_are_tried_take_their_steps_together(monkeypatch):
     given, fit = _given()
     change = AppliedEffect(registry().get("effects", "regime_change"), "ax", {"time": 2.0, "gain": 0.8})
     later = evaluate(given, insert(fit.model, change, 0))
-    slot = next(slot for slot in later.free if retimed.is_time(later.model, slot))
+    slot = next(slot for slot in later.free if change_times.is_time(later.model, slot))
     base = fitting.under_noise(given, fit.model, later.noise)
     given.predicted(fit.model)
     calls, step, times = [], DoubleIntegrator.step, np.linspace(1.0, 5.0, 20)
     monkeypatch.setattr(DoubleIntegrator, "step", lambda self, x, *rest: (calls.append(len(x)), step(self, x, *rest))[1])
-    together = retimed._nats(given, later, base, slot, times)
+    together = change_times._nats(given, later, base, slot, times)
     assert len(calls) < len(times)
-    alone = [retimed._nats(given, later, base, slot, times[k : k + 1])[0] for k in range(len(times))]
+    alone = [change_times._nats(given, later, base, slot, times[k : k + 1])[0] for k in range(len(times))]
     assert together == pytest.approx(alone, rel=1e-9)
 
 
@@ -221,9 +223,9 @@ def test_a_noise_floor_is_one_call_of_a_model_a_step(monkeypatch, loud):
 
 def test_what_is_absurd_in_one_column_only_is_cut_off_there():
     x, far = np.array([[1.0, 5.0], [-3.0, np.nan]]), np.array([2.0, 100.0])
-    assert not residual.near(x, far)
-    assert np.array_equal(residual.no_farther(x, far), [[1.0, 5.0], [-2.0, np.nan]], equal_nan=True)
-    assert residual.no_farther(x[:1, :1], far[:1]).base is x
+    assert not prediction.near(x, far)
+    assert np.array_equal(prediction.no_farther(x, far), [[1.0, 5.0], [-2.0, np.nan]], equal_nan=True)
+    assert prediction.no_farther(x[:1, :1], far[:1]).base is x
 
 
 @pytest.mark.parametrize(("name", "values"), [("input_rate_limit", {"rate": 3.0}), ("input_backlash", {"width": 0.2})])

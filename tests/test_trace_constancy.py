@@ -10,9 +10,9 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace import constancy
 from s2r_runtime.trace.constancy import ALPHA, TOLD, _recently, uneven
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem
 from s2r_runtime.trace.lack_of_fit import left_of
-from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.tracer import trace
 
 DT = 0.05

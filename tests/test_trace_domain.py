@@ -13,7 +13,7 @@ from s2r_runtime.modelspec import dump_model
 from s2r_runtime.plugins import registry
 from s2r_runtime.report.trace_page import trace_page
 from s2r_runtime.trace.domain import ALL_ROUND, BEYOND, Range, _arc, _span, domain_of, told
-from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.tracer import trace
 
 GAIN = [("input_gain", "w", {"gain": 0.75})]

@@ -11,13 +11,13 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import fields
-from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.data.dataset import from_arrays
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem
 from s2r_runtime.trace.fields import SEEN, field
-from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
 from s2r_runtime.trace.lack_of_fit import _wanders, left_of
 from s2r_runtime.trace.lack_of_fit_judged import Judged
-from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.tracer import trace
 
 DT = 0.05

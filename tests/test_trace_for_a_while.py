@@ -11,9 +11,9 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.trace import lack_of_fit
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.episodes import _staying_wild, episodes
-from s2r_runtime.trace.fitting import evaluate, insert, problem
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, insert, problem
 from s2r_runtime.trace.lack_of_fit import left_of
-from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.rivals import representative
 from s2r_runtime.trace.scores import Scored
 from s2r_runtime.trace.tracer import trace

@@ -19,12 +19,12 @@ from s2r_runtime.trace.about import about_states
 from s2r_runtime.trace.acceptance import significant
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.errors import held, judge, noise_floor
+from s2r_runtime.trace.estimation.noise import MEMORIES
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.fields import Field
-from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.lack_of_fit import Looks, Structure, _weight_of, left_of
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged
-from s2r_runtime.trace.residual import steps_of
-from s2r_runtime.trace.residual_noise import MEMORIES
 from s2r_runtime.trace.sensor_faults.detect import Checked
 from s2r_runtime.trace.tracer import trace
 from s2r_runtime.trace.verdict import foretells, misses

@@ -14,11 +14,11 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import Stream, from_arrays, from_streams
 from s2r_runtime.trace.data.initial_conditions import with_history
 from s2r_runtime.trace.data.readers import load_dataset
+from s2r_runtime.trace.estimation.parameters import Added
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, fitted, problem
 from s2r_runtime.trace.exchange import parted
-from s2r_runtime.trace.fitting import evaluate, fitted, problem
-from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.scores import STRICT
-from s2r_runtime.trace.slots import Added
 from s2r_runtime.trace.tracer import trace
 
 ROBOTS = {

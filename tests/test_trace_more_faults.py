@@ -9,7 +9,7 @@ from seeds import first
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.data.dataset import Dataset, Stream, from_arrays, from_streams
-from s2r_runtime.trace.residual import rms
+from s2r_runtime.trace.estimation.prediction import rms
 from s2r_runtime.trace.sensor_faults.detect import check
 from s2r_runtime.trace.tracer import trace
 

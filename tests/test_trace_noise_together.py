@@ -7,9 +7,9 @@ from seeds import first
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.fitting import evaluate, problem
-from s2r_runtime.trace.residual import steps_of
-from s2r_runtime.trace.residual_noise import Noise, Whitener, estimate, hidden_by_others, together
+from s2r_runtime.trace.estimation.noise import Noise, Whitener, estimate, hidden_by_others, together
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, problem
 from s2r_runtime.trace.tracer import trace
 
 DT_S, ROWS = 0.004, 570

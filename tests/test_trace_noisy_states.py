@@ -14,8 +14,8 @@ from s2r_runtime.trace import second_look, selection, verdict
 from s2r_runtime.trace.acceptance import BY_CHANCE, _scattered
 from s2r_runtime.trace.data.dataset import from_arrays, from_streams
 from s2r_runtime.trace.data.streams import Stream
-from s2r_runtime.trace.fitting import SCORE_BLOCKS, evaluate, fitted, gain, insert, nearer, problem
-from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import SCORE_BLOCKS, evaluate, fitted, gain, insert, nearer, problem
 from s2r_runtime.trace.scores import STRICT
 from s2r_runtime.trace.selection import Selection
 from s2r_runtime.trace.tracer import trace

@@ -14,10 +14,10 @@ from s2r_runtime.models.composed import AppliedEffect, ComposedModel, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import Dataset, from_arrays
-from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem
 from s2r_runtime.trace.lack_of_fit import left_of
 from s2r_runtime.trace.now_and_then import now_and_then
-from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.tracer import trace
 
 Array = NDArray[np.float64]

@@ -10,20 +10,20 @@ from s2r_runtime.hookspecs import Parameter
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import grid_errors
 from s2r_runtime.trace.acceptance import _beyond_rounding
 from s2r_runtime.trace.data import gridding
 from s2r_runtime.trace.data.dataset import Run, from_arrays, from_streams
 from s2r_runtime.trace.data.streams import Stream
-from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem, sensitivities, told
-from s2r_runtime.trace.grid_errors import widened
-from s2r_runtime.trace.intervals import intervals
-from s2r_runtime.trace.noise_doubt import doubted
-from s2r_runtime.trace.orders import in_either_order
-from s2r_runtime.trace.residual import steps_of
-from s2r_runtime.trace.residual_noise import Colour, no_colour, no_steadier
-from s2r_runtime.trace.retimed import retimed
-from s2r_runtime.trace.slots import Slot, bounds_of, values_of
+from s2r_runtime.trace.estimation import discretisation_error
+from s2r_runtime.trace.estimation.change_times import retimed
+from s2r_runtime.trace.estimation.discretisation_error import widened
+from s2r_runtime.trace.estimation.intervals import intervals
+from s2r_runtime.trace.estimation.noise import Colour, no_colour, no_steadier
+from s2r_runtime.trace.estimation.noise_uncertainty import doubted
+from s2r_runtime.trace.estimation.order_intervals import in_either_order
+from s2r_runtime.trace.estimation.parameters import Slot, bounds_of, values_of
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem, sensitivities, told
 
 DRY, VISCOUS = 0.5, 0.4
 WIND = 0.05
@@ -271,7 +271,7 @@ def test_an_interval_takes_up_what_is_not_known_of_when_within_a_step_a_command_
 def test_what_a_grid_adds_stays_within_what_a_number_may_be(monkeypatch):
     given, fit = _two((("input_lag", {"time_constant": 0.2}), ("input_gain", {"gain": 0.7})))
     found = intervals(given, fit)
-    monkeypatch.setattr(grid_errors, "_shifts", lambda given, fit: [np.array([-1.0, 1e9])])
+    monkeypatch.setattr(discretisation_error, "_shifts", lambda given, fit: [np.array([-1.0, 1e9])])
     lag, gain = (widened(given, fit, dict(found))[slot] for slot in fit.free)
     assert lag == (bounds_of(fit.model, fit.free[0]).low, found[fit.free[0]][1])
     assert gain == (found[fit.free[1]][0], bounds_of(fit.model, fit.free[1]).high)

@@ -10,10 +10,10 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace import whole
 from s2r_runtime.trace.answer import with_time
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.fitting import evaluate, problem
+from s2r_runtime.trace.estimation.parameters import Added
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, problem
 from s2r_runtime.trace.one_stretch import _once, in_one_stretch
-from s2r_runtime.trace.residual import steps_of
-from s2r_runtime.trace.slots import Added
 from s2r_runtime.trace.tracer import trace
 
 DT, HOLD = 0.05, 20

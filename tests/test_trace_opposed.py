@@ -10,10 +10,10 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.fitting import evaluate, fitted, problem
+from s2r_runtime.trace.estimation.parameters import Added
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, fitted, problem
 from s2r_runtime.trace.opposed import opposed
-from s2r_runtime.trace.residual import steps_of
-from s2r_runtime.trace.slots import Added
 from s2r_runtime.trace.tracer import trace
 
 DT_S, PARTS, INERTIA = 0.008, 4, 2.0

@@ -7,8 +7,8 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace import scores, selection
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.fitting import Problem, evaluate, gain, problem
-from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import Problem, evaluate, gain, problem
 
 DT_S = 0.02
 MODEL = compose(ModelSpec("double_integrator", DT_S))

@@ -10,9 +10,9 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.about import about, about_states, carried, only_pushes
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.fitting import fitted, gain, insert
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import fitted, gain, insert
 from s2r_runtime.trace.patchwork import AS_MUCH, MOSTLY, patchwork
-from s2r_runtime.trace.residual import steps_of
 from s2r_runtime.trace.selection import Selection
 from s2r_runtime.trace.sensor_faults.detect import Checked
 from s2r_runtime.trace.whole import Whole

@@ -6,11 +6,11 @@ import pytest
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.fitting import evaluate, problem
+from s2r_runtime.trace.estimation.prediction import acting, residual, steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, problem
 from s2r_runtime.trace.lack_of_fit import dictionaries_of, left_of
 from s2r_runtime.trace.lack_of_fit_judged import first_look
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
-from s2r_runtime.trace.residual import acting, residual, steps_of
 from s2r_runtime.trace.tracer import trace
 
 DT_S, ROWS = 0.01, 1200

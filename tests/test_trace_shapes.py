@@ -13,8 +13,8 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace import challenge, whole
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.fitting import evaluate, problem
-from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, problem
 from s2r_runtime.trace.shapes import SHAPES
 from s2r_runtime.trace.tracer import trace
 

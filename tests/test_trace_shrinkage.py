@@ -7,10 +7,10 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.fitting import evaluate, fitted, insert, problem, told, values_of
-from s2r_runtime.trace.intervals import spread_of
-from s2r_runtime.trace.residual import steps_of
-from s2r_runtime.trace.shrinkage import _size, drawn_in
+from s2r_runtime.trace.estimation.intervals import spread_of
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem, told, values_of
+from s2r_runtime.trace.estimation.shrinkage import _size, drawn_in
 
 pytestmark = pytest.mark.slow
 

@@ -8,8 +8,8 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace import rivals
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.fitting import evaluate, insert, problem
-from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, insert, problem
 from s2r_runtime.trace.state_shapes import STATE_SHAPES, starts
 from s2r_runtime.trace.tracer import trace
 

@@ -13,9 +13,9 @@ from s2r_runtime.trace.data import input_hold as inputs_straight
 from s2r_runtime.trace.data.dataset import Stream, from_streams
 from s2r_runtime.trace.data.input_hold import ROUNDS, samples_of, straight
 from s2r_runtime.trace.data.input_interpolation import Samples, Way
-from s2r_runtime.trace.fitting import evaluate, fitted, problem
-from s2r_runtime.trace.residual import steps_of
-from s2r_runtime.trace.slots import Added
+from s2r_runtime.trace.estimation.parameters import Added
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, fitted, problem
 from s2r_runtime.trace.tracer import load_dataset, trace
 
 pytestmark = pytest.mark.slow

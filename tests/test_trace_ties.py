@@ -15,8 +15,8 @@ from s2r_runtime.trace.acceptance import _scattered
 from s2r_runtime.trace.any_shape import any_shape_of
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.errors import Judged, held
-from s2r_runtime.trace.fitting import evaluate, fitted, gain, insert, problem
-from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.rivals import SURELY, rivals_of, simplified, tied
 from s2r_runtime.trace.scores import Scored, _search, names, unlimited
 from s2r_runtime.trace.selection import Selection, doing_something

@@ -22,7 +22,7 @@ from s2r_runtime.trace.data.initial_conditions import with_history
 from s2r_runtime.trace.data.reconstruction import at_step
 from s2r_runtime.trace.data.split import part
 from s2r_runtime.trace.data.streams import Stream
-from s2r_runtime.trace.residual import Acting, acting, advanced, residual, steps_of
+from s2r_runtime.trace.estimation.prediction import Acting, acting, advanced, residual, steps_of
 from s2r_runtime.trace.shapes import SHAPES, Shape
 from s2r_runtime.trace.tracer import trace
 

@@ -10,10 +10,10 @@ from seeds import first
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.checks.columns import check_plausible
 from s2r_runtime.trace.data.dataset import Dataset, from_arrays
-from s2r_runtime.trace.residual import rms
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.prediction import rms
 from s2r_runtime.trace.tracer import trace
 
 pytestmark = pytest.mark.slow

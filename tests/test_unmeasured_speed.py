@@ -8,13 +8,13 @@ from trace_robots import PARTS, acted, commands
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace.begun import begun
 from s2r_runtime.trace.data.dataset import thinned
 from s2r_runtime.trace.data.missing_rows import BRIEF, bridged
 from s2r_runtime.trace.data.readers import load_dataset
-from s2r_runtime.trace.fitting import evaluate, problem
-from s2r_runtime.trace.residual import steps_of
-from s2r_runtime.trace.speeds import smoothed
+from s2r_runtime.trace.estimation.initial_states import begun
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, problem
+from s2r_runtime.trace.estimation.speed_spline import smoothed
 from s2r_runtime.trace.tracer import trace
 
 MASS = 2.0

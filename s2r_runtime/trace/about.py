@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace.data.dataset import Dataset
-from s2r_runtime.trace.fitting import without
+from s2r_runtime.trace.estimation.prediction import Acting, Steps, acting, advanced, rms
+from s2r_runtime.trace.estimation.problem import without
 from s2r_runtime.trace.lack_of_fit_terms import token_of
-from s2r_runtime.trace.residual import Acting, Steps, acting, advanced, rms
 
 Array = NDArray[np.float64]
 

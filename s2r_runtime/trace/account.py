@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.file_model import FileModel
+from s2r_runtime.trace.estimation.prediction import rms
 from s2r_runtime.trace.found import Found
-from s2r_runtime.trace.residual import rms
 from s2r_runtime.trace.shape import Component, Shape, components, derived, strongest, variables
 
 if TYPE_CHECKING:

@@ -18,14 +18,16 @@ from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.domain import domain_of
 from s2r_runtime.trace.endless import endless
 from s2r_runtime.trace.errors import Held, Judged, Kind, at_most_seen, gaps, judge, noise_floor
+from s2r_runtime.trace.estimation.discretisation_error import widened
+from s2r_runtime.trace.estimation.noise import no_colour
+from s2r_runtime.trace.estimation.order_intervals import in_either_order
+from s2r_runtime.trace.estimation.parameters import Slot, values_of
+from s2r_runtime.trace.estimation.problem import Fit, Problem, told, without
+from s2r_runtime.trace.estimation.shrinkage import drawn_in
 from s2r_runtime.trace.excitation import advice
-from s2r_runtime.trace.fitting import Fit, Problem, told, without
 from s2r_runtime.trace.found import each_once
-from s2r_runtime.trace.grid_errors import widened
 from s2r_runtime.trace.lack_of_fit import Structure
-from s2r_runtime.trace.orders import in_either_order
 from s2r_runtime.trace.power import visible
-from s2r_runtime.trace.residual_noise import no_colour
 from s2r_runtime.trace.result import Found, Limit, TraceResult
 from s2r_runtime.trace.same_thing import other_names
 from s2r_runtime.trace.scores import name_of
@@ -33,8 +35,6 @@ from s2r_runtime.trace.selection import Selection
 from s2r_runtime.trace.sensor_faults.detect import Checked
 from s2r_runtime.trace.sensor_faults.fault import Fault
 from s2r_runtime.trace.sensor_faults.pose_latency import late_faults
-from s2r_runtime.trace.shrinkage import drawn_in
-from s2r_runtime.trace.slots import Slot, values_of
 from s2r_runtime.trace.verdict import Verdict, asked, final_fit, verdict_of, worth_its_risk
 
 Array = NDArray[np.float64]

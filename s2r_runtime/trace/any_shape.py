@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from s2r_runtime.effects.classes import same
 from s2r_runtime.trace.about import about
 from s2r_runtime.trace.data.dataset import Dataset
-from s2r_runtime.trace.fitting import Fit
-from s2r_runtime.trace.residual import Steps
+from s2r_runtime.trace.estimation.prediction import Steps
+from s2r_runtime.trace.estimation.problem import Fit
 from s2r_runtime.trace.scores import name_of
 
 SEVERAL = 3

@@ -16,11 +16,11 @@ from s2r_runtime.hookspecs import Effect
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import Dataset
-from s2r_runtime.trace.fitting import insert
+from s2r_runtime.trace.estimation.parameters import Added
+from s2r_runtime.trace.estimation.prediction import times
+from s2r_runtime.trace.estimation.problem import insert
 from s2r_runtime.trace.leftover import Leftover
 from s2r_runtime.trace.measured_forces import on_motion
-from s2r_runtime.trace.residual import times
-from s2r_runtime.trace.slots import Added
 
 Array = NDArray[np.float64]
 

@@ -26,15 +26,15 @@ from s2r_runtime.hookspecs import Effect
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.models.forces import axes, lone_speeds
 from s2r_runtime.trace.acceptance import accepted
-from s2r_runtime.trace.begun import begun, measured
 from s2r_runtime.trace.candidates import Candidate
-from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, without
+from s2r_runtime.trace.estimation.initial_states import begun, measured
+from s2r_runtime.trace.estimation.parameters import bounds_of, values_of
+from s2r_runtime.trace.estimation.prediction import acting, covered, first_steps, rms, rollout, rollout_starts, some_of
+from s2r_runtime.trace.estimation.problem import Fit, Problem, fitted, gain, without
 from s2r_runtime.trace.lack_of_fit_terms import token_of
-from s2r_runtime.trace.residual import acting, covered, first_steps, rms, rollout, rollout_starts, some_of
 from s2r_runtime.trace.scores import at_first_look
 from s2r_runtime.trace.screening import screen
 from s2r_runtime.trace.shapes import SHAPES, Shape
-from s2r_runtime.trace.slots import bounds_of, values_of
 from s2r_runtime.trace.state_shapes import STATE_SHAPES, Limit, StateShape
 from s2r_runtime.trace.state_shapes import starts as state_starts
 

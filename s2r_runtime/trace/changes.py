@@ -17,11 +17,11 @@ import numpy as np
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, foretold, gain, sought, under_noise, without
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.parameters import Added, Slot, bounds_of, values_of, with_values
+from s2r_runtime.trace.estimation.problem import Fit, Problem, evaluate, fitted, foretold, gain, sought, under_noise, without
 from s2r_runtime.trace.rivals import CLOSE, rivals_of
 from s2r_runtime.trace.scores import ONWARD, Bar, Scored, name_of
-from s2r_runtime.trace.slots import Added, Slot, bounds_of, values_of, with_values
 
 EDGE = 0.02
 """Share of the steps on either side of a change that makes it one."""

@@ -21,12 +21,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.prediction import acting, first_steps
+from s2r_runtime.trace.estimation.problem import evaluate, foretold, gain, slopes, without
 from s2r_runtime.trace.evidence import margin
-from s2r_runtime.trace.fitting import evaluate, foretold, gain, slopes, without
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
 from s2r_runtime.trace.lack_of_fit_terms import VELOCITIES, quieter, token_of
-from s2r_runtime.trace.residual import acting, first_steps
 
 Array = NDArray[np.float64]
 

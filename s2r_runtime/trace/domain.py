@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.data.dataset import Dataset
-from s2r_runtime.trace.residual import Steps, acting
+from s2r_runtime.trace.estimation.prediction import Steps, acting
 
 Array = NDArray[np.float64]
 

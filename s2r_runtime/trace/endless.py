@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from s2r_runtime.trace.data.dataset import Dataset
-from s2r_runtime.trace.fitting import Fit
-from s2r_runtime.trace.slots import Slot, values_of
+from s2r_runtime.trace.estimation.parameters import Slot, values_of
+from s2r_runtime.trace.estimation.problem import Fit
 
 LAG = "input_lag"
 

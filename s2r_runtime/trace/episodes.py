@@ -22,12 +22,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.noise import Whitener
+from s2r_runtime.trace.estimation.prediction import acting
 from s2r_runtime.trace.evidence import evidence
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
 from s2r_runtime.trace.lack_of_fit_terms import pushes_by_token
-from s2r_runtime.trace.residual import acting
-from s2r_runtime.trace.residual_noise import Whitener
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

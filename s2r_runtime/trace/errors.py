@@ -18,12 +18,12 @@ from s2r_runtime.bounds import scenario_confidence
 from s2r_runtime.errors import S2RError
 from s2r_runtime.gap import Transitions, different, discrepancy, hold_residuals, residuals
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.begun import begun, measured, uncertain
 from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.data.split import FEWEST_RUNS
-from s2r_runtime.trace.fitting import Fit, evaluate, gain, problem
-from s2r_runtime.trace.inverse import Inverse, input_relative, inverse
-from s2r_runtime.trace.residual import (
+from s2r_runtime.trace.estimation.initial_states import begun, measured, uncertain
+from s2r_runtime.trace.estimation.inverse_dynamics import Inverse, input_relative, inverse
+from s2r_runtime.trace.estimation.noise import Noise, Past
+from s2r_runtime.trace.estimation.prediction import (
     Acting,
     Steps,
     acting,
@@ -37,7 +37,7 @@ from s2r_runtime.trace.residual import (
     state_jacobian,
     wherever,
 )
-from s2r_runtime.trace.residual_noise import Noise, Past
+from s2r_runtime.trace.estimation.problem import Fit, evaluate, gain, problem
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -133,7 +133,7 @@ def better(given: Held, model: ComposedModel, other: ComposedModel, share: float
 
 
 def _begun(given: Held, model: ComposedModel) -> Array | None:
-    """Where rollouts begin, under the noise that the model leaves there (`begun`)."""
+    """Where rollouts begin, under the noise that the model leaves there (`initial_states`)."""
     if not given.data.axes_without_speed or not len(given.steps):
         return None
     here = problem(given.data, given.steps)

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.drives import Room, draw, room_of
 from s2r_runtime.trace.errors import Held
-from s2r_runtime.trace.fitting import Fit, evaluate
-from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import Fit, evaluate
 from s2r_runtime.trace.rival_fits import Rivals, ground, library, rivals_of
 from s2r_runtime.trace.separation import as_data, between, expected, refitted, trajectories
 from s2r_runtime.trace.suggestion import ENOUGH, Suggestion

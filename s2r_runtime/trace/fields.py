@@ -21,15 +21,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.body_noise import BodyNoise, body_noise, whitener
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.body_frame_noise import BodyNoise, body_noise, whitener
+from s2r_runtime.trace.estimation.noise import Whitener
+from s2r_runtime.trace.estimation.parameters import free_of
+from s2r_runtime.trace.estimation.prediction import acting
+from s2r_runtime.trace.estimation.problem import Fit, slopes
 from s2r_runtime.trace.evidence import evidence
-from s2r_runtime.trace.fitting import Fit, slopes
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
 from s2r_runtime.trace.lack_of_fit_terms import directions_of, own_pushes, quieter
-from s2r_runtime.trace.residual import acting
-from s2r_runtime.trace.residual_noise import Whitener
-from s2r_runtime.trace.slots import free_of
 
 Array = NDArray[np.float64]
 Marginal = tuple[float, Array]

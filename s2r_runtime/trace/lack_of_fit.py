@@ -23,21 +23,21 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.begun import begun, measured
 from s2r_runtime.trace.constancy import uneven
 from s2r_runtime.trace.episodes import episodes, may_depend_on
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.initial_states import begun, measured
+from s2r_runtime.trace.estimation.noise import Colour, Noise, Whitener
+from s2r_runtime.trace.estimation.prediction import Mask, acting, covered, rms, rollout, rollout_starts, some_of
+from s2r_runtime.trace.estimation.problem import FLOORED, Fit, Problem
+from s2r_runtime.trace.estimation.problem import gain as explained
 from s2r_runtime.trace.evidence import evidence, margin
 from s2r_runtime.trace.fields import Field, as_noise, field, nats_of
-from s2r_runtime.trace.fitting import FLOORED, Fit, Problem
-from s2r_runtime.trace.fitting import gain as explained
 from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, SLOWLY, Judged, Left, first_look, judge, leading
 from s2r_runtime.trace.lack_of_fit_terms import dictionaries
 from s2r_runtime.trace.lack_of_fit_together import pairs
 from s2r_runtime.trace.measured_forces import about_inputs
 from s2r_runtime.trace.now_and_then import Lost, now_and_then
-from s2r_runtime.trace.residual import Mask, acting, covered, rms, rollout, rollout_starts, some_of
-from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
 
 Array = NDArray[np.float64]
 

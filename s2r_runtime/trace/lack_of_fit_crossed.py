@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.residual import Steps
+from s2r_runtime.trace.estimation.prediction import Steps
 
 Array = NDArray[np.float64]
 Terms = list[Array]

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.noise import Colour, Whitener
+from s2r_runtime.trace.estimation.problem import Fit, Problem
 from s2r_runtime.trace.evidence import evidence
-from s2r_runtime.trace.fitting import Fit, Problem
-from s2r_runtime.trace.residual_noise import Colour, Whitener
 
 Array = NDArray[np.float64]
 

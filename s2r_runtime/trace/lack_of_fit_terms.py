@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import POSE, axes, coupled, lone_speeds
-from s2r_runtime.trace.fitting import Problem, slopes
+from s2r_runtime.trace.estimation.noise import Noise
+from s2r_runtime.trace.estimation.parameters import free_of
+from s2r_runtime.trace.estimation.prediction import Acting, Steps, acting, wherever
+from s2r_runtime.trace.estimation.problem import Problem, slopes
 from s2r_runtime.trace.lack_of_fit_crossed import bent_product, over_time, overtones
-from s2r_runtime.trace.residual import Acting, Steps, acting, wherever
-from s2r_runtime.trace.residual_noise import Noise
-from s2r_runtime.trace.slots import free_of
 
 Array = NDArray[np.float64]
 Terms = list[Array]

@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.evidence import evidence
 from s2r_runtime.trace.lack_of_fit_judged import Judged, Left, judge, leading
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from s2r_runtime.hookspecs import Effect
 from s2r_runtime.models.composed import AppliedEffect
-from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.fitting import Fit, Problem, insert
-from s2r_runtime.trace.residual import Acting, acting, predicted, wherever
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.prediction import Acting, acting, predicted, wherever
+from s2r_runtime.trace.estimation.problem import Fit, Problem, insert
 
 Array = NDArray[np.float64]
 

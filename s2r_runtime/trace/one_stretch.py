@@ -17,8 +17,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.fitting import Fit, Problem, foretold, without
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.problem import Fit, Problem, foretold, without
 
 Array = NDArray[np.float64]
 

@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.forces import axes
-from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.fitting import Fit, Problem, foretold, objective, sensitivities, without
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.prediction import acting
+from s2r_runtime.trace.estimation.problem import Fit, Problem, foretold, objective, sensitivities, without
 from s2r_runtime.trace.lack_of_fit_terms import own_pushes, quieter
-from s2r_runtime.trace.residual import acting
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.about import about, carried, only_pushes
-from s2r_runtime.trace.fitting import Fit, Problem, fitted, gain, without
+from s2r_runtime.trace.estimation.problem import Fit, Problem, fitted, gain, without
 from s2r_runtime.trace.lack_of_fit_judged import Judged
 from s2r_runtime.trace.lack_of_fit_terms import token_of
 

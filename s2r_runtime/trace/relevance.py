@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.begun import begun, uncertain
-from s2r_runtime.trace.fitting import Fit, Problem, objective, sensitivities, under_noise
-from s2r_runtime.trace.residual import acting, rms, rollout, rollout_starts, some_of
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.initial_states import begun, uncertain
+from s2r_runtime.trace.estimation.parameters import values_of, with_values
+from s2r_runtime.trace.estimation.prediction import acting, rms, rollout, rollout_starts, some_of
+from s2r_runtime.trace.estimation.problem import Fit, Problem, objective, sensitivities, under_noise
 from s2r_runtime.trace.scores import STRICT, Bar, name_of, names
-from s2r_runtime.trace.slots import values_of, with_values
 
 Array = NDArray[np.float64]
 

@@ -22,7 +22,7 @@ from s2r_runtime.trace.data.reconstruction import IN_PARTS, Reconstruction
 from s2r_runtime.trace.domain import Range
 from s2r_runtime.trace.domain import told as domain_told
 from s2r_runtime.trace.errors import Held, Judged
-from s2r_runtime.trace.fitting import insert
+from s2r_runtime.trace.estimation.problem import insert
 from s2r_runtime.trace.found import Found, Limit
 from s2r_runtime.trace.power import Visible
 from s2r_runtime.trace.sensor_faults.fault import Fault

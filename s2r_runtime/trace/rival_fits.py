@@ -18,11 +18,11 @@ from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.data.split import part
 from s2r_runtime.trace.errors import Held
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, insert, problem, without
+from s2r_runtime.trace.estimation.parameters import Added, bounds_of, free_of, slots_of, values_of
+from s2r_runtime.trace.estimation.prediction import first_steps
+from s2r_runtime.trace.estimation.problem import Fit, Problem, evaluate, fitted, gain, insert, problem, without
 from s2r_runtime.trace.found import Found
-from s2r_runtime.trace.residual import first_steps
 from s2r_runtime.trace.scores import best_candidates, name_of
-from s2r_runtime.trace.slots import Added, bounds_of, free_of, slots_of, values_of
 
 if TYPE_CHECKING:
     from s2r_runtime.trace.result import TraceResult

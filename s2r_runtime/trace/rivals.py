@@ -23,10 +23,10 @@ from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.data.dataset import Dataset, Run
-from s2r_runtime.trace.fitting import SETTLED, Fit, Problem, evaluate, fitted, foretold, gain, problem, scatter, without
-from s2r_runtime.trace.residual import steps_of
+from s2r_runtime.trace.estimation.parameters import Added, slots_of
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import SETTLED, Fit, Problem, evaluate, fitted, foretold, gain, problem, scatter, without
 from s2r_runtime.trace.scores import STRICT, Scored, at_first_look, best_candidates, limited, name_of
-from s2r_runtime.trace.slots import Added, slots_of
 
 Array = NDArray[np.float64]
 

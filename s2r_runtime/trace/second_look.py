@@ -11,12 +11,12 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.data.command_timing import checked_of
 from s2r_runtime.trace.data.dataset import Dataset, in_finer_parts
 from s2r_runtime.trace.errors import Held, at_most_seen, judge, noise_floor
-from s2r_runtime.trace.fitting import Fit, Problem, fitted, foretold, gain, problem
+from s2r_runtime.trace.estimation.change_times import dated
+from s2r_runtime.trace.estimation.noise import Whitener
+from s2r_runtime.trace.estimation.prediction import steps_of
+from s2r_runtime.trace.estimation.problem import Fit, Problem, fitted, foretold, gain, problem
 from s2r_runtime.trace.hidden_pairs import two_together
 from s2r_runtime.trace.lack_of_fit import Structure
-from s2r_runtime.trace.residual import steps_of
-from s2r_runtime.trace.residual_noise import Whitener
-from s2r_runtime.trace.retimed import dated
 from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, Bar, Scored, names
 from s2r_runtime.trace.selection import Selection, against_rivals, all_dated, called_for, crowded
 from s2r_runtime.trace.verdict import confirmed, foretelling, takes_far

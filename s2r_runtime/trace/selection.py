@@ -15,13 +15,13 @@ from s2r_runtime.models.forces import axes
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.acceptance import accepted
 from s2r_runtime.trace.changes import from_the_beginning
+from s2r_runtime.trace.estimation.change_times import dated
+from s2r_runtime.trace.estimation.parameters import Slot, bounds_of, values_of
+from s2r_runtime.trace.estimation.problem import Fit, Problem, evaluate, fitted, gain, nearer, plainly, without
 from s2r_runtime.trace.exchange import exchanged, overtaken, parted, pruned, unbent
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, nearer, plainly, without
 from s2r_runtime.trace.friction import KINDS, with_friction
-from s2r_runtime.trace.retimed import dated
 from s2r_runtime.trace.rivals import CLOSE, simplified
 from s2r_runtime.trace.scores import STRICT, Bar, Scored, best_candidates, names, overlooked, rescored
-from s2r_runtime.trace.slots import Slot, bounds_of, values_of
 
 MOST, MOST_ON_ONE = 5, 3
 """Effects that are looked for at most, and on one input: more are a curve in parts, not so many things that happen."""

@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.data.dataset import Dataset, Run
-from s2r_runtime.trace.fitting import Fit, Problem, objective, problem, refine, sensitivities
-from s2r_runtime.trace.residual import acting, predicted, state_jacobian, steps_of
-from s2r_runtime.trace.residual_noise import Noise, Whitener
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.noise import Noise, Whitener
+from s2r_runtime.trace.estimation.prediction import acting, predicted, state_jacobian, steps_of
+from s2r_runtime.trace.estimation.problem import Fit, Problem, objective, problem, refine, sensitivities
 
 Array = NDArray[np.float64]
 

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.errors import Held
+from s2r_runtime.trace.estimation.prediction import acting
 from s2r_runtime.trace.lack_of_fit_terms import token_of
-from s2r_runtime.trace.residual import acting
 
 Array = NDArray[np.float64]
 

@@ -31,7 +31,6 @@ from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.about import remembers
 from s2r_runtime.trace.answer import answered, with_time
-from s2r_runtime.trace.begun import begun
 from s2r_runtime.trace.checks.columns import check_plausible
 from s2r_runtime.trace.checks.common_start import from_one_place
 from s2r_runtime.trace.checks.measured_inputs import refuted, says_forces
@@ -55,9 +54,10 @@ from s2r_runtime.trace.data.readers import load_dataset
 from s2r_runtime.trace.data.split import Part, fit_mask, part
 from s2r_runtime.trace.data.unmeasured_states import alike
 from s2r_runtime.trace.errors import Held, Kind, displacement, held, judge
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, problem
+from s2r_runtime.trace.estimation.initial_states import begun
+from s2r_runtime.trace.estimation.prediction import Mask, acting, first_steps, rms, steps_of
+from s2r_runtime.trace.estimation.problem import Fit, Problem, evaluate, problem
 from s2r_runtime.trace.lack_of_fit import Structure
-from s2r_runtime.trace.residual import Mask, acting, first_steps, rms, steps_of
 from s2r_runtime.trace.result import TraceResult
 from s2r_runtime.trace.rivals import CLOSE
 from s2r_runtime.trace.scores import names

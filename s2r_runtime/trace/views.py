@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.errors import MANY
-from s2r_runtime.trace.fitting import evaluate, problem
-from s2r_runtime.trace.residual import Steps, acting, advanced, first_steps, residual, rollout_starts, steps_of
+from s2r_runtime.trace.estimation.prediction import Steps, acting, advanced, first_steps, residual, rollout_starts, steps_of
+from s2r_runtime.trace.estimation.problem import evaluate, problem
 from s2r_runtime.trace.shape import Component, components, variables
 
 if TYPE_CHECKING:

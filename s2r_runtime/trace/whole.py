@@ -12,8 +12,9 @@ from s2r_runtime.trace.about import about_states
 from s2r_runtime.trace.challenge import MORE as SHAPED
 from s2r_runtime.trace.challenge import Better, best_shape, better_shape
 from s2r_runtime.trace.data.split import part
+from s2r_runtime.trace.estimation.prediction import first_steps
+from s2r_runtime.trace.estimation.problem import Fit, evaluate, fitted, gain, problem
 from s2r_runtime.trace.fields import Field, beats, nats_of, nats_of_fit, wanders
-from s2r_runtime.trace.fitting import Fit, evaluate, fitted, gain, problem
 from s2r_runtime.trace.lack_of_fit import (
     ALIKE,
     MORE,
@@ -32,7 +33,6 @@ from s2r_runtime.trace.now_and_then import Lost, nats_of_lost
 from s2r_runtime.trace.one_stretch import in_one_stretch
 from s2r_runtime.trace.opposed import opposed
 from s2r_runtime.trace.patchwork import patchwork
-from s2r_runtime.trace.residual import first_steps
 from s2r_runtime.trace.selection import Selection, crowded
 from s2r_runtime.trace.sensor_faults.detect import Checked
 

@@ -21,7 +21,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.checks.prediction_error import FEWEST_STARTS
 from s2r_runtime.trace.data.dataset import Dataset, Run
-from s2r_runtime.trace.residual import Index, acting, first_steps, rollout, rollout_starts
+from s2r_runtime.trace.estimation.prediction import Index, acting, first_steps, rollout, rollout_starts
 
 Array = NDArray[np.float64]
 

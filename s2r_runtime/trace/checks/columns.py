@@ -33,7 +33,7 @@ from s2r_runtime.trace.checks.scale_free_error import heading_off, loosely_unfor
 from s2r_runtime.trace.checks.units import SCALES, Scale, axis_pairs, groups
 from s2r_runtime.trace.data.dataset import Dataset, regridded
 from s2r_runtime.trace.data.streams import Stream
-from s2r_runtime.trace.residual import acting, advanced, predicted, steps_of
+from s2r_runtime.trace.estimation.prediction import acting, advanced, predicted, steps_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.data.dataset import Dataset
-from s2r_runtime.trace.residual import acting, first_steps, residual, steps_of
+from s2r_runtime.trace.estimation.prediction import acting, first_steps, residual, steps_of
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.data.dataset import Dataset
-from s2r_runtime.trace.residual import Steps, acting, predicted, steps_of
+from s2r_runtime.trace.estimation.prediction import Steps, acting, predicted, steps_of
 
 Array = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.errors import Held, noise_there
-from s2r_runtime.trace.fitting import Fit
-from s2r_runtime.trace.inverse import off, off_by_noise, recorded
+from s2r_runtime.trace.estimation.inverse_dynamics import off, off_by_noise, recorded
+from s2r_runtime.trace.estimation.problem import Fit
 
 Array = NDArray[np.float64]
 

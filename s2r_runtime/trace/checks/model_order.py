@@ -21,7 +21,7 @@ from s2r_runtime.errors import ConfigError, RecordingError
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.checks.prediction_error import shares, some_starts, steps_ahead, unforetold
 from s2r_runtime.trace.data.dataset import Dataset
-from s2r_runtime.trace.residual import Acting, Index, acting, first_steps, rms, rollout
+from s2r_runtime.trace.estimation.prediction import Acting, Index, acting, first_steps, rms, rollout
 
 Array = NDArray[np.float64]
 

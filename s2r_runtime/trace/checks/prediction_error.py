@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.data.dataset import Dataset
-from s2r_runtime.trace.residual import Index, acting, first_steps, rollout, rollout_starts
+from s2r_runtime.trace.estimation.prediction import Index, acting, first_steps, rollout, rollout_starts
 
 Array = NDArray[np.float64]
 

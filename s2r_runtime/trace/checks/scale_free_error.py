@@ -18,7 +18,7 @@ from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.checks.prediction_error import FEWEST_STARTS, GOES, bend_noise, some_starts, steps_ahead, trimmed
 from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.data.missing_rows import filled
-from s2r_runtime.trace.residual import acting, advanced, first_steps
+from s2r_runtime.trace.estimation.prediction import acting, advanced, first_steps
 
 Array = NDArray[np.float64]
 

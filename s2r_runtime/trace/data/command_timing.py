@@ -25,8 +25,8 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.checks.clocks import earlier
 from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.data.initial_conditions import with_history
-from s2r_runtime.trace.fitting import Fit, Problem
-from s2r_runtime.trace.residual import acting, first_steps, predicted
+from s2r_runtime.trace.estimation.prediction import acting, first_steps, predicted
+from s2r_runtime.trace.estimation.problem import Fit, Problem
 from s2r_runtime.trace.sensor_faults.detect import Checked, check
 
 Array = NDArray[np.float64]

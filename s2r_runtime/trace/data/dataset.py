@@ -56,7 +56,7 @@ Mask = NDArray[np.bool_]
 PARTS = (10, 12)
 """Least and most parts of a step where inputs change within steps. A change within a part counts as a mean over it, which spreads it as a
 lag would: of a delay and a lag of a step each, parts of a quarter make the one longer and the other shorter by a hundredth of a step, far
-outside their intervals where there is little noise. Even, so that a grid half as fine tells what is left of that (`grid_errors`).
+outside their intervals where there is little noise. Even, so that a grid half as fine tells what is left of that (`discretisation_error`).
 """
 
 MOST_ROWS, EVEN = 12, 0.02

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.models.input_chains import Inputs
 from s2r_runtime.trace.data.dataset import Dataset, Run
-from s2r_runtime.trace.residual import acting, residual, steps_of
+from s2r_runtime.trace.estimation.prediction import acting, residual, steps_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -24,12 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.data.dataset import Dataset, regridded
 from s2r_runtime.trace.data.input_interpolation import MOVING, Samples, Way
 from s2r_runtime.trace.data.streams import Stream
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, fitted, gain, sensitivities, slopes
-from s2r_runtime.trace.residual import Acting, acting, predicted, residual, state_jacobian
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.prediction import Acting, acting, predicted, residual, state_jacobian
+from s2r_runtime.trace.estimation.problem import Fit, Problem, evaluate, fitted, gain, sensitivities, slopes
 from s2r_runtime.trace.rivals import CLOSE, NEAR
 
 Array = NDArray[np.float64]

@@ -1,7 +1,7 @@
 """How inputs went that a recording has samples of: between its rows, and less the noise of the sensors that told them.
 
 u_k = a_k + n_k                    a: what acted at the row's stamp, n: white noise of its sensor
-a'_k = u_k + clean (s_k - u_k)     s: a smoothing spline through u, as smooth as its own likelihood says (`speeds`)
+a'_k = u_k + clean (s_k - u_k)     s: a smoothing spline through u, as smooth as its own likelihood says (`speed_spline`)
 a''_k = a'_k + on (m_k - a'_k)     m: the mean over the row of a cubic through a'
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.trace.data.streams import Stream
-from s2r_runtime.trace.speeds import FEWEST, less_noise
+from s2r_runtime.trace.estimation.speed_spline import FEWEST, less_noise
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -51,8 +51,8 @@ def moving(inputs: Sequence[Stream]) -> Mask:
 
 
 def less_noise_of(inputs: Stream, ratios: Sequence[float] = ()) -> tuple[Stream, tuple[float, ...]]:
-    """Inputs without the noise of samples, where they change in most rows, and how smooth each is (`speeds`; NaN where it is as it was).
-    ratios: the latter, where it is known.
+    """Inputs without the noise of samples, where they change in most rows, and how smooth each is (`speed_spline`; NaN where it is as it
+    was). ratios: the latter, where it is known.
     """
     values, told = inputs.values.copy(), [math.nan] * inputs.values.shape[1]
     sure = moving([inputs]) & np.isfinite(inputs.values).all(axis=0) & (np.count_nonzero(np.diff(inputs.t)) + 1 >= FEWEST)

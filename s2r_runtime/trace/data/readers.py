@@ -32,8 +32,8 @@ from s2r_runtime.table_text import Limits, Progress, refuse_special
 from s2r_runtime.trace.data.dataset import Array, Dataset, Stream, from_streams
 from s2r_runtime.trace.data.reconstruction import late_speeds, reconstruct
 from s2r_runtime.trace.data.unmeasured_states import unneeded, without
-from s2r_runtime.trace.hidden import told_through
-from s2r_runtime.trace.residual import check_steps
+from s2r_runtime.trace.estimation.hidden_state import told_through
+from s2r_runtime.trace.estimation.prediction import check_steps
 from s2r_runtime.trace.sensor_faults.pose_latency import earlier, late_pose
 
 Row = tuple[float, ...]
@@ -187,8 +187,8 @@ def _table_segments(path: Path, model: ComposedModel, how: _Tables) -> _Part:
 
 
 def _hidden(path: Path, model: ComposedModel, free: set[str], columns: Mapping[str, str]) -> set[str]:
-    """States that the table does not have, and that other ones tell by the model (`hidden`). Not where it has a column that nobody asked
-    for, of nearly the same name: that is it, misspelt.
+    """States that the table does not have, and that other ones tell by the model (`hidden_state`). Not where it has a column that nobody
+    asked for, of nearly the same name: that is it, misspelt.
     """
     from s2r_runtime.tables import header_of, places_of
 

@@ -26,11 +26,11 @@ from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.data import differentiation
 from s2r_runtime.trace.data.input_interpolation import less_noise_of
 from s2r_runtime.trace.data.streams import Stream, complete, fresh, held_between, held_means, unwrapped
-from s2r_runtime.trace.hidden import smoothed_hidden, told_through
+from s2r_runtime.trace.estimation.hidden_state import smoothed_hidden, told_through
+from s2r_runtime.trace.estimation.speed_spline import Smoothed, smoothed
 from s2r_runtime.trace.sensor_faults.fault import Fault
 from s2r_runtime.trace.sensor_faults.position_outliers import mended
 from s2r_runtime.trace.sensor_faults.speed_latency import late, of_differences
-from s2r_runtime.trace.speeds import Smoothed, smoothed
 
 Array = NDArray[np.float64]
 
@@ -214,7 +214,7 @@ def _axes_without_speed(model: ComposedModel, missing: Sequence[str]) -> tuple[t
 def _with_speeds(
     model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], pairs: tuple[tuple[str, str], ...], source: str
 ) -> tuple[list[tuple[Stream, Stream]], Reconstruction]:
-    """Segments as they were received, with speeds of axes (`speeds`) on the same rows. Where rows come much more often than steps are
+    """Segments as they were received, with speeds of axes (`speed_spline`) on the same rows. Where rows come much more often than steps are
     taken, all passes through one low-pass, so that no row is lost.
     """
     missing = tuple(speed for _, speed in pairs)
@@ -253,7 +253,7 @@ def _with_speeds(
 def _with_hidden(
     model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], pairs: tuple[tuple[str, str], ...], source: str
 ) -> tuple[list[tuple[Stream, Stream]], Reconstruction]:
-    """Segments as they were received, with states of somebody's own model that others tell (`hidden`), on the same rows."""
+    """Segments as they were received, with states of somebody's own model that others tell (`hidden_state`), on the same rows."""
     missing = tuple(h for _, h in pairs)
     measured = [name for name in model.states if name not in missing]
     coarse = not model.nominal.integration and steps_coarsely(model.nominal)

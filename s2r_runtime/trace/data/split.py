@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.trace.data.dataset import Dataset, Run
-from s2r_runtime.trace.residual import Steps, first_steps, steps_of
+from s2r_runtime.trace.estimation.prediction import Steps, first_steps, steps_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

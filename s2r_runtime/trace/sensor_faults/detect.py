@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.data.dataset import Dataset, Pause
 from s2r_runtime.trace.data.missing_rows import bridged
-from s2r_runtime.trace.residual import Acting, acting
+from s2r_runtime.trace.estimation.prediction import Acting, acting
 from s2r_runtime.trace.sensor_faults.fault import Fault, fault_of
 from s2r_runtime.trace.sensor_faults.frozen import frozen
 from s2r_runtime.trace.sensor_faults.heading import carried, departures

@@ -15,7 +15,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes, lone_speeds
 from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.data.missing_rows import filled
-from s2r_runtime.trace.residual import Acting, advanced, first_steps
+from s2r_runtime.trace.estimation.prediction import Acting, advanced, first_steps
 from s2r_runtime.trace.sensor_faults.fault import FROZEN_ROWS, QUANTA, REPEATS, RESTLESS, RESTS, SIGMAS, Fault, fault_of, stretches
 from s2r_runtime.trace.sensor_faults.heading import course_of
 from s2r_runtime.trace.sensor_faults.largest_step import Reach, predicted

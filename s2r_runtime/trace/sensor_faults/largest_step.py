@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.data.dataset import Dataset
-from s2r_runtime.trace.residual import Acting, advanced, first_steps
-from s2r_runtime.trace.residual_noise import quantum
+from s2r_runtime.trace.estimation.noise import quantum
+from s2r_runtime.trace.estimation.prediction import Acting, advanced, first_steps
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

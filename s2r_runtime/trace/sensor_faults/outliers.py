@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.data.dataset import Dataset
-from s2r_runtime.trace.residual import Acting
+from s2r_runtime.trace.estimation.prediction import Acting
 from s2r_runtime.trace.sensor_faults.fault import SIGMAS, Fault, fault_of
 from s2r_runtime.trace.sensor_faults.heading import wrong_before
 from s2r_runtime.trace.sensor_faults.largest_step import ONE_IN, Reach, predicted

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.data.streams import Stream, complete, fresh, held, unwrapped
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.speed_spline import less_noise
 from s2r_runtime.trace.sensor_faults.fault import Fault
-from s2r_runtime.trace.speeds import less_noise
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -1,7 +1,7 @@
 """A speed that a controller made of positions comes late: a filter that looks back only is behind by its time constant, and the difference
 of the last two positions by half a row.
 
-Against the speed v that positions alone say (`speeds`: a spline looks both ways, and is not late), a recorded one is
+Against the speed v that positions alone say (`speed_spline`: a spline looks both ways, and is not late), a recorded one is
 
     s_k = v_k - late a_k + noise,      a_k = (v_{k+1} - v_{k-1}) / (t_{k+1} - t_{k-1})
 
@@ -26,8 +26,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace.residual_noise import quantum
-from s2r_runtime.trace.speeds import Smoothed
+from s2r_runtime.trace.estimation.noise import quantum
+from s2r_runtime.trace.estimation.speed_spline import Smoothed
 
 Array = NDArray[np.float64]
 

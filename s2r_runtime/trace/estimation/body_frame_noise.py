@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.forces import POSE
-from s2r_runtime.trace import residual_noise as noises
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.noise import Noise, Whitener
+from s2r_runtime.trace.estimation.prediction import acting
 from s2r_runtime.trace.lack_of_fit_judged import Left
 from s2r_runtime.trace.lack_of_fit_terms import directions_of
-from s2r_runtime.trace.residual import acting
-from s2r_runtime.trace.residual_noise import Noise, Whitener
 
 Array = NDArray[np.float64]
 

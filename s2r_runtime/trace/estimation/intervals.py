@@ -1,9 +1,9 @@
 """95 % intervals of fitted parameters.
 
 Smooth parameters: value ± 1.96 s, s from Gauss-Newton, widened by the ratio in which the scores of blocks of time scatter more than
-the likelihood says (a sandwich; never narrowed), or for noise that is not known, if that is more (`noise_doubt`). Parameters that enter
-with a kink (delays, limits): profile likelihood, where the log likelihood, the other parameters refitted, has fallen by 1.92 (3.68 for the
-time of a change) times the square of that ratio.
+the likelihood says (a sandwich; never narrowed), or for noise that is not known, if that is more (`noise_uncertainty`). Parameters that
+enter with a kink (delays, limits): profile likelihood, where the log likelihood, the other parameters refitted, has fallen by 1.92 (3.68
+for the time of a change) times the square of that ratio.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.fitting import Fit, Problem, objective, sensitivities, widening
-from s2r_runtime.trace.noise_doubt import doubted
-from s2r_runtime.trace.retimed import is_time
-from s2r_runtime.trace.retimed import spread as times_of
-from s2r_runtime.trace.slots import Free, Slot, bounds_of, values_of, with_values
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.change_times import is_time
+from s2r_runtime.trace.estimation.change_times import spread as times_of
+from s2r_runtime.trace.estimation.noise_uncertainty import doubted
+from s2r_runtime.trace.estimation.parameters import Free, Slot, bounds_of, values_of, with_values
+from s2r_runtime.trace.estimation.problem import Fit, Problem, objective, sensitivities, widening
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.input_chains import Key, values_key
-from s2r_runtime.trace.slots import Free
+from s2r_runtime.trace.estimation.parameters import Free
 
 Array = NDArray[np.float64]
 

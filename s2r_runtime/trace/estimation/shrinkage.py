@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate
-from s2r_runtime.trace.intervals import spread_of
-from s2r_runtime.trace.slots import Free, bounds_of, inside, values_of, with_values
+from s2r_runtime.trace.estimation.intervals import spread_of
+from s2r_runtime.trace.estimation.parameters import Free, bounds_of, inside, values_of, with_values
+from s2r_runtime.trace.estimation.problem import Fit, Problem, evaluate
 
 Array = NDArray[np.float64]
 

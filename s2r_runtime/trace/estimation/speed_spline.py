@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace.smoother import Smoother
+from s2r_runtime.trace.estimation.smoother import Smoother
 
 Array = NDArray[np.float64]
 

@@ -18,9 +18,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.fitting import WIDEST, Fit, Problem, slopes
-from s2r_runtime.trace.state_noise import State
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.problem import WIDEST, Fit, Problem, slopes
+from s2r_runtime.trace.estimation.state_noise import State
 
 Array = NDArray[np.float64]
 

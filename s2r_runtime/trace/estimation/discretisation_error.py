@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.forces import axes
-from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.data.gridding import coarser
-from s2r_runtime.trace.fitting import Fit, Problem, foretold, objective, sensitivities
-from s2r_runtime.trace.slots import Slot, bounds_of
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.parameters import Slot, bounds_of
+from s2r_runtime.trace.estimation.problem import Fit, Problem, foretold, objective, sensitivities
 
 Array = NDArray[np.float64]
 Ranges = dict[Slot, tuple[float, float]]

@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace import residual_noise as noises
 from s2r_runtime.trace.data.dataset import Dataset
-from s2r_runtime.trace.residual import Steps
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.prediction import Steps
 
 if TYPE_CHECKING:
-    from s2r_runtime.trace.fitting import Fit, Problem
+    from s2r_runtime.trace.estimation.problem import Fit, Problem
 
 Array = NDArray[np.float64]
 

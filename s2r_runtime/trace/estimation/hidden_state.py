@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError, RecordingError
 from s2r_runtime.hookspecs import NominalModel
 from s2r_runtime.models.bound import turned
-from s2r_runtime.trace.smoother import Smoother
-from s2r_runtime.trace.speeds import Smoothed
+from s2r_runtime.trace.estimation.smoother import Smoother
+from s2r_runtime.trace.estimation.speed_spline import Smoothed
 
 Array = NDArray[np.float64]
 Pair = tuple[str, str]
@@ -41,7 +41,7 @@ LEAST_MOVED = 1e-2
 """Of its usual size, g in a row: where h hardly moves p, p says next to nothing of it there, and G has no inverse."""
 
 WILD = 4.0
-"""Standard deviations from which a row counts less, as in `speeds`."""
+"""Standard deviations from which a row counts less, as in `speed_spline`."""
 
 
 def told_through(nominal: NominalModel, missing: Sequence[str]) -> tuple[Pair, ...]:

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.fitting import Fit, Problem, evaluate, predicted_by, refine, sensitivities, sought, under_noise, without
-from s2r_runtime.trace.slots import Slot, bounds_of, values_of, with_values
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.parameters import Slot, bounds_of, values_of, with_values
+from s2r_runtime.trace.estimation.problem import Fit, Problem, evaluate, predicted_by, refine, sensitivities, sought, under_noise, without
 
 Array = NDArray[np.float64]
 

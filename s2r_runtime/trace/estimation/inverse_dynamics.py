@@ -20,7 +20,7 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.data import differentiation
 from s2r_runtime.trace.data.dataset import Dataset, regridded
 from s2r_runtime.trace.data.reconstruction import at_step
-from s2r_runtime.trace.residual import Acting, Steps, acting, rms, steps_of, wherever
+from s2r_runtime.trace.estimation.prediction import Acting, Steps, acting, rms, steps_of, wherever
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

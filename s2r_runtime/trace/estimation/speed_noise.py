@@ -1,7 +1,7 @@
 """Noise of an axis whose speed was not measured: of its position's measurement (R), and of what pushes it (Q, on the speed).
 
-The speed that stands in the recording (`speeds`) is where the model is stepped from, not a measurement: it is given a measurement noise
-beyond all bounds, K R. The residual of position and speed,
+The speed that stands in the recording (`speed_spline`) is where the model is stepped from, not a measurement: it is given a measurement
+noise beyond all bounds, K R. The residual of position and speed,
 
     r_k = (p, v)_{k+1} - f(p, v)_k = w_k + e_{k+1} - F_k e_k,      e ~ (0, R diag(1, K)),  w ~ (0, Q (h^2/3 h/2; h/2 1)),
 

@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
-from s2r_runtime.trace import residual_noise as noises
-from s2r_runtime.trace.answers import Known, kept
-from s2r_runtime.trace.begun import retold
 from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.data.gridding import coarse
-from s2r_runtime.trace.residual import TOGETHER, Steps, acting, advanced, near, predicted, side_by_side, state_jacobian
-from s2r_runtime.trace.residual_noise import Colour, Noise, Whitener
-from s2r_runtime.trace.slots import Added, Free, Slot, bounds_of, free_of, inside, values_of, with_values
-from s2r_runtime.trace.speed_noise import BEYOND
+from s2r_runtime.trace.estimation import noise as noises
+from s2r_runtime.trace.estimation.initial_states import retold
+from s2r_runtime.trace.estimation.noise import Colour, Noise, Whitener
+from s2r_runtime.trace.estimation.parameters import Added, Free, Slot, bounds_of, free_of, inside, values_of, with_values
+from s2r_runtime.trace.estimation.prediction import TOGETHER, Steps, acting, advanced, near, predicted, side_by_side, state_jacobian
+from s2r_runtime.trace.estimation.prediction_cache import Known, kept
+from s2r_runtime.trace.estimation.speed_noise import BEYOND
 
 Array = NDArray[np.float64]
 
@@ -400,7 +400,7 @@ def _law(given: Problem, fit: Fit) -> Colour | None:
 
 
 def about(given: Problem, fit: Fit) -> Problem:
-    """The same transitions, taken about where a model says, with its noise, that the robot was: with e_k = y_k - x_k (`begun`),
+    """The same transitions, taken about where a model says, with its noise, that the robot was: with e_k = y_k - x_k (`initial_states`),
 
         y0 -> x,   y1 -> y1 - F e,   so that  y1 (-) f(y0)  becomes  y1 (-) f(x) - F e:
 

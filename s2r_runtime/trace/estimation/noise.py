@@ -3,7 +3,7 @@
     r_k = y_{k+1} (-) f(y_k) = effect + w_k + e_{k+1} - F_k e_k,      w ~ (0, Q),  e ~ (0, R),  Q and R diagonal
     cov(r_k, r_k) = Q + R + F_k R F_k^T,    cov(r_k, r_{k-1}) = -F_k R   where step k begins where k-1 ended, else 0
 
-(Q plus p_k p_k^T where noise of its own `push`es along p_k, `body_noise`.)
+(Q plus p_k p_k^T where noise of its own `push`es along p_k, `body_frame_noise`.)
 
 S = L L^T is banded (2 nx - 1 below the diagonal); whitened residual z = L^-1 r. Q and R maximise, state by state, the likelihood of
 that state's residual alone (tridiagonal), the others' measurement noise in it taken from the round before: consistent, and a
@@ -22,9 +22,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace.shocks import are_shocks
-from s2r_runtime.trace.speed_noise import of_axis
-from s2r_runtime.trace.state_noise import of_state
+from s2r_runtime.trace.estimation.innovation_outliers import are_shocks
+from s2r_runtime.trace.estimation.speed_noise import of_axis
+from s2r_runtime.trace.estimation.state_noise import of_state
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
