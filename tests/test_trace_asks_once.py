@@ -18,16 +18,18 @@ from s2r_runtime.models.file_model import FileModel
 from s2r_runtime.models.input_chains import Inputs
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import exchange, fields, lack_of_fit, relevance, scores, selection, whole
-from s2r_runtime.trace.changes import rivals_that_happen
+from s2r_runtime.trace import lack_of_fit, whole
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.errors import Held, noise_floor
 from s2r_runtime.trace.estimation import change_times, prediction
 from s2r_runtime.trace.estimation import problem as fitting
 from s2r_runtime.trace.estimation.prediction import acting, state_jacobian, steps_of
 from s2r_runtime.trace.estimation.problem import Problem, evaluate, fitted, foretold, foretold_by, insert, problem, scatter, without
-from s2r_runtime.trace.fields import Field
+from s2r_runtime.trace.hypotheses import random_fields
+from s2r_runtime.trace.hypotheses.random_fields import Field
 from s2r_runtime.trace.lack_of_fit import left_of
+from s2r_runtime.trace.selection import exchange, relevance, scores, stepwise
+from s2r_runtime.trace.selection.change_points import rivals_that_happen
 from s2r_runtime.trace.sensor_faults.detect import Checked
 
 DT_S, ROWS = 0.02, 300
@@ -279,12 +281,12 @@ def test_a_candidate_that_a_round_leaves_far_behind_gets_no_other_one(monkeypatc
 def test_what_is_far_from_needed_is_not_asked_how_it_began(monkeypatch):
     given, fit = _given()
     asked, found = [], []
-    began = selection.from_the_beginning
-    monkeypatch.setattr(selection, "from_the_beginning", lambda *of: (asked.append(1), began(*of))[1])
-    for share in (-math.inf, selection.NEAR):
+    began = stepwise.from_the_beginning
+    monkeypatch.setattr(stepwise, "from_the_beginning", lambda *of: (asked.append(1), began(*of))[1])
+    for share in (-math.inf, stepwise.NEAR):
         asked.clear()
-        monkeypatch.setattr(selection, "NEAR", share)
-        chosen = selection.called_for(replace(given, searches={}), without(fit.model, 0), 20, lambda share: None)
+        monkeypatch.setattr(stepwise, "NEAR", share)
+        chosen = stepwise.called_for(replace(given, searches={}), without(fit.model, 0), 20, lambda share: None)
         found.append((len(asked), scores.names(chosen.fit.model), chosen.fit.white))
     assert found[1][0] < found[0][0]
     assert found[1][1:] == found[0][1:]
@@ -300,7 +302,7 @@ def test_no_dictionary_explains_more_where_next_to_nothing_is_left(monkeypatch):
         asked.clear()
         monkeypatch.setattr(whole, "LITTLE", share)
         everything = whole.Whole(Checked(given.data, (), (), 0), without(fit.model, 0), 20)
-        structure = everything.structure(selection.Selection(everything.nominal, fit, 1, (), ()))
+        structure = everything.structure(stepwise.Selection(everything.nominal, fit, 1, (), ()))
         found.append((len(asked), structure.tokens, structure.matters))
     assert found == [(1, *found[1][1:]), (0, *found[1][1:])]
 
@@ -333,15 +335,15 @@ def test_candidates_are_held_against_what_one_model_foretells(monkeypatch):
 def test_a_field_that_was_looked_at_goes_on_from_there(monkeypatch):
     given, fit = _given()
     left = left_of(given, evaluate(given, without(fit.model, 0)))
-    offer = max(fields._offered(left), key=lambda offer: fields._marginal(left, offer.x, 1)[0])
-    whole, first = fields._marginal(left, offer.x, fields.PASSES), fields._marginal(left, offer.x, 1)
-    passes, evidence = [], fields.evidence
-    monkeypatch.setattr(fields, "evidence", lambda *asked: (passes.append(1), evidence(*asked))[1])
-    onward = fields._marginal(left, offer.x, fields.PASSES, first)
+    offer = max(random_fields._offered(left), key=lambda offer: random_fields._marginal(left, offer.x, 1)[0])
+    whole, first = random_fields._marginal(left, offer.x, random_fields.PASSES), random_fields._marginal(left, offer.x, 1)
+    passes, evidence = [], random_fields.evidence
+    monkeypatch.setattr(random_fields, "evidence", lambda *asked: (passes.append(1), evidence(*asked))[1])
+    onward = random_fields._marginal(left, offer.x, random_fields.PASSES, first)
     assert onward[0] == whole[0]
     assert np.array_equal(onward[1], whole[1])
     asked = len(passes)
-    fields._marginal(left, offer.x, fields.PASSES)
+    random_fields._marginal(left, offer.x, random_fields.PASSES)
     assert len(passes) == 2 * asked + 1
 
 

@@ -7,11 +7,11 @@ import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.trace import fields
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.estimation.body_frame_noise import body_noise, whitener
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, problem
+from s2r_runtime.trace.hypotheses import random_fields
 from s2r_runtime.trace.lack_of_fit import left_of
 
 DT, STEPS = 0.05, 900
@@ -111,16 +111,16 @@ def test_it_makes_no_field(monkeypatch):
     three have it, of which one in a hundred such tests would have one.
     """
     noisy = [_left(seed, 0.03) for seed in range(12)]
-    assert [fields.field(left) for left in noisy] == [None] * 12
-    monkeypatch.setattr(fields, "body_noise", lambda left: None)
-    assert any(fields.field(left) is not None for left in noisy)
+    assert [random_fields.field(left) for left in noisy] == [None] * 12
+    monkeypatch.setattr(random_fields, "body_noise", lambda left: None)
+    assert any(random_fields.field(left) is not None for left in noisy)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_floor_is_a_field_beside_it(seed):
     left = _left(seed, 0.03, floor=lambda x: 1.0 - 0.5 * math.sin(4.0 * math.pi * x[0]) * math.cos(4.0 * math.pi * x[1]))
     assert body_noise(left) is not None
-    found = fields.field(left)
+    found = random_fields.field(left)
     assert found is not None
     assert found.tokens == ("position",)
 
@@ -130,7 +130,7 @@ def test_a_floor_that_slips_here_and_there_is_no_noise_along_the_body(seed):
     """Patches of 6 cm, where it goes up to 2.5 cm in a step. Of a step or two, they are as good as noise, which explains far more."""
     left = _left(seed, 0.0, rolls=lambda x: 1.0 - 0.4 * math.sin(16.0 * math.pi * x[0]) * math.cos(16.0 * math.pi * x[1]))
     assert body_noise(left) is None
-    assert fields.field(left) is not None
+    assert random_fields.field(left) is not None
 
 
 def test_it_must_be_clear(monkeypatch):

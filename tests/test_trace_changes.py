@@ -9,15 +9,15 @@ from seeds import first
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import changes
-from s2r_runtime.trace.acceptance import accepted
-from s2r_runtime.trace.changes import from_the_beginning, rivals_that_happen
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.estimation.parameters import Added
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem
-from s2r_runtime.trace.scores import STRICT, Scored, name_of
-from s2r_runtime.trace.selection import Selection, all_dated
+from s2r_runtime.trace.selection import change_points
+from s2r_runtime.trace.selection.acceptance import accepted
+from s2r_runtime.trace.selection.change_points import from_the_beginning, rivals_that_happen
+from s2r_runtime.trace.selection.scores import STRICT, Scored, name_of
+from s2r_runtime.trace.selection.stepwise import Selection, all_dated
 from s2r_runtime.trace.tracer import trace
 
 DT_S, STANDS, CHANGED_S = 0.1, 40, 30.0
@@ -89,7 +89,7 @@ def test_a_change_before_the_robot_moves_is_no_rival(monkeypatch):
         found("regime_change", {"time": 3.0, "gain": 0.95}),
         found("input_gain_asymmetry", {"gain_positive": 0.9, "gain_negative": 0.9}),
     ]
-    monkeypatch.setattr(changes, "rivals_of", lambda given, fit, place: others)
+    monkeypatch.setattr(change_points, "rivals_of", lambda given, fit, place: others)
     assert rivals_that_happen(given, gain.fit) == others[1:]
 
 

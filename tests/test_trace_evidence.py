@@ -9,8 +9,6 @@ from trace_robots import DT, NOISE, ROBOTARIUM, commands, declared, drive, recor
 from s2r_runtime.models.composed import AppliedEffect, compose, wrap
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import exchange, scores
-from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.data.dataset import Stream, from_arrays, from_streams
 from s2r_runtime.trace.data.streams import held_between, held_means
 from s2r_runtime.trace.estimation import problem as fitting
@@ -18,10 +16,12 @@ from s2r_runtime.trace.estimation.noise import Noise, quantum
 from s2r_runtime.trace.estimation.parameters import Added
 from s2r_runtime.trace.estimation.prediction import acting, residual, steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem, refine
-from s2r_runtime.trace.evidence import RIDGES, evidence, margin
-from s2r_runtime.trace.lack_of_fit_terms import LINE, dictionaries, line, quieter
-from s2r_runtime.trace.leftover import Leftover
-from s2r_runtime.trace.scores import STRICT, Scored, limited, names
+from s2r_runtime.trace.hypotheses.basis import LINE, dictionaries, line, quieter
+from s2r_runtime.trace.hypotheses.library import candidates
+from s2r_runtime.trace.hypotheses.starting_values import Leftover
+from s2r_runtime.trace.selection import exchange, scores
+from s2r_runtime.trace.selection.evidence import RIDGES, evidence, margin
+from s2r_runtime.trace.selection.scores import STRICT, Scored, limited, names
 from s2r_runtime.trace.sensor_faults.detect import check
 from s2r_runtime.trace.tracer import trace
 

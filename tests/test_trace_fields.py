@@ -10,14 +10,14 @@ from seeds import first
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import fields
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem
-from s2r_runtime.trace.fields import SEEN, field
+from s2r_runtime.trace.hypotheses import random_fields
+from s2r_runtime.trace.hypotheses.random_fields import SEEN, field
 from s2r_runtime.trace.lack_of_fit import _wanders, left_of
-from s2r_runtime.trace.lack_of_fit_judged import Judged
+from s2r_runtime.trace.selection.basis_evidence import Judged
 from s2r_runtime.trace.tracer import trace
 
 DT = 0.05
@@ -71,10 +71,10 @@ def test_a_floor_may_go_with_one_axis_of_the_place_alone():
     """Of which far fewer cells say it: a robot comes back to an x wherever it is in y."""
     y = np.random.default_rng(0).uniform(size=(50, 3))
     for states in (("x", "y", "theta"), ("y", "theta", "x")):
-        both, *alone = fields._places(states, y)
+        both, *alone = random_fields._places(states, y)
         assert both.shape == (50, 2)
         assert sorted(one[0, 0] for one in alone) == sorted(both[0])
-    assert [one.shape for one in fields._places(("q", "qd"), y[:, :2])] == [(50, 1)]
+    assert [one.shape for one in random_fields._places(("q", "qd"), y[:, :2])] == [(50, 1)]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -200,7 +200,7 @@ def test_what_a_wandering_push_explains_is_its_marginal_likelihood(seed):
     theta = given.steps.y0[:, 2]
     x = np.column_stack([np.cos(theta), np.sin(theta), 0.0 * theta])[:, :, None] * bumps[:, None, :]
     x /= math.sqrt(np.mean(x * x))
-    told, beta = fields._marginal(left, x, fields.PASSES)
+    told, beta = random_fields._marginal(left, x, random_fields.PASSES)
     rest = left.r - x @ beta
     whiten = noises.Whitener(noises.estimate(rest, left.f, given.steps.joined, given.floor), left.f, given.steps.joined)
     table, z = whiten(x).reshape(-1, 40), whiten(left.r).ravel()
@@ -229,8 +229,8 @@ def test_what_is_known_of_what_a_model_leaves_is_forgotten_with_another_fit():
     given = problem(data, steps_of(data))
     left = left_of(given, evaluate(given, model))
     noisier = replace(left, fit=replace(left.fit, z=2.0 * left.fit.z))
-    assert fields.bare_nats(left) > fields.bare_nats(noisier) + 1.0
-    assert fields.bare_nats(replace(left, fit=noisier.fit)) == fields.bare_nats(noisier)
+    assert random_fields.bare_nats(left) > random_fields.bare_nats(noisier) + 1.0
+    assert random_fields.bare_nats(replace(left, fit=noisier.fit)) == random_fields.bare_nats(noisier)
 
 
 def test_only_fields_that_stand_out_are_looked_at(monkeypatch):
@@ -238,8 +238,10 @@ def test_only_fields_that_stand_out_are_looked_at(monkeypatch):
     half of them, whatever the tails (Cantelli: 1 / (1 + SEEN^2)).
     """
     looked = []
-    marginal = fields._marginal
-    monkeypatch.setattr(fields, "_marginal", lambda left, x, passes, *first: looked.append(passes) or marginal(left, x, passes, *first))
+    marginal = random_fields._marginal
+    monkeypatch.setattr(
+        random_fields, "_marginal", lambda left, x, passes, *first: looked.append(passes) or marginal(left, x, passes, *first)
+    )
     for slips in (0.0, 0.4):
         rng = np.random.default_rng(3)
         u = _held(rng, 600, [-0.5, -1.5], [0.5, 1.5])
@@ -247,12 +249,12 @@ def test_only_fields_that_stand_out_are_looked_at(monkeypatch):
         data, model = _recording(y, u)
         given = problem(data, steps_of(data))
         left = left_of(given, evaluate(given, model))
-        flipped = fields._flipped(left)
-        offered = list(fields._offered(left))
-        standing = [offer for offer in offered if fields._stands_out(offer, np.einsum("ki,kis->ks", offer.push, flipped)) > SEEN]
+        flipped = random_fields._flipped(left)
+        offered = list(random_fields._offered(left))
+        standing = [offer for offer in offered if random_fields._stands_out(offer, np.einsum("ki,kis->ks", offer.push, flipped)) > SEEN]
         looked.clear()
         found = field(left)
-        assert slips or len(looked) <= 2 * (fields.LOOKED_AT + fields.FITTED)  # fields, and pushes that wander
+        assert slips or len(looked) <= 2 * (random_fields.LOOKED_AT + random_fields.FITTED)  # fields, and pushes that wander
         assert (found is not None) == bool(slips)
         if slips:
             assert found.tokens[0] == "position"
@@ -292,7 +294,7 @@ def test_what_a_smooth_function_took_away_is_no_law_of_the_noise():
     white, joined = noises.no_colour(3), left.given.steps.joined
     whiten = left.fit.whiten
     usual = max(noises.log_likelihood(rest, whiten, law, joined) for law in (white, noises.colour(rest, joined)))
-    assert fields._under_any_law(rest, whiten, left) < usual + 1.0
+    assert random_fields._under_any_law(rest, whiten, left) < usual + 1.0
 
 
 def test_what_is_slow_in_a_short_drive_and_foretells_little_is_a_push_that_wanders():
@@ -318,9 +320,9 @@ def test_a_model_and_a_dictionary_that_say_the_same_are_weighed_alike(seed):
     gain = insert(model, AppliedEffect(registry().get("effects", "input_gain"), "w", {"gain": 0.97}), 0)
     fit = fitted(given, nominal, gain)
     price = 0.5 * math.log(len(given.steps))
-    as_model = fields.nats_of_fit(left, fit, price)
-    as_term = fields.nats_of(left, (given.predicted(model) - given.predicted(gain))[:, :, None])
-    assert fields.nats_of_fit(left, nominal, 0.0) == pytest.approx(0.0)
-    assert as_model == pytest.approx(fields.nats_of_fit(left, fit, 0.0) - price)
+    as_model = random_fields.nats_of_fit(left, fit, price)
+    as_term = random_fields.nats_of(left, (given.predicted(model) - given.predicted(gain))[:, :, None])
+    assert random_fields.nats_of_fit(left, nominal, 0.0) == pytest.approx(0.0)
+    assert as_model == pytest.approx(random_fields.nats_of_fit(left, fit, 0.0) - price)
     assert min(as_model, as_term) > 20.0
     assert as_model - 12.0 < as_term < as_model + 3.0  # a term may be of any size: that costs up to log(1e5) / 2 more

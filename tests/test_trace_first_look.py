@@ -12,19 +12,19 @@ from s2r_runtime.hookspecs import Parameter
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.data.gridding import FEW, coarse, coarser
 from s2r_runtime.trace.estimation.noise import weight
 from s2r_runtime.trace.estimation.parameters import Added
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, gain, insert, problem
-from s2r_runtime.trace.hidden_pairs import TAKEN, _nats, _nats_beside, _nats_of_spans, _span, _together, two_together
-from s2r_runtime.trace.leftover import Leftover
-from s2r_runtime.trace.relevance import _edges, relevant
-from s2r_runtime.trace.scores import best_candidates, names
-from s2r_runtime.trace.screening import _Aside, probes_of, screen
-from s2r_runtime.trace.selection import Selection, doing_something
+from s2r_runtime.trace.hypotheses.library import candidates
+from s2r_runtime.trace.hypotheses.starting_values import Leftover
+from s2r_runtime.trace.selection.pairs import TAKEN, _nats, _nats_beside, _nats_of_spans, _span, _together, two_together
+from s2r_runtime.trace.selection.relevance import _edges, relevant
+from s2r_runtime.trace.selection.scores import best_candidates, names
+from s2r_runtime.trace.selection.screening import _Aside, probes_of, screen
+from s2r_runtime.trace.selection.stepwise import Selection, doing_something
 
 JOINT, WHEELS = ModelSpec("joint", DT, {"mass": 1.0}, ()), ModelSpec("differential_drive", DT, {}, ())
 

@@ -15,16 +15,16 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.report.trace_page import trace_page
 from s2r_runtime.trace import lack_of_fit as lack_of_fit_of
 from s2r_runtime.trace import verdict
-from s2r_runtime.trace.about import about_states
-from s2r_runtime.trace.acceptance import significant
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.errors import held, judge, noise_floor
 from s2r_runtime.trace.estimation.noise import MEMORIES
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, gain, insert, problem
-from s2r_runtime.trace.fields import Field
+from s2r_runtime.trace.hypotheses.dependence import about_states
+from s2r_runtime.trace.hypotheses.random_fields import Field
 from s2r_runtime.trace.lack_of_fit import Looks, Structure, _weight_of, left_of
-from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged
+from s2r_runtime.trace.selection.acceptance import significant
+from s2r_runtime.trace.selection.basis_evidence import BLOCKS, Judged
 from s2r_runtime.trace.sensor_faults.detect import Checked
 from s2r_runtime.trace.tracer import trace
 from s2r_runtime.trace.verdict import foretells, misses

@@ -18,7 +18,7 @@ from s2r_runtime.trace.errors import held
 from s2r_runtime.trace.estimation.inverse_dynamics import off, off_by_noise, recorded
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, insert, problem
-from s2r_runtime.trace.measured_forces import about_inputs, on_motion
+from s2r_runtime.trace.hypotheses.measured_forces import about_inputs, on_motion
 from s2r_runtime.trace.tracer import trace
 
 DT_S, ROWS, MASS, VISCOUS, DRY = 0.004, 570, 0.2, 6.7, 0.5

@@ -17,8 +17,8 @@ from s2r_runtime.trace.data.readers import load_dataset
 from s2r_runtime.trace.estimation.parameters import Added
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, problem
-from s2r_runtime.trace.exchange import parted
-from s2r_runtime.trace.scores import STRICT
+from s2r_runtime.trace.selection.exchange import parted
+from s2r_runtime.trace.selection.scores import STRICT
 from s2r_runtime.trace.tracer import trace
 
 ROBOTS = {

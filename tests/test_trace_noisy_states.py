@@ -10,14 +10,15 @@ from trace_robots import commands, drive
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace import second_look, selection, verdict
-from s2r_runtime.trace.acceptance import BY_CHANCE, _scattered
+from s2r_runtime.trace import second_look, verdict
 from s2r_runtime.trace.data.dataset import from_arrays, from_streams
 from s2r_runtime.trace.data.streams import Stream
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import SCORE_BLOCKS, evaluate, fitted, gain, insert, nearer, problem
-from s2r_runtime.trace.scores import STRICT
-from s2r_runtime.trace.selection import Selection
+from s2r_runtime.trace.selection import stepwise
+from s2r_runtime.trace.selection.acceptance import BY_CHANCE, _scattered
+from s2r_runtime.trace.selection.scores import STRICT
+from s2r_runtime.trace.selection.stepwise import Selection
 from s2r_runtime.trace.tracer import trace
 
 DT = 0.005
@@ -71,7 +72,7 @@ def test_a_spring_that_noise_hides_is_named(monkeypatch):
     result = trace(data, model)
     assert [e.name for e in result.spec.effects] == ["cubic_stiffness"]
     assert result.spec.effects[0].parameters["coefficient"] == pytest.approx(450.0, rel=0.1)
-    monkeypatch.setattr(selection, "nearer", lambda *_: 0.0)
+    monkeypatch.setattr(stepwise, "nearer", lambda *_: 0.0)
     assert trace(data, model).verdict == "unexplained"
 
 
@@ -130,9 +131,9 @@ def test_what_is_foretold_worse_is_no_name_however_well_it_fits():
     y, u = _sled(450.0, seed=2, sigma=np.array([0.09, 0.05, 0.005, 0.09]), push=15.0)
     given, model = _given(y, u)
     none_yet = Selection(evaluate(given, model), evaluate(given, model), 200, (), ())
-    assert selection.one_more(given, none_yet, 20, lambda fit, base: 1.0).fit.added
+    assert stepwise.one_more(given, none_yet, 20, lambda fit, base: 1.0).fit.added
     for foretold in (0.0, -3.0, -math.inf):
-        assert selection.one_more(given, none_yet, 20, lambda fit, base, told=foretold: told) is none_yet
+        assert stepwise.one_more(given, none_yet, 20, lambda fit, base, told=foretold: told) is none_yet
 
 
 def _late(u, start, step, dt, share=0.7, parts=50):

@@ -16,8 +16,8 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import Dataset, from_arrays
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem
+from s2r_runtime.trace.hypotheses.packet_loss import now_and_then
 from s2r_runtime.trace.lack_of_fit import left_of
-from s2r_runtime.trace.now_and_then import now_and_then
 from s2r_runtime.trace.tracer import trace
 
 Array = NDArray[np.float64]

@@ -10,7 +10,6 @@ from s2r_runtime.hookspecs import Parameter
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.acceptance import _beyond_rounding
 from s2r_runtime.trace.data import gridding
 from s2r_runtime.trace.data.dataset import Run, from_arrays, from_streams
 from s2r_runtime.trace.data.streams import Stream
@@ -24,6 +23,7 @@ from s2r_runtime.trace.estimation.order_intervals import in_either_order
 from s2r_runtime.trace.estimation.parameters import Slot, bounds_of, values_of
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem, sensitivities, told
+from s2r_runtime.trace.selection.acceptance import _beyond_rounding
 
 DRY, VISCOUS = 0.5, 0.4
 WIND = 0.05

@@ -5,10 +5,10 @@ import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace import scores, selection
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import Problem, evaluate, gain, problem
+from s2r_runtime.trace.selection import scores, stepwise
 
 DT_S = 0.02
 MODEL = compose(ModelSpec("double_integrator", DT_S))
@@ -30,7 +30,7 @@ def _given(slow_y: float) -> Problem:
 
 @pytest.mark.parametrize(("slow_y", "found"), [(0.1, {("viscous_friction", "vy")}), (0.0, set())])
 def test_what_is_refused_hides_nothing_else(monkeypatch, slow_y, found):
-    given, accepted = _given(slow_y), selection.accepted
+    given, accepted = _given(slow_y), stepwise.accepted
     asked = []
 
     def but_along_x(given, fit, base, *more):
@@ -38,13 +38,13 @@ def test_what_is_refused_hides_nothing_else(monkeypatch, slow_y, found):
         asked.extend(new)
         return {channel for _, channel in new} <= {"vy", "ay", "y"} and accepted(given, fit, base, *more)
 
-    monkeypatch.setattr(selection, "accepted", but_along_x)
-    chosen = selection.called_for(given, MODEL, 50, lambda share: None)
+    monkeypatch.setattr(stepwise, "accepted", but_along_x)
+    chosen = stepwise.called_for(given, MODEL, 50, lambda share: None)
     assert {*scores.names(chosen.fit.model)} == found
     assert ("viscous_friction", "vx") in asked
     if slow_y:
-        monkeypatch.setattr(selection, "overlooked", lambda *_: [])
-        assert not selection.called_for(given, MODEL, 50, lambda share: None).fit.added
+        monkeypatch.setattr(stepwise, "overlooked", lambda *_: [])
+        assert not stepwise.called_for(given, MODEL, 50, lambda share: None).fit.added
 
 
 def test_nothing_is_asked_again_where_the_rest_says_too_little(monkeypatch):
@@ -62,8 +62,8 @@ def test_nothing_is_asked_again_where_the_rest_says_too_little(monkeypatch):
 def test_what_makes_next_to_nothing_of_what_is_looked_for_is_not_gone_on_from(share):
     """A drag that explains so many nats, where something without a name explains a little fewer, or more, than five times as many."""
     given = _given(0.1)
-    usual = selection.called_for(given, MODEL, 50, lambda share: None)
-    before = selection.Selection(usual.nominal, usual.nominal, usual.tried, usual.ranking, ())
-    lacks = share * gain(usual.fit, usual.nominal) / selection.A_PART  # of both axes, which are looked for together
-    chosen = selection.called_for(given, MODEL, 50, lambda share: None, scores.LENIENT, before, lacks=lacks)
+    usual = stepwise.called_for(given, MODEL, 50, lambda share: None)
+    before = stepwise.Selection(usual.nominal, usual.nominal, usual.tried, usual.ranking, ())
+    lacks = share * gain(usual.fit, usual.nominal) / stepwise.A_PART  # of both axes, which are looked for together
+    chosen = stepwise.called_for(given, MODEL, 50, lambda share: None, scores.LENIENT, before, lacks=lacks)
     assert bool(chosen.fit.added) == (share < 1.0)

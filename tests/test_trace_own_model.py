@@ -13,15 +13,15 @@ from s2r_runtime.models.bound import integrating, steps_coarsely
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import screening
-from s2r_runtime.trace.challenge import better_shape
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.errors import held
 from s2r_runtime.trace.estimation.prediction import Acting, steps_of, wherever
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem
-from s2r_runtime.trace.hidden_pairs import two_together
-from s2r_runtime.trace.scores import names
-from s2r_runtime.trace.selection import Selection
+from s2r_runtime.trace.selection import screening
+from s2r_runtime.trace.selection.pairs import two_together
+from s2r_runtime.trace.selection.scores import names
+from s2r_runtime.trace.selection.stepwise import Selection
+from s2r_runtime.trace.selection.unnamed_alternatives import better_shape
 from s2r_runtime.trace.tracer import trace, usual_horizon
 from s2r_runtime.trace.verdict import foretelling
 

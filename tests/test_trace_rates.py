@@ -8,9 +8,9 @@ from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.estimation.prediction import acting, residual, steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, problem
+from s2r_runtime.trace.hypotheses.basis import dictionaries
 from s2r_runtime.trace.lack_of_fit import dictionaries_of, left_of
-from s2r_runtime.trace.lack_of_fit_judged import first_look
-from s2r_runtime.trace.lack_of_fit_terms import dictionaries
+from s2r_runtime.trace.selection.basis_evidence import first_look
 from s2r_runtime.trace.tracer import trace
 
 DT_S, ROWS = 0.01, 1200

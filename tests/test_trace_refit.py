@@ -11,9 +11,9 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem
-from s2r_runtime.trace.exchange import parted
-from s2r_runtime.trace.scores import STRICT, best_candidates, names
-from s2r_runtime.trace.selection import Selection
+from s2r_runtime.trace.selection.exchange import parted
+from s2r_runtime.trace.selection.scores import STRICT, best_candidates, names
+from s2r_runtime.trace.selection.stepwise import Selection
 from s2r_runtime.trace.sensor_faults.detect import check
 from s2r_runtime.trace.whole import Whole
 

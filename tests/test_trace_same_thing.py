@@ -14,7 +14,7 @@ from s2r_runtime.report.page import Page
 from s2r_runtime.report.trace_section import add_trace
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.found import Found
-from s2r_runtime.trace.same_thing import other_names
+from s2r_runtime.trace.hypotheses.equivalence import other_names
 from s2r_runtime.trace.tracer import trace
 
 ARCS = (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),)

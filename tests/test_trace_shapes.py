@@ -11,11 +11,12 @@ from trace_robots import declared, recordings
 
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace import challenge, whole
+from s2r_runtime.trace import whole
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, problem
-from s2r_runtime.trace.shapes import SHAPES
+from s2r_runtime.trace.hypotheses.input_dynamics import SHAPES
+from s2r_runtime.trace.selection import unnamed_alternatives as challenge
 from s2r_runtime.trace.tracer import trace
 
 DT = 0.02

@@ -6,11 +6,11 @@ from seeds import first
 
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace import rivals
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, insert, problem
-from s2r_runtime.trace.state_shapes import STATE_SHAPES, starts
+from s2r_runtime.trace.hypotheses.state_nonlinearity import STATE_SHAPES, starts
+from s2r_runtime.trace.selection import ties
 from s2r_runtime.trace.tracer import trace
 
 pytestmark = pytest.mark.slow
@@ -136,7 +136,7 @@ def test_what_does_nothing_on_rich_inputs_says_nothing_there_of_the_others():
     given = problem(data, steps_of(data))
     effects = [("input_gain", {"gain": 0.9}), ("input_bias", {"bias": -0.05}), ("input_saturation", {"low": -9.0, "high": 9.0})]
     models = [compose(ModelSpec("unicycle", DT, {}, (EffectSpec(name, "v", p),))) for name, p in effects]
-    gain, bias, limit = rivals._rich(given, model).worst(models, evaluate(given, model).model)
+    gain, bias, limit = ties._rich(given, model).worst(models, evaluate(given, model).model)
     assert limit == pytest.approx(1.0)
     assert gain < 1.0
     assert bias < 1.0

@@ -11,15 +11,15 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace import second_look, verdict
-from s2r_runtime.trace.acceptance import _scattered
-from s2r_runtime.trace.any_shape import any_shape_of
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.errors import Judged, held
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, gain, insert, problem
-from s2r_runtime.trace.rivals import SURELY, rivals_of, simplified, tied
-from s2r_runtime.trace.scores import Scored, _search, names, unlimited
-from s2r_runtime.trace.selection import Selection, doing_something
+from s2r_runtime.trace.selection.acceptance import _scattered
+from s2r_runtime.trace.selection.scores import Scored, _search, names, unlimited
+from s2r_runtime.trace.selection.shared_dependence import any_shape_of
+from s2r_runtime.trace.selection.stepwise import Selection, doing_something
+from s2r_runtime.trace.selection.ties import SURELY, rivals_of, simplified, tied
 from s2r_runtime.trace.tracer import load_dataset, trace
 from s2r_runtime.trace.verdict import confirmed, harms
 

@@ -9,8 +9,8 @@ from trace_robots import declared, recordings
 
 from s2r_runtime.trace import whole
 from s2r_runtime.trace.answer import _in_order
-from s2r_runtime.trace.challenge import Better
 from s2r_runtime.trace.lack_of_fit import Structure
+from s2r_runtime.trace.selection.unnamed_alternatives import Better
 from s2r_runtime.trace.tracer import trace
 
 

@@ -23,7 +23,7 @@ from s2r_runtime.trace.data.reconstruction import at_step
 from s2r_runtime.trace.data.split import part
 from s2r_runtime.trace.data.streams import Stream
 from s2r_runtime.trace.estimation.prediction import Acting, acting, advanced, residual, steps_of
-from s2r_runtime.trace.shapes import SHAPES, Shape
+from s2r_runtime.trace.hypotheses.input_dynamics import SHAPES, Shape
 from s2r_runtime.trace.tracer import trace
 
 pytestmark = pytest.mark.slow

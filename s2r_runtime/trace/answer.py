@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.seen_rows import united
-from s2r_runtime.trace.any_shape import any_shape_of
 from s2r_runtime.trace.data.command_timing import before_changes
 from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.domain import domain_of
-from s2r_runtime.trace.endless import endless
 from s2r_runtime.trace.errors import Held, Judged, Kind, at_most_seen, gaps, judge, noise_floor
 from s2r_runtime.trace.estimation.discretisation_error import widened
 from s2r_runtime.trace.estimation.noise import no_colour
@@ -26,12 +24,14 @@ from s2r_runtime.trace.estimation.problem import Fit, Problem, told, without
 from s2r_runtime.trace.estimation.shrinkage import drawn_in
 from s2r_runtime.trace.excitation import advice
 from s2r_runtime.trace.found import each_once
+from s2r_runtime.trace.hypotheses.equivalence import other_names
 from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.power import visible
 from s2r_runtime.trace.result import Found, Limit, TraceResult
-from s2r_runtime.trace.same_thing import other_names
-from s2r_runtime.trace.scores import name_of
-from s2r_runtime.trace.selection import Selection
+from s2r_runtime.trace.selection.lag_or_integrator import endless
+from s2r_runtime.trace.selection.scores import name_of
+from s2r_runtime.trace.selection.shared_dependence import any_shape_of
+from s2r_runtime.trace.selection.stepwise import Selection
 from s2r_runtime.trace.sensor_faults.detect import Checked
 from s2r_runtime.trace.sensor_faults.fault import Fault
 from s2r_runtime.trace.sensor_faults.pose_latency import late_faults

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.prediction import acting, first_steps
 from s2r_runtime.trace.estimation.problem import evaluate, foretold, gain, slopes, without
-from s2r_runtime.trace.evidence import margin
-from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
-from s2r_runtime.trace.lack_of_fit_terms import VELOCITIES, quieter, token_of
+from s2r_runtime.trace.hypotheses.basis import VELOCITIES, quieter, token_of
+from s2r_runtime.trace.selection.basis_evidence import BLOCKS, Judged, Left
+from s2r_runtime.trace.selection.evidence import margin
 
 Array = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ ALPHA = 1e-3
 """Chance that a number that is one number fails, as far as the noise's law is right."""
 
 MORE = 0.05
-"""Of what an effect explains that its variation must explain (`challenge`): a number that differs by a fifth of itself."""
+"""Of what an effect explains that its variation must explain (`unnamed_alternatives`): a number that differs by a fifth of itself."""
 
 TOLD, LITTLE = 0.05, 0.01
 """The same where no name is at stake, and what a number seems to go with is only told beside it: a number that differs by a tenth."""
@@ -247,7 +247,7 @@ def _varied(scores: _Scores, along: Array, slope: Array, m: int) -> Array:
 
 
 def _token(left: Left, along: _Along, place: int) -> str:
-    """As `lack_of_fit_terms` calls what varies."""
+    """As `basis` calls what varies."""
     model = left.fit.model
     a = model.effects[place]
     if a.channel not in model.inputs:

@@ -1,6 +1,6 @@
 """What is left in the residual of the final model, named by what it depends on.
 
-A group is a set of dictionaries of terms (see `lack_of_fit_terms`), all of which depend on the same thing. A dictionary is judged like a
+A group is a set of dictionaries of terms (see `basis`), all of which depend on the same thing. A dictionary is judged like a
 rival model: its terms are added to the step,
 
     r = sum_j beta_j X_j + noise,        beta by ridge, its strength by the evidence (`evidence`); without the block of time that is judged
@@ -9,7 +9,7 @@ and its gain is the log likelihood of what is left, with noise and colour re-est
 best group is named, then those that add to it. A group counts only if it is beyond chance, and if the rollouts' errors fall
 with it: structure that nobody would notice is none. Beyond chance: its gain is, the scatter of its scores over blocks of time
 allowed for; or its evidence is out of reach of the same residual slid along the recording. Where no group counts, or foretells nothing
-elsewhere and explains less, what happens for a while only is looked for (`episodes`). A residual that is only correlated in time, or
+elsewhere and explains less, what happens for a while only is looked for (`disturbances`). A residual that is only correlated in time, or
 wanders, whatever the inputs do, is `noise`.
 """
 
@@ -24,20 +24,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.trace.constancy import uneven
-from s2r_runtime.trace.episodes import episodes, may_depend_on
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.initial_states import begun, measured
 from s2r_runtime.trace.estimation.noise import Colour, Noise, Whitener
 from s2r_runtime.trace.estimation.prediction import Mask, acting, covered, rms, rollout, rollout_starts, some_of
 from s2r_runtime.trace.estimation.problem import FLOORED, Fit, Problem
 from s2r_runtime.trace.estimation.problem import gain as explained
-from s2r_runtime.trace.evidence import evidence, margin
-from s2r_runtime.trace.fields import Field, as_noise, field, nats_of
-from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, SLOWLY, Judged, Left, first_look, judge, leading
-from s2r_runtime.trace.lack_of_fit_terms import dictionaries
-from s2r_runtime.trace.lack_of_fit_together import pairs
-from s2r_runtime.trace.measured_forces import about_inputs
-from s2r_runtime.trace.now_and_then import Lost, now_and_then
+from s2r_runtime.trace.hypotheses.basis import dictionaries
+from s2r_runtime.trace.hypotheses.disturbances import episodes, may_depend_on
+from s2r_runtime.trace.hypotheses.measured_forces import about_inputs
+from s2r_runtime.trace.hypotheses.packet_loss import Lost, now_and_then
+from s2r_runtime.trace.hypotheses.random_fields import Field, as_noise, field, nats_of
+from s2r_runtime.trace.selection.basis_evidence import BLOCKS, SLOWLY, Judged, Left, first_look, judge, leading
+from s2r_runtime.trace.selection.basis_pairs import pairs
+from s2r_runtime.trace.selection.evidence import evidence, margin
 
 Array = NDArray[np.float64]
 
@@ -122,10 +122,10 @@ class Structure:
     """tokens: docs/json.md's `depends_on`, most important first. matters: it shows in rollouts.
 
     share: part of all that the nominal model lacks which is still left (0 where there is nothing). gains: nats by group. nameless: what
-    was named looks more like something that has no name (`challenge`). for_a_while: it comes and goes (`episodes`). varies: it is a
-    field (`fields`), or a number of what was named that varies (`constancy`). beside: what it may depend on besides, which no rollout
-    shows. noise: what would be left beside the structure, and its colour; None where there is none that matters. nats: of what comes and
-    goes, or varies.
+    was named looks more like something that has no name (`unnamed_alternatives`). for_a_while: it comes and goes (`disturbances`). varies:
+    it is a field (`random_fields`), or a number of what was named that varies (`constancy`). beside: what it may depend on besides, which
+    no rollout shows. noise: what would be left beside the structure, and its colour; None where there is none that matters. nats: of what
+    comes and goes, or varies.
     """
 
     tokens: tuple[str, ...]

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.candidates import Candidate, candidates
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.parameters import Slot, bounds_of, slots_of, values_of
 from s2r_runtime.trace.estimation.problem import Fit, Problem, foretold, sensitivities
-from s2r_runtime.trace.scores import STRICT
+from s2r_runtime.trace.hypotheses.library import Candidate, candidates
+from s2r_runtime.trace.selection.scores import STRICT
 
 Array = NDArray[np.float64]
 

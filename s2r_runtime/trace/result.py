@@ -77,7 +77,9 @@ class TraceResult:
     may_depend_on: tuple[str, ...] = ()
     """Of `depends_on`, beside a name: what no rollout shows, or what is less sure."""
     any_shape_of: tuple[str, ...] = ()
-    """Of `depends_on`: what several explanations have in common that tie, or add up to it; one without a name may, too (`any_shape`)."""
+    """Of `depends_on`: what several explanations have in common that tie, or add up to it; one without a name may, too
+    (`shared_dependence`).
+    """
     way: Way = field(default_factory=Way)
     """As the dataset's: how inputs went that the recording has samples of."""
     noisy: dict[str, float] = field(default_factory=dict)

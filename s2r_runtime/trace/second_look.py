@@ -15,10 +15,10 @@ from s2r_runtime.trace.estimation.change_times import dated
 from s2r_runtime.trace.estimation.noise import Whitener
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import Fit, Problem, fitted, foretold, gain, problem
-from s2r_runtime.trace.hidden_pairs import two_together
 from s2r_runtime.trace.lack_of_fit import Structure
-from s2r_runtime.trace.scores import ALONE, LENIENT, STRICT, Bar, Scored, names
-from s2r_runtime.trace.selection import Selection, against_rivals, all_dated, called_for, crowded
+from s2r_runtime.trace.selection.pairs import two_together
+from s2r_runtime.trace.selection.scores import ALONE, LENIENT, STRICT, Bar, Scored, names
+from s2r_runtime.trace.selection.stepwise import Selection, against_rivals, all_dated, called_for, crowded
 from s2r_runtime.trace.verdict import confirmed, foretelling, takes_far
 from s2r_runtime.trace.whole import Whole
 

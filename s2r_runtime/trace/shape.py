@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.errors import Held
 from s2r_runtime.trace.estimation.prediction import acting
-from s2r_runtime.trace.lack_of_fit_terms import token_of
+from s2r_runtime.trace.hypotheses.basis import token_of
 
 Array = NDArray[np.float64]
 

@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, UsageError
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.about import remembers
 from s2r_runtime.trace.answer import answered, with_time
 from s2r_runtime.trace.checks.columns import check_plausible
 from s2r_runtime.trace.checks.common_start import from_one_place
@@ -57,12 +56,13 @@ from s2r_runtime.trace.errors import Held, Kind, displacement, held, judge
 from s2r_runtime.trace.estimation.initial_states import begun
 from s2r_runtime.trace.estimation.prediction import Mask, acting, first_steps, rms, steps_of
 from s2r_runtime.trace.estimation.problem import Fit, Problem, evaluate, problem
+from s2r_runtime.trace.hypotheses.dependence import remembers
 from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.result import TraceResult
-from s2r_runtime.trace.rivals import CLOSE
-from s2r_runtime.trace.scores import names
 from s2r_runtime.trace.second_look import astray, finer, once_more
-from s2r_runtime.trace.selection import MOST, Selection, all_dated, select
+from s2r_runtime.trace.selection.scores import names
+from s2r_runtime.trace.selection.stepwise import MOST, Selection, all_dated, select
+from s2r_runtime.trace.selection.ties import CLOSE
 from s2r_runtime.trace.sensor_faults.detect import Checked, check
 from s2r_runtime.trace.verdict import confirmed, foretold_too
 from s2r_runtime.trace.whole import Whole

@@ -22,18 +22,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.about import about_states
-from s2r_runtime.trace.changes import rivals_that_happen
 from s2r_runtime.trace.checks.measured_inputs import refuted
 from s2r_runtime.trace.errors import Held, Judged, better, displacement, rollout_starts_of
 from s2r_runtime.trace.estimation.noise import OUTLIER
 from s2r_runtime.trace.estimation.parameters import Added, slots_of
 from s2r_runtime.trace.estimation.prediction import Mask, acting, first_steps, predicted, rms
 from s2r_runtime.trace.estimation.problem import Fit, Problem, evaluate, fitted, foretold, gain, plainly, problem, without
+from s2r_runtime.trace.hypotheses.dependence import about_states
 from s2r_runtime.trace.lack_of_fit import Structure
-from s2r_runtime.trace.rivals import only_in, representative, simplified, tied
-from s2r_runtime.trace.scores import STRICT, Scored, name_of, names
-from s2r_runtime.trace.selection import Selection, doing_something, one_more
+from s2r_runtime.trace.selection.change_points import rivals_that_happen
+from s2r_runtime.trace.selection.scores import STRICT, Scored, name_of, names
+from s2r_runtime.trace.selection.stepwise import Selection, doing_something, one_more
+from s2r_runtime.trace.selection.ties import only_in, representative, simplified, tied
 from s2r_runtime.trace.sensor_faults.fault import Fault
 
 Array = NDArray[np.float64]

@@ -8,13 +8,12 @@ from functools import cached_property
 import numpy as np
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.about import about_states
-from s2r_runtime.trace.challenge import MORE as SHAPED
-from s2r_runtime.trace.challenge import Better, best_shape, better_shape
 from s2r_runtime.trace.data.split import part
 from s2r_runtime.trace.estimation.prediction import first_steps
 from s2r_runtime.trace.estimation.problem import Fit, evaluate, fitted, gain, problem
-from s2r_runtime.trace.fields import Field, beats, nats_of, nats_of_fit, wanders
+from s2r_runtime.trace.hypotheses.dependence import about_states
+from s2r_runtime.trace.hypotheses.packet_loss import Lost, nats_of_lost
+from s2r_runtime.trace.hypotheses.random_fields import Field, beats, nats_of, nats_of_fit, wanders
 from s2r_runtime.trace.lack_of_fit import (
     ALIKE,
     MORE,
@@ -28,12 +27,13 @@ from s2r_runtime.trace.lack_of_fit import (
     lost_commands,
     still_left,
 )
-from s2r_runtime.trace.lack_of_fit_judged import Judged, Left
-from s2r_runtime.trace.now_and_then import Lost, nats_of_lost
 from s2r_runtime.trace.one_stretch import in_one_stretch
-from s2r_runtime.trace.opposed import opposed
-from s2r_runtime.trace.patchwork import patchwork
-from s2r_runtime.trace.selection import Selection, crowded
+from s2r_runtime.trace.selection.basis_evidence import Judged, Left
+from s2r_runtime.trace.selection.input_confounding import opposed
+from s2r_runtime.trace.selection.several_or_one import patchwork
+from s2r_runtime.trace.selection.stepwise import Selection, crowded
+from s2r_runtime.trace.selection.unnamed_alternatives import MORE as SHAPED
+from s2r_runtime.trace.selection.unnamed_alternatives import Better, best_shape, better_shape
 from s2r_runtime.trace.sensor_faults.detect import Checked
 
 STRUCTURE_STEPS = 4000
@@ -183,8 +183,8 @@ class Whole:
 
     def _bent(self, found: Structure, best: Fit) -> bool:
         """Whether what is left goes with the very position, speed or heading that a named effect goes with, by as large a part of what was
-        explained as that by which a shape must be better to win (`challenge`): then it is another curve. A spring is not what gravity does
-        to a link.
+        explained as that by which a shape must be better to win (`unnamed_alternatives`): then it is another curve. A spring is not what
+        gravity does to a link.
         """
         least = SHAPED * max(gain(best, self.nominal), 0.0)
         left = {token for token, nats in found.gains.items() if token in found.tokens and nats > least}

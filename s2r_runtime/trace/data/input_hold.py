@@ -30,7 +30,7 @@ from s2r_runtime.trace.data.streams import Stream
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.prediction import Acting, acting, predicted, residual, state_jacobian
 from s2r_runtime.trace.estimation.problem import Fit, Problem, evaluate, fitted, gain, sensitivities, slopes
-from s2r_runtime.trace.rivals import CLOSE, NEAR
+from s2r_runtime.trace.selection.ties import CLOSE, NEAR
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -77,7 +77,7 @@ ROUNDS, NARROW = 4, 0.005
 
 NATS = 15.0
 """By which halfway must explain more than held, and each input on a way of its own more than all alike: what is held is the rule, as
-everywhere where rivals are told apart (`rivals`). What is noisy, or moved on, is a sample, and samples are mostly both: CLOSE is enough.
+everywhere where rivals are told apart (`ties`). What is noisy, or moved on, is a sample, and samples are mostly both: CLOSE is enough.
 """
 
 

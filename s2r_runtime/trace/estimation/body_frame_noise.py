@@ -5,7 +5,7 @@ some of it. Of the variances q of x and y, less their floors, a share s is that 
 
     Q = diag(q) - s diag(q - floor) + s sum(q - floor) p p',      |p| = 1: over all headings alike, the trace stays
 
-What goes on from step to step is none of this, but a push that wanders (`fields`).
+What goes on from step to step is none of this, but a push that wanders (`random_fields`).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from s2r_runtime.models.forces import POSE
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.noise import Noise, Whitener
 from s2r_runtime.trace.estimation.prediction import acting
-from s2r_runtime.trace.lack_of_fit_judged import Left
-from s2r_runtime.trace.lack_of_fit_terms import directions_of
+from s2r_runtime.trace.hypotheses.basis import directions_of
+from s2r_runtime.trace.selection.basis_evidence import Left
 
 Array = NDArray[np.float64]
 

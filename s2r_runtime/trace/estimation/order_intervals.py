@@ -19,9 +19,9 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.estimation.intervals import intervals
 from s2r_runtime.trace.estimation.parameters import Slot
 from s2r_runtime.trace.estimation.problem import NEXT, Fit, Problem, fitted, foretold, gain, objective
-from s2r_runtime.trace.exchange import numberless
-from s2r_runtime.trace.rivals import CLOSE
-from s2r_runtime.trace.scores import limited
+from s2r_runtime.trace.selection.exchange import numberless
+from s2r_runtime.trace.selection.scores import limited
+from s2r_runtime.trace.selection.ties import CLOSE
 
 ROUNDS = 3
 """Of parameters and noise, from the numbers of the other order."""

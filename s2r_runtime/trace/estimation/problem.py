@@ -63,7 +63,7 @@ ABOUT, STAYS = 4, 1e-3
 @dataclass(frozen=True)
 class Problem:
     """Transitions that a model is to explain. floor: least variances of noise. searches: what was tried beside which model (`scores`).
-    blind: how fits foretell what they did not see (`selection`).
+    blind: how fits foretell what they did not see (`stepwise`).
     """
 
     data: Dataset

@@ -1,7 +1,8 @@
 """Does what was named look more like something that has no name?
 
-The effects that were found on an input, or on an axis, are taken out, and each shape (`shapes`, `state_shapes`) is put in their place and
-fitted. With L the log likelihood of the recording, noise re-estimated for each, the smaller of white and coloured, and a price per number,
+The effects that were found on an input, or on an axis, are taken out, and each shape (`input_dynamics`, `state_nonlinearity`) is put in
+their place and fitted. With L the log likelihood of the recording, noise re-estimated for each, the smaller of white and coloured, and a
+price per number,
 
     shape wins     L(shape) - L(named) > log(tried / ALPHA) + the price of numbers that it has more than they,
                    and by LITTLE of all that the named effects explain
@@ -25,18 +26,18 @@ import numpy as np
 from s2r_runtime.hookspecs import Effect
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.models.forces import axes, lone_speeds
-from s2r_runtime.trace.acceptance import accepted
-from s2r_runtime.trace.candidates import Candidate
 from s2r_runtime.trace.estimation.initial_states import begun, measured
 from s2r_runtime.trace.estimation.parameters import bounds_of, values_of
 from s2r_runtime.trace.estimation.prediction import acting, covered, first_steps, rms, rollout, rollout_starts, some_of
 from s2r_runtime.trace.estimation.problem import Fit, Problem, fitted, gain, without
-from s2r_runtime.trace.lack_of_fit_terms import token_of
-from s2r_runtime.trace.scores import at_first_look
-from s2r_runtime.trace.screening import screen
-from s2r_runtime.trace.shapes import SHAPES, Shape
-from s2r_runtime.trace.state_shapes import STATE_SHAPES, Limit, StateShape
-from s2r_runtime.trace.state_shapes import starts as state_starts
+from s2r_runtime.trace.hypotheses.basis import token_of
+from s2r_runtime.trace.hypotheses.input_dynamics import SHAPES, Shape
+from s2r_runtime.trace.hypotheses.library import Candidate
+from s2r_runtime.trace.hypotheses.state_nonlinearity import STATE_SHAPES, Limit, StateShape
+from s2r_runtime.trace.hypotheses.state_nonlinearity import starts as state_starts
+from s2r_runtime.trace.selection.acceptance import accepted
+from s2r_runtime.trace.selection.scores import at_first_look
+from s2r_runtime.trace.selection.screening import screen
 
 ALPHA, TOLD = 1e-3, 0.05
 """Chances that a shape wins against the truth, as far as the likelihood is right, and that it is told beside it."""

@@ -28,11 +28,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.trace.episodes import BEYOND
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.noise import OUTLIER, Whitener
 from s2r_runtime.trace.estimation.prediction import acting, advanced, rms, rollout, rollout_starts
-from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
+from s2r_runtime.trace.hypotheses.disturbances import BEYOND
+from s2r_runtime.trace.selection.basis_evidence import BLOCKS, Judged, Left
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

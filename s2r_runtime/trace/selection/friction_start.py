@@ -19,7 +19,7 @@ from s2r_runtime.models.forces import axes, lone_speeds
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.problem import Fit, Problem, fitted, foretold, insert
-from s2r_runtime.trace.scores import name_of
+from s2r_runtime.trace.selection.scores import name_of
 
 Array = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""Shapes that what goes with a state can have, and that no effect has a name for; as `shapes` are of an input.
+"""Shapes that what goes with a state can have, and that no effect has a name for; as `input_dynamics` are of an input.
 
     a power     of a speed v: drag  v' = a - rate v |v / most|^(power - 1).  Viscous at power 1, quadratic at 2; there is more between and
                 beyond

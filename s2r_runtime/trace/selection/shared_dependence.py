@@ -13,11 +13,11 @@ from collections import Counter
 from collections.abc import Sequence
 
 from s2r_runtime.effects.classes import same
-from s2r_runtime.trace.about import about
 from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.estimation.prediction import Steps
 from s2r_runtime.trace.estimation.problem import Fit
-from s2r_runtime.trace.scores import name_of
+from s2r_runtime.trace.hypotheses.dependence import about
+from s2r_runtime.trace.selection.scores import name_of
 
 SEVERAL = 3
 """Explanations that tie, from which on none is believed to be the one: two may be just the two that are there."""

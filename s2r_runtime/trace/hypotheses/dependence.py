@@ -12,7 +12,7 @@ from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.estimation.prediction import Acting, Steps, acting, advanced, rms
 from s2r_runtime.trace.estimation.problem import without
-from s2r_runtime.trace.lack_of_fit_terms import token_of
+from s2r_runtime.trace.hypotheses.basis import token_of
 
 Array = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""Dictionaries of terms (see `lack_of_fit_terms`) in two things at once, and of what comes again with what was named."""
+"""Dictionaries of terms (see `basis`) in two things at once, and of what comes again with what was named."""
 
 from __future__ import annotations
 

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
-from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.estimation.parameters import Added, bounds_of, values_of
 from s2r_runtime.trace.estimation.problem import Fit, Problem, fitted, gain, under_noise
-from s2r_runtime.trace.leftover import Leftover
-from s2r_runtime.trace.screening import Screened, screen
+from s2r_runtime.trace.hypotheses.library import candidates
+from s2r_runtime.trace.hypotheses.starting_values import Leftover
+from s2r_runtime.trace.selection.screening import Screened, screen
 
 Name = tuple[str, str]
 """(effect, channel)."""

@@ -13,15 +13,15 @@ from dataclasses import dataclass, replace
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.models.forces import axes
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.acceptance import accepted
-from s2r_runtime.trace.changes import from_the_beginning
 from s2r_runtime.trace.estimation.change_times import dated
 from s2r_runtime.trace.estimation.parameters import Slot, bounds_of, values_of
 from s2r_runtime.trace.estimation.problem import Fit, Problem, evaluate, fitted, gain, nearer, plainly, without
-from s2r_runtime.trace.exchange import exchanged, overtaken, parted, pruned, unbent
-from s2r_runtime.trace.friction import KINDS, with_friction
-from s2r_runtime.trace.rivals import CLOSE, simplified
-from s2r_runtime.trace.scores import STRICT, Bar, Scored, best_candidates, names, overlooked, rescored
+from s2r_runtime.trace.selection.acceptance import accepted
+from s2r_runtime.trace.selection.change_points import from_the_beginning
+from s2r_runtime.trace.selection.exchange import exchanged, overtaken, parted, pruned, unbent
+from s2r_runtime.trace.selection.friction_start import KINDS, with_friction
+from s2r_runtime.trace.selection.scores import STRICT, Bar, Scored, best_candidates, names, overlooked, rescored
+from s2r_runtime.trace.selection.ties import CLOSE, simplified
 
 MOST, MOST_ON_ONE = 5, 3
 """Effects that are looked for at most, and on one input: more are a curve in parts, not so many things that happen."""
@@ -39,7 +39,7 @@ drive. Among 265 recordings of ten families, none got another name for it.
 
 A_PART = 0.2
 """Of what something without a name explains: the least that an effect must do of it, where all of it is looked for: five are looked for at
-most. Two that say little alone are looked for together (`hidden_pairs`). No answer changed by it on 204 made recordings of four families.
+most. Two that say little alone are looked for together (`pairs`). No answer changed by it on 204 made recordings of four families.
 """
 
 CLOSE_BY, SHORT = 3, 0.5

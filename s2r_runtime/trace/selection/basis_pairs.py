@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.trace.estimation import noise as noises
-from s2r_runtime.trace.evidence import evidence
-from s2r_runtime.trace.lack_of_fit_judged import Judged, Left, judge, leading
+from s2r_runtime.trace.selection.basis_evidence import Judged, Left, judge, leading
+from s2r_runtime.trace.selection.evidence import evidence
 
 Array = NDArray[np.float64]
 

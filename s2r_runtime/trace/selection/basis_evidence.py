@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.noise import Colour, Whitener
 from s2r_runtime.trace.estimation.problem import Fit, Problem
-from s2r_runtime.trace.evidence import evidence
+from s2r_runtime.trace.selection.evidence import evidence
 
 Array = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ class Judged:
 @dataclass(frozen=True)
 class Left:
     """What is to be explained. r: (n, nx); f: (n, nx, nx); block: (n,). clipped: (n, nx), whitened, wild values cut off but with the
-    weight of any other; None if there are none. known: what was asked of it before (`fields`).
+    weight of any other; None if there are none. known: what was asked of it before (`random_fields`).
 
     What shows only when an input jumps is wild, and few: weights would take it for outliers. Whether outliers have to do with the inputs
     is told by sliding.

@@ -20,8 +20,8 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.parameters import Added, Slot, bounds_of, values_of, with_values
 from s2r_runtime.trace.estimation.problem import Fit, Problem, evaluate, fitted, foretold, gain, sought, under_noise, without
-from s2r_runtime.trace.rivals import CLOSE, rivals_of
-from s2r_runtime.trace.scores import ONWARD, Bar, Scored, name_of
+from s2r_runtime.trace.selection.scores import ONWARD, Bar, Scored, name_of
+from s2r_runtime.trace.selection.ties import CLOSE, rivals_of
 
 EDGE = 0.02
 """Share of the steps on either side of a change that makes it one."""

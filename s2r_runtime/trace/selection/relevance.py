@@ -16,7 +16,7 @@ from s2r_runtime.trace.estimation.initial_states import begun, uncertain
 from s2r_runtime.trace.estimation.parameters import values_of, with_values
 from s2r_runtime.trace.estimation.prediction import acting, rms, rollout, rollout_starts, some_of
 from s2r_runtime.trace.estimation.problem import Fit, Problem, objective, sensitivities, under_noise
-from s2r_runtime.trace.scores import STRICT, Bar, name_of, names
+from s2r_runtime.trace.selection.scores import STRICT, Bar, name_of, names
 
 Array = NDArray[np.float64]
 

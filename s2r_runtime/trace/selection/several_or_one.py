@@ -1,7 +1,7 @@
 """Do several names stand for one thing that has none?
 
 With enough numbers, names together can follow what none of them means: a gyro that drifts, as a bias, a field of places and a rate limit.
-What tells: it depends on one thing, and a dictionary of that (`lack_of_fit_terms`) explains as much as all of them together.
+What tells: it depends on one thing, and a dictionary of that (`basis`) explains as much as all of them together.
 
     patchwork    gain(dictionary) >= AS_MUCH gain(all names)     and     every gain(one name) <= MOSTLY gain(all names)
                  and some name is about something else than the dictionary
@@ -18,10 +18,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.about import about, carried, only_pushes
 from s2r_runtime.trace.estimation.problem import Fit, Problem, fitted, gain, without
-from s2r_runtime.trace.lack_of_fit_judged import Judged
-from s2r_runtime.trace.lack_of_fit_terms import token_of
+from s2r_runtime.trace.hypotheses.basis import token_of
+from s2r_runtime.trace.hypotheses.dependence import about, carried, only_pushes
+from s2r_runtime.trace.selection.basis_evidence import Judged
 
 AS_MUCH = 1.0
 """Of what all names explain: of two effects that are there, one dictionary explained up to 0.96, but for pairs of which one is MOSTLY

@@ -2,7 +2,7 @@
 
 A robot slips where the floor is wet, a gust comes and goes: what is left is nothing for most of the time, and the same push, or the same
 share of an input, for some of it. Noise that is estimated over all of the time takes that for colour, and terms that must foretell it
-from other times (`lack_of_fit_judged`) cannot. So windows [a, b) are looked for one after the other, each the one that explains most,
+from other times (`basis_evidence`) cannot. So windows [a, b) are looked for one after the other, each the one that explains most,
 
     r = sum_w beta_w 1[a_w <= k < b_w] d_w + noise          d: a push in some direction, or what an input pushes
 
@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.noise import Whitener
 from s2r_runtime.trace.estimation.prediction import acting
-from s2r_runtime.trace.evidence import evidence
-from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
-from s2r_runtime.trace.lack_of_fit_terms import pushes_by_token
+from s2r_runtime.trace.hypotheses.basis import pushes_by_token
+from s2r_runtime.trace.selection.basis_evidence import BLOCKS, Judged, Left
+from s2r_runtime.trace.selection.evidence import evidence
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -21,7 +21,7 @@ from s2r_runtime.trace.estimation.noise import Noise
 from s2r_runtime.trace.estimation.parameters import free_of
 from s2r_runtime.trace.estimation.prediction import Acting, Steps, acting, wherever
 from s2r_runtime.trace.estimation.problem import Problem, slopes
-from s2r_runtime.trace.lack_of_fit_crossed import bent_product, over_time, overtones
+from s2r_runtime.trace.hypotheses.crossed_basis import bent_product, over_time, overtones
 
 Array = NDArray[np.float64]
 Terms = list[Array]

@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from s2r_runtime.effects.classes import canonical
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.candidates import candidates
 from s2r_runtime.trace.data.dataset import Dataset, Run
 from s2r_runtime.trace.estimation.parameters import Added, slots_of
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import SETTLED, Fit, Problem, evaluate, fitted, foretold, gain, problem, scatter, without
-from s2r_runtime.trace.scores import STRICT, Scored, at_first_look, best_candidates, limited, name_of
+from s2r_runtime.trace.hypotheses.library import candidates
+from s2r_runtime.trace.selection.scores import STRICT, Scored, at_first_look, best_candidates, limited, name_of
 
 Array = NDArray[np.float64]
 

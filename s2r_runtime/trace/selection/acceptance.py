@@ -13,13 +13,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace.changes import happens
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.noise import Colour
 from s2r_runtime.trace.estimation.parameters import bounds_of, values_of
 from s2r_runtime.trace.estimation.problem import SCORE_BLOCKS, WIDEST, Fit, Problem, gain, objective, refine, scatter, sought
-from s2r_runtime.trace.relevance import relevant
-from s2r_runtime.trace.scores import STRICT, Bar, limited, name_of, names
+from s2r_runtime.trace.selection.change_points import happens
+from s2r_runtime.trace.selection.relevance import relevant
+from s2r_runtime.trace.selection.scores import STRICT, Bar, limited, name_of, names
 
 Array = NDArray[np.float64]
 

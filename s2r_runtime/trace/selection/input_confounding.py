@@ -24,7 +24,7 @@ from s2r_runtime.models.forces import axes
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.prediction import acting
 from s2r_runtime.trace.estimation.problem import Fit, Problem, foretold, objective, sensitivities, without
-from s2r_runtime.trace.lack_of_fit_terms import own_pushes, quieter
+from s2r_runtime.trace.hypotheses.basis import own_pushes, quieter
 
 Array = NDArray[np.float64]
 

@@ -27,9 +27,9 @@ from s2r_runtime.trace.estimation.noise import Whitener
 from s2r_runtime.trace.estimation.parameters import free_of
 from s2r_runtime.trace.estimation.prediction import acting
 from s2r_runtime.trace.estimation.problem import Fit, slopes
-from s2r_runtime.trace.evidence import evidence
-from s2r_runtime.trace.lack_of_fit_judged import BLOCKS, Judged, Left
-from s2r_runtime.trace.lack_of_fit_terms import directions_of, own_pushes, quieter
+from s2r_runtime.trace.hypotheses.basis import directions_of, own_pushes, quieter
+from s2r_runtime.trace.selection.basis_evidence import BLOCKS, Judged, Left
+from s2r_runtime.trace.selection.evidence import evidence
 
 Array = NDArray[np.float64]
 Marginal = tuple[float, Array]

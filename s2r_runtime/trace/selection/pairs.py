@@ -20,15 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.candidates import candidates, places
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.parameters import bounds_of, slots_of, values_of
 from s2r_runtime.trace.estimation.problem import Fit, Problem, fitted, foretold, gain, insert, sought
-from s2r_runtime.trace.leftover import Leftover
-from s2r_runtime.trace.rivals import NEAR
-from s2r_runtime.trace.scores import STRICT, name_of, names
-from s2r_runtime.trace.screening import Probe, columns, probes_of
-from s2r_runtime.trace.selection import Selection
+from s2r_runtime.trace.hypotheses.library import candidates, places
+from s2r_runtime.trace.hypotheses.starting_values import Leftover
+from s2r_runtime.trace.selection.scores import STRICT, name_of, names
+from s2r_runtime.trace.selection.screening import Probe, columns, probes_of
+from s2r_runtime.trace.selection.stepwise import Selection
+from s2r_runtime.trace.selection.ties import NEAR
 
 Array = NDArray[np.float64]
 

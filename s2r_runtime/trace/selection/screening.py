@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.candidates import Candidate
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.parameters import Free, bounds_of, inside, slots_of, values_of, with_values
 from s2r_runtime.trace.estimation.problem import Fit, Problem, foretold, foretold_by, refine, sensitivities
+from s2r_runtime.trace.hypotheses.library import Candidate
 
 Array = NDArray[np.float64]
 

@@ -19,8 +19,8 @@ from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.estimation.parameters import Added
 from s2r_runtime.trace.estimation.prediction import times
 from s2r_runtime.trace.estimation.problem import insert
-from s2r_runtime.trace.leftover import Leftover
-from s2r_runtime.trace.measured_forces import on_motion
+from s2r_runtime.trace.hypotheses.measured_forces import on_motion
+from s2r_runtime.trace.hypotheses.starting_values import Leftover
 
 Array = NDArray[np.float64]
 

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.acceptance import accepted, significant
-from s2r_runtime.trace.candidates import candidates
-from s2r_runtime.trace.changes import from_the_beginning, happens, rivals_that_happen
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.parameters import Added, slots_of, values_of
 from s2r_runtime.trace.estimation.problem import Fit, Problem, fitted, foretold, gain, objective, plainly, sensitivities, without
-from s2r_runtime.trace.rivals import CLOSE
-from s2r_runtime.trace.scores import Bar, Name, Scored, at_first_look, best_candidates, name_of, unlimited
+from s2r_runtime.trace.hypotheses.library import candidates
+from s2r_runtime.trace.selection.acceptance import accepted, significant
+from s2r_runtime.trace.selection.change_points import from_the_beginning, happens, rivals_that_happen
+from s2r_runtime.trace.selection.scores import Bar, Name, Scored, at_first_look, best_candidates, name_of, unlimited
+from s2r_runtime.trace.selection.ties import CLOSE
 
 Array = NDArray[np.float64]
 

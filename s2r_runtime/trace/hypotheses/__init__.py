@@ -1,0 +1,1 @@
+"""What a model may lack: named effects, unnamed nonlinearities, bases, disturbances, packet loss."""

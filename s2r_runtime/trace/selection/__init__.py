@@ -1,0 +1,1 @@
+"""Which hypotheses the data call for: screening, stepwise search, evidence, relevance, ties."""
