@@ -9,7 +9,7 @@ import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.trace.tracer import load_dataset, trace
+from s2r_runtime.trace.pipeline import load_dataset, trace
 
 MOTOR = Path(__file__).parent.parent / "examples" / "motor"
 FRICTION_RAD_PER_S2, DELAY_S = 0.02 / 4e-4, 0.06

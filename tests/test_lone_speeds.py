@@ -8,7 +8,7 @@ from s2r_runtime.models.forces import is_speed, own_rate
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 DT = 0.02
 MOTOR = """

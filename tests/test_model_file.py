@@ -12,7 +12,7 @@ from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.tracer import load_dataset
+from s2r_runtime.trace.pipeline import load_dataset
 
 HEAD = 'import sys\nimport numpy as np\nSTATES = ("x", "v")\nINPUTS = ("force",)\nPARAMS = {"mass": 2.0}\n'
 STEP = "def step(x, u, dt, params):\n    "

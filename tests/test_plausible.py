@@ -12,7 +12,7 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.checks.columns import _if_each_taken_back, _if_taken_back, _mistake, _mistakes, _scaled, check_plausible
 from s2r_runtime.trace.checks.prediction_error import unforetold
 from s2r_runtime.trace.data.dataset import Stream, from_streams
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 DT, STEPS = 0.05, 700
 BOUNDS = {

@@ -10,7 +10,7 @@ from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.checks import columns
 from s2r_runtime.trace.checks.columns import check_plausible
 from s2r_runtime.trace.data.dataset import Stream, from_streams
-from s2r_runtime.trace.tracer import load_dataset
+from s2r_runtime.trace.pipeline import load_dataset
 
 HEADER = "import numpy as np\n\n"
 TANKS = (

@@ -17,7 +17,7 @@ from s2r_runtime.trace.data.reconstruction import reconstruct
 from s2r_runtime.trace.data.streams import Stream
 from s2r_runtime.trace.estimation.inverse_dynamics import input_relative, inverse
 from s2r_runtime.trace.estimation.prediction import steps_of
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 DT = 0.01
 GEOMETRY = {"joint": {"mass": 2.0}, "differential_drive": {"wheel_radius": 0.1, "track": 0.5}, "bicycle": {"wheel_base": 0.33}}

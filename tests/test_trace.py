@@ -12,7 +12,7 @@ from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import dump_model, load_model
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 SETS, STEPS = 2, 600
 

@@ -12,9 +12,9 @@ from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.estimation.prediction import acting, steps_of
 from s2r_runtime.trace.estimation.problem import problem
 from s2r_runtime.trace.hypotheses.basis import directions_of
-from s2r_runtime.trace.result import TraceResult
+from s2r_runtime.trace.pipeline import trace
+from s2r_runtime.trace.reporting.result import TraceResult
 from s2r_runtime.trace.selection.stepwise import select
-from s2r_runtime.trace.tracer import trace
 
 DT_S, PARTS = 0.01, 20
 ARM = """

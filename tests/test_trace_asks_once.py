@@ -18,16 +18,17 @@ from s2r_runtime.models.file_model import FileModel
 from s2r_runtime.models.input_chains import Inputs
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import lack_of_fit, whole
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.errors import Held, noise_floor
+from s2r_runtime.trace.diagnostics import lack_of_fit
+from s2r_runtime.trace.diagnostics import whole_recording as whole
+from s2r_runtime.trace.diagnostics.lack_of_fit import left_of
+from s2r_runtime.trace.diagnostics.rollout_error import Held, noise_floor
 from s2r_runtime.trace.estimation import change_times, prediction
-from s2r_runtime.trace.estimation import problem as fitting
+from s2r_runtime.trace.estimation import problem as problems
 from s2r_runtime.trace.estimation.prediction import acting, state_jacobian, steps_of
 from s2r_runtime.trace.estimation.problem import Problem, evaluate, fitted, foretold, foretold_by, insert, problem, scatter, without
 from s2r_runtime.trace.hypotheses import random_fields
 from s2r_runtime.trace.hypotheses.random_fields import Field
-from s2r_runtime.trace.lack_of_fit import left_of
 from s2r_runtime.trace.selection import exchange, relevance, scores, stepwise
 from s2r_runtime.trace.selection.change_points import rivals_that_happen
 from s2r_runtime.trace.sensor_faults.detect import Checked
@@ -35,7 +36,7 @@ from s2r_runtime.trace.sensor_faults.detect import Checked
 DT_S, ROWS = 0.02, 300
 
 
-def _given(drag: float = 0.3) -> tuple[Problem, fitting.Fit]:
+def _given(drag: float = 0.3) -> tuple[Problem, problems.Fit]:
     """A body with drag, and a fit of it that begins elsewhere."""
     rng = np.random.default_rng(0)
     robot = compose(ModelSpec("double_integrator", DT_S, {}, (EffectSpec("viscous_friction", "vx", {"coefficient": drag}),)))
@@ -53,13 +54,13 @@ def _given(drag: float = 0.3) -> tuple[Problem, fitting.Fit]:
 
 def test_rounds_of_a_fit_and_what_follows_ask_for_slopes_once_a_model(monkeypatch):
     asked: list[tuple[float, ...]] = []
-    slopes = fitting._slopes
+    slopes = problems._slopes
 
     def counted(given, model, free):
-        asked.append(tuple(fitting.values_of(model, free)))
+        asked.append(tuple(problems.values_of(model, free)))
         return slopes(given, model, free)
 
-    monkeypatch.setattr(fitting, "_slopes", counted)
+    monkeypatch.setattr(problems, "_slopes", counted)
     given, fit = _given()
     scatter(given, fit)
     assert 1 < len(asked) == len({*asked})
@@ -70,14 +71,14 @@ def test_what_is_known_of_a_model_is_what_it_says():
     act = acting(fit.model, given.data)
     assert np.array_equal(given.residual(fit.model), prediction.residual(fit.model, given.steps, act))
     assert np.array_equal(given.jacobian(fit.model), state_jacobian(fit.model, given.steps, act))
-    assert np.array_equal(fitting.slopes(given, fit.model, fit.free), fitting._slopes(given, fit.model, fit.free))
+    assert np.array_equal(problems.slopes(given, fit.model, fit.free), problems._slopes(given, fit.model, fit.free))
     with pytest.raises(ValueError, match="read-only"):
         given.predicted(fit.model)[0] = 0.0
 
 
 def test_another_value_is_another_model():
     given, fit = _given()
-    other = fitting.with_values(fit.model, fit.free, 2.0 * fitting.values_of(fit.model, fit.free))
+    other = problems.with_values(fit.model, fit.free, 2.0 * problems.values_of(fit.model, fit.free))
     assert other is not None
     assert not np.array_equal(given.predicted(other), given.predicted(fit.model))
 
@@ -144,7 +145,7 @@ def test_times_that_are_tried_take_their_steps_together(monkeypatch):
     change = AppliedEffect(registry().get("effects", "regime_change"), "ax", {"time": 2.0, "gain": 0.8})
     later = evaluate(given, insert(fit.model, change, 0))
     slot = next(slot for slot in later.free if change_times.is_time(later.model, slot))
-    base = fitting.under_noise(given, fit.model, later.noise)
+    base = problems.under_noise(given, fit.model, later.noise)
     given.predicted(fit.model)
     calls, step, times = [], DoubleIntegrator.step, np.linspace(1.0, 5.0, 20)
     monkeypatch.setattr(DoubleIntegrator, "step", lambda self, x, *rest: (calls.append(len(x)), step(self, x, *rest))[1])
@@ -267,7 +268,7 @@ def test_a_candidate_that_a_round_leaves_far_behind_gets_no_other_one(monkeypatc
     given, fit = _given()
     base = evaluate(given, without(fit.model, 0))
     rounds, found = [], []
-    monkeypatch.setattr(fitting, "evaluate", lambda *asked: (rounds.append(1), evaluate(*asked))[1])
+    monkeypatch.setattr(problems, "evaluate", lambda *asked: (rounds.append(1), evaluate(*asked))[1])
     for share in (0.0, scores.ONWARD):
         rounds.clear()
         monkeypatch.setattr(scores, "ONWARD", share)
@@ -359,7 +360,7 @@ def test_a_candidate_that_is_fitted_already_is_not_fitted_again(monkeypatch):
         return fitted(given, start, model, rounds, hopeless)
 
     monkeypatch.setattr(scores, "fitted", counted)
-    itself = scores.Scored(*mine, fitting.gain(fit, base), fit)
+    itself = scores.Scored(*mine, problems.gain(fit, base), fit)
     found, _ = scores.best_candidates(given, base, known=itself)
     assert found[0] is itself
     assert began

@@ -8,11 +8,11 @@ import pytest
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.data.dataset import from_arrays
+from s2r_runtime.trace.diagnostics.lack_of_fit import left_of
 from s2r_runtime.trace.estimation.body_frame_noise import body_noise, whitener
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, problem
 from s2r_runtime.trace.hypotheses import random_fields
-from s2r_runtime.trace.lack_of_fit import left_of
 
 DT, STEPS = 0.05, 900
 PROCESS, SENSOR = np.array([3e-4, 3e-4, 1e-3]), np.array([8e-4, 8e-4, 2e-3])

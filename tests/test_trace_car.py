@@ -8,7 +8,7 @@ from trace_robots import commands
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 MASS_KG, INERTIA, FRONT_M, REAR_M, FRONT_N, REAR_N = 1500.0, 2500.0, 1.2, 1.5, 80_000.0, 90_000.0
 DT_S, PARTS, STEPS, BASE_M = 0.1, 20, 1200, 2.7

@@ -13,12 +13,12 @@ from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.estimation.parameters import Added
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem
+from s2r_runtime.trace.pipeline import trace
 from s2r_runtime.trace.selection import change_points
 from s2r_runtime.trace.selection.acceptance import accepted
 from s2r_runtime.trace.selection.change_points import from_the_beginning, rivals_that_happen
 from s2r_runtime.trace.selection.scores import STRICT, Scored, name_of
 from s2r_runtime.trace.selection.stepwise import Selection, all_dated
-from s2r_runtime.trace.tracer import trace
 
 DT_S, STANDS, CHANGED_S = 0.1, 40, 30.0
 

@@ -7,13 +7,13 @@ import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace import constancy
-from s2r_runtime.trace.constancy import ALPHA, TOLD, _recently, uneven
 from s2r_runtime.trace.data.dataset import from_arrays
+from s2r_runtime.trace.diagnostics import parameter_constancy
+from s2r_runtime.trace.diagnostics.lack_of_fit import left_of
+from s2r_runtime.trace.diagnostics.parameter_constancy import ALPHA, TOLD, _recently, uneven
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem
-from s2r_runtime.trace.lack_of_fit import left_of
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 DT = 0.05
 NOISE = np.array([0.0008, 0.0008, 0.002])
@@ -89,7 +89,7 @@ def test_what_wanders_is_no_number_that_varies():
 
 
 def test_what_the_same_residual_shows_when_slid_along_the_recording_is_not_sure(monkeypatch):
-    monkeypatch.setattr(constancy, "margin", lambda *of: -1.0)
+    monkeypatch.setattr(parameter_constancy, "margin", lambda *of: -1.0)
     found = uneven(_left(np.random.default_rng(1), 700, lambda x, v, w: 0.75 + 0.5 * (v - 0.3)))
     assert found is not None
     assert not found.sure

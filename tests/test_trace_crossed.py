@@ -10,7 +10,7 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.hypotheses.crossed_basis import bent_product, over_time, overtones
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 DT, PARTS = 0.02, 10
 JOINT = compose(ModelSpec("joint", DT, {"mass": 2.0}))

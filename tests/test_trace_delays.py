@@ -8,7 +8,7 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.data.dataset import from_streams
 from s2r_runtime.trace.data.streams import Stream
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 DT_S, TICK_S, TICKS = 0.01, 0.001, 6000
 RADIUS_M, TRACK_M = 0.05, 0.4

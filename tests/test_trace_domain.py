@@ -12,9 +12,9 @@ from s2r_runtime.models.composed import AppliedEffect
 from s2r_runtime.modelspec import dump_model
 from s2r_runtime.plugins import registry
 from s2r_runtime.report.trace_page import trace_page
-from s2r_runtime.trace.domain import ALL_ROUND, BEYOND, Range, _arc, _span, domain_of, told
+from s2r_runtime.trace.diagnostics.validity_domain import ALL_ROUND, BEYOND, Range, _arc, _span, domain_of, told
 from s2r_runtime.trace.estimation.prediction import steps_of
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 GAIN = [("input_gain", "w", {"gain": 0.75})]
 

@@ -11,7 +11,7 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import Stream, from_arrays, from_streams
 from s2r_runtime.trace.data.streams import held_between, held_means
-from s2r_runtime.trace.estimation import problem as fitting
+from s2r_runtime.trace.estimation import problem as problems
 from s2r_runtime.trace.estimation.noise import Noise, quantum
 from s2r_runtime.trace.estimation.parameters import Added
 from s2r_runtime.trace.estimation.prediction import acting, residual, steps_of
@@ -19,11 +19,11 @@ from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, probl
 from s2r_runtime.trace.hypotheses.basis import LINE, dictionaries, line, quieter
 from s2r_runtime.trace.hypotheses.library import candidates
 from s2r_runtime.trace.hypotheses.starting_values import Leftover
+from s2r_runtime.trace.pipeline import trace
 from s2r_runtime.trace.selection import exchange, scores
 from s2r_runtime.trace.selection.evidence import RIDGES, evidence, margin
 from s2r_runtime.trace.selection.scores import STRICT, Scored, limited, names
 from s2r_runtime.trace.sensor_faults.detect import check
-from s2r_runtime.trace.tracer import trace
 
 
 def test_the_evidence_is_the_ratio_of_two_normal_densities():
@@ -275,8 +275,8 @@ def test_a_refinement_that_is_at_its_optimum_steps_the_model_no_more(monkeypatch
     model = insert(declared(), AppliedEffect(registry().get("effects", "input_gain"), "w", {"gain": 0.9}), len(declared().effects))
     fit = fitted(given, evaluate(given, model), model)
     stepped = []
-    foretell = fitting.foretold
-    monkeypatch.setattr(fitting, "foretold", lambda given, model: stepped.append(model) or foretell(given, model))
+    foretell = problems.foretold
+    monkeypatch.setattr(problems, "foretold", lambda given, model: stepped.append(model) or foretell(given, model))
     assert refine(given, fit, fit.model) is fit.model
     assert not stepped
     assert (
@@ -388,7 +388,7 @@ def test_a_model_less_what_stands_in_for_one_of_its_effects_is_the_model_as_give
     data = from_arrays(model, [(np.zeros((80, 3)), np.ones((79, 2)))])
     instead = next(c for c in candidates(model, data) if c.replaced >= 0)
     for other in instead.models(model):
-        assert fitting.without(other, instead.replaced) == model
+        assert problems.without(other, instead.replaced) == model
 
 
 def test_what_never_happens_takes_no_place_of_a_gain(monkeypatch):

@@ -11,14 +11,14 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import from_arrays
+from s2r_runtime.trace.diagnostics.lack_of_fit import _wanders, left_of
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem
 from s2r_runtime.trace.hypotheses import random_fields
 from s2r_runtime.trace.hypotheses.random_fields import SEEN, field
-from s2r_runtime.trace.lack_of_fit import _wanders, left_of
+from s2r_runtime.trace.pipeline import trace
 from s2r_runtime.trace.selection.basis_evidence import Judged
-from s2r_runtime.trace.tracer import trace
 
 DT = 0.05
 NOISE = np.array([0.0008, 0.0008, 0.002])

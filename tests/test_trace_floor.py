@@ -5,7 +5,7 @@ import numpy as np
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.errors import Held, at_most_seen, held, judge
+from s2r_runtime.trace.diagnostics.rollout_error import Held, at_most_seen, held, judge
 from s2r_runtime.trace.estimation.prediction import first_steps, rms, steps_of
 
 DT_S, ROWS, NOISE = 0.05, 900, 0.003

@@ -8,15 +8,15 @@ import pytest
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import lack_of_fit
 from s2r_runtime.trace.data.dataset import from_arrays
+from s2r_runtime.trace.diagnostics import lack_of_fit
+from s2r_runtime.trace.diagnostics.lack_of_fit import left_of
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, insert, problem
 from s2r_runtime.trace.hypotheses.disturbances import _staying_wild, episodes
-from s2r_runtime.trace.lack_of_fit import left_of
+from s2r_runtime.trace.pipeline import trace
 from s2r_runtime.trace.selection.scores import Scored
 from s2r_runtime.trace.selection.ties import representative
-from s2r_runtime.trace.tracer import trace
 
 DT, PARTS = 0.05, 10
 NOISE = np.array([0.0008, 0.0008, 0.002])

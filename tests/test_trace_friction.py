@@ -11,8 +11,8 @@ from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, problem
+from s2r_runtime.trace.pipeline import load_dataset, trace
 from s2r_runtime.trace.selection.friction_start import with_friction
-from s2r_runtime.trace.tracer import load_dataset, trace
 
 INERTIA, DRY, VISCOUS = 3.5, 12.0, 9.0
 

@@ -12,7 +12,7 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.data.readers import load_dataset
 from s2r_runtime.trace.estimation.hidden_state import smoothed_hidden, told_through
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 DT_S, ROWS, PARTS, NOISE = 4.0, 500, 20, 0.01
 TANKS = """

@@ -7,7 +7,7 @@ from seeds import first
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 DT_S, ROWS, CHANGE_S = 0.02, 900, 7.2
 """What is held out begins at 30 % of the time, and goes on to 50 %: the change is in it."""

@@ -9,7 +9,7 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.data.split import fit_mask, part
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 STEPS = 1000
 

@@ -13,22 +13,22 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.report.trace_page import trace_page
-from s2r_runtime.trace import lack_of_fit as lack_of_fit_of
 from s2r_runtime.trace import verdict
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.errors import held, judge, noise_floor
+from s2r_runtime.trace.diagnostics import lack_of_fit as lack_of_fit_of
+from s2r_runtime.trace.diagnostics.lack_of_fit import Looks, Structure, _weight_of, left_of
+from s2r_runtime.trace.diagnostics.rollout_error import held, judge, noise_floor
+from s2r_runtime.trace.diagnostics.whole_recording import Whole
 from s2r_runtime.trace.estimation.noise import MEMORIES
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, gain, insert, problem
 from s2r_runtime.trace.hypotheses.dependence import about_states
 from s2r_runtime.trace.hypotheses.random_fields import Field
-from s2r_runtime.trace.lack_of_fit import Looks, Structure, _weight_of, left_of
+from s2r_runtime.trace.pipeline import trace
 from s2r_runtime.trace.selection.acceptance import significant
 from s2r_runtime.trace.selection.basis_evidence import BLOCKS, Judged
 from s2r_runtime.trace.sensor_faults.detect import Checked
-from s2r_runtime.trace.tracer import trace
 from s2r_runtime.trace.verdict import foretells, misses
-from s2r_runtime.trace.whole import Whole
 
 STEPS = 700
 GAIN = [("input_gain", "w", {"gain": 0.75})]

@@ -9,9 +9,9 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.data.readers import load_dataset
+from s2r_runtime.trace.diagnostics.whole_recording import Whole
+from s2r_runtime.trace.pipeline import trace
 from s2r_runtime.trace.sensor_faults.detect import check
-from s2r_runtime.trace.tracer import trace
-from s2r_runtime.trace.whole import Whole
 
 DT_S, PARTS, INERTIA = 0.004, 8, 0.8
 

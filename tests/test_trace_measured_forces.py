@@ -11,15 +11,15 @@ from s2r_runtime.daemon import trace_job
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import second_look, tracer
+from s2r_runtime.trace import pipeline, second_search
 from s2r_runtime.trace.checks.measured_inputs import refuted, says_forces
 from s2r_runtime.trace.data.dataset import Dataset, from_arrays
-from s2r_runtime.trace.errors import held
+from s2r_runtime.trace.diagnostics.rollout_error import held
 from s2r_runtime.trace.estimation.inverse_dynamics import off, off_by_noise, recorded
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, insert, problem
 from s2r_runtime.trace.hypotheses.measured_forces import about_inputs, on_motion
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 DT_S, ROWS, MASS, VISCOUS, DRY = 0.004, 570, 0.2, 6.7, 0.5
 JOINT = compose(ModelSpec("joint", DT_S, {"mass": MASS}))
@@ -116,7 +116,7 @@ def test_a_weak_motor_with_friction_is_told_from_a_strong_one_with_more(noise, m
 
     What ties with the gain alone explains clearly less than both, and is not asked what it leaves, which takes seconds.
     """
-    monkeypatch.setattr(second_look, "_left_by", lambda *_: pytest.fail("a rival was asked what it leaves"))
+    monkeypatch.setattr(second_search, "_left_by", lambda *_: pytest.fail("a rival was asked what it leaves"))
     friction = EffectSpec("viscous_friction", "qd", {"coefficient": 1.34})
     result = trace(_commanded(2, EffectSpec("input_gain", "force", {"gain": 0.2}), friction, noise=noise, slowly=True, rows=1500), JOINT)
     told = {e.name: e.values for e in result.effects}
@@ -273,8 +273,8 @@ def test_only_what_is_another_in_most_rows_may_have_a_sensors_noise():
     kept = _commanded(0)
     (run,) = kept.runs
     loud = replace(kept, runs=(replace(run, u=run.u + 0.01 * np.random.default_rng(1).normal(size=run.u.shape)),))
-    assert not tracer._ever_another(kept)
-    assert tracer._ever_another(loud)
+    assert not pipeline._ever_another(kept)
+    assert pipeline._ever_another(loud)
 
 
 def test_what_foretells_better_ends_nearer_whatever_the_units_of_a_state():
@@ -284,13 +284,13 @@ def test_what_foretells_better_ends_nearer_whatever_the_units_of_a_state():
         apart = [np.full((8, 2), e) * [1.0, 1e-3] for e in ([4.0, 4.0], far)]
         return SimpleNamespace(before=SimpleNamespace(ends=apart[0]), after=SimpleNamespace(ends=apart[1]))
 
-    assert tracer._foretells_better(ending(0.5, 1.1), ending(1.0, 1.0))
-    assert not tracer._foretells_better(ending(1.1, 0.5), ending(0.5, 1.0))
-    assert not tracer._foretells_better(ending(1.1, 1e-15), ending(1.0, 1e-12))
+    assert pipeline._foretells_better(ending(0.5, 1.1), ending(1.0, 1.0))
+    assert not pipeline._foretells_better(ending(1.1, 0.5), ending(0.5, 1.0))
+    assert not pipeline._foretells_better(ending(1.1, 1e-15), ending(1.0, 1e-12))
 
 
 def test_a_memory_of_every_input_is_doubted_where_that_of_one_may_be_something_else():
     lag = insert(JOINT, AppliedEffect(registry().get("effects", "input_lag"), "*", {"time_constant": 0.05}), 0)
     fit = SimpleNamespace(model=lag, added=(0,))
-    assert tracer._doubted_memory(fit, SimpleNamespace(may_depend_on=("memory(force)",)))
-    assert not tracer._doubted_memory(fit, SimpleNamespace(may_depend_on=("speed",)))
+    assert pipeline._doubted_memory(fit, SimpleNamespace(may_depend_on=("memory(force)",)))
+    assert not pipeline._doubted_memory(fit, SimpleNamespace(may_depend_on=("speed",)))

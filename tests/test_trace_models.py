@@ -17,9 +17,9 @@ from s2r_runtime.trace.data.readers import load_dataset
 from s2r_runtime.trace.estimation.parameters import Added
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, problem
+from s2r_runtime.trace.pipeline import trace
 from s2r_runtime.trace.selection.exchange import parted
 from s2r_runtime.trace.selection.scores import STRICT
-from s2r_runtime.trace.tracer import trace
 
 ROBOTS = {
     "unicycle": (0.05, [(-0.5, 0.5), (-2.0, 2.0)], [0.001, 0.001, 0.004]),

@@ -10,8 +10,8 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.data.dataset import Dataset, Stream, from_arrays, from_streams
 from s2r_runtime.trace.estimation.prediction import rms
+from s2r_runtime.trace.pipeline import trace
 from s2r_runtime.trace.sensor_faults.detect import check
-from s2r_runtime.trace.tracer import trace
 
 DT_S, ROWS, FAST = 0.01, 3000, 1154
 FRICTION = (EffectSpec("coulomb_friction", "qd", {"force": 1.5}), EffectSpec("viscous_friction", "qd", {"coefficient": 1.2}))

@@ -10,7 +10,7 @@ from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.estimation.noise import Noise, Whitener, estimate, hidden_by_others, together
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, problem
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 DT_S, ROWS = 0.004, 570
 JOINT = compose(ModelSpec("joint", DT_S, {"mass": 0.2}))

@@ -10,16 +10,16 @@ from trace_robots import commands, drive
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace import second_look, verdict
+from s2r_runtime.trace import second_search, verdict
 from s2r_runtime.trace.data.dataset import from_arrays, from_streams
 from s2r_runtime.trace.data.streams import Stream
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import SCORE_BLOCKS, evaluate, fitted, gain, insert, nearer, problem
+from s2r_runtime.trace.pipeline import trace
 from s2r_runtime.trace.selection import stepwise
 from s2r_runtime.trace.selection.acceptance import BY_CHANCE, _scattered
 from s2r_runtime.trace.selection.scores import STRICT
 from s2r_runtime.trace.selection.stepwise import Selection
-from s2r_runtime.trace.tracer import trace
 
 DT = 0.005
 SPEC = ModelSpec("double_integrator", DT, {}, ())
@@ -181,7 +181,7 @@ def test_parts_in_which_a_model_gives_no_numbers_are_no_reason(monkeypatch):
     u = _held(rng, 400, [-2.0, -2.0], [2.0, 2.0])
     y = _late(u, np.zeros(4), _mass, 0.02) + rng.normal(size=(401, 4)) * [7e-5, 7e-5, 1e-4, 1e-4]
     model = compose(ModelSpec("double_integrator", 0.02, {}, ()))
-    monkeypatch.setattr(second_look, "foretold", lambda given, model: None)
+    monkeypatch.setattr(second_search, "foretold", lambda given, model: None)
     result = trace(_streams(model, y, u, 0.02), model)
     assert result.verdict == "unexplained"
     assert result.to_json()["step_parts"] == 1

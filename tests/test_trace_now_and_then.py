@@ -14,11 +14,11 @@ from s2r_runtime.models.composed import AppliedEffect, ComposedModel, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import Dataset, from_arrays
+from s2r_runtime.trace.diagnostics.lack_of_fit import left_of
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem
 from s2r_runtime.trace.hypotheses.packet_loss import now_and_then
-from s2r_runtime.trace.lack_of_fit import left_of
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.checks.common_start import from_one_place
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 DT, NOISE = 0.05, np.array([0.001, 0.01])
 

@@ -7,14 +7,14 @@ import pytest
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace import whole
-from s2r_runtime.trace.answer import with_time
+from s2r_runtime.trace.assemble import with_time
 from s2r_runtime.trace.data.dataset import from_arrays
+from s2r_runtime.trace.diagnostics import whole_recording
+from s2r_runtime.trace.diagnostics.block_influence import _once, in_one_stretch
 from s2r_runtime.trace.estimation.parameters import Added
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, problem
-from s2r_runtime.trace.one_stretch import _once, in_one_stretch
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 DT, HOLD = 0.05, 20
 UNICYCLE = compose(ModelSpec("unicycle", DT))
@@ -79,7 +79,7 @@ def test_a_change_at_some_time_is_about_time_anyhow():
 def test_the_answer_says_that_a_name_may_be_about_that_time(monkeypatch):
     data = _limited((3, 11, 22, 34))
     for once in (False, True):
-        monkeypatch.setattr(whole, "in_one_stretch", lambda *of, once=once: once)
+        monkeypatch.setattr(whole_recording, "in_one_stretch", lambda *of, once=once: once)
         found = trace(data, UNICYCLE)
         assert [(e.name, e.channel) for e in found.effects] == [("input_saturation", "w")]
         assert ("time" in found.may_depend_on) == ("time" in found.depends_on) == once

@@ -13,8 +13,8 @@ from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.estimation.parameters import Added
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, problem
+from s2r_runtime.trace.pipeline import trace
 from s2r_runtime.trace.selection.input_confounding import opposed
-from s2r_runtime.trace.tracer import trace
 
 DT_S, PARTS, INERTIA = 0.008, 4, 2.0
 JOINT = compose(ModelSpec("joint", DT_S, {"mass": INERTIA}))

@@ -13,8 +13,8 @@ from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.estimation.parameters import with_values
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, insert, problem
+from s2r_runtime.trace.pipeline import trace
 from s2r_runtime.trace.selection.lag_or_integrator import endless
-from s2r_runtime.trace.tracer import trace
 
 DT, ROWS, FINE = 0.05, 900, 10
 NOISE = np.array([0.003, 0.003, 0.005])

@@ -14,15 +14,15 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.errors import held
+from s2r_runtime.trace.diagnostics.rollout_error import held
 from s2r_runtime.trace.estimation.prediction import Acting, steps_of, wherever
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem
+from s2r_runtime.trace.pipeline import trace, usual_horizon
 from s2r_runtime.trace.selection import screening
 from s2r_runtime.trace.selection.pairs import two_together
 from s2r_runtime.trace.selection.scores import names
 from s2r_runtime.trace.selection.stepwise import Selection
 from s2r_runtime.trace.selection.unnamed_alternatives import better_shape
-from s2r_runtime.trace.tracer import trace, usual_horizon
 from s2r_runtime.trace.verdict import foretelling
 
 DT_S, NOISE_M, PARTS = 2.0, 0.01, 20

@@ -9,13 +9,13 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import from_arrays
+from s2r_runtime.trace.diagnostics.whole_recording import Whole
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import fitted, gain, insert
 from s2r_runtime.trace.hypotheses.dependence import about, about_states, carried, only_pushes
 from s2r_runtime.trace.selection.several_or_one import AS_MUCH, MOSTLY, patchwork
 from s2r_runtime.trace.selection.stepwise import Selection
 from s2r_runtime.trace.sensor_faults.detect import Checked
-from s2r_runtime.trace.whole import Whole
 
 DT, PARTS = 0.05, 10
 NOISE = np.array([0.001, 0.001, 0.002, 0.002])

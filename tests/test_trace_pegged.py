@@ -10,8 +10,8 @@ from seeds import first
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.data.dataset import Dataset, from_arrays
+from s2r_runtime.trace.pipeline import trace
 from s2r_runtime.trace.sensor_faults.detect import check
-from s2r_runtime.trace.tracer import trace
 
 Array = NDArray[np.float64]
 

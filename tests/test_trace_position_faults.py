@@ -5,8 +5,8 @@ import pytest
 from test_trace_friction import _joint, _recorded
 
 from s2r_runtime.trace.data.streams import Stream
+from s2r_runtime.trace.pipeline import load_dataset, trace
 from s2r_runtime.trace.sensor_faults.position_outliers import mended
-from s2r_runtime.trace.tracer import load_dataset, trace
 
 
 def _frozen(q):

@@ -6,12 +6,12 @@ import pytest
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.data.dataset import from_arrays
+from s2r_runtime.trace.diagnostics.lack_of_fit import dictionaries_of, left_of
 from s2r_runtime.trace.estimation.prediction import acting, residual, steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, problem
 from s2r_runtime.trace.hypotheses.basis import dictionaries
-from s2r_runtime.trace.lack_of_fit import dictionaries_of, left_of
+from s2r_runtime.trace.pipeline import trace
 from s2r_runtime.trace.selection.basis_evidence import first_look
-from s2r_runtime.trace.tracer import trace
 
 DT_S, ROWS = 0.01, 1200
 NOISE = np.array([2e-4, 4e-3])

@@ -9,13 +9,13 @@ from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import from_arrays
+from s2r_runtime.trace.diagnostics.whole_recording import Whole
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, insert, problem
 from s2r_runtime.trace.selection.exchange import parted
 from s2r_runtime.trace.selection.scores import STRICT, best_candidates, names
 from s2r_runtime.trace.selection.stepwise import Selection
 from s2r_runtime.trace.sensor_faults.detect import check
-from s2r_runtime.trace.whole import Whole
 
 DT, NOISE = 0.05, np.array([0.001, 0.001, 0.003])
 

@@ -18,13 +18,13 @@ from s2r_runtime.report import plots
 from s2r_runtime.report.page import Page
 from s2r_runtime.report.trace_page import trace_page
 from s2r_runtime.report.trace_section import add_trace
-from s2r_runtime.trace.account import _assumed, loud
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.excitation import suggest
-from s2r_runtime.trace.found import Found, each_once, interval_text
-from s2r_runtime.trace.plain_words import in_words
-from s2r_runtime.trace.tracer import trace
-from s2r_runtime.trace.views import envelope, spread, stretches
+from s2r_runtime.trace.design.suggest import suggest
+from s2r_runtime.trace.pipeline import trace
+from s2r_runtime.trace.reporting.figures import envelope, spread, stretches
+from s2r_runtime.trace.reporting.found import Found, each_once, interval_text
+from s2r_runtime.trace.reporting.text import _assumed, loud
+from s2r_runtime.trace.reporting.wording import in_words
 
 DT, NOISE, STEPS = 0.05, np.array([0.001, 0.001, 0.004]), 900
 BOUNDS = [(-0.5, 0.5), (-2.0, 2.0)]

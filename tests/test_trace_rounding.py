@@ -6,8 +6,8 @@ import pytest
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.lack_of_fit import beyond_rounding
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.diagnostics.lack_of_fit import beyond_rounding
+from s2r_runtime.trace.pipeline import trace
 
 DT_S, STEP = 0.02, 0.24
 NOISE = np.array([0.02, 0.02, 0.004, 0.1 * STEP])

@@ -13,9 +13,9 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.report.page import Page
 from s2r_runtime.report.trace_section import add_trace
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.found import Found
 from s2r_runtime.trace.hypotheses.equivalence import other_names
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
+from s2r_runtime.trace.reporting.found import Found
 
 ARCS = (EffectSpec("integration_scheme", "*", {"scheme": "exact"}),)
 UNICYCLE = compose(ModelSpec("unicycle", 0.05, {}, ARCS))

@@ -7,9 +7,9 @@ from trace_robots import GEOMETRY, commands
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.report.trace_page import trace_page
+from s2r_runtime.trace.pipeline import load_dataset, trace
 from s2r_runtime.trace.sensor_faults.detect import check
 from s2r_runtime.trace.sensor_faults.heading import carried
-from s2r_runtime.trace.tracer import load_dataset, trace
 
 DT, RUNS, ROWS = 0.05, 24, 60
 NAMES = [f"d{k + 1}" for k in range(RUNS)]

@@ -11,13 +11,13 @@ from trace_robots import declared, recordings
 
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.trace import whole
 from s2r_runtime.trace.data.dataset import from_arrays
+from s2r_runtime.trace.diagnostics import whole_recording
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, problem
 from s2r_runtime.trace.hypotheses.input_dynamics import SHAPES
-from s2r_runtime.trace.selection import unnamed_alternatives as challenge
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
+from s2r_runtime.trace.selection import unnamed_alternatives as alternatives
 
 DT = 0.02
 UNICYCLE = compose(ModelSpec("unicycle", DT))
@@ -168,19 +168,19 @@ def test_bends_leave_a_place_for_shapes_with_memory(monkeypatch):
     (data,) = recordings([("cubic", "w", {"share": -0.5})], 1, steps=600, seed=61)
     given = problem(data, steps_of(data))
     base, asked = evaluate(given, declared()), []
-    monkeypatch.setattr(challenge, "fitted", lambda of, fit, model, rounds: asked.append(model.effects[-1].effect) or fit)
-    monkeypatch.setattr(challenge, "_outlasts", lambda fit, dt: False)
-    monkeypatch.setattr(challenge, "NEARLY", 0.0)
-    challenge._fits(given, base, "w", least=0.1)
+    monkeypatch.setattr(alternatives, "fitted", lambda of, fit, model, rounds: asked.append(model.effects[-1].effect) or fit)
+    monkeypatch.setattr(alternatives, "_outlasts", lambda fit, dt: False)
+    monkeypatch.setattr(alternatives, "NEARLY", 0.0)
+    alternatives._fits(given, base, "w", least=0.1)
     remember = [shape.memory for shape in asked]
-    assert remember.count(False) == challenge.BENDS
-    assert 0 < remember.count(True) <= challenge.FITTED
+    assert remember.count(False) == alternatives.BENDS
+    assert 0 < remember.count(True) <= alternatives.FITTED
 
 
 def test_what_settles_with_time_is_told_as_that():
     at = {"loss": 0.4, "time_constant": 2.0, "most": 0.8}
     settling = replace(UNICYCLE, effects=(AppliedEffect(BY_NAME["settling with time"], "w", at),))
-    assert challenge._token(SimpleNamespace(model=settling)) == "time*w"
+    assert alternatives._token(SimpleNamespace(model=settling)) == "time*w"
 
 
 def test_what_sticks_and_stays_short_is_a_play_if_by_all_its_reach_and_jumps_all_the_way_if_by_none():
@@ -242,8 +242,8 @@ def test_names_are_held_against_dictionaries_and_fields_where_they_leave_somethi
     """What explained more than a name would explain something beside it. A shape need not: it may do all that a name does."""
     asked = []
     for name in ("better_shape", "best_unnamed", "wanders"):
-        challenge = getattr(whole, name)
-        monkeypatch.setattr(whole, name, lambda *of, name=name, challenge=challenge: asked.append(name) or challenge(*of))
+        challenge = getattr(whole_recording, name)
+        monkeypatch.setattr(whole_recording, name, lambda *of, name=name, challenge=challenge: asked.append(name) or challenge(*of))
     data = recordings([physics], 2, steps=900, seed=61)[which]
     found = trace(data, declared())
     assert bool({*asked} - {"better_shape"}) == left

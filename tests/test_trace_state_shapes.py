@@ -10,8 +10,8 @@ from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, insert, problem
 from s2r_runtime.trace.hypotheses.state_nonlinearity import STATE_SHAPES, starts
+from s2r_runtime.trace.pipeline import trace
 from s2r_runtime.trace.selection import ties
-from s2r_runtime.trace.tracer import trace
 
 pytestmark = pytest.mark.slow
 

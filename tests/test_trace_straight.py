@@ -16,7 +16,7 @@ from s2r_runtime.trace.data.input_interpolation import Samples, Way
 from s2r_runtime.trace.estimation.parameters import Added
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, problem
-from s2r_runtime.trace.tracer import load_dataset, trace
+from s2r_runtime.trace.pipeline import load_dataset, trace
 
 pytestmark = pytest.mark.slow
 

@@ -18,9 +18,9 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec, dump_model
 from s2r_runtime.profile import load_profile
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.excitation import advice, suggest, suggest_first
-from s2r_runtime.trace.suggestion import ENOUGH
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.design.suggest import advice, suggest, suggest_first
+from s2r_runtime.trace.design.suggestion import ENOUGH
+from s2r_runtime.trace.pipeline import trace
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ from seeds import first
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 pytestmark = pytest.mark.slow
 

@@ -10,17 +10,17 @@ from trace_sets.families import make
 from s2r_runtime.models.composed import AppliedEffect, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace import second_look, verdict
+from s2r_runtime.trace import second_search, verdict
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.errors import Judged, held
+from s2r_runtime.trace.diagnostics.rollout_error import Judged, held
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, fitted, gain, insert, problem
+from s2r_runtime.trace.pipeline import load_dataset, trace
 from s2r_runtime.trace.selection.acceptance import _scattered
 from s2r_runtime.trace.selection.scores import Scored, _search, names, unlimited
 from s2r_runtime.trace.selection.shared_dependence import any_shape_of
 from s2r_runtime.trace.selection.stepwise import Selection, doing_something
 from s2r_runtime.trace.selection.ties import SURELY, rivals_of, simplified, tied
-from s2r_runtime.trace.tracer import load_dataset, trace
 from s2r_runtime.trace.verdict import confirmed, harms
 
 pytestmark = pytest.mark.slow
@@ -193,7 +193,7 @@ def test_the_second_of_two_effects_is_found(tmp_path, seed, names):
 
 def test_two_effects_that_foretell_no_better_what_was_not_fitted_are_not_taken(tmp_path, monkeypatch):
     """However little structure they leave."""
-    monkeypatch.setattr(second_look, "foretelling", lambda judged_on, fits: [0.0] + [-1.0] * (len(fits) - 1))
+    monkeypatch.setattr(second_search, "foretelling", lambda judged_on, fits: [0.0] + [-1.0] * (len(fits) - 1))
     found = _traced_pair(tmp_path, 20014)
     assert not found.effects
     assert found.verdict == "unexplained"

@@ -7,11 +7,11 @@ import pytest
 from seeds import first
 from trace_robots import declared, recordings
 
-from s2r_runtime.trace import whole
-from s2r_runtime.trace.answer import _in_order
-from s2r_runtime.trace.lack_of_fit import Structure
+from s2r_runtime.trace.assemble import _in_order
+from s2r_runtime.trace.diagnostics import whole_recording
+from s2r_runtime.trace.diagnostics.lack_of_fit import Structure
+from s2r_runtime.trace.pipeline import trace
 from s2r_runtime.trace.selection.unnamed_alternatives import Better
-from s2r_runtime.trace.tracer import trace
 
 
 def test_what_is_left_comes_first_where_no_name_is_given():
@@ -24,15 +24,15 @@ def test_what_is_left_comes_first_where_no_name_is_given():
 @pytest.mark.parametrize(("nats", "first"), [(580.0, "time*v"), (5.0, "memory(v)")])
 def test_of_a_field_and_a_shape_the_one_that_explains_more_comes_first(nats, first, monkeypatch):
     left = Structure(("time*v",), True, 1.0, {}, varies=True, nats=nats)
-    monkeypatch.setattr(whole, "lack_of_fit", lambda *of: left)
-    asked = whole.Whole.__new__(whole.Whole)
+    monkeypatch.setattr(whole_recording, "lack_of_fit", lambda *of: left)
+    asked = whole_recording.Whole.__new__(whole_recording.Whole)
     asked.__dict__.update(_looks=None, nominal=None, _horizon=1, _shape=Better("memory(v)", 17.0))
     assert asked._of_nominal().tokens[0] == first
 
 
 def _likened(weighed, unnamed, shape=None, field=None):
     """What is told of a dictionary that is likeliest, of one that foretells other blocks of time best, of a shape and a field."""
-    asked = whole.Whole.__new__(whole.Whole)
+    asked = whole_recording.Whole.__new__(whole_recording.Whole)
     looks = SimpleNamespace(weighed=dict(weighed), field=field, chosen=([], {}), left=None)
     given = SimpleNamespace(floor=SimpleNamespace(axes=()))
     asked.__dict__.update(_looks=looks, given=given, unnamed=SimpleNamespace(token=unnamed[0], gain=unnamed[1]), _shape=shape)

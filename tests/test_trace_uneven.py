@@ -24,7 +24,7 @@ from s2r_runtime.trace.data.split import part
 from s2r_runtime.trace.data.streams import Stream
 from s2r_runtime.trace.estimation.prediction import Acting, acting, advanced, residual, steps_of
 from s2r_runtime.trace.hypotheses.input_dynamics import SHAPES, Shape
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 pytestmark = pytest.mark.slow
 

@@ -10,7 +10,7 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.data.command_timing import before_changes
 from s2r_runtime.trace.data.dataset import from_streams
 from s2r_runtime.trace.data.streams import Stream
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 pytestmark = pytest.mark.slow
 

@@ -14,7 +14,7 @@ from s2r_runtime.trace.checks.columns import check_plausible
 from s2r_runtime.trace.data.dataset import Dataset, from_arrays
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.prediction import rms
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 pytestmark = pytest.mark.slow
 

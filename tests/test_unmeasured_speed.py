@@ -15,7 +15,7 @@ from s2r_runtime.trace.estimation.initial_states import begun
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, problem
 from s2r_runtime.trace.estimation.speed_spline import smoothed
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 MASS = 2.0
 

@@ -8,7 +8,7 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.trace.data.readers import load_dataset
 from s2r_runtime.trace.data.unmeasured_states import unneeded, without
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
 
 DT = 0.05
 BOUNDS = {"bicycle": [(-0.3, 0.3), (0.2, 1.5)], "differential_drive": [(-3.0, 8.0)] * 2}

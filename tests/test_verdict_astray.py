@@ -6,7 +6,7 @@ import pytest
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.data.dataset import from_arrays
-from s2r_runtime.trace.errors import Held, Judged
+from s2r_runtime.trace.diagnostics.rollout_error import Held, Judged
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.verdict import goes_astray
 

@@ -80,7 +80,7 @@ def _answer(given: TraceSet, path: Path) -> Record:
     from s2r_runtime.models.composed import compose
     from s2r_runtime.modelspec import EffectSpec, ModelSpec
     from s2r_runtime.trace.data.unmeasured_states import alike
-    from s2r_runtime.trace.tracer import load_dataset, trace
+    from s2r_runtime.trace.pipeline import load_dataset, trace
 
     model = given.model
     spec = ModelSpec(model["name"], model["dt"], model["parameters"], tuple(EffectSpec(**e) for e in model["effects"]))

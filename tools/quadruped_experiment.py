@@ -37,8 +37,8 @@ from s2r_runtime.plugins import registry
 from s2r_runtime.profile import load_profile
 from s2r_runtime.tasks.grid_world import GridWorld
 from s2r_runtime.trace.data.dataset import Stream, from_streams
-from s2r_runtime.trace.found import Found
-from s2r_runtime.trace.tracer import trace
+from s2r_runtime.trace.pipeline import trace
+from s2r_runtime.trace.reporting.found import Found
 from s2r_runtime.transitions import from_samples
 from s2r_runtime.uncertain import roll_out
 

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from s2r_runtime.models.composed import ComposedModel
     from s2r_runtime.profile import Profile
     from s2r_runtime.trace.data.dataset import Dataset
-    from s2r_runtime.trace.result import TraceResult
-    from s2r_runtime.trace.suggestion import Suggestion
+    from s2r_runtime.trace.design.suggestion import Suggestion
+    from s2r_runtime.trace.reporting.result import TraceResult
 
 
 MOST_SUGGESTED = 100_000
@@ -94,7 +94,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def run(args: argparse.Namespace) -> int:
     """Exit 0 with any verdict, 3 with too little data."""
     from s2r_runtime.table_text import limits_of
-    from s2r_runtime.trace.tracer import load_dataset, trace
+    from s2r_runtime.trace.pipeline import load_dataset, trace
 
     if bool(args.recording) == (args.live is not None):
         raise UsageError("trace: give a RECORDING, or --live with what the running daemon recorded")
@@ -211,7 +211,7 @@ def _tell(args: argparse.Namespace, result: TraceResult, suggested: Suggestion |
 
 
 def _tell_drive(path: Path | None, suggested: Suggestion) -> None:
-    from s2r_runtime.trace.account import labelled
+    from s2r_runtime.trace.reporting.text import labelled
 
     output.out("")
     for line in labelled("drive", suggested.lines()):
@@ -221,7 +221,7 @@ def _tell_drive(path: Path | None, suggested: Suggestion) -> None:
 
 
 def _suggested(args: argparse.Namespace, result: TraceResult, profile: Profile | None) -> Suggestion:
-    from s2r_runtime.trace.excitation import suggest
+    from s2r_runtime.trace.design.suggest import suggest
 
     bounds, region = _allowed(profile)
     return suggest(result, bounds=bounds, region=region, duration=args.suggest_duration, seed=args.seed)
@@ -229,7 +229,7 @@ def _suggested(args: argparse.Namespace, result: TraceResult, profile: Profile |
 
 def _suggest_first(args: argparse.Namespace, model: ComposedModel, data: Dataset, profile: Profile | None) -> dict[str, object]:
     """For a recording that cannot be traced: a first drive, where a profile says what is allowed. What `--json` tells of it."""
-    from s2r_runtime.trace.excitation import suggest_first
+    from s2r_runtime.trace.design.suggest import suggest_first
 
     bounds, region = _allowed(profile)
     drive = suggest_first(model, data, bounds=bounds, region=region, duration=args.suggest_duration, seed=args.seed)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from s2r_runtime.models.composed import ComposedModel
     from s2r_runtime.profile import Profile
     from s2r_runtime.trace.data.dataset import Dataset
-    from s2r_runtime.trace.result import TraceResult
+    from s2r_runtime.trace.reporting.result import TraceResult
 
 WRITTEN_WITHIN_S = 45.0
 """The recorder hands over what it has every 50 ms; a disk that takes nothing for this long is full. Nobody waits but this process."""
@@ -71,7 +71,7 @@ def traced(
     whole log.
     """
     from s2r_runtime.models.composed import compose
-    from s2r_runtime.trace.tracer import trace as tracer
+    from s2r_runtime.trace.pipeline import trace as tracer
     from s2r_runtime.transitions import from_samples
 
     model = compose(profile.model)
@@ -120,7 +120,7 @@ def _number(value: Any) -> Any:
 
 def options(profile: Profile, states: Sequence[str], rows: int) -> dict[str, Any]:
     """What the tracer was told besides rows, model and seed."""
-    from s2r_runtime.trace.tracer import usual_horizon
+    from s2r_runtime.trace.pipeline import usual_horizon
 
     horizon_s = usual_horizon(profile.model.dt)
     return {"horizon_s": horizon_s, "weights": list(weights(profile, states)), "set": profile.norm.set, "rows": rows}

@@ -14,12 +14,22 @@ import numpy as np
 from s2r_runtime.report import trace_plots as plots
 from s2r_runtime.report.page import Page
 from s2r_runtime.report.trace_section import add_trace
-from s2r_runtime.trace.account import FOLLOWED, loud
-from s2r_runtime.trace.shape import Shape, clearest, components, derived, has_pose, of_tokens, shape_of, variables, world
-from s2r_runtime.trace.views import correlations, over_time, stretches
+from s2r_runtime.trace.diagnostics.residual_plots import (
+    Shape,
+    clearest,
+    components,
+    derived,
+    has_pose,
+    of_tokens,
+    shape_of,
+    variables,
+    world,
+)
+from s2r_runtime.trace.reporting.figures import correlations, over_time, stretches
+from s2r_runtime.trace.reporting.text import FOLLOWED, loud
 
 if TYPE_CHECKING:
-    from s2r_runtime.trace.result import TraceResult
+    from s2r_runtime.trace.reporting.result import TraceResult
 
 CANDIDATES = 12
 """Candidates that are listed."""

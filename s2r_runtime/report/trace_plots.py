@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from s2r_runtime.report.plots import BLUE, GREEN, GRID, INK, ORANGE, QUIET, RED, SOFT, Array, figure, svg
-from s2r_runtime.trace.shape import Binned, Component, Shape, Variable, binned
-from s2r_runtime.trace.views import Correlated, OverTime, Stretch, envelope, spread
+from s2r_runtime.trace.diagnostics.residual_plots import Binned, Component, Shape, Variable, binned
+from s2r_runtime.trace.reporting.figures import Correlated, OverTime, Stretch, envelope, spread
 
 WIDTH, HEIGHT = 3.2, 2.2
 """Of a small figure, inches: at 300 pixels its words are as large as those of the page's captions."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from s2r_runtime.report.page import Page
-from s2r_runtime.trace.found import Found
+from s2r_runtime.trace.reporting.found import Found
 
 SAY = {
     "none": ("nothing beyond noise is left in the residual.", "good"),

@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.checks.measured_inputs import refuted
-from s2r_runtime.trace.errors import Held, Judged, better, displacement, rollout_starts_of
+from s2r_runtime.trace.diagnostics.lack_of_fit import Structure
+from s2r_runtime.trace.diagnostics.rollout_error import Held, Judged, better, displacement, rollout_starts_of
 from s2r_runtime.trace.estimation.noise import OUTLIER
 from s2r_runtime.trace.estimation.parameters import Added, slots_of
 from s2r_runtime.trace.estimation.prediction import Mask, acting, first_steps, predicted, rms
 from s2r_runtime.trace.estimation.problem import Fit, Problem, evaluate, fitted, foretold, gain, plainly, problem, without
 from s2r_runtime.trace.hypotheses.dependence import about_states
-from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.selection.change_points import rivals_that_happen
 from s2r_runtime.trace.selection.scores import STRICT, Scored, name_of, names
 from s2r_runtime.trace.selection.stepwise import Selection, doing_something, one_more

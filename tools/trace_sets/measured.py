@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from s2r_runtime.modelspec import ModelSpec
 
 if TYPE_CHECKING:
-    from s2r_runtime.trace.result import TraceResult
+    from s2r_runtime.trace.reporting.result import TraceResult
 
 
 class Measured(NamedTuple):
@@ -46,7 +46,7 @@ RECORDINGS = {
 def trace_measured(one: Measured, folder: Path, scratch: Path) -> TraceResult:
     """What the tracer answers on it. folder: of the recordings. scratch: for files that are made of them."""
     from s2r_runtime.models.composed import compose
-    from s2r_runtime.trace.tracer import load_dataset, trace
+    from s2r_runtime.trace.pipeline import load_dataset, trace
 
     model = compose(one.spec)
     fit, test = folder / one.fit, folder / one.test if one.test else None

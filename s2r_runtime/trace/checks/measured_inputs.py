@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.errors import Held, noise_there
+from s2r_runtime.trace.diagnostics.rollout_error import Held, noise_there
 from s2r_runtime.trace.estimation.inverse_dynamics import off, off_by_noise, recorded
 from s2r_runtime.trace.estimation.problem import Fit
 

@@ -9,7 +9,7 @@ first is taken to have been commanded before, whatever the first command is. A w
 
 The first command need not have been held for long, and not all inputs change at once. If the first steps of a run that was under way are
 far off, and those after them are not, something remembers another command, which nobody recorded: these rows only let it be forgotten.
-They are told; and where all is explained, and nothing found that remembers, they count after all (`tracer`): a limit may be met at the
+They are told; and where all is explained, and nothing found that remembers, they count after all (`pipeline`): a limit may be met at the
 start alone.
 """
 

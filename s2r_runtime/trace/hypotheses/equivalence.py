@@ -16,7 +16,7 @@ from s2r_runtime.effects.classes import same
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.found import Found, Limit
+from s2r_runtime.trace.reporting.found import Found, Limit
 
 Array = NDArray[np.float64]
 Name = tuple[str, str]

@@ -10,17 +10,17 @@ import numpy as np
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.data.command_timing import checked_of
 from s2r_runtime.trace.data.dataset import Dataset, in_finer_parts
-from s2r_runtime.trace.errors import Held, at_most_seen, judge, noise_floor
+from s2r_runtime.trace.diagnostics.lack_of_fit import Structure
+from s2r_runtime.trace.diagnostics.rollout_error import Held, at_most_seen, judge, noise_floor
+from s2r_runtime.trace.diagnostics.whole_recording import Whole
 from s2r_runtime.trace.estimation.change_times import dated
 from s2r_runtime.trace.estimation.noise import Whitener
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import Fit, Problem, fitted, foretold, gain, problem
-from s2r_runtime.trace.lack_of_fit import Structure
 from s2r_runtime.trace.selection.pairs import two_together
 from s2r_runtime.trace.selection.scores import ALONE, LENIENT, STRICT, Bar, Scored, names
 from s2r_runtime.trace.selection.stepwise import Selection, against_rivals, all_dated, called_for, crowded
 from s2r_runtime.trace.verdict import confirmed, foretelling, takes_far
-from s2r_runtime.trace.whole import Whole
 
 MAKES = 0.5
 """Of what structure is told by, in nats, that inputs within steps must make at the least to be the reason."""

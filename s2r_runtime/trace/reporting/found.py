@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from s2r_runtime.trace.plain_words import degrees, in_words
+from s2r_runtime.trace.reporting.wording import degrees, in_words
 
 Limit = float | list[list[float | None]] | None
 Value = tuple[Any, Limit, Limit, str]

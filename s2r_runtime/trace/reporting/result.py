@@ -15,19 +15,19 @@ from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.table_rows import Subset
 from s2r_runtime.trace import VERSION
-from s2r_runtime.trace.account import account
 from s2r_runtime.trace.data.command_timing import before_changes
 from s2r_runtime.trace.data.input_interpolation import Way
 from s2r_runtime.trace.data.reconstruction import IN_PARTS, Reconstruction
-from s2r_runtime.trace.domain import Range
-from s2r_runtime.trace.domain import told as domain_told
-from s2r_runtime.trace.errors import Held, Judged
+from s2r_runtime.trace.diagnostics.detectability import Visible
+from s2r_runtime.trace.diagnostics.rollout_error import Held, Judged
+from s2r_runtime.trace.diagnostics.validity_domain import Range
+from s2r_runtime.trace.diagnostics.validity_domain import told as domain_told
 from s2r_runtime.trace.estimation.problem import insert
-from s2r_runtime.trace.found import Found, Limit
-from s2r_runtime.trace.power import Visible
+from s2r_runtime.trace.reporting.figures import views
+from s2r_runtime.trace.reporting.found import Found, Limit
+from s2r_runtime.trace.reporting.text import account
 from s2r_runtime.trace.sensor_faults.fault import Fault
 from s2r_runtime.trace.verdict import Verdict
-from s2r_runtime.trace.views import views
 
 Array = NDArray[np.float64]
 __all__ = ["Found", "Limit", "TraceResult"]

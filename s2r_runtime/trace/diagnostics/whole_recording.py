@@ -9,12 +9,8 @@ import numpy as np
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.data.split import part
-from s2r_runtime.trace.estimation.prediction import first_steps
-from s2r_runtime.trace.estimation.problem import Fit, evaluate, fitted, gain, problem
-from s2r_runtime.trace.hypotheses.dependence import about_states
-from s2r_runtime.trace.hypotheses.packet_loss import Lost, nats_of_lost
-from s2r_runtime.trace.hypotheses.random_fields import Field, beats, nats_of, nats_of_fit, wanders
-from s2r_runtime.trace.lack_of_fit import (
+from s2r_runtime.trace.diagnostics.block_influence import in_one_stretch
+from s2r_runtime.trace.diagnostics.lack_of_fit import (
     ALIKE,
     MORE,
     Looks,
@@ -27,7 +23,11 @@ from s2r_runtime.trace.lack_of_fit import (
     lost_commands,
     still_left,
 )
-from s2r_runtime.trace.one_stretch import in_one_stretch
+from s2r_runtime.trace.estimation.prediction import first_steps
+from s2r_runtime.trace.estimation.problem import Fit, evaluate, fitted, gain, problem
+from s2r_runtime.trace.hypotheses.dependence import about_states
+from s2r_runtime.trace.hypotheses.packet_loss import Lost, nats_of_lost
+from s2r_runtime.trace.hypotheses.random_fields import Field, beats, nats_of, nats_of_fit, wanders
 from s2r_runtime.trace.selection.basis_evidence import Judged, Left
 from s2r_runtime.trace.selection.input_confounding import opposed
 from s2r_runtime.trace.selection.several_or_one import patchwork

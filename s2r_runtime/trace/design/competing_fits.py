@@ -16,16 +16,16 @@ from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.data.split import part
-from s2r_runtime.trace.errors import Held
+from s2r_runtime.trace.diagnostics.rollout_error import Held
 from s2r_runtime.trace.estimation.parameters import Added, bounds_of, free_of, slots_of, values_of
 from s2r_runtime.trace.estimation.prediction import first_steps
 from s2r_runtime.trace.estimation.problem import Fit, Problem, evaluate, fitted, gain, insert, problem, without
-from s2r_runtime.trace.found import Found
 from s2r_runtime.trace.hypotheses.library import candidates
+from s2r_runtime.trace.reporting.found import Found
 from s2r_runtime.trace.selection.scores import best_candidates, name_of
 
 if TYPE_CHECKING:
-    from s2r_runtime.trace.result import TraceResult
+    from s2r_runtime.trace.reporting.result import TraceResult
 
 STEPS = 4000
 """Transitions that rivals are fitted on at most."""

@@ -14,20 +14,20 @@ from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.seen_rows import united
 from s2r_runtime.trace.data.command_timing import before_changes
 from s2r_runtime.trace.data.dataset import Dataset
-from s2r_runtime.trace.domain import domain_of
-from s2r_runtime.trace.errors import Held, Judged, Kind, at_most_seen, gaps, judge, noise_floor
+from s2r_runtime.trace.design.suggest import advice
+from s2r_runtime.trace.diagnostics.detectability import visible
+from s2r_runtime.trace.diagnostics.lack_of_fit import Structure
+from s2r_runtime.trace.diagnostics.rollout_error import Held, Judged, Kind, at_most_seen, gaps, judge, noise_floor
+from s2r_runtime.trace.diagnostics.validity_domain import domain_of
 from s2r_runtime.trace.estimation.discretisation_error import widened
 from s2r_runtime.trace.estimation.noise import no_colour
 from s2r_runtime.trace.estimation.order_intervals import in_either_order
 from s2r_runtime.trace.estimation.parameters import Slot, values_of
 from s2r_runtime.trace.estimation.problem import Fit, Problem, told, without
 from s2r_runtime.trace.estimation.shrinkage import drawn_in
-from s2r_runtime.trace.excitation import advice
-from s2r_runtime.trace.found import each_once
 from s2r_runtime.trace.hypotheses.equivalence import other_names
-from s2r_runtime.trace.lack_of_fit import Structure
-from s2r_runtime.trace.power import visible
-from s2r_runtime.trace.result import Found, Limit, TraceResult
+from s2r_runtime.trace.reporting.found import each_once
+from s2r_runtime.trace.reporting.result import Found, Limit, TraceResult
 from s2r_runtime.trace.selection.lag_or_integrator import endless
 from s2r_runtime.trace.selection.scores import name_of
 from s2r_runtime.trace.selection.shared_dependence import any_shape_of

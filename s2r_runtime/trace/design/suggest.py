@@ -4,8 +4,8 @@ Each effect is told from the others by what it does to one feature of the input:
 sizes, a limit by sizes up to the largest, memory by steps seen at once after they are made, and one that couples inputs by
 values of the one at several values of the other.
 
-A sequence is found by drawing many (`drives`) and taking the one under which the smallest expected log likelihood difference between
-rivals (`separation`) is largest; for the whole library, the one under which most effects are told from one another and from none.
+A sequence is found by drawing many (`candidates`) and taking the one under which the smallest expected log likelihood difference between
+rivals (`discrimination`) is largest; for the whole library, the one under which most effects are told from one another and from none.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.drives import Room, draw, room_of
-from s2r_runtime.trace.errors import Held
+from s2r_runtime.trace.design.candidates import Room, draw, room_of
+from s2r_runtime.trace.design.competing_fits import Rivals, ground, library, rivals_of
+from s2r_runtime.trace.design.discrimination import as_data, between, expected, refitted, trajectories
+from s2r_runtime.trace.design.suggestion import ENOUGH, Suggestion
+from s2r_runtime.trace.diagnostics.rollout_error import Held
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import Fit, evaluate
-from s2r_runtime.trace.rival_fits import Rivals, ground, library, rivals_of
-from s2r_runtime.trace.separation import as_data, between, expected, refitted, trajectories
-from s2r_runtime.trace.suggestion import ENOUGH, Suggestion
 
 if TYPE_CHECKING:
     from s2r_runtime.trace.data.dataset import Dataset
-    from s2r_runtime.trace.result import TraceResult
+    from s2r_runtime.trace.reporting.result import TraceResult
 
 Array = NDArray[np.float64]
 Bounds = Mapping[str, tuple[float, float]]

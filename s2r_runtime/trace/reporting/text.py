@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.file_model import FileModel
+from s2r_runtime.trace.diagnostics.residual_plots import Component, Shape, components, derived, strongest, variables
 from s2r_runtime.trace.estimation.prediction import rms
-from s2r_runtime.trace.found import Found
-from s2r_runtime.trace.shape import Component, Shape, components, derived, strongest, variables
+from s2r_runtime.trace.reporting.found import Found
 
 if TYPE_CHECKING:
-    from s2r_runtime.trace.result import TraceResult
+    from s2r_runtime.trace.reporting.result import TraceResult
     from s2r_runtime.trace.sensor_faults.fault import Fault
 
 Array = NDArray[np.float64]

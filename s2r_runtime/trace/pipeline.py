@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, UsageError
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.plugins import registry
-from s2r_runtime.trace.answer import answered, with_time
+from s2r_runtime.trace.assemble import answered, with_time
 from s2r_runtime.trace.checks.columns import check_plausible
 from s2r_runtime.trace.checks.common_start import from_one_place
 from s2r_runtime.trace.checks.measured_inputs import refuted, says_forces
@@ -52,20 +52,20 @@ from s2r_runtime.trace.data.input_interpolation import MOVING, Way, moving
 from s2r_runtime.trace.data.readers import load_dataset
 from s2r_runtime.trace.data.split import Part, fit_mask, part
 from s2r_runtime.trace.data.unmeasured_states import alike
-from s2r_runtime.trace.errors import Held, Kind, displacement, held, judge
+from s2r_runtime.trace.diagnostics.lack_of_fit import Structure
+from s2r_runtime.trace.diagnostics.rollout_error import Held, Kind, displacement, held, judge
+from s2r_runtime.trace.diagnostics.whole_recording import Whole
 from s2r_runtime.trace.estimation.initial_states import begun
 from s2r_runtime.trace.estimation.prediction import Mask, acting, first_steps, rms, steps_of
 from s2r_runtime.trace.estimation.problem import Fit, Problem, evaluate, problem
 from s2r_runtime.trace.hypotheses.dependence import remembers
-from s2r_runtime.trace.lack_of_fit import Structure
-from s2r_runtime.trace.result import TraceResult
-from s2r_runtime.trace.second_look import astray, finer, once_more
+from s2r_runtime.trace.reporting.result import TraceResult
+from s2r_runtime.trace.second_search import astray, finer, once_more
 from s2r_runtime.trace.selection.scores import names
 from s2r_runtime.trace.selection.stepwise import MOST, Selection, all_dated, select
 from s2r_runtime.trace.selection.ties import CLOSE
 from s2r_runtime.trace.sensor_faults.detect import Checked, check
 from s2r_runtime.trace.verdict import confirmed, foretold_too
-from s2r_runtime.trace.whole import Whole
 
 __all__ = ["Dataset", "TraceResult", "load_dataset", "trace", "usual_horizon"]
 

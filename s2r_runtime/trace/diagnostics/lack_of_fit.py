@@ -23,7 +23,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.trace.constancy import uneven
+from s2r_runtime.trace.diagnostics.parameter_constancy import uneven
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.initial_states import begun, measured
 from s2r_runtime.trace.estimation.noise import Colour, Noise, Whitener
@@ -123,9 +123,9 @@ class Structure:
 
     share: part of all that the nominal model lacks which is still left (0 where there is nothing). gains: nats by group. nameless: what
     was named looks more like something that has no name (`unnamed_alternatives`). for_a_while: it comes and goes (`disturbances`). varies:
-    it is a field (`random_fields`), or a number of what was named that varies (`constancy`). beside: what it may depend on besides, which
-    no rollout shows. noise: what would be left beside the structure, and its colour; None where there is none that matters. nats: of what
-    comes and goes, or varies.
+    it is a field (`random_fields`), or a number of what was named that varies (`parameter_constancy`). beside: what it may depend on
+    besides, which no rollout shows. noise: what would be left beside the structure, and its colour; None where there is none that matters.
+    nats: of what comes and goes, or varies.
     """
 
     tokens: tuple[str, ...]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.errors import Held
+from s2r_runtime.trace.diagnostics.rollout_error import Held
 
 Array = NDArray[np.float64]
 

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
-from s2r_runtime.trace.errors import MANY
+from s2r_runtime.trace.diagnostics.residual_plots import Component, components, variables
+from s2r_runtime.trace.diagnostics.rollout_error import MANY
 from s2r_runtime.trace.estimation.prediction import Steps, acting, advanced, first_steps, residual, rollout_starts, steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, problem
-from s2r_runtime.trace.shape import Component, components, variables
 
 if TYPE_CHECKING:
-    from s2r_runtime.trace.result import TraceResult
+    from s2r_runtime.trace.reporting.result import TraceResult
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -1,0 +1,1 @@
+"""Inputs under which competing hypotheses can be told apart."""
