@@ -14,7 +14,6 @@ from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.table_rows import Subset
-from s2r_runtime.trace import VERSION
 from s2r_runtime.trace.data.command_timing import before_changes
 from s2r_runtime.trace.data.input_interpolation import Way
 from s2r_runtime.trace.data.reconstruction import IN_PARTS, Reconstruction
@@ -28,6 +27,7 @@ from s2r_runtime.trace.reporting.found import Found, Limit
 from s2r_runtime.trace.reporting.text import account
 from s2r_runtime.trace.sensor_faults.fault import Fault
 from s2r_runtime.trace.verdict import Verdict
+from s2r_runtime.trace.version import VERSION
 
 Array = NDArray[np.float64]
 __all__ = ["Found", "Limit", "TraceResult"]
