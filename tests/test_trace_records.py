@@ -8,9 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import bench_trace
+import msgspec
 import pytest
 import trace_records
 from trace_records import mcnemar, paired, read, verdict_of
+
+from s2r_runtime.modelspec import EffectSpec, ModelSpec
 
 TOOL = Path(__file__).parent.parent / "tools" / "trace_records.py"
 
@@ -118,3 +122,13 @@ def test_the_same_set_gives_the_same_record(tmp_path):
     (one,) = read(files[0]).values()
     assert {"verdict", "judgement", "effects", "depends_on", "error", "cpu_s"} <= one.keys()
     assert len(one["digest"]) == 16
+
+
+def test_a_digest_is_of_the_answer_and_of_the_model_only(tmp_path):
+    spec = ModelSpec("unicycle", 0.1, {}, (EffectSpec("input_gain", "v", {"gain": 0.9}),), ("sha256:a",))
+    answer = {"verdict": "traced", "tracer": 1, "notes": [f"read from {tmp_path}/one.csv"]}
+    same = bench_trace.digest(answer, spec, tmp_path)
+    moved = {**answer, "tracer": 2, "notes": ["read from /one.csv"]}
+    assert same == bench_trace.digest(moved, msgspec.structs.replace(spec, fitted_on=("sha256:b",)), Path("/nowhere"))
+    assert same != bench_trace.digest({**answer, "verdict": "ambiguous"}, spec, tmp_path)
+    assert same != bench_trace.digest(answer, msgspec.structs.replace(spec, effects=()), tmp_path)
