@@ -132,3 +132,20 @@ def test_a_digest_is_of_the_answer_and_of_the_model_only(tmp_path):
     assert same == bench_trace.digest(moved, msgspec.structs.replace(spec, fitted_on=("sha256:b",)), Path("/nowhere"))
     assert same != bench_trace.digest({**answer, "verdict": "ambiguous"}, spec, tmp_path)
     assert same != bench_trace.digest(answer, msgspec.structs.replace(spec, effects=()), tmp_path)
+
+
+def test_an_unopened_set_is_counted_and_never_shown(tmp_path):
+    family = bench_trace.GROUPS["unopened"][0]
+    effect = {"name": "input_gain", "channel": "v", "parameters": {}}
+    answer = {"depends_on": ["v"], "effects": [effect], "cpu_s": 1.0, "digest": "a", "depends_right": False}
+    r = trace_records.compact({"family": family, "seed": 0, "verdict": "traced", "outcome": "false_name", **answer})
+    assert (r["judgement"], r["effects"], r["depends_on"]) == ("wrong", [], [])
+    old, new = write(tmp_path / "old.jsonl", [{**r, "judgement": "right", "digest": "b"}]), write(tmp_path / "new.jsonl", [r])
+    _, text = compared(old, new, "--changed")
+    assert "lost 1" in text
+    assert f"{family}:0" not in text
+
+
+def test_families_that_are_named_are_recorded_at_every_seed():
+    assert bench_trace.tasks(bench_trace.ungrouped(["unopened"]), range(1, 2))[0] == (bench_trace.GROUPS["unopened"][0], 1)
+    assert {family for family, _ in bench_trace.tasks([], range(1, 2))}.isdisjoint(bench_trace.GROUPS["unopened"])

@@ -197,9 +197,14 @@ def run_all(tasks: list[tuple[str, int]], jobs: int, file: Path | None) -> Itera
 
 
 def tasks(families: Iterable[str], seeds: Iterable[int]) -> list[tuple[str, int]]:
-    """(family, seed) of every set, seed by seed; of SELDOM families some."""
-    each = [*families]
-    return [(family, seed) for seed in seeds for family in each if seed % SELDOM.get(family, 1) == 0]
+    """(family, seed) of every set of these families, seed by seed; without any: of all, of SELDOM ones some."""
+    named = [*families]
+    return [(family, seed) for seed in seeds for family in named or FAMILIES if named or seed % SELDOM.get(family, 1) == 0]
+
+
+def ungrouped(names: Iterable[str] | None) -> list[str]:
+    """The families that names of families and of GROUPS stand for."""
+    return [family for name in names or () for family in GROUPS.get(name, [name])]
 
 
 def seeds(text: str) -> range:
@@ -222,7 +227,7 @@ def main() -> int:
     parser.add_argument("--by", metavar="KEY", help="count outcomes by effect, robot, layout, noise, law, rate or family")
     parser.add_argument("--all", action="store_true", help="print every set, a line each")
     args = parser.parse_args()
-    args.family = [f for name in args.family or () for f in GROUPS.get(name, [name])]
+    args.family = ungrouped(args.family)
     if (args.failures or args.all) and not args.source and args.seeds.stop > UNTOUCHED.start:
         parser.error(
             f"seeds from {UNTOUCHED.start} on are not looked at one by one: they would be tuned on; take others with --failures and --all"
@@ -231,9 +236,8 @@ def main() -> int:
         records = [json.loads(line) for line in args.source.read_text(encoding="utf-8").splitlines()]
         records = [r for r in records if not args.family or r["family"] in args.family]
     else:
-        every = [(f, seed) for seed in args.seeds for f in args.family] if args.family else tasks(FAMILIES, args.seeds)
         records = []
-        for record in run_all(every, args.jobs, args.json):
+        for record in run_all(tasks(args.family, args.seeds), args.jobs, args.json):
             records.append(record)
             if (args.all or (args.failures and went_wrong(record))) and record["family"] not in UNOPENED:
                 print(failure(record), flush=True)

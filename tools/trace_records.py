@@ -6,7 +6,8 @@
 `record` appends one JSON line a set to FILE as it is done, seed by seed over all families, and skips what FILE has: a run that was
 stopped goes on where it was. --measured: only the measured recordings in FOLDER (default with an empty FOLDER: $S2R_DATA).
 `compare` takes the sets that both files have (plain or .gz). Of each property it counts the sets that have it in one file only and tests
-whether the two counts differ significantly (McNemar, exact, two-sided). Exit 0: no worse; 1: worse, or with --identical any answer differs.
+whether the two counts differ significantly (McNemar, exact, two-sided). Sets of `unopened` are counted and never listed: their
+records hold no more than the counts need. Exit 0: no worse; 1: worse, or with --identical any answer differs.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ import bench_trace
 from trace_sets.families import FAMILIES
 from trace_sets.measured import RECORDINGS, trace_measured
 from trace_sets.targets import Record
+from trace_sets.unopened import UNOPENED
 
 DIGITS = 6
 """Significant ones of a record's numbers. The digest is of all."""
@@ -39,6 +41,8 @@ NET_LOSS = 0.01
 """Share of a family's sets that may be lost, net of those that were gained."""
 HARM = {"alarm", "wrong", "false_name", "named", "accepted", "overclaimed", "crash", "long_error"}
 """Outcomes in which the answer says something that is not so."""
+DETAILS = {"effects", "depends_on", "faults", "error"}
+"""Of an answer; without them a record says whether it was right, and not what it was."""
 WORSE = 1.02
 """Error of the repaired model over that of the nominal one, on a new recording, from which on the repair did harm."""
 
@@ -50,7 +54,8 @@ Key = tuple[str, str]
 
 
 def compact(r: Record) -> Record:
-    """A record of the bench, without what its set says by itself."""
+    """A record of the bench, without what its set says by itself. Of an unopened set nothing that could be tuned on."""
+    r = {key: value for key, value in r.items() if key not in DETAILS} if r["family"] in UNOPENED else r
     return {
         "family": r["family"],
         "seed": r["seed"],
@@ -218,7 +223,7 @@ def compare(old: dict[Key, Record], new: dict[Key, Record], *, changed: bool) ->
     ratio = f", ratio {spent[1] / spent[0]:.3f}" if spent[0] else ""
     lines.append(f"CPU s {spent[0]:.1f} -> {spent[1]:.1f}{ratio}")
     shown = [(a, b) for a, b in differ if changed or (a["judgement"], a["outcome"]) != (b["judgement"], b["outcome"]) or not a["judgement"]]
-    lines += [f"{a['family']}:{a['seed']}  {_said(a)}  ->  {_said(b)}" for a, b in shown]
+    lines += [f"{a['family']}:{a['seed']}  {_said(a)}  ->  {_said(b)}" for a, b in shown if a["family"] not in UNOPENED]
     return lines, worse, len(differ)
 
 
@@ -236,7 +241,7 @@ def main(argv: list[str] | None = None) -> int:
     verbs = parser.add_subparsers(dest="verb", required=True)
     making = verbs.add_parser("record", help="append a record of every set to FILE")
     making.add_argument("file", type=Path, metavar="FILE")
-    making.add_argument("--family", action="append", choices=[*FAMILIES], help="may be repeated; default: all")
+    making.add_argument("--family", action="append", choices=[*bench_trace.GROUPS, *FAMILIES], help="may be repeated; default: all")
     making.add_argument("--seeds", type=bench_trace.seeds, default=range(10), metavar="A:B", help="of every family (default 0:10)")
     making.add_argument("--jobs", type=int, default=1, help="processes (default 1)")
     making.add_argument("--measured", metavar="FOLDER", help="the measured recordings in FOLDER instead ('': of $S2R_DATA)")
@@ -264,7 +269,7 @@ def main(argv: list[str] | None = None) -> int:
             parser.error(f"{folder} holds none of the measured recordings")
         record(args.file, (of_measured(n, folder) for n in names if ("measured", n) not in has))
     else:
-        tasks = [t for t in bench_trace.tasks(args.family or FAMILIES, args.seeds) if (t[0], str(t[1])) not in has]
+        tasks = [t for t in bench_trace.tasks(bench_trace.ungrouped(args.family), args.seeds) if (t[0], str(t[1])) not in has]
         record(args.file, (compact(r) for r in bench_trace.run_all(tasks, args.jobs, None)))
     return 0
 
