@@ -91,7 +91,7 @@ def test_files_are_compared_set_by_set_with_their_time(tmp_path):
     new.write_bytes(gzip.compress("".join(json.dumps(r) + "\n" for r in changed).encode()))
     code, text = compared(old, new)
     assert code == 0
-    assert "2 sets in both, 1 in the old file only, 1 in the new one only\n1 answers differ" in text
+    assert "2 sets in both, 1 in the old file only, 1 in the new one only\n1 of 2 answers differ" in text
     assert "ratio 2.000" in text
     assert "one:2  right right traced  ->  wrong wrong traced" in text
     assert compared(old, new, "--identical")[0] == 1
@@ -149,3 +149,13 @@ def test_an_unopened_set_is_counted_and_never_shown(tmp_path):
 def test_families_that_are_named_are_recorded_at_every_seed():
     assert bench_trace.tasks(bench_trace.ungrouped(["unopened"]), range(1, 2))[0] == (bench_trace.GROUPS["unopened"][0], 1)
     assert {family for family, _ in bench_trace.tasks([], range(1, 2))}.isdisjoint(bench_trace.GROUPS["unopened"])
+
+
+def test_the_records_of_the_first_version_can_be_compared():
+    path = TOOL.parent.parent / "tests" / "records" / "tracer_1.jsonl.gz"
+    records = read(path)
+    assert len(records) > 600
+    assert path.stat().st_size < 1_000_000
+    assert {"measured", *bench_trace.FAMILIES} == {family for family, _ in records}
+    _, worse, differ = trace_records.compare(records, records, changed=True)
+    assert (worse, differ) == (False, 0)

@@ -3,6 +3,7 @@
     tools/trace_records.py record FILE [--family F]... [--seeds A:B] [--jobs J] [--measured FOLDER]
     tools/trace_records.py compare OLD NEW [--identical] [--changed]
 
+tests/records holds what version 1 of the tracer answered; a record without a digest is compared by its numbers only.
 `record` appends one JSON line a set to FILE as it is done, seed by seed over all families, and skips what FILE has: a run that was
 stopped goes on where it was. --measured: only the measured recordings in FOLDER (default with an empty FOLDER: $S2R_DATA).
 `compare` takes the sets that both files have (plain or .gz). Of each property it counts the sets that have it in one file only and tests
@@ -209,9 +210,10 @@ def compare(old: dict[Key, Record], new: dict[Key, Record], *, changed: bool) ->
     """The lines of the report; whether it got worse; how many answers differ."""
     keys = [k for k in old if k in new]
     pairs = [(old[k], new[k]) for k in keys]
-    differ = [(a, b) for a, b in pairs if a["digest"] != b["digest"]]
+    known = [(a, b) for a, b in pairs if a["digest"] and b["digest"]]
+    differ = [(a, b) for a, b in known if a["digest"] != b["digest"]]
     lines = [f"{len(pairs)} sets in both, {len(old) - len(keys)} in the old file only, {len(new) - len(keys)} in the new one only"]
-    lines.append(f"{len(differ)} answers differ")
+    lines.append(f"{len(differ)} of {len(known)} answers differ")
     worse = False
     for name, family, counts, is_bad in verdict_of(pairs):
         worse |= is_bad
@@ -222,7 +224,8 @@ def compare(old: dict[Key, Record], new: dict[Key, Record], *, changed: bool) ->
     spent = [sum(r["cpu_s"] for r in side) for side in zip(*pairs, strict=True)] if pairs else [0.0, 0.0]
     ratio = f", ratio {spent[1] / spent[0]:.3f}" if spent[0] else ""
     lines.append(f"CPU s {spent[0]:.1f} -> {spent[1]:.1f}{ratio}")
-    shown = [(a, b) for a, b in differ if changed or (a["judgement"], a["outcome"]) != (b["judgement"], b["outcome"]) or not a["judgement"]]
+    otherwise = [(a, b) for a, b in pairs if (a["judgement"], a["outcome"]) != (b["judgement"], b["outcome"])]
+    shown = differ if changed else [*otherwise, *((a, b) for a, b in differ if not a["judgement"])]
     lines += [f"{a['family']}:{a['seed']}  {_said(a)}  ->  {_said(b)}" for a, b in shown if a["family"] not in UNOPENED]
     return lines, worse, len(differ)
 
