@@ -226,7 +226,7 @@ def test_parts_of_a_log_are_one_recording(tmp_path):
     data = load_dataset(paths, _model())
     assert [len(run.y) for run in data.runs] == [80]
     assert data.substeps == 1
-    assert [digest.partition(":")[0] for digest in data.digests] == ["sha256", "sha256", "rows"]
+    assert [digest.partition(":")[0] for digest in data.digests] == ["sha256", "sha256", "rows2"]
 
 
 def test_steps_know_which_of_them_share_a_measurement():
