@@ -130,6 +130,8 @@ def test_a_digest_is_of_the_answer_and_of_the_model_only(tmp_path):
     same = bench_trace.digest(answer, spec, tmp_path)
     moved = {**answer, "tracer": 2, "notes": ["read from /one.csv"]}
     assert same == bench_trace.digest(moved, msgspec.structs.replace(spec, fitted_on=("sha256:b",)), Path("/nowhere"))
+    here, there = (msgspec.structs.replace(spec, name=f"{folder}/boat.py") for folder in ("/a", "/b/c"))
+    assert bench_trace.digest(answer, here, tmp_path) == bench_trace.digest(answer, there, tmp_path)
     assert same != bench_trace.digest({**answer, "verdict": "ambiguous"}, spec, tmp_path)
     assert same != bench_trace.digest(answer, msgspec.structs.replace(spec, effects=()), tmp_path)
 

@@ -119,7 +119,8 @@ def _answer(given: TraceSet, path: Path) -> Record:
 
 def digest(answer: dict[str, Any], spec: Any, folder: Path) -> str:
     """Of a whole answer, as `s2r trace --json` prints it, and of the model that it made, whatever the tracer's version and the folder."""
-    model = msgspec.structs.replace(spec, fitted_on=())  # it says how rows are counted, which is no part of an answer
+    # how rows are counted, and in which folder a model's file is, are no part of an answer
+    model = msgspec.structs.replace(spec, name=Path(spec.name).name, fitted_on=())
     said = {key: value for key, value in answer.items() if key != "tracer"}
     return _digest(json.dumps([said, model.digest()], sort_keys=True).replace(str(folder), ""))
 
