@@ -79,6 +79,10 @@ class _Unpacked(io.RawIOBase):
         """It is."""
         return True
 
+    def tell(self) -> int:
+        """Bytes of content read so far."""
+        return self._unpacked
+
     def readinto(self, buffer: Any) -> int:
         """As of any file."""
         n = int(self._source.readinto(buffer))

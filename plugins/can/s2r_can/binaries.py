@@ -13,11 +13,12 @@ import zlib
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import IO, BinaryIO, cast
+from typing import IO
 
 from s2r_can.records import LogFrame, frame_of
 from s2r_can.tally import Tally
 from s2r_runtime.errors import RecordingError, one_line
+from s2r_runtime.formats.sizes import content_of
 
 CONTAINER_MAX = 32 << 20
 """Bytes of a BLF container, unpacked: Vector's tools and python-can write 128 KiB."""
@@ -28,15 +29,15 @@ _FRAMES = (1, 73, 86, 100, 101)
 """Object types that python-can reads: CAN_MESSAGE, CAN_ERROR_EXT, CAN_MESSAGE2, CAN_FD_MESSAGE, CAN_FD_MESSAGE_64."""
 
 
-def blf(path: Path, file: IO[bytes], tally: Tally) -> Iterator[LogFrame]:
+def blf(path: Path, tally: Tally) -> Iterator[LogFrame]:
     """A BLF's frames. One that was cut is read up to there. Raises RecordingError."""
     import can
 
-    whole = _looked_through(path, file, tally)
-    file.seek(0)
+    with content_of(path) as file:
+        whole = _looked_through(path, file, tally)
     try:
-        with _quiet():
-            for message in can.BLFReader(cast(BinaryIO, file)):
+        with _quiet(), content_of(path) as file:
+            for message in can.BLFReader(file):
                 frame = frame_of(message, message.timestamp)
                 tally.frames += frame is not None
                 if frame is None:

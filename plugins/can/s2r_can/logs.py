@@ -30,13 +30,11 @@ def read_frames(path: Path, tally: Tally | None = None) -> Iterator[LogFrame]:
     tally = Tally() if tally is None else tally
     try:
         kind = kind_of(head_of(path), suffix_of(path))
-        if kind == SQLITE:
-            yield from binaries.sqlite(path, tally)
+        if kind in {SQLITE, BLF}:
+            yield from (binaries.sqlite if kind == SQLITE else binaries.blf)(path, tally)
             return
         with content_of(path) as file:
-            if kind == BLF:
-                yield from binaries.blf(path, file, tally)
-            elif kind == CANDUMP:
+            if kind == CANDUMP:
                 yield from candump.frames(path, _lines(file), tally)
             elif kind == SAVVYCAN:
                 yield from savvycan.frames(path, _lines(file), tally)
