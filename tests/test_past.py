@@ -483,6 +483,11 @@ def test_an_edited_campaign_does_not_go_on(rig: Rig, edit: str) -> None:
     persistence.replace(file, persistence.seal("campaign", content))
     rig.start()
     answer = rig.sample()
-    says = {"added": f"has {count + 3} samples of epoch 1, its logs have", "skipped": f"has {count} samples and goes on at {count + 3}"}
-    assert (answer["exit_code"] != 0, says[edit] in answer["text"]) == (True, True), answer
+    says = {
+        # a daemon that ends may have logged more than it stored: then an added sample stands where the log has another one
+        "added": (f"has {count + 3} samples of epoch 1, its logs have", "of epoch 1 is not the one that was logged"),
+        "skipped": (f"has {count} samples and goes on at {count + 3}",),
+    }
+    assert answer["exit_code"] != 0
+    assert any(text in answer["text"] for text in says[edit]), answer["text"]
     assert rig.status()["gate"] != "open"
