@@ -107,7 +107,7 @@ class TraceJob(msgspec.Struct, frozen=True, tag="trace"):
     base: str = ""
     cpu_s: float = 0.0
     row_sketch: str = COMPACT
-    """Whether the model remembers the rows that it was fitted on; an audit of a log from before does not ask for it."""
+    """In which form the model remembers the rows that it was fitted on; empty: not, as in an audit of a log from before."""
 
 
 class InputsJob(msgspec.Struct, frozen=True, tag="inputs"):
