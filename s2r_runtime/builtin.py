@@ -78,10 +78,10 @@ def s2r_tasks() -> list[Offer]:
 def s2r_formats() -> list[Offer]:
     """Formats whose readers need no robot's protocol; their libraries are in the extra `formats`."""
     return [
-        Offer("ulog", "s2r_runtime.formats.ulog:ULogFile", "PX4 ULog, by pyulog"),
-        Offer("mdf", "s2r_runtime.formats.mdf:open_mdf", "MF4 and MDF measurement files, by asammdf"),
-        Offer("parquet", "s2r_runtime.formats.parquet:open_parquet", "Parquet files and LeRobot data sets, by pyarrow"),
-        Offer("matlab", "s2r_runtime.formats.matlab:open_matlab", "MATLAB files up to version 7, by scipy"),
+        Offer("ulog", "s2r_runtime.recordings.formats.ulog:ULogFile", "PX4 ULog, by pyulog"),
+        Offer("mdf", "s2r_runtime.recordings.formats.mdf:open_mdf", "MF4 and MDF measurement files, by asammdf"),
+        Offer("parquet", "s2r_runtime.recordings.formats.parquet:open_parquet", "Parquet files and LeRobot data sets, by pyarrow"),
+        Offer("matlab", "s2r_runtime.recordings.formats.matlab:open_matlab", "MATLAB files up to version 7, by scipy"),
     ]
 
 

@@ -10,10 +10,12 @@ from pathlib import Path
 
 import msgspec
 
-from s2r_runtime.canonical import digest_of
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.toml_text import load_toml
+from s2r_runtime.files.canonical import digest_of
+from s2r_runtime.files.toml_text import load_toml, parse_toml
 
+TIME, SEGMENT = "t", "segment"
+"""Columns of a table that no state and no input may be named like: the stamps, and the number of the run."""
 PREFIX = "rows:"
 """A sketch of rows stands among `ModelSpec.fitted_on` with this before it: 40 bits a hash, as earlier versions wrote it (`seen_rows`)."""
 COMPACT = "rows2:"
@@ -118,3 +120,18 @@ def _toml(value: object) -> str:
     if isinstance(value, list | tuple):
         return "[" + ", ".join(_toml(item) for item in value) + "]"
     return msgspec.json.encode(value).decode()
+
+
+def parse_model(text: str, base: str, where: str) -> ModelSpec:
+    """A model from the text of a TOML; a Python file in it is looked up from `base`. Raises ConfigError."""
+    table = parse_toml(text, where)
+    if "model" not in table:
+        raise ConfigError(f"{where}: has no [model] table")
+    try:
+        spec = msgspec.convert(table["model"], ModelSpec)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{where}: model: {error}") from None
+    if spec.name.endswith(".py"):
+        path = Path(base) / spec.name
+        spec = msgspec.structs.replace(spec, name=str(path.resolve()))
+    return spec

@@ -11,18 +11,20 @@ import pytest
 from scipy.signal import lfilter
 from scipy.special import erf
 
-from s2r_runtime import blocked, certificate, statements
-from s2r_runtime.bounds import clopper_pearson_lower, sample_size
-from s2r_runtime.canonical import digest_of_all, digest_of_path
 from s2r_runtime.cli.evidence import gap_of, load_recordings
 from s2r_runtime.core import ledger
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
-from s2r_runtime.gap import Drive, Transitions, estimate_gap
-from s2r_runtime.gap import blocked as in_blocks
+from s2r_runtime.evidence import blocked, statements
+from s2r_runtime.evidence.bounds import clopper_pearson_lower, sample_size
+from s2r_runtime.evidence.gap import blocked as in_blocks
+from s2r_runtime.evidence.gap import estimate_gap
+from s2r_runtime.files.canonical import digest_of_all, digest_of_path
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Driving, Profile, load_profile, parse_profile
-from s2r_runtime.transitions import load_transitions
+from s2r_runtime.recordings.loading import load_transitions
+from s2r_runtime.recordings.transitions import Drive, Transitions
+from s2r_runtime.trust import certificate
 
 DT = 0.1
 SETTINGS = {"epsilon": 0.05, "share": 0.0152, "discard": 0}

@@ -10,7 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from s2r_runtime.bounds import (
+from s2r_runtime.core import ledger, stream
+from s2r_runtime.errors import UsageError
+from s2r_runtime.evidence.bounds import (
     anytime_discards,
     anytime_evidence,
     anytime_sample_size,
@@ -23,8 +25,6 @@ from s2r_runtime.bounds import (
     scenario_confidence,
     split,
 )
-from s2r_runtime.core import ledger, stream
-from s2r_runtime.errors import UsageError
 
 SIZES = (1, 2, 7, 50, 99, 299)
 EPSILONS = (Fraction(1, 1000), Fraction(1, 200), Fraction(1, 100), Fraction(3, 100), Fraction(1, 4), Fraction(9, 10))

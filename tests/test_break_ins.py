@@ -16,10 +16,10 @@ import msgspec
 import pytest
 from daemon_rig import Rig, made_up_certificate
 
-from s2r_runtime import certificate, keys, revocations
 from s2r_runtime.controllers.file import load
-from s2r_runtime.daemon import persistence
+from s2r_runtime.files import durable
 from s2r_runtime.messages import Memory, Revoked, Tries
+from s2r_runtime.trust import certificate, keys, revocations
 
 RECKLESS = "    return np.tile([0.2, 0.0], (len(x), 1))\n"
 PAST_S = 1_700_000_000.0
@@ -178,13 +178,11 @@ def forged(rig: Rig, controller: Path, key: Path, verified: float = 0.02, *, tri
     """
     text = made_up_certificate(rig.profile, key, controller, radius=0.01, verified=verified, epoch=1, tries=tries).encode()
     one = certificate.load(text, [keys.load_public(key.with_suffix(".pub"))])
-    memory = persistence.unseal((rig.state / "state.json").read_bytes(), "state", Memory, "state")
+    memory = durable.unseal((rig.state / "state.json").read_bytes(), "state", Memory, "state")
     facts = certificate.facts(one)
     facts = msgspec.structs.replace(facts, fixed_seed=facts.fixed_seed and told)
-    persistence.replace(
-        rig.state / "state.json", persistence.seal("state", msgspec.structs.replace(memory, certificates=(facts,), gap=one.gap))
-    )
-    persistence.replace(rig.state / "certificates" / f"{facts.id.removeprefix('sha256:')}.json", text)
+    durable.replace(rig.state / "state.json", durable.seal("state", msgspec.structs.replace(memory, certificates=(facts,), gap=one.gap)))
+    durable.replace(rig.state / "certificates" / f"{facts.id.removeprefix('sha256:')}.json", text)
     return facts.id
 
 
@@ -225,17 +223,17 @@ def test_a_state_that_somebody_wrote_carries_no_certificate_that_nobody_signed(r
     rig.stop()
 
     honest = forged(rig, good, rig.state / "key.pem", 0.025)  # the certificate is real; the state claims that it reaches farther
-    memory: Any = persistence.unseal((rig.state / "state.json").read_bytes(), "state", Memory, "state")
+    memory: Any = durable.unseal((rig.state / "state.json").read_bytes(), "state", Memory, "state")
     wider = msgspec.structs.replace(memory.certificates[0], verified_radius=9.0, controller_digest=load(reckless).digest)
-    persistence.replace(rig.state / "state.json", persistence.seal("state", msgspec.structs.replace(memory, certificates=(wider,))))
+    durable.replace(rig.state / "state.json", durable.seal("state", msgspec.structs.replace(memory, certificates=(wider,))))
     rig.start()
     assert "says something else than the robot's state" in rig.status()["revoked"][honest]
     rig.stop()
     told = json.loads(rig.s2r("audit", *map(str, rig.log_files()), "--json").stdout)
     assert not any(one["valid"] for one in told["certificates"] if one["id"] in {identity, honest})
 
-    memory = persistence.unseal((rig.state / "state.json").read_bytes(), "state", Memory, "state")
-    persistence.replace(rig.state / "state.json", persistence.seal("state", msgspec.structs.replace(memory, revoked={})))
+    memory = durable.unseal((rig.state / "state.json").read_bytes(), "state", Memory, "state")
+    durable.replace(rig.state / "state.json", durable.seal("state", msgspec.structs.replace(memory, revoked={})))
     before, rig.logs = rig.log_files(), rig.folder / "where no log tells"
     time.sleep(1.0)  # a run is named by its second, and made another name of in its own folder only
     rig.start()

@@ -13,11 +13,12 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from s2r_runtime import certificate, keys, statements
 from s2r_runtime.core.ledger import binomial_tail, sample_size
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, S2RError
+from s2r_runtime.evidence import statements
+from s2r_runtime.evidence.trials import Found, Run, trials
 from s2r_runtime.messages import Tries
-from s2r_runtime.trials import Found, Run, trials
+from s2r_runtime.trust import certificate, keys
 
 OTHER = Ed25519PrivateKey.from_private_bytes(bytes(32))
 

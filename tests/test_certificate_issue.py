@@ -12,13 +12,14 @@ import msgspec
 import pytest
 from certificate_rig import KEY, NOW, PROFILE, PUBLIC, Evidence, evidence, law
 
-from s2r_runtime import certificate, keys, statements
-from s2r_runtime.canonical import canonical
-from s2r_runtime.certificate import Certificate
 from s2r_runtime.core.ledger import binomial_tail, campaign_size, sample_size, share
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
+from s2r_runtime.evidence import statements
+from s2r_runtime.files.canonical import canonical
 from s2r_runtime.messages import Trials
 from s2r_runtime.profile import parse_profile
+from s2r_runtime.trust import certificate, keys
+from s2r_runtime.trust.certificate import Certificate
 
 replace = msgspec.structs.replace
 SLACK = 1.0 + 1e-9

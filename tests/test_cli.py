@@ -20,9 +20,9 @@ from command_reference import verbs
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import writable
 from s2r_runtime.cli.main import main, parser
-from s2r_runtime.daemon import persistence
 from s2r_runtime.errors import UsageError
-from s2r_runtime.offline_ledger import open_ledger
+from s2r_runtime.files import durable
+from s2r_runtime.trust.offline_ledger import open_ledger
 
 ROOT = Path(__file__).parent.parent
 PROFILE = ROOT / "profiles" / "robotarium.toml"
@@ -361,7 +361,7 @@ def test_a_certificate_that_cannot_be_written_tells_what_the_spent_attempt_showe
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(persistence, "replace", full)
+    monkeypatch.setattr(durable, "replace", full)
     given = ("certify", ROOT / "controllers" / "grid.py", "--profile", PROFILE, "--recording", campaign, "--key", key)
     assert main([*map(str, given), "-o", str(tmp_path / "a.cert"), "--json"]) == 2
     told = capsys.readouterr()

@@ -8,9 +8,9 @@ import math
 import pytest
 
 from s2r_runtime.cli.main import main
-from s2r_runtime.column_names import places, told
 from s2r_runtime.errors import RecordingError
-from s2r_runtime.tables import read_csv
+from s2r_runtime.recordings.column_names import places, told
+from s2r_runtime.recordings.tables import read_csv
 
 UNICYCLE = ("t", "x", "y", "theta", "v", "w")
 

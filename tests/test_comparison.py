@@ -12,8 +12,8 @@ from collections.abc import Callable
 import msgspec
 import pytest
 
-from s2r_runtime.comparison import ATTEMPTS, JITTER_PERIODS, Campaign, CampaignStep
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.evidence.comparison import ATTEMPTS, JITTER_PERIODS, Campaign, CampaignStep
 from s2r_runtime.messages import GRID, RULES, Observation, SampleTaken
 from s2r_runtime.profile import Sampling
 
@@ -453,7 +453,7 @@ def test_model_without_a_way_to_a_waypoint_is_refused() -> None:
 
 
 def test_the_daemons_process_gets_no_numpy_from_the_campaign() -> None:
-    code = "import sys, s2r_runtime.comparison; sys.exit('numpy' in sys.modules)"
+    code = "import sys, s2r_runtime.evidence.comparison; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from daemon_rig import Rig
 
+from s2r_runtime.controllers.processor import family, used
 from s2r_runtime.daemon import computer
 from s2r_runtime.daemon.computer import Ability, measure, not_held
-from s2r_runtime.processor import family, used
 from s2r_runtime.profile import Gate, Machine, Recording
 
 GOOD = Ability(0.001, 100, 0.01, 10, 1.0)

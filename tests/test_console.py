@@ -14,9 +14,9 @@ from daemon_rig import Rig
 
 from s2r_runtime import gate
 from s2r_runtime import messages as m
+from s2r_runtime.core.reasons import WORDS, in_words
 from s2r_runtime.core.state import State
 from s2r_runtime.daemon.console import REPEAT_NS, Console
-from s2r_runtime.reasons import WORDS, in_words
 
 
 @pytest.fixture

@@ -139,7 +139,6 @@ def test_a_library_that_may_be_missing_is_part_of_the_digest(tmp_path: Path) -> 
 
 
 def test_the_daemon_loads_controllers_without_numpy() -> None:
-    code = (
-        "import sys, s2r_runtime.controllers.hosted, s2r_runtime.certificate, s2r_runtime.daemon.persistence; print('numpy' in sys.modules)"
-    )
+    loaded = "s2r_runtime.controllers.hosted, s2r_runtime.trust.certificate, s2r_runtime.daemon.persistence"
+    code = f"import sys, {loaded}; print('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "False"

@@ -11,18 +11,19 @@ import msgspec
 import numpy as np
 import pytest
 
-from s2r_runtime.bounds import attempt_beta, clopper_pearson_upper, epoch_beta, sample_size
 from s2r_runtime.controllers.hosted import batch_control, load
-from s2r_runtime.gap import Transitions, estimate_gap
+from s2r_runtime.evidence.bounds import attempt_beta, clopper_pearson_upper, epoch_beta, sample_size
+from s2r_runtime.evidence.gap import estimate_gap
+from s2r_runtime.evidence.uncertain import GapSet, roll_out
+from s2r_runtime.evidence.verify import seed_for, verify
 from s2r_runtime.messages import Gap, Verification
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.modelspec import EffectSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import load_profile
+from s2r_runtime.recordings.transitions import Transitions
 from s2r_runtime.tasks.grid_world import GridWorld
 from s2r_runtime.tasks.keep_out import KeepOut
-from s2r_runtime.uncertain import GapSet, roll_out
-from s2r_runtime.verify import seed_for, verify
 
 ROOT = Path(__file__).parent.parent
 PROFILE = load_profile(ROOT / "profiles" / "robotarium.toml")

@@ -9,8 +9,8 @@ import msgspec
 import pytest
 from core_rig import GAP, SETTINGS, Rig, S, answers, kinds, lockstep, memory, of, one
 
-from s2r_runtime import bounds
 from s2r_runtime.core import reducer as core
+from s2r_runtime.evidence import bounds
 from s2r_runtime.messages import (
     MEMORY_SCHEMA,
     Answer,

@@ -10,10 +10,10 @@ import msgspec
 import pytest
 from core_rig import GAP, Rig, answers, kinds, memory, of, one
 
-from s2r_runtime import bounds
 from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
 from s2r_runtime.core.state import unix_now
+from s2r_runtime.evidence import bounds
 from s2r_runtime.messages import (
     FIXED_SEEDS,
     SEEDS,

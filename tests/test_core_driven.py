@@ -13,10 +13,10 @@ import pytest
 from core_rig import Rig, answers, of
 from daemon_rig import Rig as DaemonRig
 
-from s2r_runtime.bounds import anytime_evidence, clopper_pearson_lower
 from s2r_runtime.core import driven, stream
 from s2r_runtime.core import reducer as core
 from s2r_runtime.core.stream import BINS, bin_of
+from s2r_runtime.evidence.bounds import anytime_evidence, clopper_pearson_lower
 from s2r_runtime.messages import REFUSED_FIRST, AttemptSpent, Measured, Persist, StartController, StartJob
 
 

@@ -12,6 +12,7 @@ from report_rig import Answered
 from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
 from s2r_runtime.core.gaps import GOOD_REFUSED
+from s2r_runtime.evidence.whiteness import SERIAL_ALPHA
 from s2r_runtime.messages import (
     REPEATED,
     RULES,
@@ -24,7 +25,6 @@ from s2r_runtime.messages import (
     StartCampaign,
     StartJob,
 )
-from s2r_runtime.whiteness import SERIAL_ALPHA
 
 WHY = f"{SERIAL} (p = 0.002)"
 

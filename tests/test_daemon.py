@@ -17,6 +17,8 @@ import pytest
 from daemon_rig import Rig
 
 from s2r_runtime.daemon import control, door
+from s2r_runtime.evidence.seen_rows import sketch, united
+from s2r_runtime.files.toml_text import TEXT_MAX
 from s2r_runtime.messages import (
     LinkChanged,
     Observed,
@@ -26,8 +28,6 @@ from s2r_runtime.messages import (
 from s2r_runtime.modelspec import EffectSpec, dump_model, load_model
 from s2r_runtime.profile import load_profile
 from s2r_runtime.recording.reading import read
-from s2r_runtime.seen_rows import sketch, united
-from s2r_runtime.toml_text import TEXT_MAX
 
 
 @pytest.fixture

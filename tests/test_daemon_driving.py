@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from daemon_rig import Rig, made_up_certificate
 
-from s2r_runtime import keys
 from s2r_runtime.messages import AnalyticsChanged, Decided, GateChanged, Measured, Revoked, Send, SourceStopped
+from s2r_runtime.trust import keys
 
 
 @pytest.fixture

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from s2r_runtime.evidence.uncertain import GapSet, roll_out
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.tasks.keep_out import KeepOut
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.estimation.prediction import acting, residual, state_jacobian, steps_of
 from s2r_runtime.trace.pipeline import trace
-from s2r_runtime.uncertain import GapSet, roll_out
 
 ARC = ("integration_scheme", "*", {"scheme": "exact"})
 DT = 0.05

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from effects_rig import VALUES
 
+from s2r_runtime.evidence.uncertain import GapSet, roll_out
+from s2r_runtime.evidence.verify import verify
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.tasks.keep_out import KeepOut
-from s2r_runtime.uncertain import GapSet, roll_out
-from s2r_runtime.verify import verify
 
 DT = 0.1
 GAP = GapSet("ball", (1.0, 1.0, 0.05), 1e-9)

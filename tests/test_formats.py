@@ -15,15 +15,15 @@ from foreign_files import DT, Drive
 
 from s2r_runtime.cli.main import main
 from s2r_runtime.errors import RecordingError, S2RError, UsageError
-from s2r_runtime.formats import isolated
-from s2r_runtime.formats.guess import guessed
-from s2r_runtime.formats.recognise import open_recording, recognised
-from s2r_runtime.formats.series import Topic
-from s2r_runtime.formats.signals import resolve
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.recordings.formats import isolated
+from s2r_runtime.recordings.formats.guess import guessed
+from s2r_runtime.recordings.formats.recognise import open_recording, recognised
+from s2r_runtime.recordings.formats.series import Topic
+from s2r_runtime.recordings.formats.signals import resolve
+from s2r_runtime.recordings.loading import load_transitions
 from s2r_runtime.trace.data.readers import load_dataset
-from s2r_runtime.transitions import load_transitions
 
 MODEL = compose(ModelSpec("unicycle", DT))
 UNICYCLE = ["--model", "unicycle", "--dt", str(DT)]
@@ -168,7 +168,7 @@ def test_several_recordings_are_runs_of_their_own(tmp_path: Path, capsys: pytest
     assert main(["trace", *map(str, paths), *UNICYCLE]) == 0
     capsys.readouterr()
     fitted = compose(ModelSpec("unicycle", DT, fitted_on=(load_transitions(paths[1], MODEL).content_digest,)))
-    from s2r_runtime.gap import refuse_fitted
+    from s2r_runtime.evidence.gap import refuse_fitted
 
     with pytest.raises(S2RError, match="was fitted on this recording"):
         refuse_fitted(fitted, found)

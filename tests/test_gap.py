@@ -10,13 +10,23 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from s2r_runtime.bounds import clopper_pearson_lower, clopper_pearson_upper, sample_size, scenario_confidence
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, UsageError
-from s2r_runtime.gap import Drive, Transitions, blocked, discrepancy, doubted, estimate_gap, gap_json, noise_share, residuals, statement
+from s2r_runtime.evidence.bounds import clopper_pearson_lower, clopper_pearson_upper, sample_size, scenario_confidence
+from s2r_runtime.evidence.gap import (
+    blocked,
+    discrepancy,
+    doubted,
+    estimate_gap,
+    gap_json,
+    noise_share,
+    residuals,
+    statement,
+)
+from s2r_runtime.evidence.whiteness import SERIAL_ALPHA, serial_p, whiteness
 from s2r_runtime.messages import SERIAL
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.whiteness import SERIAL_ALPHA, serial_p, whiteness
+from s2r_runtime.recordings.transitions import Drive, Transitions
 
 DT = 0.1
 UNICYCLE = compose(ModelSpec("unicycle", DT))

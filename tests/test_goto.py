@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from s2r_runtime.core.goto import Gains, distance, go_to, supported
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.goto import Gains, distance, go_to, supported
 
 DT = 0.033
 BOUNDS = ((-0.2, 0.2), (-math.pi, math.pi))

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from s2r_runtime.audit.evidence import _radii_problem
-from s2r_runtime.bounds import clopper_pearson_lower, clopper_pearson_upper, sample_size
+from s2r_runtime.core.headroom import STEPS, follows, grid, search
 from s2r_runtime.errors import NotEnoughEvidence
-from s2r_runtime.headroom import STEPS, follows, grid, search
+from s2r_runtime.evidence.bounds import clopper_pearson_lower, clopper_pearson_upper, sample_size
+from s2r_runtime.evidence.statements import confidence
+from s2r_runtime.evidence.uncertain import GapSet, roll_out
+from s2r_runtime.evidence.verify import statement, verify
 from s2r_runtime.messages import RadiusTried, StartJob, Verification
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.statements import confidence
 from s2r_runtime.tasks.stl_task import StlTask
-from s2r_runtime.uncertain import GapSet, roll_out
-from s2r_runtime.verify import statement, verify
 
 MODEL = compose(ModelSpec("double_integrator", 0.1))
 TASK = StlTask(

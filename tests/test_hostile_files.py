@@ -20,13 +20,13 @@ import pytest
 import zstandard
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from s2r_runtime import limits
-from s2r_runtime.bounded_file import read_bounded
 from s2r_runtime.errors import ConfigError, RecordingError
-from s2r_runtime.formats.sizes import check_size, check_values, content_of
+from s2r_runtime.files import limits
+from s2r_runtime.files.bounded_file import read_bounded
+from s2r_runtime.files.toml_text import load_toml
 from s2r_runtime.recording.layout import MAGIC, RECORD
 from s2r_runtime.recording.start import FIRST, make_start
-from s2r_runtime.toml_text import load_toml
+from s2r_runtime.recordings.formats.sizes import check_size, check_values, content_of
 
 ROOT = Path(__file__).parent.parent
 PROFILE, GRID = ROOT / "profiles" / "robotarium.toml", ROOT / "controllers" / "grid.py"
@@ -180,7 +180,7 @@ def packed(kind: str, path: Path) -> Path:
 READER = """
 import sys
 from pathlib import Path
-from s2r_runtime.formats import isolated
+from s2r_runtime.recordings.formats import isolated
 
 header, _ = isolated._answer({"reader": sys.argv[1], "path": sys.argv[2], "name": "it", "options": {}, "wanted": None}, {})
 print(header.get("error"))

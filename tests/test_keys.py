@@ -13,10 +13,10 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed448 import Ed448PrivateKey
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from s2r_runtime import keys, offline_ledger, revocations
 from s2r_runtime.cli.main import main
-from s2r_runtime.daemon import persistence
 from s2r_runtime.errors import ConfigError, UsageError
+from s2r_runtime.files import durable
+from s2r_runtime.trust import keys, offline_ledger, revocations
 
 
 def test_a_new_pair_signs_and_its_public_half_checks(tmp_path: Path) -> None:
@@ -114,9 +114,8 @@ def test_the_default_place_follows_the_user_and_not_a_relative_setting(monkeypat
 
 
 def test_a_key_is_private_from_its_first_byte_under_any_umask(tmp_path: Path) -> None:
-    code = (
-        f"import os; os.umask(0); from pathlib import Path; from s2r_runtime import keys; keys.new(Path({str(tmp_path / 'd' / 'k.key')!r}))"
-    )
+    new = f"keys.new(Path({str(tmp_path / 'd' / 'k.key')!r}))"
+    code = f"import os; os.umask(0); from pathlib import Path; from s2r_runtime.trust import keys; {new}"
     subprocess.run([sys.executable, "-c", code], check=True)
     assert (tmp_path / "d" / "k.key").stat().st_mode & 0o777 == 0o600
     assert (tmp_path / "d").stat().st_mode & 0o777 == 0o700
@@ -241,8 +240,8 @@ def test_a_list_that_cannot_be_read_is_no_empty_list(pair: Path, what: str) -> N
             {
                 "cut": data[:-5],
                 "flipped": data.replace(b"ed25519:0", b"ed25519:1"),
-                "another kind": persistence.seal("ledger", {"schema": 1, "revoked": []}),
-                "newer": persistence.seal("revocations", {"schema": 2, "revoked": []}),
+                "another kind": durable.seal("ledger", {"schema": 1, "revoked": []}),
+                "newer": durable.seal("revocations", {"schema": 2, "revoked": []}),
             }[what]
         )
     with pytest.raises(ConfigError, match=r"revoked\.json: (is damaged|has schema 2|is a symlink)"):
@@ -271,7 +270,7 @@ def test_what_is_no_fingerprint_is_refused(pair: Path) -> None:
 def test_two_that_revoke_at_once_lose_neither(pair: Path) -> None:
     path = pair.parent / revocations.NAME
     code = (
-        f"import sys; from pathlib import Path; from s2r_runtime import revocations\n"
+        f"import sys; from pathlib import Path; from s2r_runtime.trust import revocations\n"
         f"for i in range(10): revocations.revoke(Path({str(path)!r}), f'ed25519:{{i:x}}' + sys.argv[1] * 31, '')"
     )
     both = [subprocess.Popen([sys.executable, "-c", code, digit]) for digit in "ab"]

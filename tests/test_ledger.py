@@ -7,8 +7,8 @@ import random
 
 import pytest
 
-from s2r_runtime import bounds
 from s2r_runtime.core import ledger
+from s2r_runtime.evidence import bounds
 
 
 def test_shares_are_those_of_the_bounds_and_never_sum_to_more_than_the_budget() -> None:

@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from s2r_runtime.canonical import digest
 from s2r_runtime.errors import RecordingError
+from s2r_runtime.files.canonical import digest
+from s2r_runtime.files.table_text import Limits, TextLines
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.table_rows import MAX_SEGMENT_ROWS, UNITS, RowStore
-from s2r_runtime.table_text import Limits, TextLines
-from s2r_runtime.tables import read_csv
+from s2r_runtime.recordings.loading import load_transitions
+from s2r_runtime.recordings.table_rows import MAX_SEGMENT_ROWS, UNITS, RowStore
+from s2r_runtime.recordings.tables import read_csv
 from s2r_runtime.trace.data import readers
-from s2r_runtime.transitions import load_transitions
 
 MB = 1 << 20
 MODEL = ("--model", "unicycle", "--dt", "0.1")
@@ -125,7 +125,7 @@ def test_reading_stores_eight_bytes_a_number(tmp_path: Path) -> None:
     packed = tmp_path / "run.csv.gz"
     packed.write_bytes(gzip.compress(path.read_bytes(), 1))
     script = PEAK + (
-        "import sys, numpy; from s2r_runtime.tables import read_csv; import csv, gzip, hashlib\n"
+        "import sys, numpy; from s2r_runtime.recordings.tables import read_csv; import csv, gzip, hashlib\n"
         "before = peak(); table = read_csv(sys.argv[1]); print(len(table.t), peak() - before)"
     )
     for one in (path, packed):
@@ -179,8 +179,8 @@ def test_of_an_endless_segment_the_first_rows_count() -> None:
 
 
 def test_the_gap_of_a_long_drive_says_which_rows_it_is_of(tmp_path: Path, monkeypatch, capsys) -> None:
-    from s2r_runtime import transitions
     from s2r_runtime.cli.main import main
+    from s2r_runtime.recordings import loading as transitions
 
     monkeypatch.setattr(transitions, "MAX_VALUES", 6 * 6400)
     path = table(tmp_path / "run.csv", 20_000)

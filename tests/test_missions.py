@@ -7,8 +7,8 @@ import pytest
 from bench_missions import Row, Watches, missions, naive, ten_controllers, vectorised_is_the_watch
 from missions import Life, profile_and_settings
 
-from s2r_runtime.bounds import clopper_pearson_upper
-from s2r_runtime.watch import EProcess
+from s2r_runtime.evidence.bounds import clopper_pearson_upper
+from s2r_runtime.evidence.watch import EProcess
 
 SURE = 1e-3
 MISSIONS, SAMPLES = 100, 1500

@@ -21,10 +21,10 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from s2r_runtime import seeds
 from s2r_runtime.cli.main import main
 from s2r_runtime.core import ledger
 from s2r_runtime.daemon.campaign_run import run_campaign
+from s2r_runtime.evidence import seeds
 from s2r_runtime.profile import load_profile
 
 pytest.importorskip("s2r_can")

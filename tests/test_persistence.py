@@ -13,12 +13,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from s2r_runtime import offline_ledger
 from s2r_runtime.core.ledger import share
-from s2r_runtime.daemon import persistence
 from s2r_runtime.daemon.persistence import StateFolder
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.files import durable
 from s2r_runtime.messages import MEMORY_SCHEMA, CertificateFacts, Gap, Memory
+from s2r_runtime.trust import offline_ledger
 
 GAP = Gap(0.25, 0.5, 0.75, 50, "ball", (1.0, 1.0, 0.0525), 161, 0, 0.03, 0.0152, 1, "sha256:aa", "sha256:bb", {"out_of_region": 3})
 FACTS = CertificateFacts("sha256:01", "sha256:02", "sha256:03", "sha256:04", "sha256:05", 1, 0.25, 0.375, 1000, 2000, 1)
@@ -51,7 +51,7 @@ def test_every_single_flipped_bit_in_a_state_is_refused(tmp_path: Path) -> None:
             changed = bytearray(whole)
             changed[place // 8] ^= 1 << place % 8
             with pytest.raises(ConfigError, match="damaged"):
-                persistence.unseal(bytes(changed), "state", Memory, "state.json")
+                durable.unseal(bytes(changed), "state", Memory, "state.json")
         file.write_bytes(whole[:-1] + b" ")
         with pytest.raises(ConfigError, match=r"state\.json: is damaged"):
             folder.memory()
@@ -63,7 +63,7 @@ def test_a_state_cut_anywhere_is_refused(tmp_path: Path) -> None:
         whole = (tmp_path / "state.json").read_bytes()
         for length in range(len(whole)):
             with pytest.raises(ConfigError, match="damaged"):
-                persistence.unseal(whole[:length], "state", Memory, "state.json")
+                durable.unseal(whole[:length], "state", Memory, "state.json")
 
 
 @pytest.mark.parametrize("sign", ["begun", "campaign.json", "logs/run.mcap"])
@@ -95,14 +95,14 @@ def test_state_of_another_robot_schema_or_kind_is_refused(tmp_path: Path) -> Non
         with pytest.raises(ValueError, match="memory of robot 'rover'"):
             folder.save(MEMORY)
     with StateFolder(tmp_path, "rover") as folder:
-        newer = persistence.seal("state", msgspec.structs.replace(MEMORY, schema=MEMORY_SCHEMA + 1))
+        newer = durable.seal("state", msgspec.structs.replace(MEMORY, schema=MEMORY_SCHEMA + 1))
         (tmp_path / "state.json").write_bytes(newer)
         with pytest.raises(ConfigError, match=f"has state schema {MEMORY_SCHEMA + 1}"):
             folder.memory()
         (tmp_path / "state.json").write_bytes((tmp_path / "campaign.json").read_bytes())
         with pytest.raises(ConfigError, match="damaged"):
             folder.memory()
-        (tmp_path / "state.json").write_bytes(persistence.seal("state", {"robot": "rover", "unheard_of": 1}))
+        (tmp_path / "state.json").write_bytes(durable.seal("state", {"robot": "rover", "unheard_of": 1}))
         with pytest.raises(ConfigError, match="written by another version"):
             folder.memory()
 
@@ -246,7 +246,7 @@ def test_a_damaged_or_missing_ledger_is_never_taken_for_an_empty_one(key: Path) 
     path.write_bytes(whole)
     with pytest.raises(ConfigError, match="is there already"):
         offline_ledger.create(key)
-    path.write_bytes(persistence.seal("ledger", {"schema": 2, "entries": []}))
+    path.write_bytes(durable.seal("ledger", {"schema": 2, "entries": []}))
     with pytest.raises(ConfigError, match="ledger schema 2"):
         offline_ledger.open_ledger(key, "rover")
 
@@ -254,7 +254,7 @@ def test_a_damaged_or_missing_ledger_is_never_taken_for_an_empty_one(key: Path) 
 SPENDER = """
 import sys
 from pathlib import Path
-from s2r_runtime.offline_ledger import open_ledger
+from s2r_runtime.trust.offline_ledger import open_ledger
 ledger = open_ledger(Path(sys.argv[1]), "rover")
 print(*(ledger.spend_attempt("c") for _ in range(25)))
 """

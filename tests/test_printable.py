@@ -15,7 +15,7 @@ from daemon_rig import PROFILE
 from s2r_runtime import messages as m
 from s2r_runtime.cli import output
 from s2r_runtime.cli.main import main
-from s2r_runtime.printable import printable
+from s2r_runtime.files.printable import printable
 from s2r_runtime.recording.writer import Writer
 
 CLEAR, LINK, BELL, C1, BIDI = "\x1b[2J", "\x1b]8;;http://x\x1b\\", "\x07", "\x9b31m", "\u202egpj.exe"

@@ -17,14 +17,14 @@ from quadruped_gaps import BODY, READINGS, Reading, of_more, row
 from quadruped_truth import Holds, placed, run, stops, walked
 from swaying_walker import SwayingWalker
 
-from s2r_runtime.bounds import sample_size
-from s2r_runtime.disturbance import GapSet
 from s2r_runtime.errors import NotEnoughEvidence
+from s2r_runtime.evidence.bounds import sample_size
+from s2r_runtime.evidence.disturbance import GapSet
+from s2r_runtime.evidence.uncertain import roll_out
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.profile import Profile, check_names, load_profile
 from s2r_runtime.tasks.grid_world import GridWorld
-from s2r_runtime.uncertain import roll_out
 
 ROOT = Path(__file__).parent.parent
 PROFILE, SECOND = experiment.PROFILE, load_profile(ROOT / "profiles" / "quadruped-second.toml")

@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from s2r_runtime.bounds import clopper_pearson_lower
 from s2r_runtime.errors import NotEnoughEvidence
-from s2r_runtime.gap import Transitions, blocked, doubted, estimate_gap
+from s2r_runtime.evidence.bounds import clopper_pearson_lower
+from s2r_runtime.evidence.gap import blocked, doubted, estimate_gap
+from s2r_runtime.evidence.repeats import ALPHA, repeats
 from s2r_runtime.messages import REPEATED
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.repeats import ALPHA, repeats
+from s2r_runtime.recordings.transitions import Transitions
 
 MODEL = compose(ModelSpec("unicycle", 0.1))
 SETTINGS = {"epsilon": 0.01, "beta": 0.05, "weights": (1.0, 1.0, 1.0)}
@@ -124,7 +125,7 @@ def test_a_robot_that_stands_still_repeats_itself_and_counts_once(tmp_path: Path
     rows = [f"{0.1 * k!r},{0.001 * (k % 700 if k < 700 else 700)!r},0,0,{0.01 if k < 700 else 0},0" for k in range(1400)]
     path = tmp_path / "drive.csv"
     path.write_text("\n".join(["t,x,y,theta,v,w", *rows]))
-    from s2r_runtime.transitions import load_transitions
+    from s2r_runtime.recordings.loading import load_transitions
 
     tr = blocked(load_transitions(path, MODEL), 0.3, 0.1)
     gap = estimate_gap(MODEL, tr, epsilon=0.05, beta=0.05, weights=(1.0, 1.0, 1.0))

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 from report_rig import Answered
 
-from s2r_runtime.bounds import anytime_upper
 from s2r_runtime.core import reducer as core
+from s2r_runtime.evidence.bounds import anytime_upper
 from s2r_runtime.messages import Measured
 from s2r_runtime.report.page import Page
 from s2r_runtime.report.run_page import _watched

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from s2r_runtime import robot_logs
 from s2r_runtime.cli.main import main
 from s2r_runtime.errors import ConfigError, RecordingError, UsageError
 from s2r_runtime.hookspecs import Offer, ReadLog, hookimpl
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import Registry
-from s2r_runtime.robot_logs import content_digest, is_robot_log, is_table, read_robot_log, readers_of
+from s2r_runtime.recordings import robot_logs
+from s2r_runtime.recordings.loading import load_transitions
+from s2r_runtime.recordings.robot_logs import content_digest, is_robot_log, is_table, read_robot_log, readers_of
 from s2r_runtime.trace.data.readers import load_dataset
-from s2r_runtime.transitions import load_transitions
 
 MODEL = compose(ModelSpec("unicycle", 0.1))
 GIVEN: list[Any] = []

@@ -9,16 +9,17 @@ import msgspec
 import numpy as np
 import pytest
 
-from s2r_runtime import offline_ledger, seeds
-from s2r_runtime.bounds import attempt_beta
 from s2r_runtime.controllers.hosted import batch_control, load
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.evidence import seeds
+from s2r_runtime.evidence.bounds import attempt_beta
+from s2r_runtime.evidence.probe import behaviour
 from s2r_runtime.messages import Tries
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.offline_ledger import Ledger
-from s2r_runtime.probe import behaviour
 from s2r_runtime.tasks.keep_out import KeepOut
+from s2r_runtime.trust import offline_ledger
+from s2r_runtime.trust.offline_ledger import Ledger
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "tools"))

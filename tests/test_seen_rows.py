@@ -14,14 +14,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from s2r_runtime.bounds import clopper_pearson_lower
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
-from s2r_runtime.gap import refuse_fitted
+from s2r_runtime.evidence.bounds import clopper_pearson_lower
+from s2r_runtime.evidence.gap import refuse_fitted
+from s2r_runtime.evidence.seen_rows import ALPHA, FALSE_BITS, KEPT, TEXT_MAX, seen, sketch, united
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import COMPACT, PREFIX, ModelSpec, dump_model, form_of, load_model
-from s2r_runtime.seen_rows import ALPHA, FALSE_BITS, KEPT, TEXT_MAX, seen, sketch, united
+from s2r_runtime.recordings.loading import load_transitions
 from s2r_runtime.trace.data.readers import load_dataset
-from s2r_runtime.transitions import load_transitions
 
 DT = 0.1
 MODEL = compose(ModelSpec("unicycle", DT))

@@ -10,9 +10,9 @@ import pytest
 import stl_random
 
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.stl.robustness import Formula
-from s2r_runtime.stl.syntax import positive
-from s2r_runtime.stl.text import parse_expression
+from s2r_runtime.tasks.stl.robustness import Formula
+from s2r_runtime.tasks.stl.syntax import positive
+from s2r_runtime.tasks.stl.text import parse_expression
 
 NAMES = ("x", "y", "z")
 

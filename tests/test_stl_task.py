@@ -13,12 +13,12 @@ import pytest
 
 from s2r_runtime.controllers.hosted import batch_control, load
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
+from s2r_runtime.evidence.uncertain import GapSet, roll_out
 from s2r_runtime.models.composed import compose
 from s2r_runtime.models.unicycle import MODEL as UNICYCLE
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Profile, load_profile, parse_profile
 from s2r_runtime.tasks.stl_task import StlTask
-from s2r_runtime.uncertain import GapSet, roll_out
 
 ROOT = Path(__file__).parent.parent
 DT = 0.1

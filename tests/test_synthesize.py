@@ -16,12 +16,12 @@ from s2r_runtime.controllers.candidates import Synthesis, declared_bounds, with_
 from s2r_runtime.controllers.file import ControllerFile, load
 from s2r_runtime.controllers.hosted import batch_control
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.evidence.synthesize import BROKEN, search, search_seed
+from s2r_runtime.evidence.uncertain import GapSet
+from s2r_runtime.evidence.verify import seed_for
 from s2r_runtime.models.composed import compose
 from s2r_runtime.profile import load_profile
-from s2r_runtime.synthesize import BROKEN, search, search_seed
 from s2r_runtime.tasks.stl_task import StlTask
-from s2r_runtime.uncertain import GapSet
-from s2r_runtime.verify import seed_for
 
 PROFILE = """
 [robot]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from s2r_runtime.errors import RecordingError
-from s2r_runtime.tables import read_csv
+from s2r_runtime.recordings.tables import read_csv
 
 GOOD = "t,x,v\n0.0,1.5,\n0.1,,0.2\n0.1,1.6,\n0.3,1.7,0.1\n"
 

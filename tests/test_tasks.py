@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from s2r_runtime.bounds import clopper_pearson_lower, clopper_pearson_upper
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
+from s2r_runtime.evidence.bounds import clopper_pearson_lower, clopper_pearson_upper
 from s2r_runtime.hookspecs import Scenario, Task
 from s2r_runtime.models.joint import MODEL as JOINT
 from s2r_runtime.models.unicycle import MODEL as UNICYCLE

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from trace_robots import declared, recordings
 
-from s2r_runtime.daemon.model_store import parse_model
 from s2r_runtime.models.composed import AppliedEffect
-from s2r_runtime.modelspec import dump_model
+from s2r_runtime.modelspec import dump_model, parse_model
 from s2r_runtime.plugins import registry
 from s2r_runtime.report.trace_page import trace_page
 from s2r_runtime.trace.diagnostics.validity_domain import ALL_ROUND, BEYOND, Range, _arc, _span, domain_of, told

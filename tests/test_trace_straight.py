@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from s2r_runtime.gap import Transitions
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
+from s2r_runtime.recordings.transitions import Transitions
 from s2r_runtime.trace.data import input_hold as inputs_straight
 from s2r_runtime.trace.data.dataset import Stream, from_streams
 from s2r_runtime.trace.data.input_hold import ROUNDS, samples_of, straight

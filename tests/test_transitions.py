@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from s2r_runtime.errors import NotEnoughEvidence, RecordingError, UsageError
-from s2r_runtime.gap import blocked, estimate_gap, hold_residuals, refuse_fitted, residuals
+from s2r_runtime.evidence.gap import blocked, estimate_gap, hold_residuals, refuse_fitted, residuals
 from s2r_runtime.messages import CampaignFinished, Event, Observation, Observed, SampleTaken, Send
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.recording.writer import Writer
+from s2r_runtime.recordings.loading import from_samples, load_transitions
 from s2r_runtime.trace.data.readers import load_dataset
-from s2r_runtime.transitions import from_samples, load_transitions
 
 DT = 0.1
 MODEL = compose(ModelSpec("unicycle", DT))

@@ -15,19 +15,19 @@ from daemon_rig import Rig
 from msgspec.structs import replace
 
 from s2r_runtime import messages as m
-from s2r_runtime.bounds import clopper_pearson_upper
 from s2r_runtime.controllers.episodes import Episodes
 from s2r_runtime.controllers.file import load
 from s2r_runtime.errors import NotEnoughEvidence
+from s2r_runtime.evidence.bounds import clopper_pearson_upper
+from s2r_runtime.evidence.statements import of_trials
+from s2r_runtime.evidence.trials import Found, Run, _Deployment, _judged, _left_out, _within, read_runs, trials
 from s2r_runtime.models.composed import compose
 from s2r_runtime.models.unicycle import MODEL as UNICYCLE
 from s2r_runtime.profile import load_profile
 from s2r_runtime.recording.logs import read_all
 from s2r_runtime.recording.reading import read
 from s2r_runtime.recording.writer import Writer
-from s2r_runtime.statements import of_trials
 from s2r_runtime.tasks.stl_task import StlTask
-from s2r_runtime.trials import Found, Run, _Deployment, _judged, _left_out, _within, read_runs, trials
 
 TASK = """name = "stl"
 episodes = 6
@@ -333,7 +333,7 @@ def test_299_safe_runs_show_one_percent_at_most() -> None:
 
 def test_both_bounds_of_trials_keep_their_confidence() -> None:
     """n runs from a known law, 4000 times: misses at most beta (exact lower limit of 99.9 %)."""
-    from s2r_runtime.bounds import clopper_pearson_lower
+    from s2r_runtime.evidence.bounds import clopper_pearson_lower
 
     rng, repetitions, n, beta, p = np.random.default_rng(5), 4000, 60, 0.1, 0.07
     digests = {"controller_digest": "c", "task_digest": "t", "model_digest": "m"}

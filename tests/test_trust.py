@@ -10,11 +10,11 @@ from core_rig import Rig as Core
 from core_rig import kinds, one
 from daemon_rig import PROFILE, made_up_certificate
 
-from s2r_runtime import certificate, keys, revocations
 from s2r_runtime.core import reducer as core
 from s2r_runtime.daemon.trust import Trust, certificate_file
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import MEMORY_SCHEMA, CertificateFacts, CertificatesDistrusted, Memory, Revoked, Send, StopController
+from s2r_runtime.trust import certificate, keys, revocations
 
 
 class Robot:

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from s2r_runtime.bounds import clopper_pearson_lower, clopper_pearson_upper
 from s2r_runtime.controllers.hosted import batch_control, load
-from s2r_runtime.disturbance import LAWS, Ahead
 from s2r_runtime.errors import ControllerError, UsageError
+from s2r_runtime.evidence.bounds import clopper_pearson_lower, clopper_pearson_upper
+from s2r_runtime.evidence.disturbance import LAWS, Ahead
+from s2r_runtime.evidence.uncertain import BATCH, GapSet, roll_out
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.models.double_integrator import MODEL as DOUBLE_INTEGRATOR
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import load_profile
 from s2r_runtime.tasks.grid_world import GridWorld
 from s2r_runtime.tasks.keep_out import KeepOut
-from s2r_runtime.uncertain import BATCH, GapSet, roll_out
 
 ROOT = Path(__file__).parent.parent
 MODEL = compose(load_profile(ROOT / "profiles" / "robotarium.toml").model)

@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from s2r_runtime.bounds import attempt_beta, clopper_pearson_lower, clopper_pearson_upper, sample_size
-from s2r_runtime.canonical import canonical
 from s2r_runtime.controllers.hosted import batch_control, load
 from s2r_runtime.errors import ControllerError, NotEnoughEvidence, UsageError
+from s2r_runtime.evidence.bounds import attempt_beta, clopper_pearson_lower, clopper_pearson_upper, sample_size
+from s2r_runtime.evidence.seeds import drawn
+from s2r_runtime.evidence.statements import worst
+from s2r_runtime.evidence.uncertain import GapSet
+from s2r_runtime.evidence.verify import not_shown, seed_for, statement, verification_json, verify, verify_in_detail
+from s2r_runtime.files.canonical import canonical
 from s2r_runtime.messages import Verification
 from s2r_runtime.models.composed import compose
 from s2r_runtime.profile import load_profile
-from s2r_runtime.seeds import drawn
-from s2r_runtime.statements import worst
 from s2r_runtime.tasks.keep_out import KeepOut
-from s2r_runtime.uncertain import GapSet
-from s2r_runtime.verify import not_shown, seed_for, statement, verification_json, verify, verify_in_detail
 
 ROOT = Path(__file__).parent.parent
 MODEL = compose(load_profile(ROOT / "profiles" / "robotarium.toml").model)

@@ -112,7 +112,7 @@ def test_a_ceiling_never_rises() -> None:
     [
         ("README.md", "."),
         ("docs/decisions/0001.md", "docs"),
-        ("s2r_runtime/gap.py", "s2r_runtime"),
+        ("s2r_runtime/gate.py", "s2r_runtime"),
         ("s2r_runtime/trace/a/b.py", "s2r_runtime/trace"),
         ("plugins/can/s2r_can/dbc.py", "plugins/can"),
     ],

@@ -10,11 +10,11 @@ import sys
 import numpy as np
 import pytest
 
-from s2r_runtime.bounds import clopper_pearson_lower
+from s2r_runtime.evidence.bounds import clopper_pearson_lower
+from s2r_runtime.evidence.watch import LARGEST, EProcess, Stream, measurement_fault
 from s2r_runtime.messages import IMPLAUSIBLE, RULES, Gap, Measured, Observation, Send
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.watch import LARGEST, EProcess, Stream, measurement_fault
 
 SURE = 1e-3
 
@@ -131,7 +131,7 @@ def test_the_jump_rule_rejects_above_its_bound_and_only_where_there_is_one() -> 
 
 
 def test_the_module_needs_no_numpy_to_be_imported() -> None:
-    code = "import sys, s2r_runtime.watch; assert 'numpy' not in sys.modules and 'scipy' not in sys.modules"
+    code = "import sys, s2r_runtime.evidence.watch; assert 'numpy' not in sys.modules and 'scipy' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from s2r_runtime.bounds import anytime_discards, clopper_pearson_lower, clopper_pearson_upper
 from s2r_runtime.core import stream
 from s2r_runtime.core.stream import BINS, EDGES, bin_of
+from s2r_runtime.evidence.bounds import anytime_discards, clopper_pearson_lower, clopper_pearson_upper
+from s2r_runtime.evidence.watch import GRID, ChangeDetector, ConformalTest, EProcess, tie_break
 from s2r_runtime.messages import Measured, WatchStood
-from s2r_runtime.watch import GRID, ChangeDetector, ConformalTest, EProcess, tie_break
 
 SURE = 1e-3
 

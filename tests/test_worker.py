@@ -21,8 +21,8 @@ from s2r_runtime.daemon.analytics import Analytics, Ready, Refused, Reply, Watch
 from s2r_runtime.daemon.settings import fault_jump_of
 from s2r_runtime.daemon.worker import Failed, LoadJob, Result, Upward, Worker
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.evidence.watch import measurement_fault
 from s2r_runtime.messages import IMPLAUSIBLE
-from s2r_runtime.watch import measurement_fault
 
 # ---------------------------------------------------------------- jobs
 

@@ -22,10 +22,10 @@ zenoh = pytest.importorskip("zenoh")
 from s2r_zenoh.testing import INPUTS, STATES, free_endpoint, session  # noqa: E402 - only where Zenoh is
 from s2r_zenoh.transport import ZenohTransport  # noqa: E402
 
-from s2r_runtime import tls  # noqa: E402
 from s2r_runtime.cli.main import main  # noqa: E402
 from s2r_runtime.errors import ConfigError, UsageError  # noqa: E402
 from s2r_runtime.messages import Command  # noqa: E402
+from s2r_runtime.trust import tls  # noqa: E402
 
 PROFILE = Path(__file__).parent.parent / "profiles" / "robotarium-mtls.toml"
 PREFIX = "s2r/robot"

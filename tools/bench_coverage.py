@@ -4,7 +4,7 @@
 
 G1: the built-in robot's campaign (docs/guarantee.md; paper, section V) in a vectorised form: 2 x repetitions robots side by side, each with
 latency of one period, clipped wheels, arcs and pose noise, drive to waypoints, stop, and hold one input for 50 periods. One half are the
-experiments, each bounded by `s2r_runtime.gap`; the other half are the law: V(r) is counted on all their discrepancies together.
+experiments, each bounded by `s2r_runtime.evidence.gap`; the other half are the law: V(r) is counted on all their discrepancies together.
 G2: rollouts of the uncertain model, in groups of N; V(s*) is counted on as many others.
 
 A promise is broken if the exact 99.9 % lower limit of the observed miss rate exceeds beta. The planted faults must be caught: all
@@ -25,13 +25,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.bounds import clopper_pearson_lower, sample_size, scenario_confidence
 from s2r_runtime.controllers.hosted import batch_control, load
-from s2r_runtime.gap import Transitions, discrepancy, estimate_gap, hold_residuals, residuals
+from s2r_runtime.evidence.bounds import clopper_pearson_lower, sample_size, scenario_confidence
+from s2r_runtime.evidence.gap import discrepancy, estimate_gap, hold_residuals, residuals
+from s2r_runtime.evidence.uncertain import GapSet, roll_out
 from s2r_runtime.models.composed import ComposedModel, compose, wrap
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.uncertain import GapSet, roll_out
+from s2r_runtime.recordings.transitions import Transitions
 
 Array = NDArray[np.float64]
 
@@ -175,7 +176,7 @@ def moved(x: Array, u: Array) -> Array:
 
 
 def go_to(x: Array, target: Array) -> Array:
-    """(R, 2) the campaign's Lyapunov law (`s2r_runtime.goto`), for many robots."""
+    """(R, 2) the campaign's Lyapunov law (`s2r_runtime.core.goto`), for many robots."""
     away = target - x[:, :2]
     rho = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-9)
     alpha = wrap(np.arctan2(away[:, 1], away[:, 0]) - x[:, 2])

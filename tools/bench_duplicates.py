@@ -15,13 +15,14 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.bounds import clopper_pearson_lower, clopper_pearson_upper, sample_size
 from s2r_runtime.errors import NotEnoughEvidence
-from s2r_runtime.gap import Transitions, doubted, estimate_gap
+from s2r_runtime.evidence.bounds import clopper_pearson_lower, clopper_pearson_upper, sample_size
+from s2r_runtime.evidence.gap import doubted, estimate_gap
+from s2r_runtime.evidence.repeats import ALPHA
 from s2r_runtime.messages import REPEATED
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.repeats import ALPHA
+from s2r_runtime.recordings.transitions import Transitions
 
 Array = NDArray[np.float64]
 Rows = tuple[Array, Array, Array]

@@ -26,12 +26,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime import offline_ledger
-from s2r_runtime.bounds import attempt_beta, clopper_pearson_lower, sample_size
+from s2r_runtime.evidence.bounds import attempt_beta, clopper_pearson_lower, sample_size
+from s2r_runtime.evidence.uncertain import GapSet
+from s2r_runtime.evidence.verify import seed_for, verify
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.uncertain import GapSet
-from s2r_runtime.verify import seed_for, verify
+from s2r_runtime.trust import offline_ledger
 
 Array = NDArray[np.float64]
 

@@ -35,20 +35,20 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 from scipy.special import erf
 
-from s2r_runtime.bounds import anytime_discards, clopper_pearson_lower, clopper_pearson_upper, sample_size, scenario_confidence
 from s2r_runtime.controllers.hosted import batch_control, load
 from s2r_runtime.core import reducer as core
 from s2r_runtime.core.ledger import share
 from s2r_runtime.core.stream import bin_of
 from s2r_runtime.daemon.analytics import Analytics, Reply, Watching
+from s2r_runtime.evidence.bounds import anytime_discards, clopper_pearson_lower, clopper_pearson_upper, sample_size, scenario_confidence
+from s2r_runtime.evidence.uncertain import GapSet
+from s2r_runtime.evidence.verify import verify_in_detail
+from s2r_runtime.evidence.watch import ChangeDetector, ConformalTest, EProcess
+from s2r_runtime.evidence.watch.exceedance import GRID, grid
 from s2r_runtime.messages import GateChanged, Observation, Send, Settings
 from s2r_runtime.models.composed import compose
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import load_profile
-from s2r_runtime.uncertain import GapSet
-from s2r_runtime.verify import verify_in_detail
-from s2r_runtime.watch import ChangeDetector, ConformalTest, EProcess
-from s2r_runtime.watch.exceedance import GRID, grid
 
 Array = NDArray[np.float64]
 

@@ -4,8 +4,8 @@
 
 The law: a start state drawn from `starts` robots that walked and stopped, moved to a random pose; an input uniform over its bounds, held
 for one model step of 0.1 s (100 steps of the robot); the discrepancy of what was measured. Start states are set, not walked to, and every
-sample is drawn anew, so all of them are independent and of one law. Each campaign's r is bounded by `s2r_runtime.gap`; V(r) is the share
-of `law` other samples beyond it. At 100 samples and epsilon 3 % the statement may be wrong in 4.8 % of campaigns.
+sample is drawn anew, so all of them are independent and of one law. Each campaign's r is bounded by `s2r_runtime.evidence.gap`; V(r) is the
+share of `law` other samples beyond it. At 100 samples and epsilon 3 % the statement may be wrong in 4.8 % of campaigns.
 
 The promise is broken if the exact 99.9 % lower limit of the rate of misses exceeds beta. A planted fault must be caught: the least r of ten
 campaigns, which misses in 39 %. Exit 1 if the promise is broken, or if the fault is not caught in 30 groups of ten campaigns or more (in
@@ -28,11 +28,12 @@ from quadruped_experiment import quadruped
 from quadruped_gaps import BODY, LITERAL
 from quadruped_truth import Holds, Walker, placed, stops
 
-from s2r_runtime.bounds import clopper_pearson_lower, clopper_pearson_upper, scenario_confidence
 from s2r_runtime.errors import S2RError
-from s2r_runtime.gap import Kind, Transitions, discrepancy, estimate_gap, residuals
+from s2r_runtime.evidence.bounds import clopper_pearson_lower, clopper_pearson_upper, scenario_confidence
+from s2r_runtime.evidence.gap import Kind, discrepancy, estimate_gap, residuals
 from s2r_runtime.models.composed import compose
 from s2r_runtime.profile import load_profile
+from s2r_runtime.recordings.transitions import Transitions
 
 Array = NDArray[np.float64]
 PROFILE = load_profile(ROOT / "profiles" / "quadruped.toml")

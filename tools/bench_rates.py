@@ -3,11 +3,11 @@
     tools/bench_rates.py [--repetitions 1000] [--seed 1] [--json]
 
 A planar robot does 15 % more than it is commanded, after a short lag; the model lacks both. It reports `rate` times a step, each time off
-by up to `jitter` of the interval. The campaign itself (`s2r_runtime.comparison`) drives it, one call a control instant: the observation
-nearest to the grid. The law is what a whole step shows: from the same states and inputs, the robot's state exactly one step later, with
-noise of its own. A promise is broken if the exact 99.9 % lower limit of the rate at which a gap misses it exceeds beta. Planted fault:
-the rules of before, which took an observation 0.9 steps after the last one and compared it with a whole step. Exit 1 if a promise breaks
-or the fault is not caught.
+by up to `jitter` of the interval. The campaign itself (`s2r_runtime.evidence.comparison`) drives it, one call a control instant: the
+observation nearest to the grid. The law is what a whole step shows: from the same states and inputs, the robot's state exactly one step
+later, with noise of its own. A promise is broken if the exact 99.9 % lower limit of the rate at which a gap misses it exceeds beta. Planted
+fault: the rules of before, which took an observation 0.9 steps after the last one and compared it with a whole step. Exit 1 if a promise
+breaks or the fault is not caught.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.bounds import clopper_pearson_lower, sample_size
-from s2r_runtime.comparison import Campaign
-from s2r_runtime.gap import discrepancy, estimate_gap
+from s2r_runtime.evidence.bounds import clopper_pearson_lower, sample_size
+from s2r_runtime.evidence.comparison import Campaign
+from s2r_runtime.evidence.gap import discrepancy, estimate_gap
 from s2r_runtime.messages import GRID, RULES, Observation, SampleTaken
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Sampling
-from s2r_runtime.transitions import from_samples
+from s2r_runtime.recordings.loading import from_samples
 
 Array = NDArray[np.float64]
 

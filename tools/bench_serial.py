@@ -12,12 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from s2r_runtime.bounds import clopper_pearson_lower
-from s2r_runtime.gap import Transitions, estimate_gap
+from s2r_runtime.evidence.bounds import clopper_pearson_lower
+from s2r_runtime.evidence.gap import estimate_gap
+from s2r_runtime.evidence.whiteness import SERIAL_ALPHA
 from s2r_runtime.messages import SERIAL
 from s2r_runtime.models.composed import compose
 from s2r_runtime.profile import load_profile
-from s2r_runtime.whiteness import SERIAL_ALPHA
+from s2r_runtime.recordings.transitions import Transitions
 
 PROFILE = Path(__file__).parent.parent / "profiles" / "robotarium.toml"
 SAMPLES, BETA = 161, 0.0152

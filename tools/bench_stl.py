@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "rigs"))
 
 import stl_random
 
-from s2r_runtime.stl.robustness import Formula
+from s2r_runtime.tasks.stl.robustness import Formula
 
 PROMISED = 100.0
 FORMULAS = {

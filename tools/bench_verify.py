@@ -29,13 +29,13 @@ from numpy.typing import NDArray
 
 from s2r_runtime.controllers.hosted import batch_control, load
 from s2r_runtime.core.ledger import share
+from s2r_runtime.evidence.uncertain import LAWS, GapSet, roll_out
+from s2r_runtime.evidence.verify import verify
 from s2r_runtime.hookspecs import Scenario
 from s2r_runtime.messages import Verification
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.profile import load_profile
 from s2r_runtime.tasks.grid_world import GridWorld
-from s2r_runtime.uncertain import LAWS, GapSet, roll_out
-from s2r_runtime.verify import verify
 
 Array = NDArray[np.float64]
 

@@ -30,18 +30,21 @@ sys.path.insert(0, str(ROOT / "tests" / "rigs"))
 
 import daemon_rig  # noqa: E402
 
-from s2r_runtime import certificate, keys  # noqa: E402
 from s2r_runtime.controllers import file as controllers  # noqa: E402
 from s2r_runtime.daemon import door, jobs  # noqa: E402
 from s2r_runtime.daemon.control import REQUEST_MAX  # noqa: E402
-from s2r_runtime.daemon.model_store import parse_model  # noqa: E402
 from s2r_runtime.errors import S2RError  # noqa: E402
 from s2r_runtime.messages import Requested  # noqa: E402
 from s2r_runtime.models.composed import compose  # noqa: E402
-from s2r_runtime.modelspec import ModelSpec, load_model  # noqa: E402
+from s2r_runtime.modelspec import (  # noqa: E402
+    ModelSpec,
+    load_model,
+    parse_model,
+)
 from s2r_runtime.profile import check_model, load_profile  # noqa: E402
 from s2r_runtime.recording.writer import Writer, read  # noqa: E402
-from s2r_runtime.transitions import load_transitions  # noqa: E402
+from s2r_runtime.recordings.loading import load_transitions  # noqa: E402
+from s2r_runtime.trust import certificate, keys  # noqa: E402
 
 HELD_MAX_S = 0.02
 """Of processor time: what the gate's loop may spend on one request."""

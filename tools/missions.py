@@ -13,13 +13,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.bounds import clopper_pearson_upper, sample_size
 from s2r_runtime.core import reducer as core
+from s2r_runtime.core.headroom import grid, search
 from s2r_runtime.core.state import State, certificate, usable_gap
 from s2r_runtime.daemon.settings import facts_of, settings_of
 from s2r_runtime.errors import NotEnoughEvidence
-from s2r_runtime.gap import Transitions, estimate_gap
-from s2r_runtime.headroom import grid, search
+from s2r_runtime.evidence.bounds import clopper_pearson_upper, sample_size
+from s2r_runtime.evidence.gap import estimate_gap
 from s2r_runtime.messages import (
     MEMORY_SCHEMA,
     CampaignFinished,
@@ -52,6 +52,7 @@ from s2r_runtime.messages import (
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Profile, parse_profile
+from s2r_runtime.recordings.transitions import Transitions
 
 Array = NDArray[np.float64]
 

@@ -53,7 +53,7 @@ EQUIVALENT = Path(__file__).with_name("mutation_equivalent.txt")
 
 def modules(wanted: list[str]) -> dict[str, Path]:
     """Short name -> file, of those that are asked for."""
-    known = {"gate.py": PACKAGE / "gate.py", "certificate.py": PACKAGE / "certificate.py"}
+    known = {"gate.py": PACKAGE / "gate.py", "certificate.py": PACKAGE / "trust" / "certificate.py"}
     known |= {f"core/{path.name}": path for path in sorted((PACKAGE / "core").glob("*.py"))}
     return {name: path for name, path in known.items() if not wanted or any(name.startswith(one) for one in wanted)}
 

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from s2r_runtime.bounds import scenario_confidence
 from s2r_runtime.controllers.hosted import batch_control, load
+from s2r_runtime.evidence.bounds import scenario_confidence
+from s2r_runtime.evidence.uncertain import Control, GapSet, roll_out
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.tasks.grid_world import GridWorld
-from s2r_runtime.uncertain import Control, GapSet, roll_out
 
 ROOT = Path(__file__).parent.parent
 SCENARIOS, LARGE = (300, 500), 20_000

@@ -29,18 +29,18 @@ from paper_figures import PREDICTED, Again
 from quadruped_gaps import BODY, READINGS, STRIDE_S, Reading, curve, of_more, row
 from quadruped_truth import Holds, Run, Walker, placed, run, stops, walked
 
-from s2r_runtime.bounds import clopper_pearson_upper
 from s2r_runtime.errors import S2RError
+from s2r_runtime.evidence.bounds import clopper_pearson_upper
+from s2r_runtime.evidence.uncertain import roll_out
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.modelspec import EffectSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import load_profile
+from s2r_runtime.recordings.loading import from_samples
 from s2r_runtime.tasks.grid_world import GridWorld
 from s2r_runtime.trace.data.dataset import Stream, from_streams
 from s2r_runtime.trace.pipeline import trace
 from s2r_runtime.trace.reporting.found import Found
-from s2r_runtime.transitions import from_samples
-from s2r_runtime.uncertain import roll_out
 
 Array = NDArray[np.float64]
 PROFILE = load_profile(ROOT / "profiles" / "quadruped.toml")

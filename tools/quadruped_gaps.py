@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from quadruped_truth import FINE, Holds
 
-from s2r_runtime.bounds import scenario_confidence
-from s2r_runtime.disturbance import GapSet
-from s2r_runtime.gap import Kind, discrepancy
+from s2r_runtime.evidence.bounds import scenario_confidence
+from s2r_runtime.evidence.disturbance import GapSet
+from s2r_runtime.evidence.gap import Kind, discrepancy
 from s2r_runtime.models.composed import ComposedModel, compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 

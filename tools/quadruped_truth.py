@@ -19,14 +19,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.comparison import Campaign
 from s2r_runtime.errors import ControllerError, NotEnoughEvidence
+from s2r_runtime.evidence.comparison import Campaign
+from s2r_runtime.evidence.uncertain import Control
 from s2r_runtime.hookspecs import Scenario
 from s2r_runtime.messages import Observation, SampleTaken
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.profile import Profile
 from s2r_runtime.tasks.grid_world import GridWorld
-from s2r_runtime.uncertain import Control
 
 Array = NDArray[np.float64]
 Pose = tuple[float, float, float]

@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from paper_experiment import LARGE, SCENARIOS, Setting, claim_lines, claims, control_of, named, plain, verified
 from robotarium_truth import HOLD, NOISE, TRACK, Before, Samples, campaign
 
-from s2r_runtime.bounds import clopper_pearson_upper
+from s2r_runtime.evidence.bounds import clopper_pearson_upper
+from s2r_runtime.evidence.uncertain import Control, GapSet, Rollouts, roll_out
 from s2r_runtime.models.composed import compose, wrap
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.tasks.grid_world import GridWorld
-from s2r_runtime.uncertain import Control, GapSet, Rollouts, roll_out
 
 Array = NDArray[np.float64]
 

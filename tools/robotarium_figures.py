@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from paper_figures import PREDICTED, Again, among, tile, verification
 
+from s2r_runtime.evidence.uncertain import Control, GapSet, roll_out
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.report import plots
 from s2r_runtime.report.page import Page
 from s2r_runtime.tasks.grid_world import GridWorld
-from s2r_runtime.uncertain import Control, GapSet, roll_out
 
 STILL: dict[str, Any] = {"movers": 0}
 """The grid without moving obstacles: one picture can show its predictions."""

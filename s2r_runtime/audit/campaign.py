@@ -9,8 +9,8 @@ from typing import Any
 import msgspec
 
 from s2r_runtime.audit.findings import Findings
-from s2r_runtime.comparison import EARLY, EARLY_BEFORE, Campaign
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.evidence.comparison import EARLY, EARLY_BEFORE, Campaign
 from s2r_runtime.messages import (
     Ask,
     CampaignFinished,

@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from s2r_runtime import certificate as certificates
-from s2r_runtime import keys
 from s2r_runtime.audit.evidence import Evidence, attached_controller
 from s2r_runtime.audit.findings import CertificateFinding, Findings
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
@@ -15,13 +13,15 @@ from s2r_runtime.messages import FIXED_SEEDS, CertificateFacts, CertificateStore
 from s2r_runtime.profile import Profile
 from s2r_runtime.recording.layout import Attached
 from s2r_runtime.recording.reading import Entry
+from s2r_runtime.trust import certificate as certificates
+from s2r_runtime.trust import keys
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from s2r_runtime.certificate import Certificate
     from s2r_runtime.controllers.file import ControllerFile
-    from s2r_runtime.revocations import Revocation
+    from s2r_runtime.trust.certificate import Certificate
+    from s2r_runtime.trust.revocations import Revocation
 
 
 CLOCK_S = 60

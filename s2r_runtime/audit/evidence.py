@@ -9,15 +9,15 @@ import msgspec
 
 from s2r_runtime.audit.findings import Findings, alike, close
 from s2r_runtime.audit.traces import Traces
-from s2r_runtime.bounds import clopper_pearson_upper
-from s2r_runtime.canonical import digest_of
 from s2r_runtime.controllers.file import ControllerFile
 from s2r_runtime.core import ledger
+from s2r_runtime.core.headroom import follows, grid
 from s2r_runtime.daemon import jobs
 from s2r_runtime.daemon.past import lost
 from s2r_runtime.daemon.worker import Failed, GapJob, Progress, Result, VerifyJob, Worker
 from s2r_runtime.errors import S2RError
-from s2r_runtime.headroom import follows, grid
+from s2r_runtime.evidence.bounds import clopper_pearson_upper
+from s2r_runtime.files.canonical import digest_of
 from s2r_runtime.messages import (
     FIXED_SEEDS,
     AttemptSpent,

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from s2r_runtime.audit.findings import Findings
-from s2r_runtime.canonical import digest
 from s2r_runtime.daemon.given_inputs import GivenInputs, parse_inputs
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.files.canonical import digest
 from s2r_runtime.messages import Ask, Command, InputsFinished, Observation, Proposed, SourceStarted, SourceStopped, StartInputs
 from s2r_runtime.recording.layout import Attached
 from s2r_runtime.recording.reading import Entry

@@ -15,7 +15,6 @@ from typing import Any
 
 import msgspec
 
-from s2r_runtime import keys
 from s2r_runtime.audit.ahead import Ahead
 from s2r_runtime.audit.beside import Beside
 from s2r_runtime.audit.campaign import CampaignReplay
@@ -26,14 +25,15 @@ from s2r_runtime.audit.findings import CertificateFinding, Difference, Findings,
 from s2r_runtime.audit.run import Across, RunAudit
 from s2r_runtime.audit.traces import SECONDS, Traces
 from s2r_runtime.errors import NotEnoughEvidence, RecordingError
-from s2r_runtime.printable import printable
+from s2r_runtime.files.printable import printable
 from s2r_runtime.recording.blocks import find
 from s2r_runtime.recording.channels import DELETED, UNRECORDED
 from s2r_runtime.recording.layout import ABOUT
 from s2r_runtime.recording.logs import is_log, runs
 from s2r_runtime.recording.reading import Entry, Reading
 from s2r_runtime.recording.writer import environment
-from s2r_runtime.revocations import Revocation
+from s2r_runtime.trust import keys
+from s2r_runtime.trust.revocations import Revocation
 
 COLLECT_EVERY = 20_000
 """Objects made beyond those that are gone again, between two searches for cycles: some MB."""

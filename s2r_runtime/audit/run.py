@@ -17,13 +17,12 @@ from s2r_runtime.audit.findings import Findings
 from s2r_runtime.audit.inputs import InputsReplay
 from s2r_runtime.audit.older import as_recorded
 from s2r_runtime.audit.traces import RELEVANT, Traces
-from s2r_runtime.bounded_file import read_bounded
-from s2r_runtime.canonical import digest
 from s2r_runtime.core.state import unix_now
 from s2r_runtime.core.status import against_sampler
-from s2r_runtime.daemon.model_store import parse_model
 from s2r_runtime.daemon.settings import ModelFacts, facts_of, settings_of
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.files.bounded_file import read_bounded
+from s2r_runtime.files.canonical import digest
 from s2r_runtime.messages import (
     GRID,
     RULES,
@@ -64,7 +63,7 @@ from s2r_runtime.messages import (
     Stopping,
     Ticked,
 )
-from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.modelspec import ModelSpec, parse_model
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import Profile, parse_profile
 from s2r_runtime.recording.channels import CHANNELS

@@ -21,12 +21,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgspec
 
 from s2r_runtime.audit.findings import Findings, ModelFinding
-from s2r_runtime.daemon.model_store import parse_model
 from s2r_runtime.daemon.trace_job import VOLATILE, options
 from s2r_runtime.daemon.worker import Failed, Progress, Result, TraceJob, Worker
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.messages import JobFinished, Memory, ModelAdopted, SampleTaken, StartCampaign, StartJob, Struct
-from s2r_runtime.modelspec import COMPACT, form_of
+from s2r_runtime.modelspec import COMPACT, form_of, parse_model
 from s2r_runtime.recording.layout import Attached
 from s2r_runtime.recording.reading import Entry
 from s2r_runtime.recording.stretches import CHANNELS, Cut, Stretches, log_identity

@@ -10,10 +10,10 @@ import msgspec
 from s2r_runtime.audit.findings import Findings, alike
 from s2r_runtime.core import stream
 from s2r_runtime.daemon.settings import fault_jump_of
+from s2r_runtime.evidence.watch import Stream
 from s2r_runtime.messages import Gap, Measured, Memory, Observation, Send, WatchStood
 from s2r_runtime.profile import Profile
 from s2r_runtime.recording.reading import Entry
-from s2r_runtime.watch import Stream
 
 if TYPE_CHECKING:
     from s2r_runtime.models.composed import ComposedModel

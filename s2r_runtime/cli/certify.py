@@ -49,10 +49,10 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Exit 0 with a certificate written, 1 if the controller did not pass (the attempt is spent all the same)."""
-    from s2r_runtime import keys, offline_ledger
-    from s2r_runtime.bounds import attempt_beta, epoch_beta
     from s2r_runtime.cli.evidence import gap_of, load_recordings, profile_model, run_verification
     from s2r_runtime.cli.trials_verb import trials_of
+    from s2r_runtime.evidence.bounds import attempt_beta, epoch_beta
+    from s2r_runtime.trust import keys, offline_ledger
 
     writable(args.output, replaced=True)  # now, because what is spent below stays spent, whatever becomes of the certificate
     inputs = {"the controller": args.controller, "the profile": args.profile, "the model": args.model}
@@ -110,9 +110,9 @@ def _write(
     key: Ed25519PrivateKey,
 ) -> None:
     """The certificate, signed."""
-    from s2r_runtime import certificate
-    from s2r_runtime.daemon import persistence
+    from s2r_runtime.files import durable
     from s2r_runtime.plugins import registry
+    from s2r_runtime.trust import certificate
 
     task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
     issued = certificate.issue(
@@ -128,7 +128,7 @@ def _write(
         period=period,
     )
     try:
-        persistence.replace(path, certificate.sign(issued, key))
+        durable.replace(path, certificate.sign(issued, key))
     except OSError as error:
         raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
 
@@ -147,7 +147,7 @@ def _tell(
 ) -> None:
     """beta: of the whole budget."""
     from s2r_runtime.cli.evidence import print_verification
-    from s2r_runtime.verify import verification_json
+    from s2r_runtime.evidence.verify import verification_json
 
     answer = verification_json(result)
     if args.json:

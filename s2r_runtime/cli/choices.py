@@ -13,8 +13,8 @@ import msgspec
 from s2r_runtime.errors import ConfigError, UsageError
 from s2r_runtime.modelspec import ModelSpec, load_model
 from s2r_runtime.profile import Profile, check_names, load_profile
-from s2r_runtime.profile_checks import HEAVIEST, LIGHTEST
-from s2r_runtime.units import number_of
+from s2r_runtime.profile.checks import HEAVIEST, LIGHTEST
+from s2r_runtime.recordings.units import number_of
 
 if TYPE_CHECKING:
     from s2r_runtime.controllers.hosted import ControllerFile
@@ -104,8 +104,8 @@ def columns_of(args: argparse.Namespace, model: ComposedModel, profile: Profile 
     columns |= signals_of(args, model) if hasattr(args, "state") else {}
     if not args.column:
         return columns
-    from s2r_runtime.robot_logs import has_columns
-    from s2r_runtime.tables import TIME
+    from s2r_runtime.modelspec import TIME
+    from s2r_runtime.recordings.robot_logs import has_columns
 
     for path in recordings:
         if path is not None and not has_columns(path):

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from s2r_runtime.bounded_file import read_bounded
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import count, positive
 from s2r_runtime.cli.presence import Presence
 from s2r_runtime.errors import ConfigError, UsageError
+from s2r_runtime.files.bounded_file import read_bounded
 
 WAITING = ("sample", "excite", "deploy", "trace", "verify")
 """Requests whose answer takes long. A person who leaves before it stops what drives for it."""
@@ -212,8 +212,8 @@ def run_deploy(args: argparse.Namespace) -> int:
 
 def run_adopt(args: argparse.Namespace) -> int:
     """Exit 0 if the model is in force."""
+    from s2r_runtime.files.toml_text import read_text
     from s2r_runtime.modelspec import load_model
-    from s2r_runtime.toml_text import read_text
 
     if args.model is None:
         return _say(args, {"verb": "adopt"})

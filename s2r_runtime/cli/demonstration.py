@@ -21,10 +21,10 @@ from s2r_runtime.cli import output
 from s2r_runtime.cli.supervised import EndedBySignal
 from s2r_runtime.daemon import control
 from s2r_runtime.errors import ConfigError, S2RError, UsageError
+from s2r_runtime.evidence.whiteness import SERIAL_ALPHA
 from s2r_runtime.hookspecs import Story
 from s2r_runtime.messages import SERIAL
 from s2r_runtime.plugins import registry
-from s2r_runtime.whiteness import SERIAL_ALPHA
 
 START_S, STOP_S, CAMPAIGN_S = 90.0, 60.0, 900.0
 """A process that ended is noticed at once; one that loads its libraries on a busy computer is waited for."""

@@ -32,11 +32,11 @@ from s2r_runtime.errors import NotEnoughEvidence, RecordingError, UsageError
 if TYPE_CHECKING:
     from s2r_runtime.controllers.hosted import ControllerFile
     from s2r_runtime.daemon.worker import Failed, Job, Result
-    from s2r_runtime.gap import Transitions
     from s2r_runtime.messages import Gap, Verification
     from s2r_runtime.models.composed import ComposedModel
     from s2r_runtime.profile import Profile
-    from s2r_runtime.table_rows import Subset
+    from s2r_runtime.recordings.table_rows import Subset
+    from s2r_runtime.recordings.transitions import Transitions
 
 LAWS = ("uniform", "persistent", "adversarial")
 
@@ -104,10 +104,10 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run_gap(args: argparse.Namespace) -> int:
     """Exit 0 with a statement, 3 if the data do not carry one (the numbers are printed all the same)."""
-    from s2r_runtime import gap as gaps
+    from s2r_runtime.evidence import gap as gaps
+    from s2r_runtime.files.table_text import limits_of
     from s2r_runtime.messages import NOT_INDEPENDENT, REPEATED
-    from s2r_runtime.table_text import limits_of
-    from s2r_runtime.transitions import load_transitions
+    from s2r_runtime.recordings.loading import load_transitions
 
     model, profile = chosen_model(args)
     columns, signals = columns_of(args, model, profile, *args.recording), signals_of(args, model)
@@ -144,7 +144,7 @@ def _print_gap(answer: dict[str, Any], subset: Subset | None) -> None:
     if answer["hold_periods"] > 1:
         output.out(f"hold gap        {answer['hold_radius']:.6g} over {answer['hold_periods']} periods")
     if answer.get("radius_noise"):
-        from s2r_runtime.gap import noise_share
+        from s2r_runtime.evidence.gap import noise_share
 
         output.out(f"noise alone     would make about {noise_share(answer['radius_noise'], answer['radius'])} of it")
     output.out(f"transitions     {answer['n']}, {answer['discarded']} discarded, rejected: {answer['rejected'] or 'none'}")
@@ -158,7 +158,7 @@ def _print_gap(answer: dict[str, Any], subset: Subset | None) -> None:
 
 def run_verify(args: argparse.Namespace) -> int:
     """Exit 0 if it passed, 1 if it did not."""
-    from s2r_runtime import verify as verification
+    from s2r_runtime.evidence import verify as verification
 
     profile = load_checked(args.profile)
     model = profile_model(args, profile)
@@ -223,9 +223,9 @@ def load_recordings(
     depend on the order in which a person names them, so several are digested first. max_gb: of one recording. Raises as
     `load_transitions`.
     """
-    from s2r_runtime.canonical import digest_of_all, digest_of_path
-    from s2r_runtime.table_text import limits_of
-    from s2r_runtime.transitions import load_transitions, look_at
+    from s2r_runtime.files.canonical import digest_of_all, digest_of_path
+    from s2r_runtime.files.table_text import limits_of
+    from s2r_runtime.recordings.loading import load_transitions, look_at
 
     limits, digests, ordered = limits_of(max_gb), [], list(paths)
     for path in paths:
@@ -253,12 +253,12 @@ def gap_of(
     and which period of each hold gave the sample. beta: the epoch's share; without one the gap founds no certificate. Raises
     NotEnoughEvidence if it carries no statement.
     """
-    from s2r_runtime import gap as gaps
+    from s2r_runtime.evidence import gap as gaps
     from s2r_runtime.messages import NOT_INDEPENDENT, REPEATED
 
     share = beta or profile.guarantee.beta
     if found.drive is not None and profile.driving.block > 0.0:
-        from s2r_runtime import blocked
+        from s2r_runtime.evidence import blocked
 
         epsilon, discard = profile.guarantee.epsilon, profile.guarantee.discard
         angles = model.angle_columns
@@ -304,9 +304,9 @@ def run_verification(
     behaviour (`probe`), or an empty text.
     """
     from s2r_runtime import messages
-    from s2r_runtime.bounds import sample_size
+    from s2r_runtime.core.headroom import grid
     from s2r_runtime.daemon.worker import Failed, Result, VerifyJob
-    from s2r_runtime.headroom import grid
+    from s2r_runtime.evidence.bounds import sample_size
 
     # laws asked for by name are what the question is about, even where the profile does not require them
     required = tuple(law for law in profile.verification.required if law in laws) or laws

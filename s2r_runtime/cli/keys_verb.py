@@ -46,7 +46,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def keys_new(args: argparse.Namespace) -> int:
     """Makes a key pair; refuses to overwrite one."""
-    from s2r_runtime import keys
+    from s2r_runtime.trust import keys
 
     path = args.path or keys.default_path()
     public = keys.new(path)
@@ -57,7 +57,7 @@ def keys_new(args: argparse.Namespace) -> int:
 
 def keys_rotate(args: argparse.Namespace) -> int:
     """Puts a new pair in the old one's place. Exit 0 when it is there."""
-    from s2r_runtime import keys, revocations
+    from s2r_runtime.trust import keys, revocations
 
     path = args.path or keys.default_path()
     if args.trust_old and not (path.parent / "state.json").exists():
@@ -84,7 +84,7 @@ def keys_rotate(args: argparse.Namespace) -> int:
 
 def keys_revoke(args: argparse.Namespace) -> int:
     """Puts a key on the list. Exit 0 when it stands there, durably."""
-    from s2r_runtime import keys, revocations
+    from s2r_runtime.trust import keys, revocations
 
     if args.state is not None and not args.state.is_dir():
         raise UsageError(f"{args.state}: there is no such state folder, so no daemon would read a list there; nothing was revoked")
@@ -99,7 +99,7 @@ def keys_revoke(args: argparse.Namespace) -> int:
 
 def keys_list(args: argparse.Namespace) -> int:
     """Exit 0; what is wrong with a key's file stands beside it."""
-    from s2r_runtime import keys, revocations
+    from s2r_runtime.trust import keys, revocations
 
     folders = [keys.config_dir(), *([args.state] if args.state else [])]
     revoked = revocations.known(revocations.places(*folders[1:]))
@@ -123,7 +123,7 @@ def keys_list(args: argparse.Namespace) -> int:
 
 def keys_tls(args: argparse.Namespace) -> int:
     """Exit 0 when they are there."""
-    from s2r_runtime import tls
+    from s2r_runtime.trust import tls
 
     for path in tls.make(args.folder, args.names, args.host, args.days or tls.DAYS):
         output.out(f"{path.stem:12s} {path}, {path.with_suffix('.key').name}")
@@ -134,7 +134,7 @@ def keys_tls(args: argparse.Namespace) -> int:
 
 
 def _described(use: str, path: Path, load: Callable[[Path], bytes]) -> dict[str, str]:
-    from s2r_runtime import keys
+    from s2r_runtime.trust import keys
 
     try:
         return {"use": use, "fingerprint": keys.fingerprint(load(path)), "path": str(path), "problem": ""}

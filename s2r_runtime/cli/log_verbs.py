@@ -59,8 +59,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run_audit(args: argparse.Namespace) -> int:
     """Exit 0 if all that is there holds, 1 if something does not, 3 if nothing fails but parts that are needed were not given."""
-    from s2r_runtime import keys, revocations
     from s2r_runtime.audit.log import audit
+    from s2r_runtime.trust import keys, revocations
 
     _need(args.log)
     bar = output.Progress("auditing")

@@ -20,7 +20,7 @@ from typing import Any, TextIO
 import msgspec
 
 from s2r_runtime.errors import UsageError
-from s2r_runtime.printable import printable
+from s2r_runtime.files.printable import printable
 
 _STYLE = f"\x1b{secrets.token_hex(8)}["
 """Begins a terminal style until `_shown` lets it through: no file can hold this, so no file can style."""

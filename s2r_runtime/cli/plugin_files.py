@@ -1,4 +1,4 @@
-"""The packages that `s2r plugin new` writes: files in `data/plugin/KIND`, with the name filled in. Tests run them."""
+"""The packages that `s2r plugin new` writes: files in `testing/templates/KIND`, with the name filled in. Tests run them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from s2r_runtime.errors import UsageError
 
-TEMPLATES = Path(__file__).parent.parent / "data" / "plugin"
+TEMPLATES = Path(__file__).parent.parent / "testing" / "templates"
 KINDS = ("transport", "model", "effect", "task", "recording", "controller")
 NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 OFFERED = {"transport": "transports", "model": "models", "effect": "effects", "task": "tasks"}

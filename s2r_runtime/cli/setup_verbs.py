@@ -20,7 +20,7 @@ import msgspec
 
 from s2r_runtime.cli import output
 from s2r_runtime.errors import S2RError
-from s2r_runtime.printable import printable
+from s2r_runtime.files.printable import printable
 from s2r_runtime.profile import Gate, Machine, Recording, load_profile
 
 MINIMUM_FREE_BYTES = 1_000_000_000
@@ -182,7 +182,7 @@ def _loopback() -> Finding:
 
 
 def _key() -> Finding:
-    from s2r_runtime import keys
+    from s2r_runtime.trust import keys
 
     path = keys.default_path()
     if not path.exists():

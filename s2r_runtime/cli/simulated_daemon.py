@@ -8,8 +8,8 @@ from __future__ import annotations
 import argparse
 import sys
 
-from s2r_runtime import seeds
 from s2r_runtime.cli import daemon_verbs, main
+from s2r_runtime.evidence import seeds
 
 
 def _run(args: argparse.Namespace) -> int:

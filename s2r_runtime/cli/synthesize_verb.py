@@ -11,7 +11,7 @@ import msgspec
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import add_limit, apart, controller_at, count, load_checked, own_file, positive, writable
 from s2r_runtime.errors import ControllerError, UsageError
-from s2r_runtime.units import number_of
+from s2r_runtime.recordings.units import number_of
 
 if TYPE_CHECKING:
     from s2r_runtime.controllers.candidates import Candidate, Synthesis
@@ -46,13 +46,13 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Exit 0 if the winner passed verification, 1 if it did not (the attempt is spent all the same)."""
-    from s2r_runtime import keys, offline_ledger
-    from s2r_runtime import verify as verification
-    from s2r_runtime.bounds import attempt_beta
     from s2r_runtime.cli.evidence import gap_at, gap_of, load_recordings, print_verification, profile_model, run_verification, work
     from s2r_runtime.controllers import candidates
-    from s2r_runtime.daemon import persistence
     from s2r_runtime.daemon.worker import Failed, SynthesisJob
+    from s2r_runtime.evidence import verify as verification
+    from s2r_runtime.evidence.bounds import attempt_beta
+    from s2r_runtime.files import durable
+    from s2r_runtime.trust import keys, offline_ledger
 
     if args.evaluations < 2 or args.scenarios < 1:
         raise UsageError("--evaluations must be at least 2, --scenarios at least 1")
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
         raise ControllerError(f"{args.controller}: the search ended: {done.text if isinstance(done, Failed) else 'no result'}")
     found = done.synthesis
     try:
-        persistence.replace(args.output, candidates.with_parameters(controller, found.best.parameters))
+        durable.replace(args.output, candidates.with_parameters(controller, found.best.parameters))
     except OSError as error:
         raise UsageError(f"{args.output}: cannot be written: {error.strerror}") from None
     winner = controller_at(args.output, [])

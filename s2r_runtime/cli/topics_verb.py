@@ -13,8 +13,8 @@ from s2r_runtime.cli.choices import add_dbc, transport_of
 from s2r_runtime.errors import ConfigError, RecordingError, UsageError
 
 if TYPE_CHECKING:
-    from s2r_runtime.formats.series import Topic
     from s2r_runtime.models.composed import ComposedModel
+    from s2r_runtime.recordings.formats.series import Topic
 
 FIELDS_SHOWN = 12
 USUAL_DT = 0.05
@@ -33,8 +33,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Exit 0 if something can be used, 3 if nothing can."""
-    from s2r_runtime.formats.guess import guessed
-    from s2r_runtime.formats.signals import paths_of
+    from s2r_runtime.recordings.formats.guess import guessed
+    from s2r_runtime.recordings.formats.signals import paths_of
 
     model = _model(args.model) if args.model else None
     kind, topics, notes = _listed(args.recording, transport_of(args, None))
@@ -67,10 +67,10 @@ def _listed(path: Path, described: dict[str, Any] | None) -> tuple[str, Sequence
     """What the file is, its topics, and what the user should know of how it was read. described: by which file. Raises UsageError,
     RecordingError.
     """
-    from s2r_runtime.formats.recognise import open_recording
-    from s2r_runtime.formats.routes import Named, form_of, signals_of_log
-    from s2r_runtime.robot_logs import is_mcap, is_robot_log
-    from s2r_runtime.table_text import refuse_special
+    from s2r_runtime.files.table_text import refuse_special
+    from s2r_runtime.recordings.formats.recognise import open_recording
+    from s2r_runtime.recordings.formats.routes import Named, form_of, signals_of_log
+    from s2r_runtime.recordings.robot_logs import is_mcap, is_robot_log
 
     refuse_special(path)
     form = form_of(path)
@@ -93,8 +93,9 @@ def _table(path: Path) -> Topic:
     """A CSV as one topic without a name."""
     import numpy as np
 
-    from s2r_runtime.formats.series import Topic
-    from s2r_runtime.tables import SEGMENT, TIME, header_of, missing_columns, places_of, read_csv
+    from s2r_runtime.modelspec import SEGMENT, TIME
+    from s2r_runtime.recordings.formats.series import Topic
+    from s2r_runtime.recordings.tables import header_of, missing_columns, places_of, read_csv
 
     header = [name for name in header_of(path) if name and name != SEGMENT]
     if len(header) <= 1:
@@ -124,7 +125,7 @@ def _model(name: str) -> ComposedModel:
 
 def _moves(topic: Topic) -> bool:
     """Whether the topic's type says where a robot is, or what it is commanded."""
-    from s2r_runtime.formats.guess import INPUTS, STATES
+    from s2r_runtime.recordings.formats.guess import INPUTS, STATES
 
     return any(topic.kind == source.match or f"#{topic.name}" == source.match for source in (*STATES, *INPUTS))
 
@@ -137,7 +138,7 @@ def _print(
     model: ComposedModel | None,
     taken: dict[str, str],
 ) -> None:
-    from s2r_runtime.formats.signals import full_name, quaternions
+    from s2r_runtime.recordings.formats.signals import full_name, quaternions
 
     spans = [topic for topic in topics if math.isfinite(topic.first_s)]
     begin = min((topic.first_s for topic in spans), default=0.0)

@@ -93,7 +93,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Exit 0 with any verdict, 3 with too little data."""
-    from s2r_runtime.table_text import limits_of
+    from s2r_runtime.files.table_text import limits_of
     from s2r_runtime.trace.pipeline import load_dataset, trace
 
     if bool(args.recording) == (args.live is not None):
@@ -175,8 +175,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _seen_by_the_fit(data: Dataset, test: Dataset) -> bool:
     """Whether the fit would see rows of the test (guarantee G6)."""
+    from s2r_runtime.evidence.seen_rows import seen
     from s2r_runtime.modelspec import is_sketch
-    from s2r_runtime.seen_rows import seen
 
     if set(test.digests) & set(data.digests):
         return True

@@ -44,7 +44,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def run(args: argparse.Namespace) -> int:
     """Exit 0 if no run was unsafe, 1 if one was, 3 if there are not enough."""
     from s2r_runtime.cli.evidence import profile_model
-    from s2r_runtime.statements import of_trials
+    from s2r_runtime.evidence.statements import of_trials
 
     profile = load_checked(args.profile)
     model = profile_model(args, profile)
@@ -62,8 +62,8 @@ def trials_of(
     logs: Sequence[Path], controller: ControllerFile, model: ComposedModel, profile: Profile, *, n: int = 0, beta: float | None = None
 ) -> Trials:
     """The controller's runs in these logs, which are audited first. Raises ConfigError for a log that does not hold."""
-    from s2r_runtime import trials
     from s2r_runtime.audit.log import audit
+    from s2r_runtime.evidence import trials
     from s2r_runtime.plugins import registry
 
     bar = output.Progress("auditing")

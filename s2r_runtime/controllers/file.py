@@ -21,9 +21,9 @@ from typing import Any
 
 import msgspec
 
-from s2r_runtime.canonical import digest, digest_of
 from s2r_runtime.controllers.imports import Imports, installed, parse, read_source, version
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.files.canonical import digest, digest_of
 
 ENTRY = "control"
 ARGUMENTS = ("x", "theta", "parameters")

@@ -24,10 +24,10 @@ from s2r_runtime.controllers.confined_process import ConfinedProcess
 from s2r_runtime.controllers.episodes import Episode
 from s2r_runtime.controllers.file import ControllerFile, Identity, load
 from s2r_runtime.controllers.hosting import Chosen, Ended, Loaded, Message, Package, Question, Up
+from s2r_runtime.controllers.processor import Used, used
 from s2r_runtime.errors import ControllerError, one_line
 from s2r_runtime.messages import Observation
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.processor import Used, used
 from s2r_runtime.profile import TaskChoice
 
 if TYPE_CHECKING:

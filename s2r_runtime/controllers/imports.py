@@ -21,8 +21,8 @@ from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 
-from s2r_runtime.canonical import digest, digest_of
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.files.canonical import digest, digest_of
 
 SOURCE_MAX = 4 << 20
 """Bytes of source in all. They are attached to every log and handed to every process that runs them."""

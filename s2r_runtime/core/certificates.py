@@ -14,9 +14,9 @@ import msgspec
 from s2r_runtime import gate
 from s2r_runtime.core import driven, ledger
 from s2r_runtime.core.drive import regate
+from s2r_runtime.core.headroom import grid
 from s2r_runtime.core.sources import end_deployment
 from s2r_runtime.core.state import VERIFYING, Deployment, Job, Turn, certificate, job, situation, usable_gap
-from s2r_runtime.headroom import grid
 from s2r_runtime.messages import (
     BEHAVIOURS,
     FIXED_SEEDS,

@@ -17,7 +17,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from s2r_runtime import gate, goto
+from s2r_runtime import gate
+from s2r_runtime.core import goto
 from s2r_runtime.core.state import Asked, Turn, situation
 from s2r_runtime.messages import GRID, AnswerLate, Ask, Command, Decided, GateChanged, Observation, Send, Source
 

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from s2r_runtime import messages as m
-from s2r_runtime import seeds
 from s2r_runtime.controllers.file import ControllerFile
 from s2r_runtime.core import stream
 from s2r_runtime.core.status import against_sampler
@@ -25,6 +24,7 @@ from s2r_runtime.daemon.analytics import Watching
 from s2r_runtime.daemon.console import campaign_line
 from s2r_runtime.daemon.settings import fault_jump_of
 from s2r_runtime.daemon.worker import Failed, GapJob, Progress, Result, TraceJob, VerifyJob
+from s2r_runtime.evidence import seeds
 
 if TYPE_CHECKING:
     from s2r_runtime.daemon.loop import Daemon

@@ -23,7 +23,7 @@ from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Profile
 
 if TYPE_CHECKING:
-    from s2r_runtime.watch import Stream
+    from s2r_runtime.evidence.watch import Stream
 
 
 class Setup(msgspec.Struct, frozen=True, tag="setup"):
@@ -246,8 +246,8 @@ def _checked(message: Setup) -> Ready | Refused:
 
 
 def _stream(watching: Watching) -> Stream:
+    from s2r_runtime.evidence.watch import Stream
     from s2r_runtime.models.composed import compose
-    from s2r_runtime.watch import Stream
 
     return Stream(
         compose(watching.model),

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import msgspec
 
-from s2r_runtime.daemon.persistence import read, replace
 from s2r_runtime.errors import S2RError
+from s2r_runtime.files.durable import read, replace
 
 SLACK_S = 3600.0
 """A wall clock that is ahead by less is believed: what rests on it keeps an hour of doubt anyway."""

@@ -15,8 +15,8 @@ import msgspec
 
 from s2r_runtime.core.gaps import RETRY
 from s2r_runtime.daemon.loop import Daemon
-from s2r_runtime.daemon.persistence import read, unseal
 from s2r_runtime.errors import UsageError
+from s2r_runtime.files.durable import read, unseal
 from s2r_runtime.messages import Memory
 from s2r_runtime.profile import Profile
 

@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 
 from s2r_runtime import messages as m
 from s2r_runtime.core import ledger
+from s2r_runtime.core.reasons import in_words
 from s2r_runtime.core.state import State
-from s2r_runtime.reasons import in_words
 
 REPEAT_NS = 10_000_000_000
 REMEMBERED = 200

@@ -23,7 +23,7 @@ from typing import Any, Protocol
 
 from s2r_runtime.daemon import door
 from s2r_runtime.errors import ConfigError, S2RError, UsageError, one_line
-from s2r_runtime.toml_text import TEXT_MAX
+from s2r_runtime.files.toml_text import TEXT_MAX
 
 REQUEST_MAX = TEXT_MAX + (1 << 20)
 """Of a line: the text of the largest model that is read, and what JSON adds. It is scanned in a millisecond or two (`door`)."""

@@ -14,9 +14,9 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 
-from s2r_runtime.canonical import digest
 from s2r_runtime.errors import ConfigError
-from s2r_runtime.units import number_of
+from s2r_runtime.files.canonical import digest
+from s2r_runtime.recordings.units import number_of
 
 BYTES_MAX = 8 << 20
 ROWS_MAX = 100_000

@@ -7,14 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from s2r_runtime import certificate as certificates
-from s2r_runtime import keys
 from s2r_runtime.core.state import unix_now
-from s2r_runtime.daemon.persistence import replace
 from s2r_runtime.daemon.trust import certificate_file
 from s2r_runtime.daemon.worker import Brought
 from s2r_runtime.errors import ConfigError, S2RError
+from s2r_runtime.files.durable import replace
 from s2r_runtime.messages import CertificateFacts, CertificateFailed, CertificateStored, Gap, IssueCertificate
+from s2r_runtime.trust import certificate as certificates
+from s2r_runtime.trust import keys
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey

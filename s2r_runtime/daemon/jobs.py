@@ -13,7 +13,7 @@ import msgspec
 
 from s2r_runtime.controllers.file import ControllerFile, load
 from s2r_runtime.daemon.given_inputs import BYTES_MAX, GivenInputs, parse_inputs
-from s2r_runtime.daemon.model_store import ModelStore, parse_model
+from s2r_runtime.daemon.model_store import ModelStore
 from s2r_runtime.daemon.settings import facts_of, settings_of
 from s2r_runtime.daemon.worker import (
     Brought,
@@ -30,13 +30,13 @@ from s2r_runtime.daemon.worker import (
 )
 from s2r_runtime.errors import ConfigError, ControllerError, one_line
 from s2r_runtime.messages import Gap
-from s2r_runtime.modelspec import dump_model
+from s2r_runtime.modelspec import dump_model, parse_model
 from s2r_runtime.profile import Profile, check_model
 
 if TYPE_CHECKING:
+    from s2r_runtime.evidence.uncertain import GapSet
     from s2r_runtime.hookspecs import Task
     from s2r_runtime.models.composed import ComposedModel
-    from s2r_runtime.uncertain import GapSet
 
 Progress = Callable[[float, float, str], None]
 
@@ -82,7 +82,7 @@ def brought(job: LoadJob) -> Result:
 
 
 def _certificate(text: str, job: LoadJob, profile: Profile, controller: str) -> Brought:
-    from s2r_runtime import certificate as certificates
+    from s2r_runtime.trust import certificate as certificates
 
     where, data = "--certificate", text.encode()
     signer = certificates.signer(data)
@@ -126,9 +126,9 @@ def model(job: ModelJob) -> Model:
 
 def gap(job: GapJob) -> Gap:
     """The gap of the profile's model on a campaign's samples; the epoch's share of beta covers both radii."""
-    from s2r_runtime.gap import estimate_gap
+    from s2r_runtime.evidence.gap import estimate_gap
     from s2r_runtime.models.composed import compose
-    from s2r_runtime.transitions import from_samples
+    from s2r_runtime.recordings.loading import from_samples
 
     profile = job.profile
     model = compose(profile.model)
@@ -150,10 +150,10 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
     """
     import numpy as np
 
-    from s2r_runtime import probe
     from s2r_runtime.controllers.batches import BatchController
     from s2r_runtime.controllers.rehearsal import Kept
-    from s2r_runtime.verify import verify_in_detail
+    from s2r_runtime.evidence import probe
+    from s2r_runtime.evidence.verify import verify_in_detail
 
     profile, settings = job.profile, job.profile.verification
     model, task, gap_set = _asked(job)
@@ -190,9 +190,9 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
 
 def _asked(job: VerifyJob | SynthesisJob) -> tuple[ComposedModel, Task, GapSet]:
     """The model and task of the job's profile, and the disturbances that it names."""
+    from s2r_runtime.evidence.uncertain import GapSet
     from s2r_runtime.models.composed import compose
     from s2r_runtime.plugins import registry
-    from s2r_runtime.uncertain import GapSet
 
     model, task = compose(job.profile.model), job.profile.task
     gap_set = GapSet(job.gap.set, job.gap.weights, job.radius, job.hold_radius, job.gap.hold_periods)
@@ -202,7 +202,7 @@ def _asked(job: VerifyJob | SynthesisJob) -> tuple[ComposedModel, Task, GapSet]:
 def synthesize(job: SynthesisJob, progress: Progress) -> Result:
     """A search over the controller's parameters; each candidate answers from a confined process of its own, as in a verification."""
     from s2r_runtime.controllers.batches import BatchController
-    from s2r_runtime.synthesize import search, search_seed
+    from s2r_runtime.evidence.synthesize import search, search_seed
 
     profile, settings = job.profile, job.profile.verification
     model, task, gap_set = _asked(job)

@@ -23,7 +23,6 @@ from pathlib import Path
 
 import msgspec
 
-from s2r_runtime import keys
 from s2r_runtime.child import Child
 from s2r_runtime.core import reducer as core
 from s2r_runtime.core.state import State
@@ -50,6 +49,7 @@ from s2r_runtime.daemon.transport_values import Inbound
 from s2r_runtime.daemon.trust import Trust
 from s2r_runtime.daemon.workshop import Watcher, Workshop
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.files.printable import printable_lines
 from s2r_runtime.messages import (
     AnalyticsChanged,
     Command,
@@ -73,8 +73,8 @@ from s2r_runtime.messages import (
 )
 from s2r_runtime.modelspec import dump_model
 from s2r_runtime.plugins import registry
-from s2r_runtime.printable import printable_lines
 from s2r_runtime.profile import Profile
+from s2r_runtime.trust import keys
 
 TICK_NS = 20_000_000
 ROUND_NS = 100_000_000

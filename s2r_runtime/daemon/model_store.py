@@ -13,12 +13,12 @@ from pathlib import Path
 
 import msgspec
 
-from s2r_runtime.daemon.persistence import replace
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.files.durable import replace
+from s2r_runtime.files.toml_text import load_toml
 from s2r_runtime.messages import Memory
 from s2r_runtime.modelspec import ModelSpec, dump_model, load_model
 from s2r_runtime.profile import Profile
-from s2r_runtime.toml_text import load_toml, parse_toml
 
 DIGITS = 16
 """Of a digest, in a file's name; what is in the file is compared with all of it."""
@@ -55,7 +55,7 @@ class ModelStore:
 
     def keep(self, spec: ModelSpec, comments: Sequence[str] = ()) -> ModelSpec:
         """Puts the model there, durably, before any memory names it; gives it back with all that it was fitted on. Raises OSError."""
-        from s2r_runtime.seen_rows import united
+        from s2r_runtime.evidence.seen_rows import united
 
         digest, file = spec.digest(), self.file(spec.digest())
         if file.exists() and _of_base(file, self.base) and (known := load_model(file)).digest() == digest:
@@ -70,18 +70,3 @@ def _of_base(file: Path, base: str) -> bool:
         return bool(load_toml(file).get("base") == base)
     except ConfigError as error:
         raise ConfigError(f"{file}: is damaged: {error}") from None
-
-
-def parse_model(text: str, base: str, where: str) -> ModelSpec:
-    """A model from the text of a TOML; a Python file in it is looked up from `base`. Raises ConfigError."""
-    table = parse_toml(text, where)
-    if "model" not in table:
-        raise ConfigError(f"{where}: has no [model] table")
-    try:
-        spec = msgspec.convert(table["model"], ModelSpec)
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{where}: model: {error}") from None
-    if spec.name.endswith(".py"):
-        path = Path(base) / spec.name
-        spec = msgspec.structs.replace(spec, name=str(path.resolve()))
-    return spec

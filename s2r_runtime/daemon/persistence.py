@@ -17,21 +17,14 @@ is a whole folder that was deleted or put back, logs included: the audit counts 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
-import msgspec
-
-from s2r_runtime import keys
-from s2r_runtime.canonical import canonical, digest
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.files.durable import lock, read, replace, seal, sync_folder, unseal
 from s2r_runtime.messages import MEMORY_SCHEMA, Memory
-
-FILE_MAX = 64 << 20
-"""Bytes. No state is that big; something else bearing its name might be."""
 
 T = TypeVar("T")
 
@@ -108,7 +101,7 @@ class StateFolder:
         """The campaign is over."""
         with contextlib.suppress(FileNotFoundError):
             (self.path / "campaign.json").unlink()
-            _sync_folder(self.path)
+            sync_folder(self.path)
 
     def close(self) -> None:
         """Frees the lock; may be called twice."""
@@ -131,80 +124,3 @@ class StateFolder:
                     f"{self.path / 'state.json'}: is missing, but {sign} shows that robot {self.robot!r} has a past; put the state "
                     "back from a copy, or move the whole folder away to begin a new life (earlier certificates are then void)"
                 )
-
-
-# ---------------------------------------------------------------- files that are whole or refused
-
-
-def seal(kind: str, content: Any) -> bytes:
-    """Canonical JSON with the content's digest inside. Raises ValueError on a number that is not finite."""
-    return _sealed(kind, canonical(content))
-
-
-def _sealed(kind: str, body: bytes) -> bytes:
-    return b'{"kind":"' + kind.encode() + b'","digest":"' + digest(body).encode() + b'","content":' + body + b"}\n"
-
-
-def unseal(data: bytes, kind: str, content: type[T], where: str) -> T:
-    """What `seal` was given. Raises ConfigError if it was cut, changed, is of another kind, or does not fit the type."""
-    frame = len(_sealed(kind, b"")) - len(b"}\n")
-    body = data[frame : -len(b"}\n")]
-    if _sealed(kind, body) != data:
-        raise ConfigError(f"{where}: is damaged (its digest does not fit its content); put it back from a copy, it is not reset by itself")
-    try:
-        return msgspec.json.decode(body, type=content)
-    except msgspec.DecodeError as error:
-        raise ConfigError(f"{where}: was written by another version: {error}") from None
-
-
-def read(file: Path) -> bytes:
-    """The file's bytes. Raises ConfigError if it can't be read, is far too big, no file of its own, or others could have written it."""
-    keys.check_own(file, "this")
-    try:
-        if (size := file.stat().st_size) > FILE_MAX:
-            raise ConfigError(f"{file}: has {size} bytes, more than any file of its kind")
-        return file.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
-
-
-def replace(file: Path, data: bytes, mode: int = 0o600) -> None:
-    """Puts `data` in the file's place, durably and as a whole. Raises OSError; what was there before is then untouched.
-
-    One writer at a time (callers hold a lock): the temporary file has a fixed name, so a crash leaves at most one behind.
-    """
-    temporary = file.with_name(f".{file.name}.new")
-    try:
-        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW, mode)
-        with os.fdopen(descriptor, "wb") as stream:
-            os.fchmod(descriptor, mode)
-            stream.write(data)
-            stream.flush()
-            os.fsync(descriptor)
-        temporary.replace(file)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise
-    _sync_folder(file.parent)
-
-
-def lock(file: Path, *, wait: bool) -> int:
-    """A descriptor that holds the file's lock until it is closed (or the process ends). Raises BlockingIOError if `wait` is
-    false and somebody else has it. The file is its own: a file that is replaced as a whole cannot carry a lock.
-    """
-    descriptor = os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except BaseException:
-        os.close(descriptor)
-        raise
-    return descriptor
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

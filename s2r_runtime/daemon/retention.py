@@ -22,8 +22,8 @@ from typing import Any
 import msgspec
 
 from s2r_runtime.daemon.believed_time import BelievedTime
-from s2r_runtime.daemon.persistence import read, replace
 from s2r_runtime.errors import S2RError
+from s2r_runtime.files.durable import read, replace
 from s2r_runtime.messages import (
     AttemptSpent,
     CertificateFacts,

@@ -12,9 +12,9 @@ from typing import Any
 
 import msgspec
 
-from s2r_runtime.comparison import Campaign
 from s2r_runtime.daemon.persistence import StateFolder
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.evidence.comparison import Campaign
 from s2r_runtime.messages import (
     CampaignFinished,
     Command,

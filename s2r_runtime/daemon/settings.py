@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from s2r_runtime.canonical import digest_of
+from s2r_runtime.files.canonical import digest_of
 from s2r_runtime.messages import GRID, IMPLAUSIBLE, RULES, Gap, Settings
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Profile, plain_table

@@ -71,8 +71,8 @@ def traced(
     whole log.
     """
     from s2r_runtime.models.composed import compose
+    from s2r_runtime.recordings.loading import from_samples
     from s2r_runtime.trace.pipeline import trace as tracer
-    from s2r_runtime.transitions import from_samples
 
     model = compose(profile.model)
     about = cut.about

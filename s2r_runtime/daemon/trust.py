@@ -17,11 +17,11 @@ from pathlib import Path
 
 import msgspec
 
-from s2r_runtime import certificate as certificates
-from s2r_runtime import keys, revocations
-from s2r_runtime.daemon.persistence import read
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.files.durable import read
 from s2r_runtime.messages import CertificateFacts, CertificatesDistrusted, Memory
+from s2r_runtime.trust import certificate as certificates
+from s2r_runtime.trust import keys, revocations
 
 _Seen = tuple[tuple[str, int, int, int], ...]
 

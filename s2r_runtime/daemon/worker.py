@@ -18,13 +18,13 @@ import msgspec
 from s2r_runtime.child import Child, die_with_parent, say, stand_back, take_stdout
 from s2r_runtime.controllers.candidates import Synthesis
 from s2r_runtime.controllers.file import ControllerFile
+from s2r_runtime.controllers.processor import family, used
 from s2r_runtime.daemon.given_inputs import GivenInputs
 from s2r_runtime.daemon.settings import ModelFacts
 from s2r_runtime.errors import S2RError, one_line
+from s2r_runtime.files.printable import printable_lines
 from s2r_runtime.messages import CertificateFacts, Gap, SampleTaken, Stretch, Verification
 from s2r_runtime.modelspec import COMPACT, ModelSpec
-from s2r_runtime.printable import printable_lines
-from s2r_runtime.processor import family, used
 from s2r_runtime.profile import Profile
 from s2r_runtime.recording.stretches import Cut
 

@@ -30,9 +30,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.bounded_file import read_bounded
-from s2r_runtime.canonical import digest
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.files.bounded_file import read_bounded
+from s2r_runtime.files.canonical import digest
 from s2r_runtime.hookspecs import Effect, NominalModel, Parameter
 from s2r_runtime.models.bound import BoundModel, bind, integrating, wrap
 from s2r_runtime.models.file_model import load_file_model

@@ -22,12 +22,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.bounded_file import read_bounded
-from s2r_runtime.canonical import digest
 from s2r_runtime.errors import ConfigError, one_line
+from s2r_runtime.files.bounded_file import read_bounded
+from s2r_runtime.files.canonical import digest
 from s2r_runtime.hookspecs import Follows, NominalModel
-from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.tables import SEGMENT, TIME
+from s2r_runtime.modelspec import SEGMENT, TIME, ModelSpec
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from typing import BinaryIO, NamedTuple
 import zstandard
 from mcap.opcode import Opcode
 
-from s2r_runtime.limits import ATTACHED, MB
+from s2r_runtime.files.limits import ATTACHED, MB
 from s2r_runtime.recording.layout import (
     CHUNK,
     CHUNK_FIELDS,

@@ -23,6 +23,7 @@ import zstandard
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from mcap.opcode import Opcode
 
+from s2r_runtime.files.durable import sync_folder
 from s2r_runtime.recording.chain import GENESIS, advance, signed
 from s2r_runtime.recording.channels import CHAIN, NUMBERS, Seal
 from s2r_runtime.recording.layout import MESSAGE, MESSAGE_FIELDS, chunk, declaration
@@ -105,7 +106,7 @@ class LogFile:
         path = self._path if part == 1 else self._path.with_suffix(f".{part:03d}{self._path.suffix}")
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         try:
-            _sync_folder(path.parent)
+            sync_folder(path.parent)
         except OSError:
             os.close(fd)
             path.unlink()
@@ -278,11 +279,3 @@ def _write(fd: int, data: bytes, at: int) -> int:
         written = os.pwrite(fd, view, at)
         view, at = view[written:], at + written
     return at
-
-
-def _sync_folder(path: Path) -> None:
-    fd = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)

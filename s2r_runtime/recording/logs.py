@@ -56,7 +56,7 @@ class Log:
 
     def models(self) -> dict[str, ModelSpec]:
         """The attached models, by digest."""
-        from s2r_runtime.daemon.model_store import parse_model
+        from s2r_runtime.modelspec import parse_model
 
         texts = [one for one in self.attachments if one.name == "model.toml" or one.name.startswith("model/")]
         specs = [parse_model(one.data.decode(), ".", one.name) for one in texts]

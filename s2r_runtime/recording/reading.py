@@ -18,6 +18,7 @@ import msgspec
 from mcap.opcode import Opcode
 
 from s2r_runtime.errors import RecordingError
+from s2r_runtime.files.table_text import refuse_special
 from s2r_runtime.recording.blocks import Block, Damage, extent, find, take
 from s2r_runtime.recording.chain import advance, is_signed_by
 from s2r_runtime.recording.channels import CHAIN, CHANNELS, Seal
@@ -33,7 +34,6 @@ from s2r_runtime.recording.layout import (
 )
 from s2r_runtime.recording.start import read_start
 from s2r_runtime.recording.summary import tail
-from s2r_runtime.table_text import refuse_special
 
 
 class Ending(msgspec.Struct, frozen=True):

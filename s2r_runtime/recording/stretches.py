@@ -17,7 +17,7 @@ from collections.abc import Iterable
 
 import msgspec
 
-from s2r_runtime.canonical import digest
+from s2r_runtime.files.canonical import digest
 from s2r_runtime.messages import (
     RESTARTS,
     CampaignFinished,

@@ -21,8 +21,8 @@ from pathlib import Path
 import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from s2r_runtime.canonical import canonical
 from s2r_runtime.errors import RecordingError
+from s2r_runtime.files.canonical import canonical
 from s2r_runtime.messages import Frame, LogHead, Struct
 from s2r_runtime.recording.channels import BY_TYPE, FRAME_IN, FRAME_OUT, NUMBERS
 from s2r_runtime.recording.layout import MAX_CHUNK, attachment_record

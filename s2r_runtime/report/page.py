@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from importlib import resources
 
-from s2r_runtime.printable import printable_lines
+from s2r_runtime.files.printable import printable_lines
 
-_STYLE = resources.files("s2r_runtime").joinpath("data/page.css").read_text(encoding="utf-8")
+_STYLE = resources.files("s2r_runtime.report").joinpath("page.css").read_text(encoding="utf-8")
 
 
 SENTENCE = 25

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from s2r_runtime.bounds import anytime_upper
 from s2r_runtime.core import stream
 from s2r_runtime.core.gaps import GOOD_REFUSED
 from s2r_runtime.errors import NotEnoughEvidence
-from s2r_runtime.gap import discrepancy, residuals, statement
+from s2r_runtime.evidence.bounds import anytime_upper
+from s2r_runtime.evidence.gap import discrepancy, residuals, statement
+from s2r_runtime.evidence.verify import not_shown
 from s2r_runtime.messages import REPEATED, Gap, Settings
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.recording.writer import read_all
@@ -22,7 +23,6 @@ from s2r_runtime.report import plots
 from s2r_runtime.report.page import Page
 from s2r_runtime.report.story import Story, tell
 from s2r_runtime.report.trace_section import add_trace
-from s2r_runtime.verify import not_shown
 
 COLOURS = {"good": plots.GREEN, "bad": plots.RED, "plain": plots.SOFT}
 SOURCES = {"sampler": (plots.BLUE, "sampler"), "controller": (plots.GREEN, "certified controller"), "recovery": (plots.QUIET, "recovery")}
@@ -193,7 +193,7 @@ def add_refused(page: Page, story: Story, models: dict[str, ModelSpec]) -> None:
 
 def _discrepancies(story: Story, gap: Gap, models: dict[str, ModelSpec]) -> plots.Array | None:
     from s2r_runtime.models.composed import compose
-    from s2r_runtime.transitions import from_samples
+    from s2r_runtime.recordings.loading import from_samples
 
     spec, samples = models.get(gap.model_digest), story.samples.get(gap.epoch, [])
     if spec is None or not samples:

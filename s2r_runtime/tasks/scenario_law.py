@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
-from s2r_runtime.stl.functions import FUNCTIONS
-from s2r_runtime.stl.robustness import compile_expression, compile_truth
-from s2r_runtime.stl.syntax import Apply, Expression, Name, is_instant
-from s2r_runtime.stl.text import CONSTANTS, parse_expression, parse_truth
-from s2r_runtime.stl.tokens import WORDS
+from s2r_runtime.tasks.stl.functions import FUNCTIONS
+from s2r_runtime.tasks.stl.robustness import compile_expression, compile_truth
+from s2r_runtime.tasks.stl.syntax import Apply, Expression, Name, is_instant
+from s2r_runtime.tasks.stl.text import CONSTANTS, parse_expression, parse_truth
+from s2r_runtime.tasks.stl.tokens import WORDS
 
 Array = NDArray[np.float64]
 Law = float | str | list[float] | dict[str, list[float]]

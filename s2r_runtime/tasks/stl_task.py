@@ -20,11 +20,26 @@ from numpy.typing import NDArray
 
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import NominalModel, Scenario
-from s2r_runtime.stl.robustness import Formula, compile_expression, compile_truth
-from s2r_runtime.stl.syntax import Always, And, Apply, Compare, Eventually, Name, Not, Number, Or, Truth, Until, is_instant, parts, positive
-from s2r_runtime.stl.text import parse_either, parse_expression, parse_truth
 from s2r_runtime.tasks.parameters import known_name
 from s2r_runtime.tasks.scenario_law import ScenarioLaw
+from s2r_runtime.tasks.stl.robustness import Formula, compile_expression, compile_truth
+from s2r_runtime.tasks.stl.syntax import (
+    Always,
+    And,
+    Apply,
+    Compare,
+    Eventually,
+    Name,
+    Not,
+    Number,
+    Or,
+    Truth,
+    Until,
+    is_instant,
+    parts,
+    positive,
+)
+from s2r_runtime.tasks.stl.text import parse_either, parse_expression, parse_truth
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

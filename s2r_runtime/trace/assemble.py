@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.evidence.seen_rows import united
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
-from s2r_runtime.seen_rows import united
 from s2r_runtime.trace.data.command_timing import before_changes
 from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.design.suggest import advice

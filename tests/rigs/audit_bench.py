@@ -17,32 +17,31 @@ from typing import Any, ClassVar
 import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from s2r_runtime import certificate as certificates
 from s2r_runtime import messages as m
 from s2r_runtime.audit.core import in_effect_order
 from s2r_runtime.audit.log import AuditResult, audit
-from s2r_runtime.bounds import clopper_pearson_upper
-from s2r_runtime.comparison import Campaign
 from s2r_runtime.controllers.file import load
 from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
+from s2r_runtime.core.headroom import grid
 from s2r_runtime.core.status import against_sampler
 from s2r_runtime.core.stream import stood
 from s2r_runtime.daemon import jobs, trace_job
 from s2r_runtime.daemon.excitation import Excitation
 from s2r_runtime.daemon.given_inputs import parse_inputs
-from s2r_runtime.daemon.model_store import parse_model
 from s2r_runtime.daemon.settings import facts_of, fault_jump_of, settings_of
 from s2r_runtime.daemon.worker import GapJob, TraceJob
-from s2r_runtime.headroom import grid
+from s2r_runtime.evidence.bounds import clopper_pearson_upper
+from s2r_runtime.evidence.comparison import Campaign
+from s2r_runtime.evidence.watch import Stream
 from s2r_runtime.hookspecs import Offer, hookimpl
 from s2r_runtime.models.composed import compose
-from s2r_runtime.modelspec import ModelSpec, dump_model
+from s2r_runtime.modelspec import ModelSpec, dump_model, parse_model
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import parse_profile
 from s2r_runtime.recording.reading import Entry, read
 from s2r_runtime.recording.writer import Writer
-from s2r_runtime.watch import Stream
+from s2r_runtime.trust import certificate as certificates
 
 KEY = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
 OTHER = Ed25519PrivateKey.from_private_bytes(bytes(range(1, 33)))

@@ -10,12 +10,12 @@ from typing import Any
 import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from s2r_runtime import certificate, keys
-from s2r_runtime.certificate import Certificate
 from s2r_runtime.controllers.file import ControllerFile
 from s2r_runtime.core.ledger import campaign_size, sample_size, share
 from s2r_runtime.messages import Gap, LawResult, Verification
 from s2r_runtime.profile import Profile, parse_profile
+from s2r_runtime.trust import certificate, keys
+from s2r_runtime.trust.certificate import Certificate
 
 PROFILE = """
 [robot]

@@ -9,8 +9,8 @@ import msgspec
 
 from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
+from s2r_runtime.core.headroom import grid
 from s2r_runtime.core.state import State
-from s2r_runtime.headroom import grid
 from s2r_runtime.messages import (
     MEMORY_SCHEMA,
     RULES,

@@ -14,8 +14,8 @@ from core_rig import GAP, S
 
 from s2r_runtime.core import driven, ledger, wall_clock
 from s2r_runtime.core import reducer as core
+from s2r_runtime.core.headroom import grid
 from s2r_runtime.core.state import unix_now
-from s2r_runtime.headroom import grid
 from s2r_runtime.messages import (
     MEMORY_SCHEMA,
     AnalyticsChanged,

@@ -337,7 +337,7 @@ def _state_file(change: Callable[[bytes, random.Random], bytes]) -> Callable[[Dr
 
 
 def _resealed(**changes: Any) -> Callable[[bytes, random.Random], bytes]:
-    from s2r_runtime.daemon.persistence import seal
+    from s2r_runtime.files.durable import seal
 
     def change(data: bytes, _: random.Random) -> bytes:
         return seal("state", {**msgspec.json.decode(data)["content"], **changes})

@@ -16,7 +16,6 @@ from typing import Any
 
 import msgspec
 
-from s2r_runtime import certificate, keys
 from s2r_runtime.controllers.file import load
 from s2r_runtime.core.ledger import campaign_size, sample_size, share
 from s2r_runtime.daemon import control
@@ -24,6 +23,7 @@ from s2r_runtime.errors import S2RError
 from s2r_runtime.messages import Gap, LawResult, Struct, Tries, Verification
 from s2r_runtime.profile import load_profile
 from s2r_runtime.recording.reading import read
+from s2r_runtime.trust import certificate, keys
 
 PROGRAM = Path(__file__).with_name("loop_robot.py")
 WITHIN_S = 60.0

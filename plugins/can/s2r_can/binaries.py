@@ -18,7 +18,7 @@ from typing import IO
 from s2r_can.records import LogFrame, frame_of
 from s2r_can.tally import Tally
 from s2r_runtime.errors import RecordingError, one_line
-from s2r_runtime.formats.sizes import content_of
+from s2r_runtime.recordings.formats.sizes import content_of
 
 CONTAINER_MAX = 32 << 20
 """Bytes of a BLF container, unpacked: Vector's tools and python-can write 128 KiB."""

@@ -18,8 +18,8 @@ from s2r_can.kinds import BLF, CANDUMP, SAVVYCAN, SQLITE, kind_of
 from s2r_can.records import LogFrame
 from s2r_can.tally import Tally
 from s2r_runtime.errors import RecordingError
-from s2r_runtime.formats.sizes import content_of
-from s2r_runtime.robot_logs import head_of, suffix_of
+from s2r_runtime.recordings.formats.sizes import content_of
+from s2r_runtime.recordings.robot_logs import head_of, suffix_of
 
 LINE_MAX = 4096
 """Characters of a line: a CAN FD frame in any of the formats has less than 400."""

@@ -31,9 +31,9 @@ from s2r_can.recordings import AGAIN_S, BACKWARD_SHARE
 from s2r_can.records import ERROR, EXTENDED, REMOTE, LogFrame, spelled
 from s2r_can.tally import Tally
 from s2r_runtime.errors import ConfigError, RecordingError
-from s2r_runtime.formats.series import Run, Samples, Topic
-from s2r_runtime.formats.sizes import check_values
-from s2r_runtime.robot_logs import head_of, suffix_of
+from s2r_runtime.recordings.formats.series import Run, Samples, Topic
+from s2r_runtime.recordings.formats.sizes import check_values
+from s2r_runtime.recordings.robot_logs import head_of, suffix_of
 
 if TYPE_CHECKING:
     from cantools.database.can import Message

@@ -19,7 +19,7 @@ from s2r_can.records import ERROR, EXTENDED, REMOTE, LogFrame
 from s2r_can.tally import Tally
 
 from s2r_runtime.errors import RecordingError
-from s2r_runtime.robot_logs import readers_of
+from s2r_runtime.recordings.robot_logs import readers_of
 
 START_S = 1_700_000_000.0
 MICRO = 2e-6

@@ -22,10 +22,10 @@ from s2r_can.recordings import read
 from s2r_can.standin import DBC
 
 from s2r_runtime.errors import ConfigError, RecordingError
-from s2r_runtime.formats.routes import read_recording
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import load_profile
+from s2r_runtime.recordings.formats.routes import read_recording
 
 ROOT = Path(__file__).parents[3]
 STATES, INPUTS = ("x", "y", "theta", "wheel_left", "wheel_right"), ("cmd_left", "cmd_right")

@@ -16,7 +16,7 @@ from s2r_runtime.cli.main import main
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.transitions import load_transitions
+from s2r_runtime.recordings.loading import load_transitions
 
 SPEC = importlib.util.spec_from_file_location("random_dbc", Path(__file__).with_name("random_dbc.py"))
 assert SPEC is not None

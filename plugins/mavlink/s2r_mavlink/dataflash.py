@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from s2r_runtime.errors import RecordingError, one_line
-from s2r_runtime.formats.series import Array, Run, Samples, Topic
-from s2r_runtime.formats.sizes import check_size
+from s2r_runtime.recordings.formats.series import Array, Run, Samples, Topic
+from s2r_runtime.recordings.formats.sizes import check_size
 
 KIND = "ArduPilot DataFlash log"
 HEADER = b"\xa3\x95"

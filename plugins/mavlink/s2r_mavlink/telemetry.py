@@ -25,8 +25,8 @@ from fastcrc.crc16 import mcrf4xx as crc16
 from s2r_mavlink.frames import header, payload
 from s2r_mavlink.tlog_records import Record, checked, records
 from s2r_runtime.errors import RecordingError
-from s2r_runtime.formats.series import Array, Run, Samples, Topic
-from s2r_runtime.formats.sizes import check_values
+from s2r_runtime.recordings.formats.series import Array, Run, Samples, Topic
+from s2r_runtime.recordings.formats.sizes import check_values
 
 KIND = "MAVLink telemetry log"
 TIMES = ("time_boot_ms", "time_usec", "time_unix_usec")

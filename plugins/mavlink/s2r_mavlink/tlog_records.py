@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from s2r_mavlink.frames import LONGEST, V1, V2, header, length_at, whole
 from s2r_runtime.errors import RecordingError
-from s2r_runtime.formats.sizes import content_of
+from s2r_runtime.recordings.formats.sizes import content_of
 
 STAMP = 8
 _BEGINS = re.compile(b"[" + re.escape(bytes([V1, V2])) + b"]")

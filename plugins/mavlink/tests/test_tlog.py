@@ -17,9 +17,9 @@ from s2r_mavlink.tlog import read as read_log
 from s2r_runtime.errors import RecordingError
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
-from s2r_runtime.robot_logs import readers_of
+from s2r_runtime.recordings.loading import load_transitions
+from s2r_runtime.recordings.robot_logs import readers_of
 from s2r_runtime.trace.data.readers import load_dataset
-from s2r_runtime.transitions import load_transitions
 
 STATES, INPUTS = ("x", "y", "theta"), ("v", "w")
 SITL = Path("../shared/data/rover_sitl.tlog.gz")

@@ -2,7 +2,7 @@
 
 Messages are judged as on the wire (`observer.Told`). A pose's stamp is its header's (or, with stamp = arrival, when it was recorded). A
 command has no stamp that could be trusted: it counts from when it was recorded, log time l, which is brought to the clock of the stamps
-(`s2r_runtime.formats.clock`), and acts until the next one, or for `command_timeout`.
+(`s2r_runtime.recordings.formats.clock`), and acts until the next one, or for `command_timeout`.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from s2r_ros2.payloads import decode_transforms, decode_twist, decode_twist_stam
 from s2r_ros2.records import Message
 from s2r_ros2.typed import Types
 from s2r_runtime.errors import MissingSignal, RecordingError
-from s2r_runtime.formats.clock import newer, on_stamps, stretches
 from s2r_runtime.hookspecs import ReadLog
+from s2r_runtime.recordings.formats.clock import newer, on_stamps, stretches
 
 Array = NDArray[np.float64]
 Rows = tuple[Array, Array]

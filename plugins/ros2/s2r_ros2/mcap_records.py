@@ -24,7 +24,7 @@ import zstandard
 
 from s2r_ros2.records import Channel, Definition, Message, kind_of, unpacked
 from s2r_runtime.errors import RecordingError
-from s2r_runtime.formats.sizes import content_of
+from s2r_runtime.recordings.formats.sizes import content_of
 
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 3, 4, 5, 6, 15

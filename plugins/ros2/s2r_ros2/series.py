@@ -24,7 +24,7 @@ from s2r_ros2.payloads import Located, decode_transforms
 from s2r_ros2.records import Channel, Message, Messages
 from s2r_ros2.typed import LARGEST_BYTES, Types, fields_of, getter_of, stamp_of
 from s2r_runtime.errors import RecordingError
-from s2r_runtime.formats.series import Run, Samples, Topic
+from s2r_runtime.recordings.formats.series import Run, Samples, Topic
 
 TREES = (TF, "tf/msg/tfMessage")
 PAIRS = 64

@@ -20,7 +20,7 @@ import zstandard
 
 from s2r_ros2.records import PAYLOAD_BYTES, ZSTD, Channel, Definition, Message, kind_of, unpacked
 from s2r_runtime.errors import RecordingError, one_line
-from s2r_runtime.formats.sizes import content_of
+from s2r_runtime.recordings.formats.sizes import content_of
 
 SQLITE = b"SQLite format 3\0"
 GZIP = b"\x1f\x8b"

@@ -24,11 +24,11 @@ from s2r_ros2.typed import Types
 
 from s2r_runtime.cli.main import main
 from s2r_runtime.errors import RecordingError, S2RError, UsageError
-from s2r_runtime.formats.recognise import open_recording
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
+from s2r_runtime.recordings.formats.recognise import open_recording
+from s2r_runtime.recordings.loading import load_transitions
 from s2r_runtime.trace.data.readers import load_dataset
-from s2r_runtime.transitions import load_transitions
 
 DT = 0.05
 SECOND = 1_000_000_000

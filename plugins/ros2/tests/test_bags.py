@@ -26,9 +26,9 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.recording import layout, origin
 from s2r_runtime.recording.writer import read as read_log
-from s2r_runtime.robot_logs import is_robot_log
+from s2r_runtime.recordings.loading import load_transitions
+from s2r_runtime.recordings.robot_logs import is_robot_log
 from s2r_runtime.trace.data.readers import load_dataset
-from s2r_runtime.transitions import load_transitions
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND

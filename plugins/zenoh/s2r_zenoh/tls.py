@@ -12,8 +12,8 @@ import stat
 from pathlib import Path
 from typing import Any
 
-from s2r_runtime.bounded_file import read_bounded
 from s2r_runtime.errors import ConfigError
+from s2r_runtime.files.bounded_file import read_bounded
 
 OPTIONS = {
     "tls_ca": "certificate of the site's authority (PEM); with it both sides are mTLS, and endpoints begin with tls/ or quic/",

@@ -25,11 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.errors import NotEnoughEvidence, RecordingError
-from s2r_runtime.gap import Transitions
 from s2r_runtime.models.composed import SUBSTEPS, ComposedModel
 from s2r_runtime.models.input_chains import Inputs
-from s2r_runtime.table_rows import Subset
-from s2r_runtime.tables import LARGEST
+from s2r_runtime.recordings.table_rows import Subset
+from s2r_runtime.recordings.tables import LARGEST
+from s2r_runtime.recordings.transitions import Transitions
 from s2r_runtime.trace.data.input_interpolation import Way
 from s2r_runtime.trace.data.reconstruction import Reconstruction, at_step, independent_step, snapped
 from s2r_runtime.trace.data.streams import (

@@ -17,18 +17,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from s2r_runtime.canonical import digest_of_path
 from s2r_runtime.errors import RecordingError, UsageError
-from s2r_runtime.formats.mapping import Recorded
-from s2r_runtime.formats.routes import read_recording
+from s2r_runtime.evidence.seen_rows import sketch
+from s2r_runtime.files.canonical import digest_of_path
+from s2r_runtime.files.table_text import Limits, Progress, refuse_special
 from s2r_runtime.messages import CampaignFinished, Observed, Send, StartCampaign, Started
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import COMPACT
 from s2r_runtime.recording.origin import other_writer
-from s2r_runtime.robot_logs import content_digest, is_mcap, is_robot_log
-from s2r_runtime.seen_rows import sketch
-from s2r_runtime.table_rows import Subset, joined
-from s2r_runtime.table_text import Limits, Progress, refuse_special
+from s2r_runtime.recordings.formats.mapping import Recorded
+from s2r_runtime.recordings.formats.routes import read_recording
+from s2r_runtime.recordings.robot_logs import content_digest, is_mcap, is_robot_log
+from s2r_runtime.recordings.table_rows import Subset, joined
 from s2r_runtime.trace.data.dataset import Array, Dataset, Stream, from_streams
 from s2r_runtime.trace.data.reconstruction import late_speeds, reconstruct
 from s2r_runtime.trace.data.unmeasured_states import unneeded, without
@@ -151,7 +151,7 @@ class _Tables(NamedTuple):
 
 def _table_segments(path: Path, model: ComposedModel, how: _Tables) -> _Part:
     """A table's. A column that the caller stated must be there."""
-    from s2r_runtime.tables import read_csv
+    from s2r_runtime.recordings.tables import read_csv
 
     columns, names = how.columns, (*model.states, *model.inputs)
     free = {name for name in getattr(model.nominal, "follows", {}) if name not in columns}
@@ -190,7 +190,7 @@ def _hidden(path: Path, model: ComposedModel, free: set[str], columns: Mapping[s
     """States that the table does not have, and that other ones tell by the model (`hidden_state`). Not where it has a column that nobody
     asked for, of nearly the same name: that is it, misspelt.
     """
-    from s2r_runtime.tables import header_of, places_of
+    from s2r_runtime.recordings.tables import header_of, places_of
 
     header = header_of(path)
     there = places_of(path, (*model.states, *model.inputs), columns, model.nominal.angles)

@@ -14,10 +14,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from s2r_runtime.bounds import scenario_confidence
 from s2r_runtime.errors import S2RError
-from s2r_runtime.gap import Transitions, different, discrepancy, hold_residuals, residuals
+from s2r_runtime.evidence.bounds import scenario_confidence
+from s2r_runtime.evidence.gap import different, discrepancy, hold_residuals, residuals
 from s2r_runtime.models.composed import ComposedModel
+from s2r_runtime.recordings.transitions import Transitions
 from s2r_runtime.trace.data.dataset import Dataset
 from s2r_runtime.trace.data.split import FEWEST_RUNS
 from s2r_runtime.trace.estimation.initial_states import begun, measured, uncertain
@@ -310,7 +311,7 @@ def _in_file(model: ComposedModel, paths: tuple[Path, ...]) -> Transitions | Non
     """A campaign's samples in a log."""
     if len(paths) != 1 or paths[0].suffix != ".mcap":
         return None
-    from s2r_runtime.transitions import from_mcap
+    from s2r_runtime.recordings.loading import from_mcap
 
     try:
         return from_mcap(paths[0], model)

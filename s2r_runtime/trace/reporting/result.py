@@ -13,7 +13,7 @@ from s2r_runtime.effects.classes import same
 from s2r_runtime.models.composed import AppliedEffect, ComposedModel
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.plugins import registry
-from s2r_runtime.table_rows import Subset
+from s2r_runtime.recordings.table_rows import Subset
 from s2r_runtime.trace.data.command_timing import before_changes
 from s2r_runtime.trace.data.input_interpolation import Way
 from s2r_runtime.trace.data.reconstruction import IN_PARTS, Reconstruction

@@ -1,0 +1,1 @@
+"""What is believed, and why: canonical bytes, keys, certificates, revocations and the offline ledger."""
