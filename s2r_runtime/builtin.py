@@ -43,6 +43,8 @@ _EFFECTS = {
     "gravity_slope": "a tilted world: a pull along the body that depends on the heading",
     "lateral_slip": "a turning robot slides sideways",
     "longitudinal_slip": "wheels turn farther than the robot moves",
+    "wheel_radius_scale": "the wheels of a differential drive have other radii than the model, or unequal ones",
+    "wheel_slip": "each side of a differential drive slips by its own share",
     "track_scale": "yaw is a constant factor of the ideal one: skidding wheels",
     "understeer": "a car turns less the faster it goes",
     "rear_slip": "a car's rear tyres give way in curves, with the speed squared",

@@ -215,9 +215,9 @@ class Effect(Protocol):
       a function of its values that gives theirs. The tracer looks for the first of them instead (`effects.classes` has the built-in ones);
     - `simpler(p) -> (name, p)`: the effect with fewer numbers that it is if its own agree, on the same channel;
     - `takes(model, channel) -> tuple[str, ...]`: names of the parameters that it has there (default: all);
-    - `frame(model, channel) -> str` (stage `step`): "body" if it changes the motion of the body (it then applies before a pose is
-      integrated along it), "sliding" if it depends on that motion (after "body"), "world" if it adds to the motion along the world's
-      axes (after that);
+    - `frame(model, channel) -> str` (stage `step`), in the order in which they apply: "wheels" if it changes the displacement of each
+      wheel, "body" if it changes the motion of the body (before a pose is integrated along it), "sliding" if it depends on that motion,
+      "world" if it adds to the motion along the world's axes;
     - `rebound(model, channel, p) -> dict[str, float]` (stage `step`): the model's parameters as they are with it; the next effect that has
       this gets the model with them, so that several together are one model with all of them;
     - `integrates(p) -> str`: it is the scheme by which a pose is integrated; effects see it as the `integration` of their model;

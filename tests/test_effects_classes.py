@@ -43,6 +43,8 @@ VALUES = {
     "lateral_slip": {"coefficient": -0.2},
     "longitudinal_slip": {"ratio": 0.2},
     "track_scale": {"gain": 0.6},
+    "wheel_radius_scale": {"left": 1.3, "right": 0.8, "track": 0.4},
+    "wheel_slip": {"left": -0.3, "right": 0.2, "track": 0.4},
     "understeer": {"coefficient": 0.3},
     "rear_slip": {"coefficient": 0.2},
     "position_field": {"matrix": [[0.2, -0.1], [0.3, 0.4]]},
@@ -114,6 +116,9 @@ def _special(name):
         yield "sensor_lever_arm", "*", {"x": 0.0, "y": 0.3}
         yield "track_scale", "theta", {"gain": -0.5}
         yield "longitudinal_slip", "*", {"ratio": 1.7}
+        yield "wheel_radius_scale", "*", {"left": 0.9, "right": 0.9, "track": 0.4}
+    if name == "differential_drive":
+        yield "wheel_radius_scale", "*", {"left": 0.9, "right": 0.9}
     if name == "double_integrator":
         yield "constant_disturbance", "world", {"x": 0.3, "y": 0.0}
         yield "gravity_slope", "*", {"x": 0.0, "y": -0.3}
@@ -157,6 +162,8 @@ def test_one_member_of_a_class_is_searched_and_it_is_its_own_class(name):
         ("joint", "input_delay", "*", ("input_delay", "force")),
         ("double_integrator", "gravity_slope", "*", ("constant_disturbance", "world")),
         ("differential_drive", "track_scale", "theta", ("track_scale", "theta")),
+        ("differential_drive", "wheel_slip", "*", ("wheel_radius_scale", "*")),
+        ("unicycle", "wheel_slip", "*", ("wheel_radius_scale", "*")),
         ("bicycle", "longitudinal_slip", "*", ("longitudinal_slip", "*")),
         ("bicycle", "input_gain", "steer_cmd", ("input_gain", "steer_cmd")),
     ],

@@ -16,6 +16,8 @@ VALUES = {
     "gravity_slope": ({"x": 0.2, "y": -0.1},),
     "lateral_slip": ({"coefficient": -0.1}, {"coefficient": 0.3}),
     "longitudinal_slip": ({"ratio": 0.2}, {"ratio": 1.0}),
+    "wheel_radius_scale": ({"left": 1.04, "right": 0.97, "track": 0.4}, {"left": -1.0, "right": 0.0, "track": 0.1}),
+    "wheel_slip": ({"left": 0.1, "right": -0.05, "track": 0.4}, {"left": 1.0, "right": 0.0, "track": 0.1}),
     "track_scale": ({"gain": 0.4}, {"gain": -1.0}),
     "understeer": ({"coefficient": 0.05}, {"coefficient": -0.05}, {"coefficient": -1e3}),
     "rear_slip": ({"coefficient": 0.02}, {"coefficient": -0.02}),

@@ -4,6 +4,7 @@
 | --- | --- | --- |
 | `track_scale` gain g | unicycle | `input_gain` of the yaw rate, g |
 | `longitudinal_slip` ratio r | unicycle | `input_gain` of the speed, 1 - r |
+| `wheel_slip` left, right | two wheels | `wheel_radius_scale` 1 - left, 1 - right |
 | `mass_change` ratio r (mass m r) | joint | `input_gain` of the force, 1/r |
 | `parameter_change` ratio r | a model of one's own, where it divides or multiplies one input | `input_gain` of it, r or 1/r |
 | `constant_disturbance` world, x | joint | `input_bias` of the force, x |
@@ -109,6 +110,10 @@ def several(model: NominalModel, name: str, channel: str, p: Values) -> list[lis
         biases = [[one for one in part if one[0] == "input_bias"] for part in parts]
         if all(biases):
             found.append([one[0] for one in biases])
+    if name == "wheel_radius_scale" and p["left"] == p["right"]:
+        ahead = ("longitudinal_slip", "*", {"ratio": 1.0 - p["left"]})
+        turns = ("track_scale", "theta", {"gain": p["left"]})
+        found += [[one, two] for one in (ahead, *same(model, *ahead)) for two in (turns, *same(model, *turns))]
     if channel == "*" and name in {"input_delay", "input_gain_drift", "regime_change"} and len(model.inputs) > 1:
         found.append([(name, single, dict(p)) for single in model.inputs])
     return found
@@ -171,6 +176,8 @@ def _proposed(model: BoundModel) -> Iterator[Row]:
         for other in changeable[:late]:
             yield Row("parameter_change", name, "parameter_change", other, dict, dict, {"ratio": 1.4})
             yield Row("parameter_change", name, "parameter_change", other, _inverse, _inverse, {"ratio": 1.4})
+    slips = dict.fromkeys(registry().get("effects", "wheel_slip").takes(model, "*"), 0.3)
+    yield Row("wheel_slip", "*", "wheel_radius_scale", "*", _slips_to_radii, _slips_to_radii, {**slips, "right": -0.2})
     yield Row("gravity_slope", "*", "constant_disturbance", "world", dict, dict, dict.fromkeys(along, 0.3))
     yield Row(
         "sensor_offset", "theta", "heading_offset", "theta", _renamed("offset", "angle"), _renamed("angle", "offset"), {"offset": 0.3}
@@ -260,6 +267,11 @@ def _slip_to_gain(p: Values) -> Values:
 
 def _gain_to_slip(p: Values) -> Values:
     return {"ratio": 1.0 - p["gain"]}
+
+
+def _slips_to_radii(p: Values) -> Values:
+    """And back."""
+    return {**p, "left": 1.0 - p["left"], "right": 1.0 - p["right"]}
 
 
 def _mass_to_gain(model: NominalModel) -> Convert:

@@ -11,7 +11,7 @@ from s2r_runtime.effects.step_effect import Array, StepEffect, Values
 from s2r_runtime.hookspecs import NominalModel, Parameter
 
 NAMED = frozenset({"mass", "inertia", "wheel_base", "wheel_radius", "track"})
-"""`mass_change`, `input_gain` and `track_scale` speak of these."""
+"""`mass_change`, `input_gain`, `wheel_radius_scale` and `track_scale` speak of these."""
 
 
 class ParameterChange(StepEffect):

@@ -6,9 +6,10 @@ x: (n, nx), u: (n, nu), angles wrapped to (-pi, pi]. h: effects of stage `sensor
 state on both sides. The hidden state is a tuple of one array an effect, (n, nh); at rest it is what a long time at zero input
 leaves (a campaign's full stop).
 
-Effects of stage `step` apply in this order, and within it as listed: what changes the motion of the body (`frame` says so); what slides by
-that motion; all others (the scheme by which a pose is integrated among them); what adds to the motion along the world's axes; and last, all
-together, the forces on axes (`push`): dry friction holds against the sum of all that pulls.
+Effects of stage `step` apply in this order, and within it as listed: what changes the displacement of each wheel (`frame` says so); what
+changes the motion of the body; what slides by that motion; all others (the scheme by which a pose is integrated among them); what adds to
+the motion along the world's axes; and last, all together, the forces on axes (`push`): dry friction holds against the sum of all that
+pulls.
 
 u_act is the input's mean over the step. Where a nominal model says that a state is set to an input at once (`reached`: a wheel's
 speed, a car's speed), that state is the input as it acts at the end of the step. What an effect makes of a held input may change within
@@ -47,7 +48,7 @@ T = TypeVar("T")
 SUBSTEPS = 5
 """Parts of a step where one is not enough. What an effect does not say of the step's end (`at_end`) is then known to a tenth of a step."""
 
-FRAMES = ("body", "sliding", "", "world")
+FRAMES = ("wheels", "body", "sliding", "", "world")
 """Where an effect on the step acts, in the order in which they apply."""
 
 SETTLE_STEPS = 20_000

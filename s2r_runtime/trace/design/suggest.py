@@ -92,6 +92,7 @@ _NEEDS = {
     "rear_slip": "curves at several speeds",
     "longitudinal_slip": _SIZES,
     "track_scale": _SIZES,
+    "wheel_radius_scale": "straight ahead, turns on the spot to both sides, and curves, at several speeds",
     "sensor_lever_arm": "turning on the spot, and driving straight",
 }
 _OTHERWISE = "steps of several sizes and both signs"

@@ -115,6 +115,10 @@ _WORDS: dict[str, Callable[[str, Values], str]] = {
     "gravity_slope": lambda what, p: "the ground slopes: what it does turns with the heading",
     "lateral_slip": lambda what, p: "the robot slides sideways in curves",
     "longitudinal_slip": lambda what, p: f"the wheels slip: {_percent(p['ratio'])} of the way is lost",
+    "wheel_radius_scale": lambda what, p: (
+        f"the left wheel has {_percent(p['left'])} of the model's radius, the right one {_percent(p['right'])}"
+    ),
+    "wheel_slip": lambda what, p: f"the left wheel slips by {_percent(p['left'])}, the right one by {_percent(p['right'])}",
     "track_scale": lambda what, p: f"it turns at {_percent(p['gain'])} of the ideal rate",
     "understeer": lambda what, p: f"it turns {'less' if p['coefficient'] > 0.0 else 'more'} than its steering says, with the speed squared",
     "rear_slip": lambda what, p: (

@@ -151,7 +151,7 @@ def _of_body(model: ComposedModel, place: int) -> bool:
     """Whether an effect changes how a pose moves, or where on it somebody measures."""
     a = model.effects[place]
     frame = a.effect.frame(model.nominal, a.channel) if hasattr(a.effect, "frame") else ""
-    return a.effect.stage == "sensor" or (a.effect.stage == "step" and frame in {"body", "sliding"})
+    return a.effect.stage == "sensor" or (a.effect.stage == "step" and frame in {"wheels", "body", "sliding"})
 
 
 def _deviations(given: Problem, fit: Fit) -> Array:

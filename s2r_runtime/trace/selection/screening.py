@@ -203,11 +203,8 @@ def _moved_on(given: Problem, white: Fit, aside: _Aside, before: Array, s: Scree
     """An effect of several numbers, or of one that has no neutral value, some steps on from its best start: no scale brings it in place."""
     place = _place(s)
     slots = tuple(slots_of(s.start.effects[place], place))
-    if (
-        not slots
-        or (len(slots) < 2 and bounds_of(s.start, slots[0]).neutral is not None)
-        or getattr(s.start.effects[place].effect, "additive", False)
-    ):
+    scales = all(bounds_of(s.start, slot).neutral is not None for slot in slots)
+    if scales and (len(slots) < 2 or getattr(s.start.effects[place].effect, "additive", False)):
         return s
     start = refine(given, white, s.start, slots, STEPS_ON)
     column = _column(white, given.predicted(start) - before)
@@ -236,10 +233,10 @@ def _probes(candidate: Candidate, model: ComposedModel) -> Iterator[Probe]:
         if len(sizes) == 1:  # from nothing at all to the start, whatever else it holds (when, how often)
             yield Probe(candidate, start, (start,), sizes, held)
             continue
-        if slots and len(sizes) == len(slots) and getattr(start.effects[place].effect, "additive", False):
-            alone = [_alone(start, slots, i, neutral) for i in range(len(slots))]
+        if sizes and getattr(start.effects[place].effect, "additive", False):  # what else it has stays as it begins
+            alone = [_alone(start, sizes, i, [bounds_of(start, s).neutral for s in sizes]) for i in range(len(sizes))]
             if all(m is not None for m in alone):
-                yield Probe(candidate, start, tuple(m for m in alone if m is not None), slots, held)
+                yield Probe(candidate, start, tuple(m for m in alone if m is not None), sizes, held)
                 continue
         if len(sizes) > 1 and getattr(start.effects[place].effect, "homogeneous", False):  # in the shape that the start has
             yield Probe(candidate, start, (start,), sizes, held)
