@@ -13,7 +13,7 @@ import numpy as np
 from s2r_runtime.effects.body_motion import body_motion, moved
 from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, force_unit, has_pose, size_of
 from s2r_runtime.hookspecs import NominalModel, Parameter
-from s2r_runtime.models.forces import Axis, Push, axes, lone_speeds, mass
+from s2r_runtime.models.forces import Axis, Push, axes, lone_speeds, mass_on
 
 SHARE = 0.05
 """Of the inputs' size: the first look; the response is linear."""
@@ -50,7 +50,7 @@ class ConstantDisturbance(ForceEffect):
     def push(self, x: Array, axis: Axis, model: NominalModel, channel: str, p: Values) -> Push | None:
         """Its acceleration on this axis; None where nothing of that name pushes."""
         along = direction(model, axis)
-        return Push(drive=float(p[along]) / mass(model)) if along in p else None
+        return Push(drive=float(p[along]) / mass_on(model, model.states[axis.velocity])) if along in p else None
 
     def after_step(self, x: Array, u: Array, x_next: Array, model: NominalModel, channel: str, dt: float | Array, p: Values) -> Array:
         """Rates on a pose, forces on axes."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, force_unit, length_unit, size_of, usual_speed
 from s2r_runtime.hookspecs import NominalModel, Parameter
-from s2r_runtime.models.forces import PART_S, Axis, Push, axes, mass
+from s2r_runtime.models.forces import PART_S, Axis, Push, axes, mass_on
 
 STIFFEST = 1.0 / PART_S**2
 """1/s²: it swings by a radian within the longest part of a step; twice that would be unstable."""
@@ -36,19 +36,19 @@ class CubicStiffness(ForceEffect):
 
     def unit(self, model: NominalModel, channel: str, parameter: str) -> str:
         """Of force over length cubed."""
-        force, length = force_unit(model), length_unit(model, channel)
-        return f"1/({length}² s²)" if force == "m/s²" else f"{force}/{length}³"
+        force, length = force_unit(model, channel), length_unit(model, channel)
+        return f"1/({length}² s²)" if force.endswith("/s²") else f"{force}/{length}³"
 
     def push(self, x: Array, axis: Axis, model: NominalModel, channel: str, p: Values) -> Push | None:
         """Its acceleration at this position."""
         if model.states[axis.position] != channel:
             return None
         q = x[:, axis.position]
-        return Push(drive=-np.clip(float(p["coefficient"]) / mass(model) * q * q, SOFTEST, STIFFEST) * q)
+        return Push(drive=-np.clip(float(p["coefficient"]) / mass_on(model, channel) * q * q, SOFTEST, STIFFEST) * q)
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
         """One is enough."""
-        return [{"coefficient": SHARE * size_of(u) / (SPAN_S * usual_speed(u, model, dt)) ** 3}]
+        return [{"coefficient": SHARE * size_of(u) / (SPAN_S * usual_speed(u, model, dt, channel)) ** 3}]
 
 
 EFFECT = CubicStiffness()

@@ -74,7 +74,7 @@ class QuadraticDrag(ForceEffect):
             if channel not in getattr(model, "units", {}) and not is_speed(channel):
                 return []  # nothing drags at a steering angle, a voltage or a valve
             return [{"coefficient": INPUT_SHARE / size_of(u[:, [model.inputs.index(channel)]])}]
-        return [{"coefficient": RATE * mass_on(model, channel) / usual_speed(u, model, dt)}]
+        return [{"coefficient": RATE * mass_on(model, channel) / usual_speed(u, model, dt, channel)}]
 
 
 EFFECT = QuadraticDrag()

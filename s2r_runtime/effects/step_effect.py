@@ -15,7 +15,21 @@ from numpy.typing import NDArray
 
 from s2r_runtime.hookspecs import NominalModel, Parameter
 from s2r_runtime.models.force_inputs import force_input
-from s2r_runtime.models.forces import POSE, Axis, Push, axes, coupled, lone_speeds, mass, mass_name, pushed, turns
+from s2r_runtime.models.forces import (
+    POSE,
+    Axis,
+    Push,
+    axes,
+    axis_of,
+    coupled,
+    is_rotary,
+    lone_speeds,
+    mass_name,
+    mass_on,
+    pushed,
+    torque_inertia,
+    turns,
+)
 
 Array = NDArray[np.float64]
 Values = dict[str, Any]
@@ -101,16 +115,21 @@ def has_pose(model: NominalModel) -> bool:
 
 
 def force_unit(model: NominalModel, channel: str = "") -> str:
-    """Of what acts on an axis: the input's that the mass divides, where there is a mass; else an acceleration, as on a speed without a
-    position.
+    """SI unit of what acts on an axis or a speed: of a force, or of a torque on a rotary axis, where there is a mass or an inertia.
+
+    Otherwise of an acceleration, as on a speed without a position. channel: of the axis; the first one's without it.
     """
     units: dict[str, str] = getattr(model, "units", {})
     if channel in lone_speeds(model, slowed=True):
         return f"{length_unit(model, channel)}/s²"
     if coupled(model):
         return units.get(model.inputs[0], "input's unit")
+    axis = axis_of(model, channel) or next(iter(axes(model)), None)
+    if axis is not None and is_rotary(model, axis):
+        known = "inertia" in model.parameters or ("mass" in model.parameters and torque_inertia(model, axis) > 0.0)
+        return "N m" if known else "rad/s²"
     if not mass_name(model):
-        return "m/s²"
+        return f"{length_unit(model, channel)}/s²"
     usual = "N m" if mass_name(model) == "inertia" else "N"
     force = force_input(model)
     return usual if force is None else units.get(force, usual)
@@ -126,17 +145,12 @@ def length_unit(model: NominalModel, channel: str) -> str:
     name = model.states[axis.position]
     if coupled(model):
         return units.get(name, f"{name}'s unit")
-    return units.get(name, "rad" if mass_name(model) == "inertia" else "m")
+    return units.get(name, "rad" if is_rotary(model, axis) else "m")
 
 
-def axis_of(model: NominalModel, channel: str) -> Axis | None:
-    """The axis whose position or velocity the channel is."""
-    return next((axis for axis in axes(model) if channel in {model.states[axis.velocity], model.states[axis.position]}), None)
-
-
-def usual_speed(u: Array, model: NominalModel, dt: float) -> float:
+def usual_speed(u: Array, model: NominalModel, dt: float, channel: str = "") -> float:
     """Rms of what u (T, nu) adds to the speed of an axis within REMEMBERED_S, as a guess of the speeds that a recording shows."""
-    total = np.cumsum(np.vstack([np.zeros((1, u.shape[1])), u]), axis=0) * dt / mass(model)
+    total = np.cumsum(np.vstack([np.zeros((1, u.shape[1])), u]), axis=0) * dt / mass_on(model, channel)
     ago = np.maximum(np.arange(1, len(total)) - max(1, round(REMEMBERED_S / dt)), 0)
     gained = total[1:] - total[ago]
     return float(np.sqrt(np.mean(gained * gained))) if np.any(u) else 1.0

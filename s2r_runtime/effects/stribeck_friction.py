@@ -56,7 +56,7 @@ class StribeckFriction(ForceEffect):
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
         """Curves that fall within a part of the speeds that such inputs lead to."""
-        force, speed = FORCE_SHARE * size_of(u), usual_speed(u, model, dt)
+        force, speed = FORCE_SHARE * size_of(u), usual_speed(u, model, dt, channel)
         return [{"force": force, "static_force": STATIC * force, "velocity": share * speed} for share in SPEED_SHARES]
 
 

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, axis_of, force_unit, has_pose, length_unit
+from s2r_runtime.effects.step_effect import Array, ForceEffect, Values, force_unit, has_pose, length_unit
 from s2r_runtime.hookspecs import NominalModel, Parameter
-from s2r_runtime.models.forces import Axis, Push, axes, coupled, mass_on
+from s2r_runtime.models.forces import Axis, Push, axes, axis_of, coupled, mass_on
 
 START_RATE = 0.5
 """1/s: a slow loss; what it does to a step is in proportion to it."""

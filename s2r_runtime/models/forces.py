@@ -244,9 +244,62 @@ def mass(model: NominalModel) -> float:
     return float(model.parameters[name]) if name else 1.0
 
 
+def axis_of(model: NominalModel, channel: str) -> Axis | None:
+    """The axis whose position or velocity the channel is."""
+    return next((axis for axis in axes(model) if channel in {model.states[axis.velocity], model.states[axis.position]}), None)
+
+
+def is_rotary(model: NominalModel, axis: Axis) -> bool:
+    """Whether an axis turns, by its units; without units, if its position wraps or the model has an inertia and no mass."""
+    units: dict[str, str] = getattr(model, "units", {})
+    position, velocity = model.states[axis.position], model.states[axis.velocity]
+    if position in units or velocity in units:
+        return units.get(position) == "rad" or units.get(velocity) == "rad/s"
+    return position in model.angles or mass_name(model) == "inertia"
+
+
 def mass_on(model: NominalModel, channel: str) -> float:
-    """By which a force on a speed is divided. Whether a model's mass is that of a speed without a position, nobody says: 1."""
-    return 1.0 if channel in lone_speeds(model, slowed=True) else mass(model)
+    """Divisor of a force on an axis or a speed: kg, or kg m² on a rotary axis; 1 where the force is an acceleration.
+
+    Whether a model's mass is that of a speed without a position is unknown. A rotary axis has an `inertia`; in a model with a mass only,
+    the inertia on which its torque input acts.
+    """
+    if channel in lone_speeds(model, slowed=True):
+        return 1.0
+    axis = axis_of(model, channel)
+    if axis is None or coupled(model) or not mass_name(model) or not is_rotary(model, axis):
+        return mass(model)
+    return float(model.parameters["inertia"]) if "inertia" in model.parameters else torque_inertia(model, axis) or 1.0
+
+
+TORQUE_UNITS, EVENLY = {"N m", "Nm", "N*m", "N·m"}, 0.02
+"""Of inputs; and the share by which what a torque does may differ from state to state where it acts on one inertia."""
+
+_INERTIAS: WeakKeyDictionary[BoundModel, dict[Axis, float]] = WeakKeyDictionary()
+
+
+def torque_inertia(model: NominalModel, axis: Axis) -> float:
+    """kg m², the inertia on which the model's torque input acts; 0 where it has no such input, or none that acts on one inertia."""
+    if not isinstance(model, BoundModel):
+        return 0.0
+    known = _INERTIAS.setdefault(model, {})
+    if axis not in known:
+        known[axis] = _torque_inertia(model, axis)
+    return known[axis]
+
+
+def _torque_inertia(model: BoundModel, axis: Axis) -> float:
+    torques = [j for j, name in enumerate(model.inputs) if model.units.get(name) in TORQUE_UNITS]
+    x = np.random.default_rng(0).uniform(-1.0, 1.0, (8, len(model.states)))
+    try:
+        found = response(x, np.zeros((len(x), len(model.inputs))), model, SHORT_S, 1.0 / PROBE)[:, axis.velocity] / SHORT_S
+    except ConfigError:  # a user's model that cannot be stepped just anywhere
+        return 0.0
+    for j in torques:
+        usual = float(np.mean(found[:, j]))
+        if usual and np.all(np.abs(found[:, j] - usual) <= EVENLY * abs(usual)):
+            return 1.0 / abs(usual)
+    return 0.0
 
 
 def coupled(model: NominalModel) -> bool:
