@@ -28,6 +28,7 @@ ORDER = (
     "bench_ros2.py",
     "fuzz_ros2.py",
     "bench_coverage.py",
+    "bench_compare.py",
     "bench_duplicates.py",
     "bench_grinding.py",
     "bench_rates.py",
