@@ -17,6 +17,7 @@ from s2r_runtime.messages import Decided, GateChanged, Observed, OverrideChanged
 
 pytest.importorskip("s2r_mavlink")
 
+from mavlink_floods import FLOODS, HELD_MAX_S, Flood, held_s
 from pymavlink.dialects.v20 import common as mavlink
 
 
@@ -152,3 +153,11 @@ def test_robot_that_starts_anew_in_a_campaign_is_not_sampled_across_it(rig: Mavl
     changes = [m.reason for m in rig.messages("out/gate_changed") if isinstance(m, GateChanged)]
     assert "manual_override" in changes
     assert rig.audit()["ok"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("flood", FLOODS.values(), ids=FLOODS)
+def test_flood_holds_the_loop_for_no_longer_than_it_may_and_the_robot_is_driven_on(tmp_path: Path, flood: Flood) -> None:
+    held, gate = held_s(tmp_path, flood, 2.0)
+    assert held <= HELD_MAX_S
+    assert gate == "open"

@@ -145,6 +145,21 @@ def test_what_a_transport_may_not_give_is_a_lost_link_once_until_it_works_again(
     assert (link.trouble, link.lines()) == ("", ["transport 'odd' of odd-dist 1.2 works again"])
 
 
+def test_frames_beyond_the_callers_time_come_with_the_next_call_in_order_and_once(link: RobotLink, fake: Fake) -> None:
+    """So that the loop can give others a turn before all of a flood is worked off; what one frame says stays together."""
+    frames = [Frame(k, "o", b"") for k in range(1, 6)]
+    fake.given["receive"] = lambda: frames
+    fake.given["decode"] = [GOOD, GOOD]
+    turns = [[at for at, _ in link.receive(until_ns=0)] for _ in range(3)]
+    assert turns == [[1, 1], [2, 2], [3, 3]]
+    assert link.waits
+    fake.given["receive"] = []
+    assert [at for at, _ in link.receive()] == [4, 4, 5, 5]
+    assert not link.waits
+    assert fake.asked.count("receive") == 1
+    assert list(link.receive()) == []
+
+
 def test_a_flood_is_dropped_and_the_link_stays_down_until_it_is_calm(link: RobotLink, fake: Fake, monkeypatch: pytest.MonkeyPatch) -> None:
     turn(link)
     monkeypatch.setattr(robot_link, "CALM_NS", 50_000_000)

@@ -77,6 +77,8 @@ from s2r_runtime.profile import Profile
 from s2r_runtime.trust import keys
 
 TICK_NS = 20_000_000
+SHARE_NS = 5_000_000
+"""Of a turn of the loop for what the robot's side sent, a quarter of a tick; the rest comes with the next turn, at once."""
 ROUND_NS = 100_000_000
 WALL_CLOCK_NS = 1_000_000_000
 MEASURED_S = 1.0
@@ -321,10 +323,14 @@ class Daemon:
     def _turn(self) -> None:
         while not (self._signals.name or self._ended):
             due_ns = self._next_tick_ns if self.driver.due_ns is None else min(self._next_tick_ns, self.driver.due_ns)
-            ready = self.selector.select(max(0, due_ns - time.monotonic_ns()) * 1e-9)
+            waits = self.link.waits
+            ready = self.selector.select(0 if waits else max(0, due_ns - time.monotonic_ns()) * 1e-9)
             self.awake.look()
             for key, mask in ready:
+                waits = waits and key.fileobj is not self.link
                 key.data(mask)
+            if waits:
+                self._robot_ready()
             now_ns = time.monotonic_ns()
             if now_ns >= due_ns:
                 self._tick(now_ns)
@@ -370,10 +376,11 @@ class Daemon:
                 "set the clock, or, if it was ahead then by mistake: s2r clear wall_clock"
             )
 
-    def _robot_ready(self, _mask: int) -> None:
+    def _robot_ready(self, _mask: int = 0) -> None:
+        """What came from the robot's side, for SHARE_NS: commands, ticks and people get their turn in between."""
         if self.clock.lockstep and self._recorder_ok and self.logbook.behind:
             self._wait_for_log()
-        for arrival_ns, message in self.link.receive():
+        for arrival_ns, message in self.link.receive(time.monotonic_ns() + SHARE_NS):
             self._from_robot(arrival_ns, message)
 
     def _wait_for_log(self) -> None:

@@ -8,7 +8,9 @@ Also the daemon's clock: the host's monotonic one in real time; in lockstep the 
 
 from __future__ import annotations
 
+import math
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from typing import TypeVar
 
@@ -75,6 +77,7 @@ class RobotLink:
         self._fileno = -1
         self._news: list[LinkChanged] = []
         self._journal: list[str] = []
+        self._waiting: deque[Frame] = deque()
         self.out_of_use = False
 
     @property
@@ -103,8 +106,26 @@ class RobotLink:
         self.out_of_use = True
         self._news += self._failed(what, error)
 
-    def receive(self) -> Iterator[tuple[int, Inbound]]:
-        """(arrival on the host's clock, ns; what came), in order. The caller acts on each before it takes the next."""
+    def receive(self, until_ns: float = math.inf) -> Iterator[tuple[int, Inbound]]:
+        """(arrival on the host's clock, ns; what came), in order. The caller acts on each before it takes the next, and takes them all.
+        until_ns: after that time no further frame is begun; the rest comes with the next call (`waits`).
+        """
+        if not self._waiting:
+            yield from self._take()
+        while self._waiting and not self.out_of_use:
+            frame = self._waiting.popleft()
+            self._record(frame)
+            yield from self._passed_on(frame, self._decoded(frame))
+            if time.monotonic_ns() >= until_ns:
+                return
+
+    @property
+    def waits(self) -> bool:
+        """Whether frames came that were not decoded yet."""
+        return bool(self._waiting) and not self.out_of_use
+
+    def _take(self) -> Iterator[tuple[int, Inbound]]:
+        """What the transport has; yields what became of input that could not be taken."""
         if self.out_of_use:
             return
         given: object = None
@@ -116,11 +137,7 @@ class RobotLink:
             return
         if time.monotonic_ns() >= self._calm_ns:
             self._faults.pop("receive", None)
-        for frame in frames:
-            self._record(frame)
-            yield from self._passed_on(frame, self._decoded(frame))
-            if self.out_of_use:
-                return
+        self._waiting.extend(frames)
 
     def _spoilt(self, given: object, error: BaseException) -> Iterator[tuple[int, Inbound]]:
         """What becomes of input that could not be taken. given: what the transport gave, None if nothing."""

@@ -25,6 +25,7 @@ import socket
 import sys
 import time
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -251,7 +252,7 @@ def main() -> int:
         daemon.add_argument("--break-at", type=int, default=0, help="the core raises at the observation of this number")
         if name == "daemon":
             daemon.add_argument("--log", type=Path)
-            daemon.add_argument("--held", type=Path, help="where to note the longest processor time that a client took from the loop, s")
+            daemon.add_argument("--held", type=Path, help="where to note the longest processor times that held the loop, s")
         else:
             daemon.add_argument("out", type=Path)
     which.add_parser("s2r").add_argument("verb", nargs=argparse.REMAINDER)
@@ -269,21 +270,26 @@ def main() -> int:
     return run(args)
 
 
-def note_what_clients_take(path: Path) -> None:
-    """Processor time of the longest turn of the loop for a client."""
+def note_what_holds_the_loop(path: Path) -> None:
+    """Processor time of the longest turn of the loop, s: for a client, for what came from the robot's side, and for what time brings."""
     from s2r_runtime.daemon.control import Connection
+    from s2r_runtime.daemon.loop import Daemon
 
-    ready, longest = Connection.ready, 0.0
+    longest = {"client": 0.0, "robot": 0.0, "tick": 0.0}
 
-    def timed(connection: Connection, mask: int) -> None:
-        nonlocal longest
-        begun = time.thread_time()
-        ready(connection, mask)
-        if (took := time.thread_time() - begun) > longest:
-            longest = took
-            path.write_text(str(longest))
+    def timed(what: str, function: Callable[..., None]) -> Callable[..., None]:
+        def call(*arguments: Any) -> None:
+            begun = time.thread_time()
+            function(*arguments)
+            if (took := time.thread_time() - begun) > longest[what]:
+                longest[what] = took
+                path.write_text(json.dumps(longest))
 
-    Connection.ready = timed  # type: ignore[method-assign]
+        return call
+
+    Connection.ready = timed("client", Connection.ready)  # type: ignore[method-assign]
+    Daemon._robot_ready = timed("robot", Daemon._robot_ready)  # type: ignore[method-assign]
+    Daemon._tick = timed("tick", Daemon._tick)  # type: ignore[method-assign]
 
 
 def run(args: argparse.Namespace) -> int:
@@ -305,7 +311,7 @@ def run(args: argparse.Namespace) -> int:
         return handle(state, event)
 
     if getattr(args, "held", None):
-        note_what_clients_take(args.held)
+        note_what_holds_the_loop(args.held)
     if args.break_at:
         core.handle = breaking
     try:

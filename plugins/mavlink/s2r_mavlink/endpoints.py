@@ -20,10 +20,13 @@ Source = Any
 
 RETRY_NS = 200_000_000
 """Between two attempts to connect: a link heals within a second of its return."""
-ROBOT_MOST, OTHERS_MOST = 32 << 10, 4 << 10
-"""Bytes taken at a time from the robot's line, and from all that others say at once, so that no flood holds the loop that runs the gate.
-A frame has 8 bytes or more, and costs 4 µs to judge, or 25 to pass on: some 20 ms; 28 to 43 ms were measured on a busy machine.
+ROBOT_MOST, OTHERS_MOST, SHOWN_MOST = 32 << 10, 4 << 10, 8 << 10
+"""Bytes taken at a time from the robot's line, and from each side of others, and shown to the others: no flood holds the gate's loop.
+The robot's share is large, because old messages are dropped there, not acted on. A frame has 8 bytes or more, and costs 2 µs to judge, or
+5 to pass on. `tools/bench_mavlink.py --only flood` measures whole turns.
 """
+READ_COST = 64
+"""Bytes that each read from a line counts as, at least: an empty datagram, or a single byte, costs as much to take."""
 
 
 class Piece(NamedTuple):

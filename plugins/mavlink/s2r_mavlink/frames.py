@@ -23,6 +23,10 @@ SIGNED = 0x01
 SIGNATURE = 13
 LONGEST = 280
 """Bytes of the longest frame: 10 of header, 255 of payload, 2 of checksum, 13 of signature."""
+DATAGRAM = 1400
+"""Bytes of a datagram that no network in common use has to cut."""
+FALSE_STARTS = 512
+"""False starts of frames after which the rest of a piece is dropped: noise has one in 128 bytes, an attack nothing else."""
 
 _EXTRA = {number: bytes([extra]) for number, extra in CRC_EXTRA.items()}
 
@@ -84,7 +88,10 @@ def is_frame(data: bytes) -> bool:
 
 
 class Framer:
-    """Cuts what a line gives into frames. datagrams: frames do not go on in the next piece. `malformed`: stretches that were no frame."""
+    """Cuts what a line gives into frames. datagrams: frames do not go on in the next piece. `malformed`: stretches that were no frame.
+
+    A piece costs at most `FALSE_STARTS` checksums that fail, whatever is in it.
+    """
 
     def __init__(self, *, datagrams: bool) -> None:
         self._datagrams = datagrams
@@ -96,7 +103,7 @@ class Framer:
         if self._rest:
             data, self._rest = self._rest + data, b""
         frames: list[bytes] = []
-        at, end, bad = 0, len(data), False
+        at, end, bad, false_starts = 0, len(data), False, 0
         while at < end:
             size = length_at(data, at)
             if size > 0 and end - at >= size and whole(data, at, size):
@@ -109,6 +116,9 @@ class Framer:
                 self._rest = data[at:]
                 break
             bad = True
+            false_starts += 1
+            if false_starts > FALSE_STARTS:
+                break
             at = _next_marker(data, at + 1)
         self.malformed += bad
         return frames
@@ -120,6 +130,28 @@ def _next_marker(data: bytes, at: int) -> int:
     if second < 0 or first < 0:
         return max(second, first) if max(second, first) >= 0 else len(data)
     return min(second, first)
+
+
+def packed(frames: list[bytes], most: int = DATAGRAM) -> list[bytes]:
+    """Frames one behind the other, in pieces of at most `most` bytes."""
+    pieces: list[list[bytes]] = []
+    room = 0
+    for data in frames:
+        if len(data) > room or not pieces:
+            pieces.append([])
+            room = most
+        pieces[-1].append(data)
+        room -= len(data)
+    return [b"".join(piece) for piece in pieces]
+
+
+def newest(frames: list[bytes], most: int) -> list[bytes]:
+    """The last ones that have at most `most` bytes together."""
+    first, room = len(frames), most
+    while first and len(frames[first - 1]) <= room:
+        first -= 1
+        room -= len(frames[first])
+    return frames[first:]
 
 
 def build(number: int, content: bytes, sequence: int, system: int, component: int, *, signed: bool = False) -> bytes:

@@ -20,8 +20,10 @@ from s2r_mavlink.frames import header, payload
 from s2r_runtime.messages import Frame
 
 KEPT_PER_SECOND = 32
-BYTES_PER_SECOND = 92_160
-"""Passed on to the robot at most: what a serial line at 921 600 baud, the fastest in common use, carries. More only crowds out commands."""
+BYTES_PER_SECOND, BURST_BYTES = 92_160, 4096
+"""Passed on to the robot at most: what a serial line at 921 600 baud, the fastest in common use, carries. More only crowds out commands.
+At once: some fifty of the longest frames.
+"""
 SECOND = 1_000_000_000
 
 MANUAL_CONTROL, RC_CHANNELS_OVERRIDE, SET_MODE = 69, 70, 11
@@ -53,7 +55,7 @@ class Relay:
     def __init__(self, channel: str, line: Endpoint, reserved: frozenset[tuple[int, int]]) -> None:
         self.channel, self.line, self._reserved = channel, line, reserved
         self._second = self._kept = 0
-        self._passing = self._bytes = 0
+        self._room_bytes, self._room_ns = float(BURST_BYTES), 0
         self.passed = self.refused = self.blocked = self.unlogged = 0
         self.disturbed = False
 
@@ -99,10 +101,14 @@ class Relay:
         return number in COMPANION_MAY or _command(number, data) in COMPANION_MAY_ASK
 
     def _carried(self, data: bytes, now_ns: int) -> bool:
-        if now_ns // SECOND != self._passing:
-            self._passing, self._bytes = now_ns // SECOND, 0
-        self._bytes += len(data)
-        return self._bytes <= BYTES_PER_SECOND
+        """Whether the robot's line has room for it: a bucket of BURST_BYTES that fills at BYTES_PER_SECOND."""
+        since_s = max(0, now_ns - self._room_ns) / SECOND
+        self._room_bytes = min(float(BURST_BYTES), self._room_bytes + since_s * BYTES_PER_SECOND)
+        self._room_ns = max(now_ns, self._room_ns)
+        if len(data) > self._room_bytes:
+            return False
+        self._room_bytes -= len(data)
+        return True
 
     def _room(self, now_ns: int) -> bool:
         """Whether the log takes one more: their number per second is bounded, so that a stranger can't fill the log."""

@@ -10,7 +10,7 @@ import struct
 import termios
 import time
 
-from s2r_mavlink.endpoints import RETRY_NS, Address, Piece, Source
+from s2r_mavlink.endpoints import READ_COST, RETRY_NS, Address, Piece, Source
 from s2r_mavlink.frames import Framer
 from s2r_runtime.errors import ConfigError
 
@@ -92,7 +92,7 @@ class SerialLine:
             if not data:
                 self._shut()
                 break
-            taken += len(data)
+            taken += max(len(data), READ_COST)
             frames += self._framer.feed(data)
         return [Piece(self.text, time.monotonic_ns(), frames)] if frames else []
 

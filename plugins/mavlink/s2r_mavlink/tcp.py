@@ -15,7 +15,7 @@ import termios
 import time
 from contextlib import suppress
 
-from s2r_mavlink.endpoints import RETRY_NS, Address, Piece, Source, resolved
+from s2r_mavlink.endpoints import READ_COST, RETRY_NS, Address, Piece, Source, resolved
 from s2r_mavlink.frames import LONGEST, Framer
 from s2r_runtime.errors import ConfigError
 
@@ -54,7 +54,7 @@ class Connection:
             if not data:
                 stands = False
                 break
-            taken += len(data)
+            taken += max(len(data), READ_COST)
             frames += self.framer.feed(data)
         if frames:
             self.heard_ns = time.monotonic_ns()

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import select
 import time
+from collections import deque
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,8 +19,8 @@ from typing import Any, ClassVar
 from s2r_mavlink import dialect
 from s2r_mavlink.asking import STOPS, Asking
 from s2r_mavlink.door import Door
-from s2r_mavlink.endpoints import ROBOT_MOST, endpoint
-from s2r_mavlink.frames import build, payload
+from s2r_mavlink.endpoints import ROBOT_MOST, SHOWN_MOST, endpoint
+from s2r_mavlink.frames import build, newest, packed, payload
 from s2r_mavlink.options import MEANINGS, checked
 from s2r_mavlink.pose import SOURCES
 from s2r_mavlink.relay import Relay
@@ -27,6 +28,8 @@ from s2r_mavlink.signing import Signing, default_state, read_key
 from s2r_mavlink.wire import Decoded, Wire
 from s2r_runtime.messages import Command, Decided, Frame, GateChanged, LinkChanged
 
+SHARE_NS = 4_000_000
+"""Of one call: a line is not read any more after so long."""
 TEXT_BYTES = 50
 TEXT_NS = 1_000_000_000
 SAME_TEXT_NS = 10_000_000_000
@@ -51,6 +54,7 @@ class MavlinkTransport:
         self._line = endpoint(o["robot"], many=False)
         reserved = robot | {(self._system, self._own)}
         self._relays = [Relay(side, endpoint(o[side], many=True), reserved) for side in ("ground", "companion") if o[side]]
+        self._sides: deque[Relay | None] = deque((None, *self._relays))  # None: the robot's
         self._asking = Asking(o, self._wire, self._door.told, self._tell_robot)
         self._poller: select.epoll | None = None
         self._sequence = 0
@@ -106,27 +110,37 @@ class MavlinkTransport:
         if self._poller is None:
             return []
         ready = {number for number, _ in self._poller.poll(0)}
+        until_ns = time.monotonic_ns() + SHARE_NS
         frames: list[Frame] = []
-        if not ready.isdisjoint(self._line.descriptors()):
-            pieces = self._line.read(ROBOT_MOST)
-            frames = self._door.come_in(self._line, pieces)
-            self._show([piece for piece in pieces if not self._line.is_other(piece.source)])
-            frames += self._overflow()
-        for relay in self._relays:
-            if not ready.isdisjoint(relay.line.descriptors()):
-                through, kept = relay.take()
-                for data in through:
-                    self._line.write(data)
-                frames += kept
+        for _ in range(len(self._sides)):
+            if time.monotonic_ns() > until_ns:  # the next call begins with the line that was not read
+                break
+            relay = self._sides[0]
+            self._sides.rotate(-1)
+            if not ready.isdisjoint((self._line if relay is None else relay.line).descriptors()):
+                frames += self._from_robot() if relay is None else self._from_others(relay)
         frames += self._door.notes(time.monotonic_ns())
         return frames
 
-    def _show(self, pieces: list[Any]) -> None:
-        """The robot's frames to everybody else, as they came."""
-        for relay in self._relays:
-            for piece in pieces:
-                for data in piece.frames:
-                    relay.line.write(data)
+    def _from_robot(self) -> list[Frame]:
+        pieces = self._line.read(ROBOT_MOST)
+        frames = self._door.come_in(self._line, pieces)
+        self._show([data for piece in pieces if not self._line.is_other(piece.source) for data in piece.frames])
+        return frames + self._overflow()
+
+    def _from_others(self, relay: Relay) -> list[Frame]:
+        through, refused = relay.take()
+        for data in through:
+            self._line.write(data)
+        return refused
+
+    def _show(self, frames: list[bytes]) -> None:
+        """The robot's newest frames to everybody else, unchanged; those that came together go together, as each write costs more than a
+        frame.
+        """
+        for data in packed(newest(frames, SHOWN_MOST)) if self._relays else []:
+            for relay in self._relays:
+                relay.line.write(data)
 
     def _overflow(self) -> list[Frame]:
         """What the kernel dropped, because nobody came for it."""

@@ -11,7 +11,7 @@ import socket
 import struct
 import time
 
-from s2r_mavlink.endpoints import RETRY_NS, Address, Piece, Source, resolved
+from s2r_mavlink.endpoints import READ_COST, RETRY_NS, Address, Piece, Source, resolved
 from s2r_mavlink.frames import Framer
 from s2r_runtime.errors import ConfigError
 
@@ -21,8 +21,6 @@ OTHERS = 8
 RECEIVE_BUFFER = 1 << 20
 DATAGRAM = 9216
 """Bytes of the longest that is read whole: a jumbo frame of Ethernet."""
-DATAGRAM_COST = 64
-"""Bytes that each one counts as, at least: taking an empty one costs as much."""
 SO_RXQ_OVFL = getattr(socket, "SO_RXQ_OVFL", 40)
 """Linux: a datagram comes with the number of those that were dropped before it (socket(7)); Python has no name for it."""
 
@@ -104,9 +102,9 @@ class Udp:
             except BlockingIOError:
                 break
             except OSError:  # nobody listens there: an answer to something that was sent
-                taken += DATAGRAM_COST
+                taken += READ_COST
                 continue
-            taken += max(len(data), DATAGRAM_COST)
+            taken += max(len(data), READ_COST)
             frames = feed(data)
             if frames:
                 pieces.append(Piece(source, clock(), frames))
@@ -120,14 +118,14 @@ class Udp:
         except BlockingIOError:
             return 0
         except OSError:
-            return DATAGRAM_COST
+            return READ_COST
         for level, kind, value in extra:
             if level == socket.SOL_SOCKET and kind == SO_RXQ_OVFL:
                 self.overflowed = max(self.overflowed, struct.unpack_from("I", value)[0])
         frames = self._framer.feed(data)
         if frames:
             pieces.append(Piece(source, time.monotonic_ns(), frames))
-        return max(len(data), DATAGRAM_COST)
+        return max(len(data), READ_COST)
 
     def write(self, frame: bytes, source: Source | None = None) -> bool:
         """To the robot, or to all others, or to one of them."""

@@ -5,6 +5,7 @@ The truth is at x = k mm for its k-th observation; every lie says that it is at 
 
 from __future__ import annotations
 
+import contextlib
 import math
 import random
 import socket
@@ -16,8 +17,9 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from s2r_mavlink.dialect import MESSAGES
-from s2r_mavlink.endpoints import ROBOT_MOST
-from s2r_mavlink.frames import build, header, is_frame
+from s2r_mavlink.endpoints import ROBOT_MOST, SHOWN_MOST
+from s2r_mavlink.frames import DATAGRAM as DATAGRAM_MOST
+from s2r_mavlink.frames import LONGEST, build, header, is_frame
 from s2r_mavlink.rover_lines import TcpServerLine, UdpLine
 from s2r_mavlink.signing import stamp_of
 from s2r_mavlink.testing import HOLD, INPUTS, STATES, Robot, Runtime, free_port, fuzzed
@@ -191,6 +193,25 @@ def test_flood_from_another_address_holds_no_call_up(truth: Truth, stranger: Rob
     time.sleep(0.6)  # the robot was silent meanwhile, and the stranger was taken for it: until it is silent
     truth.tell(5)
     assert truth.heard()
+
+
+def test_what_a_flooding_robot_sends_is_shown_to_the_others_in_a_bounded_share() -> None:
+    """Each write to somebody else costs more than a frame: eight listeners must not multiply a flood."""
+    port, companion = free_port(), free_port(socket.SOCK_STREAM)
+    with Runtime(f"udp:127.0.0.1:{port}", companion=f"tcpin:127.0.0.1:{companion}") as runtime, contextlib.ExitStack() as stack:
+        for _ in range(8):
+            stack.enter_context(socket.create_connection(("127.0.0.1", companion)))
+        runtime.turn()
+        robot = Robot(UdpLine("127.0.0.1", port))
+        stack.callback(robot.line.close)
+        written: list[bytes] = []
+        line = runtime.transport._relays[0].line
+        line.write = lambda data, source=None: bool(written.append(data)) or True  # type: ignore[assignment, method-assign]
+        for _ in range(20):
+            robot.line.write(b"".join(robot.pack(robot.heartbeat()) for _ in range(400)))
+        runtime.transport.receive()
+    assert 0 < len(written) <= SHOWN_MOST // (DATAGRAM_MOST - LONGEST) + 1
+    assert sum(map(len, written)) <= SHOWN_MOST
 
 
 # ---------------------------------------------------------------- the robot's own line

@@ -7,12 +7,27 @@ import struct
 from typing import Any
 
 import pytest
+from fastcrc.crc16 import mcrf4xx as crc16
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
+from s2r_mavlink import frames
 from s2r_mavlink.dialect import CRC_EXTRA, MESSAGES
-from s2r_mavlink.frames import LONGEST, Framer, build, header, is_frame, payload, renumbered
+from s2r_mavlink.frames import (
+    DATAGRAM,
+    FALSE_STARTS,
+    LONGEST,
+    Framer,
+    build,
+    header,
+    is_frame,
+    newest,
+    packed,
+    payload,
+    renumbered,
+)
 
+GOOD = build(0, bytes(9), 1, 1, 1)
 OPAQUE = 163
 """AHRS of ArduPilot's own dialect: a message that `common` doesn't have."""
 
@@ -214,3 +229,39 @@ def test_any_bytes_are_cut_into_whole_frames_or_nothing(data: bytes) -> None:
         for frame in framer.feed(data):
             assert frame in data
             assert len(frame) <= LONGEST
+
+
+@pytest.mark.parametrize("datagrams", [True, False])
+@pytest.mark.parametrize("noise", [b"\xfe", b"\xfe\x00", b"\xfd\x00\x00"])
+def test_noise_of_nothing_but_false_starts_costs_a_bounded_number_of_checksums(
+    noise: bytes, datagrams: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried = 0
+
+    def counted(data: bytes) -> int:
+        nonlocal tried
+        tried += 1
+        return int(crc16(data))
+
+    monkeypatch.setattr(frames, "crc16", counted)
+    framer = Framer(datagrams=datagrams)
+    assert not [frame for frame in framer.feed(noise * 40_000) if header(frame).known]
+    assert tried <= FALSE_STARTS + 1
+    assert framer.malformed <= FALSE_STARTS + 1
+    assert framer.feed(GOOD) == [GOOD], "what comes after it is read"
+
+
+def test_good_frame_between_the_false_starts_of_a_bad_line_is_found() -> None:
+    assert Framer(datagrams=False).feed(b"\xfe" * (FALSE_STARTS // 2) + GOOD * 40)[-20:] == [GOOD] * 20
+
+
+@given(st.lists(st.integers(1, LONGEST), max_size=60), st.integers(0, 3000))
+def test_frames_are_packed_whole_and_the_newest_are_taken(sizes: list[int], most: int) -> None:
+    made = [bytes([k & 0xFF]) * size for k, size in enumerate(sizes)]
+    pieces = packed(made)
+    assert b"".join(pieces) == b"".join(made)
+    assert all(0 < len(piece) <= DATAGRAM for piece in pieces)
+    last = newest(made, most)
+    assert last == made[len(made) - len(last) :]
+    assert sum(map(len, last)) <= most
+    assert len(last) == len(made) or sum(map(len, last)) + len(made[-len(last) - 1]) > most
