@@ -20,6 +20,7 @@ from command_reference import verbs
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import writable
 from s2r_runtime.cli.main import main, parser
+from s2r_runtime.cli.verbs import VERBS
 from s2r_runtime.errors import UsageError
 from s2r_runtime.files import durable
 from s2r_runtime.trust.offline_ledger import open_ledger
@@ -488,3 +489,20 @@ def test_what_the_daemon_refuses_is_told_as_the_programs_own_errors_are(tmp_path
         thread.join()
     refused(done, 1)
     assert done.stderr == "s2r: nothing drives\n"
+
+
+@pytest.mark.parametrize(
+    ("argv", "wrong", "right"),
+    [
+        (["smaple"], "'smaple'", "did you mean sample?"),
+        (["gap", "run.csv", "--modle", "unicycle"], "'--modle'", "did you mean --model?"),
+        (["log", "inof"], "'inof'", "did you mean info?"),
+        (["xyzzy"], "'xyzzy'", "it can be demo, run,"),
+    ],
+)
+def test_what_is_mistyped_gets_the_nearest_name(argv: list[str], wrong: str, right: str) -> None:
+    refused(s2r(*argv), 2, wrong, right)
+
+
+def test_the_table_of_verbs_is_the_command_line() -> None:
+    assert {name.split()[1] for name, _, _ in verbs(parser(), "s2r")} == set(VERBS)

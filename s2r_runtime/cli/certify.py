@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verb."""
-    verb = verbs.add_parser("certify", help="gap + verify + sign: a certificate for this controller from a recorded campaign")
+    verb = verbs.add_parser("certify")
     verb.add_argument("controller", type=Path, metavar="CONTROLLER", help="a Python file with control(x, theta, parameters)")
     verb.add_argument("--profile", type=Path, required=True, metavar="P", help="the robot's profile (TOML)")
     verb.add_argument(

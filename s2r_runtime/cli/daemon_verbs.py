@@ -19,7 +19,7 @@ WAITING = ("sample", "excite", "deploy", "trace", "verify")
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verbs of this module."""
-    run = verbs.add_parser("run", help="the daemon: talks to the robot, guards it, records everything")
+    run = verbs.add_parser("run")
     run.add_argument("profile", type=Path, metavar="PROFILE", help="the robot's profile (TOML)")
     run.add_argument(
         "--state", type=Path, metavar="DIR", help="where counters, certificates and logs live (default: the user's state folder, by robot)"
@@ -33,7 +33,6 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
     sample = verbs.add_parser(
         "sample",
-        help="one sampling campaign, through the running daemon if there is one",
         epilog="Ctrl-C, a closed terminal, a dropped ssh or a killed command stop the robot and keep the campaign; the same command goes "
         "on with it. With --detach the campaign goes on by itself.",
     )
@@ -70,7 +69,6 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     deploy = _talker(
         verbs,
         "deploy",
-        "let this controller drive, if a certificate covers it; verify it first if none does",
         "Ctrl-C before the controller drives withdraws it. Once it drives, it drives on without this command: s2r undeploy ends that.",
     )
     deploy.add_argument("controller", type=Path, metavar="CONTROLLER", help="a Python file with control(x, theta, parameters)")
@@ -78,36 +76,34 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     deploy.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the controller; may be repeated")
     deploy.set_defaults(run=run_deploy)
 
-    undeploy = _talker(verbs, "undeploy", "end the deployment; the recovery controller stops the robot")
+    undeploy = _talker(verbs, "undeploy")
     undeploy.set_defaults(run=lambda a: _say(a, {"verb": "undeploy"}))
 
-    revoke = _talker(verbs, "revoke", "withdraw a certificate, or all of them")
+    revoke = _talker(verbs, "revoke")
     revoke.add_argument("certificate", metavar="ID", nargs="?", default="", help="certificate id (default: all)")
     revoke.set_defaults(run=lambda a: _say(a, {"verb": "revoke", "text": a.certificate}))
 
-    adopt = _talker(verbs, "adopt", "use this model from now on; voids the gap, so a fresh campaign comes next")
+    adopt = _talker(verbs, "adopt")
     adopt.add_argument("model", type=Path, nargs="?", metavar="MODEL.toml", help="default: the model that tracing proposes (s2r status)")
     adopt.set_defaults(run=run_adopt)
 
-    clear = _talker(verbs, "clear", "clear a latched reason, after looking into it")
+    clear = _talker(verbs, "clear")
     clear.add_argument("reason", metavar="REASON", help="as s2r status names it, such as emergency_stop")
     clear.set_defaults(run=lambda a: _say(a, {"verb": "clear", "text": a.reason}))
 
-    stop = _talker(verbs, "stop", "emergency stop; latches until cleared")
+    stop = _talker(verbs, "stop")
     stop.set_defaults(run=lambda a: _say(a, {"verb": "stop"}))
 
-    permit = _talker(verbs, "permit", "let the sampler drive inside the geofence for a limited time")
+    permit = _talker(verbs, "permit")
     permit.add_argument("seconds", type=positive, metavar="SECONDS", help="from now on")
     permit.set_defaults(run=lambda a: _say(a, {"verb": "permit", "duration_s": a.seconds}))
 
-    status = _talker(verbs, "status", "what the daemon is doing, and why")
+    status = _talker(verbs, "status")
     status.set_defaults(run=run_status)
 
 
-def _talker(
-    verbs: argparse._SubParsersAction[argparse.ArgumentParser], name: str, summary: str, epilog: str | None = None
-) -> argparse.ArgumentParser:
-    verb = verbs.add_parser(name, help=summary, epilog=epilog)
+def _talker(verbs: argparse._SubParsersAction[argparse.ArgumentParser], name: str, epilog: str | None = None) -> argparse.ArgumentParser:
+    verb = verbs.add_parser(name, epilog=epilog)
     _common(verb)
     return verb
 

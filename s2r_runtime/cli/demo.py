@@ -14,9 +14,7 @@ from s2r_runtime.cli.choices import count
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verb."""
-    verb = verbs.add_parser(
-        "demo", help="the whole loop on a built-in robot: sample, gap, verify, refuse, trace, repair, certify, drive, revoke, audit"
-    )
+    verb = verbs.add_parser("demo")
     verb.add_argument("--robot", default="robotarium", metavar="NAME", help="which built-in robot (default robotarium)")
     verb.add_argument("--out", type=Path, metavar="DIR", help="where the log, the report and the rest go (default s2r-demo/run-NNN)")
     verb.add_argument("--seed", type=count, default=1, help="one seed gives one story (default 1)")

@@ -43,7 +43,7 @@ LAWS = ("uniform", "persistent", "adversarial")
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verbs of this module."""
-    gap = verbs.add_parser("gap", help="the sim2real gap that a recording shows, and its statement")
+    gap = verbs.add_parser("gap")
     gap.add_argument(
         "recording",
         type=Path,
@@ -67,7 +67,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     gap.add_argument("--json", action="store_true", help="print one JSON object")
     gap.set_defaults(run=run_gap)
 
-    verify = verbs.add_parser("verify", help="run a controller on the uncertain model and say what that shows")
+    verify = verbs.add_parser("verify")
     verify.add_argument("controller", type=Path, metavar="CONTROLLER", help="a Python file with control(x, theta, parameters)")
     verify.add_argument("--profile", type=Path, required=True, metavar="P", help="the robot's profile (TOML)")
     verify.add_argument("--model", metavar="MODEL.toml", help="a repaired model instead of the profile's")

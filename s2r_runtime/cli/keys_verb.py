@@ -13,7 +13,7 @@ from s2r_runtime.errors import S2RError, UsageError
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verb."""
-    keys = verbs.add_parser("keys", help="signing keys").add_subparsers(dest="what", metavar="WHAT", required=True)
+    keys = verbs.add_parser("keys").add_subparsers(dest="what", metavar="WHAT", required=True)
     new = keys.add_parser("new", help="make a key pair that signs certificates and logs")
     new.add_argument("path", type=Path, nargs="?", metavar="FILE", help="where (default: the user's configuration folder)")
     new.set_defaults(run=keys_new)

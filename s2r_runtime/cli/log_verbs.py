@@ -14,7 +14,7 @@ HEAD_BYTES = 32
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verbs of this module."""
-    audit = verbs.add_parser("audit", help="recompute every number and every decision from the log alone")
+    audit = verbs.add_parser("audit")
     audit.add_argument("log", type=Path, nargs="+", metavar="LOG", help="a run's files, in order if it was rotated")
     audit.add_argument(
         "--key", type=Path, metavar="PUB", help="the public key to trust (default: the one in the log, which shows consistency only)"
@@ -38,14 +38,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     audit.add_argument("--json", action="store_true", help="print one JSON object")
     audit.set_defaults(run=run_audit)
 
-    report = verbs.add_parser("report", help="plots and statements of a log on one self-contained page")
+    report = verbs.add_parser("report")
     report.add_argument("log", type=Path, nargs="+", metavar="LOG", help="a run's files, in order if it was rotated")
     report.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.html", help="where the page goes")
     report.set_defaults(run=run_report)
 
-    log = verbs.add_parser("log", help="look at a log, or recover what a crash left").add_subparsers(
-        dest="what", metavar="WHAT", required=True
-    )
+    log = verbs.add_parser("log").add_subparsers(dest="what", metavar="WHAT", required=True)
     recover = log.add_parser("recover", help="write a clean file with all that is readable, and say what is missing")
     recover.add_argument("log", type=Path, metavar="LOG", help="a log that is damaged or was cut off; it is kept as it is")
     recover.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="another file, for what is readable")

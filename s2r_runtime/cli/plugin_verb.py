@@ -25,7 +25,7 @@ CHECK_S = 900.0
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verbs of this module."""
-    plugin = verbs.add_parser("plugin", help="what is installed; check it, or begin a new one")
+    plugin = verbs.add_parser("plugin")
     what = plugin.add_subparsers(dest="what", metavar="WHAT", required=True)
     listing = what.add_parser("list", help="every plug-in found, what it offers, and why one could not be loaded")
     listing.add_argument("--json", action="store_true", help="print one JSON object")

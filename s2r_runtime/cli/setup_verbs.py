@@ -33,14 +33,14 @@ IDLE_S, LOADED_S = 2.0, 10.0
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verbs of this module."""
-    profile = verbs.add_parser("profile", help="check a robot's profile").add_subparsers(dest="what", metavar="WHAT", required=True)
+    profile = verbs.add_parser("profile").add_subparsers(dest="what", metavar="WHAT", required=True)
     check = profile.add_parser("check", help="is this profile valid here, and what does it mean")
     check.add_argument("profile", type=Path, metavar="PROFILE", help="the robot's profile (TOML)")
     check.add_argument("--defaults", action="store_true", help="print every setting in force, the defaults included")
     check.add_argument("--json", action="store_true", help="print one JSON object")
     check.set_defaults(run=profile_check)
 
-    doctor = verbs.add_parser("doctor", help="what is missing on this machine, and what to do about it")
+    doctor = verbs.add_parser("doctor")
     doctor.add_argument(
         "--load", action="store_true", help="try the computer beside as many busy loops as it has processors, for 10 s; else idle, for 2 s"
     )

@@ -23,9 +23,7 @@ SEARCH_TIMEOUT = 24 * 3600.0
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verb."""
-    verb = verbs.add_parser(
-        "synthesize", help="search a controller's parameters, then verify the winner on scenarios that did not choose it"
-    )
+    verb = verbs.add_parser("synthesize")
     verb.add_argument("controller", type=Path, metavar="CONTROLLER", help="a controller with BOUNDS for its PARAMETERS")
     verb.add_argument("--profile", type=Path, required=True, metavar="P", help="the robot's profile (TOML)")
     verb.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.py", help="where the winner goes, with its parameters")

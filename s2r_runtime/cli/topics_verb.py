@@ -22,7 +22,7 @@ USUAL_DT = 0.05
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verb."""
-    verb = verbs.add_parser("topics", help="what a recording holds: topics, rates, spans, and signals for --state and --input")
+    verb = verbs.add_parser("topics")
     verb.add_argument("recording", type=Path, metavar="FILE", help="a bag (file or folder), a flight log, a measurement file, a table, ...")
     verb.add_argument("--model", metavar="M", default="", help="say which signals would be taken for this model's states and inputs")
     add_dbc(verb)

@@ -40,7 +40,7 @@ MOST_SUGGESTED = 100_000
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verb."""
-    verb = verbs.add_parser("trace", help="find the effect that the model lacks, add it, and report the error before and after")
+    verb = verbs.add_parser("trace")
     verb.add_argument(
         "recording",
         type=Path,

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verb."""
-    verb = verbs.add_parser("trials", help="closed-loop runs of a controller on the robot, from its logs, and what they show")
+    verb = verbs.add_parser("trials")
     verb.add_argument("controller", type=Path, metavar="CONTROLLER", help="a Python file with control(x, theta, parameters)")
     verb.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="logs of drives; each is audited first")
     verb.add_argument("--profile", type=Path, required=True, metavar="P", help="the robot's profile (TOML)")

@@ -48,10 +48,9 @@ class Drive:
 class Transitions:
     """n transitions. x0, x1: (n, nx); u: (n, nu); t0_s: (n,). held: (n, nx), the state after `hold_periods` held periods, or None.
 
-    `independent`: drawn independently from one distribution; if not, `doubt` says why, and there is no statement. `assumption`: what the
-    user
-    vouched for instead. `digest`: of the recording's bytes; `samples_digest`: of a campaign's samples, alike in every log that holds
-    them; `content_digest`: of a table's numbers, however they are written; for driving in a daemon's log, of which run it is.
+    `independent`: drawn independently from one distribution; if not, `doubt` says why, and there is no statement. `assumption`: what
+    the user vouched for instead. `digest`: of the recording's bytes; `samples_digest`: of a campaign's samples, alike in every log that
+    holds them; `content_digest`: of a table's numbers, however they are written; for driving in a daemon's log, of which run it is.
     `noise`: (nx,) standard deviation of the measurements, None if the recording doesn't show it. `subset`: which rows of a long recording
     are used (None: all). `holds`: of a campaign's samples, how long each lasted and what was commanded before; None: one step, from rest.
     """
