@@ -224,6 +224,9 @@ def test_a_head_that_was_published_must_be_reached(run: Any, tmp_path: Path) -> 
         ("certificate", "what it says is not what the evidence says"),
         ("signer", "which is not trusted here"),
         ("discrepancy", "the discrepancy (or what the watch makes of it) is another one"),
+        ("an episode left out", "a run's end is not recorded"),
+        ("a better episode", "what a run came to is not what the observations make of it"),
+        ("an episode put in", "what a run came to is not what the observations make of it"),
         ("verdict", "the core gives another output here"),
         ("silent opening", "the core gives another output here"),
         ("send", "a frame left that no command of the core makes"),
@@ -442,7 +445,7 @@ def test_a_later_run_cannot_forget_what_an_earlier_one_spent(run: Any, tmp_path:
     honest = Bench(tmp_path, memory=memory).stop().write(tmp_path / "b.mcap", run="second")
     assert audit([first, honest]).ok
     forgetful = Bench(tmp_path, memory=msgspec.structs.replace(memory, attempts=0)).stop().write(tmp_path / "c.mcap", run="third")
-    assert audit([forgetful]).ok, "alone it cannot be told"
+    assert audit([forgetful]).ok, "alone it cannot be seen"
     result = audit([first, forgetful])
     assert not result.ok
     assert result.first_difference is not None

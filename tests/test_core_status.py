@@ -48,6 +48,7 @@ NOTHING: dict[str, Any] = {
     "jobs": [],
     "measurement_faults": 0,
     "episodes": 0,
+    "runs": None,
     "model": "",
     "proposal": None,
     "traced": False,

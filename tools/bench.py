@@ -33,6 +33,7 @@ ORDER = (
     "bench_grinding.py",
     "bench_rates.py",
     "bench_missions.py",
+    "bench_episodes.py",
 )
 
 

@@ -161,6 +161,7 @@ class Certificates:
             horizon=horizon(),
             traced_not_adopted=traced,
             tries=order.tries,
+            runs=order.run_limits,
         )
         if again.id != certificate.id:
             raise ConfigError("what it says is not what the evidence says")

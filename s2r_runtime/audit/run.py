@@ -16,6 +16,7 @@ from s2r_runtime.audit.evidence import Evidence, attached_controller
 from s2r_runtime.audit.findings import Findings
 from s2r_runtime.audit.inputs import InputsReplay
 from s2r_runtime.audit.older import as_recorded
+from s2r_runtime.audit.runs import RunsReplay
 from s2r_runtime.audit.traces import RELEVANT, Traces
 from s2r_runtime.core.state import unix_now
 from s2r_runtime.core.status import against_sampler
@@ -24,6 +25,7 @@ from s2r_runtime.errors import ConfigError
 from s2r_runtime.files.bounded_file import read_bounded
 from s2r_runtime.files.canonical import digest
 from s2r_runtime.messages import (
+    EPISODES,
     GRID,
     RULES,
     SEEDS,
@@ -34,6 +36,8 @@ from s2r_runtime.messages import (
     CertificateStored,
     Decided,
     DrawSeed,
+    EpisodeEnded,
+    EpisodeScored,
     EpochChanged,
     Event,
     InputsFinished,
@@ -107,6 +111,7 @@ class RunAudit:
         self._traces = across.traces
         self._trusted, self._rerun = across.trusted, across.rerun
         self._inputs, self._driven = InputsReplay(across.findings), DrivenAgain(across.findings)
+        self._runs = RunsReplay(across.findings)
         self._observation: Observation | None = None
         self._core = CoreReplay(across.findings)
         self._beside, self._begun = across.beside, False
@@ -200,16 +205,22 @@ class RunAudit:
                 self._seen_seq, self._observation = observation.seq, observation
                 self._campaigns.observed(observation)
                 self._driven.observed(observation)
+                self._runs.observed(observation)
             case LinkChanged():
                 self._campaigns.restarted()
             case Proposed() if event.command.source == "sampler":
                 (self._inputs if self._inputs.driving else self._campaigns).proposed(entry, event)
             case Proposed() if event.command.source == "controller":
                 self._driven.proposed(entry, event)
+                self._runs.answered(entry, event.command.obs_seq)
+            case EpisodeEnded() | EpisodeScored():
+                self._runs.reported(entry, event)
             case AnswerLate():
                 self._driven.lost_track()
+                self._runs.late()
             case SourceStopped(source="controller"):
                 self._driven.stop()
+                self._runs.gone(entry, event)
             case SampleTaken():
                 self._campaigns.sample(entry, event)
             case CampaignFinished():
@@ -306,7 +317,7 @@ class RunAudit:
             case Decided() if not settings.fault_share:
                 self._campaigns.decided(output.reason)  # an earlier version took the gate's last word, whatever it was about
             case Ask(source="controller"):
-                pass
+                self._runs.shown(output.obs_seq)
             case Ask(source="sampler") if self._inputs.driving:
                 self._inputs.ask(output, self._observation, settings.command_ttl_ns)
             case Ask(source="sampler"):
@@ -321,6 +332,8 @@ class RunAudit:
                 self._campaigns.start(output, in_force, profile.sampling)
             case StartController():
                 model = self._compose(profile.model)
+                if settings.rules >= EPISODES:
+                    self._runs.start(model, profile, settings.seed)
                 if self._rerun and model is not None:
                     self._driven.start(attached_controller(self._attached(), output.digest), model, profile.task, settings.seed)
                 if state.memory.gap is not None and model is not None:
@@ -328,6 +341,7 @@ class RunAudit:
             case StopController():
                 self._beside.stop()
                 self._driven.stop()
+                self._runs.stop(entry)
             case DrawSeed():
                 self._evidence.paid(output)
             case StartJob():
@@ -336,7 +350,7 @@ class RunAudit:
                 self._certificates.issuing(output, traced=state.memory.traced)
             case EpochChanged() | AttemptSpent():
                 self._evidence.spent(entry, output, settings.beta)
-            case Persist():
+            case Persist() if not output.later:  # the disk may not have had it when the daemon was cut
                 self._evidence.persisted(output.memory)
             case Revoked():
                 self._certificates.revoked(output)

@@ -251,11 +251,28 @@ def run_status(args: argparse.Namespace) -> int:
         output.out(f"covered     gap {data['radius']:.4g}, certified to {data['verified_radius']:.4g}")
     if driven := data.pop("driven", None):
         output.out(f"driving/gap {_ratio(driven)}")
+    for line in _runs(data.pop("runs", None)):
+        output.out(f"runs        {line}")
     if line := _budget(data):
         output.out(f"budget      {line}")
     for key, value in data.items():
         output.out(f"{key.replace('_', ' '):11s} {_plain(value)}")
     return int(answer["exit_code"])
+
+
+def _runs(runs: dict[str, Any] | None) -> list[str]:
+    """What the controller's runs on this robot show, in a line each."""
+    if runs is None or runs["all"] is None:
+        return []
+    whole, own, highest = runs["all"], runs["under_certificate"], runs["max_unsafe"]
+    lines = [str(whole["statement"])]
+    if own is not None and own["number"] != whole["number"]:
+        lines.append(str(own["statement"]))
+    if whole["lower"] > 0.0:
+        lines.append(f"at least {100.0 * whole['lower']:.2g} % are unsafe" + (f"; {100.0 * highest:g} % are allowed" if highest else ""))
+    if runs["refused"]:
+        lines.append("REFUSED: more than the profile allows; if the cause was removed: s2r clear unsafe_runs")
+    return lines
 
 
 def _ratio(driven: dict[str, Any]) -> str:

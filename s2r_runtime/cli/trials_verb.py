@@ -1,4 +1,4 @@
-"""s2r trials: closed-loop runs of a controller on the robot, taken from its logs, and what they show (guarantee G9)."""
+"""s2r trials: closed-loop runs of a controller on the robot, taken from its logs, and what they show (guarantee G9, G10)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import msgspec
 
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import controller_at, count, load_checked, probability
-from s2r_runtime.errors import ConfigError
+from s2r_runtime.errors import ConfigError, NotEnoughEvidence
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -44,17 +44,28 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def run(args: argparse.Namespace) -> int:
     """Exit 0 if no run was unsafe, 1 if one was, 3 if there are not enough."""
     from s2r_runtime.cli.evidence import profile_model
-    from s2r_runtime.evidence.statements import of_trials
+    from s2r_runtime.evidence.statements import of_runs, of_trials
+    from s2r_runtime.evidence.trials import newest_limits
 
     profile = load_checked(args.profile)
     model = profile_model(args, profile)
-    found = trials_of(args.logs, controller_at(args.controller, args.param), model, profile, n=args.n, beta=args.beta)
+    controller = controller_at(args.controller, args.param)
+    try:
+        found = trials_of(args.logs, controller, model, profile, n=args.n, beta=args.beta)
+    except NotEnoughEvidence:
+        if not args.json and (counted := newest_limits(args.logs, controller.digest)) is not None:  # of logs that hold: they were audited
+            output.out(of_runs(counted))
+        raise
+    counted = newest_limits(args.logs, controller.digest)
     if args.json:
-        output.result_json({**msgspec.to_builtins(found), "statement": of_trials(found)})
+        runs = None if counted is None else {**msgspec.to_builtins(counted), "statement": of_runs(counted)}
+        output.result_json({**msgspec.to_builtins(found), "statement": of_trials(found), "runs": runs})
     else:
         for why, number in found.left_out.items():
             output.out(f"left out    {number}: {why}")
         output.out(of_trials(found))
+        if counted is not None:
+            output.out(of_runs(counted))
     return 1 if found.unsafe else 0
 
 

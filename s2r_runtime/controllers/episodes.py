@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from s2r_runtime.hookspecs import Scenario, Task
+from s2r_runtime.messages import EpisodeEnded, EpisodeScored
 
 if TYPE_CHECKING:
     import numpy as np
@@ -83,3 +84,24 @@ class Episodes:
 def _finite(values: Array) -> float | None:
     value = float(values[0])
     return value if math.isfinite(value) else None
+
+
+# ---------------------------------------------------------------- what is reported of them
+
+
+def end_report(t_ns: int, ended: Episode) -> EpisodeEnded:
+    """Report of a scenario that came to its end."""
+    missing = ", ".join(f"no {name}" for name, value in (("safety", ended.safety), ("progress", ended.progress)) if value is None)
+    return EpisodeEnded(t_ns, ended.index, ended.k, ended.safety or 0.0, ended.progress or 0.0, missing)
+
+
+def score_report(t_ns: int, now: Episode, before: tuple[int, bool], threshold: float) -> tuple[tuple[int, bool], EpisodeScored | None]:
+    """Report of a scenario whose safety value crosses the threshold; None where it does not.
+
+    before: index of the scenario that was scored last, and whether it was below. Also returns the same for this one.
+    """
+    below = now.safety is None or now.safety < threshold
+    after = (now.index, below)
+    if below == (before[0] == now.index and before[1]):
+        return after, None
+    return after, EpisodeScored(t_ns, now.index, now.k, now.safety or 0.0, below, "no safety" if now.safety is None else "")

@@ -12,7 +12,7 @@ from typing import Literal, cast
 import msgspec
 
 from s2r_runtime import gate
-from s2r_runtime.core import driven, ledger
+from s2r_runtime.core import driven, ledger, runs
 from s2r_runtime.core.drive import regate
 from s2r_runtime.core.headroom import grid
 from s2r_runtime.core.sources import end_deployment
@@ -30,6 +30,7 @@ from s2r_runtime.messages import (
     CertificatesDistrusted,
     CertificateStored,
     DrawSeed,
+    EpisodeCounted,
     Gap,
     IssueCertificate,
     JobFinished,
@@ -169,7 +170,8 @@ def verification_finished(turn: Turn, done: Job, event: JobFinished) -> None:
     else:
         turn.set(issuing=msgspec.structs.replace(done, least_radius=result.radius))
         lifetime_s = turn.settings.certificate_lifetime_s
-        turn.emit(IssueCertificate(turn.now, gap, result, done.request_id, lifetime_s, _tries(turn, done)))
+        driven_runs = next(iter(runs.limits_of(turn.memory, done.digest)), None) if runs.counted(turn.settings) else None
+        turn.emit(IssueCertificate(turn.now, gap, result, done.request_id, lifetime_s, _tries(turn, done), driven_runs))
     reverify_if_due(turn)
 
 
@@ -310,6 +312,8 @@ def facts_problem(turn: Turn, facts: CertificateFacts, digest: str, epoch: int, 
         return f"it was revoked: {turn.memory.revoked[facts.id]}"
     if _of_simulation(turn, facts):
         return "a simulation fixed its seed beforehand"
+    if exceeded := runs.refusal(turn.memory, turn.settings, facts.controller_digest):
+        return exceeded
     if any(other.id == facts.id and other != facts for other in turn.memory.certificates):
         return "another certificate in force has its id"
     for name, value, wanted in (
@@ -363,6 +367,7 @@ def _go_on(turn: Turn, done: Job, gap: Gap, facts: CertificateFacts) -> None:
 def start_controller(turn: Turn, deployment: Deployment, facts: CertificateFacts) -> None:
     """The deployment has its certificate: its process may start."""
     turn.set(deployment=msgspec.structs.replace(deployment, stage="starting", certificate_id=facts.id), ended="")
+    runs.begin(turn, deployment.digest, facts.id)
     turn.emit(StartController(turn.now, deployment.digest, facts.id))
     regate(turn)
 
@@ -377,6 +382,15 @@ def distrusted(turn: Turn, event: CertificatesDistrusted) -> None:
 def revoke_controller(turn: Turn, digest: str, reason: str) -> None:
     """Ends all certificates of a controller."""
     revoke(turn, [facts.id for facts in turn.memory.certificates if facts.controller_digest == digest], reason)
+
+
+def revoke_unsafe(turn: Turn) -> None:
+    """After a run was counted: a controller whose lower limit was above `Settings.max_unsafe` loses its certificates (guarantee G10)."""
+    if not any(isinstance(output, EpisodeCounted) for output in turn.outputs):
+        return
+    for digest in dict.fromkeys(facts.controller_digest for facts in turn.memory.certificates):
+        if runs.refusal(turn.memory, turn.settings, digest):
+            revoke_controller(turn, digest, runs.REASON)
 
 
 def revoke(turn: Turn, ids: Sequence[str], reason: str) -> None:

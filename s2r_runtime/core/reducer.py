@@ -13,15 +13,15 @@ the campaign must be told. Everything that happens comes as an event, in the ord
 
 The parts: `state`, `drive` (instants, sends, the gate opening and closing), `faults` (of observations, counted), `sources` (who may
 command), `gaps` (campaigns, gap, watch), `excitation` (given inputs), `repair` (traces, proposed models), `certificates` (attempts,
-certificates), `requests` (what a person asks for), `gate` (the verdict on a command), `ledger` (what is spent), `stream` (what is kept of
-the discrepancies), `wall_clock` (the time of day, for expiry), `status`.
+certificates), `runs` (counted, with their limits), `requests` (of a person), `gate` (the verdict on a command), `ledger` (what
+is spent), `stream` (what is stored of the discrepancies), `wall_clock` (the time of day, for expiry), `status`.
 """
 
 from __future__ import annotations
 
 import msgspec
 
-from s2r_runtime.core import certificates, drive, excitation, faults, gaps, repair, sources, wall_clock
+from s2r_runtime.core import certificates, drive, excitation, faults, gaps, repair, runs, sources, wall_clock
 from s2r_runtime.core.requests import requested
 from s2r_runtime.core.state import State, Turn
 from s2r_runtime.core.status import status
@@ -35,6 +35,7 @@ from s2r_runtime.messages import (
     CertificatesDistrusted,
     CertificateStored,
     EpisodeEnded,
+    EpisodeScored,
     Event,
     InputsFinished,
     JobFinished,
@@ -82,6 +83,8 @@ def handle(state: State, event: Event) -> tuple[State, tuple[Output, ...]]:
     excitation.follow_inputs(turn, event)
     repair.follow(turn, event)
     drive.wake(turn)
+    runs.follow(turn, event)
+    certificates.revoke_unsafe(turn)
     turn.persist()
     return turn.state, tuple(turn.outputs)
 
@@ -116,6 +119,7 @@ def _started(state: State, event: Started) -> tuple[State, tuple[Output, ...]]:
             if memory.campaign_digest:
                 gaps.void_gap(turn, "profile_changed")
             turn.remember(campaign_digest=settings.campaign_digest)
+        runs.restored(turn)
         turn.persist()
         drive.regate(turn)
     return turn.state, tuple(turn.outputs)
@@ -142,6 +146,7 @@ def _dispatch(turn: Turn, event: Event) -> None:
             sources.source_started(turn, event)
         case SourceStopped():
             deployment = turn.state.deployment
+            runs.stopped(turn, event)
             sources.source_stopped(turn, event)
             if event.source == "controller" and event.reason == "inconsistent" and deployment is not None:
                 certificates.revoke_controller(turn, deployment.digest, "controller_inconsistent")
@@ -174,6 +179,10 @@ def _noted(turn: Turn, event: Event) -> None:
             certificates.seed_drawn(turn, event)
         case EpisodeEnded():
             turn.set(episodes=turn.state.episodes + 1)
+            runs.ended(turn, event)
+            certificates.revoke_unsafe(turn)
+        case EpisodeScored():
+            runs.scored(turn, event)
         case CampaignFinished():
             gaps.campaign_finished(turn, event)
         case InputsFinished():

@@ -11,7 +11,7 @@ import math
 import msgspec
 
 from s2r_runtime import gate
-from s2r_runtime.core import driven, faults, wall_clock
+from s2r_runtime.core import driven, faults, runs, wall_clock
 from s2r_runtime.core.certificates import begin_verification, refusal_to_verify, revoke, start_controller, valid_certificate
 from s2r_runtime.core.drive import recover_now, regate
 from s2r_runtime.core.excitation import begin_inputs
@@ -86,7 +86,7 @@ def _deploy(turn: Turn, request: Requested) -> None:
         turn.answer(request.request_id, 1, f"refused: {_hinted(turn, stopped)}")
     elif state.campaign is not None or job(state, "gap") is not None:
         turn.answer(request.request_id, 1, "refused: a campaign is under way")
-    elif exceeded := driven.refusal(turn.memory, turn.settings):
+    elif exceeded := driven.refusal(turn.memory, turn.settings) or runs.refusal(turn.memory, turn.settings, digest):
         turn.answer(request.request_id, 1, f"refused: {exceeded}")
     elif (facts := valid_certificate(turn, digest)) is not None:
         start_controller(turn, Deployment(digest, request.request_id, "starting"), facts)
@@ -100,6 +100,8 @@ def _deploy(turn: Turn, request: Requested) -> None:
 def _verify(turn: Turn, request: Requested) -> None:
     if not request.digest:
         turn.answer(request.request_id, 2, "verify needs a controller")
+    elif exceeded := runs.refusal(turn.memory, turn.settings, request.digest):
+        turn.answer(request.request_id, 1, f"refused: {exceeded}")
     elif refusal := refusal_to_verify(turn):
         turn.answer(request.request_id, 1, f"refused: {refusal}")
     else:
@@ -133,6 +135,9 @@ def _clear(turn: Turn, request: Requested) -> None:
     if reason == wall_clock.REASON:
         wall_clock.clear(turn, request.request_id)
         regate(turn)
+        return
+    if reason == runs.REASON:
+        runs.clear(turn, request.request_id)
         return
     if reason == driven.REASON and turn.memory.driven:
         turn.remember(driven=())

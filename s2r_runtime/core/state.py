@@ -92,6 +92,30 @@ class Job(Struct, frozen=True):
     fixed: bool = False
 
 
+class Run(Struct, frozen=True):
+    """A run in progress, or about to begin (`core.runs`). open: the gate is. shown: the controller saw the scenario's beginning;
+    settled: the gate was open then.
+
+    from_start: the controller's command was the first in it; None: none was sent yet. took_over: one of its commands was sent. closed: why
+    the gate closed in it; said: why it was closed last; failed: how the controller did. index, steps, safety, below: as last scored.
+    """
+
+    controller: str
+    certificate: str
+    index: int = 0
+    open: bool = False
+    shown: bool = False
+    settled: bool = False
+    from_start: bool | None = None
+    took_over: bool = False
+    closed: str = ""
+    said: str = ""
+    failed: str = ""
+    steps: int = 0
+    safety: float | None = None
+    below: bool = False
+
+
 VERIFYING = ("deploy", "verify", "reverify")
 
 
@@ -167,6 +191,7 @@ class State(Struct, frozen=True):
     faulty: bool = False
     unsaved: bool = False
     saved_e_value: float = 1.0
+    run: Run | None = None
 
     @property
     def e_value(self) -> float:
@@ -246,12 +271,12 @@ def situation(state: State) -> Situation:
 class Turn:
     """One event being handled: `state` so far, `outputs` in the order in which they take effect. Lives for one call of `handle`."""
 
-    __slots__ = ("_unsaved", "now", "outputs", "settings", "state")
+    __slots__ = ("_soon", "_unsaved", "now", "outputs", "settings", "state")
 
     def __init__(self, state: State, settings: Settings, now_ns: int) -> None:
         self.state, self.settings, self.now = state, settings, now_ns
         self.outputs: list[Output] = []
-        self._unsaved = False
+        self._unsaved = self._soon = False
 
     @property
     def memory(self) -> Memory:
@@ -271,12 +296,20 @@ class Turn:
         """As `remember`, but nothing that moves the robot has to wait for the disk: persisted once nothing drives, or with what is next."""
         self.set(memory=msgspec.structs.replace(self.state.memory, **changes), unsaved=True)
 
+    def remember_soon(self, **changes: Any) -> None:
+        """As `remember`, but nothing waits for the disk: it is in the log at once, and the state folder follows."""
+        self.set(memory=msgspec.structs.replace(self.state.memory, **changes))
+        self._soon = True
+
     def persist(self) -> None:
-        """What was remembered is durable before what is emitted after this."""
+        """What was remembered is durable before what is emitted after this, but for what is remembered soon."""
         if self.state.unsaved and not self.state.gate_open and self.state.campaign is None:
             self._unsaved = True
+        if self._soon and not self._unsaved:
+            self._soon = False
+            self.outputs.append(Persist(self.now, self.state.memory, later=True))
         if self._unsaved:
-            self._unsaved = False
+            self._unsaved = self._soon = False
             self.set(unsaved=False, saved_e_value=self.state.memory.watch_e_value)
             self.outputs.append(Persist(self.now, self.state.memory))
 

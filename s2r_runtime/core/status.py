@@ -7,7 +7,7 @@ import math
 import msgspec
 
 from s2r_runtime import gate
-from s2r_runtime.core import driven, ledger, stream
+from s2r_runtime.core import driven, ledger, runs, stream
 from s2r_runtime.core.state import NANO, State, certificate, situation, unix_now, usable_gap
 from s2r_runtime.messages import Decided, Memory, Output, Settings
 
@@ -56,6 +56,7 @@ def status(state: State) -> dict[str, object]:
         "jobs": [one.purpose for one in state.jobs],
         "measurement_faults": state.faults,
         "episodes": state.episodes,
+        "runs": runs.status(memory, settings, "" if deployment is None else deployment.digest, "" if facts is None else facts.id),
         "model": memory.model_digest,
         "proposal": None
         if memory.proposal is None

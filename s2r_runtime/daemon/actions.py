@@ -22,6 +22,7 @@ from s2r_runtime.core import stream
 from s2r_runtime.core.status import against_sampler
 from s2r_runtime.daemon.analytics import Watching
 from s2r_runtime.daemon.console import campaign_line
+from s2r_runtime.daemon.saver import Saver
 from s2r_runtime.daemon.settings import fault_jump_of
 from s2r_runtime.daemon.worker import Failed, GapJob, Progress, Result, TraceJob, VerifyJob
 from s2r_runtime.evidence import seeds
@@ -44,7 +45,9 @@ def must_be_durable(output: m.Output) -> bool:
     """Whether nothing may rest on this before the disk has it (docs/gate.md)."""
     if isinstance(output, m.GateChanged):
         return output.open
-    return isinstance(output, m.Persist | m.CertificateInstalled | m.AttemptSpent | m.EpochChanged)
+    if isinstance(output, m.Persist):
+        return not output.later
+    return isinstance(output, m.CertificateInstalled | m.AttemptSpent | m.EpochChanged)
 
 
 class Actions:
@@ -59,6 +62,7 @@ class Actions:
         self.last_trace: m.TraceEnded | None = None
         self.episodes: deque[m.EpisodeEnded] = deque(maxlen=KEPT_EPISODES)
         self._memory: m.Memory | None = None
+        self._saver = Saver(daemon.folder)
         self._save_again_ns = 0
         self._controllers: dict[str, ControllerFile] = {}
         self._do: dict[type, Callable[[Any], None]] = {
@@ -112,9 +116,16 @@ class Actions:
 
     def tick(self, now_ns: int) -> None:
         """Tries again to save a memory that the disk did not take. now_ns: the host's clock."""
+        if (trouble := self._saver.trouble) and not self.unsaved:
+            self.unsaved = f"the state cannot be saved: {trouble}"
+            self._d.log_changed(False, self.unsaved)
         if self.unsaved and self._memory is not None and now_ns >= self._save_again_ns:
             self._save_again_ns = now_ns + SAVE_AGAIN_NS
             self._save(self._memory)
+
+    def close(self) -> None:
+        """Saves what is not saved yet."""
+        self._saver.close()
 
     def controller(self, digest: str) -> ControllerFile | None:
         """A controller that was loaded."""
@@ -255,6 +266,10 @@ class Actions:
     # ------------------------------------------------------------------ what lasts
 
     def _persist(self, persist: m.Persist) -> None:
+        if persist.later and not self.unsaved:
+            self._memory = persist.memory
+            self._saver.soon(persist.memory)
+            return
         self._save(persist.memory)
         if self.unsaved:
             self._d.log_changed(False, self.unsaved)
@@ -262,7 +277,7 @@ class Actions:
     def _save(self, memory: m.Memory) -> None:
         self._memory = memory
         try:
-            self._d.folder.save(memory)
+            self._saver.now(memory)
             self.unsaved = ""
         except OSError as error:
             self.unsaved = f"the state cannot be saved: {error.strerror or error}"

@@ -84,6 +84,8 @@ class Console:
                 return f"certificate {facts.id}: verified to radius {facts.verified_radius:.3g}"
             case m.Revoked(certificate_id=identity, reason=reason):
                 return f"certificate {identity} revoked: {reason.replace('_', ' ')}"
+            case m.EpisodeCounted(outcome=outcome, reason=reason, limits=limits) if outcome in ("unsafe", "censored"):
+                return f"run {limits[0].n} of this controller counts as {outcome}: {reason}"
             case m.RadiusGrew(radius=radius, verified_radius=verified) if radius > self._radius * GROWN or 0.0 < verified < radius:
                 self._radius = radius
                 return f"the gap grew to {radius:.3g}" + (f", above the verified {verified:.3g}" if 0.0 < verified < radius else "")

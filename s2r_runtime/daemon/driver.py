@@ -6,13 +6,22 @@ import selectors
 import time
 from collections.abc import Callable
 
-from s2r_runtime.controllers.episodes import Episode
+from s2r_runtime.controllers.episodes import Episode, end_report, score_report
 from s2r_runtime.controllers.file import ControllerFile
 from s2r_runtime.controllers.hosted import HostedController, Late, Ready, Reply, Stopped
 from s2r_runtime.daemon.awake import AwakeClock
 from s2r_runtime.daemon.settings import controller_deadline_s
 from s2r_runtime.errors import ControllerError
-from s2r_runtime.messages import AnswerLate, Command, EpisodeEnded, Event, Observation, Proposed, Settings, SourceStarted, SourceStopped
+from s2r_runtime.messages import (
+    AnswerLate,
+    Command,
+    Event,
+    Observation,
+    Proposed,
+    Settings,
+    SourceStarted,
+    SourceStopped,
+)
 from s2r_runtime.profile import Profile
 
 
@@ -38,6 +47,7 @@ class Driver:
         self._patience_s = 0.0 if profile.clock == "lockstep" else profile.machine.process_timeout
         self.latency_ns = 0
         self._contained: tuple[str, ...] = ()
+        self._scored: tuple[int, bool] = (-1, False)
 
     @property
     def running(self) -> bool:
@@ -62,7 +72,7 @@ class Driver:
     def start(self, file: ControllerFile, seed: int) -> None:
         """Starts the process; SourceStarted or SourceStopped(start_failed) follows."""
         self.stop()
-        self._stood_still_ns = self._awake.stood_still_ns
+        self._stood_still_ns, self._scored = self._awake.stood_still_ns, (-1, False)
         settings = self._settings()
         host = HostedController(
             file,
@@ -107,7 +117,9 @@ class Driver:
             if isinstance(message, Reply):
                 self.latency_ns = message.latency_ns
                 self._episode(t_ns, message.ended)
-                if message.late:
+                if self._host is not None:
+                    self._score(t_ns, message.episode)
+                if message.late or self._host is None:
                     continue  # its question is void
                 ttl_ns = self._settings().command_ttl_ns
                 self._emit(Proposed(t_ns, Command(self._next_seq(), t_ns, "controller", message.u, message.obs_seq, ttl_ns)))
@@ -141,9 +153,10 @@ class Driver:
 
     def _episode(self, t_ns: int, ended: Episode | None) -> None:
         if ended is not None:
-            self._emit(EpisodeEnded(t_ns, ended.index, ended.k, ended.safety or 0.0, ended.progress or 0.0, _missing(ended)))
+            self._emit(end_report(t_ns, ended))
 
-
-def _missing(ended: Episode) -> str:
-    """What the task had no finite value for: the message has a number for each."""
-    return ", ".join(f"no {name}" for name, value in (("safety", ended.safety), ("progress", ended.progress)) if value is None)
+    def _score(self, t_ns: int, now: Episode | None) -> None:
+        if now is not None:
+            self._scored, report = score_report(t_ns, now, self._scored, self._profile.verification.threshold)
+            if report is not None:
+                self._emit(report)

@@ -50,6 +50,7 @@ def issue(daemon: Daemon, order: IssueCertificate) -> CertificateStored | Certif
             horizon=daemon.facts.horizon,
             traced_not_adopted=daemon.state.memory.traced,
             tries=order.tries,
+            runs=order.run_limits,
         )
         return _store(daemon, certificates.facts(certificate), certificates.sign(certificate, daemon.key), None, order.request_id)
     except S2RError as error:

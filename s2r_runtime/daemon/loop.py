@@ -177,6 +177,7 @@ class Daemon:
         self._open_log(stack)
         self._set_up_sources(stack, taken)
         self.actions = Actions(self)
+        stack.callback(self.actions.close)
         self._open_desk(stack)
         self._open_link()
         newest = self.memory.refused_campaign or self.memory.gap

@@ -27,6 +27,7 @@ from pathlib import Path
 import msgspec
 
 from s2r_runtime.core.gaps import REFUTED
+from s2r_runtime.core.runs import CONTROLLERS
 from s2r_runtime.core.stream import stood
 from s2r_runtime.errors import ConfigError, RecordingError
 from s2r_runtime.messages import BEHAVIOURS, Memory, Persist, SampleTaken, Started
@@ -196,11 +197,30 @@ def lost(before: Memory, now: Memory) -> str:
         return f"that certificate {min(gone)} was revoked"
     if not set(before.refuted) <= set(now.refuted) and len(now.refuted) < REFUTED:
         return "samples whose gap was refuted or outgrown"
+    if what := _runs_lost(before, now):
+        return what
     if now.campaign_epoch and now.campaign_epoch == before.campaign_epoch and now.campaign_n != before.campaign_n:
         return f"that the campaign of epoch {now.campaign_epoch} was fixed beforehand at {before.campaign_n} samples"
     if before.gap is None or now.gap is None or before.gap.epoch != now.gap.epoch:
         return ""
     return _of_one_epoch(before, now, now.gap.epoch)
+
+
+def _runs_lost(before: Memory, now: Memory) -> str:
+    """As `lost`, of the runs that controllers drove (guarantee G10)."""
+    if now.run_sequences < before.run_sequences or now.runs_cleared < before.runs_cleared:
+        return f"sequences of runs: {before.run_sequences} were begun"
+    if now.drives < before.drives:
+        return f"drives: {before.drives} starts and ends of controllers were seen"
+    known = {(one.controller, one.certificate): one for one in now.runs}
+    for one in before.runs:
+        later = known.get((one.controller, one.certificate))
+        if later is not None and later.number == one.number:
+            if later.n < one.n or later.unsafe < one.unsafe or later.censored < one.censored or (one.exceeded and not later.exceeded):
+                return f"runs of controller {one.controller}: {one.n} were counted, {one.unsafe} of them unsafe"
+        elif later is None and not one.certificate and now.runs_cleared == before.runs_cleared and len(now.runs) < CONTROLLERS:
+            return f"the {one.n} runs of controller {one.controller}"
+    return ""
 
 
 def _of_one_epoch(before: Memory, now: Memory, epoch: int) -> str:

@@ -7,14 +7,15 @@ anyhow and tells the facts when it starts.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from s2r_runtime.files.canonical import digest_of
-from s2r_runtime.messages import GRID, IMPLAUSIBLE, RULES, Gap, Settings
+from s2r_runtime.messages import EPISODES, GRID, IMPLAUSIBLE, RULES, Gap, Settings
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Profile, plain_table
+from s2r_runtime.profile.settings import AS_BEFORE
 
 if TYPE_CHECKING:
     from s2r_runtime.models.composed import ComposedModel
@@ -81,6 +82,11 @@ def settings_of(
     region = {**circle, **profile.region}
     fence = fence_of(profile, facts.angles)
     held = recovery.input if recovery.kind == "hold" else {}
+    runs: dict[str, Any] = {}
+    if rules >= EPISODES:
+        about = profile.guarantee
+        runs = {"beta_episodes": about.beta_episodes, "max_unsafe": about.max_unsafe, "gate_closing": about.gate_closing}
+        runs["threshold"] = profile.verification.threshold
     return Settings(
         robot=profile.robot.name,
         states=facts.states,
@@ -128,6 +134,7 @@ def settings_of(
         rules=rules,
         any_step=facts.any_step and rules >= GRID,
         simulated=simulated,
+        **runs,
     )
 
 
@@ -157,5 +164,6 @@ def controller_deadline_s(profile: Profile) -> float:
 def campaign_digest(profile: Profile) -> str:
     """Digest of what a gap rests on besides the model: the law of the samples, the norm, and what was fixed beforehand."""
     sampling = plain_table("sampling", profile.sampling)
-    tables = (profile.region, profile.geofence, profile.inputs, profile.norm, sampling, profile.guarantee)
+    guarantee = {name: value for name, value in msgspec.to_builtins(profile.guarantee).items() if name not in AS_BEFORE["guarantee"]}
+    tables = (profile.region, profile.geofence, profile.inputs, profile.norm, sampling, guarantee)
     return digest_of([msgspec.to_builtins(table) for table in tables])

@@ -6,7 +6,11 @@ import os
 import time
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from s2r_runtime.core import reducer as core
+from s2r_runtime.evidence.statements import runs_line
+from s2r_runtime.messages import RunLimits
 
 if TYPE_CHECKING:
     from s2r_runtime.daemon.loop import Daemon
@@ -18,6 +22,9 @@ def status(daemon: Daemon) -> dict[str, Any]:
     found: dict[str, Any] = core.status(daemon.state)
     sampling, health = daemon.sampler.progress(), daemon.logbook.health()
     memory, observation = daemon.state.memory, daemon.observation
+    for limits in ((found["runs"] or {}).get(name) for name in ("all", "under_certificate")):
+        if limits is not None:
+            limits["statement"] = runs_line(msgspec.convert(limits, RunLimits))
     trouble = daemon.actions.unsaved or daemon.trust.trouble
     return found | {
         "robot": daemon.settings.robot,

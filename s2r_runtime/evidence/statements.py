@@ -9,7 +9,7 @@ import math
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 
 from s2r_runtime.core.ledger import spent
-from s2r_runtime.messages import BEHAVIOURS, Gap, LawResult, Trials, Tries, Verification
+from s2r_runtime.messages import BEHAVIOURS, Gap, LawResult, RunLimits, Trials, Tries, Verification
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Driving
 
@@ -32,9 +32,11 @@ def shown(
     trials: Trials | None = None,
     period: str = "first",
     tries: Tries | None = None,
+    runs: RunLimits | None = None,
 ) -> tuple[str, ...]:
-    """The statements G1 to G4 and G8 of this evidence. budget: beta of the robot's life. assumption: one that the user made.
+    """The statements G1 to G4, G8 and G10 of this evidence. budget: beta of the robot's life. assumption: one that the user made.
     period: of each hold that gave the sample (`sampling.period`). tries: what was tried before, if it was counted.
+    runs: of this controller on this robot.
 
     Whether the numbers carry them is for `certificate.issue` to check.
     """
@@ -52,6 +54,7 @@ def shown(
         ),
         *(() if tries is None else (_tried(tries, verification),)),
         *(() if trials is None else (of_trials(trials),)),
+        *(() if runs is None else (of_runs(runs),)),
     )
 
 
@@ -82,6 +85,37 @@ def of_trials(t: Trials) -> str:
         f"exceeds {bound(t.radius)} with probability at most {bound(t.epsilon)}. These confidences are no part of the budget above; with "
         "the others they add."
     )
+
+
+def of_runs(r: RunLimits) -> str:
+    """The statement G10, as on a certificate."""
+    censored = (
+        f". {r.censored} had an unknown end, and count as unsafe in the upper limit and as safe in the lower one" if r.censored else ""
+    )
+    return (
+        f"Runs (G10). Of {r.n} runs that this controller drove on this robot, {r.unsafe or 'none'} were unsafe{censored}. With confidence "
+        f"{confidence(r.beta_upper)} their mean probability of being unsafe is at most {bound(r.upper)}. With confidence "
+        f"{confidence(r.beta_lower)} it is at least {worst(r.lower)}. Each holds after every run at once, whatever the runs depend on. "
+        "It is about the runs so far, in the scenarios that they met. These confidences are shares of a budget of their own "
+        "(guarantee.beta_episodes)."
+    )
+
+
+def runs_line(r: RunLimits) -> str:
+    """The same in one line, for an operator."""
+    percent = Decimal(100) * (Decimal(1) - Decimal(r.beta_upper))
+    sure = percent.quantize(Decimal(1) if percent < 99 else Decimal("0.1"), rounding=ROUND_FLOOR)
+    cut = f", {r.censored} with an unknown end" if r.censored else ""
+    where = "on this robot" if not r.certificate else "on this robot under this certificate"
+    return (
+        f"of the runs this controller drives {where}, at most {_percent(r.upper, ROUND_CEILING)} are unsafe "
+        f"({sure} %, as of now, {r.n} {'run' if r.n == 1 else 'runs'}, {r.unsafe or 'none'} unsafe{cut})"
+    )
+
+
+def _percent(share: float, rounding: str) -> str:
+    """Two digits."""
+    return f"{Context(prec=2, rounding=rounding).create_decimal(Decimal(share) * 100).normalize():f} %"
 
 
 def assumption(driving: Driving) -> str:

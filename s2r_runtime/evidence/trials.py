@@ -13,6 +13,8 @@ gate closed in it or refused its first command, or where it scores below the pro
 gate had not opened yet, and where a person or the log's end cut it short, no recovery command sent, while it was not below the threshold.
 
 Logs are taken in the order of their own start times, so that the first n runs are the same however the files are given.
+
+The daemon counts runs by itself as well, all of them, with limits that hold after every run (guarantee G10, `core.runs`): `newest_limits`.
 """
 
 from __future__ import annotations
@@ -161,6 +163,17 @@ def read_runs(paths: Sequence[Path], profile: Profile, task: Task, controller_di
                 else:
                     found.counted.append((run, not run.closed and run.safety >= threshold))
         found.heads += [parts[-1].head.hex()]
+    return found
+
+
+def newest_limits(paths: Sequence[Path], controller_digest: str) -> m.RunLimits | None:
+    """What the daemon counted of this controller's runs until the end of these logs (guarantee G10); None where it counted none."""
+    found: m.RunLimits | None = None
+    for parts in sorted(logged_runs(paths, ("event/started", "out/episode_counted")), key=_began):
+        for entry in (entry for reading in parts for entry in reading):
+            message: Any = entry.message
+            if isinstance(message, m.EpisodeCounted) and message.controller == controller_digest and message.limits:
+                found = message.limits[0]
     return found
 
 

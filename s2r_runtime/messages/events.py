@@ -249,6 +249,20 @@ class EpisodeEnded(Struct, frozen=True, tag="episode_ended"):
     detail: str = ""
 
 
+class EpisodeScored(Struct, frozen=True, tag="episode_scored"):
+    """The safety value of the scenario in progress fell below the profile's threshold (`below`), or is no longer below it.
+
+    safety: after `steps` observations; where detail names a lack, it has no finite value, and counts as below.
+    """
+
+    t_ns: int
+    index: int
+    steps: int
+    safety: float
+    below: bool
+    detail: str = ""
+
+
 class CertificateStored(Struct, frozen=True, tag="certificate_stored"):
     """A certificate was signed or loaded, its signature verified against a trusted key, and it is durable in the log.
 
@@ -301,5 +315,5 @@ class Requested(Struct, frozen=True, tag="requested"):
 Event = (
     Started | Observed | Proposed | Ticked | WallClockRead | LinkChanged | RecorderChanged | AnalyticsChanged | OverrideChanged | Measured
     | EpisodeEnded | SourceStarted | SourceStopped | SampleTaken | CampaignFinished | InputsFinished | JobFinished | CertificateStored
-    | CertificateFailed | CertificatesDistrusted | Requested | Stopping | ObservationRefused | AnswerLate | SeedDrawn
+    | CertificateFailed | CertificatesDistrusted | Requested | Stopping | ObservationRefused | AnswerLate | SeedDrawn | EpisodeScored
 )  # fmt: skip

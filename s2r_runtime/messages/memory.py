@@ -73,6 +73,14 @@ class Settings(Struct, frozen=True):
     """Whether the model and its effects step exactly at any length, so that a transition may last longer than one step (rules 2)."""
     simulated: bool = False
     """Whether the seeds of verifications are fixed, so that a simulation can be repeated (rules 9)."""
+    beta_episodes: float = 0.0
+    """One minus the confidence of all limits of unsafe runs together (guarantee G10, rules 11). 0: a run before they were counted."""
+    max_unsafe: float = 0.0
+    """A lower limit above this revokes. 0: none does."""
+    gate_closing: Literal["unsafe", "safe", "censored"] = "unsafe"
+    """What a run counts as in which the gate closed."""
+    threshold: float = 0.0
+    """Safety value below which a run is unsafe."""
 
 
 GRID = 2
@@ -95,10 +103,12 @@ FIXED_SEEDS = 9
 """Since these rules a certificate whose seed a simulation fixed says so, and drives only in a simulation."""
 UNKNOWN_PAST = 10
 """Since these rules nothing is measured after that until commands from before it cannot matter any more, however long effects remember."""
-RULES = 10
+EPISODES = 11
+"""Since these rules every run of a certified controller is counted, and limits of its unsafe runs hold at all times (`core.runs`)."""
+RULES = 11
 """1: a campaign that is refused for dependent samples is remembered, and can be traced and repeated. 2: `GRID`. 3: what driving showed is
 kept over epochs (`Driven`). 4: `RESTARTS`. 5: `SEEDS`. 6: `LATEST_TIME`. 7: `IMPLAUSIBLE`. 8: `REFUSED_FIRST`. 9: `FIXED_SEEDS`.
-10: `UNKNOWN_PAST`.
+10: `UNKNOWN_PAST`. 11: `EPISODES`.
 """
 BEHAVIOURS = 1000
 """Remembered on one gap: some 20 KB of what is persisted. Beyond that a certificate says *at least*."""
@@ -159,6 +169,30 @@ class Driven(Struct, frozen=True):
     upper: float | None
 
 
+class RunCounts(Struct, frozen=True):
+    """Runs of one controller on this robot (certificate empty), or under one certificate, since its sequence began (guarantee G10).
+
+    number: of the sequence among all of this robot's; beta: its share of the budget. unsafe, censored: of the n runs. exceeded: its lower
+    limit was above `Settings.max_unsafe` once.
+    """
+
+    controller: str
+    certificate: str
+    number: int
+    beta: float
+    n: int = 0
+    unsafe: int = 0
+    censored: int = 0
+    exceeded: bool = False
+
+
+class OpenRun(Struct, frozen=True):
+    """A controller that may be driving a run while this is in the memory. Found at a start, that run was cut: it counts as censored."""
+
+    controller: str
+    certificate: str
+
+
 class Memory(Struct, frozen=True):
     """What outlives a restart: counters, the gap in force, the grown radius, certificates and revocations."""
 
@@ -206,3 +240,13 @@ class Memory(Struct, frozen=True):
     """How often a person said that the clock is right although it is behind the latest time."""
     latest_unix_s: int = 0
     """The latest time of day that was ever believed, s since 1970 (0: not said). An earlier clock is not: see `core.wall_clock`."""
+    runs: tuple[RunCounts, ...] = ()
+    """Runs of controllers on this robot, the newest controller last (`core.runs`)."""
+    run_sequences: int = 0
+    """How many sequences of runs began; each has its own share of `Settings.beta_episodes`."""
+    open_run: OpenRun | None = None
+    """Who drives, or did when the daemon was cut."""
+    drives: int = 0
+    """How often a controller was to start, and how often one ended: together, so that it only grows."""
+    runs_cleared: int = 0
+    """How often a person discarded the runs of controllers that exceeded `Settings.max_unsafe`."""

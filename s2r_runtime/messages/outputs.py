@@ -6,7 +6,7 @@ from typing import Literal
 
 from s2r_runtime.messages.link import Source, Struct
 from s2r_runtime.messages.memory import Memory, Stretch
-from s2r_runtime.messages.results import CertificateFacts, Gap, Tries, Verification
+from s2r_runtime.messages.results import CertificateFacts, Gap, RunLimits, Tries, Verification
 
 # ---------------------------------------------------------------- actions
 
@@ -107,7 +107,9 @@ class DrawSeed(Struct, frozen=True, tag="draw_seed"):
 
 
 class IssueCertificate(Struct, frozen=True, tag="issue_certificate"):
-    """Sign what was shown: the gap in force and this verification. tries: None in a log of before (rules < 5)."""
+    """Sign what was shown: the gap in force and this verification. tries: None in a log of before (rules < 5). run_limits: of this
+    controller, under any certificate; None: it drove no run, or a log of before (rules < 11).
+    """
 
     t_ns: int
     gap: Gap
@@ -115,13 +117,15 @@ class IssueCertificate(Struct, frozen=True, tag="issue_certificate"):
     request_id: int
     lifetime_s: int
     tries: Tries | None = None
+    run_limits: RunLimits | None = None
 
 
 class Persist(Struct, frozen=True, tag="persist"):
-    """Write the memory durably before the outputs after this one take effect."""
+    """Write the memory durably before the outputs after this one take effect. later: nothing waits for it (rules 11)."""
 
     t_ns: int
     memory: Memory
+    later: bool = False
 
 
 class Answer(Struct, frozen=True, tag="answer"):
@@ -235,6 +239,25 @@ class Revoked(Struct, frozen=True, tag="revoked"):
     reason: str
 
 
+class EpisodeCounted(Struct, frozen=True, tag="episode_counted"):
+    """A run of a certified controller is over (guarantee G10). reason: why it counts as it does. left_out: the controller did not drive
+    it from its start, and nothing went wrong in it; it is in no count.
+
+    index, steps, safety: of the scenario, as last scored; safety None: not known. limits: of the controller's runs, and of those under this
+    certificate, after this one.
+    """
+
+    t_ns: int
+    controller: str
+    certificate: str
+    index: int
+    steps: int
+    safety: float | None
+    outcome: Literal["safe", "unsafe", "censored", "left_out"]
+    reason: str
+    limits: tuple[RunLimits, ...]
+
+
 class TraceEnded(Struct, frozen=True, tag="trace_ended"):
     """A trace is over: its verdict, or the reason why there is none. `proposal`: digest of the model that is proposed, or empty."""
 
@@ -265,6 +288,6 @@ Action = (
 )  # fmt: skip
 Record = (
     Decided | GateChanged | EpochChanged | AttemptSpent | AttemptEnded | RadiusGrew | AlarmRaised | ChangeNoticed | CertificateInstalled
-    | Revoked | TraceEnded | ModelAdopted
+    | Revoked | TraceEnded | ModelAdopted | EpisodeCounted
 )  # fmt: skip
 Output = Action | Record

@@ -123,6 +123,24 @@ class Trials(Struct, frozen=True):
     model_digest: str
 
 
+class RunLimits(Struct, frozen=True):
+    """Runs of a controller on the robot, and limits of the mean probability that such a run is unsafe (guarantee G10, `anytime`).
+
+    certificate: under which they were driven; empty: under any. number, beta: of the sequence, and its share of the budget. The lower limit
+    holds with confidence 1 - beta_lower, the upper with 1 - beta_upper, each after every run.
+    """
+
+    certificate: str
+    number: int
+    n: int
+    unsafe: int
+    censored: int
+    lower: float
+    upper: float
+    beta_lower: float
+    beta_upper: float
+
+
 class CertificateFacts(Struct, frozen=True):
     """What the gate compares. Taken from a certificate whose signature was verified when it was loaded."""
 

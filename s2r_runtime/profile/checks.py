@@ -90,10 +90,12 @@ def _probabilities(p: Profile) -> Iterator[Check]:
         ("guarantee.epsilon", g.epsilon),
         ("guarantee.beta", g.beta),
         ("guarantee.alpha", g.alpha),
+        ("guarantee.beta_episodes", g.beta_episodes),
         ("verification.epsilon", p.verification.epsilon),
     ):
         yield 0.0 < value < 1.0, field, value, "between 0 and 1"
     yield g.discard >= 0, "guarantee.discard", g.discard, ">= 0"
+    yield 0.0 <= g.max_unsafe < 1.0, "guarantee.max_unsafe", g.max_unsafe, "0 (no such limit) to less than 1"
 
 
 def _sampling(s: Sampling) -> Iterator[Check]:

@@ -78,7 +78,7 @@ class Driving(_Table, frozen=True):
 
 
 class Guarantee(_Table, frozen=True):
-    """What the gap's statement says (guarantee G1, G4, G5)."""
+    """What the statements about gap and runs say (guarantee G1, G4, G5, G10)."""
 
     epsilon: float = 0.01
     """A new discrepancy exceeds the gap with at most this probability."""
@@ -88,6 +88,14 @@ class Guarantee(_Table, frozen=True):
     """Probability of a false alarm of the watch, at most."""
     discard: int = 0
     """Largest discrepancies to leave out, fixed beforehand; each asks for more samples."""
+    beta_episodes: float = 0.1
+    """One minus the confidence of all limits of unsafe runs in the robot's life together. The first controller's upper limit has 45.6 % of
+    it, so by default a confidence of 95.4 %."""
+    max_unsafe: float = 0.0
+    """A controller is revoked and refused when the lower limit of its unsafe runs is above this. 0: none is."""
+    gate_closing: Literal["unsafe", "safe", "censored"] = "unsafe"
+    """What a run counts as in which the gate closed while its safety value was good. `censored`: as unsafe in the upper limit, as safe in
+    the lower one. A run in which the controller itself failed is always unsafe."""
 
 
 class VerificationSettings(_Table, frozen=True):
@@ -242,7 +250,11 @@ class Repair(_Table, frozen=True):
     """`ask`: a person adopts it (`s2r adopt`); `always`: it is in force as soon as nothing drives."""
 
 
-AS_BEFORE: dict[str, dict[str, Any]] = {"gate": {"fault_share": 0.0, "fault_burst": 0}, "sampling": {"period": "first"}}
+AS_BEFORE: dict[str, dict[str, Any]] = {
+    "gate": {"fault_share": 0.0, "fault_burst": 0},
+    "sampling": {"period": "first"},
+    "guarantee": {"beta_episodes": 0.1, "max_unsafe": 0.0, "gate_closing": "unsafe"},
+}
 """Settings that were added later: table -> setting -> the value by which everything was done before it was there. A log is audited, and a
 digest computed, as if a profile with that value did not have the setting.
 """

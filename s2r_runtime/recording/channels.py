@@ -70,7 +70,14 @@ def _table() -> dict[str, type[Struct]]:
     return table | {name: table.pop(name) for name in LATER}
 
 
-LATER = ("event/observation_refused", "event/answer_late", "event/seed_drawn", "out/draw_seed")
+LATER = (
+    "event/observation_refused",
+    "event/answer_late",
+    "event/seed_drawn",
+    "out/draw_seed",
+    "event/episode_scored",
+    "out/episode_counted",
+)
 """Channels that came after others had their numbers, in the order in which they came."""
 
 CHANNELS: dict[str, type[Struct]] = _table()

@@ -21,6 +21,7 @@ from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.recording.writer import read_all
 from s2r_runtime.report import plots
 from s2r_runtime.report.page import Page
+from s2r_runtime.report.runs_section import add_runs
 from s2r_runtime.report.story import Story, tell
 from s2r_runtime.report.trace_section import add_trace
 
@@ -51,6 +52,7 @@ def log_page(paths: Sequence[Path]) -> str:
         add_trace(page, trace)
     _verifications(page, story)
     _driving(page, story)
+    add_runs(page, story.runs, story.settings)
     _certificates(page, story)
     page.heading("Not shown")
     page.items(not_shown(), "soft")

@@ -57,6 +57,7 @@ class Story:
     certificates: list[m.CertificateFacts] = field(default_factory=list)
     revoked: list[tuple[str, str]] = field(default_factory=list)
     episodes: list[m.EpisodeEnded] = field(default_factory=list)
+    runs: list[m.EpisodeCounted] = field(default_factory=list)
     refusals: dict[str, int] = field(default_factory=dict)
     """reason -> refused commands"""
     poses: Thinned = field(default_factory=Thinned)
@@ -118,6 +119,8 @@ def _take(story: Story, message: Any) -> None:
             story.gate.append((story.seconds(t), is_open, reason))
         case m.EpisodeEnded():
             story.episodes.append(message)
+        case m.EpisodeCounted():
+            story.runs.append(message)
         case _:
             _take_decision(story, message)
 

@@ -11,17 +11,19 @@ gate only compares digests.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from s2r_runtime.controllers.file import ControllerFile, Identity
+from s2r_runtime.core import anytime
 from s2r_runtime.core.ledger import binomial_tail, campaign_size, sample_size, share
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
 from s2r_runtime.evidence import statements
 from s2r_runtime.files.canonical import canonical, digest
-from s2r_runtime.messages import NOT_INDEPENDENT, CertificateFacts, Gap, Struct, Trials, Tries, Verification
+from s2r_runtime.messages import NOT_INDEPENDENT, CertificateFacts, Gap, RunLimits, Struct, Trials, Tries, Verification
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Profile, TaskValue
 from s2r_runtime.trust import keys
@@ -66,6 +68,8 @@ class Certificate(Struct, frozen=True):
     trials: Trials | None = None
     tries: Tries | None = None
     """None: issued before seeds were drawn. Then the key is not in the file, as it was not then."""
+    runs: RunLimits | None = None
+    """Of this controller on this robot until then (guarantee G10). None: it drove none, or they were not counted; then the same holds."""
 
     @property
     def id(self) -> str:
@@ -94,12 +98,14 @@ def issue(
     trials: Trials | None = None,
     period: str = "",
     tries: Tries | None = None,
+    runs: RunLimits | None = None,
 ) -> Certificate:
     """Writes down what gap and verification show, if they show it. profile: with the model in force.
 
     lifetime_s: the profile's unless given. horizon: the task's, for the sentences. assumption: one the user made about independence.
     trials: closed-loop runs, if there were any. period: of each hold that gave the sample, where that is not what the profile says.
     tries: what was tried until this attempt (None: as a certificate of before, whose seed anybody knew beforehand).
+    runs: of this controller on this robot, with their limits.
     Raises NotEnoughEvidence if the evidence doesn't carry a certificate, ConfigError if its parts don't belong together.
     """
     identity = controller.identity if isinstance(controller, ControllerFile) else controller
@@ -132,12 +138,14 @@ def issue(
             trials,
             period or profile.sampling.period,
             tries,
+            runs,
         ),
         not_shown=statements.not_shown(gap, verification, horizon, trials=trials is not None),
         issued_unix_s=issued_unix_s,
         expires_unix_s=issued_unix_s + lifetime,
         trials=trials,
         tries=tries,
+        runs=runs,
     )
     for what, ok in (*_bindings(certificate), *_asked_for(profile, gap, verification)):
         if not ok:
@@ -243,6 +251,8 @@ def _plain(certificate: Certificate) -> dict[str, Any]:
     plain: dict[str, Any] = msgspec.to_builtins(certificate)
     if certificate.tries is None:
         del plain["tries"]
+    if certificate.runs is None:
+        del plain["runs"]
     return plain
 
 
@@ -350,8 +360,19 @@ def _evidence(c: Certificate, *, traced_not_adopted: bool) -> list[tuple[str, bo
             0,
         ),
         ("the trials do not carry their statement", c.trials is None or _carried(c.trials, slack), 0),
+        ("the limits of its runs do not follow from their counts", c.runs is None or _follow(c.runs), 0),
         ("only the law uniform was required, and an effect was traced that the model lacks", not (alone and traced_not_adopted), 0),
     ]
+
+
+def _follow(runs: RunLimits) -> bool:
+    """Whether these are the limits of the counts at their shares (guarantee G10)."""
+    if not (0 <= runs.unsafe <= runs.n - runs.censored and runs.censored >= 0 and min(runs.beta_lower, runs.beta_upper) > 0.0):
+        return False
+    if not max(runs.beta_lower, runs.beta_upper) < 1.0:
+        return False
+    again = anytime.limits(anytime.Counts(runs.n, runs.unsafe, runs.censored), runs.beta_lower, runs.beta_upper)
+    return math.isclose(again.lower, runs.lower, abs_tol=1e-9) and math.isclose(again.upper, runs.upper, abs_tol=1e-9)
 
 
 def _carried(trials: Trials, slack: float) -> bool:

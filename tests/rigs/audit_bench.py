@@ -15,11 +15,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import msgspec
+import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from s2r_runtime import messages as m
 from s2r_runtime.audit.core import in_effect_order
 from s2r_runtime.audit.log import AuditResult, audit
+from s2r_runtime.controllers.episodes import Episodes, end_report, score_report
 from s2r_runtime.controllers.file import load
 from s2r_runtime.core import ledger
 from s2r_runtime.core import reducer as core
@@ -152,12 +154,39 @@ class BenchTransport:
 
 
 class BenchTask:
-    """A horizon is all that a certificate's sentences need of a task."""
+    """Runs of 25 steps; the safety value falls with the distance from the line y = 0."""
 
-    horizon = 150
+    horizon = 25
 
     def __init__(self, *_: object) -> None:
         pass
+
+    def draw_at(self, _rng: np.random.Generator, _x: Any) -> dict[str, Any]:
+        return {}
+
+    def view(self, scenario: dict[str, Any]) -> dict[str, Any]:
+        return scenario
+
+    def advance(self, scenario: dict[str, Any], _rng: np.random.Generator) -> dict[str, Any]:
+        return scenario
+
+    def begin(self, _scenario: dict[str, Any]) -> Any:
+        return np.array([math.inf])
+
+    def observe(self, tally: Any, x: Any, _scenario: dict[str, Any]) -> Any:
+        return np.minimum(tally, 1.0 - np.abs(x[:, 1]))
+
+    def done(self, tally: Any) -> Any:
+        return np.zeros(len(tally), dtype=bool)
+
+    def safety(self, tally: Any) -> Any:
+        return tally
+
+    def progress(self, tally: Any) -> Any:
+        return np.ones(len(tally))
+
+    def clearance(self, _x: Any, _scenario: dict[str, Any]) -> None:
+        return None
 
 
 @hookimpl
@@ -359,6 +388,7 @@ class Bench:
             case m.Ask():
                 self.numbers += 1
                 u = self._told("another face", (0.1, 0.8), lambda _: (0.15, 0.0))
+                self.feed(*self._reports())
                 self.feed(m.Proposed(0, m.Command(self.numbers, self.t_ns, "controller", u, output.obs_seq, 100_000_000)))
             case m.StartCampaign():
                 self.order = output
@@ -406,11 +436,26 @@ class Bench:
                 memory = self.state.memory
                 jump = fault_jump_of(self.profile, self.model.states, tuple(self.model.nominal.angles), gap)
                 self.stream = Stream(self.model, gap, fault_jump=jump, **msgspec.structs.asdict(stood(memory)))
+                self.episodes, self.scored = Episodes(BenchTask(), self.settings.seed), (-1, False)
                 self.feed(m.SourceStarted(0, "controller", output.digest))
             case m.StopController():
                 self.stream = None
             case _:
                 pass
+
+    def _reports(self) -> list[m.Event]:
+        """What the controller's process reports of its scenarios with this observation."""
+        _, now, over = self.episodes.look(np.array(self.observation.x))
+        found: list[m.Event] = []
+        if over is not None:
+            ended = end_report(0, over)
+            better = msgspec.structs.replace(ended, safety=2.0)
+            found += self._told("an episode left out", [ended], lambda _: [])
+            found = self._told("a better episode", found, lambda _: [better])
+        else:
+            found = self._told("an episode put in", found, lambda _: [m.EpisodeEnded(0, 7, 25, 1.0, 1.0)], now.index == 1)
+        self.scored, report = score_report(0, now, self.scored, self.profile.verification.threshold)
+        return [*found, *([] if report is None else [report])]
 
     def _sampler(self, ask: m.Ask) -> list[m.Event]:
         assert self.campaign is not None

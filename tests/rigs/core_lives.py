@@ -31,9 +31,16 @@ LATER: dict[str, object] = {
     "latest_unix_s": 0,
     "clock_cleared": 0,
     "fixed_seed": False,
+    "runs": (),
+    "run_sequences": 0,
+    "open_run": None,
+    "runs_cleared": 0,
+    "drives": 0,
+    "run_limits": None,
+    "later": False,
 }
 """Fields of memory and outputs that came after the lives were recorded: at their defaults they say nothing else than before."""
-LATER_STATUS = ("refused_campaign", "next_campaign", "next_attempt", "driven", "clock_behind_s")
+LATER_STATUS = ("refused_campaign", "next_campaign", "next_attempt", "driven", "clock_behind_s", "runs")
 
 
 class Life(msgspec.Struct, frozen=True):
