@@ -223,6 +223,8 @@ class Effect(Protocol):
     - `integrates(p) -> str`: it is the scheme by which a pose is integrated; effects see it as the `integration` of their model;
     - `pushes(model, channel) -> bool`, `push(x, axis, model, channel, p) -> Push | None` and `varies`: it is a force on an axis
       (`models.forces`). A model solves for all its forces together, and does not call `after_step`;
+    - `push_under(x, u, axis, model, channel, p) -> Push | None`: the push where it also depends on the inputs as they act, u (n, nu). It is
+      called instead of `push`, which then says on which axes it acts;
     - `side_by_side` = True: `input_sequence` also takes u (T, runs, nu), many short runs at once;
     - `uneven` = True: `input_sequence` also takes dt as (T,), how long each row lasts (and `start` as (T,), when each begins, where it is
       `timed`), with which runs come one after the other, a row of zeros and REST_S seconds (`models.input_chains`) between two;
@@ -243,7 +245,10 @@ class Effect(Protocol):
     - `starts_from_residual(residual, t, pushes, model, channel, dt) -> list[dict]`: further values to begin from, for what the input
       alone does not show (a frequency, the time of a change). residual (n, nx): measured less foretold, t (n,): the steps' times in s,
       ascending, gaps allowed; pushes (n, nx): by how much a unit more of the channel's input moves the state over each step. With
-      `proportional` = True: by how much the input's own value more of it does. Both may be whitened, alike.
+      `proportional` = True: by how much the input's own value more of it does. Both may be whitened, alike;
+    - `starts_from_states(x, residual, pushes, model, channel, dt) -> list[dict]`: the same for what shows over the states at the steps'
+      starts, x (n, nx), such as a period in the position of an axis. The channel is that axis' position or velocity; pushes are those
+      of the input that is the force on it. It has an `amplitude` and a `phase` (rad), which are then fitted to the residual.
     """
 
     name: str

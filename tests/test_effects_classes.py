@@ -43,6 +43,13 @@ VALUES = {
     "lateral_slip": {"coefficient": -0.2},
     "longitudinal_slip": {"ratio": 0.2},
     "track_scale": {"gain": 0.6},
+    "castor_drag": {"loss": 0.01, "arm": 0.3},
+    "steering_ratio": {"ratio": 0.7},
+    "steering_offset": {"angle": 0.2},
+    "link_gravity": {"torque": 0.7, "angle": 0.4},
+    "load_friction": {"coefficient": 0.3},
+    "torque_ripple": {"amplitude": 0.3, "period": 0.7, "phase": 0.5},
+    "static_friction": {"force": 0.3, "velocity": 0.3},
     "wheel_radius_scale": {"left": 1.3, "right": 0.8, "track": 0.4},
     "wheel_slip": {"left": -0.3, "right": 0.2, "track": 0.4},
     "understeer": {"coefficient": 0.3},
@@ -53,6 +60,10 @@ VALUES = {
     "sensor_offset": {"offset": 0.3},
     "sensor_lever_arm": {"x": 0.2, "y": -0.3},
 }
+
+
+ON_A_BOUND = {("static_friction", "stribeck_friction")}
+"""The second one is the first at a bound of its own (a force of 0), before which an interior method stops short."""
 
 
 def _model(name, *effects, exact=True):
@@ -246,7 +257,7 @@ def test_no_two_effects_are_the_same_that_the_table_does_not_know(name):
             fits = _fits(bare, target, other, other_channel, begin)
             if fits and (other, other_channel) not in known:
                 unknown.append((effect, channel, other, other_channel))
-            if not fits and (other, other_channel) in known:
+            if not fits and (other, other_channel) in known and (effect, other) not in ON_A_BOUND:
                 missed.append((effect, channel, other, other_channel))
     assert unknown == []
     assert missed == []  # this search finds what the table knows

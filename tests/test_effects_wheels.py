@@ -109,6 +109,34 @@ def test_on_a_unicycle_unequal_wheels_couple_speed_and_turning():
     assert np.allclose(first, second, rtol=0.0, atol=1e-12)
 
 
+@pytest.mark.parametrize(("loss", "arm"), [(0.02, 0.3), (0.01, 0.05), (5.0, 0.3)])
+def test_a_castor_loads_the_wheels_by_its_drag_against_its_own_motion(loss, arm):
+    """The forces on the wheels by their balance; each wheel gives way in proportion to its own, and neither speed changes its sign."""
+    x, u, left, right = anywhere("differential_drive")
+    v, w = (left + right) / 2.0, (right - left) / TRACK
+    castor = np.column_stack([v, -arm * w])
+    drag = -castor / np.linalg.norm(castor, axis=1, keepdims=True)  # of 1 N
+    moment = -arm * drag[:, 1]  # of a force at (-arm, 0)
+    forces = np.linalg.solve([[1.0, 1.0], [-TRACK / 2.0, TRACK / 2.0]], -np.stack([drag[:, 0], moment]))  # on the wheels, left and right
+    given = 2.0 * loss * forces  # m/s: straight ahead each wheel has half of the drag
+    ahead, turning = v - given.mean(axis=0), w - (given[1] - given[0]) / TRACK
+    ahead, turning = np.where(ahead * v > 0.0, ahead, 0.0), np.where(turning * w > 0.0, turning, 0.0)
+    half = 0.5 * TRACK * turning
+    x1 = composed("differential_drive", ARC, ("castor_drag", "*", {"loss": loss, "arm": arm})).advance(x, u, u)
+    assert np.allclose(x1[:, :3], rolled(x, ahead - half, ahead + half), rtol=0.0, atol=1e-12)
+    assert np.array_equal(x1[:, 3:], u)
+    still = composed("differential_drive", ("castor_drag", "*", {"loss": loss, "arm": arm}))
+    assert np.array_equal(still.advance(x, 0.0 * u, 0.0 * u)[:, :3], x[:, :3])
+
+
+def test_straight_ahead_at_one_speed_a_castor_is_a_slip():
+    u = np.full((3, 2), 5.0)
+    x = np.zeros((3, 5))
+    castor = composed("differential_drive", ARC, ("castor_drag", "*", {"loss": 0.02, "arm": 0.3}))
+    slip = composed("differential_drive", ARC, ("longitudinal_slip", "*", {"ratio": 0.02 / (5.0 * RADIUS)}))
+    assert np.allclose(castor.advance(x, u, u), slip.advance(x, u, u), rtol=0.0, atol=1e-12)
+
+
 @pytest.mark.parametrize("name", ["wheel_radius_scale", "wheel_slip"])
 def test_only_what_has_two_wheels_has_them(name):
     effect = registry().get("effects", name)

@@ -31,6 +31,21 @@ def traced(name, left, right, seed, track=1.0):
     return trace(from_arrays(model, [(y[0], u[0])]), model)
 
 
+def dragged(seed, loss, arm):
+    """The trace of a differential drive with a castor."""
+
+    def castor(x, v, w):
+        share = loss / np.maximum(np.hypot(v, arm * w), 1e-12)
+        return v * np.maximum(1.0 - share, 0.0), w * np.maximum(1.0 - 4.0 * (arm / 0.5) ** 2 * share, 0.0), 0.0, 0.0
+
+    rng = np.random.default_rng(seed)
+    u = commands(rng, 1, STEPS, DT, BOUNDS["differential_drive"])
+    arcs = EffectSpec("integration_scheme", "*", {"scheme": "exact"})
+    model = compose(ModelSpec("differential_drive", DT, GEOMETRY["differential_drive"], (arcs,)))
+    y = drive(rng, "differential_drive", u, (), DT, NOISE, castor)
+    return trace(from_arrays(model, [(y[0], u[0])]), model)
+
+
 def holds(effect, **truth):
     """Whether each true value lies in its interval, widened by half: a 95 % interval of three misses one in seven recordings."""
     ends = {name: effect.parameters[name][:3] for name in truth}
@@ -55,6 +70,13 @@ def test_wheels_that_differ_are_found_with_their_track_from_a_unicycle_s_command
     (effect,) = (found := traced("unicycle", 1.0, 0.96, seed=3)).effects
     assert (found.verdict, effect.name) == ("traced", "wheel_radius_scale")
     assert holds(effect, left=1.0, right=0.96, track=0.3)
+
+
+@pytest.mark.parametrize(("loss", "arm"), [(0.01, 0.2), (0.03, 0.35)])
+def test_a_castor_that_drags_is_found_with_its_place(loss, arm):
+    (effect,) = (found := dragged(3, loss, arm)).effects
+    assert (found.verdict, effect.name) == ("traced", "castor_drag")
+    assert holds(effect, loss=loss, arm=arm)
 
 
 @pytest.mark.slow

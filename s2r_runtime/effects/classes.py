@@ -5,6 +5,9 @@
 | `track_scale` gain g | unicycle | `input_gain` of the yaw rate, g |
 | `longitudinal_slip` ratio r | unicycle | `input_gain` of the speed, 1 - r |
 | `wheel_slip` left, right | two wheels | `wheel_radius_scale` 1 - left, 1 - right |
+| `steering_ratio` ratio r | a steering input | `input_gain` of it, r |
+| `steering_offset` angle b | a steering input | `input_bias` of it, b |
+| `static_friction` force f, velocity | axes | `stribeck_friction`, force 0, static_force f |
 | `mass_change` ratio r (mass m r) | joint | `input_gain` of the force, 1/r |
 | `parameter_change` ratio r | a model of one's own, where it divides or multiplies one input | `input_gain` of it, r or 1/r |
 | `constant_disturbance` world, x | joint | `input_bias` of the force, x |
@@ -105,6 +108,9 @@ def several(model: NominalModel, name: str, channel: str, p: Values) -> list[lis
             here = model.states[axis.position] if len(along) > 1 else along[0]
             constant = ("constant_disturbance", "world", {k: push if k == here else 0.0 for k in along})
             found += [[(name, channel, {"force": mean}), one] for one in [constant, *same(model, *constant)]]
+    if name == "stribeck_friction" and 0.0 < p["force"] < p["static_force"]:
+        beyond = {"force": p["static_force"] - p["force"], "velocity": p["velocity"]}
+        found.append([("coulomb_friction", channel, {"force": p["force"]}), ("static_friction", channel, beyond)])
     if name in {"constant_disturbance", "gravity_slope"} and {"x", "y"} <= set(p):
         parts = [same(model, name, channel, {**dict.fromkeys(p, 0.0), key: p[key]}) for key in p]
         biases = [[one for one in part if one[0] == "input_bias"] for part in parts]
@@ -156,6 +162,8 @@ def _proposed(model: BoundModel) -> Iterator[Row]:
     for i in model.inputs:
         yield Row("track_scale", "theta", "input_gain", i, _renamed("gain", "gain"), _renamed("gain", "gain"), {"gain": 0.7})
         yield Row("longitudinal_slip", "*", "input_gain", i, _slip_to_gain, _gain_to_slip, {"ratio": 0.3})
+        yield Row("steering_ratio", i, "input_gain", i, _renamed("ratio", "gain"), _renamed("gain", "ratio"), {"ratio": 0.7})
+        yield Row("steering_offset", i, "input_bias", i, _renamed("angle", "bias"), _renamed("bias", "angle"), {"angle": 0.2})
         for name in changeable:
             for to_gain, from_gain in ((_ratio_to_gain, _gain_to_ratio), (_ratio_to_inverse, _gain_to_mass)):
                 yield Row("parameter_change", name, "input_gain", i, to_gain, from_gain, {"ratio": 1.4})
@@ -184,6 +192,7 @@ def _proposed(model: BoundModel) -> Iterator[Row]:
     )
     for axis in axes(model):
         v = model.states[axis.velocity]
+        yield Row("static_friction", v, "stribeck_friction", v, _beyond_none, _without_force, {"force": 0.3, "velocity": 0.1})
         curve = {"force": 0.2, "static_force": 0.2, "velocity": 0.1}
         yield Row("stribeck_friction", v, "coulomb_friction", v, _flat, lambda p: None, curve, always=False)
     yield from _all_alike(model)
@@ -312,6 +321,16 @@ def _arm_to_coupling(other: str) -> Convert:
 
 def _coupling_to_arm(other: str) -> Convert:
     return lambda p: {"x": 0.0, "y": -p["coefficient"]} if p["from"] == other else None
+
+
+def _beyond_none(p: Values) -> Values:
+    """Static friction beyond a dry friction of zero."""
+    return {"force": 0.0, "static_force": p["force"], "velocity": p["velocity"]}
+
+
+def _without_force(p: Values) -> Values | None:
+    """Stribeck's curve as static friction alone."""
+    return {"force": p["static_force"], "velocity": p["velocity"]} if p["force"] == 0.0 else None
 
 
 def _flat(p: Values) -> Values | None:

@@ -12,13 +12,39 @@ import numpy as np
 
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.hookspecs import NominalModel
-from s2r_runtime.models.bound import BoundModel
-from s2r_runtime.models.forces import SHORT_S, axes, mass, response
+from s2r_runtime.models.bound import BoundModel, bind
+from s2r_runtime.models.forces import SHORT_S, Axis, axes, coupled, mass, mass_on, response
 
 NEAR = 0.02
 """Of 1/mass: what a model loses to its own friction within the probe is less."""
 
 _KNOWN: WeakKeyDictionary[BoundModel, str | None] = WeakKeyDictionary()
+_ON_AXES: WeakKeyDictionary[BoundModel, dict[Axis, str | None]] = WeakKeyDictionary()
+
+
+def input_on(model: NominalModel, axis: Axis) -> str | None:
+    """Name of the input that is the force on this axis: a unit of it adds 1/mass to the speed in a second; None if none does.
+
+    Of axes that move one another, the input in the same place.
+    """
+    if not isinstance(model, BoundModel):
+        return _input_on(bind(model, {}), axis)
+    known = _ON_AXES.setdefault(model, {})
+    if axis not in known:
+        known[axis] = _input_on(model, axis)
+    return known[axis]
+
+
+def _input_on(model: BoundModel, axis: Axis) -> str | None:
+    if coupled(model):
+        return model.inputs[axes(model).index(axis)]
+    x = np.random.default_rng(0).uniform(-1.0, 1.0, (8, len(model.states)))
+    try:
+        found = response(x, np.zeros((len(x), len(model.inputs))), model, SHORT_S, 1.0 / SHORT_S)[:, axis.velocity] / SHORT_S
+    except ConfigError:  # a user's model cannot be stepped just anywhere
+        return None
+    alike = np.all(np.abs(mass_on(model, model.states[axis.velocity]) * found - 1.0) < NEAR, axis=0)
+    return next((name for name, one in zip(model.inputs, alike, strict=True) if one), None)
 
 
 def force_input(model: NominalModel) -> str | None:

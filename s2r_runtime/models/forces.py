@@ -258,6 +258,14 @@ def is_rotary(model: NominalModel, axis: Axis) -> bool:
     return position in model.angles or mass_name(model) == "inertia"
 
 
+def may_turn(model: NominalModel, axis: Axis) -> bool:
+    """Whether an axis turns or may turn: the built-in joint's does if its `mass` is an inertia, and a file's `q` if it has no unit."""
+    if is_rotary(model, axis):
+        return True
+    own = isinstance(model, BoundModel) and isinstance(model.shared, FileModel)
+    return model.states[axis.position] == "q" and not (own and "q" in getattr(model, "units", {}))
+
+
 def mass_on(model: NominalModel, channel: str) -> float:
     """Divisor of a force on an axis or a speed: kg, or kg m² on a rotary axis; 1 where the force is an acceleration.
 
@@ -376,7 +384,7 @@ def pushed(
     alone = {*lone_speeds(model, slowed=True)}.intersection(channel for _, channel, _ in pushing)
     for name in sorted(alone):
         rate = own_rate(model, model.states.index(name), dt, parameters)
-        x_next = _braked(x, x_next, model, [one for one in pushing if one[1] == name], dt, rate)
+        x_next = _braked(x, u, x_next, model, [one for one in pushing if one[1] == name], dt, rate)
     pushing = [one for one in pushing if one[1] not in alone]
     if not pushing:
         return x_next
@@ -391,11 +399,11 @@ def pushed(
     now, at = (x.copy(), x.copy()) if varies else (x, x)
     for _ in range(parts if varies else 0):
         for k, g, rate in zip(moved, given, rates, strict=True):
-            half, _ = _glide(now[:, k.velocity], g, _losing(_together(now, k, model, pushing), rate), 0.5 * h)
+            half, _ = _glide(now[:, k.velocity], g, _losing(_together(now, u, k, model, pushing), rate), 0.5 * h)
             at[:, k.position] = now[:, k.position] + 0.5 * h * now[:, k.velocity]
             at[:, k.velocity] = half
         for k, g, rate in zip(moved, given, rates, strict=True):
-            now[:, k.velocity], way = _glide(now[:, k.velocity], g, _losing(_together(at, k, model, pushing), rate), h)
+            now[:, k.velocity], way = _glide(now[:, k.velocity], g, _losing(_together(at, u, k, model, pushing), rate), h)
             now[:, k.position] += way
     after = x_next.copy()
     for k, g, rate in zip(moved, given, rates, strict=True):
@@ -403,7 +411,7 @@ def pushed(
         if varies:
             end, way = now[:, k.velocity], now[:, k.position] - x[:, k.position]
         else:
-            end, way = _glide(v, g, _losing(_together(x, k, model, pushing), rate), dt)
+            end, way = _glide(v, g, _losing(_together(x, u, k, model, pushing), rate), dt)
         after[:, k.position] += way - (dt * v + 0.5 * dt * dt * g if _lossless(rate) else _moved(v, g, _flow(rate, dt))[1])
         after[:, k.velocity] = end
     return after
@@ -426,7 +434,7 @@ def _losing(push: Push, rate: Value) -> Push:
     return push if _lossless(rate) else replace(push, rate=_sum(push.rate, (rate, rate)))
 
 
-def _braked(x: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushing], dt: float | Array, rate: Value) -> Array:
+def _braked(x: Array, u: Array, x_next: Array, model: NominalModel, pushing: Sequence[Pushing], dt: float | Array, rate: Value) -> Array:
     """x_next (n, nx), under pushes on one speed that has no position, which the model itself slows down at this rate."""
     j = model.states.index(pushing[0][1])
     axis = Axis(x.shape[1], j)  # a push that asks where it is fails
@@ -437,8 +445,8 @@ def _braked(x: Array, x_next: Array, model: NominalModel, pushing: Sequence[Push
     for _ in range(parts):
         at[:, j] = v
         if varies:
-            at[:, j] = _glide(v, given, _losing(_together(at, axis, model, pushing), rate), 0.5 * dt / parts)[0]
-        v = _glide(v, given, _losing(_together(at, axis, model, pushing), rate), dt / parts)[0]
+            at[:, j] = _glide(v, given, _losing(_together(at, u, axis, model, pushing), rate), 0.5 * dt / parts)[0]
+        v = _glide(v, given, _losing(_together(at, u, axis, model, pushing), rate), dt / parts)[0]
     after = x_next.copy()
     after[:, j] = v
     return after
@@ -459,7 +467,7 @@ def _pushed_together(x: Array, u: Array, x_next: Array, model: BoundModel, pushi
         for k, g in zip(among if varies else (), given, strict=False):
             at[:, k.position] += 0.5 * h * now[:, k.velocity]
             at[:, k.velocity] += 0.5 * h * g
-        pushes = [_times(_together(at, k, model, pushing), w[:, i, i]) for i, k in enumerate(among)]
+        pushes = [_times(_together(at, u, k, model, pushing), w[:, i, i]) for i, k in enumerate(among)]
         forces, moved = _swept([np.ascontiguousarray(now[:, k.velocity]) for k in among], given, pushes, w, h)
         mean += forces / parts
         for k, (end, way) in zip(among, moved, strict=True):
@@ -539,11 +547,12 @@ def _both(pair: Pair, w: Array) -> Pair:
     return first, first if _alike(pair) else pair[1] * w
 
 
-def _together(x: Array, axis: Axis, model: NominalModel, pushing: Sequence[Pushing]) -> Push:
-    """The sum of all pushes on one axis."""
+def _together(x: Array, u: Array, axis: Axis, model: NominalModel, pushing: Sequence[Pushing]) -> Push:
+    """The sum of all pushes on one axis, at x (n, nx) under u (n, nu)."""
     total = Push(hold=(0.0, 0.0))
     for effect, channel, p in pushing:
-        one = effect.push(x, axis, model, channel, p)
+        under = getattr(effect, "push_under", None)
+        one = effect.push(x, axis, model, channel, p) if under is None else under(x, u, axis, model, channel, p)
         if one is not None:
             total = Push(
                 total.drive + one.drive,

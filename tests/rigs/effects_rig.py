@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+ON_STEERING = {"steering_ratio": ({"ratio": 0.8}, {"ratio": -2.0}), "steering_offset": ({"angle": 0.05},)}
+"""On steering angles only."""
+
 VALUES = {
     "input_gain": ({"gain": 0.8}, {"gain": -2.0}),
     "input_gain_asymmetry": ({"gain_positive": 0.8, "gain_negative": 1.3},),

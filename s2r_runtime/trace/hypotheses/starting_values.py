@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from s2r_runtime.hookspecs import Effect
 from s2r_runtime.models.composed import AppliedEffect
+from s2r_runtime.models.force_inputs import input_on
+from s2r_runtime.models.forces import axis_of
 from s2r_runtime.trace.estimation import noise as noises
 from s2r_runtime.trace.estimation.prediction import Acting, acting, predicted, wherever
 from s2r_runtime.trace.estimation.problem import Fit, Problem, insert
@@ -35,6 +37,8 @@ class Leftover:
     def starts(self, effect: Effect, channel: str) -> list[dict[str, Any]]:
         """Further values to begin from, of an effect that asks for the residual; none of another one's."""
         model, steps = self.fit.model, self.given.steps
+        if hasattr(effect, "starts_from_states"):
+            return self._from_states(effect, channel)
         if not hasattr(effect, "starts_from_residual") or channel not in {*model.inputs, "*"}:  # a state has no input that pushes
             return []
         pushes = self._pushes(channel, proportional=bool(getattr(effect, "proportional", False)))
@@ -45,6 +49,26 @@ class Leftover:
             found = effect.starts_from_residual(pulled, steps.t, pushes, model.nominal, channel, model.dt)
             return [self._sized(effect, channel, p, pushes) for p in found]
         return list(effect.starts_from_residual(self.fit.z, steps.t, self.fit.whiten(pushes), model.nominal, channel, model.dt))
+
+    def _from_states(self, effect: Any, channel: str) -> list[dict[str, Any]]:
+        """Sines of a state, with amplitude and phase by least squares of what they change."""
+        model = self.fit.model
+        axis = axis_of(model.nominal, channel)
+        force = None if axis is None else input_on(model.nominal, axis)
+        if force is None:
+            return []
+        pulled = self.fit.whiten.back(self.fit.z * noises.weight(self.fit.z))
+        starts = effect.starts_from_states(
+            self.given.steps.y0, pulled, self._pushes(force, proportional=False), model.nominal, channel, model.dt
+        )
+        found = []
+        for p in starts:
+            ahead = {**p, "phase": math.remainder(float(p["phase"]) + 0.25 * math.tau, math.tau)}
+            columns = np.stack([self._changed(effect, channel, one).ravel() for one in (p, ahead)], axis=1)
+            a, b = np.linalg.lstsq(columns, self.fit.z.ravel(), rcond=None)[0].tolist()
+            size, phase = math.hypot(a, b), math.remainder(float(p["phase"]) + math.atan2(b, a), math.tau)
+            found.append({**p, "amplitude": size * float(p["amplitude"]), "phase": phase})
+        return found
 
     def _sized(self, effect: Effect, channel: str, p: dict[str, Any], pushes: Array) -> dict[str, Any]:
         """The same as large as it explains most: by least squares of what it changes, a sine's phase being free."""
