@@ -49,6 +49,7 @@ _EFFECTS = {
     "steering_offset": "the road wheels are not straight at a steering command of zero",
     "link_gravity": "gravity on a link that turns about a horizontal axis",
     "torque_ripple": "a force that repeats with the position: a motor's magnets, an eccentric gear",
+    "gear_backlash": "no force reaches the link while the motor crosses the backlash of its gear",
     "load_friction": "dry friction of a gear that grows with the transmitted force",
     "static_friction": "what must be overcome near standstill, beyond the friction of a motion",
     "wheel_slip": "each side of a differential drive slips by its own share",

@@ -48,6 +48,7 @@ VALUES = {
     "steering_offset": {"angle": 0.2},
     "link_gravity": {"torque": 0.7, "angle": 0.4},
     "load_friction": {"coefficient": 0.3},
+    "gear_backlash": {"width": 0.004},
     "torque_ripple": {"amplitude": 0.3, "period": 0.7, "phase": 0.5},
     "static_friction": {"force": 0.3, "velocity": 0.3},
     "wheel_radius_scale": {"left": 1.3, "right": 0.8, "track": 0.4},

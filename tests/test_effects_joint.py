@@ -89,6 +89,70 @@ def test_ripple_s_period_is_found_over_positions_that_come_in_any_order():
     assert effect.starts_from_states(still, residual[:50], pushes[:50], joint(0.01).nominal, "q", 0.01) == []
 
 
+def two_bodies(forces, dt, backlash, share, parts=2000):
+    """(T + 1, 2) position and speed of a link that a motor with this share of MASS drives through a backlash, inelastic contact."""
+    motor, link, h = share * MASS, (1.0 - share) * MASS, dt / parts
+    gap = v_m = q = v = 0.0
+    rows = [(q, v)]
+    for force in forces:
+        for _ in range(parts):
+            if abs(gap) >= 0.5 * backlash and gap * force >= 0.0 and v_m == v:
+                v_m = v = v + h * force / MASS
+            else:
+                v_m += h * force / motor
+                gap += h * (v_m - v)
+                if abs(gap) >= 0.5 * backlash and gap * (v_m - v) > 0.0:
+                    gap = np.copysign(0.5 * backlash, gap)
+                    v_m = v = (motor * v_m + link * v) / MASS
+            q += h * v
+        rows.append((q, v))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize(("backlash", "share"), [(0.02, 0.4), (0.08, 0.1), (0.3, 0.5)])
+def test_a_gear_with_backlash_moves_its_link_as_two_bodies_do(backlash, share):
+    """Only the product of backlash and share shows. Speeds agree but for when a contact comes, within one small step."""
+    rng = np.random.default_rng(6)
+    forces, dt, parts = np.repeat(rng.uniform(-4.0, 4.0, 25), 3), 0.02, 2000
+    model = joint(dt, ("gear_backlash", "force", {"width": backlash * share}))
+    want = two_bodies(forces, dt, backlash, share, parts)
+    x, hidden, speeds = np.zeros((1, 2)), model.at_rest(1), []
+    for force in forces:
+        x, hidden = model.step(x, np.array([[force]]), hidden)
+        speeds.append(x[0, 1])
+    bare, x0 = [0.0], 0.0
+    for force in forces:
+        x0 += dt * force / MASS
+        bare.append(x0)
+    assert np.allclose(speeds, want[1:, 1], rtol=0.0, atol=20 * 4.0 / MASS * dt / parts)
+    assert np.max(np.abs(want[:, 1] - bare)) > 0.01
+
+
+def test_all_of_the_momentum_arrives_when_the_motor_does():
+    """A constant force: the link rests until the motor is there, and then has the speed that it has without backlash."""
+    dt, force, width = 0.01, 3.0, 0.01
+    model = joint(dt, ("gear_backlash", "force", {"width": width}))
+    arrives = np.sqrt(width * MASS / force)  # half of the width, from its middle
+    x, hidden = np.zeros((1, 2)), model.at_rest(1)
+    for k in range(1, 21):
+        x, hidden = model.step(x, np.array([[force]]), hidden)
+        assert x[0, 1] == pytest.approx(force * dt * k / MASS if dt * k > arrives else 0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("many", [1, 7])
+def test_backlash_is_the_same_row_by_row_for_many_at_once(many):
+    effect, nominal = registry().get("effects", "gear_backlash"), joint(0.01).nominal
+    rng = np.random.default_rng(7)
+    u = np.repeat(rng.uniform(-3.0, 3.0, (20, many, 1)), 5, axis=0)
+    p = {"width": 0.013}
+    at_once = effect.input_sequence(u, nominal, "force", 0.01, p)
+    z = effect.hidden(many, nominal, "force", 0.01, p)
+    for row, expected in zip(u, at_once, strict=True):
+        acting, z = effect.input_step(row, z, nominal, "force", 0.01, p)
+        assert np.allclose(acting, expected, rtol=1e-9, atol=1e-12)
+    assert np.any(at_once != u)
+
+
 def test_a_link_rests_where_it_hangs_and_where_it_stands():
     model = joint(0.01, ("link_gravity", "q", {"torque": 1.7, "angle": 0.4}))
     x = np.array([[0.4, 0.0], [0.4 + np.pi, 0.0]])

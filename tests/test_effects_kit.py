@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from effects_rig import ON_STEERING, VALUES
+from effects_rig import ON_JOINTS, ON_STEERING, VALUES
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
 from s2r_runtime.plugins import registry
 from s2r_runtime.testing import EffectKit
 
-for _name, (_first, *_others) in {**VALUES, **ON_STEERING}.items():
+for _name, (_first, *_others) in {**VALUES, **ON_STEERING, **ON_JOINTS}.items():
     _class = f"Test_{_name}"
     globals()[_class] = type(
         _class, (EffectKit,), {"effect": registry().get("effects", _name), "parameters": _first, "others": tuple(_others)}
@@ -18,7 +18,7 @@ for _name, (_first, *_others) in {**VALUES, **ON_STEERING}.items():
 
 def test_no_effect_on_inputs_is_left_out():
     offered = {name for name in registry().names("effects") if registry().get("effects", name).stage == "input"}
-    assert offered == {*VALUES, *ON_STEERING}
+    assert offered == {*VALUES, *ON_STEERING, *ON_JOINTS}
 
 
 class _Wrong:

@@ -5,6 +5,9 @@ from __future__ import annotations
 ON_STEERING = {"steering_ratio": ({"ratio": 0.8}, {"ratio": -2.0}), "steering_offset": ({"angle": 0.05},)}
 """On steering angles only."""
 
+ON_JOINTS = {"gear_backlash": ({"width": 0.02}, {"width": 1e-4}, {"width": 9.0})}
+"""On the forces of joints only."""
+
 VALUES = {
     "input_gain": ({"gain": 0.8}, {"gain": -2.0}),
     "input_gain_asymmetry": ({"gain_positive": 0.8, "gain_negative": 1.3},),

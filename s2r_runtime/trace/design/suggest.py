@@ -85,6 +85,7 @@ _NEEDS = {
     "castor_drag": "straight ahead, turns on the spot and curves, slow and fast",
     "link_gravity": "the whole range of positions, slowly",
     "torque_ripple": "slow motion over the whole range of positions",
+    "gear_backlash": "many reversals, small and large, sampled quickly",
     "load_friction": "small and large forces in both directions, also against the motion",
     "cubic_stiffness": "the whole range of positions",
     "constant_disturbance": _TURNS,

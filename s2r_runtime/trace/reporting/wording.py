@@ -111,6 +111,7 @@ _WORDS: dict[str, Callable[[str, Values], str]] = {
     "castor_drag": lambda what, p: f"a castor {p['arm']:.3g} m behind the axle drags and takes {p['loss']:.3g} m/s off the speed ahead",
     "link_gravity": lambda what, p: f"gravity pulls the link to {what} = {p['angle']:.3g}",
     "torque_ripple": lambda what, p: f"a force of {p['amplitude']:.3g} repeats with every {p['period']:.3g} of {what}",
+    "gear_backlash": lambda what, p: f"after a reversal {what} acts only when the motor has crossed the backlash of its gear",
     "load_friction": lambda what, p: f"friction takes {_percent(p['coefficient'])} of the transmitted force off {what}",
     "static_friction": lambda what, p: f"friction near standstill holds {what}",
     "viscous_friction": _friction("friction that grows with speed"),
