@@ -11,7 +11,8 @@ import pytest
 from scipy.signal import lfilter
 from scipy.special import erf
 
-from s2r_runtime.cli.evidence import gap_of, load_recordings
+from s2r_runtime.api.progress import Watcher
+from s2r_runtime.api.verification import gap_of, load_recordings
 from s2r_runtime.core import ledger
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
 from s2r_runtime.evidence import blocked, statements
@@ -186,9 +187,9 @@ def test_several_drives_found_one_gap_in_whatever_order_they_are_named(tmp_path:
         gap_of(load_transitions(drives[0], model), model, vouching, beta=share)
     found = []
     for named in (drives, drives[::-1]):
-        recorded, digest = load_recordings(named, model, vouching)
+        recorded, digest = load_recordings(named, model, vouching, Watcher())
         gap, _, _ = gap_of(recorded, model, vouching, beta=share)
         assert gap.n == n
         found.append((gap, digest))
     assert found[0] == found[1]
-    assert load_recordings(drives[:1], model, vouching)[1] == digest_of_all([digest_of_path(drives[0])]) != found[0][1]
+    assert load_recordings(drives[:1], model, vouching, Watcher())[1] == digest_of_all([digest_of_path(drives[0])]) != found[0][1]

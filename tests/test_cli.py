@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from command_reference import verbs
 
+from s2r_runtime.api.files import writable
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import writable
 from s2r_runtime.cli.main import main, parser
 from s2r_runtime.cli.verbs import VERBS
 from s2r_runtime.errors import UsageError

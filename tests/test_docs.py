@@ -1,7 +1,8 @@
 """What the docs show is what happens: console blocks are run, Python blocks are run, verbs and hooks are all documented.
 
 A ```console block's lines that begin with `$ ` are commands, the lines after each are its stdout and stderr; `...` stands
-for anything. Blocks marked ```console no-run show what needs hardware, root or minutes; the demo's is run by test_demo.py.
+for anything. Python blocks of a page share their names. Blocks marked no-run show what needs hardware, root or minutes.
+The demo is run by test_demo.py, a log and a daemon in Python by test_python_evidence.py.
 """
 
 from __future__ import annotations
@@ -73,11 +74,24 @@ def test_console_block_shows_what_happens(where: str, block: str, tmp_path: Path
         assert matches(expected, done.stdout + done.stderr), f"{where}: {command}\nshown:\n{expected}\ngot:\n{done.stdout}{done.stderr}"
 
 
+def python_pages() -> dict[str, list[tuple[str, str]]]:
+    """Page -> its Python blocks: (page and line, text)."""
+    found: dict[str, list[tuple[str, str]]] = {}
+    for where, block in blocks("python"):
+        found.setdefault(where.partition(":")[0], []).append((where, block))
+    return found
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(("where", "block"), blocks("python"), ids=[w for w, _ in blocks("python")])
-def test_python_block_runs(where: str, block: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("page", python_pages())
+def test_python_blocks_of_a_page_run_one_after_the_other_in_an_empty_folder(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    exec(compile(block, where, "exec"), {"__name__": "docs"})  # noqa: S102 - the docs' own code
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    names: dict[str, object] = {"__name__": "docs"}
+    for where, block in python_pages()[page]:
+        exec(compile(block, where, "exec"), names)  # noqa: S102 - the docs' own code
 
 
 def test_command_reference_is_the_command_line() -> None:

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-import s2r_runtime.trace as package
+package = importlib.import_module("s2r_runtime.trace")
 
 
 @pytest.mark.parametrize("name", package.__all__)

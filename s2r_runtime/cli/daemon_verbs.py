@@ -10,11 +10,7 @@ from typing import Any
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import count, positive
 from s2r_runtime.cli.presence import Presence
-from s2r_runtime.errors import ConfigError, UsageError
-from s2r_runtime.files.bounded_file import read_bounded
-
-WAITING = ("sample", "excite", "deploy", "trace", "verify")
-"""Requests whose answer takes long. A person who leaves before it stops what drives for it."""
+from s2r_runtime.errors import UsageError
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -143,6 +139,7 @@ def run_daemon(args: argparse.Namespace, *, simulated_seeds: Iterator[int] | Non
 
 def run_sample(args: argparse.Namespace) -> int:
     """Exit 0 if the campaign is complete, or all of the given inputs were driven."""
+    from s2r_runtime.api import live
     from s2r_runtime.daemon import control
     from s2r_runtime.profile import load_driving_profile
 
@@ -153,17 +150,9 @@ def run_sample(args: argparse.Namespace) -> int:
             raise UsageError(
                 f"-o: robot {profile.robot.name!r} has a running daemon, which records the campaign in its own log; leave -o out"
             )
-        if args.inputs and (args.cancel or args.pause or args.n or args.retry):
+        if args.inputs and (args.cancel or args.pause):
             raise UsageError("--inputs: drives what is in the file; leave -n, --retry, --pause and --cancel out")
-        if args.inputs and not args.inputs.is_file():
-            raise UsageError(f"--inputs {args.inputs}: no such file; s2r trace --suggest writes one")
-        request: dict[str, Any] = {"verb": "sample", "count": args.n}
-        if args.inputs:
-            request = {"verb": "excite", "path": str(args.inputs.resolve())}
-        if args.detach:
-            request["detached"] = True
-        if args.retry and not args.inputs:
-            request["text"] = "retry"
+        request = live.sample_request(n=args.n, retry=args.retry, detach=args.detach, inputs=args.inputs)
         return _say(args, {"verb": "cancel"} if args.cancel else {"verb": "pause"} if args.pause else request, socket)
     if args.inputs:
         raise UsageError(f"--inputs: no daemon of robot {profile.robot.name!r} is running; start one: s2r run {args.profile}")
@@ -190,16 +179,10 @@ def run_sample(args: argparse.Namespace) -> int:
 
 def run_deploy(args: argparse.Namespace) -> int:
     """Exit 0 if the controller drives, 1 if it was refused."""
-    if not args.controller.exists():
-        raise UsageError(f"{args.controller}: no such file; a controller is a Python file with control(x, theta, parameters)")
-    request: dict[str, Any] = {"verb": "deploy", "path": str(args.controller.resolve()), "parameters": _parameters(args.param)}
-    if args.certificate:
-        try:
-            request["certificate"] = read_bounded(args.certificate).decode()
-        except ConfigError as error:
-            raise UsageError(str(error)) from None
-        except UnicodeDecodeError:
-            raise UsageError(f"{args.certificate}: is no certificate: not UTF-8 text") from None
+    from s2r_runtime.api import live
+    from s2r_runtime.cli.choices import pairs
+
+    request = live.deploy_request(args.controller, pairs(args.param, "--param"), args.certificate)
     code = _say(args, request)
     if code == 0 and not args.json:
         output.err("it drives on without this command; s2r undeploy ends that, s2r stop is the emergency stop")
@@ -208,13 +191,9 @@ def run_deploy(args: argparse.Namespace) -> int:
 
 def run_adopt(args: argparse.Namespace) -> int:
     """Exit 0 if the model is in force."""
-    from s2r_runtime.files.toml_text import read_text
-    from s2r_runtime.modelspec import load_model
+    from s2r_runtime.api import live
 
-    if args.model is None:
-        return _say(args, {"verb": "adopt"})
-    load_model(args.model)
-    return _say(args, {"verb": "adopt", "text": read_text(args.model), "base": str(args.model.resolve().parent)})
+    return _say(args, live.adopt_request(args.model))
 
 
 def run_live_trace(args: argparse.Namespace) -> int:
@@ -306,36 +285,20 @@ def _say(args: argparse.Namespace, request: dict[str, Any], socket: Path | None 
 
 
 def _call(args: argparse.Namespace, request: dict[str, Any], socket: Path | None = None) -> dict[str, Any]:
+    from s2r_runtime.api import live
     from s2r_runtime.daemon import control
 
     path = socket or args.socket or control.find_socket(args.robot)
     if path is None:
         raise UsageError("no daemon is running here")
-    bar = output.Progress(request["verb"])
-
-    def on_progress(line: dict[str, Any]) -> None:
-        if "done" in line and "total" in line:
-            bar(float(line["done"]), float(line["total"]), str(line.get("detail", "")), line.get("seconds_left"))
-        elif line.get("text"):
-            bar.close()
-            output.err(str(line["text"]))
-
-    if request["verb"] not in WAITING:
-        return control.call(path, request, on_progress)
+    watcher = output.Terminal()
+    if request["verb"] not in live.WAITING:
+        return live.talk(path, request, watcher)
     with Presence() as presence:
-        try:
-            answer = control.call(path, request, on_progress, presence)
-        finally:
-            bar.close()
+        answer = live.talk(path, request, watcher, presence)
     if presence.left and answer["exit_code"]:
         return {**answer, "exit_code": presence.exit_code, "text": f"interrupted: {answer['text']}"}
     return answer
-
-
-def _parameters(items: list[str]) -> dict[str, float]:
-    from s2r_runtime.cli.choices import pair
-
-    return dict(pair(item, "--param") for item in items)
 
 
 def _plain(value: object) -> str:

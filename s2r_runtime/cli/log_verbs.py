@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from s2r_runtime.api.files import apart, writable
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import apart, writable
-from s2r_runtime.errors import NotEnoughEvidence, UsageError
+from s2r_runtime.errors import UsageError
 
 HEAD_BYTES = 32
 
@@ -57,30 +57,21 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run_audit(args: argparse.Namespace) -> int:
     """Exit 0 if all that is there holds, 1 if something does not, 3 if nothing fails but parts that are needed were not given."""
-    from s2r_runtime.audit.log import audit
-    from s2r_runtime.trust import keys, revocations
+    from s2r_runtime.api.logs import audited
 
-    _need(args.log)
-    bar = output.Progress("auditing")
-    try:
-        result = audit(
-            args.log,
-            public_key=keys.load_public(args.key) if args.key else None,
-            rerun_controllers=args.rerun_controllers,
-            rerun_traces=args.rerun_traces,
-            heads=args.head,
-            revoked=revocations.known(revocations.places()),
-            progress=bar,
-        )
-    finally:
-        bar.close()
+    found = audited(
+        args.log,
+        output.Terminal(),
+        key=args.key,
+        rerun_controllers=args.rerun_controllers,
+        rerun_traces=args.rerun_traces,
+        heads=args.head,
+    )
     if args.json:
-        output.result_json(result.to_json())
+        output.result_json(found.to_dict())
     else:
-        output.out_lines(result.text())
-    if result.only_incomplete:
-        return NotEnoughEvidence.exit_code
-    return 0 if result.ok else 1
+        output.out_lines(found.summary())
+    return found.exit_code
 
 
 def run_report(args: argparse.Namespace) -> int:

@@ -12,13 +12,15 @@ import shutil
 import stat
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TextIO
 
 import msgspec
 
+from s2r_runtime.api.progress import Report, Watcher
 from s2r_runtime.errors import UsageError
 from s2r_runtime.files.printable import printable
 
@@ -163,6 +165,31 @@ class Progress:
         """Clears the line."""
         if self._live and self._drawn:
             _draw("\r\x1b[2K")
+
+
+class Terminal(Watcher):
+    """Progress as one line that is drawn over, notes as lines on stderr."""
+
+    def __init__(self) -> None:
+        self._bar = Progress("")
+
+    @contextmanager
+    def phase(self, what: str) -> Iterator[Report]:
+        """As `Progress`, with what is done as its label."""
+        self._bar = bar = Progress(what)
+        try:
+            yield bar
+        finally:
+            bar.close()
+
+    def line(self, text: str) -> None:
+        """In the place of the progress."""
+        self._bar.close()
+        err(text)
+
+    def notes(self, source: str, lines: Sequence[str]) -> None:
+        """A line each."""
+        notes(source, lines)
 
 
 def _draw(text: str) -> None:

@@ -56,7 +56,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def profile_check(args: argparse.Namespace) -> int:
     """Exit 0 if the profile is valid here; otherwise ConfigError says what is wrong."""
-    from s2r_runtime.cli.choices import load_checked
+    from s2r_runtime.api.models import load_checked
 
     profile = load_checked(args.profile)
     if args.json:

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from s2r_runtime.api.files import apart, own_file, writable
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import add_limit, apart, controller_at, count, load_checked, own_file, positive, writable
+from s2r_runtime.cli.choices import add_limit, count, positive
+from s2r_runtime.cli.evidence import print_verification
 from s2r_runtime.errors import ControllerError, UsageError
 from s2r_runtime.recordings.units import number_of
 
@@ -44,11 +46,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Exit 0 if the winner passed verification, 1 if it did not (the attempt is spent all the same)."""
-    from s2r_runtime.cli.evidence import gap_at, gap_of, load_recordings, print_verification, profile_model, run_verification, work
+    from s2r_runtime.api.models import controller_at, load_checked, profile_model
+    from s2r_runtime.api.verification import gap_at, gap_of, load_recordings, run_verification, verification_lines, work
     from s2r_runtime.controllers import candidates
     from s2r_runtime.daemon.worker import Failed, SynthesisJob
-    from s2r_runtime.evidence import verify as verification
     from s2r_runtime.evidence.bounds import attempt_beta
+    from s2r_runtime.evidence.verify import verification_json
     from s2r_runtime.files import durable
     from s2r_runtime.trust import keys, offline_ledger
 
@@ -58,15 +61,15 @@ def run(args: argparse.Namespace) -> int:
     inputs = {"the controller": args.controller, "the profile": args.profile, "the recording": args.recording, "the model": args.model}
     apart({"-o": args.output}, {**inputs, "the key": args.key or keys.default_path()})
     profile = load_checked(args.profile)
-    model = profile_model(args, profile)
+    model, watcher = profile_model(args.model, profile, str(args.profile)), output.Terminal()
     apart({"-o": args.output}, {"the model's file": own_file(model.spec)})
-    controller = controller_at(args.controller, [])
+    controller = controller_at(args.controller, {})
     if controller.modules and args.output.resolve().parent != args.controller.resolve().parent:
         raise UsageError(f"-o {args.output}: must lie beside {args.controller}, which imports {', '.join(controller.modules)} from there")
     bounds = candidates.declared_bounds(controller, dict(_bound(item) for item in args.bound))
     ledger = offline_ledger.open_ledger(args.key or keys.default_path(), profile.robot.name)
     if args.recording:
-        gap = gap_of(load_recordings([args.recording], model, profile, args.max_gb)[0], model, profile)[0]
+        gap = gap_of(load_recordings([args.recording], model, profile, watcher, args.max_gb)[0], model, profile)[0]
     else:
         gap = gap_at(args.radius, args.hold_radius, model, profile)
     headroom = profile.verification.headroom if args.recording else 1.0
@@ -75,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     job = SynthesisJob(
         asked, controller, bounds, gap, amid * gap.radius, amid * gap.hold_radius, args.evaluations, args.scenarios, args.seed
     )
-    done = work(job, SEARCH_TIMEOUT, "searching")
+    done = work(job, SEARCH_TIMEOUT, "searching", watcher)
     if isinstance(done, Failed) or done.synthesis is None:
         raise ControllerError(f"{args.controller}: the search ended: {done.text if isinstance(done, Failed) else 'no result'}")
     found = done.synthesis
@@ -83,16 +86,16 @@ def run(args: argparse.Namespace) -> int:
         durable.replace(args.output, candidates.with_parameters(controller, found.best.parameters))
     except OSError as error:
         raise UsageError(f"{args.output}: cannot be written: {error.strerror}") from None
-    winner = controller_at(args.output, [])
+    winner = controller_at(args.output, {})
     attempt = ledger.spend_attempt(winner.digest)
     beta = attempt_beta(profile.guarantee.beta, attempt)
     laws = profile.verification.laws
     seed = ledger.draw_seed(attempt)
     result, behaviour = run_verification(
-        winner, model, profile, gap=gap, headroom=headroom, laws=laws, n=0, attempt=attempt, seed=seed, beta=beta
+        winner, model, profile, watcher, gap=gap, headroom=headroom, laws=laws, n=0, attempt=attempt, seed=seed, beta=beta
     )
     ledger.ended(attempt, behaviour)
-    answer = {**verification.verification_json(result), "gap_radius": gap.radius}
+    answer = {**verification_json(result), "gap_radius": gap.radius}
     if args.json:
         spent = {
             "beta_spent": ledger.spent(profile.guarantee.beta),
@@ -102,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         _print_search(found, bounds)
         output.out(f"the winner is in {args.output}; verified on fresh scenarios (attempt {attempt}, beta {beta:.4g}):")
-        print_verification(answer)
+        print_verification("\n".join(verification_lines(answer)))
         output.out("a certificate comes from s2r certify or s2r deploy, and costs an attempt of its own" if result.passed else "no pass")
     return 0 if result.passed else 1
 

@@ -4,38 +4,18 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Set
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from s2r_runtime.api.files import apart, own_file, writable
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import (
-    add_model_options,
-    add_signal_options,
-    apart,
-    chosen_model,
-    columns_of,
-    count,
-    own_file,
-    positive,
-    signals_of,
-    transport_of,
-    weights_of,
-    writable,
-)
+from s2r_runtime.cli.choices import add_model_options, add_signal_options, chosen_model, count, positive, recording_of
 from s2r_runtime.cli.daemon_verbs import add_daemon_options, run_live_trace
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
 
 if TYPE_CHECKING:
-    from s2r_runtime.models.composed import ComposedModel
-    from s2r_runtime.profile import Profile
-    from s2r_runtime.trace.data.dataset import Dataset
+    from s2r_runtime.api.tracing import Ready, Trace
     from s2r_runtime.trace.design.suggestion import Suggestion
-    from s2r_runtime.trace.reporting.result import TraceResult
-
-
-MOST_SUGGESTED = 100_000
-"""Steps of a drive: many are drawn side by side, and every rival is simulated under each."""
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -93,9 +73,6 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Exit 0 with any verdict, 3 with too little data."""
-    from s2r_runtime.files.table_text import limits_of
-    from s2r_runtime.trace.pipeline import load_dataset, trace
-
     if bool(args.recording) == (args.live is not None):
         raise UsageError("trace: give a RECORDING, or --live with what the running daemon recorded")
     for path in (args.output, args.report, args.suggest):
@@ -113,59 +90,38 @@ def run(args: argparse.Namespace) -> int:
         return run_live_trace(args)
     if args.suggest_duration and not args.suggest:
         raise UsageError("--suggest-duration: belongs to --suggest FILE.csv")
-    model, profile = chosen_model(args)
-    apart({"-o": args.output, "--report": args.report, "--suggest": args.suggest}, {"the model's file": own_file(model.spec)})
-    if args.suggest_duration and args.suggest_duration > MOST_SUGGESTED * model.dt:
-        most = MOST_SUGGESTED * model.dt
-        raise UsageError(f"--suggest-duration {args.suggest_duration:g}: must be at most {most:g} s, {MOST_SUGGESTED} steps of the model")
-    if args.horizon and args.horizon < model.dt:
-        raise UsageError(f"--horizon {args.horizon:g}: must be at least the model's step, {model.dt:g} s")
-    columns, transport = columns_of(args, model, profile, *args.recording, args.test), transport_of(args, profile)
-    reading = output.Progress("reading")
-    read = partial(load_dataset, model=model, columns=columns, transport=transport, signals=signals_of(args, model))
-    read = partial(read, limits=limits_of(args.max_gb), progress=reading)
+    return _traced(args)
+
+
+def _traced(args: argparse.Namespace) -> int:
+    from s2r_runtime.api import tracing
+    from s2r_runtime.api.recordings import Recording
+
+    chosen, watcher = chosen_model(args), output.Terminal()
+    apart({"-o": args.output, "--report": args.report, "--suggest": args.suggest}, {"the model's file": own_file(chosen.model.spec)})
+    tracing.check_duration(args.suggest_duration, chosen)
+    test = Recording((args.test,)) if args.test else None
+    given = recording_of(args, args.recording)
+    ready = tracing.read(given, chosen, watcher, test=test, horizon=args.horizon, bandwidth=args.bandwidth)
     try:
-        data = read(args.recording, bandwidth=args.bandwidth)
-        used = data.reconstruction.bandwidth if data.reconstruction and not data.reconstruction.axes else args.bandwidth
-        test = read(args.test, bandwidth=used, behind=data.behind) if args.test else None
-    finally:
-        reading.close()
-    for one in (data, test):
-        output.notes(one.source if one else "", one.notes if one else ())
-    if test and _seen_by_the_fit(data, test):
-        raise UsageError(
-            f"--test {args.test}: is the recording that the fit is made on, or has rows of it; take one that the fit never sees"
-        )
-    bar = output.Progress("tracing")
-    try:
-        result = trace(
-            data,
-            model,
-            test=test,
-            horizon=args.horizon,
-            seed=args.seed,
-            progress=bar,
-            weights=weights_of(model.states, [], profile),
-            kind=profile.norm.set if profile else "ball",
-        )
+        found = tracing.run(ready, watcher, args.horizon, args.seed)
+        suggested = None
         if args.suggest:
-            bar(100.0, 100.0, "looking for a drive")
-        suggested = _suggested(args, result, profile) if args.suggest else None
+            with watcher.phase("tracing") as report:
+                report(100.0, 100.0, "looking for a drive")
+                suggested = tracing.suggested(found, args.suggest_duration, args.seed)
     except NotEnoughEvidence as error:
-        bar.close()
         if args.suggest:
-            error.also = _suggest_first(args, model, data, profile)
+            error.also = _suggest_first(args, ready)
         raise
-    finally:
-        bar.close()
-    files = _files(args, result, suggested)
+    result = found.result
+    files = _files(args, found, suggested)
     trouble = {path: why for path, text in files.items() if (why := output.trouble_writing(path, text))}
     if args.json:
-        told = result.to_json()
         drive = {"suggested_sequence": suggested.to_json(str(args.suggest) if args.suggest not in trouble else None)} if suggested else {}
-        output.result_json(told | drive)
+        output.result_json(found.to_dict() | drive)
     else:
-        _tell(args, result, suggested, files.keys() - trouble.keys(), changed=result.spec.effects != model.spec.effects)
+        _tell(args, found, suggested, files.keys() - trouble.keys())
     if args.horizon and result.held.horizon < round(args.horizon / result.nominal.dt):
         output.err(f"s2r: --horizon {args.horizon:g}: what was judged on bears no such rollouts; they are {result.horizon_s:.4g} s long")
     for why in trouble.values():  # last: what was found is told all the same
@@ -173,38 +129,26 @@ def run(args: argparse.Namespace) -> int:
     return UsageError.exit_code if trouble else 0
 
 
-def _seen_by_the_fit(data: Dataset, test: Dataset) -> bool:
-    """Whether the fit would see rows of the test (guarantee G6)."""
-    from s2r_runtime.evidence.seen_rows import seen
-    from s2r_runtime.modelspec import is_sketch
-
-    if set(test.digests) & set(data.digests):
-        return True
-    rows = [states.values for states, _ in test.segments]
-    return any(seen(text, rows).refused for text in data.digests if is_sketch(text))
-
-
-def _files(args: argparse.Namespace, result: TraceResult, suggested: Suggestion | None) -> dict[Path, str]:
+def _files(args: argparse.Namespace, found: Trace, suggested: Suggestion | None) -> dict[Path, str]:
     """Texts of the files that were asked for."""
-    from s2r_runtime.modelspec import dump_model
-
     files: dict[Path, str] = {}
     if args.output:
-        files[args.output] = dump_model(result.spec, result.comments())
+        files[args.output] = found.model_toml()
     if suggested and suggested.u is not None:
         files[args.suggest] = suggested.to_csv()
     if args.report:
         from s2r_runtime.report.trace_page import trace_page
 
-        files[args.report] = trace_page(result, suggested)
+        files[args.report] = trace_page(found.result, suggested)
     return files
 
 
-def _tell(args: argparse.Namespace, result: TraceResult, suggested: Suggestion | None, written: Set[Path], *, changed: bool) -> None:
-    output.out_lines(result.text())
+def _tell(args: argparse.Namespace, found: Trace, suggested: Suggestion | None, written: Set[Path]) -> None:
+    output.out_lines(found.summary())
     if suggested:
         _tell_drive(args.suggest if args.suggest in written else None, suggested)
     if args.output in written:
+        changed = found.result.spec.effects != found.ready.chosen.model.spec.effects
         output.out(f"model written to {args.output}" + ("" if changed else " (unchanged: no effect was added)"))
     if args.report in written:
         output.out(f"report written to {args.report}")
@@ -220,19 +164,11 @@ def _tell_drive(path: Path | None, suggested: Suggestion) -> None:
         output.out(f"drive written to {path}")
 
 
-def _suggested(args: argparse.Namespace, result: TraceResult, profile: Profile | None) -> Suggestion:
-    from s2r_runtime.trace.design.suggest import suggest
+def _suggest_first(args: argparse.Namespace, ready: Ready) -> dict[str, object]:
+    """For a recording that cannot be traced: a first drive, where a profile says what is allowed. What `--json` prints of it."""
+    from s2r_runtime.api.tracing import suggested_first
 
-    bounds, region = _allowed(profile)
-    return suggest(result, bounds=bounds, region=region, duration=args.suggest_duration, seed=args.seed)
-
-
-def _suggest_first(args: argparse.Namespace, model: ComposedModel, data: Dataset, profile: Profile | None) -> dict[str, object]:
-    """For a recording that cannot be traced: a first drive, where a profile says what is allowed. What `--json` tells of it."""
-    from s2r_runtime.trace.design.suggest import suggest_first
-
-    bounds, region = _allowed(profile)
-    drive = suggest_first(model, data, bounds=bounds, region=region, duration=args.suggest_duration, seed=args.seed)
+    drive = suggested_first(ready, args.suggest_duration, args.seed)
     trouble = output.trouble_writing(args.suggest, drive.to_csv()) if drive.u is not None else ""
     written = args.suggest if drive.u is not None and not trouble else None
     if not args.json:
@@ -240,8 +176,3 @@ def _suggest_first(args: argparse.Namespace, model: ComposedModel, data: Dataset
     if trouble:
         output.err(f"s2r: {trouble}")
     return {"suggested_sequence": drive.to_json(None if written is None else str(written))}
-
-
-def _allowed(profile: Profile | None) -> tuple[dict[str, tuple[float, float]] | None, dict[str, tuple[float, float]] | None]:
-    """Bounds of the inputs, and of the states: the geofence where there is one, else the region."""
-    return (dict(profile.inputs), {**profile.region, **profile.geofence}) if profile else (None, None)

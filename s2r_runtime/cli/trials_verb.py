@@ -4,21 +4,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import controller_at, count, load_checked, probability
-from s2r_runtime.errors import ConfigError, NotEnoughEvidence
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from s2r_runtime.controllers.file import ControllerFile
-    from s2r_runtime.messages import Trials
-    from s2r_runtime.models.composed import ComposedModel
-    from s2r_runtime.profile import Profile
+from s2r_runtime.cli.choices import count, pairs, probability
+from s2r_runtime.errors import NotEnoughEvidence
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -43,15 +34,16 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Exit 0 if no run was unsafe, 1 if one was, 3 if there are not enough."""
-    from s2r_runtime.cli.evidence import profile_model
+    from s2r_runtime.api.certification import trials_of
+    from s2r_runtime.api.models import controller_at, load_checked, profile_model
     from s2r_runtime.evidence.statements import of_runs, of_trials
     from s2r_runtime.evidence.trials import newest_limits
 
     profile = load_checked(args.profile)
-    model = profile_model(args, profile)
-    controller = controller_at(args.controller, args.param)
+    model = profile_model(args.model, profile, str(args.profile))
+    controller = controller_at(args.controller, pairs(args.param, "--param"))
     try:
-        found = trials_of(args.logs, controller, model, profile, n=args.n, beta=args.beta)
+        found = trials_of(args.logs, controller, model, profile, output.Terminal(), n=args.n, beta=args.beta)
     except NotEnoughEvidence:
         if not args.json and (counted := newest_limits(args.logs, controller.digest)) is not None:  # of logs that hold: they were audited
             output.out(of_runs(counted))
@@ -67,28 +59,3 @@ def run(args: argparse.Namespace) -> int:
         if counted is not None:
             output.out(of_runs(counted))
     return 1 if found.unsafe else 0
-
-
-def trials_of(
-    logs: Sequence[Path], controller: ControllerFile, model: ComposedModel, profile: Profile, *, n: int = 0, beta: float | None = None
-) -> Trials:
-    """The controller's runs in these logs, which are audited first. Raises ConfigError for a log that does not hold."""
-    from s2r_runtime.audit.log import audit
-    from s2r_runtime.evidence import trials
-    from s2r_runtime.plugins import registry
-
-    bar = output.Progress("auditing")
-    try:
-        result = audit(list(logs), progress=bar)
-    finally:
-        bar.close()
-    if not result.ok:
-        first = result.first_difference
-        lacks = [*(f"{one} was not given" for one in result.incomplete), *result.unchecked]
-        what = first.what if first is not None else "; ".join(lacks) or f"the chain is {result.chain}"
-        raise ConfigError(f"{', '.join(map(str, logs))}: does not hold, so no trials are taken from it: {what} (s2r audit says more)")
-    task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
-    digests = {"controller_digest": controller.digest, "model_digest": model.spec.digest()}
-    found = trials.read_runs(logs, profile, task, **digests)
-    share = beta or profile.guarantee.beta
-    return trials.trials(found, **digests, task_digest=profile.task_digest(), beta=share, fixed=n)

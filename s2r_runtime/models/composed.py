@@ -323,9 +323,12 @@ def _waits(nominal: BoundModel, a: AppliedEffect, channel: str) -> bool:
     return channel == "*" or touched == {channel} or (channel not in touched and "*" not in touched)
 
 
-def compose(spec: ModelSpec, where: str = "model") -> ComposedModel:
-    """The model that a spec describes. Raises ConfigError (unknown names with the nearest known one, bad parameters)."""
-    shared: NominalModel = load_file_model(spec, where) if spec.name.endswith(".py") else _registered("models", spec.name, where)
+def compose(spec: ModelSpec, where: str = "model", nominal_model: NominalModel | None = None) -> ComposedModel:
+    """The model that a spec describes. nominal_model: instead of the one of that name, where nothing is registered under it.
+
+    Raises ConfigError (unknown names with the nearest known one, bad parameters).
+    """
+    shared = nominal_model or (load_file_model(spec, where) if spec.name.endswith(".py") else _registered("models", spec.name, where))
     for name in spec.parameters:
         if name not in shared.parameters:
             known = ", ".join(shared.parameters) or "none"

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -194,6 +194,14 @@ def load_file_model(spec: ModelSpec, where: str) -> NominalModel:
     module = _run(path)
     if spec.source_digest and spec.source_digest != digest(source):
         raise ConfigError(f"{path}: has changed since the model was saved (digest {digest(source)}, saved {spec.source_digest})")
+    return model_of(path, module)
+
+
+def model_of(path: Path | str, module: ModuleType | SimpleNamespace) -> FileModel:
+    """The model that a module's names make: STATES, INPUTS, PARAMS, step(x, u, dt, params), and maybe ANGLES, RATES, UNITS.
+
+    path: how messages call it. Raises ConfigError saying what is wrong.
+    """
     for name in ("STATES", "INPUTS", "PARAMS", "step"):
         if not hasattr(module, name):
             raise ConfigError(f"{path}: lacks {name}; a model file has STATES, INPUTS, PARAMS and step(x, u, dt, params)")
@@ -229,7 +237,7 @@ def _run(path: Path) -> ModuleType:
     return module
 
 
-def _check_batched(path: Path, step: Callable[..., Any], nx: int, nu: int, parameters: dict[str, float]) -> None:
+def _check_batched(path: Path | str, step: Callable[..., Any], nx: int, nu: int, parameters: dict[str, float]) -> None:
     """Raises ConfigError if `step` takes one state, and not a table of them: else that would show only after hours, row by row."""
 
     def taken(x: Array, u: Array) -> bool:
@@ -248,14 +256,14 @@ def _check_batched(path: Path, step: Callable[..., Any], nx: int, nu: int, param
         )
 
 
-def _names(path: Path, module: ModuleType, name: str) -> tuple[str, ...]:
+def _names(path: Path | str, module: ModuleType | SimpleNamespace, name: str) -> tuple[str, ...]:
     given = getattr(module, name, ())
     if not isinstance(given, tuple | list) or not all(isinstance(one, str) for one in given):
         raise ConfigError(f"{path}: {name} is {given!r}, must be a tuple of names")
     return tuple(given)
 
 
-def _check_columns(path: Path, states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
+def _check_columns(path: Path | str, states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
     """Each state and each input is a column of its own in a recording, beside those of the time and the run."""
     for what, names in (("STATES", states), ("INPUTS", inputs)):
         if not names:
@@ -267,7 +275,7 @@ def _check_columns(path: Path, states: tuple[str, ...], inputs: tuple[str, ...])
         raise ConfigError(f"{path}: {taken[0]!r} is no name for a state or an input: in recordings it is the column of the time or the run")
 
 
-def _follows(path: Path, module: ModuleType, states: tuple[str, ...]) -> dict[str, Follows]:
+def _follows(path: Path | str, module: ModuleType | SimpleNamespace, states: tuple[str, ...]) -> dict[str, Follows]:
     """RATES = {"vx": "x"}: states that are rates of others, and so need not be measured."""
     given = getattr(module, "RATES", {})
     if not isinstance(given, dict) or not {*given, *given.values()} <= {*states} or {*given} & {*given.values()}:
@@ -275,7 +283,7 @@ def _follows(path: Path, module: ModuleType, states: tuple[str, ...]) -> dict[st
     return {name: Follows((of,), partial(_rate, of)) for name, of in given.items()}
 
 
-def _units(path: Path, module: ModuleType, columns: tuple[str, ...]) -> dict[str, str]:
+def _units(path: Path | str, module: ModuleType | SimpleNamespace, columns: tuple[str, ...]) -> dict[str, str]:
     """UNITS = {"x": "m", "force": "N"}: SI units of states and inputs, as far as they are said."""
     given = getattr(module, "UNITS", {})
     if not isinstance(given, dict) or not all(isinstance(unit, str) and unit and unit.isprintable() for unit in given.values()):

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.errors import RecordingError, UsageError
 from s2r_runtime.files.canonical import digest_of, digest_of_all, digest_of_path
-from s2r_runtime.files.table_text import GB, Limits, Progress, check_regular, refuse_special
+from s2r_runtime.files.table_text import GB, Limits, Progress, check_regular
 from s2r_runtime.messages import CampaignFinished, LinkChanged, Observed, SampleTaken, Send, Started
 from s2r_runtime.models.bound import wrap
 from s2r_runtime.models.composed import ComposedModel
@@ -37,10 +37,10 @@ from s2r_runtime.recordings.driving import MAX_GAP, Streams, drive_transitions, 
 from s2r_runtime.recordings.formats.mapping import Recorded
 from s2r_runtime.recordings.formats.recognise import recognised
 from s2r_runtime.recordings.formats.routes import read_recording
-from s2r_runtime.recordings.robot_logs import content_digest, is_mcap, is_robot_log, merged_rows
+from s2r_runtime.recordings.robot_logs import content_digest, is_mcap, is_robot_log, merged_rows, refuse_special, sources_of
 from s2r_runtime.recordings.sensor_noise import FEWEST, NORMAL_MAD
 from s2r_runtime.recordings.table_rows import Subset, joined
-from s2r_runtime.recordings.tables import header_of, read_csv
+from s2r_runtime.recordings.tables import ArrayTable, Source, header_of, read_csv
 from s2r_runtime.recordings.transitions import Holds, Transitions
 
 Array = NDArray[np.float64]
@@ -64,7 +64,7 @@ class _Read(NamedTuple):
 
 
 def load_transitions(
-    path: Path | str | Sequence[Path | str],
+    path: Source | str | Sequence[Source | str],
     model: ComposedModel,
     columns: Mapping[str, str] | None = None,
     *,
@@ -80,10 +80,10 @@ def load_transitions(
 
     Raises RecordingError (not readable, columns missing, of another robot), UsageError (recordings of different kinds, or one given twice).
     """
-    paths = [Path(one) for one in ([path] if isinstance(path, str | Path) else path)]
+    paths = sources_of(path)
     for one in paths:
         refuse_special(one)
-    own = [one for one in paths if _is_own_log(one)]
+    own = [one for one in paths if isinstance(one, Path) and _is_own_log(one)]
     if len(own) > 1 or (own and len(paths) > 1):
         raise UsageError(f"{own[0]}: is a log of this software; the number of samples of each campaign was fixed for itself: give it alone")
     if own:
@@ -94,13 +94,20 @@ def load_transitions(
     return _together(model, [_read_one(one, model, tables, transport, signals) for one in paths])
 
 
-def look_at(path: Path, limits: Limits) -> None:
+def digest_of_source(path: Source) -> str:
+    """Digest of a recording: of its bytes, or of the cells of a table in memory. Raises OSError."""
+    return path.digest if isinstance(path, ArrayTable) else digest_of_path(path)
+
+
+def look_at(path: Source, limits: Limits) -> None:
     """Raises RecordingError for what cannot be a recording, by its size and its beginning: before its bytes are digested.
 
     limits: of a table its text, of anything else all bytes, of a folder those of all its files.
     """
     from s2r_runtime.recording.writer import read
 
+    if isinstance(path, ArrayTable):
+        return
     files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
     size = sum(check_regular(file) for file in files)
     if size > limits.text_bytes:
@@ -132,7 +139,7 @@ class _Tables(NamedTuple):
 
 
 def _read_one(
-    path: Path,
+    path: Source,
     model: ComposedModel,
     tables: _Tables,
     transport: Mapping[str, Any] | None,
@@ -142,7 +149,7 @@ def _read_one(
     if recorded is None:
         return _of_table(path, model, tables)
     content = content_digest(recorded.stretches, model)
-    return _Read(_streams(recorded, len(model.states)), recorded.drawn, digest_of_path(path), content, str(path), recorded.notes)
+    return _Read(_streams(recorded, len(model.states)), recorded.drawn, digest_of_source(path), content, str(path), recorded.notes)
 
 
 def _streams(recorded: Recorded, nx: int) -> list[Streams]:
@@ -190,7 +197,7 @@ def from_csv(path: Path, model: ComposedModel, columns: Mapping[str, str], dt: f
     return _together(model, [_of_table(path, model, _Tables(columns, MAX_VALUES))])
 
 
-def _of_table(path: Path, model: ComposedModel, how: _Tables) -> _Read:
+def _of_table(path: Source, model: ComposedModel, how: _Tables) -> _Read:
     names = (*model.states, *model.inputs)
     table = read_csv(
         path,

@@ -7,7 +7,7 @@ the only one (it then gets no options). A log in one of them is ordinary driving
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.errors import ConfigError, RecordingError, UsageError
-from s2r_runtime.files.table_text import refuse_special
+from s2r_runtime.files.table_text import refuse_special as refuse_special_file
 from s2r_runtime.hookspecs import HEAD_BYTES, ReadLog
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.plugins import registry
 from s2r_runtime.recording.origin import other_writer
 from s2r_runtime.recordings.formats.recognise import BAG, recognised
-from s2r_runtime.recordings.tables import LARGEST, Table
+from s2r_runtime.recordings.tables import LARGEST, ArrayTable, Source, Table
 
 Array = NDArray[np.float64]
 
@@ -49,6 +49,18 @@ class RobotLog(NamedTuple):
 
     stretches: list[Stretch]
     notes: tuple[str, ...]
+
+
+def sources_of(path: Source | str | Sequence[Source | str]) -> tuple[Source, ...]:
+    """The recordings that are named: one, or several."""
+    several = [path] if isinstance(path, str | Path | ArrayTable) else path
+    return tuple(one if isinstance(one, ArrayTable) else Path(one) for one in several)
+
+
+def refuse_special(source: Source) -> None:
+    """Raises RecordingError for a pipe or a device, which may block or never end when it is opened."""
+    if isinstance(source, Path):
+        refuse_special_file(source)
 
 
 def suffix_of(path: Path) -> str:
@@ -130,9 +142,9 @@ def is_table(path: Path) -> bool:
         return True
 
 
-def has_columns(path: Path) -> bool:
+def has_columns(path: Source) -> bool:
     """Whether a recording is read by names that the user may say: a table, or a file with named signals that is no bag."""
-    return _form_of(path) not in ("", BAG) or is_table(path)
+    return isinstance(path, ArrayTable) or _form_of(path) not in ("", BAG) or is_table(path)
 
 
 def read_robot_log(path: Path, model: ComposedModel, transport: Mapping[str, Any] | None) -> RobotLog:

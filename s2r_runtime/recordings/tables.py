@@ -1,4 +1,4 @@
-"""Recordings in table form: CSV, or CSV.gz (docs/recordings.md).
+"""Recordings in table form: CSV, CSV.gz, or in memory (docs/recordings.md).
 
 A header row (comments with # or % may stand before it, or be it); the
 stamps (`t`, s); one column for each measured state and each input, by the model's name, a usual other one
@@ -17,6 +17,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,9 +34,14 @@ from s2r_runtime.recordings.table_rows import RowStore, Subset
 if TYPE_CHECKING:
     from _csv import Reader
 
-__all__ = ["LARGEST", "MISSING", "SEGMENT", "TIME", "Limits", "Subset", "Table", "header_of", "missing_columns", "places_of", "read_csv"]
+__all__ = [
+    "LARGEST", "MISSING", "SEGMENT", "TIME", "ArrayTable", "Limits", "Source", "Subset", "Table", "header_of", "missing_columns",
+    "places_of", "read_csv",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
+Cells = Array | tuple[str, ...]
+"""(n,) numbers, or text as in a file."""
 
 LARGEST = 1e30
 """In size, whatever the unit: what is beyond (the largest float of 32 or 64 bits) says that there is no value, and its square overflows."""
@@ -80,6 +86,43 @@ class Table:
         return content.digest
 
 
+@dataclass(frozen=True, eq=False)
+class ArrayTable:
+    """A table in memory, which is read as a file with the same cells is.
+
+    name: how messages call it; columns: name -> (n,) cells, all of one length. Numbers are NaN, and text is blank, where nothing was
+    received; the labels of `segment` are text.
+    """
+
+    name: str
+    columns: Mapping[str, Cells]
+
+    def __str__(self) -> str:
+        return self.name
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()), ()))
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of names and cells: what stands for the file's bytes (guarantee G6)."""
+        found = hashlib.sha256()
+        for name, cells in self.columns.items():
+            data = cells.astype("<f8").tobytes() if isinstance(cells, np.ndarray) else "\0".join(cells).encode(errors="surrogatepass")
+            found.update(f"{name}\0{len(cells)}\0".encode(errors="surrogatepass") + data)
+        return "sha256:" + found.hexdigest()
+
+    def blocks(self) -> Iterator[tuple[list[Cells], range]]:
+        """Columns of cells, and the numbers of their rows, as of a file."""
+        most = _block_rows(len(self.columns))
+        for a in range(0, len(self), most):
+            yield [cells[a : a + most] for cells in self.columns.values()], range(a, min(a + most, len(self)))
+
+
+Source = Path | ArrayTable
+"""Where a table is."""
+
+
 class _Content:
     """The content digest of rows that come block by block."""
 
@@ -100,7 +143,7 @@ class _Content:
 
 
 def read_csv(
-    path: Path | str,
+    path: Source | str,
     wanted: Sequence[str] | None = None,
     optional: Sequence[str] = (),
     columns: Mapping[str, str] | None = None,
@@ -114,20 +157,21 @@ def read_csv(
 ) -> Table:
     """Reads the states and inputs `wanted` (None: every column, by its own name), and those of `optional` that are there.
 
-    columns: name (or `t`) -> column, as the person stated. order: of names in the content digest (default: as requested). angles: names
-    of angles. max_rows: more rows than that are thinned (`table_rows`), by whole segments if `whole_segments`. limits: of the text.
-    Raises RecordingError, one line: file, line, column, value, what would be right.
+    path: of a file, or a table in memory. columns: name (or `t`) -> column, as the person stated. order: of names in the content digest
+    (default: as in `wanted`). angles: names of angles. max_rows: more rows than that are thinned (`table_rows`), by whole segments if
+    `whole_segments`. limits: of the text.
+    Raises RecordingError, one line: file, line (in memory: row), column, value, what would be right.
     """
-    path, columns = Path(path), dict(columns or {})
-    text = TextLines(path, limits, progress)
-    header, rows = _opened(path, text)
-    found = _places(path, header, wanted, optional, columns, angles)
+    source, columns = path if isinstance(path, ArrayTable) else Path(path), dict(columns or {})
+    text = None if isinstance(source, ArrayTable) else TextLines(source, limits, progress)
+    header, blocks = _opened(source, text)
+    found = _places(source, header, wanted, optional, columns, angles)
     names = [name for name in (order or found) if name in found and name != TIME]
-    reading = _Reading(path, header, found, names, RowStore(len(names), max_rows, whole_segments=whole_segments))
-    for cells, lines in _blocks(path, rows, len(header)):
-        reading.add(cells, lines, text.has_odd)
+    reading = _Reading(source, header, found, names, RowStore(len(names), max_rows, whole_segments=whole_segments))
+    for cells, lines in blocks:
+        reading.add(cells, lines, text is not None and text.has_odd)
     if not reading.store.rows:
-        raise RecordingError(f"{path}: has a header and no rows")
+        raise RecordingError(f"{source}: {'has a header and no rows' if text else 'has columns and no rows'}")
     t, values, segment, piece, subset = reading.store.end()
     note = told(found)
     return Table(
@@ -135,7 +179,7 @@ def read_csv(
         dict(zip(names, values, strict=True)),
         segment,
         tuple(reading.labels),
-        text.digest,
+        source.digest if isinstance(source, ArrayTable) else text.digest if text else "",
         reading.content.digest,
         piece,
         subset,
@@ -143,19 +187,28 @@ def read_csv(
     )
 
 
-def header_of(path: Path | str, limits: Limits | None = None) -> list[str]:
+def header_of(path: Source | str, limits: Limits | None = None) -> list[str]:
     """Names of the columns. Raises RecordingError as `read_csv`."""
+    if isinstance(path, ArrayTable):
+        return list(path.columns)
     return _opened(Path(path), TextLines(Path(path), limits))[0]
 
 
-def places_of(path: Path | str, wanted: Sequence[str], columns: Mapping[str, str], angles: Sequence[str] = ()) -> dict[str, Place]:
+def places_of(path: Source | str, wanted: Sequence[str], columns: Mapping[str, str], angles: Sequence[str] = ()) -> dict[str, Place]:
     """Where a table has these names, of those that it has. Raises RecordingError as `read_csv`."""
     return places(header_of(path), wanted, columns, str(path), angles)
 
 
-def _opened(path: Path, text: TextLines) -> tuple[list[str], Reader]:
-    """The header, and the rows after it."""
-    rows = csv.reader(_without_comments(iter(text)), strict=True)
+def _opened(source: Source, text: TextLines | None) -> tuple[list[str], Iterator[tuple[Sequence[Cells], Sequence[int]]]]:
+    """The header, and the rows after it, block by block. text: of a file."""
+    if isinstance(source, ArrayTable):
+        return list(source.columns), source.blocks()
+    header, rows = _header(source, iter(text or ()))
+    return header, _blocks(source, rows, len(header))
+
+
+def _header(path: Path, text: Iterator[str]) -> tuple[list[str], Reader]:
+    rows = csv.reader(_without_comments(text), strict=True)
     try:
         while not (header := next(rows)) and rows.line_num < MAX_COMMENTS:
             pass
@@ -192,7 +245,7 @@ def _names(comment: str, row: str) -> bool:
 
 
 def _places(
-    path: Path,
+    path: Source,
     header: list[str],
     wanted: Sequence[str] | None,
     optional: Sequence[str],
@@ -201,7 +254,9 @@ def _places(
 ) -> dict[str, Place]:
     """Where the stamps and the names are that are to be read."""
     if not any(header):
-        raise RecordingError(f"{path}: is empty, must start with a header row")
+        raise RecordingError(
+            f"{path}: is empty, must {'have named columns' if isinstance(path, ArrayTable) else 'start with a header row'}"
+        )
     time = columns.get(TIME, TIME)
     for name in (*(wanted or ()), *optional):
         if (column := columns.get(name, name)) in {time, SEGMENT}:
@@ -239,28 +294,31 @@ def missing_columns(absent: list[str], header: list[str]) -> str:
 class _Reading:
     """Checks blocks of rows, and stores their numbers."""
 
-    def __init__(self, path: Path, header: list[str], found: Mapping[str, Place], names: list[str], store: RowStore) -> None:
+    def __init__(self, source: Source, header: list[str], found: Mapping[str, Place], names: list[str], store: RowStore) -> None:
         self.store, self.content, self.labels = store, _Content(), {}  # type: ignore[var-annotated]
-        self._path = path
+        self._where = f"{source}: {'row' if isinstance(source, ArrayTable) else 'line'}"
         self._columns = [(found[name], header.index(found[name].column)) for name in (TIME, *names)]
         self._segment = header.index(SEGMENT) if SEGMENT in header else None
         self._last = -math.inf
         self._run = -1
         self._label = ""
 
-    def add(self, cells: list[tuple[str, ...]], lines: list[int], odd: bool) -> None:
-        """The next rows, as columns of cells; lines: on which each ends; odd: whether cells may hold what only looks like a number."""
-        t, *values = (_numbers(self._path, place.column, cells[column], lines, odd) * place.scale for place, column in self._columns)
+    def add(self, cells: Sequence[Cells], lines: Sequence[int], odd: bool) -> None:
+        """The next rows, as columns of cells.
+
+        lines: on which each ends, or numbers of rows; odd: whether cells may hold what only looks like a number.
+        """
+        t, *values = (_numbers(self._where, place.column, cells[column], lines, odd) * place.scale for place, column in self._columns)
         if blank := np.flatnonzero(np.isnan(t)).tolist():
             raise RecordingError(
-                f"{self._path}: line {lines[blank[0]]}: column {self._columns[0][0].column!r} is blank, every row needs its stamp"
+                f"{self._where} {lines[blank[0]]}: column {self._columns[0][0].column!r} is blank, every row needs its stamp"
             )
         if far := np.flatnonzero(np.abs(t) > LATEST_S).tolist():
             t_far = float(np.abs(t[far[0]]))
             unit = "ms" if t_far < 1e3 * LATEST_S else "us" if t_far < 1e6 * LATEST_S else "ns"
             column = self._columns[0][0].column
             raise RecordingError(
-                f"{self._path}: line {lines[far[0]]}: column {column!r} has a stamp of {t_far:.3g} s; "
+                f"{self._where} {lines[far[0]]}: column {column!r} has a stamp of {t_far:.3g} s; "
                 f"if it is in {unit}, name it t_{unit} in the header"
             )
         segment = None if self._segment is None else self._numbered(cells[self._segment], lines)
@@ -268,24 +326,24 @@ class _Reading:
         self.content.add(t, values)
         self.store.add(t, values, segment)
 
-    def _numbered(self, cells: tuple[str, ...], lines: list[int]) -> NDArray[np.int64]:
+    def _numbered(self, cells: Cells, lines: Sequence[int]) -> NDArray[np.int64]:
         """(n,) 0, 1, ... in order of appearance."""
         numbers: list[int] = []
-        for label, rows in groupby(cell.strip() for cell in cells):
+        for label, rows in groupby(str(cell).strip() for cell in cells):
             line = lines[len(numbers)]
             if not label:
-                raise RecordingError(f"{self._path}: line {line}: column {SEGMENT!r} is blank, every row needs its segment")
+                raise RecordingError(f"{self._where} {line}: column {SEGMENT!r} is blank, every row needs its segment")
             if label != self._label:
                 if label in self.labels:
                     raise RecordingError(
-                        f"{self._path}: line {line}: segment {label!r} goes on after another one began; its rows must stand together"
+                        f"{self._where} {line}: segment {label!r} goes on after another one began; its rows must stand together"
                     )
                 self._label = label
                 self.labels[label] = len(self.labels)
             numbers += [self.labels[label]] * sum(1 for _ in rows)
         return np.array(numbers, dtype=np.int64)
 
-    def _check_time(self, t: Array, segment: NDArray[np.int64] | None, lines: list[int]) -> None:
+    def _check_time(self, t: Array, segment: NDArray[np.int64] | None, lines: Sequence[int]) -> None:
         backwards = np.diff(t, prepend=self._last) < 0.0
         if segment is not None:
             backwards &= np.diff(segment, prepend=self._run) == 0
@@ -293,7 +351,7 @@ class _Reading:
         if back := np.flatnonzero(backwards).tolist():
             row = back[0]
             before = float(t[row - 1]) if row else self._last
-            raise RecordingError(f"{self._path}: line {lines[row]}: time runs backwards, from {before} s to {float(t[row])} s")
+            raise RecordingError(f"{self._where} {lines[row]}: time runs backwards, from {before} s to {float(t[row])} s")
         self._last = float(t[-1])
 
 
@@ -305,11 +363,16 @@ def _is_number(text: str) -> bool:
     return True
 
 
+def _block_rows(width: int) -> int:
+    """Rows of a block; width: its columns."""
+    return max(1, min(BLOCK_ROWS, BLOCK_CELLS // max(1, width)))
+
+
 def _blocks(path: Path, rows: Reader, width: int) -> Iterator[tuple[list[tuple[str, ...]], list[int]]]:
     """Columns of cells, and the line on which each row ends. Blank lines are skipped."""
     kept: list[list[str]] = []
     lines: list[int] = []
-    most = max(1, min(BLOCK_ROWS, BLOCK_CELLS // width))
+    most = _block_rows(width)
     try:
         for row in rows:
             if len(row) == width:
@@ -327,27 +390,32 @@ def _blocks(path: Path, rows: Reader, width: int) -> Iterator[tuple[list[tuple[s
         yield list(zip(*kept, strict=True)), lines
 
 
-def _numbers(path: Path, name: str, cells: tuple[str, ...], lines: list[int], odd: bool) -> Array:
+def _numbers(where: str, name: str, cells: Cells, lines: Sequence[int], odd: bool) -> Array:
     """(N,), NaN for cells without a value."""
-    try:
-        if odd:
-            raise ValueError
-        values = np.array([float(cell) if cell else math.nan for cell in cells])
-    except ValueError:
-        values = np.array([_number(path, name, cell, line) for cell, line in zip(cells, lines, strict=True)])
+    values = cells if isinstance(cells, np.ndarray) else _parsed(where, name, cells, lines, odd)
     if np.all(np.abs(values) <= LARGEST):
         return values
     for row in np.flatnonzero(np.abs(values) > LARGEST).tolist():
         must = f"a number within {LARGEST:g}" if math.isfinite(values[row]) else "a finite number"
-        raise RecordingError(f"{path}: line {lines[row]}: column {name!r} is {cells[row]!r}, must be {must} (or blank: not received)")
+        cell = str(cells[row])
+        raise RecordingError(f"{where} {lines[row]}: column {name!r} is {cell!r}, must be {must} (or blank: not received)")
     return values
 
 
-def _number(path: Path, name: str, cell: str, line: int) -> float:
+def _parsed(where: str, name: str, cells: tuple[str, ...], lines: Sequence[int], odd: bool) -> Array:
+    try:
+        if odd:
+            raise ValueError
+        return np.array([float(cell) if cell else math.nan for cell in cells])
+    except ValueError:
+        return np.array([_number(where, name, cell, line) for cell, line in zip(cells, lines, strict=True)])
+
+
+def _number(where: str, name: str, cell: str, line: int) -> float:
     text = cell.strip()
     if not text or text.lower() in MISSING:
         return math.nan
     if _NUMBER.fullmatch(text):
         return float(text)
     must = "have a decimal point" if _NUMBER.fullmatch(text.replace(",", ".")) else "be a number (or blank: not received)"
-    raise RecordingError(f"{path}: line {line}: column {name!r} is {cell!r}, must {must}")
+    raise RecordingError(f"{where} {line}: column {name!r} is {cell!r}, must {must}")

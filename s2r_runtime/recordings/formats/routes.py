@@ -18,6 +18,7 @@ from s2r_runtime.recordings.formats.guess import guessed
 from s2r_runtime.recordings.formats.mapping import Recorded, read_signals, resolved, unit_notes
 from s2r_runtime.recordings.formats.recognise import BAG, Form, not_installed, open_recording, recognised
 from s2r_runtime.recordings.robot_logs import is_robot_log, known_by_content, read_robot_log, readers_of
+from s2r_runtime.recordings.tables import ArrayTable, Source
 
 FILES = ("dbc",)
 """Options of transports that name a file which describes messages, and can be given without a profile."""
@@ -31,18 +32,22 @@ class Named(NamedTuple):
 
 
 def read_recording(
-    path: Path,
+    path: Source,
     model: ComposedModel,
     *,
     columns: Mapping[str, str] | None = None,
     transport: Mapping[str, Any] | None = None,
     signals: Mapping[str, str] | None = None,
 ) -> Recorded | None:
-    """The recording's stretches; None for a table, and for a log of this software.
+    """The recording's stretches; None for a table (in a file or in memory), and for a log of this software.
 
     columns, signals: name in the model (or `t`, the stamps) -> signal; `columns` may be a profile's, and is not for bags. transport: the
     profile's, or only the file that describes the messages (`dbc`). What was guessed is in the notes. Raises RecordingError, UsageError.
     """
+    if isinstance(path, ArrayTable):
+        if transport and set(transport) <= {"name", *FILES}:
+            raise UsageError(f"{path}: --dbc: is no log of a CAN bus")
+        return None
     robots, form = is_robot_log(path), form_of(path)
     named = signals_of_log(path, transport) if robots and form is None else None
     described = bool(transport) and set(transport or {}) <= {"name", *FILES}

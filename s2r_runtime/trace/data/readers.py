@@ -20,15 +20,16 @@ import numpy as np
 from s2r_runtime.errors import RecordingError, UsageError
 from s2r_runtime.evidence.seen_rows import sketch
 from s2r_runtime.files.canonical import digest_of_path
-from s2r_runtime.files.table_text import Limits, Progress, refuse_special
+from s2r_runtime.files.table_text import Limits, Progress
 from s2r_runtime.messages import CampaignFinished, Observed, Send, StartCampaign, Started
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.modelspec import COMPACT
 from s2r_runtime.recording.origin import other_writer
 from s2r_runtime.recordings.formats.mapping import Recorded
 from s2r_runtime.recordings.formats.routes import read_recording
-from s2r_runtime.recordings.robot_logs import content_digest, is_mcap, is_robot_log
+from s2r_runtime.recordings.robot_logs import content_digest, is_mcap, is_robot_log, refuse_special, sources_of
 from s2r_runtime.recordings.table_rows import Subset, joined
+from s2r_runtime.recordings.tables import ArrayTable, Source
 from s2r_runtime.trace.data.dataset import Array, Dataset, Stream, from_streams
 from s2r_runtime.trace.data.reconstruction import late_speeds, reconstruct
 from s2r_runtime.trace.data.unmeasured_states import unneeded, without
@@ -48,7 +49,7 @@ MISSPELT = 0.75
 
 
 def load_dataset(
-    path: Path | str | Sequence[Path | str],
+    path: Source | str | Sequence[Source | str],
     model: ComposedModel,
     columns: Mapping[str, str] | None = None,
     *,
@@ -60,7 +61,9 @@ def load_dataset(
     limits: Limits | None = None,
     progress: Progress | None = None,
 ) -> Dataset:
-    """Reads a recording on the model's grid. columns: name in the model, or `t` -> column of the table. Several paths: parts of one log, or
+    """Reads a recording on the model's grid: a file, a folder, or a table in memory.
+
+    columns: name in the model, or `t` -> column of the table. Several paths: parts of one log, or
     recordings of one kind, each of them a run of its own. signals: name in the model -> signal, for a file with named signals.
     epoch: of a log, only what was recorded while that campaign was under way. bandwidth: Hz within which states that the table does not
     have are reconstructed from those that it has (None: what the data bear, and only those that the motion
@@ -72,18 +75,19 @@ def load_dataset(
     somebody's own model fails at the states of a table, NotEnoughEvidence if states were measured at one moment only, or too seldom for
     what was not measured, UsageError if a recording is there twice.
     """
-    paths = tuple(Path(p) for p in ([path] if isinstance(path, str | Path) else path))
+    paths = sources_of(path)
     for one in paths:
         refuse_special(one)
     source = ", ".join(str(p) for p in paths)
-    own = [one for one in paths if _is_own_log(one)]
+    own = [one for one in paths if isinstance(one, Path) and _is_own_log(one)]
+    files = tuple(one for one in paths if isinstance(one, Path))
     if own and len(own) < len(paths):
         raise UsageError(f"{own[0]}: is a log of this software, other recordings are none; trace one kind at a time")
-    segments = _log_segments(paths, model, epoch) if own else []  # first: what is no log is refused before all of it is digested
+    segments = _log_segments(files, model, epoch) if own else []  # first: what is no log is refused before all of it is digested
     if own:
         digests = tuple(_digest(p) for p in paths) if any(len(states.t) for states, _ in segments) else ()
         _once(paths, digests)
-        return replace(from_streams(model, segments, source, (*digests, *row_sketch(model, segments)), paths), commanded=True)
+        return replace(from_streams(model, segments, source, (*digests, *row_sketch(model, segments)), files), commanded=True)
     tables = _Tables(columns or {}, not bandwidth, MAX_ROWS // len(paths), limits, progress)
     parts = [_read_one(one, model, tables, transport, signals) for one in paths]
     digests = tuple(_digest(p) for p in paths)
@@ -109,7 +113,7 @@ def load_dataset(
     if missing:
         segments, done = reconstruct(model, segments, missing, source, bandwidth, slow)
     named = called if len(called) > 1 and done is None else ()  # what was reconstructed may be in more parts
-    data = from_streams(model, segments, source, (*digests, *(part.content for part in parts), *rows), paths, done)
+    data = from_streams(model, segments, source, (*digests, *(part.content for part in parts), *rows), files, done)
     subset = joined([part.subset for part in parts], [sum(len(states.t) for states, _ in part.segments) for part in parts])
     names = [f"{one.name}: " if len(paths) > 1 else "" for one in paths]
     notes = tuple(f"{name}{line}" for name, part in zip(names, parts, strict=True) for line in part.notes)
@@ -131,8 +135,10 @@ def row_sketch(model: ComposedModel, segments: Sequence[tuple[Stream, Stream]], 
     return sketch([states.values for states, _ in segments], model.angle_columns, form)
 
 
-def _digest(path: Path) -> str:
+def _digest(path: Source) -> str:
     """As guarantee G6 wants it: of the file's bytes."""
+    if isinstance(path, ArrayTable):
+        return path.digest
     try:
         return digest_of_path(path)
     except OSError as error:
@@ -149,7 +155,7 @@ class _Tables(NamedTuple):
     progress: Progress | None
 
 
-def _table_segments(path: Path, model: ComposedModel, how: _Tables) -> _Part:
+def _table_segments(path: Source, model: ComposedModel, how: _Tables) -> _Part:
     """A table's. A column that the caller stated must be there."""
     from s2r_runtime.recordings.tables import read_csv
 
@@ -186,7 +192,7 @@ def _table_segments(path: Path, model: ComposedModel, how: _Tables) -> _Part:
     return _Part(given, missing, table.content, called, table.notes, table.subset)
 
 
-def _hidden(path: Path, model: ComposedModel, free: set[str], columns: Mapping[str, str]) -> set[str]:
+def _hidden(path: Source, model: ComposedModel, free: set[str], columns: Mapping[str, str]) -> set[str]:
     """States that the table does not have, and that other ones tell by the model (`hidden_state`). Not where it has a column that nobody
     asked for, of nearly the same name: that is it, misspelt.
     """
@@ -222,7 +228,7 @@ def _is_own_log(path: Path) -> bool:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _once(paths: Sequence[Path], digests: Sequence[str]) -> None:
+def _once(paths: Sequence[Source], digests: Sequence[str]) -> None:
     """Raises UsageError if a recording is there twice: it would count twice."""
     for k, digest in enumerate(digests):
         if digest in digests[:k]:
@@ -231,7 +237,7 @@ def _once(paths: Sequence[Path], digests: Sequence[str]) -> None:
 
 
 def _read_one(
-    path: Path,
+    path: Source,
     model: ComposedModel,
     tables: _Tables,
     transport: Mapping[str, Any] | None,
@@ -241,7 +247,7 @@ def _read_one(
     return _table_segments(path, model, tables) if recorded is None else _recorded_segments(recorded, model)
 
 
-def _joined(paths: Sequence[Path], parts: Sequence[_Part]) -> tuple[list[tuple[Stream, Stream]], tuple[str, ...], tuple[str, ...]]:
+def _joined(paths: Sequence[Source], parts: Sequence[_Part]) -> tuple[list[tuple[Stream, Stream]], tuple[str, ...], tuple[str, ...]]:
     """Segments, states that are missing, and names of segments, of all recordings. Raises RecordingError if they lack different states."""
     for path, part in zip(paths, parts, strict=True):
         if part.missing != parts[0].missing:

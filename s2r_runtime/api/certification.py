@@ -1,0 +1,236 @@
+"""`s2r certify` and `s2r.certify`: gap + verification + signature. The budget is in a ledger next to the key (guarantee G4)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from s2r_runtime.api.files import apart, own_file, writable
+from s2r_runtime.api.models import ModelLike, ProfileLike, controller_at, load_checked, profile_model
+from s2r_runtime.api.progress import Callback, Watcher, watcher_of
+from s2r_runtime.api.recordings import RecordingLike, recording
+from s2r_runtime.api.spelling import front_door
+from s2r_runtime.api.verification import Verified, gap_of, load_recordings, run_verification, verification_lines
+from s2r_runtime.errors import ConfigError, UsageError
+from s2r_runtime.evidence.bounds import attempt_beta, epoch_beta
+from s2r_runtime.evidence.verify import verification_json
+from s2r_runtime.messages import Gap, Trials, Tries, Verification
+from s2r_runtime.profile import Profile
+from s2r_runtime.trust import keys, offline_ledger
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+    from s2r_runtime.controllers.file import ControllerFile
+    from s2r_runtime.models.composed import ComposedModel
+    from s2r_runtime.recordings.tables import Source
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Certification(Verified):
+    """One paid attempt at a certificate. It is spent whether or not the controller passed."""
+
+    verification: Verification
+    gap: Gap
+    trials: Trials | None
+    tries: Tries
+    epoch: int
+    beta: float
+    """The whole error budget of this robot."""
+    beta_spent: float
+    output: Path
+    written: bool
+    """Whether the certificate is in `output`."""
+    trouble: str = ""
+    """Why it is not, although the controller passed."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `s2r certify --json` prints."""
+        result = self.verification
+        plain: dict[str, Any] = msgspec.to_builtins(
+            {
+                **verification_json(result),
+                "certificate": str(self.output) if self.written else None,
+                "gap": self.gap,
+                "trials": self.trials,
+                "tries": self.tries,
+                "verified_radius": result.radius if result.passed else None,
+                "epoch": self.epoch,
+                "attempt": result.attempt,
+                "beta_spent": self.beta_spent,
+                "beta_left": self.beta - self.beta_spent,
+            }
+        )
+        return plain
+
+    def summary(self) -> str:
+        """What `s2r certify` prints."""
+        result, lines = self.verification, verification_lines(verification_json(self.verification))
+        lines.append(f"gap epoch {self.epoch}, verification attempt {result.attempt}: {self.beta_spent:.4f} of beta {self.beta} spent")
+        lines.append(f"on this gap: {self.tries.on_gap} attempts on {self.tries.controllers} controllers that differ in their behaviour")
+        written = f"gap {self.gap.radius:.4g}, certified to {result.radius:.4g}: certificate written to {self.output}"
+        return "\n".join([*lines, written if self.written else "no certificate"])
+
+
+@front_door
+def certify(
+    controller: str | Path,
+    *,
+    profile: ProfileLike,
+    recording: RecordingLike,
+    output: str | Path,
+    trials: Sequence[str | Path] | str | Path = (),
+    model: ModelLike | None = None,
+    key: str | Path | None = None,
+    param: Mapping[str, float] | None = None,
+    max_gb: float | None = None,
+    progress: Callback | bool | None = None,
+) -> Certification:
+    """Gap, verification and signature: a certificate for this controller. Every call spends an attempt of the key's budget.
+
+    controller, profile, model, param, max_gb, progress: as `s2r.verify`. recording: a campaign, or drives for which the profile states an
+    assumption. output: where the certificate goes. trials: logs of closed-loop runs of this controller. key: the signing key (default:
+    the user's; `s2r keys new` makes one).
+
+    A controller that does not pass gives `passed == False`, and no file. Raises UsageError where `output` cannot be written (with the
+    attempt spent, if that shows only at the end), ConfigError (profile, key, ledger, a log that does not hold), NotEnoughEvidence.
+    """
+    logs = [trials] if isinstance(trials, str | Path) else list(trials)
+    found = certified(
+        Path(controller), profile, _sources(recording), Path(output), watcher_of(progress), trials=[Path(log) for log in logs], model=model,
+        key=None if key is None else Path(key), param=param or {}, max_gb=max_gb,
+    )  # fmt: skip
+    if found.trouble:
+        raise UsageError(f"{found.trouble}; attempt {found.verification.attempt} passed and is spent")
+    return found
+
+
+def certified(
+    controller: Path,
+    profile: ProfileLike,
+    recordings: Sequence[Source],
+    output: Path,
+    watcher: Watcher,
+    *,
+    trials: Sequence[Path],
+    model: ModelLike | None,
+    key: Path | None,
+    param: Mapping[str, float],
+    max_gb: float | None,
+) -> Certification:
+    """As `certify`; what hinders the writing of a certificate is in `trouble`, since its attempt is spent."""
+    writable(output, replaced=True)  # now, because what is spent below stays spent, whatever becomes of the certificate
+    key_path = key or keys.default_path()
+    inputs: dict[str, Path | str | None] = {"the controller": controller}
+    inputs["the profile"] = profile if isinstance(profile, str | Path) else None
+    inputs["the model"] = model if isinstance(model, str | Path) else None
+    inputs |= {f"the recording {one}": one for one in recordings if isinstance(one, Path)}
+    apart({"-o": output}, {**inputs, "the key": key_path})
+    loaded = load_checked(profile)
+    composed = profile_model(model, loaded, str(profile) if isinstance(profile, str | Path) else "the profile")
+    apart({"-o": output}, {"the model's file": own_file(composed.spec)})
+    signing = keys.load(key_path)
+    file = controller_at(controller, param)
+    found, digest = load_recordings(recordings, composed, loaded, watcher, max_gb)
+    runs = trials_of(trials, file, composed, loaded, watcher) if trials else None
+    ledger, beta = offline_ledger.open_ledger(key_path, loaded.robot.name), loaded.guarantee.beta
+    epoch = ledger.epoch_for(digest, composed.spec.digest(), loaded.digest())
+    gap, assumption, period = gap_of(found, composed, loaded, beta=epoch_beta(beta, epoch), epoch=epoch)
+    attempt = ledger.spend_attempt(file.digest, epoch=epoch)
+    result, behaviour = run_verification(
+        file,
+        composed,
+        loaded,
+        watcher,
+        gap=gap,
+        headroom=loaded.verification.headroom,
+        laws=loaded.verification.laws,
+        n=0,
+        attempt=attempt,
+        seed=ledger.draw_seed(attempt),
+        beta=attempt_beta(beta, attempt),
+    )
+    tries = ledger.ended(attempt, behaviour)
+    trouble = ""
+    if result.passed:
+        try:
+            _write(output, loaded, composed, file, gap, result, runs, tries, assumption, period, signing)
+        except UsageError as error:  # the attempt is spent: what it showed is reported all the same
+            trouble = str(error)
+    written = result.passed and not trouble
+    return Certification(result, gap, runs, tries, epoch, beta, ledger.spent(beta), output, written, trouble)
+
+
+def trials_of(
+    logs: Sequence[Path],
+    controller: ControllerFile,
+    model: ComposedModel,
+    profile: Profile,
+    watcher: Watcher,
+    *,
+    n: int = 0,
+    beta: float | None = None,
+) -> Trials:
+    """The controller's runs in these logs, which are audited first. Raises ConfigError for a log that does not hold."""
+    from s2r_runtime.audit.log import audit
+    from s2r_runtime.evidence import trials
+    from s2r_runtime.plugins import registry
+
+    with watcher.phase("auditing") as report:
+        result = audit(list(logs), progress=report)
+    if not result.ok:
+        first = result.first_difference
+        lacks = [*(f"{one} was not given" for one in result.incomplete), *result.unchecked]
+        what = first.what if first is not None else "; ".join(lacks) or f"the chain is {result.chain}"
+        raise ConfigError(f"{', '.join(map(str, logs))}: does not hold, so no trials are taken from it: {what} (s2r audit says more)")
+    task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
+    digests = {"controller_digest": controller.digest, "model_digest": model.spec.digest()}
+    found = trials.read_runs(logs, profile, task, **digests)
+    share = beta or profile.guarantee.beta
+    return trials.trials(found, **digests, task_digest=profile.task_digest(), beta=share, fixed=n)
+
+
+def _write(
+    path: Path,
+    profile: Profile,
+    model: ComposedModel,
+    controller: ControllerFile,
+    gap: Gap,
+    result: Verification,
+    trials: Trials | None,
+    tries: Tries,
+    assumption: str,
+    period: str,
+    key: Ed25519PrivateKey,
+) -> None:
+    """The certificate, signed."""
+    from s2r_runtime.files import durable
+    from s2r_runtime.plugins import registry
+    from s2r_runtime.trust import certificate
+
+    task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
+    issued = certificate.issue(
+        profile=msgspec.structs.replace(profile, model=model.spec),
+        controller=controller,
+        gap=gap,
+        verification=result,
+        issued_unix_s=int(time.time()),
+        horizon=task.horizon,
+        trials=trials,
+        tries=tries,
+        assumption=assumption,
+        period=period,
+    )
+    try:
+        durable.replace(path, certificate.sign(issued, key))
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def _sources(given: RecordingLike) -> tuple[Source, ...]:
+    return recording(given).sources
