@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -139,6 +142,34 @@ def test_a_daemon_answers_in_python(rig: Rig, tmp_path: Path) -> None:
             daemon.permit(float("nan"))
 
 
+def page_block(name: str) -> str:
+    """A block of docs/python.md that needs a daemon or its log."""
+    page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    return page.split(f"```python no-run {name}\n")[1].split("\n```")[0]
+
+
+def test_the_pages_lines_about_a_daemon_run(rig: Rig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    rig.controller()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(rig.folder))
+    monkeypatch.chdir(rig.folder)
+    exec(page_block("daemon"), {"s2r": s2r})  # noqa: S102 - the docs' own code
+    out = capsys.readouterr().out.splitlines()
+    assert out[0].startswith("closed no_controller ")
+    assert out[1:] == ["the sampler may drive for 600 s", *out[2:-1], "emergency_stop"]
+    assert out[2].startswith("False refused: ")
+
+
+def test_an_interrupt_while_a_campaign_runs_stops_the_robot_and_keeps_it(rig: Rig) -> None:
+    rig.ask("permit", duration_s=600.0)
+    code = "import sys, s2r_runtime as s2r; s2r.connect(socket=sys.argv[1]).sample()"
+    with subprocess.Popen([sys.executable, "-c", code, str(rig.socket)], stderr=subprocess.PIPE) as caller:
+        rig.until(lambda: "samples" in str(rig.status()["campaign"]) or rig.status()["campaign"])
+        caller.send_signal(signal.SIGINT)
+        assert b"KeyboardInterrupt" in caller.communicate(timeout=60)[1]
+    rig.until(lambda: "its command is gone" in rig.said())
+    assert rig.ask("cancel")["exit_code"] == 0
+
+
 def test_a_log_gives_its_channels_by_the_models_names(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
     assert rig.stop() == 0
     (path,) = rig.log_files()
@@ -162,6 +193,18 @@ def test_a_log_gives_its_channels_by_the_models_names(rig: Rig, capsys: pytest.C
         log.arrays("x")
     with pytest.raises(s2r.RecordingError, match=r"is part 1 of run"):
         s2r.read_log([path, path])
+
+
+def test_the_pages_lines_about_a_log_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    for library in ("pandas", "matplotlib"):
+        pytest.importorskip(library)
+    bench = Bench(tmp_path)
+    bench.steps(40)
+    bench.stop().write(tmp_path / "run.mcap")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    exec(page_block("log"), {"s2r": s2r})  # noqa: S102 - the docs' own code
+    assert capsys.readouterr().out.splitlines()[-1] == "True intact None"
 
 
 def test_a_damaged_log_is_refused_and_a_cut_one_is_read(rig: Rig, tmp_path: Path) -> None:

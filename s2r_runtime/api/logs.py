@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
 
-from s2r_runtime.api.progress import Callback, Watcher, watcher_of
+from s2r_runtime.api.progress import Callback, Report, Watcher, watcher_of
 from s2r_runtime.api.results import AFTER, LIMIT, MEASURED, Result, axes_of
 from s2r_runtime.api.spelling import front_door
 from s2r_runtime.audit.log import AuditResult
@@ -193,7 +194,7 @@ class Log(Result):
         """From the first record to the last, of all parts together."""
         return float(sum(part["duration_s"] for part in self.parts))
 
-    def arrays(self, channel: str) -> dict[str, Column]:
+    def arrays(self, channel: str, *, progress: Callback | bool | None = None) -> dict[str, Column]:
         """The messages of a channel by field: name -> (n,).
 
         `t_s` is the log's time in s since its first record. A nested field is `observation.seq`. States and inputs have the names of the
@@ -202,20 +203,27 @@ class Log(Result):
         """
         if channel not in self.channels:
             raise UsageError(f"{', '.join(map(str, self.paths))}: has no channel {channel!r}; it has: {', '.join(sorted(self.channels))}")
-        rows, stamps = [], []
-        for entry in self._entries(channel):
-            stamps.append((entry.log_time_ns - self.first_ns) * 1e-9)
-            rows.append(self._flat(channel, msgspec.json.decode(entry.raw)))
-        names = list(dict.fromkeys(name for row in rows for name in row))
-        return {"t_s": np.array(stamps), **{name: _column([row.get(name) for row in rows]) for name in names}}
+        stamps: list[float] = []
+        columns: dict[str, list[Any]] = {}
+        with watcher_of(progress).phase("reading") as report:
+            for n, entry in enumerate(self._entries(channel)):
+                stamps.append((entry.log_time_ns - self.first_ns) * 1e-9)
+                message = self._flat(channel, msgspec.json.decode(entry.raw))
+                for name, value in message.items():
+                    columns.setdefault(name, [None] * n).append(value)
+                if len(message) < len(columns):
+                    for column in columns.values():
+                        column.extend([None] * (n + 1 - len(column)))
+                report(n + 1, self.channels[channel])
+        return {"t_s": np.array(stamps), **{name: _column(column) for name, column in columns.items()}}
 
-    def frame(self, channel: str) -> DataFrame:
+    def frame(self, channel: str, *, progress: Callback | bool | None = None) -> DataFrame:
         """As `arrays`, as a pandas DataFrame. Raises ConfigError without pandas."""
         try:
             from pandas import DataFrame
         except ImportError:
             raise ConfigError("frame: needs pandas: pip install pandas; or polars.DataFrame(log.arrays(channel))") from None
-        return DataFrame(self.arrays(channel))
+        return DataFrame(self.arrays(channel, progress=progress))
 
     def to_dict(self) -> dict[str, Any]:
         """What `s2r log info --json` prints; of several files `parts`, one each."""
@@ -294,9 +302,10 @@ def read_log(log: str | Path | Sequence[str | Path], *, progress: Callback | boo
     ordered = [reading.path for parts in runs(paths) for reading in parts]
     with watcher.phase("reading") as report:
         facts = []
-        for k, path in enumerate(ordered):
-            report(k, len(ordered), path.name)
-            facts.append(info(path))
+        total, before = sum(path.stat().st_size for path in ordered), 0
+        for path in ordered:
+            facts.append(info(path, partial(_further, report, before, total, path.name)))
+            before += path.stat().st_size
     if damaged := [(path, one) for path, one in zip(ordered, facts, strict=True) if one["ended"] == "broken"]:
         path, one = damaged[0]
         raise RecordingError(f"{path}: is damaged {one['detail']}; s2r log recover writes what is readable")
@@ -310,6 +319,11 @@ def read_log(log: str | Path | Sequence[str | Path], *, progress: Callback | boo
                     break
             first = reading.first_ns if first is None else first
     return Log(tuple(ordered), tuple(facts), started, first or 0)
+
+
+def _further(report: Report, before: float, total: float, name: str, done: float, _size: float) -> None:
+    """Progress within one of several files, in bytes."""
+    report(before + done, total, name)
 
 
 def _fields(prefix: str, message: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

@@ -100,6 +100,9 @@ class _Tqdm(Watcher):
         self._bar.set_postfix_str(" · ".join(filter(None, (left, step.detail))), refresh=False)
         self._bar.refresh()
 
+    def line(self, text: str) -> None:
+        self._make.write(text, file=sys.stderr)
+
     def ended(self, phase: str) -> None:
         if self._bar is not None:
             self._bar.close()

@@ -131,6 +131,21 @@ def count(text: str) -> int:
     return int(text)
 
 
+def weights(items: Sequence[str], states: tuple[str, ...]) -> dict[str, float]:
+    """Weight by state, as --weight gives them. Raises UsageError with the option as it was written."""
+    from s2r_runtime.api.models import weights_of
+
+    found: dict[str, float] = {}
+    for item in items:
+        name, value = pair(item, "--weight")
+        try:
+            weights_of(states, {name: value}, None)
+        except UsageError as error:
+            raise UsageError(str(error).replace(f"{name}={value:g}", item)) from None
+        found[name] = value
+    return found
+
+
 def pairs(items: Sequence[str], option: str) -> dict[str, float]:
     """NAME=NUMBER of each, the last one of a name. Raises UsageError naming the option."""
     return dict(pair(item, option) for item in items)

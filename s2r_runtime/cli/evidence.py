@@ -17,6 +17,7 @@ from s2r_runtime.cli.choices import (
     positive,
     probability,
     recording_of,
+    weights,
 )
 
 LAWS = ("uniform", "persistent", "adversarial")
@@ -97,7 +98,7 @@ def run_gap(args: argparse.Namespace) -> int:
         beta=args.beta,
         discard=args.discard,
         shape=args.set,
-        weight=pairs(args.weight, "--weight"),
+        weight=weights(args.weight, chosen.model.states),
         blocking=args.blocking,
     )
     if args.json:

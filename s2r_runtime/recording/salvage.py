@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -19,6 +19,7 @@ import msgspec
 from s2r_runtime.errors import RecordingError, UsageError
 from s2r_runtime.recording.blocks import Block, Damage, find, take
 from s2r_runtime.recording.channels import CHANNELS
+from s2r_runtime.recording.entries import entries
 from s2r_runtime.recording.layout import RECOVERED, declaration, declared, metadata_record
 from s2r_runtime.recording.reading import Ending, read
 from s2r_runtime.recording.start import make_start
@@ -47,10 +48,18 @@ class Account(msgspec.Struct, frozen=True):
     missing: str
 
 
-def info(path: Path) -> dict[str, Any]:
-    """What a log holds and how it ended. Reads and checks all of it; raises RecordingError if it is not a log, or holds no message."""
+def info(path: Path, progress: Callable[[float, float], None] | None = None) -> dict[str, Any]:
+    """What a log holds and how it ended. Reads and checks all of it; raises RecordingError if it is not a log, or holds no message.
+
+    progress: (bytes read, bytes of the file).
+    """
     reading = read(path, ())
-    ending = reading.to_the_end()
+    for block in reading.blocks():
+        for _ in entries(block, reading.topics, reading.wanted, reading.counts, path):
+            pass
+        if progress is not None:
+            progress(float(reading.offset), float(reading.size))
+    ending = reading.ending
     if not reading.counts:
         more = "; s2r log recover looks for sound ones behind the damage" if ending.kind == "broken" else ""
         raise RecordingError(f"{path}: holds no message that could be read: {ending.detail}{more}")
