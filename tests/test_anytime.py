@@ -47,6 +47,29 @@ def test_the_probability_of_ever_missing_the_mean_is_at_most_alpha_for_processes
     assert max(missed.values()) <= alpha
 
 
+@pytest.mark.parametrize(
+    ("n", "failures", "alpha", "lower", "upper"),
+    [
+        (1, 0, 0.05, 0.0, 0.9721333650832883),
+        (20, 0, 0.05, 0.0, 0.15761264085909907),
+        (299, 0, 0.05, 0.0, 0.011382178416033693),
+        (299, 1, 0.05, 0.0, 0.025769024859776706),
+        (299, 5, 0.0456, 0.002871151719847747, 0.05265529074840074),
+        (10, 4, 0.0152, 0.04823614858269057, 0.8768517649589929),
+        (50, 30, 0.05, 0.3863782040000089, 0.8038876207523533),
+        (130, 7, 0.0152, 0.010380747286009368, 0.15462445475584552),
+        (2000, 60, 0.01, 0.017919299505359913, 0.04694449959804357),
+        (5000, 3000, 0.0152, 0.5757216006193826, 0.6254434924045633),
+        (100_000, 2000, 0.05, 0.018632676848410894, 0.021529763717335497),
+    ],
+)
+def test_the_limits_are_where_the_evidence_reaches_the_confidence(n: int, failures: int, alpha: float, lower: float, upper: float) -> None:
+    """Reference: sixty halvings of the interval with another program of the formula. A log is audited with these very numbers."""
+    found = anytime.limits(anytime.Counts(n, failures), alpha, alpha)
+    assert found.lower == pytest.approx(lower, rel=1e-10)
+    assert found.upper == pytest.approx(upper, rel=1e-10)
+
+
 def test_without_a_failure_the_upper_limit_is_within_a_quarter_of_the_least_that_any_method_can_give() -> None:
     for n in (10, 100, 299, 3000):
         least = 1.0 - 0.05 ** (1.0 / n)

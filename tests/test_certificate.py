@@ -13,11 +13,12 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from s2r_runtime.core import anytime
 from s2r_runtime.core.ledger import binomial_tail, sample_size
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, S2RError
 from s2r_runtime.evidence import statements
 from s2r_runtime.evidence.trials import Found, Run, trials
-from s2r_runtime.messages import Tries
+from s2r_runtime.messages import RunLimits, Tries
 from s2r_runtime.trust import certificate, keys
 
 OTHER = Ed25519PrivateKey.from_private_bytes(bytes(32))
@@ -345,3 +346,26 @@ def test_a_certificate_carries_trials_of_its_own_controller_only_and_says_them(g
     for wrong in ({"unsafe_upper": 0.001}, {"epsilon": 0.001}, {"unsafe": 300}, {"n": 0}, {"radius": -1.0}):
         with pytest.raises(NotEnoughEvidence, match="the trials do not carry their statement"):
             good.issue(trials=msgspec.structs.replace(told, **wrong))
+
+
+def test_a_certificate_carries_the_runs_of_its_controller_with_limits_that_follow_from_their_counts(good: Evidence) -> None:
+    found = anytime.limits(anytime.Counts(300, 2, 1), 0.015, 0.045)
+    counted = RunLimits("", 1, 300, 2, 1, found.lower, found.upper, 0.015, 0.045)
+    without, carrying = good.issue(), good.issue(runs=counted)
+    assert [line for line in carrying.shown if line not in without.shown] == [statements.of_runs(counted)]
+    assert certificate.load(certificate.sign(carrying, KEY), [PUBLIC], NOW + 1).runs == counted
+    assert b'"runs"' not in certificate.sign(without, KEY), "as it was before runs were counted"
+    for wrong in (
+        {"upper": 0.5 * found.upper},
+        {"lower": 2.0 * found.lower},
+        {"unsafe": 1},
+        {"unsafe": -1},
+        {"unsafe": 300},
+        {"censored": -1},
+        {"n": 299},
+        {"beta_upper": 0.0},
+        {"beta_lower": 1.0},
+        {"beta_upper": 0.09},
+    ):
+        with pytest.raises(NotEnoughEvidence, match="the limits of its runs do not follow from their counts"):
+            good.issue(runs=msgspec.structs.replace(counted, **wrong))

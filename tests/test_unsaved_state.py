@@ -13,9 +13,9 @@ import core_rig
 import msgspec
 import pytest
 
+from s2r_runtime.daemon import persistence
 from s2r_runtime.daemon.actions import Actions
 from s2r_runtime.daemon.persistence import StateFolder
-from s2r_runtime.files import durable
 from s2r_runtime.messages import Answer, IssueCertificate, Memory, RecorderChanged, StartCampaign, StartController, StartJob
 
 ORDERS = StartJob, StartCampaign, StartController, IssueCertificate
@@ -77,7 +77,7 @@ def full(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(durable, "replace", replace)
+        patch.setattr(persistence, "replace", replace)
         yield patch
 
 
@@ -135,7 +135,7 @@ def test_no_certificate_is_issued_and_no_controller_started_while_the_state_is_u
     bench.rig.observe()
     assert started(bench.carry_out(bench.rig.request("deploy", digest="controller")))
     with monkeypatch.context() as patch:
-        patch.setattr(durable, "replace", replace)
+        patch.setattr(persistence, "replace", replace)
         bench.carry_out(bench.rig.request("stop"))
         assert bench.rig.state.memory.latched == ("emergency_stop",)
         assert bench.actions.unsaved

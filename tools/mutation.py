@@ -38,6 +38,7 @@ TESTS = (
     "test_certificate.py",
     "test_certificate_issue.py",
     "test_core*.py",
+    "test_anytime.py",
     "test_ledger.py",
     "test_bounds.py",
     "test_watch_tests.py",
