@@ -132,6 +132,49 @@ def test_a_controller_that_fails_at_the_first_step_has_an_unsafe_run() -> None:
     assert [one.outcome for one in of(rig.outputs, EpisodeCounted)] == ["unsafe"]
 
 
+def test_a_command_that_the_gate_rejects_is_a_closing_from_the_first_step_on() -> None:
+    for before, expected in ((0, "unsafe"), (3, "unsafe")):
+        rig = Rig(beta_episodes=BETA)
+        rig.driving()
+        rig.observe()
+        rig.feed(EpisodeEnded(rig.t, 0, 200, 0.5, 1.0))
+        for _ in range(before):
+            rig.propose()
+            rig.observe()
+        rig.propose(u=(9.0, 0.0))
+        rig.request("undeploy")
+        assert counted(rig) == [(expected, "the gate closed: input_out_of_bounds")]
+
+
+def test_a_command_that_is_rejected_in_a_run_that_the_controller_never_took_over_changes_nothing() -> None:
+    rig = Rig(beta_episodes=BETA)
+    rig.deployed()
+    rig.observe()
+    rig.propose()
+    rig.observe()
+    rig.propose(u=(9.0, 0.0))
+    rig.request("undeploy")
+    (found,) = of(rig.outputs, EpisodeCounted)
+    assert (found.outcome, found.reason, found.limits) == ("left_out", "not driven from its start", ())
+    assert rig.state.memory.run_sequences == 0
+
+
+def test_a_controller_that_commanded_nothing_had_no_run() -> None:
+    rig = Rig(beta_episodes=BETA)
+    rig.deployed()
+    rig.request("undeploy")
+    assert of(rig.outputs, EpisodeCounted) == []
+    assert rig.state.memory.open_run is None
+
+
+def test_the_status_is_of_the_controller_that_drove_last_when_none_drives() -> None:
+    rig = driving()
+    ended(rig)
+    rig.request("undeploy")
+    shown: Any = core.status(rig.state)["runs"]
+    assert (shown["controller"], shown["all"]["n"], shown["under_certificate"]) == ("controller", 2, None)
+
+
 def test_the_end_of_all_scenarios_is_the_end_of_no_run() -> None:
     rig = driving()
     rig.observe()
