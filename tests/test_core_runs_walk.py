@@ -44,7 +44,7 @@ class Counting(World):
         return super().answer() if self.ask is not None else self.observed_instead()
 
     def observed_instead(self) -> Event:
-        """What the report of the scenario led to has ended the drive: there is nothing to answer."""
+        """What the report of the scenario led to has ended the deployment: there is nothing to answer."""
         return EpisodeScored(self.t, 0, 1, 0.0, below=False)
 
     def scenario_over(self) -> None:

@@ -2,7 +2,7 @@
 
     tools/runs_on_robots.py [robotarium | quadruped] [--runs 300] [--seed 1] [--out FOLDER] [--minutes 30]
 
-The demo's own story, without a hidden fault, up to a certified controller. It then drives until so many runs are counted. Prints the
+The demo's own story, without a hidden fault, up to a certified controller. It then drives until that number of runs is counted. Prints the
 operator's line, the audit's verdict, and the report's path. Exit 1 if the log does not hold, or the upper limit is above 1.3 %.
 """
 
@@ -43,7 +43,7 @@ class Runs(Demonstration):
             if self.found.get("n", 0) >= self._runs:
                 return True
             if not status.get("controller") and not status.get("job"):
-                return self._otherwise(f"the drive ended after {self.found.get('n', 0)} runs: {status.get('reason')}")
+                return self._otherwise(f"driving ended after {self.found.get('n', 0)} runs: {status.get('reason')}")
             time.sleep(0.2)
         return self._otherwise(f"the time is over after {self.found.get('n', 0)} runs")
 
