@@ -102,6 +102,22 @@ def test_profile_reference_is_what_a_profile_may_say() -> None:
     assert (ROOT / "docs" / "profile.md").read_text(encoding="utf-8") == profile_reference.text()
 
 
+def test_the_tracing_page_names_files_and_functions_that_exist() -> None:
+    page = (ROOT / "docs" / "tracing.md").read_text(encoding="utf-8")
+    named = re.findall(r"`(?:s2r_runtime/trace/)?((?:\w+/)?\w+\.py)`(?: \((`\w+`(?:, `\w+`)*)\))?", page)
+    named += [(file, name) for name, file in re.findall(r"(`\w+`) (?:of|in) `((?:\w+/)?\w+\.py)`", page)]
+    assert len(named) > 15
+    missing = []
+    for file, functions in named:
+        found = [path for path in (ROOT / "s2r_runtime").rglob(file.rpartition("/")[2]) if path.as_posix().endswith(f"/{file}")]
+        code = "".join(path.read_text(encoding="utf-8") for path in found)
+        names = re.findall(r"`(\w+)`", functions)
+        missing += (
+            [file] if not found else [f"{file}: {n}" for n in names if not re.search(rf"^(?:def {n}\(|{n}\b.* = )", code, re.MULTILINE)]
+        )
+    assert missing == []
+
+
 def test_every_verb_that_prints_json_says_what() -> None:
     page = (ROOT / "docs" / "json.md").read_text(encoding="utf-8")
     told = {name for row in re.findall(r"^\| (`[^|]*`) \|", page, re.MULTILINE) for name in re.findall(r"`([^`]+)`", row)}

@@ -1,4 +1,4 @@
-"""The nominal models step as docs/tracing.md tells, batched; a composed model adds effects to that step."""
+"""The nominal models step as docs/recordings.md states, batched; a composed model adds effects to that step."""
 
 import math
 

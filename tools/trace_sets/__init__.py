@@ -1,1 +1,1 @@
-"""Seeded recordings of robots whose models lack something, for the tracer: own physics, own words (docs/tracing.md, How it is tested)."""
+"""Seeded recordings of robots whose models lack something, for the tracer: own physics, own words (docs/trace-figures.md)."""

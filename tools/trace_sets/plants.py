@@ -7,7 +7,7 @@ A plant takes what acts (a, one number an input) over a small part h of a step a
                       heading in the middle of the part (arcs), or the one at the start of the recorded step (`frozen`: Euler's rule)
     force plants      a -> acceleration q, one an axis.   p += h (v + v')/2,  v' = v + h q less dry friction, which stops but never turns
 
-States, inputs and parameters are named as in docs/tracing.md; the formulas are written here a second time on purpose.
+States, inputs and parameters are named as in docs/recordings.md; the formulas are written here a second time on purpose.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The blind targets of the tracer, one row each, from records of sets (docs/tracing.md, How it is tested).
+"""The blind targets of the tracer, one row each, from records of sets (docs/trace-figures.md).
 
 A share's interval is the exact one of Clopper and Pearson, 95 %. A target is met if the observed share meets it; the
 interval says how sure that is.
