@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import s2r_runtime as s2r
+from s2r_runtime.api import progress as api_progress
 from s2r_runtime.api.spelling import in_python
 from s2r_runtime.cli.main import main, parser
 from s2r_runtime.recordings.tables import read_csv
@@ -227,6 +228,15 @@ def test_html_of_a_result_holds_no_markup_of_the_recording() -> None:
     assert "<b>" not in evil._repr_html_()
 
 
+def test_long_work_shows_a_bar_of_tqdm(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("tqdm")
+    monkeypatch.setattr(api_progress, "QUIET_S", 0.0)
+    s2r.gap(DRIVE, FILE, dt=0.02, progress=True)
+    assert "reading 100%" in capsys.readouterr().err
+    s2r.gap(DRIVE, FILE, dt=0.02)  # nobody looks
+    assert capsys.readouterr().err == ""
+
+
 def test_progress_comes_by_phase_with_the_time_left(traced: s2r.Trace, steps: list[s2r.Step]) -> None:
     assert {one.phase for one in steps} >= {"tracing"}
     assert steps[-1].done == steps[-1].total == 100.0
@@ -326,6 +336,15 @@ BAD: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "a horizon": (lambda: s2r.trace(SHORT, FILE, dt=0.02, horizon=0.001), s2r.UsageError, "horizon 0.001: must be at least"),
     "no profile": (lambda: s2r.verify("c.py", profile="no.toml", radius=0.1), s2r.ConfigError, "no.toml"),
     "radius and recording": (lambda: s2r.verify("c.py", profile="no.toml"), s2r.UsageError, "either radius=R or recording=REC"),
+    "text as a number": (lambda: s2r.gap(SHORT, FILE, dt=0.02, epsilon="1"), TypeError, "epsilon: is '1', must be a number"),  # type: ignore[arg-type]
+    "a list of parameters": (lambda: s2r.model("joint", dt=0.1, param=["mass"]), TypeError, "param: is"),  # type: ignore[arg-type]
+    "a seed below 0": (lambda: s2r.trace(SHORT, FILE, dt=0.02, seed=-1), s2r.UsageError, "seed: is -1, must be >= 0"),
+    "a seed with a fraction": (lambda: s2r.trace(SHORT, FILE, dt=0.02, seed=1.5), TypeError, "seed: is 1.5, must be a whole"),  # type: ignore[arg-type]
+    "a bandwidth of nothing": (lambda: s2r.trace(SHORT, FILE, dt=0.02, bandwidth=0.0), s2r.UsageError, "bandwidth: is 0, must be > 0"),
+    "states of one sample": (lambda: function_model().step([0.0], [1.0]), s2r.UsageError, r"must be \(n, 1\): speed"),
+    "states that are text": (lambda: function_model().step([["a"]], [[1.0]]), s2r.UsageError, "must be a table of numbers"),
+    "too many states": (lambda: function_model().rollout([0.0, 1.0], [[1.0]]), s2r.UsageError, r"x0 has the shape \(2,\), must be \(1,\)"),
+    "a number as a log": (lambda: s2r.read_log(3), TypeError, "log: is int, must be a path"),  # type: ignore[arg-type]
     "no log": (lambda: s2r.audit("no.mcap"), s2r.UsageError, "no.mcap: no such log file"),
     "a head": (lambda: s2r.audit(DRIVE, head="abc"), s2r.UsageError, "64 hexadecimal digits"),
     "a table as a log": (lambda: s2r.read_log(DRIVE), s2r.RecordingError, "drive.csv"),

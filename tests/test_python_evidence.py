@@ -79,6 +79,10 @@ def test_a_verification_is_that_of_the_command_line(profile: Path, capsys: pytes
     assert found.to_dict() == json.loads(capsys.readouterr().out)
     assert (found.passed, found.radius) == (True, 0.0005)
     assert found.summary().startswith("passed\n  uniform")
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    pyplot.switch_backend("agg")
+    assert len(found.plot().patches) == 1
+    pyplot.close("all")
     with pytest.raises(s2r.NotEnoughEvidence, match="n 3: "):
         s2r.verify(GRID, profile=profile, radius=0.0005, n=3)
     with pytest.raises(s2r.UsageError, match="side: must be one of: uniform"):

@@ -12,6 +12,7 @@ import msgspec
 
 from s2r_runtime.api.files import apart, own_file, writable
 from s2r_runtime.api.models import ModelLike, ProfileLike, controller_at, load_checked, profile_model
+from s2r_runtime.api.options import check_named_numbers, check_numbers
 from s2r_runtime.api.progress import Callback, Watcher, watcher_of
 from s2r_runtime.api.recordings import RecordingLike, recording
 from s2r_runtime.api.spelling import front_door
@@ -100,6 +101,8 @@ def certify(
     A controller that does not pass gives `passed == False`, and no file. Raises UsageError where `output` cannot be written (with the
     attempt spent, if that shows only at the end), ConfigError (profile, key, ledger, a log that does not hold), NotEnoughEvidence.
     """
+    check_numbers(max_gb=max_gb)
+    check_named_numbers(param=param)
     logs = [trials] if isinstance(trials, str | Path) else list(trials)
     found = certified(
         Path(controller), profile, _sources(recording), Path(output), watcher_of(progress), trials=[Path(log) for log in logs], model=model,

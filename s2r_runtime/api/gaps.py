@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from s2r_runtime.api.models import Chosen, ModelLike, ProfileLike, choose, weights_of
+from s2r_runtime.api.options import check_counts, check_named_numbers, check_numbers
 from s2r_runtime.api.progress import Callback, Watcher, watcher_of
 from s2r_runtime.api.recordings import Recording, RecordingLike, as_recording, columns_of, signals_of, transport_of
 from s2r_runtime.api.results import AFTER, LIMIT, Result, axes_of
@@ -131,6 +132,9 @@ def gap(
     A recording whose transitions are not independent gives its numbers and `independent == False`. Raises RecordingError (unreadable,
     a column is missing), NotEnoughEvidence (too few samples: `missing` more; or the model was fitted on them), ConfigError, UsageError.
     """
+    check_numbers(dt=dt, epsilon=epsilon, beta=beta, blocking=blocking, max_gb=max_gb)
+    check_counts(discard=discard)
+    check_named_numbers(param=param, weight=weight)
     given = as_recording(recording, column, state, input, dbc, max_gb)
     chosen = choose(model, profile, dt, param)
     return measure(

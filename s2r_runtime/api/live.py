@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from s2r_runtime.api.options import check_counts, check_named_numbers, check_numbers
 from s2r_runtime.api.progress import Callback, Watcher, watcher_of
 from s2r_runtime.api.results import Result
 from s2r_runtime.api.spelling import front_door, in_python
@@ -66,10 +67,12 @@ class Daemon(AbstractContextManager["Daemon"]):
 
     def permit(self, seconds: float) -> Answer:
         """Lets the sampler drive inside the geofence for this time in s from now on; 0 ends it."""
+        check_numbers(seconds=seconds)
         if not 0.0 <= seconds < float("inf"):
             raise UsageError(f"permit: seconds is {seconds}, must be >= 0 and finite")
         return self._request({"verb": "permit", "duration_s": float(seconds)})
 
+    @front_door
     def sample(
         self,
         *,
@@ -84,6 +87,7 @@ class Daemon(AbstractContextManager["Daemon"]):
         n: samples, fixed beforehand (0: what the profile or its beta needs). retry: repeat it once if its samples depend on each other.
         detach: return when the daemon drives. inputs: drive this file of inputs instead, which founds no gap.
         """
+        check_counts(n=n)
         return self._request(sample_request(n=n, retry=retry, detach=detach, inputs=None if inputs is None else Path(inputs)), progress)
 
     def pause(self) -> Answer:
@@ -94,6 +98,7 @@ class Daemon(AbstractContextManager["Daemon"]):
         """Stops the campaign and gives it up. Its share of beta is spent."""
         return self._request({"verb": "cancel"})
 
+    @front_door
     def deploy(
         self,
         controller: str | Path,
@@ -106,6 +111,7 @@ class Daemon(AbstractContextManager["Daemon"]):
 
         It drives on after this call: `undeploy` ends that, `stop` is the emergency stop.
         """
+        check_named_numbers(param=param)
         request = deploy_request(Path(controller), param or {}, None if certificate is None else Path(certificate))
         return self._request(request, progress)
 
@@ -125,6 +131,7 @@ class Daemon(AbstractContextManager["Daemon"]):
         """Withdraws the certificate of this id, or all of them."""
         return self._request({"verb": "revoke", "text": certificate})
 
+    @front_door
     def adopt(self, model: str | Path | None = None) -> Answer:
         """Uses this model file from now on (default: the one that tracing proposes). It voids the gap: a fresh campaign comes next."""
         return self._request(adopt_request(None if model is None else Path(model)))

@@ -149,6 +149,8 @@ def _head(given: str | bytes) -> bytes:
 
 
 def _paths(log: str | Path | Sequence[str | Path]) -> list[Path]:
+    if not isinstance(log, str | Path | Sequence):
+        raise TypeError(f"log: is {type(log).__name__}, must be a path or several")
     several = [log] if isinstance(log, str | Path) else list(log)
     if wrong := [one for one in several if not isinstance(one, str | Path)]:
         raise TypeError(f"log: is {type(wrong[0]).__name__}, must be a path or several")

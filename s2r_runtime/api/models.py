@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from s2r_runtime.api.options import check_named_numbers, check_numbers
 from s2r_runtime.api.results import Result
 from s2r_runtime.api.spelling import front_door
 from s2r_runtime.errors import ConfigError, UsageError
@@ -83,9 +84,9 @@ class Model(Result):
     def rollout(self, x0: ArrayLike, u: ArrayLike) -> Array:
         """States (m + 1, nx) from x0 (nx,) on, under inputs u (m, nu), one a step."""
         u = self._checked("u", u, self.inputs)
-        x = self._checked("x0", np.atleast_2d(np.asarray(x0, dtype=np.float64)), self.states)
-        if len(x) != 1:
-            raise UsageError(f"rollout: x0 has the shape {np.shape(x0)}, must be ({len(self.states)},)")
+        if np.shape(x0) != (len(self.states),):
+            raise UsageError(f"rollout: x0 has the shape {np.shape(x0)}, must be ({len(self.states)},): {', '.join(self.states)}")
+        x = self._checked("x0", np.asarray(x0)[None, :], self.states)
         hidden, found = self.composed.at_rest(1), [x[0]]
         for inputs in u:
             x, hidden = self.composed.step(x.copy(), inputs[None, :], hidden)
@@ -121,7 +122,10 @@ class Model(Result):
         return write_text(path, self.to_toml())
 
     def _checked(self, what: str, given: ArrayLike, names: Sequence[str]) -> Array:
-        table = np.array(given, dtype=np.float64)
+        try:
+            table = np.array(given, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise UsageError(f"{what}: must be a table of numbers, (n, {len(names)}): {', '.join(names)}") from None
         if table.ndim != 2 or table.shape[1] != len(names):
             raise UsageError(f"{what} has the shape {table.shape}, must be (n, {len(names)}): {', '.join(names)}")
         return table
@@ -163,6 +167,8 @@ def model(
 
     Raises ConfigError (unknown name or parameter, a file with an error: which line), UsageError (dt is lacking or not > 0).
     """
+    check_numbers(dt=dt)
+    check_named_numbers(param=param)
     if callable(source) and not isinstance(source, Model):
         if states is None or inputs is None:
             raise UsageError("model: a function needs the names of its columns: states=(...), inputs=(...)")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from s2r_runtime.api.models import Chosen, Model, ModelLike, ProfileLike, choose, weights_of, write_text
+from s2r_runtime.api.options import check_counts, check_named_numbers, check_numbers
 from s2r_runtime.api.progress import Callback, Watcher, watcher_of
 from s2r_runtime.api.recordings import Recording, RecordingLike, as_recording, columns_of, signals_of, transport_of
 from s2r_runtime.api.results import AFTER, BEFORE, MEASURED, Result, axes_of, labelled
@@ -100,11 +101,14 @@ class Trace(Result):
 
         return write_text(path, trace_page(self.result, None))
 
+    @front_door
     def suggest(self, *, suggest_duration: float | None = None, seed: int = 0) -> Suggestion:
         """The inputs that would distinguish what these data do not, within the profile's bounds, or those of the recording.
 
         suggest_duration: s. The result has `u` (m, nu), one row a step, or `u is None` and `refused`; `text()` and `to_csv()`.
         """
+        check_numbers(above=0.0, suggest_duration=suggest_duration)
+        check_counts(seed=seed)
         return suggested(self, suggest_duration, seed)
 
     def plot(self, ax: Axes | None = None) -> list[Axes]:
@@ -156,6 +160,10 @@ def trace(
     A DataFrame or dict gives bit for bit what `s2r trace` gives on a CSV of the same numbers. Raises NotEnoughEvidence (too few
     transitions, or no excitation), RecordingError (unreadable, a column is missing), ConfigError, UsageError.
     """
+    check_numbers(dt=dt, max_gb=max_gb)
+    check_numbers(above=0.0, horizon=horizon, bandwidth=bandwidth)
+    check_counts(seed=seed)
+    check_named_numbers(param=param)
     given = as_recording(recording, column, state, input, dbc, max_gb)
     tested = None if test is None else as_recording(test, None, None, None, None, None)
     watcher = watcher_of(progress)

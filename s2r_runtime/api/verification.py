@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from s2r_runtime.api.models import ModelLike, ProfileLike, controller_at, load_checked, profile_model, weights_of
+from s2r_runtime.api.options import check_counts, check_named_numbers, check_numbers
 from s2r_runtime.api.progress import Callback, Watcher, watcher_of
 from s2r_runtime.api.recordings import RecordingLike, recording
 from s2r_runtime.api.results import AFTER, LIMIT, Result, axes_of
@@ -110,6 +111,9 @@ def verify(
     A controller that does not pass gives `passed == False`. Raises ConfigError (profile, model or controller), NotEnoughEvidence (n or the
     campaign is too small), RecordingError, UsageError.
     """
+    check_numbers(radius=radius, hold_radius=hold_radius, headroom=headroom, max_gb=max_gb)
+    check_counts(n=n)
+    check_named_numbers(param=param)
     given = None if recording is None else _sources(recording)
     return verified(
         controller, profile, watcher_of(progress), model=model, radius=radius, recordings=given, hold_radius=hold_radius, headroom=headroom,
