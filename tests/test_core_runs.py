@@ -104,6 +104,8 @@ def test_a_closing_is_unsafe_whatever_the_profile_says_once_the_safety_value_was
     rig.observe((5.0, 0.0, 0.0))
     rig.request("undeploy")
     assert counted(rig) == [("unsafe", "its safety value is below the threshold")]
+    last = of(rig.outputs, EpisodeCounted)[-1]
+    assert (last.index, last.steps, last.safety) == (1, 4, -0.2)
 
 
 def test_a_safety_value_that_recovers_is_judged_at_the_end() -> None:
@@ -173,6 +175,9 @@ def test_the_status_is_of_the_controller_that_drove_last_when_none_drives() -> N
     rig.request("undeploy")
     shown: Any = core.status(rig.state)["runs"]
     assert (shown["controller"], shown["all"]["n"], shown["under_certificate"]) == ("controller", 2, None)
+    rig.deploying("another")
+    shown = core.status(rig.state)["runs"]
+    assert (shown["controller"], shown["all"], shown["under_certificate"]) == ("another", None, None)
 
 
 def test_the_end_of_all_scenarios_is_the_end_of_no_run() -> None:
@@ -217,6 +222,16 @@ def test_what_nobody_can_compute_from_the_log_is_censored() -> None:
     assert counted(rig) == [("censored", "the gate closed: clock_backwards")]
 
 
+def test_a_closing_counts_also_where_no_recovery_command_was_due_before_a_person_ended_the_run() -> None:
+    rig = driving(lockstep=True)
+    rig.feed(RecorderChanged(rig.t, ok=False, detail="disk full"))
+    rig.request("undeploy")
+    assert counted(rig) == [("censored", "the gate closed: recorder_down")]
+    rig = driving(lockstep=True)
+    rig.request("undeploy")
+    assert counted(rig) == [("censored", "a person ended it (undeploy)")]
+
+
 def test_a_run_that_was_taken_over_late_counts_as_censored_where_something_went_wrong_in_it() -> None:
     rig = Rig(beta_episodes=BETA)
     rig.driving()
@@ -238,6 +253,9 @@ def test_a_run_that_a_crash_cut_counts_as_censored_at_the_next_start() -> None:
     assert (counts.limits[0].n, counts.limits[0].censored) == (2, 1)
     assert again.state.memory.open_run is None
     assert of(Rig(again.state.memory, beta_episodes=BETA).outputs, EpisodeCounted) == []
+    without = Rig(memory)
+    assert of(without.outputs, EpisodeCounted) == []
+    assert without.state.memory.open_run == memory.open_run, "it counts when runs are counted again"
 
 
 def test_the_open_run_is_durable_before_the_controller_starts() -> None:
@@ -268,6 +286,12 @@ def test_each_controller_and_each_later_certificate_has_a_share_of_its_own() -> 
     ended(rig)
     second = {run.certificate: run for run in rig.state.memory.runs}
     assert {name: (run.number, run.n) for name, run in second.items()} == {"": (1, 3), "c2": (2, 1)}
+    whole, own = of(rig.outputs, EpisodeCounted)[-1].limits
+    for found in (whole, own):
+        counts = anytime.Counts(found.n, found.unsafe, found.censored)
+        assert (found.lower, found.upper) == anytime.limits(counts, found.beta_lower, found.beta_upper)
+    assert (whole.n, whole.censored, own.n, own.censored) == (3, 1, 1, 0)
+    assert own.beta_upper == pytest.approx(0.25 * whole.beta_upper)
     rig.request("undeploy")
     deployed_again(rig, "another")
     ended(rig)
@@ -326,6 +350,8 @@ def test_a_lower_limit_above_the_profile_s_revokes_and_refuses_until_a_person_cl
     again.observe()
     again.request("deploy", digest="controller")
     assert answers(again)[1][0].exit_code == 1
+    assert runs.refusal(rig.state.memory, Rig().settings, "controller") == "", "a profile without a limit refuses nothing"
+    assert runs.refusal(rig.state.memory, rig.settings, "another") == ""
     again.request("clear", text="unsafe_runs")
     assert of(again.request("deploy", digest="controller"), StartJob)
     assert (again.state.memory.runs, again.state.memory.run_sequences, again.state.memory.runs_cleared) == ((), 1, 1)
@@ -387,7 +413,7 @@ def test_runs_of_before_and_runs_without_a_budget_are_not_counted() -> None:
 def test_the_number_of_controllers_that_are_remembered_is_bounded_and_refused_ones_stay_longest() -> None:
     many = tuple(runs.RunCounts(f"k{i}", "", i + 1, 0.01, 3, exceeded=i == 0) for i in range(runs.CONTROLLERS))
     memory = _replaced(driving().state.memory, runs=many)
-    kept = runs._kept(memory, (runs.RunCounts("new", "", 300, 0.01), runs.RunCounts("new", "c", 300, 0.01)))
+    kept = runs._kept(memory, runs.RunCounts("new", "", 300, 0.01), runs.RunCounts("new", "c", 300, 0.01))
     names = [one.controller for one in kept if not one.certificate]
     assert len(names) == runs.CONTROLLERS
     assert (names[0], names[1], names[-1]) == ("k0", "k2", "new")

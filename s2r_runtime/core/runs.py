@@ -115,7 +115,7 @@ def stopped(turn: Turn, event: SourceStopped) -> None:
         return
     if event.reason == "finished" and run.from_start is None:  # all scenarios are over, and no other one began
         turn.set(run=None)
-    elif event.reason not in ("finished", "stopped", "start_failed") and run.shown:
+    elif event.reason not in ("finished", "stopped") and run.shown:
         turn.set(run=msgspec.structs.replace(run, failed=event.reason))
 
 
@@ -161,16 +161,16 @@ def _cut_by(event: Event) -> str:
 
 
 def _gate_changed(run: Run, output: GateChanged, cut: str) -> Run:
-    closes = run.open and not output.open and run.shown and not cut
-    closed = output.reason if closes and not run.closed and run.from_start is not None and run.took_over else run.closed
+    closes = run.open and not output.open and run.took_over and not cut
+    closed = run.closed or (output.reason if closes else "")
     return msgspec.structs.replace(run, open=output.open, closed=closed, said="" if output.open else run.said or output.reason)
 
 
 def _refused(run: Run, reason: str) -> Run:
-    """The gate rejected a command, for another reason than that it settles."""
-    if not run.shown or (run.from_start is False and not run.took_over):
+    """The gate rejected the controller's first command, for another reason than that it settles. (A later one: the gate closes.)"""
+    if not run.shown or run.from_start is not None:
         return run
-    return msgspec.structs.replace(run, closed=run.closed or reason, from_start=True if run.from_start is None else run.from_start)
+    return msgspec.structs.replace(run, closed=reason, from_start=True)
 
 
 def _sent(run: Run, send: Send, cut: str) -> Run:
@@ -220,20 +220,17 @@ def _outcome(run: Run, settings: Settings, cut: str) -> tuple[Outcome, str]:
 
 
 def _count(turn: Turn, run: Run, outcome: Outcome, reason: str) -> None:
-    """Adds a run to its two sequences. A lower limit above the profile's ends all of the controller's certificates."""
+    """Adds a run to its two sequences. A lower limit above the profile's marks both (`refusal`)."""
     memory, settings = turn.memory, turn.settings
-    found = _sequences(memory, settings, run.controller, run.certificate)
-    newly = False
+    limits = limits_of(memory, run.controller, run.certificate)
     if outcome != "left_out":
-        sequences, whole, own = found
-        after = [_with(one, outcome) for one in (whole, own)]
-        limits = _limits(*after)
-        newly = not whole.exceeded and settings.max_unsafe > 0.0 and any(one.lower > settings.max_unsafe for one in limits)
-        after = [msgspec.structs.replace(one, exceeded=one.exceeded or newly) for one in after]
-        turn.remember_soon(runs=_kept(memory, tuple(after)), run_sequences=sequences)
-    else:
-        limits = limits_of(memory, run.controller, run.certificate)
-    turn.emit(EpisodeCounted(turn.now, run.controller, run.certificate, run.index, run.steps, run.safety, outcome, reason, tuple(limits)))
+        sequences, whole, own = _sequences(memory, settings, run.controller, run.certificate)
+        whole, own = _with(whole, outcome), _with(own, outcome)
+        limits = _limits(whole, own)
+        if settings.max_unsafe > 0.0 and any(one.lower > settings.max_unsafe for one in limits):
+            whole, own = msgspec.structs.replace(whole, exceeded=True), msgspec.structs.replace(own, exceeded=True)
+        turn.remember_soon(runs=_kept(memory, whole, own), run_sequences=sequences)
+    turn.emit(EpisodeCounted(turn.now, run.controller, run.certificate, run.index, run.steps, run.safety, outcome, reason, limits))
 
 
 def _with(one: RunCounts, outcome: Outcome) -> RunCounts:
@@ -262,15 +259,15 @@ def share(beta: float, number: int) -> float:
     return 2.0 * ledger.share(beta, number)
 
 
-def _kept(memory: Memory, newest: tuple[RunCounts, ...]) -> tuple[RunCounts, ...]:
+def _kept(memory: Memory, whole: RunCounts, own: RunCounts) -> tuple[RunCounts, ...]:
     """What is remembered: certificates in force, and the newest controllers."""
-    controller, valid = newest[0].controller, {facts.id for facts in memory.certificates}
-    before = [one for one in memory.runs if one.controller != controller or one.certificate not in {two.certificate for two in newest}]
+    valid = {facts.id for facts in memory.certificates}
+    before = [one for one in memory.runs if one.controller != own.controller or one.certificate not in ("", own.certificate)]
     kept = [one for one in before if not one.certificate or one.certificate in valid]
     while sum(not one.certificate for one in kept) >= CONTROLLERS:
         oldest = min((one for one in kept if not one.certificate), key=lambda one: one.exceeded)
         kept = [one for one in kept if one.controller != oldest.controller]
-    return (*kept, *newest)
+    return (*kept, whole, own)
 
 
 def _find(memory: Memory, controller: str, certificate: str) -> RunCounts | None:
