@@ -6,7 +6,8 @@ by -F arm² w/s. A wheel creeps, or its motor gives way, in proportion to its lo
     v' = v (1 - loss/s),      w' = w (1 - 4 (arm/track)² loss/s),      neither changes its sign
 
 The wheels' measured speeds do not change. The force and kappa act as a product only, so that `loss` is what the castor takes off the
-speed ahead when it runs straight. What a castor does while it swivels after a reversal is not in it.
+speed ahead when it runs straight. Any point that drags over the floor there does the same, such as wheels that skid. What a castor does
+while it swivels after a reversal is not in it.
 """
 
 from __future__ import annotations

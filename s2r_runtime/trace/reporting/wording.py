@@ -108,7 +108,9 @@ _WORDS: dict[str, Callable[[str, Values], str]] = {
     }[p["scheme"]],
     "steering_ratio": lambda what, p: f"the road wheels turn by {_percent(p['ratio'])} of {what}",
     "steering_offset": lambda what, p: f"the road wheels are turned by {math.degrees(p['angle']):.3g} deg where {what} is zero",
-    "castor_drag": lambda what, p: f"a castor {p['arm']:.3g} m behind the axle drags and takes {p['loss']:.3g} m/s off the speed ahead",
+    "castor_drag": lambda what, p: (
+        f"a castor, or a wheel that skids, drags over the floor {p['arm']:.3g} m from the axle and takes {p['loss']:.3g} m/s off the speed"
+    ),
     "link_gravity": lambda what, p: f"gravity pulls the link to {what} = {p['angle']:.3g}",
     "torque_ripple": lambda what, p: f"a force of {p['amplitude']:.3g} repeats with every {p['period']:.3g} of {what}",
     "gear_backlash": lambda what, p: f"after a reversal {what} acts only when the motor has crossed the backlash of its gear",
