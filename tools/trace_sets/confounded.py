@@ -82,7 +82,8 @@ def same_speed(rng: Rng, size: float) -> Drawn:
         missing = Missing("track_scale", "theta", {"gain": 1.0 - min(share, 0.6)})
     else:
         missing = Missing("understeer", "theta", {"coefficient": share * s.plant.parameters["wheel_base"] / v**2})
-    return s, missing, [["track_scale", None], ["understeer", None], ["input_gain", "steer_cmd"]], _columns(s, [_rich(s, 0), _constant(v)])
+    rivals = [["track_scale", None], ["understeer", None], ["input_gain", "steer_cmd"], ["steering_ratio", "steer_cmd"]]
+    return s, missing, rivals, _columns(s, [_rich(s, 0), _constant(v)])
 
 
 def two_values(rng: Rng, size: float) -> Drawn:

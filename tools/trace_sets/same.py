@@ -65,6 +65,9 @@ def groups(plant: Plant) -> list[list[Name]]:
         ]
     if plant.name == "double_integrator":
         return [[("constant_disturbance", "world"), ("gravity_slope", None)]]
+    if plant.name == "bicycle":
+        gain: list[Name] = [("input_gain", "steer_cmd"), ("steering_ratio", "steer_cmd")]
+        return [gain, [("input_bias", "steer_cmd"), ("steering_offset", "steer_cmd")]]
     return []
 
 
