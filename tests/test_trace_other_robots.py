@@ -75,6 +75,11 @@ def test_the_speeds_of_two_wheels_are_not_those_of_a_body(seed):
     found = trace(data, UNICYCLE)
     assert found.verdict == "unexplained"
     assert len(found.partial) > 2
+    assert [e.name for e in found.spec.effects] == [e.name for e in found.partial]
+    assert found.comments()[0].startswith("Partial repair")
+    ends = found.to_json()["partial_error"]["rollout_rms"]
+    assert all(ends[state] < 0.05 * was for state, was in found.to_json()["error"]["before"]["rollout_rms"].items())
+    assert "-o MODEL.toml writes it, marked partial" in " ".join(found.text().split())
 
 
 @pytest.mark.slow

@@ -64,7 +64,11 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     )
     add_daemon_options(verb)
     verb.add_argument(
-        "-o", "--output", type=Path, metavar="MODEL.toml", help="write the repaired model; as it was given, where nothing was found"
+        "-o",
+        "--output",
+        type=Path,
+        metavar="MODEL.toml",
+        help="write the repaired model (marked if partial); as given, where nothing was found",
     )
     verb.add_argument("--report", type=Path, metavar="FILE.html", help="write a self-contained page with plots")
     verb.add_argument("--json", action="store_true", help="print one JSON object")
@@ -149,7 +153,8 @@ def _tell(args: argparse.Namespace, found: Trace, suggested: Suggestion | None, 
         _tell_drive(args.suggest if args.suggest in written else None, suggested)
     if args.output in written:
         changed = found.result.spec.effects != found.ready.chosen.model.spec.effects
-        output.out(f"model written to {args.output}" + ("" if changed else " (unchanged: no effect was added)"))
+        partial = " (a partial repair)" if found.result.repair is not None else ""
+        output.out(f"model written to {args.output}" + (partial if changed else " (unchanged: no effect was added)"))
     if args.report in written:
         output.out(f"report written to {args.report}")
 

@@ -35,7 +35,7 @@ from s2r_runtime.trace.selection.stepwise import Selection
 from s2r_runtime.trace.sensor_faults.detect import Checked
 from s2r_runtime.trace.sensor_faults.fault import Fault
 from s2r_runtime.trace.sensor_faults.pose_latency import late_faults
-from s2r_runtime.trace.verdict import Verdict, asked, final_fit, verdict_of, worth_its_risk
+from s2r_runtime.trace.verdict import Verdict, asked, final_fit, helps, verdict_of, where_measured, worth_its_risk
 
 Array = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ def _with(fit: Fit, ranges: dict[Slot, tuple[float, float]]) -> dict[Slot, tuple
 @dataclass(frozen=True)
 class _Decided:
     """final: the fit that the verdict leaves. before, after: of the model as given and with what was found; floor: rms that noise alone
-    makes of one step and of rollouts, (nx,) each.
+    makes of one step and of rollouts, (nx,) each. repair: of what was found, where the verdict leaves it out and it helps all the same.
     """
 
     verdict: Verdict
@@ -86,6 +86,7 @@ class _Decided:
     before: Judged
     after: Judged
     floor: tuple[Array, Array]
+    repair: Judged | None = None
 
 
 def _decided(dataset: Dataset, checked: Checked, chosen: Selection, structure: Structure, judged_on: Held, seed: int) -> _Decided:
@@ -102,12 +103,13 @@ def _decided(dataset: Dataset, checked: Checked, chosen: Selection, structure: S
         structure = replace(structure, tokens=structure.likeliest or structure.tokens)
     final = final_fit(chosen, verdict)
     told = before if final is nominal else after
+    partial = verdict == "unexplained" and bool(chosen.fit.added) and helps(before, after, where_measured(floor[1], judged_on))
     if verdict == "unexplained":
         level, colour = structure.noise or (chosen.fit.noise, chosen.fit.colour)  # the structure itself is no noise
         floor = at_most_seen(noise_floor(replace(final, noise=level, colour=colour), judged_on, seed), final.model, judged_on, told.ends)
     elif final is not chosen.fit:
         floor = at_most_seen(noise_floor(final, judged_on, seed), final.model, judged_on, told.ends)
-    return _Decided(verdict, final, structure, faults, before, told, floor)
+    return _Decided(verdict, final, structure, faults, before, told, floor, after if partial else None)
 
 
 def _recorded(
@@ -136,10 +138,12 @@ def _recorded(
         for place in _new(fit, final)
     )
     adopted = final if worth_its_risk(chosen, decided.before, decided.after) else chosen.nominal
+    adopted = chosen.fit if decided.repair is not None else adopted
     return TraceResult(
         verdict=verdict,
         effects=effects,
         partial=() if final is chosen.fit else tuple(_found(model, chosen.fit, place, {}) for place in chosen.fit.added),
+        repair=decided.repair,
         ambiguous_with=(
             *ties,
             *(other for place, e in zip(final.added, effects, strict=True) for other in other_names(final.model, place, e)),

@@ -42,7 +42,8 @@ MEASURED = (
 @dataclass(frozen=True)
 class TraceResult:
     """`spec`: the repaired model; the given one, if nothing was added, or if what ties does little here and may do harm elsewhere.
-    `partial`: effects found on the way whose names were withdrawn.
+    `partial`: effects that explain a part only. `repair`: their errors on held-out data, if they lower those of rollouts by 5 % or more;
+    `spec` then has them.
 
     `depends_on`, `share_left`: of what the final model leaves. `floor`: what noise alone makes, (one step, rollout), (nx,) each.
     """
@@ -80,6 +81,7 @@ class TraceResult:
     """Of `depends_on`: what several explanations have in common that tie, or add up to it; one without a name may, too
     (`shared_dependence`).
     """
+    repair: Judged | None = None
     way: Way = field(default_factory=Way)
     """As the dataset's: how inputs went that the recording has samples of."""
     noisy: dict[str, float] = field(default_factory=dict)
@@ -234,6 +236,7 @@ class TraceResult:
                 for e in self.ambiguous_with
             ],
             "partial": [e.to_json() for e in self.partial],
+            "partial_error": None if self.repair is None else self.repair.error(states, self.horizon_s),
             "depends_on": list(self.depends_on),
             "may_depend_on": list(self.may_depend_on),
             "any_shape_of": list(self.any_shape_of),
@@ -278,6 +281,9 @@ class TraceResult:
     def comments(self) -> tuple[str, ...]:
         """For the head of the model's TOML."""
         parts = self.reconstruction is not None and self.reconstruction.in_parts
+        if self.repair is not None:
+            partial = f"Partial repair by s2r trace on {self.source}: these effects lower the error, and more is missing"
+            return (partial, *(e.text() for e in self.partial), f"Fitted or judged where {domain_told(self.domain)}")
         found = () if self.left_as_given else tuple(e.text() for e in self.effects)
         found += (f"Fitted or judged where {domain_told(self.domain)}",) if found else ()
         found += (IN_PARTS,) if parts else ()

@@ -100,8 +100,26 @@ def _explained(r: TraceResult) -> list[str]:
     elif r.any_shape_of:
         lines += labelled("or", _nameless(r))
     if r.partial:
-        lines += ["explains a part only, so no name is lent to it:", *(line for e in r.partial for line in _effect(e))]
+        what = "explains a part, and makes the model better:" if r.repair is not None else "explains a part only, so no name is lent to it:"
+        lines += [what, *(line for e in r.partial for line in _effect(e)), *labelled("repair", _partial_repair(r))]
     return lines
+
+
+def _partial_repair(r: TraceResult) -> list[str]:
+    """Errors at the end of held-out rollouts without and with what explains a part."""
+    if r.repair is None:
+        return []
+    units: dict[str, str] = getattr(r.nominal.nominal, "units", {})
+    ends = zip(r.nominal.states, rms(r.before.ends), rms(r.repair.ends), strict=True)
+    inverted = []
+    if r.before.input_relative is not None and r.repair.input_relative is not None:
+        inverted = [f"input error {_percent(r.before.input_relative)} {ARROW} {_percent(r.repair.input_relative)} of the input's norm"]
+    each = ", ".join(f"{state} {_short(was)} {ARROW} {_short(now)} {units.get(state, '')}".rstrip() for state, was, now in ends)
+    return [
+        f"over {r.horizon_s:.4g} s on held-out data: {each}",
+        *inverted,
+        "-o MODEL.toml writes it, marked partial; no daemon adopts it by itself",
+    ]
 
 
 def _in_place_of(r: TraceResult, e: Found) -> list[str]:
