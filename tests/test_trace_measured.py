@@ -47,6 +47,17 @@ def test_the_delay_of_a_real_robot_is_found_and_its_heading_is_foretold_as_well_
     assert len(found.spec.fitted_on) == 3  # the bytes, what they say, and the rows
 
 
+@recorded("emps_own_step")
+def test_the_same_joint_at_its_own_step_gets_a_partial_repair(tmp_path):
+    found = trace_measured(RECORDINGS["emps_own_step"], FOLDER, tmp_path)
+    friction = {e.name: next(iter(e.parameters.values()))[0] for e in found.partial or found.effects}
+    assert friction["viscous_friction"] == pytest.approx(203.5, rel=0.041)
+    assert friction["coulomb_friction"] == pytest.approx(20.39, rel=0.06)
+    answer = found.to_json()
+    after = answer["partial_error"] or answer["error"]["after"]
+    assert after["rollout_rms"]["q"] < 0.1 * answer["error"]["before"]["rollout_rms"]["q"]
+
+
 @recorded("emps")
 def test_the_friction_of_a_real_joint_is_named_with_the_published_numbers(tmp_path):
     """Published: Coulomb 20.14 and 20.63 N, viscous 166.7 and 240.4 N s/m by direction; relative force error 5.98 % on the pulses."""
