@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import socket
 import subprocess
 import sys
 import time
@@ -171,3 +172,29 @@ def test_the_robots_red_button_stops_everything_and_a_held_button_cannot_be_clea
     assert "emergency_stop" not in rig.status()["reason"]
     assert count >= 1
     rig.stop()
+
+
+def test_bus_off_closes_the_gate_until_a_person_clears_it_though_the_bus_is_back(rig: CanRig) -> None:
+    """The kernel restarts the controller by itself: the robot is heard again, and nothing is driven."""
+    rig.start_robot()
+    rig.start()
+    rig.until(lambda: rig.status()["observation"])
+    with socket.create_connection(("127.0.0.1", rig.hub.port)) as raw:
+        for word in (b"< open r >", b"< rawmode >"):
+            raw.recv(64)
+            raw.sendall(word)
+        raw.recv(64)
+        raw.sendall(b"< error 20000004 >" * 200 + b"< error 20000040 >")
+        rig.until(lambda: "emergency_stop" in rig.status()["latched"])
+    seq = rig.status()["observation"]["seq"]
+    rig.until(lambda: rig.status()["link"] and rig.status()["observation"]["seq"] > seq + 20)
+    assert (rig.status()["gate"], rig.status()["reason"]) == ("closed", "emergency_stop")
+    assert rig.status()["counters"]["bus_off"] == 1
+    assert rig.ask("clear", text="emergency_stop")["exit_code"] == 0
+    assert rig.status()["latched"] == []
+    rig.stop()
+    (stop,) = [m for m in rig.messages("event/override_changed") if isinstance(m, OverrideChanged)]
+    assert stop.detail.startswith("bus-off: the CAN controller left the bus")
+    (log,) = rig.log_files()
+    found = json.loads(rig.s2r("audit", str(log), "--key", str(rig.state / "key.pub"), "--json").stdout)
+    assert (found["ok"], found["first_difference"]) == (True, None), found

@@ -57,20 +57,26 @@ class Inbox:
         self._lock = threading.Lock()
         self._rung = False
         self._second = self._in_second = 0
+        self._vital: Record | None = None
         self.dropped = 0
 
-    def put(self, record: Record, *, ring: bool, per_second: int = 0) -> bool:
+    def put(self, record: Record, *, ring: bool, per_second: int = 0, vital: bool = False) -> bool:
         """From any thread. ring: the daemon is to come now; else it may wait for what comes next. per_second: more records than that, put
-        with such a limit, are dropped at the door (0: no limit). False if this one was.
+        with such a limit, are dropped at the door (0: no limit). vital: it gives way to no other; one at a time. False if this one was
+        dropped.
         """
         with self._lock:
+            if vital and self._vital is not None:
+                self.dropped += 1
+                return False
             if per_second and self._over_rate(record.stamp_ns // 1_000_000_000, per_second):
                 self.dropped += 1
                 return False
             if len(self._waiting) >= self._capacity:
-                self._waiting.popleft()
+                del self._waiting[1 if self._waiting[0] is self._vital and self._capacity > 1 else 0]
                 self.dropped += 1
             self._waiting.append(record)
+            self._vital = record if vital else self._vital
             if self._rung or not (ring or 2 * len(self._waiting) >= self._capacity):
                 return True
             self._rung = True
@@ -82,6 +88,7 @@ class Inbox:
         with self._lock:
             taken = list(self._waiting)
             self._waiting.clear()
+            self._vital = None
             self._rung = False
         return taken
 

@@ -15,7 +15,7 @@ from s2r_can.hearing import Heard, Hearing, field
 from s2r_can.layout import Group, Inbound, Layout
 from s2r_can.odometry import Odometry
 from s2r_can.reckoning import Reckoning
-from s2r_can.records import BUS_OFF, ERROR, HEADER, PAYLOAD_MAX, REMOTE
+from s2r_can.records import BUS_OFF, ERROR, HEADER, PAYLOAD_MAX, REMOTE, STOPS
 from s2r_can.sequence import RobotClock
 from s2r_runtime.messages import Command, LinkChanged, Observation, ObservationRefused, OverrideChanged
 
@@ -26,6 +26,7 @@ SECOND_NS = 1_000_000_000
 FAULTS_PER_SECOND = 32
 AGAIN_NS = SECOND_NS
 """An override that lasts is said again after so long: whoever clears it while the button is held finds it again."""
+LEFT = "bus-off: the CAN controller left the bus"
 COUNTS = ("incomplete", "foreign", "error_frames", "bus_off", "strangers")
 
 
@@ -68,7 +69,7 @@ class Observer:
             if end - at < 14:
                 self._malformed(said, f"{end - at} bytes are no CAN frame")
                 break
-            stamp_ns, key, _, length = unpack(data, at)
+            stamp_ns, key, flags, length = unpack(data, at)
             at += 14
             if length > end - at or length > PAYLOAD_MAX:
                 self._malformed(said, f"a CAN frame claims {length} bytes of payload, {end - at} are there")
@@ -85,7 +86,7 @@ class Observer:
             elif message is not None:
                 self._heard(said, message, payload)
             else:
-                self._other(said, key)
+                self._other(said, key, flags)
         return said
 
     def _heard(self, said: list[Decoded], message: Inbound, payload: bytes) -> None:
@@ -112,14 +113,16 @@ class Observer:
             if group is trigger:
                 self._observe(said, message, heard)
 
-    def _other(self, said: list[Decoded], key: int) -> None:
+    def _other(self, said: list[Decoded], key: int, flags: int) -> None:
         """A frame of nothing that is listened to: an error frame, a command that is not ours, or somebody else's business."""
         if key & ERROR:
             self.counts["error_frames"] += 1
             if key & BUS_OFF and not self.bus_off:
                 self.counts["bus_off"] += 1
                 self.bus_off, self._up = True, False
-                said.append(LinkChanged(self._now_ns, up=False, detail="bus-off: the CAN controller left the bus"))
+                said.append(LinkChanged(self._now_ns, up=False, detail=LEFT))
+            if key & BUS_OFF and flags & STOPS:  # logs of earlier versions have no such flag
+                self._override(said, "emergency_stop", f"{LEFT}: a fault of the wiring, or another node that sends the same identifiers")
         elif key in self._commands:
             self.counts["strangers"] += 1
             self._override(said, "manual_override", f"another node sends {self._commands[key]} on the robot's bus")

@@ -24,7 +24,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from s2r_can.records import ERROR, EXTENDED, FD, INDICATOR, REMOTE, SWITCH, Record
+from s2r_can.records import ERROR, EXTENDED, FD, INDICATOR, PAYLOAD_MAX, REMOTE, SWITCH, Record
 from s2r_runtime.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -152,6 +152,7 @@ class Port:
         while not self._ending.is_set():
             try:
                 message = bus.recv(LISTEN_S)
+                record = None if message is None else self._record(message)
             except Exception:  # bytes that are no frame, or a driver that broke
                 failed += 1
                 self._counts["errors"] += 1
@@ -161,16 +162,19 @@ class Port:
                     self._ending.wait(0.001)
                 continue
             failed, good_at = 0, time.monotonic()
-            if message is None:
+            if message is None or record is None:
                 if _hung_up(bus):
                     raise ConnectionError("the other end closed the connection")
                 continue
-            record = self._record(message)
             if message.is_rx and not self._own(record):
                 self._counts["received"] += 1
                 self._take(record)
 
     def _record(self, message: can.Message) -> Record:
+        """Its record. Raises what a message raises that is no CAN frame, whatever driver made it."""
+        payload = b"" if message.is_remote_frame and not message.is_error_frame else bytes(message.data)
+        if len(payload) > PAYLOAD_MAX:
+            raise ValueError(f"{len(payload)} bytes are no CAN frame")
         now_ns = time.monotonic_ns()
         if self._prompt:  # the kernel stamped it when it came; this thread may be late
             late = time.time() - message.timestamp
@@ -179,12 +183,12 @@ class Port:
         self._last_ns = now_ns = max(now_ns, self._last_ns + 1)
         key = message.arbitration_id & 0x1FFFFFFF
         if message.is_error_frame:
-            return Record(now_ns, key | ERROR, 0, bytes(message.data)[:64])
+            return Record(now_ns, key | ERROR, 0, payload)
         key |= (EXTENDED if message.is_extended_id else 0) | (REMOTE if message.is_remote_frame else 0)
         flags = (
             (FD if message.is_fd else 0) | (SWITCH if message.bitrate_switch else 0) | (INDICATOR if message.error_state_indicator else 0)
         )
-        return Record(now_ns, key, flags, b"" if message.is_remote_frame else bytes(message.data))
+        return Record(now_ns, key, flags, payload)
 
     def _own(self, record: Record) -> bool:
         """Whether this is the echo of a frame that was sent here; each is taken for one once."""

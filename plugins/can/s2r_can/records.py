@@ -2,7 +2,7 @@
 
     stamp_ns  u64   when it came, on the host's monotonic clock; 0 in a frame that was sent
     id        u32   identifier, and SocketCAN's flags: bit 31 extended, 30 remote, 29 error frame
-    flags     u8    1 CAN FD, 2 bit-rate switch, 4 error state indicator
+    flags     u8    1 CAN FD, 2 bit-rate switch, 4 error state indicator, 8 a bus-off that stops the robot until a person clears it
     length    u8    bytes of payload, 0 to 64
     payload
 
@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 HEADER = struct.Struct("<QIBB")
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
-FD, SWITCH, INDICATOR = 1, 2, 4
+FD, SWITCH, INDICATOR, STOPS = 1, 2, 4, 8
 PAYLOAD_MAX = 64
 STAMP_MAX = 1e11
 """s: no log's clock is beyond that."""

@@ -24,7 +24,7 @@ from s2r_can.options import OPTIONS, Options, checked, named
 from s2r_can.port import Port
 from s2r_can.proposals import Proposals
 from s2r_can.reckoning import odometry_of
-from s2r_can.records import ERROR, EXTENDED, Record, packed, records
+from s2r_can.records import BUS_OFF, ERROR, EXTENDED, STOPS, Record, packed, records
 from s2r_runtime.messages import Command, Frame, LinkChanged, Observation
 
 PROPOSALS_PER_SECOND = 32
@@ -55,7 +55,7 @@ class CanTransport:
         self._metronome: Metronome | None = None
         self._due_ns = self._until_ns = 0
         self._encoded: tuple[bytes, int] = (b"", 0)
-        self._unheard = self._copies = self._forwarded = self._proposed = self._heard_ns = 0
+        self._unheard = self._copies = self._forwarded = self._proposed = self._ignored = self._heard_ns = 0
         self._up: bool | None = None
         self._past = dict.fromkeys(("received", "sent", "dropped", "errors", "opened"), 0)
 
@@ -110,6 +110,8 @@ class CanTransport:
         ring = self._ring.get(self._addresses.message(record.key))
         if ring is not None:  # of a stranger's commands some will do
             self._inbox.put(record, ring=ring, per_second=STRANGERS_PER_SECOND if record.key in self._commands else 0)
+        elif record.key & ERROR and record.key & BUS_OFF:  # it follows a storm of other errors, and must not be lost in it
+            self._inbox.put(record._replace(flags=record.flags | STOPS), ring=True, vital=True)
         elif record.key & ERROR:
             self._inbox.put(record, ring=True, per_second=ERRORS_PER_SECOND)
         else:
@@ -124,6 +126,8 @@ class CanTransport:
         if record.key in self._commands:
             self._proposed += 1
             self._others.put(record, ring=True, per_second=PROPOSALS_PER_SECOND)
+        else:
+            self._ignored += 1
 
     def receive(self) -> list[Frame]:
         """What came since the last call, oldest first; never blocks. A frame ends with what makes an observation."""
@@ -246,6 +250,7 @@ class CanTransport:
             "copies": self._copies,
             "proposals": self._proposed,
             "proposals_dropped": self._others.dropped,
+            "ignored": self._ignored,
             "forwarded": self._forwarded,
             "interface_errors": totals["errors"],
             "opened": totals["opened"],
