@@ -246,6 +246,31 @@ def test_forged_logs_hide_none_of_the_robots_own(tmp_path: Path, how: str) -> No
     assert [path.name for path in past.campaign_logs(logs, "rig", 1)] == ["rig-20260101T000000Z.mcap"]
 
 
+@pytest.mark.parametrize("how", FORGED[:3])
+@pytest.mark.parametrize("claim", [0, 10**12], ids=["older", "newer"])
+def test_a_foreign_first_part_makes_a_run_neither_older_nor_newer(tmp_path: Path, how: str, claim: int) -> None:
+    """The run's own first part is gone, and its second one has its number."""
+    for number in range(past.RUNS + 1):
+        log(tmp_path, OLDER["an attempt"], stamp=f"2025010{number + 1}T000000Z", number=number + 1)
+    run, number = "rig-20260101T000000Z", past.RUNS + 2
+    writer = Writer(tmp_path / f"{run}.mcap", run=run, signer=KEY, metadata={past.NUMBER: str(number)}, timed=False, rotate_bytes=1)
+    for memory in (OLDER["an attempt"], NOW):
+        writer.write(Persist(1, memory), 1)
+        writer.durable()
+    writer.close()
+    first, *rest = writer.parts
+    assert rest
+    first.unlink()
+    forged(tmp_path, how, OLDER["an attempt"]).rename(first)
+    if claim == 0:
+        old = b"%d" % 10**12
+        first.write_bytes(first.read_bytes().replace(old, b"0" * len(old)))
+    logs = past.Logs(tmp_path, "rig", [PUBLIC])
+    assert logs.next_number == number + 1
+    assert next(logs.runs())[0] == rest[0]
+    assert reconciled(OLDER["an attempt"], tmp_path)[0] == NOW
+
+
 def test_runs_whose_clock_was_ahead_hide_none_that_came_after_them(tmp_path: Path) -> None:
     for number in range(past.RUNS + 1):
         log(tmp_path, OLDER["the whole budget"], stamp=f"2096010{number + 1}T000000Z", number=number + 1)

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+from bisect import insort
 from collections.abc import Callable, Collection, Iterable, Iterator
 from itertools import count, islice, takewhile
 from pathlib import Path
@@ -62,27 +63,47 @@ class Logs:
             if name := _NAME.fullmatch(path.name.removeprefix(robot)):
                 found.setdefault((name[1], int(name[2] or 1)), []).append((int(name[3] or 1), path))
         runs = [(began, [path for _, path in sorted(parts)]) for began, parts in found.items()]
-        self._runs = sorted(((_number(parts[0]), began, parts) for began, parts in runs), reverse=True)
+        self._runs = sorted((max(map(_number, parts)), began, parts) for began, parts in runs)
+        self._counted: dict[Path, bool] = {}
 
     @property
     def next_number(self) -> int:
         """One more than the highest of those that count."""
-        return next((number + 1 for number, _, parts in self._runs if any(map(self._counts, parts))), 1)
+        return next((number + 1 for number, _ in self._newest_first()), 1)
+
+    def _newest_first(self) -> Iterator[tuple[int, list[Path]]]:
+        """Number and parts of each run, by the number of its first part that is this robot's own: what a foreign one in its place claims
+        makes it neither newer nor older.
+        """
+        pending = self._runs.copy()
+        while pending:
+            most, began, parts = pending.pop()
+            own = next(filter(self._counts, parts), None)
+            number = -1 if own is None else _number(own)
+            if number == most:
+                yield number, parts
+            elif own is not None:
+                insort(pending, (number, began, parts))
 
     def runs(self) -> Iterator[list[Path]]:
         """The files of each run that are this robot's own, part by part; the newest run first."""
-        for _, _, parts in self._runs:
-            if own := list(filter(self._counts, parts)):
-                yield own
+        for _, parts in self._newest_first():
+            yield list(filter(self._counts, parts))
 
     def ends(self) -> Iterator[tuple[Memory, Path]]:
         """What each run ends with, and where it says so, the newest first."""
-        for _, _, parts in self._runs:
+        for _, parts in self._newest_first():
             found = _last_memory(filter(self._counts, reversed(parts)))
             if found is not None and found[0].robot == self._robot:
                 yield found
 
     def _counts(self, path: Path) -> bool:
+        """See `_is_own`; each file is looked at once."""
+        if path not in self._counted:
+            self._counted[path] = self._is_own(path)
+        return self._counted[path]
+
+    def _is_own(self, path: Path) -> bool:
         """Whether the file begins with a seal by one of the keys, and is of the run that its name says. Nothing else in it is checked."""
         try:
             reading = Reading(path)
