@@ -16,7 +16,7 @@ from typing import Any
 import can
 import pytest
 from s2r_can.inbox import Bell, Inbox
-from s2r_can.records import BUS_OFF, ERROR, FD_LENGTHS, Record, records
+from s2r_can.records import BUS_OFF, ERROR, FD_LENGTHS, STOPS, Record, records
 from s2r_can.testing import SocketRig, VirtualRig
 from s2r_can.transport import ERRORS_PER_SECOND, CanTransport
 
@@ -99,7 +99,7 @@ def test_bus_off_in_a_log_of_before_is_a_lost_link_as_it_was_then() -> None:
 
 def test_bus_off_does_not_give_way_to_a_flood_and_a_flood_of_them_is_one() -> None:
     inbox = Inbox(Bell(), 4)
-    left = Record(5, BUS_OFF | ERROR, b"")
+    left = Record(5, BUS_OFF | ERROR, STOPS, b"")
     for k in range(3):
         inbox.put(Record(k, 7, 0, b""), ring=False)
     taken = [inbox.put(left, ring=True, vital=True) for _ in range(100)]
