@@ -129,3 +129,26 @@ def stopped(rig: Ros2Rig) -> None:
 
 def _first(x: object) -> float:
     return float(x["x"] if isinstance(x, dict) else x[0])  # type: ignore[index]
+
+
+@pytest.mark.slow
+def test_flood_of_nonsense_on_the_pose_topic_holds_the_loop_no_longer_than_it_may_and_latches(rig: Ros2Rig) -> None:
+    """By another publisher on the robot's side, up to the longest message. Nothing is driven until a person clears it."""
+    rig.start_robot()
+    rig.start("--held", str(rig.folder / "held"))
+    rig.until(lambda: (seen := rig.status()["observation"]) and not seen["fault"])
+    stranger = Node(rig.layout, "odometry", "twist", connect=rig.near)
+    try:
+        end = time.monotonic() + 3.0
+        while time.monotonic() < end:
+            for size in (0, 700, 300_000):
+                stranger.session.put(stranger.pose_key, bytes(size))
+            time.sleep(0.001)
+        rig.until(lambda: "observation_faults" in rig.status()["latched"])
+    finally:
+        stranger.close()
+    seq = rig.status()["observation"]["seq"]
+    rig.until(lambda: rig.status()["observation"]["seq"] > seq + 5)
+    assert rig.status()["gate"] == "closed"
+    assert rig.stop() == 0
+    assert max(json.loads((rig.folder / "held").read_text()).values()) < 0.02

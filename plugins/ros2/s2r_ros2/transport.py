@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from s2r_zenoh.sessions import Doorbell, Inbox, allow, session_config
 
-from s2r_ros2.cdr import Malformed
+from s2r_ros2.cdr import PAYLOAD_MAX, Malformed
 from s2r_ros2.commander import Commander
 from s2r_ros2.graph import declare, rules
-from s2r_ros2.inboxes import PER_SECOND, Ears, Mail
+from s2r_ros2.inboxes import PER_SECOND, POSE_MAX, Ears, Mail, Stops
 from s2r_ros2.keys import opened
 from s2r_ros2.observer import Observer
 from s2r_ros2.options import MEANINGS, Options, checked
@@ -50,10 +50,11 @@ class Ros2Transport:
         self._observer = Observer(self._options)
         self._commander = Commander(self._options, inputs, self._observer)
         self._bell = Doorbell()
-        self._poses = Mail(self._bell, self._options.queue)
+        longest = PAYLOAD_MAX if self._options.pose == "tf" else POSE_MAX
+        self._poses = Mail(self._bell, self._options.queue, longest=longest)
         self._proposals = Mail(self._bell, PER_SECOND, PER_SECOND)
         self._strangers = Ears(self._bell)
-        self._overrides = {kind: Mail(self._bell, OVERRIDES_WAITING) for kind in self._options.overrides}
+        self._overrides = {kind: Stops(self._bell, OVERRIDES_WAITING, longest=POSE_MAX) for kind in self._options.overrides}
         self._wanted = self._options.child_frame.lstrip("/").encode() if self._options.pose == "tf" else b""
         self._sessions: list[zenoh.Session] = []
         self._tokens: list[zenoh.LivelinessToken] = []
