@@ -75,8 +75,17 @@ def test_running_capital_is_no_more_than_one_in_expectation_whatever_the_past_de
 def test_the_limit_is_where_the_capital_reaches_the_threshold() -> None:
     x = (np.random.default_rng(2).random(60) < 0.7).astype(np.float64)
     limit = float(lower_limit(x, 0.0, 0.05, 0.0, 1.0))
-    assert max(slow_capital(list(x), [0.0] * 60, limit - 1e-6, MEAN_BETS)) >= 20.0
-    assert max(slow_capital(list(x), [0.0] * 60, limit + 1e-6, MEAN_BETS)) < 20.0
+    assert slow_capital(list(x), [0.0] * 60, limit - 1e-6, MEAN_BETS)[-1] >= 20.0
+    assert slow_capital(list(x), [0.0] * 60, limit + 1e-6, MEAN_BETS)[-1] < 20.0
+
+
+def test_limits_from_before_a_change_do_not_outlive_it() -> None:
+    """Forty successes, then forty failures: whoever looks now sees limits on either side of the mean of both."""
+    x = np.repeat([1.0, 0.0], 40)
+    before = float(lower_limit(x[:40], 0.0, 0.05, 0.0, 1.0))
+    low, high = float(lower_limit(x, 0.0, 0.05, 0.0, 1.0)), 1.0 - float(lower_limit(1.0 - x, 0.0, 0.05, 0.0, 1.0))
+    assert low < 0.5 < high
+    assert low < before - 0.3
 
 
 def test_no_limit_is_better_than_the_exact_one_for_a_fixed_number() -> None:

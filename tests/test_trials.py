@@ -348,3 +348,96 @@ def test_both_bounds_of_trials_keep_their_confidence() -> None:
     for count in missed:
         assert clopper_pearson_lower(int(count), repetitions, 1e-3) <= beta
     assert missed[1] > 0.5 * beta * repetitions
+
+
+def test_a_controller_before_and_after_an_update_is_compared_run_by_run(driven: Rig) -> None:
+    """The same logs on both sides: every scenario has its partner, and nothing is shown."""
+    logs = [str(path) for path in driven.log_files()]
+    sides = [*(word for path in logs for word in ("--a-log", path)), *(word for path in logs for word in ("--b-log", path))]
+    done = driven.s2r("compare", "controller.py", "controller.py", "--profile", "rig.toml", "--json", *sides)
+    found = json.loads(done.stdout)
+    counted = json.loads(trials_of(driven).stdout)
+    assert (done.returncode, found["answer"]) == (3, "undecided")
+    assert found["n"] == found["agree"] == counted["n"]
+    assert found["a"] == pytest.approx(1.0 - counted["unsafe"] / counted["n"])
+    assert found["pair"] == "scenario"
+    one = driven.s2r("compare", "controller.py", "controller.py", *logs, "--profile", "rig.toml")
+    assert (one.returncode, "are one controller: say which logs are before" in one.stderr) == (2, True)
+
+
+@pytest.mark.slow
+def test_runs_in_logs_are_compared_by_the_safety_value_too(driven: Rig) -> None:
+    logs = [str(path) for path in driven.log_files()]
+    sides = [*(word for path in logs for word in ("--a-log", path)), *(word for path in logs for word in ("--b-log", path))]
+    values = driven.s2r(
+        "compare", "controller.py", "controller.py", "--profile", "rig.toml", "--json", "--score", "safety", "--range", "-1", "1", *sides
+    )
+    assert json.loads(values.stdout)["a"] == pytest.approx(np.mean([run.safety for run, _ in found_in(driven, digest_in(driven)).counted]))
+
+
+def digest_in(rig: Rig) -> str:
+    return load(rig.folder / "controller.py").digest
+
+
+# ---------------------------------------------------------------- with simulation
+
+
+@pytest.mark.slow
+def test_runs_are_rolled_out_again_in_their_own_scenarios(driven: Rig) -> None:
+    done = driven.s2r("trials", "controller.py", *map(str, driven.log_files()), "--profile", "rig.toml", "--json", "--simulate", "4")
+    found = json.loads(done.stdout)
+    simulated = found["simulated"]
+    safe = 1.0 - found["unsafe"] / found["n"]
+    assert (simulated["score"], simulated["rollouts"], simulated["law"], simulated["radius"]) == ("safe", 4, "uniform", 0.0)
+    assert simulated["mean"]["n"] == simulated["optimism"]["n"] == found["n"]
+    assert simulated["mean"]["lower"] <= safe <= simulated["mean"]["upper"]
+    assert simulated["optimism"]["lower"] <= simulated["optimism"]["mean"] <= simulated["optimism"]["upper"]
+    assert "Mean with simulation (G11)." in found["statement"]
+    assert "Optimism (G12)." in found["statement"]
+
+
+@pytest.mark.slow
+def test_the_model_is_exact_where_its_rollouts_repeat_the_runs(driven: Rig) -> None:
+    """The rig's robot is the model with little noise: in the run's own scenario it turns as far, in another one as well."""
+    arguments = ("--profile", "rig.toml", "--json", "--simulate", "2", "--score", "safety", "--range", "-1", "1")
+    found = json.loads(driven.s2r("trials", "controller.py", *map(str, driven.log_files()), *arguments).stdout)
+    counted = found_in(driven, digest_in(driven)).counted
+    simulated = found["simulated"]
+    assert simulated["optimism"]["mean"] == pytest.approx(0.0, abs=0.25)
+    real = np.mean([run.safety if not run.closed else -1.0 for run, _ in counted])
+    assert simulated["mean"]["lower"] <= real <= simulated["mean"]["upper"]
+    assert [run.states[0] for run, _ in counted] == [run.start for run, _ in counted]
+    again = json.loads(driven.s2r("trials", "controller.py", *map(str, driven.log_files()), *arguments).stdout)
+    assert again["simulated"] == simulated
+
+
+def test_what_is_rolled_out_needs_a_number_of_rollouts(driven: Rig) -> None:
+    done = driven.s2r("trials", "controller.py", *map(str, driven.log_files()), "--profile", "rig.toml", "--radius", "0.1")
+    assert (done.returncode, "go with --simulate M" in done.stderr) == (2, True)
+
+
+@pytest.mark.slow
+def test_a_profile_that_demands_a_limit_of_the_optimism_gets_no_certificate_without_it(driven: Rig) -> None:
+    (log,) = map(str, driven.log_files())
+    text = driven.profile.read_text()
+    start = ("certify", "controller.py", "--recording", log, "--key", "own.pem", "-o", "demanding.cert", "--json")
+    assert (driven.folder / "own.pem").exists() or driven.s2r("keys", "new", "own.pem").returncode == 0
+    for most, more, code, line in (
+        (0.9, (), 3, "nothing is known of the model's optimism on this task"),
+        (0.01, ("--trials", log), 3, "is shown to exceed the robot's by at most"),
+        (0.99, ("--trials", log), 0, ""),
+    ):
+        demanding = (
+            text + f"\n[verification]\nmax_optimism = {most}\n"
+            if "[verification]" not in text
+            else text.replace("[verification]", f"[verification]\nmax_optimism = {most}")
+        )
+        (driven.folder / "demanding.toml").write_text(demanding)
+        assert load_profile(driven.folder / "demanding.toml").digest() != load_profile(driven.profile).digest()
+        done = driven.s2r(*start, "--profile", "demanding.toml", *more)
+        assert done.returncode == code, done.stdout + done.stderr
+        assert line in done.stderr
+        assert ("no attempt was spent" in done.stderr) == (code == 3)
+    signed = json.loads((driven.folder / "demanding.cert").read_bytes())["certificate"]
+    assert signed["trials"]["simulated"]["rollouts"] == 20
+    assert any(one.startswith("Optimism (G12).") for one in signed["shown"])

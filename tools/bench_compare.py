@@ -277,15 +277,17 @@ def half_width(real: Array, simulated: Array, p: float, n: int, *, alone: bool) 
     return float(np.mean(high - low) / 2.0)
 
 
-def runs_for(half: float, p: float, rho: float, repetitions: int, rng: np.random.Generator) -> int:
-    """Runs after which the mean half-width is `half`: binary outcomes of probability p, a binary simulator of correlation rho."""
-    guess = int(12.0 * p * (1.0 - p) * max(1.0 - rho**2, 0.4) / half**2)
-    real = (rng.random((repetitions, guess)) < p).astype(np.float64)
-    copied = rng.random(real.shape) < rho
-    simulated = np.where(copied, real, (rng.random(real.shape) < p).astype(np.float64))
-    n = guess // 2
+def runs_for(half: float, p: float, rho: float, uniform: Array) -> int:
+    """Runs after which the mean half-width is `half`: binary outcomes of probability p, a binary simulator of correlation rho.
+
+    uniform: (3, R, n), the same for every rho.
+    """
+    real = (uniform[0] < p).astype(np.float64)
+    simulated = np.where(uniform[1] < rho, real, (uniform[2] < p).astype(np.float64))
+    n = int(real.shape[1] * (1.0 - rho**2)) // 2
     for _ in range(6):
-        following = min(max(round(n * (half_width(real, simulated, p, n, alone=rho == 0.0) / half) ** 2), 20), guess)
+        following = round(n * (half_width(real, simulated, p, n, alone=rho == 0.0) / half) ** 2)
+        following = min(max(following, 20), real.shape[1])
         if abs(following - n) <= 0.003 * n:
             return following
         n = following
@@ -311,11 +313,12 @@ def widths(repetitions: int, rng: np.random.Generator) -> list[dict[str, float]]
     """Runs with a simulator over (1 - rho^2) times those without, and the least ratio that a bet can reach."""
     found = []
     for p, half in WIDTHS:
-        alone, slowest = runs_for(half, p, 0.0, repetitions, rng), {}
+        uniform, slowest = rng.random((3, repetitions, int(12.0 * p * (1.0 - p) / half**2))), {}
+        alone = runs_for(half, p, 0.0, uniform)
         for rho in (0.0, *CORRELATIONS):
             slowest[rho] = sum(1.0 / growth(p, rho, p + side * half) for side in (-1.0, 1.0))
         for rho in CORRELATIONS:
-            n, formula = runs_for(half, p, rho, repetitions, rng), 1.0 - rho**2
+            n, formula = runs_for(half, p, rho, uniform), 1.0 - rho**2
             best = slowest[rho] / (slowest[0.0] * formula)
             found.append({"p": p, "half_width": half, "rho": rho, "alone": alone, "runs": n, "ratio": n / (alone * formula), "best": best})
     return found

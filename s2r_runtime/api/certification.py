@@ -16,13 +16,16 @@ from s2r_runtime.api.options import check_named_numbers, check_numbers
 from s2r_runtime.api.progress import Callback, Watcher, watcher_of
 from s2r_runtime.api.recordings import RecordingLike, recording
 from s2r_runtime.api.spelling import front_door
+from s2r_runtime.api.trials import Rollouts, trials_of
 from s2r_runtime.api.verification import Verified, gap_of, load_recordings, run_verification, verification_lines
-from s2r_runtime.errors import ConfigError, UsageError
+from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.evidence.bounds import attempt_beta, epoch_beta
+from s2r_runtime.evidence.scores import SAFE
 from s2r_runtime.evidence.verify import verification_json
 from s2r_runtime.messages import Gap, Trials, Tries, Verification
 from s2r_runtime.profile import Profile
 from s2r_runtime.trust import keys, offline_ledger
+from s2r_runtime.trust.certificate import optimism_lack
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -30,6 +33,12 @@ if TYPE_CHECKING:
     from s2r_runtime.controllers.file import ControllerFile
     from s2r_runtime.models.composed import ComposedModel
     from s2r_runtime.recordings.tables import Source
+
+
+ROLLOUTS = 20
+"""Of each run in its scenario, and the same number in fresh ones, where the profile demands a limit of the model's optimism. The variance
+of their means is then a twentieth of one rollout's.
+"""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -86,6 +95,7 @@ def certify(
     recording: RecordingLike,
     output: str | Path,
     trials: Sequence[str | Path] | str | Path = (),
+    simulate: int = 0,
     model: ModelLike | None = None,
     key: str | Path | None = None,
     param: Mapping[str, float] | None = None,
@@ -95,8 +105,9 @@ def certify(
     """Gap, verification and signature: a certificate for this controller. Every call spends an attempt of the key's budget.
 
     controller, profile, model, param, max_gb, progress: as `s2r.verify`. recording: a campaign, or drives for which the profile states an
-    assumption. output: where the certificate goes. trials: logs of closed-loop runs of this controller. key: the signing key (default:
-    the user's; `s2r keys new` makes one).
+    assumption. output: where the certificate goes. trials: logs of closed-loop runs of this controller. simulate: roll each of them
+    out this number of times, and in fresh scenarios (default: 20 where the profile demands `max_optimism`, else 0). key: the signing key
+    (default: the user's; `s2r keys new` makes one).
 
     A controller that does not pass gives `passed == False`, and no file. Raises UsageError where `output` cannot be written (with the
     attempt spent, if that shows only at the end), ConfigError (profile, key, ledger, a log that does not hold), NotEnoughEvidence.
@@ -105,8 +116,8 @@ def certify(
     check_named_numbers(param=param)
     logs = [trials] if isinstance(trials, str | Path) else list(trials)
     found = certified(
-        Path(controller), profile, _sources(recording), Path(output), watcher_of(progress), trials=[Path(log) for log in logs], model=model,
-        key=None if key is None else Path(key), param=param or {}, max_gb=max_gb,
+        Path(controller), profile, _sources(recording), Path(output), watcher_of(progress), trials=[Path(log) for log in logs],
+        simulate=simulate, model=model, key=None if key is None else Path(key), param=param or {}, max_gb=max_gb,
     )  # fmt: skip
     if found.trouble:
         raise UsageError(f"{found.trouble}; attempt {found.verification.attempt} passed and is spent")
@@ -121,6 +132,7 @@ def certified(
     watcher: Watcher,
     *,
     trials: Sequence[Path],
+    simulate: int = 0,
     model: ModelLike | None,
     key: Path | None,
     param: Mapping[str, float],
@@ -140,10 +152,12 @@ def certified(
     signing = keys.load(key_path)
     file = controller_at(controller, param)
     found, digest = load_recordings(recordings, composed, loaded, watcher, max_gb)
-    runs = trials_of(trials, file, composed, loaded, watcher) if trials else None
     ledger, beta = offline_ledger.open_ledger(key_path, loaded.robot.name), loaded.guarantee.beta
     epoch = ledger.epoch_for(digest, composed.spec.digest(), loaded.digest())
     gap, assumption, period = gap_of(found, composed, loaded, beta=epoch_beta(beta, epoch), epoch=epoch)
+    runs = _trials(trials, simulate, file, composed, loaded, gap, watcher)
+    if lack := optimism_lack(loaded, runs):
+        raise NotEnoughEvidence(f"no certificate: {lack}; no attempt was spent")
     attempt = ledger.spend_attempt(file.digest, epoch=epoch)
     result, behaviour = run_verification(
         file,
@@ -169,33 +183,15 @@ def certified(
     return Certification(result, gap, runs, tries, epoch, beta, ledger.spent(beta), output, written, trouble)
 
 
-def trials_of(
-    logs: Sequence[Path],
-    controller: ControllerFile,
-    model: ComposedModel,
-    profile: Profile,
-    watcher: Watcher,
-    *,
-    n: int = 0,
-    beta: float | None = None,
-) -> Trials:
-    """The controller's runs in these logs, which are audited first. Raises ConfigError for a log that does not hold."""
-    from s2r_runtime.audit.log import audit
-    from s2r_runtime.evidence import trials
-    from s2r_runtime.plugins import registry
-
-    with watcher.phase("auditing") as report:
-        result = audit(list(logs), progress=report)
-    if not result.ok:
-        first = result.first_difference
-        lacks = [*(f"{one} was not given" for one in result.incomplete), *result.unchecked]
-        what = first.what if first is not None else "; ".join(lacks) or f"the chain is {result.chain}"
-        raise ConfigError(f"{', '.join(map(str, logs))}: does not hold, so no trials are taken from it: {what} (s2r audit says more)")
-    task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
-    digests = {"controller_digest": controller.digest, "model_digest": model.spec.digest()}
-    found = trials.read_runs(logs, profile, task, **digests)
-    share = beta or profile.guarantee.beta
-    return trials.trials(found, **digests, task_digest=profile.task_digest(), beta=share, fixed=n)
+def _trials(
+    logs: Sequence[Path], simulate: int, controller: ControllerFile, model: ComposedModel, profile: Profile, gap: Gap, watcher: Watcher
+) -> Trials | None:
+    """The controller's runs, with rollouts at the gap's radius under `uniform`, the disturbance model that flatters it most."""
+    if not logs:
+        return None
+    number = simulate or (ROLLOUTS if profile.verification.max_optimism < 1.0 else 0)
+    rollouts = Rollouts(number, gap.radius, "uniform", SAFE, model) if number else None
+    return trials_of(logs, controller, model, profile, watcher, rollouts=rollouts)
 
 
 def _write(

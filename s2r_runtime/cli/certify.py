@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import add_limit, pairs
+from s2r_runtime.cli.choices import add_limit, count, pairs
 from s2r_runtime.cli.evidence import print_verification
 from s2r_runtime.errors import UsageError
 
@@ -28,6 +28,13 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     verb.add_argument(
         "--trials", type=Path, action="append", default=[], metavar="LOG", help="closed-loop runs of it, from this log; may be repeated"
     )
+    verb.add_argument(
+        "--simulate",
+        type=count,
+        default=0,
+        metavar="M",
+        help="with --trials: roll each run out M times, as in s2r trials (default: 20 where the profile demands max_optimism, else 0)",
+    )
     verb.add_argument("--model", metavar="MODEL.toml", help="a repaired model instead of the profile's")
     verb.add_argument("--key", type=Path, metavar="FILE", help="signing key (default: the user's; make one with s2r keys new)")
     verb.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the controller; may be repeated")
@@ -47,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
         args.output,
         output.Terminal(),
         trials=args.trials,
+        simulate=args.simulate,
         model=args.model,
         key=args.key,
         param=pairs(args.param, "--param"),

@@ -13,6 +13,7 @@ from s2r_runtime.recordings.units import number_of
 if TYPE_CHECKING:
     from s2r_runtime.api.models import Chosen
     from s2r_runtime.api.recordings import Recording
+    from s2r_runtime.evidence.scores import Score
 
 
 def add_model_options(verb: argparse.ArgumentParser) -> None:
@@ -47,6 +48,26 @@ def add_dbc(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--dbc", type=Path, metavar="FILE", help="of a CAN log: the file that says what its frames mean (DBC, KCD, SYM, ARXML)"
     )
+
+
+def add_score_options(verb: argparse.ArgumentParser) -> None:
+    """--range, --better. Which score it is, the verb's own option says."""
+    verb.add_argument(
+        "--range", type=number, nargs=2, metavar=("LOW", "HIGH"), help="range of the score, fixed before the runs (default: 0 1)"
+    )
+    verb.add_argument("--better", choices=("high", "low"), default="high", help="which end of the range is the good one (default: high)")
+
+
+def score_of(args: argparse.Namespace, name: str) -> Score:
+    """The score of --range and --better. Raises UsageError for a range that is empty."""
+    from s2r_runtime.evidence.scores import SAFE, Score
+
+    if name == SAFE.name:
+        if args.range or args.better != "high":
+            raise UsageError("--range and --better go with another score than safe, which is 1 for a safe run and 0 for another")
+        return SAFE
+    low, high = args.range or (0.0, 1.0)
+    return Score(name, low, high, args.better)
 
 
 def add_signal_options(verb: argparse.ArgumentParser) -> None:
@@ -103,6 +124,14 @@ def probability(text: str) -> float:
     if not 0.0 < value < 1.0:
         raise argparse.ArgumentTypeError(f"{text} must be between 0 and 1")
     return value
+
+
+def number(text: str) -> float:
+    """argparse type: a number."""
+    try:
+        return number_of(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
 
 
 def positive(text: str) -> float:

@@ -40,6 +40,7 @@ GROUPS: dict[str, dict[str, Verb]] = {
         ),
         "certify": Verb("certify", "gap + verify + sign: a certificate for this controller from a recorded campaign"),
         "trials": Verb("trials_verb", "closed-loop runs of a controller on the robot, from its logs, and what they show"),
+        "compare": Verb("compare_verb", "whether controller B is worse than controller A on the robot, from paired runs"),
     },
     "look at a log": {
         "audit": Verb("log_verbs", "recompute every number and every decision from the log alone"),

@@ -24,6 +24,7 @@ from s2r_runtime.daemon.worker import (
     Model,
     ModelJob,
     Result,
+    SimulateJob,
     SynthesisJob,
     TraceJob,
     VerifyJob,
@@ -62,6 +63,8 @@ def run(job: Job, progress: Progress) -> Result:
             return Result(inputs=inputs(job))
         case SynthesisJob():
             return synthesize(job, progress)
+        case SimulateJob():
+            return simulate(job, progress)
 
 
 def opened(raw: msgspec.Raw, kind: Any, what: str) -> Any:
@@ -188,7 +191,7 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
     return Result(verification=result, safety=safety, behaviour=behaviour)
 
 
-def _asked(job: VerifyJob | SynthesisJob) -> tuple[ComposedModel, Task, GapSet]:
+def _asked(job: VerifyJob | SynthesisJob | SimulateJob) -> tuple[ComposedModel, Task, GapSet]:
     """The model and task of the job's profile, and the disturbances that it names."""
     from s2r_runtime.evidence.uncertain import GapSet
     from s2r_runtime.models.composed import compose
@@ -227,6 +230,29 @@ def synthesize(job: SynthesisJob, progress: Progress) -> Result:
             progress=progress,
         )
     return Result(synthesis=found)
+
+
+def simulate(job: SimulateJob, progress: Progress) -> Result:
+    """Rollouts in the scenarios of logged runs; the controller answers from a confined process, as in a verification."""
+    from s2r_runtime.controllers.batches import BatchController
+    from s2r_runtime.evidence.simulated_runs import roll_out_logged
+
+    model, task, gap_set = _asked(job)
+    with BatchController(job.controller, len(model.inputs)) as control:
+        found = roll_out_logged(
+            control,
+            task,
+            model,
+            gap_set,
+            job.law,
+            job.scenarios,
+            score=job.score,
+            threshold=job.profile.verification.threshold,
+            rollouts=job.rollouts,
+            seed=job.seed,
+            progress=lambda done, total: progress(done, total, job.law),
+        )
+    return Result(simulated=found)
 
 
 def inputs(job: InputsJob) -> GivenInputs:

@@ -22,6 +22,7 @@ from s2r_runtime.controllers.processor import family, used
 from s2r_runtime.daemon.given_inputs import GivenInputs
 from s2r_runtime.daemon.settings import ModelFacts
 from s2r_runtime.errors import S2RError, one_line
+from s2r_runtime.evidence.logged_scenarios import LoggedScenario, SimulatedScores
 from s2r_runtime.files.printable import printable_lines
 from s2r_runtime.messages import CertificateFacts, Gap, SampleTaken, Stretch, Verification
 from s2r_runtime.modelspec import COMPACT, ModelSpec
@@ -132,6 +133,21 @@ class SynthesisJob(msgspec.Struct, frozen=True, tag="synthesis"):
     number: int
 
 
+class SimulateJob(msgspec.Struct, frozen=True, tag="simulate"):
+    """Roll a controller out in the scenarios of logged runs, and in fresh ones from their starts (offline only). score: `trials.SCORES`."""
+
+    profile: Profile
+    controller: ControllerFile
+    gap: Gap
+    radius: float
+    hold_radius: float
+    law: str
+    scenarios: tuple[LoggedScenario, ...]
+    score: str
+    rollouts: int
+    seed: int
+
+
 class Brought(msgspec.Struct, frozen=True):
     """A certificate that a person brought: what the core is to know of it, or `problem`. signer: the key that stands in it.
     untrusted: nothing but its key is wrong.
@@ -154,7 +170,7 @@ class Model(msgspec.Struct, frozen=True):
     toml: str
 
 
-Job = LoadJob | ModelJob | GapJob | VerifyJob | TraceJob | InputsJob | SynthesisJob
+Job = LoadJob | ModelJob | GapJob | VerifyJob | TraceJob | InputsJob | SynthesisJob | SimulateJob
 
 
 class Progress(msgspec.Struct, frozen=True, tag="progress"):
@@ -178,6 +194,7 @@ class Result(msgspec.Struct, frozen=True, tag="result"):
     model: Model | None = None
     inputs: GivenInputs | None = None
     synthesis: Synthesis | None = None
+    simulated: SimulatedScores | None = None
 
 
 class Failed(msgspec.Struct, frozen=True, tag="failed"):

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.evidence.betting import COMPARISON_BETS, log_capital, lower_limit
 from s2r_runtime.evidence.bounds import check_probability
+from s2r_runtime.evidence.scores import Score
 from s2r_runtime.evidence.statements import bound
 
 Array = NDArray[np.float64]
@@ -107,8 +108,17 @@ def compare(merits_a: Array, merits_b: Array, *, delta: float = 0.0, beta: float
     )
 
 
-def statement(c: Comparison, a: str, b: str, unit: str = "success rate") -> str:
-    """What the comparison shows, in one paragraph. a, b: names. unit: of the scores, for the sentence."""
+def in_unit(c: Comparison, score: Score) -> Comparison:
+    """The same in the score's own unit instead of merits. The difference stays that of merits: positive where A is better."""
+    value = {name: score.low + getattr(c, name) * score.spread for name in ("a", "b")}
+    if score.better == "low":
+        value = {name: score.high - getattr(c, name) * score.spread for name in ("a", "b")}
+    scaled = {name: getattr(c, name) * score.spread for name in ("difference", "lower", "upper", "delta")}
+    return msgspec.structs.replace(c, **value, **scaled)
+
+
+def statement(c: Comparison, a: str, b: str, what: str = "success rate") -> str:
+    """What the comparison shows, in one paragraph. a, b: names. what: the scores' name."""
     by = f" by more than {bound(c.delta)}" if c.delta > 0.0 else ""
     sure = f"{100.0 * (1.0 - c.beta):.4g} %"
     first = {
@@ -119,8 +129,8 @@ def statement(c: Comparison, a: str, b: str, unit: str = "success rate") -> str:
     }[c.answer]
     also = f" In fact {a} is worse than {b}{by}." if c.better and by and c.answer == "not worse" else ""
     return (
-        f"{first}{also} The mean {unit} is {c.a:.3g} for {a} and {c.b:.3g} for {b}; with confidence {sure} the difference is between "
-        f"{c.lower:.3g} and {c.upper:.3g}. This may be read after every pair, and one may stop at any of them."
+        f"{first}{also} The mean {what} is {c.a:.3g} for {a} and {c.b:.3g} for {b}; with confidence {sure} the advantage "
+        f"of {a} over {b} is between {c.lower:.3g} and {c.upper:.3g}. This may be read after every pair, and one may stop at any of them."
     )
 
 

@@ -35,6 +35,8 @@ from numpy.typing import NDArray
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.evidence.betting import lower_limit, running_mean_lower_limit
 from s2r_runtime.evidence.bounds import check_probability
+from s2r_runtime.evidence.scores import Score
+from s2r_runtime.messages import Optimism, RealMean
 
 Array = NDArray[np.float64]
 
@@ -55,41 +57,6 @@ class Expected(NamedTuple):
     low: Array
     high: Array
     known: bool
-
-
-class Mean(msgspec.Struct, frozen=True):
-    """Mean merit of the real runs. Limits at confidence 1-beta, valid at all times: `lower`, `upper` if the mean is one number for all
-    runs; `running_lower`, `running_upper` of the mean over these runs without that assumption; `alone_*` without simulation.
-
-    correlation: of real and simulated scores (0 where one does not vary). slope: that of the next run. runs_alone: number of runs
-    without simulation for the same width, estimated from the widths; runs_saved: that less n.
-    """
-
-    n: int
-    mean: float
-    lower: float
-    upper: float
-    running_lower: float
-    running_upper: float
-    alone_lower: float
-    alone_upper: float
-    correlation: float
-    slope: float
-    runs_alone: float
-    runs_saved: float
-    beta: float
-
-
-class Optimism(msgspec.Struct, frozen=True):
-    """By how much the simulator scores better than the robot, as a share of the score's range. mean: of the pairs; lower, upper: one-sided
-    limits, each at confidence 1-beta and valid at all times.
-    """
-
-    n: int
-    mean: float
-    lower: float
-    upper: float
-    beta: float
 
 
 def from_rollouts(rollouts: Array, beta: float) -> Expected:
@@ -142,7 +109,9 @@ def limits(real: Array, simulated: Array, expected: Expected, slope: Array, beta
     return low, high
 
 
-def mean_with_simulation(real: Array, simulated: Array, *, fresh: Array | None = None, rollouts: Array | None = None, beta: float) -> Mean:
+def mean_with_simulation(
+    real: Array, simulated: Array, *, fresh: Array | None = None, rollouts: Array | None = None, beta: float
+) -> RealMean:
     """The mean of real merits (n,) in [0, 1], helped by simulated ones (n,). fresh: (n,); or rollouts: (N,) (`Expected`).
 
     Raises NotEnoughEvidence without pairs, UsageError for arrays that do not fit.
@@ -168,11 +137,11 @@ def mean_with_simulation(real: Array, simulated: Array, *, fresh: Array | None =
         for y, f, e in ((real, simulated, expected), (1.0 - real, 1.0 - simulated, _mirrored(expected)))
     ]
     ratio = (alone_high - alone_low) / max(high - low, 1e-12)
-    return Mean(
+    return RealMean(
         n=n,
         mean=float(np.mean(real - slope[:-1] * (simulated - 0.5 * (expected.low + expected.high)))),
         lower=low,
-        upper=max(high, low),
+        upper=high,
         running_lower=max(running[0], 0.0),
         running_upper=min(1.0 - running[1], 1.0),
         alone_lower=alone_low,
@@ -197,6 +166,20 @@ def optimism(real: Array, simulated: Array, *, beta: float) -> Optimism:
         upper=-float(lower_limit(-d, -1.0, beta, -1.0, 1.0)),
         beta=beta,
     )
+
+
+def mean_in_unit(mean: RealMean, score: Score) -> RealMean:
+    """Limits of merits as limits of the score itself, in its unit."""
+    names = ("mean", "lower", "upper", "running_lower", "running_upper", "alone_lower", "alone_upper")
+    if score.better == "high":
+        return msgspec.structs.replace(mean, **{name: score.low + getattr(mean, name) * score.spread for name in names})
+    other = {name: name.replace("lower", "UPPER").replace("upper", "lower").replace("UPPER", "upper") for name in names}
+    return msgspec.structs.replace(mean, **{name: score.high - getattr(mean, other[name]) * score.spread for name in names})
+
+
+def optimism_in_unit(found: Optimism, score: Score) -> Optimism:
+    """The same in the score's unit: positive where the simulator is better, whichever end of the range is the good one."""
+    return msgspec.structs.replace(found, **{name: getattr(found, name) * score.spread for name in ("mean", "lower", "upper")})
 
 
 def least_upper_limit(n: int, beta: float) -> float:

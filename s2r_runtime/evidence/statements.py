@@ -9,7 +9,7 @@ import math
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 
 from s2r_runtime.core.ledger import spent
-from s2r_runtime.messages import BEHAVIOURS, Gap, LawResult, RunLimits, Trials, Tries, Verification
+from s2r_runtime.messages import BEHAVIOURS, Gap, LawResult, RunLimits, Simulated, Trials, Tries, Verification
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Driving
 
@@ -54,6 +54,7 @@ def shown(
         ),
         *(() if tries is None else (_tried(tries, verification),)),
         *(() if trials is None else (of_trials(trials),)),
+        *(() if trials is None or trials.simulated is None else of_simulated(trials.simulated)),
         *(() if runs is None else (of_runs(runs),)),
     )
 
@@ -116,6 +117,27 @@ def runs_line(r: RunLimits) -> str:
 def _percent(share: float, rounding: str) -> str:
     """Two digits."""
     return f"{Context(prec=2, rounding=rounding).create_decimal(Decimal(share) * 100).normalize():f} %"
+
+
+def of_simulated(s: Simulated) -> tuple[str, str]:
+    """The statements G11 and G12."""
+    mean, optimism = s.mean, s.optimism
+    saved = f"it saved about {mean.runs_saved:.0f} runs" if mean.runs_saved >= 1.0 else "it saved no runs"
+    where = f"{s.rollouts} rollouts of the uncertain model in each run's scenario ({s.law}, radius {bound(s.radius)})"
+    return (
+        (
+            f"Mean with simulation (G11). With confidence {confidence(mean.beta)} the mean score '{s.score}' of these {mean.n} runs, in "
+            f"{s.low:g} to {s.high:g}, is between {worst(mean.lower)} and {bound(mean.upper)} if each run has the same mean given the "
+            f"past, and with that confidence between {worst(mean.running_lower)} and {bound(mean.running_upper)} without that "
+            f"assumption; at any number of runs. It is helped by {where}, whose scores have a correlation of {mean.correlation:.2g} with "
+            f"the real ones: {saved}."
+        ),
+        (
+            f"Optimism (G12). With confidence {confidence(optimism.beta)}, at any number of runs, the model scores better than the robot "
+            f"by at most {bound(optimism.upper)} on average in '{s.score}' ({optimism.mean:.3g} in these runs), if each run has the same "
+            "mean given the past."
+        ),
+    )
 
 
 def assumption(driving: Driving) -> str:

@@ -21,16 +21,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace as replace_field
 
 from s2r_runtime import messages as m
 from s2r_runtime.controllers.episodes import Episode, Episodes
-from s2r_runtime.errors import ConfigError, NotEnoughEvidence
+from s2r_runtime.errors import ConfigError, NotEnoughEvidence, UsageError
 from s2r_runtime.evidence.bounds import clopper_pearson_upper
+from s2r_runtime.evidence.scores import Score
 from s2r_runtime.hookspecs import Task
 from s2r_runtime.profile import Profile
 from s2r_runtime.recording.logs import runs as logged_runs
@@ -50,6 +52,8 @@ CHANNELS = (
     "out/ask",
     "out/send",
 )
+SCORES = ("safe", "safety", "progress")
+"""By what a run may be scored: whether it was safe, the task's safety value, or its progress."""
 KEPT = 1000
 """Observations that an answer may lag behind."""
 
@@ -57,7 +61,8 @@ KEPT = 1000
 @dataclass
 class Run:
     """One scenario. first, last: numbers of its first and last observation; driven: by the controller from the first step on; closed: the
-    gate closed in it or refused its first command, or the controller failed in it; over: it came to its own end.
+    gate closed in it or refused its first command, or the controller failed in it; over: it came to its own end. seed, start: those from
+    which its scenario is drawn again (`Episodes`), the start (nx,) as observed. progress: the task's, at its end. states: (nx,) each.
     """
 
     index: int
@@ -68,6 +73,10 @@ class Run:
     closed: bool = False
     over: bool = False
     discrepancy: float = 0.0
+    seed: int = 0
+    start: tuple[float, ...] = ()
+    progress: float | None = None
+    states: list[tuple[float, ...]] = field(default_factory=list)
 
 
 @dataclass
@@ -111,12 +120,14 @@ class _Deployment:
         if seen is None:
             return
         if not self.runs or self.runs[-1].index != now.index:
-            self.runs.append(Run(now.index, seq))
+            self.runs.append(Run(now.index, seq, seed=self.seed, start=x))
         self._note(now, seq)
+        self.runs[-1].states.append(x)
 
     def _note(self, episode: Episode, seq: int) -> None:
         run = self.runs[-1]
         run.last, run.safety = seq, -math.inf if episode.safety is None else episode.safety
+        run.progress = episode.progress
 
     def sent(self, send: m.Send) -> None:
         """The robot was told something, by somebody."""
@@ -150,8 +161,8 @@ class Found:
 
 
 def read_runs(paths: Sequence[Path], profile: Profile, task: Task, controller_digest: str, model_digest: str) -> Found:
-    """Runs of this controller in these logs, in the order of the logs' start times, however they are given. Raises ConfigError for a log of
-    another robot, task or profile.
+    """Runs of this controller in these logs, in the order of the logs' start times, however they are given. model_digest: empty, if it does
+    not matter against which model they were measured. Raises ConfigError for a log of another robot, task or profile.
     """
     found, used, threshold = Found(), set[tuple[int, int]](), profile.verification.threshold
     for parts in sorted(logged_runs(paths, CHANNELS), key=_began):
@@ -177,6 +188,23 @@ def newest_limits(paths: Sequence[Path], controller_digest: str) -> m.RunLimits 
     return found
 
 
+def values_of(found: Found, score: Score) -> list[float]:
+    """What each run that counts scores by `safe`, `safety` or `progress`; the worst value where the gate closed in it or the controller
+    failed. Raises UsageError for another name.
+    """
+    if score.name not in SCORES:
+        raise UsageError(f"the score {score.name!r} is not known, must be one of: {', '.join(SCORES)}")
+    values = []
+    for run, safe in found.counted:
+        if score.name == "safe":
+            values.append(float(safe))
+        elif run.closed:
+            values.append(score.worst)
+        else:
+            values.append(run.safety if score.name == "safety" else math.nan if run.progress is None else run.progress)
+    return values
+
+
 def _began(parts: Sequence[Reading]) -> tuple[float, str]:
     """When a run of the daemon began, s since 1970, and its name, which settles ties. A log without its beginning comes last: nothing in it
     can be judged.
@@ -195,7 +223,7 @@ def _left_out(run: Run, deployment: _Deployment, controller: str, model: str, us
     if scenario in used:
         return "the same scenario as an earlier run (same seed)"
     used.add(scenario)
-    if deployment.model_digest != model:
+    if model and deployment.model_digest != model:
         return "measured against another model"
     if run.closed:
         return ""
@@ -277,10 +305,20 @@ def _check(settings: m.Settings, profile: Profile, path: Path) -> None:
         ("task", settings.task_digest, profile.task_digest()),
         ("profile", settings.profile_digest, profile.digest()),
     ):
-        if what == "profile" and there == profile.by_text().digest():
-            continue  # a log of an earlier version
+        if what == "profile" and there in {profile.by_text().digest(), without_demand(profile).digest()}:
+            continue  # a log of an earlier version, or of before a limit of the model's optimism was demanded
         if there != here:
             raise ConfigError(f"{path}: its {what} is {there}, the profile's is {here}")
+
+
+def without_demand(profile: Profile) -> Profile:
+    """The profile before it demanded a limit of the model's optimism. Runs are driven and judged under it in the same way."""
+    return replace_field(profile, verification=replace_field(profile.verification, max_optimism=1.0))
+
+
+def first(found: Found, n: int) -> Found:
+    """The first n runs that count; all of them for 0."""
+    return replace(found, counted=found.counted[:n] if n else found.counted)
 
 
 def trials(found: Found, *, controller_digest: str, task_digest: str, model_digest: str, beta: float, fixed: int = 0) -> m.Trials:
@@ -288,7 +326,7 @@ def trials(found: Found, *, controller_digest: str, task_digest: str, model_dige
 
     Raises NotEnoughEvidence if there are none, or fewer than were fixed.
     """
-    counted = found.counted[:fixed] if fixed else found.counted
+    counted = first(found, fixed).counted
     if len(counted) < max(fixed, 1):
         raise NotEnoughEvidence(f"{len(counted)} runs of this controller count, {max(fixed, 1)} are needed", max(fixed, 1) - len(counted))
     n, unsafe = len(counted), sum(not safe for _, safe in counted)

@@ -100,7 +100,61 @@ class Tries(Struct, frozen=True):
     fixed: bool = False
 
 
-class Trials(Struct, frozen=True):
+class RealMean(Struct, frozen=True):
+    """Mean score of the real runs (guarantee G11, `real_means`). Limits at confidence 1-beta, valid at all times: `lower`, `upper` if the
+    mean is one number for all runs; `running_*` of the mean over these runs without that assumption; `alone_*` without simulation.
+
+    correlation: of real and simulated scores (0 where one does not vary). slope: that of the next run. runs_alone: number of runs
+    without simulation for the same width, estimated from the widths; runs_saved: that less n.
+    """
+
+    n: int
+    mean: float
+    lower: float
+    upper: float
+    running_lower: float
+    running_upper: float
+    alone_lower: float
+    alone_upper: float
+    correlation: float
+    slope: float
+    runs_alone: float
+    runs_saved: float
+    beta: float
+
+
+class Optimism(Struct, frozen=True):
+    """By how much the simulator scores better than the robot (guarantee G12). mean: of the pairs; lower, upper: one-sided limits, each at
+    confidence 1-beta and valid at all times.
+    """
+
+    n: int
+    mean: float
+    lower: float
+    upper: float
+    beta: float
+
+
+class Simulated(Struct, frozen=True):
+    """Real runs with simulated ones in the same scenarios. Values in the unit of `score`, whose range is low to high. rollouts: of the
+    uncertain model in each run's scenario, and the same number in fresh ones from its start. seed: of these. outside: number of real scores
+    outside the range.
+    """
+
+    score: str
+    low: float
+    high: float
+    better: Literal["high", "low"]
+    law: str
+    radius: float
+    rollouts: int
+    seed: int
+    outside: int
+    mean: RealMean
+    optimism: Optimism
+
+
+class Trials(Struct, frozen=True, omit_defaults=True):
     """Closed-loop runs of a controller on the robot, from its logs (guarantee G9, `trials`). worst: least safety value.
 
     unsafe_upper: Clopper-Pearson bound on the probability of an unsafe run; radius: the largest discrepancy in any of the runs, which a
@@ -121,6 +175,8 @@ class Trials(Struct, frozen=True):
     controller_digest: str
     task_digest: str
     model_digest: str
+    simulated: Simulated | None = None
+    """None: the runs were not simulated. Then there is no such key where it is written, as before there were simulated ones."""
 
 
 class RunLimits(Struct, frozen=True):

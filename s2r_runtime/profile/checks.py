@@ -129,6 +129,7 @@ def _verification(v: VerificationSettings) -> Iterator[Check]:
     yield math.isfinite(v.threshold), "verification.threshold", v.threshold, "finite"
     among = bool(v.required) and set(v.required) <= set(v.laws)
     yield among, "verification.required", list(v.required), "at least one of verification.laws"
+    yield 0.0 < v.max_optimism <= 1.0, "verification.max_optimism", v.max_optimism, "above 0 and at most 1 (1: no demand)"
     yield _lasting(v.timeout), "verification.timeout", v.timeout, "> 0 s and at most 1e9 s"
 
 

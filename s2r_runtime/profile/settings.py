@@ -113,6 +113,10 @@ class VerificationSettings(_Table, frozen=True):
     """Disturbance laws that are run and reported."""
     required: tuple[Literal["uniform", "persistent", "adversarial"], ...] = ("uniform", "persistent")
     """Those of them that must pass."""
+    max_optimism: float = 1.0
+    """It must be shown that the uncertain model's share of safe runs exceeds the robot's by at most this (guarantee G12); 1: no demand.
+    Below 1, a certificate needs trials (`s2r certify --trials`): the daemon issues none by itself, and takes one that is brought.
+    """
     timeout: float = 60.0
     """s; a controller that is not done by then has not passed. Time in which it waits for a processor does not count."""
 
@@ -254,6 +258,7 @@ AS_BEFORE: dict[str, dict[str, Any]] = {
     "gate": {"fault_share": 0.0, "fault_burst": 0},
     "sampling": {"period": "first"},
     "guarantee": {"beta_episodes": 0.1, "max_unsafe": 0.0, "gate_closing": "unsafe"},
+    "verification": {"max_optimism": 1.0},
 }
 """Settings that were added later: table -> setting -> the value by which everything was done before it was there. A log is audited, and a
 digest computed, as if a profile with that value did not have the setting.

@@ -23,7 +23,7 @@ from s2r_runtime.core.ledger import binomial_tail, campaign_size, sample_size, s
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
 from s2r_runtime.evidence import statements
 from s2r_runtime.files.canonical import canonical, digest
-from s2r_runtime.messages import NOT_INDEPENDENT, CertificateFacts, Gap, RunLimits, Struct, Trials, Tries, Verification
+from s2r_runtime.messages import NOT_INDEPENDENT, CertificateFacts, Gap, RunLimits, Simulated, Struct, Trials, Tries, Verification
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Profile, TaskValue
 from s2r_runtime.trust import keys
@@ -153,7 +153,29 @@ def issue(
     for lack, ok, missing in _evidence(certificate, traced_not_adopted=traced_not_adopted):
         if not ok:
             raise NotEnoughEvidence(f"no certificate: {lack}", missing)
+    if lack := optimism_lack(profile, trials):
+        raise NotEnoughEvidence(f"no certificate: {lack}")
     return certificate
+
+
+def optimism_lack(profile: Profile, trials: Trials | None) -> str:
+    """Why what is known of the model's optimism does not meet the profile's demand (guarantee G12), or empty."""
+    most = profile.verification.max_optimism
+    if most >= 1.0:
+        return ""
+    found = trials.simulated if trials is not None else None
+    if found is None or found.score != "safe":
+        return (
+            f"verification.max_optimism is {most:g}, and nothing is known of the model's optimism on this task; certify with logs of the "
+            "controller's runs (s2r certify --trials LOG)"
+        )
+    if found.optimism.upper > most:
+        return (
+            f"the model's share of safe runs is shown to exceed the robot's by at most {statements.bound(found.optimism.upper)} only "
+            f"({found.optimism.n} runs, {found.optimism.mean:.3g} on average), and verification.max_optimism is {most:g}; more runs "
+            "make the limit smaller where the model is right"
+        )
+    return ""
 
 
 def sign(certificate: Certificate, key: Ed25519PrivateKey) -> bytes:
@@ -383,4 +405,13 @@ def _carried(trials: Trials, slack: float) -> bool:
         unsafe = trials.unsafe_upper == 1.0  # no smaller bound is one
     else:
         unsafe = 0.0 < trials.unsafe_upper < 1.0 and binomial_tail(trials.n, trials.unsafe, trials.unsafe_upper) <= trials.beta * slack
+    if trials.simulated is not None and not _simulated_fit(trials.simulated, trials.n):
+        return False
     return unsafe and 0.0 < trials.epsilon < 1.0 and binomial_tail(trials.n, 0, trials.epsilon) <= trials.beta * slack
+
+
+def _simulated_fit(found: Simulated, n: int) -> bool:
+    """Whether means with simulation and optimism are of these runs, and within their ranges (guarantee G11, G12)."""
+    mean, optimism, spread = found.mean, found.optimism, found.high - found.low
+    ordered = found.low <= mean.lower <= mean.upper <= found.high and -spread <= optimism.lower <= optimism.upper <= spread
+    return mean.n == optimism.n == n and found.rollouts >= 1 and ordered and 0.0 < mean.beta < 1.0 and 0.0 < optimism.beta < 1.0
