@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -111,6 +112,21 @@ class Trace(Result):
         check_counts(seed=seed)
         return suggested(self, suggest_duration, seed)
 
+    def _repr_html_(self) -> str:
+        """The verdict, a table of effects, and the account folded."""
+        cells = [
+            (effect["name"], effect["channel"], name, f"{value['value']:.4g}", f"{value['low']:.4g} to {value['high']:.4g}", value["unit"])
+            for effect in self.effects
+            for name, value in effect["parameters"].items()
+            if all(isinstance(value[part], float) for part in ("value", "low", "high"))
+        ]
+        head = "".join(f"<th>{name}</th>" for name in ("effect", "on", "parameter", "value", "95 % interval", "unit"))
+        body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in line) + "</tr>" for line in cells)
+        table = f"<table><tr>{head}</tr>{body}</table>" if cells else ""
+        first, _, rest = str(self).partition("\n")
+        folded = f"<details><summary>details</summary><pre>{html.escape(rest)}</pre></details>"
+        return f"<div><p><strong>{html.escape(first)}</strong></p>{table}{folded}</div>"
+
     def plot(self, ax: Axes | None = None) -> list[Axes]:
         """Rollouts of the model before and after, and the measurement, for each state. Returns the axes.
 
@@ -126,7 +142,7 @@ class Trace(Result):
             here.plot(one["t"], one["before"], color=BEFORE, linewidth=1.0, label="before")
             here.plot(one["t"], one["after"], color=AFTER, linewidth=1.0, linestyle="--", label="after")
             here.set_ylabel(labelled(state, units.get(state, "")))
-        axes[0].legend(frameon=False, ncols=3, loc="upper right")
+        axes[0].legend(frameon=False, ncols=3, loc="best")
         axes[-1].set_xlabel("t (s)")
         return axes
 
