@@ -17,6 +17,7 @@ from s2r_runtime.messages import (
     EpisodeEnded,
     EpisodeScored,
     IssueCertificate,
+    LinkChanged,
     Memory,
     Persist,
     RecorderChanged,
@@ -71,6 +72,8 @@ def test_a_run_that_began_while_the_gate_settled_is_left_out_and_the_next_one_co
     assert (whole.n, whole.unsafe, whole.censored, whole.number, whole.certificate, own.certificate) == (1, 0, 0, 1, "", "c1")
     assert (whole.lower, whole.upper) == anytime.limits(anytime.Counts(1), whole.beta_lower, whole.beta_upper)
     assert whole.beta_lower + whole.beta_upper == pytest.approx(6.0 * BETA / math.pi**2)
+    assert whole.beta_upper == pytest.approx(3.0 * whole.beta_lower)
+    assert (counts.index, counts.steps, first.index) == (1, 200, 0)
 
 
 @pytest.mark.parametrize(
@@ -146,6 +149,28 @@ def test_a_command_that_the_gate_rejects_is_a_closing_from_the_first_step_on() -
         rig.propose(u=(9.0, 0.0))
         rig.request("undeploy")
         assert counted(rig) == [(expected, "the gate closed: input_out_of_bounds")]
+
+
+@pytest.mark.parametrize("lockstep", [False, True])
+def test_a_gate_that_closes_before_the_first_answer_of_a_scenario_makes_a_run(lockstep: bool) -> None:
+    rig = driving(lockstep=lockstep)
+    rig.observe()
+    rig.feed(EpisodeEnded(rig.t, 1, 200, 0.5, 1.0))
+    rig.feed(LinkChanged(rig.t, up=False))
+    rig.request("undeploy")
+    assert counted(rig) == [("safe", "the scenario came to its end"), ("unsafe", "the gate closed: link_down")]
+    assert of(rig.outputs, EpisodeCounted)[-1].index == 2
+
+
+def test_a_scenario_that_begins_while_the_gate_settles_is_left_out_also_after_the_first() -> None:
+    rig = driving()
+    rig.observe((5.0, 0.0, 0.0))
+    rig.observe()
+    rig.feed(EpisodeEnded(rig.t, 1, 200, 0.5, 1.0))
+    rig.propose()
+    steps(rig, 8)
+    ended(rig)
+    assert counted(rig) == [("unsafe", "the gate closed: outside_region"), ("left_out", "not driven from its start")]
 
 
 def test_a_command_that_is_rejected_in_a_run_that_the_controller_never_took_over_changes_nothing() -> None:
@@ -298,6 +323,9 @@ def test_each_controller_and_each_later_certificate_has_a_share_of_its_own() -> 
     third = {(run.controller, run.certificate): (run.number, run.n) for run in rig.state.memory.runs}
     assert third == {("controller", ""): (1, 4), ("controller", "c2"): (2, 2), ("another", ""): (3, 1), ("another", "c3"): (3, 1)}
     assert rig.state.memory.run_sequences == 3
+    rig.request("undeploy")
+    shown: Any = core.status(rig.state)["runs"]
+    assert (shown["controller"], shown["all"]["n"]) == ("another", 2), "the one that drove last"
     assert math.fsum(runs.share(BETA, number) for number in range(1, 100_000)) == pytest.approx(BETA, rel=1e-5)
 
 
@@ -352,7 +380,10 @@ def test_a_lower_limit_above_the_profile_s_revokes_and_refuses_until_a_person_cl
     assert answers(again)[1][0].exit_code == 1
     assert runs.refusal(rig.state.memory, Rig().settings, "controller") == "", "a profile without a limit refuses nothing"
     assert runs.refusal(rig.state.memory, rig.settings, "another") == ""
-    again.request("clear", text="unsafe_runs")
+    outputs = again.request("clear", text="unsafe_runs")
+    assert isinstance(outputs[0], Persist), "before anybody hears of it"
+    assert outputs[0].memory.runs == ()
+    assert not outputs[0].later
     assert of(again.request("deploy", digest="controller"), StartJob)
     assert (again.state.memory.runs, again.state.memory.run_sequences, again.state.memory.runs_cleared) == ((), 1, 1)
     again.request("clear", text="unsafe_runs")
@@ -384,6 +415,7 @@ def test_without_a_limit_nothing_is_revoked() -> None:
     for _ in range(10):
         ended(rig, -0.1)
     assert of(rig.outputs, Revoked) == []
+    assert not any(run.exceeded for run in rig.state.memory.runs)
     shown: Any = core.status(rig.state)["runs"]
     assert (shown["all"]["n"], shown["all"]["unsafe"], shown["max_unsafe"], shown["refused"]) == (10, 10, None, False)
     assert shown["under_certificate"] == {**shown["all"], "certificate": "c1"}

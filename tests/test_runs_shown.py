@@ -46,6 +46,8 @@ def test_the_statement_has_both_limits_with_their_confidences() -> None:
     said = of_runs(limits(300, 3, 1))
     assert "Of 300 runs that this controller drove on this robot, 3 were unsafe." in said
     assert "1 had an unknown end" in said
+    assert ", 1 was unsafe. With" in of_runs(limits(300, 1))
+    assert ", none were unsafe. With" in of_runs(limits(300))
     assert "With confidence 95.4405 % their mean probability of being unsafe is at most" in said
     assert "With confidence 98.4801 % it is at least" in said
 
@@ -73,7 +75,7 @@ def test_the_report_shows_the_limits_over_runs_and_each_run_that_was_not_safe() 
         runs_line(last),
         "-0.250",
         "its safety value is below the threshold",
-        "1 runs are in no count",
+        "Left out: 1 runs",
         "<svg",
     ):
         assert shown in html, shown

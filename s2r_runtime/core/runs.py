@@ -180,7 +180,7 @@ def _sent(run: Run, send: Send, cut: str) -> Run:
     mine = send.source == "controller"
     if mine:
         from_start = True if run.from_start is None else run.from_start
-        return msgspec.structs.replace(run, from_start=from_start, took_over=True, said="")
+        return msgspec.structs.replace(run, from_start=from_start, took_over=True)
     if cut or run.failed:
         return run
     if run.from_start is None:

@@ -90,11 +90,12 @@ def of_trials(t: Trials) -> str:
 
 def of_runs(r: RunLimits) -> str:
     """The statement G10, as on a certificate."""
+    unsafe = "1 was" if r.unsafe == 1 else f"{r.unsafe or 'none'} were"
     censored = (
         f". {r.censored} had an unknown end, and count as unsafe in the upper limit and as safe in the lower one" if r.censored else ""
     )
     return (
-        f"Runs (G10). Of {r.n} runs that this controller drove on this robot, {r.unsafe or 'none'} were unsafe{censored}. With confidence "
+        f"Runs (G10). Of {r.n} runs that this controller drove on this robot, {unsafe} unsafe{censored}. With confidence "
         f"{confidence(r.beta_upper)} their mean probability of being unsafe is at most {bound(r.upper)}. With confidence "
         f"{confidence(r.beta_lower)} it is at least {worst(r.lower)}. Each holds after every run at once, whatever the runs depend on. "
         "It is about the runs so far, in the scenarios that they met. These confidences are shares of a budget of their own "

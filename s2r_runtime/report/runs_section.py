@@ -19,7 +19,7 @@ def add_runs(page: Page, counted: Sequence[EpisodeCounted], settings: Settings |
     page.heading("Runs on this robot")
     left_out = sum(one.outcome == "left_out" for one in counted)
     if left_out:
-        page.text(f"{left_out} runs are in no count: the controller did not drive them from their start.", "soft")
+        page.text(f"Left out: {left_out} runs that the controller did not drive from their start.", "soft")
     for controller in dict.fromkeys(one.controller for one in counted):
         _of_controller(page, [one for one in counted if one.controller == controller and one.outcome != "left_out"], settings)
 
