@@ -4,7 +4,8 @@
     child -> parent   u64 length, JSON header, then the arrays of its runs as little-endian float64, in the order of the header
 
 The process is started with the first such file and serves all that follow. One that crashes, or takes longer than TIMEOUT_S, is a file that
-cannot be read; the next file gets a new process. Its address space is bounded, so it cannot fill the memory.
+cannot be read; the next file gets a new process. Its memory is bounded by the file's size (`limits.RATIO`), whatever the file claims: a
+library unpacks what a block or a page holds, not what the table of contents says.
 """
 
 from __future__ import annotations
@@ -20,18 +21,23 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
 from s2r_runtime.errors import RecordingError, one_line
+from s2r_runtime.files.limits import RATIO
 from s2r_runtime.recordings.formats.series import Array, Opened, Run, Samples, Topic
+from s2r_runtime.recordings.formats.sizes import HARMLESS, NUMBER_BYTES
 
 TIMEOUT_S = 600.0
 ADDRESS_SPACE = 12_000_000_000
 """Bytes: the largest file, its numbers, and the libraries."""
+LIBRARY_BYTES = 256 << 20
+"""Of memory that a reader's library takes itself: its code, its arenas, the stacks of its threads."""
+FULL = "does not fit into memory"
 HEADER_BYTES = 1 << 30
 BLOCK = 1 << 20
 
@@ -187,30 +193,59 @@ def _serve(requests: IO[bytes], answers: IO[bytes]) -> None:
 
 def _answer(request: Any, opened: dict[tuple[str, str, int, str], Opened]) -> tuple[dict[str, Any], list[Array]]:
     """Header and arrays. One file stays open between its topics and its samples."""
-    from s2r_runtime.plugins import registry
-
     path = Path(request["path"])
     try:
-        key = (request["reader"], str(path), path.stat().st_mtime_ns, json.dumps(request["options"], sort_keys=True))
-        if key not in opened:
-            opened.clear()
-            opened[key] = registry().get("formats", request["reader"])(path, **request["options"])
-        file = opened[key]
-        if request["wanted"] is None:
-            topics = [
-                [t.name, t.kind, t.n, *(s if math.isfinite(s) else None for s in (t.first_s, t.last_s)), dict(t.fields), t.note, t.lasts_s]
-                for t in file.topics()
-            ]
-            return {"kind": file.kind, "drawn": file.drawn, "notes": file.notes, "topics": topics}, []
-        runs = file.read(request["wanted"])
+        with _bounded_by(path):
+            return _read(path, request, opened)
     except ImportError as error:
         return {"missing": error.name or str(error)}, []
     except RecordingError as error:
-        return {"error": str(error).replace(str(path), request["name"])}, []
+        said = str(error).replace(str(path), request["name"])
+        return {"error": _full(request["name"]) if said.endswith(FULL) else said}, []
     except MemoryError:
-        return {"error": f"{request['name']}: does not fit into memory ({ADDRESS_SPACE / 1e9:g} GB)"}, []
+        return {"error": _full(request["name"])}, []
     except Exception as error:  # noqa: BLE001 - a library's, at bytes that nobody foresaw
         return {"error": f"{request['name']}: cannot be read: {type(error).__name__}: {one_line(str(error), 120)}"}, []
+
+
+def _full(name: str) -> str:
+    return f"{name}: {FULL}: its reader takes more than {RATIO.value():g} times the file's size; {RATIO.more()}"
+
+
+@contextlib.contextmanager
+def _bounded_by(path: Path) -> Iterator[None]:
+    """The process may take as much more memory as a file of this size can be packed from, and its library. path: or a folder."""
+    try:
+        files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
+        size = sum(file.stat().st_size for file in files)
+        now = int(Path("/proc/self/status").read_text(encoding="ascii").partition("VmData:")[2].split()[0]) << 10
+    except (OSError, IndexError):  # its reader says what is wrong; or no Linux: the address space is bounded
+        yield
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    most = now + LIBRARY_BYTES + HARMLESS * NUMBER_BYTES + round(RATIO.value() * size)
+    resource.setrlimit(resource.RLIMIT_DATA, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+
+def _read(path: Path, request: Any, opened: dict[tuple[str, str, int, str], Opened]) -> tuple[dict[str, Any], list[Array]]:
+    from s2r_runtime.plugins import registry
+
+    key = (request["reader"], str(path), path.stat().st_mtime_ns, json.dumps(request["options"], sort_keys=True))
+    if key not in opened:
+        opened.clear()
+        opened[key] = registry().get("formats", request["reader"])(path, **request["options"])
+    file = opened[key]
+    if request["wanted"] is None:
+        topics = [
+            [t.name, t.kind, t.n, *(s if math.isfinite(s) else None for s in (t.first_s, t.last_s)), dict(t.fields), t.note, t.lasts_s]
+            for t in file.topics()
+        ]
+        return {"kind": file.kind, "drawn": file.drawn, "notes": file.notes, "topics": topics}, []
+    runs = file.read(request["wanted"])
     listed, arrays = [], []
     for run in runs:
         samples = []

@@ -231,6 +231,8 @@ class _Guarded:
             raise self._said(error) from None
 
     def _said(self, error: BaseException) -> RecordingError:
+        if isinstance(error, MemoryError):
+            return RecordingError(f"{self._path}: does not fit into memory")
         return RecordingError(f"{self._path}: this Parquet file cannot be read: {one_line(str(error), 120) or type(error).__name__}")
 
 
