@@ -19,10 +19,12 @@ from s2r_runtime.controllers.episodes import Episodes
 from s2r_runtime.controllers.file import load
 from s2r_runtime.errors import NotEnoughEvidence
 from s2r_runtime.evidence.bounds import clopper_pearson_upper
+from s2r_runtime.evidence.seen_rows import sketch
 from s2r_runtime.evidence.statements import of_trials
 from s2r_runtime.evidence.trials import Found, Run, _Deployment, _judged, _left_out, _within, read_runs, trials
 from s2r_runtime.models.composed import compose
 from s2r_runtime.models.unicycle import MODEL as UNICYCLE
+from s2r_runtime.modelspec import EffectSpec, dump_model
 from s2r_runtime.profile import load_profile
 from s2r_runtime.recording.logs import read_all
 from s2r_runtime.recording.reading import read
@@ -88,11 +90,11 @@ def test_runs_are_judged_from_the_log_alone(driven: Rig) -> None:
     assert told["epsilon"] == pytest.approx(1.0 - 0.5 ** (1.0 / told["n"]))
 
 
-def found_in(rig: Rig, controller_digest: str) -> Found:
+def found_in(rig: Rig, controller_digest: str, *, with_states: bool = False) -> Found:
     profile = load_profile(rig.profile)
     model = compose(profile.model)
     task = StlTask(profile.task.parameters, model.nominal, model.dt)
-    return read_runs(rig.log_files(), profile, task, controller_digest, model.spec.digest())
+    return read_runs(rig.log_files(), profile, task, controller_digest, model.spec.digest(), with_states=with_states)
 
 
 def test_a_number_that_was_fixed_beforehand_is_held(driven: Rig) -> None:
@@ -406,7 +408,6 @@ def test_the_model_is_exact_where_its_rollouts_repeat_the_runs(driven: Rig) -> N
     assert simulated["optimism"]["mean"] == pytest.approx(0.0, abs=0.25)
     real = np.mean([run.safety if not run.closed else -1.0 for run, _ in counted])
     assert simulated["mean"]["lower"] <= real <= simulated["mean"]["upper"]
-    assert [run.states[0] for run, _ in counted] == [run.start for run, _ in counted]
     again = json.loads(driven.s2r("trials", "controller.py", *map(str, driven.log_files()), *arguments).stdout)
     assert again["simulated"] == simulated
 
@@ -441,3 +442,22 @@ def test_a_profile_that_demands_a_limit_of_the_optimism_gets_no_certificate_with
     signed = json.loads((driven.folder / "demanding.cert").read_bytes())["certificate"]
     assert signed["trials"]["simulated"]["rollouts"] == 20
     assert any(one.startswith("Optimism (G12).") for one in signed["shown"])
+
+
+@pytest.mark.slow
+def test_runs_are_rolled_out_on_a_repaired_model_unless_it_was_fitted_on_them(driven: Rig) -> None:
+    runs = [run for run, _ in found_in(driven, digest_in(driven), with_states=True).counted]
+    assert [run.states[0] for run in runs] == [run.start for run in runs]
+    assert all(not run.states for run, _ in found_in(driven, digest_in(driven)).counted)
+    given = load_profile(driven.profile).model
+    slower = replace(given, effects=(*given.effects, EffectSpec("input_gain", "w", {"gain": 0.5})))
+    arguments = ("trials", "controller.py", *map(str, driven.log_files()), "--profile", "rig.toml", "--json", "--simulate", "2")
+    scored = (*arguments, "--score", "safety", "--range", "-1", "1")
+    rows = sketch([np.array(run.states) for run in runs], compose(given).angle_columns)
+    for name, model in (("slower", slower), ("fitted", replace(slower, fitted_on=rows))):
+        (driven.folder / f"{name}.toml").write_text(dump_model(model))
+    before = json.loads(driven.s2r(*scored).stdout)["simulated"]["optimism"]["mean"]
+    after = json.loads(driven.s2r(*scored, "--on", "slower.toml").stdout)["simulated"]["optimism"]["mean"]
+    assert after > before + 0.1  # it turns half as far, so it stays nearer to where it is safe
+    refused = driven.s2r(*scored, "--on", "fitted.toml")
+    assert (refused.returncode, "was fitted on rows of these runs" in refused.stderr) == (78, True)

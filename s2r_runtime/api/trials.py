@@ -53,7 +53,8 @@ def trials_of(
     """
     check_logs(logs, watcher)
     digests = {"controller_digest": controller.digest, "model_digest": model.spec.digest()}
-    found = trials.read_runs(logs, profile, task_of(profile, model), **digests)
+    fitted = rollouts is not None and bool(rollouts.model.spec.fitted_on)  # then the runs' states are looked for among the fitted rows
+    found = trials.read_runs(logs, profile, task_of(profile, model), **digests, with_states=fitted)
     share = beta or profile.guarantee.beta
     result = trials.trials(found, **digests, task_digest=profile.task_digest(), beta=share, fixed=n)
     if rollouts is None:

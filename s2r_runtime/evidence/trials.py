@@ -62,7 +62,8 @@ KEPT = 1000
 class Run:
     """One scenario. first, last: numbers of its first and last observation; driven: by the controller from the first step on; closed: the
     gate closed in it or refused its first command, or the controller failed in it; over: it came to its own end. seed, start: those from
-    which its scenario is drawn again (`Episodes`), the start (nx,) as observed. progress: the task's, at its end. states: (nx,) each.
+    which its scenario is drawn again (`Episodes`), the start (nx,) as observed. progress: the task's, at its end. states: (nx,) each,
+    if they are wanted.
     """
 
     index: int
@@ -95,6 +96,7 @@ class _Deployment:
     looked: int | None = None
     open: bool = False
     settled: bool = False
+    with_states: bool = False
 
     def ask(self, seq: int) -> None:
         """The controller is asked about this."""
@@ -122,7 +124,8 @@ class _Deployment:
         if not self.runs or self.runs[-1].index != now.index:
             self.runs.append(Run(now.index, seq, seed=self.seed, start=x))
         self._note(now, seq)
-        self.runs[-1].states.append(x)
+        if self.with_states:
+            self.runs[-1].states.append(x)
 
     def _note(self, episode: Episode, seq: int) -> None:
         run = self.runs[-1]
@@ -160,13 +163,17 @@ class Found:
     heads: list[str] = field(default_factory=list)
 
 
-def read_runs(paths: Sequence[Path], profile: Profile, task: Task, controller_digest: str, model_digest: str) -> Found:
+def read_runs(
+    paths: Sequence[Path], profile: Profile, task: Task, controller_digest: str, model_digest: str, *, with_states: bool = False
+) -> Found:
     """Runs of this controller in these logs, in the order of the logs' start times, however they are given. model_digest: empty, if it does
-    not matter against which model they were measured. Raises ConfigError for a log of another robot, task or profile.
+    not matter against which model they were measured. with_states: the states of each run, too, which takes memory.
+
+    Raises ConfigError for a log of another robot, task or profile.
     """
     found, used, threshold = Found(), set[tuple[int, int]](), profile.verification.threshold
     for parts in sorted(logged_runs(paths, CHANNELS), key=_began):
-        for deployment in _deployments(parts, profile, task):
+        for deployment in _deployments(parts, profile, task, with_states=with_states):
             for run in _judged(deployment):
                 reason = _left_out(run, deployment, controller_digest, model_digest, used, threshold)
                 if reason:
@@ -244,7 +251,7 @@ def _judged(deployment: _Deployment) -> Iterator[Run]:
         yield run
 
 
-def _deployments(parts: Iterable[Reading], profile: Profile, task: Task) -> Iterator[_Deployment]:
+def _deployments(parts: Iterable[Reading], profile: Profile, task: Task, *, with_states: bool) -> Iterator[_Deployment]:
     """One run of the daemon, message by message."""
     settings: m.Settings | None = None
     model, seen, now = "", dict[int, tuple[float, ...]](), None
@@ -265,7 +272,8 @@ def _deployments(parts: Iterable[Reading], profile: Profile, task: Task) -> Iter
                 case m.StartController() if settings is not None:
                     if now is not None:
                         yield now
-                    now = _Deployment(message.digest, settings.seed, model, Episodes(task, settings.seed, profile.task.episodes))
+                    episodes = Episodes(task, settings.seed, profile.task.episodes)
+                    now = _Deployment(message.digest, settings.seed, model, episodes, with_states=with_states)
                 case _ if now is not None:
                     now = _within(now, message, seen)
         if reading.ending.kind == "broken":
