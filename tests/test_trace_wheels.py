@@ -6,6 +6,7 @@ from trace_robots import GEOMETRY, commands, drive
 
 from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import EffectSpec, ModelSpec
+from s2r_runtime.plugins import registry
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.pipeline import trace
 
@@ -31,19 +32,33 @@ def traced(name, left, right, seed, track=1.0):
     return trace(from_arrays(model, [(y[0], u[0])]), model)
 
 
-def dragged(seed, loss, arm):
-    """The trace of a differential drive with a castor."""
+DRIVE = """
+import numpy as np
+STATES, INPUTS, ANGLES = ("x", "y", "theta"), ("left", "right"), ("theta",)
+PARAMS = {params}
 
-    def castor(x, v, w):
+def step(x, u, dt, params):
+    v, w = 0.05 * (u[:, 0] + u[:, 1]), 0.1 * (u[:, 1] - u[:, 0]) / params["track"]
+    half = 0.5 * dt * w
+    ahead = dt * v * np.sinc(half / np.pi)
+    return np.column_stack([x[:, 0] + ahead * np.cos(x[:, 2] + half), x[:, 1] + ahead * np.sin(x[:, 2] + half), x[:, 2] + dt * w])
+"""
+
+
+def dragged(folder, seed, loss, arm, **castor):
+    """The trace of a differential drive with a castor, as a model file without wheel speeds."""
+
+    def drags(x, v, w):
         share = loss / np.maximum(np.hypot(v, arm * w), 1e-12)
         return v * np.maximum(1.0 - share, 0.0), w * np.maximum(1.0 - 4.0 * (arm / 0.5) ** 2 * share, 0.0), 0.0, 0.0
 
     rng = np.random.default_rng(seed)
     u = commands(rng, 1, STEPS, DT, BOUNDS["differential_drive"])
-    arcs = EffectSpec("integration_scheme", "*", {"scheme": "exact"})
-    model = compose(ModelSpec("differential_drive", DT, GEOMETRY["differential_drive"], (arcs,)))
-    y = drive(rng, "differential_drive", u, (), DT, NOISE, castor)
-    return trace(from_arrays(model, [(y[0], u[0])]), model)
+    y = drive(rng, "differential_drive", u, (), DT, NOISE, drags)
+    path = folder / "mine.py"
+    path.write_text(DRIVE.format(params={"track": 0.5, **castor}))
+    model = compose(ModelSpec(str(path), DT))
+    return trace(from_arrays(model, [(y[0, :, :3], u[0])]), model)
 
 
 def holds(effect, **truth):
@@ -73,10 +88,18 @@ def test_wheels_that_differ_are_found_with_their_track_from_a_unicycle_s_command
 
 
 @pytest.mark.parametrize(("loss", "arm"), [(0.01, 0.2), (0.03, 0.35)])
-def test_a_castor_that_drags_is_found_with_its_place(loss, arm):
-    (effect,) = (found := dragged(3, loss, arm)).effects
+def test_a_castor_that_drags_is_found_with_its_place_where_the_model_has_one(tmp_path, loss, arm):
+    (effect,) = (found := dragged(tmp_path, 3, loss, arm, castor=0.25)).effects
     assert (found.verdict, effect.name) == ("traced", "castor_drag")
     assert holds(effect, loss=loss, arm=arm)
+
+
+def test_a_robot_without_a_castor_gets_none():
+    """A skid-steered robot loses speed much as by a castor's drag."""
+    effect = registry().get("effects", "castor_drag")
+    nominal = compose(ModelSpec("differential_drive", DT, GEOMETRY["differential_drive"])).nominal
+    assert effect.channels(nominal) == ("*",)
+    assert effect.starts(np.ones((9, 2)), nominal, "*", DT) == []
 
 
 @pytest.mark.slow

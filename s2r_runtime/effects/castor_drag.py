@@ -19,8 +19,8 @@ from s2r_runtime.effects.step_effect import Array, StepEffect, Values
 from s2r_runtime.effects.wheel_radius_scale import has_two_wheels
 from s2r_runtime.hookspecs import NominalModel, Parameter
 
-SHARE, ARMS = 0.05, (0.25, 1.0)
-"""Where the tracer begins: share of the usual speed that is lost; arm over the track."""
+SHARE = 0.05
+"""Where the tracer begins: share of the usual speed that is lost."""
 
 STILL = 1e-12
 """m/s: nothing moves, and nothing drags."""
@@ -51,11 +51,14 @@ class CastorDrag(StepEffect):
         return moved(x, x_next, model, motion._replace(forward=ahead * motion.forward, turn=turning * motion.turn))
 
     def starts(self, u: Array, model: NominalModel, channel: str, dt: float) -> list[Values]:
-        """A castor near the axle and one far behind it."""
+        """At the model's own `castor` (m behind the axle). Without one it is not searched: wheels that skid lose speed much alike."""
+        arm = float(model.parameters.get("castor", 0.0))
+        if not arm > 0.0 or not len(u):
+            return []
         rest = np.zeros((len(u), len(model.states)))
         v = body_motion(rest, model.step(rest, u, dt, model.parameters), model).forward / dt
-        loss = SHARE * float(np.sqrt(np.mean(v * v))) if len(u) else 0.0
-        return [{"loss": loss, "arm": share * model.parameters["track"]} for share in ARMS] if loss > 0.0 else []
+        loss = SHARE * float(np.sqrt(np.mean(v * v)))
+        return [{"loss": loss, "arm": arm}] if loss > 0.0 else []
 
 
 EFFECT = CastorDrag()

@@ -10,7 +10,7 @@ from typing import Any
 from s2r_runtime.effects.step_effect import Array, StepEffect, Values
 from s2r_runtime.hookspecs import NominalModel, Parameter
 
-NAMED = frozenset({"mass", "inertia", "wheel_base", "wheel_radius", "track"})
+NAMED = frozenset({"mass", "inertia", "wheel_base", "wheel_radius", "track", "castor"})
 """`mass_change`, `input_gain`, `wheel_radius_scale` and `track_scale` speak of these."""
 
 
