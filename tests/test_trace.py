@@ -155,7 +155,7 @@ def test_the_account_and_the_plots_say_what_was_found(traced):
     text = result.text()
     assert text.startswith("traced: ")
     assert "input_gain on w: gain = 0.75" in text
-    assert "never saw" in text
+    assert "held-out ones" in text
     plots = result.plots()
     n = len(plots["residual"]["theta"]["t"])
     assert n == len(plots["residual"]["theta"]["before"]) == len(plots["residual"]["theta"]["against"]["w"])

@@ -78,7 +78,7 @@ def test_what_was_found_says_where():
         assert np.min(u[:, i]) - 1e-9 <= ranges[name].low < ranges[name].high <= np.max(u[:, i]) + 1e-9
     for i, name in enumerate(("x", "y")):
         assert np.mean((y[:, i] < ranges[name].low) | (y[:, i] > ranges[name].high)) <= 1.5 * BEYOND
-    line = f"fitted or judged where {told(found.domain)}; elsewhere untested"
+    line = f"range of validity: {told(found.domain)}; untested outside"
     assert line in " ".join(found.text().split())
     assert line in trace_page(found)
     within = found.to_json()["seen_within"]

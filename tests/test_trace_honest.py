@@ -98,8 +98,8 @@ def test_effects_that_the_data_cannot_tell_apart_are_listed_together_with_what_w
     assert "w" in found.suggested_excitation
     assert found.any_shape_of == ("w",)
     assert found.depends_on[0] == "w"
-    assert "or          by anything else that depends on w" in found.text()
-    assert "still there nothing beyond noise" in found.text()
+    assert "or          any unnamed effect that depends on w" in found.text()
+    assert "remaining   none above noise" in found.text()
     assert "What is left" not in trace_page(found)
 
 

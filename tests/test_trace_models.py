@@ -138,9 +138,7 @@ def test_a_command_before_the_recording_began_that_nobody_recorded_is_let_be_for
     found = trace(from_arrays(model, [(states, inputs)]), model)
     rows = there[0] - begin
     assert found.to_json()["first_left_out"] == [{"from_s": 0.0, "to_s": pytest.approx(dt * rows)}]
-    assert f"left out: 0 to {dt * rows:.4g} s; what acts there may follow a command from before the recording" in " ".join(
-        found.text().split()
-    )
+    assert f"left out: 0 to {dt * rows:.4g} s; commands from before the recording may still act there" in " ".join(found.text().split())
     assert {(e.name, e.channel) for e in found.effects} >= {("input_lag", "w")}
     assert next(e for e in found.effects if e.channel == "w").parameters["time_constant"][0] == pytest.approx(0.0164, rel=0.05)
     known = with_history(model, from_arrays(model, [(states[50:], inputs[50:])]))  # all that acts had been held

@@ -70,7 +70,7 @@ def _rows(effects: Sequence[dict[str, Any]], role: str) -> Iterator[tuple[str, s
     for effect in effects:
         values = {n: (p.get("value"), p.get("low"), p.get("high"), p.get("unit", "")) for n, p in effect["parameters"].items()}
         found = Found(effect["name"], effect["channel"], values)
-        for i, (name, text) in enumerate([*found.told()] or [("", "")]):
+        for i, (name, text) in enumerate([*found.value_texts()] or [("", "")]):
             first = i == 0
             yield (
                 role if first else "",

@@ -1,1 +1,1 @@
-"""Inputs under which competing hypotheses can be told apart."""
+"""Design of inputs that separate competing hypotheses."""

@@ -1,7 +1,7 @@
-"""Sequences of inputs that a robot could be driven through, drawn by seed, within bounds, near where they begin.
+"""Random input sequences within bounds that keep the robot near its start, drawn by seed.
 
 Each sequence has a character of its own: how long inputs are held, whether they change together or in turn, how often they jump to an
-extreme, to zero, to the opposite, or ramp. At the end of a hold a few next ones are drawn and foretold; one is taken of those that stay
+extreme, to zero, to the opposite, or ramp. At the end of a hold a few next ones are drawn and predicted; one is taken of those that stay
 inside what is allowed, also coasting on; where none does, the one that leaves it least. So an open sequence comes back by itself, whatever
 the robot is. At the end the ones that lead home are preferred.
 """
@@ -22,13 +22,13 @@ from s2r_runtime.trace.diagnostics.rollout_error import Held
 Array = NDArray[np.float64]
 
 CHOICES = 10
-"""Next holds that are drawn to choose one from."""
+"""Number of next holds that are drawn to choose from."""
 
 LOOK_S, LOOKS = 0.1, 24
-"""Step in which a next hold is foretold, s, and steps at most."""
+"""Step of the prediction of a next hold, s, and maximum number of steps."""
 
 COAST_S = 1.0
-"""For so long a robot goes on at what it then does before something else takes hold."""
+"""Time for which the motion continues before another input acts, s."""
 
 TURN_S = 0.2
 """Length of a hold that is to turn the robot round at the edge of the room, s."""
@@ -37,10 +37,10 @@ FEW_INPUTS = 4
 """Inputs of which all combinations of extremes are tried for that."""
 
 PLANNED = 0.8
-"""Part of what is allowed that is planned with: rivals and noise stray from the plan."""
+"""Share of the region that is used in the plan: other hypotheses and noise depart from it."""
 
 HOME = 0.85
-"""From this part of the time on the way leads home; REST of it is zero input, so that what is late shows."""
+"""From this part of the time on the robot returns; REST of it is zero input, so that delays show."""
 
 REST = 0.03
 
@@ -48,7 +48,7 @@ SEEN = 1.2
 """Times the values that were seen, for a state's rates."""
 
 AT_LEAST_S = 1.0
-"""What was seen is widened to what the largest inputs do in so many seconds from rest: a robot that stood still saw nothing."""
+"""What was seen is widened to what the largest inputs do in this time from rest, s: a robot that stood still has seen no range."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ class _Character:
         return max(1, round(math.exp(rng.uniform(math.log(self.shortest), math.log(self.longest))) / dt))
 
     def next(self, rng: np.random.Generator, before: Array, bounds: Array, rest: Array) -> Array:
-        """(nu,) what is held next: all inputs anew, or one of them while the others stay, or rest."""
+        """(nu,) what is held next: all inputs drawn again, or one of them while the others stay, or rest."""
         u = before.copy()
         which = range(len(u)) if rng.random() < self.together else [int(rng.integers(len(u)))]
         for j in which:
@@ -228,7 +228,7 @@ class _Character:
                 u[j] = low if rng.random() < 0.5 else high
             else:
                 u[j] = rng.uniform(low, high) if rng.random() < 0.6 else rest[j] + (rng.uniform(low, high) - rest[j]) * 0.2
-        if len(u) > 1 and rng.random() < 0.25:  # the others at rest: what is left is one input's own
+        if len(u) > 1 and rng.random() < 0.25:  # the others at rest: only one input acts
             keep = int(rng.integers(len(u)))
             u = np.where(np.arange(len(u)) == keep, u, rest)
         return u

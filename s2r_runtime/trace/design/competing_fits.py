@@ -1,7 +1,7 @@
-"""The models that a suggested drive is to tell apart, each fitted to the recording.
+"""Hypotheses that suggested inputs must separate, each fitted to the recording.
 
-The ones that tie; else the one that was found and those that came closest to it; else one for every effect of the library, at the size from
-which the tracer would begin to look for it, each against the others and against none.
+The competing explanations of an ambiguous result; else the reported effects and the closest alternatives; else every effect of the library,
+at a small start value of the search, against the others and against no effect.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ if TYPE_CHECKING:
     from s2r_runtime.trace.reporting.result import TraceResult
 
 STEPS = 4000
-"""Transitions that rivals are fitted on at most."""
+"""Maximum number of transitions that hypotheses are fitted on."""
 
 SMALL = 3
-"""Of the sizes from which the tracer begins, the one at a third: smaller ones matter little, larger ones everybody sees."""
+"""Of the start values of the search, sorted by size, the one at a third: smaller ones matter little, larger ones are obvious."""
 
 CLOSEST, LOOKED_AT = 3, 8
-"""Rivals of what was found that are taken, of those that are fitted."""
+"""Number of closest alternatives that are used, and that are fitted."""
 
 
 @dataclass(frozen=True)
-class Rivals:
-    """fits: the models, the chosen one first; names: as a person says them; instead: of each, what it replaces in the chosen one. every:
-    whether all of them are to be told from one another (any may be true), or the others from the chosen one.
+class Hypotheses:
+    """fits: the models, the selected one first; names: for the text; instead: of each, what it replaces in the selected one. every: whether
+    all pairs must be separated (any may be true), or only the others from the selected one.
     """
 
     fits: tuple[Fit, ...]
@@ -49,19 +49,19 @@ class Rivals:
     every: bool
 
     def named(self, i: int, j: int) -> tuple[str, str]:
-        """Two of them, i < j."""
+        """Names of a pair, i < j."""
         return self.instead[j] if i == 0 else self.names[i], self.names[j]
 
 
 def ground(held: Held) -> Problem:
-    """All that may be judged on and fitted on, thinned."""
+    """All transitions of the recording, thinned."""
     everything = np.ones(first_steps(held.data)[-1], dtype=bool)
     few = part(held.data, held.left_out, everything, STEPS)
     return problem(few.data, few.steps)
 
 
-def rivals_of(r: TraceResult, given: Problem) -> Rivals | None:
-    """The ones that tie, or came closest; None if there are none (`library` then)."""
+def competing_hypotheses(r: TraceResult, given: Problem) -> Hypotheses | None:
+    """Competing or closest explanations; None if the result has neither (then `library`)."""
     best = evaluate(given, r.model)
     if r.rivals:
         found = [(_said(f.name, f.channel), _with(given, best, f)) for f in r.rivals]
@@ -76,15 +76,15 @@ def rivals_of(r: TraceResult, given: Problem) -> Rivals | None:
     fits = (best, *(fit for _, fit in others))
     lost = [_effects(best) - _effects(fit) for fit in fits]
     instead = tuple(" and ".join(_said(*key) for key in sorted(keys)) for keys in lost)
-    return Rivals(fits, ("", *(name for name, _ in others)), instead, every=bool(r.rivals))
+    return Hypotheses(fits, ("", *(name for name, _ in others)), instead, every=bool(r.rivals))
 
 
 def _effects(fit: Fit) -> set[tuple[str, str]]:
     return {name_of(fit.model.effects[i]) for i in fit.added}
 
 
-def library(base: Fit, rich: Dataset) -> Rivals:
-    """One model for each effect on each channel, of a small size of those from which the tracer begins on a rich drive."""
+def library(base: Fit, rich: Dataset) -> Hypotheses:
+    """One model for each effect on each channel, at a small start value of the search on a rich excitation."""
     found: dict[tuple[str, str], ComposedModel] = {}
     for candidate in candidates(base.model, rich):
         key = candidate.name, candidate.channel
@@ -95,7 +95,7 @@ def library(base: Fit, rich: Dataset) -> Rivals:
             found[key] = models[sized[len(sized) // SMALL if sized[-1][0] > 0.0 else -1][1]]
     fits = [replace(base, model=m, free=free_of(m)) for m in found.values()]
     names = ("no effect", *(_said(*key) for key in found))
-    return Rivals((base, *fits), names, ("no effect",) * len(names), every=True)
+    return Hypotheses((base, *fits), names, ("no effect",) * len(names), every=True)
 
 
 def _size(model: ComposedModel, place: int) -> float:
@@ -105,7 +105,7 @@ def _size(model: ComposedModel, place: int) -> float:
 
 
 def _with(given: Problem, best: Fit, found: Found) -> Fit | None:
-    """The chosen model with one effect replaced by another one: the one by which the likelihood suffers least."""
+    """Selected model with one effect replaced by another, in the place with the highest likelihood."""
     effect = registry().get("effects", found.name)
     added = Added(effect, found.channel, found.values)
     models = [insert(without(best.model, place), added, at) for place in best.added for at in sorted({place, len(best.model.effects) - 1})]
@@ -115,7 +115,7 @@ def _with(given: Problem, best: Fit, found: Found) -> Fit | None:
 
 
 def _closest(given: Problem, best: Fit) -> Iterator[tuple[str, tuple[str, str], Fit]]:
-    """Fitted models that have another effect instead of one that was found, the closest first."""
+    """Fitted models with another effect instead of a reported one, the closest first."""
     found = []
     for place in best.added:
         base = fitted(given, best, without(best.model, place), 1)

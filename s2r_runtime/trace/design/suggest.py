@@ -1,11 +1,11 @@
-"""What to drive so that effects which explain the same data can be told apart: in a sentence, and as a sequence of inputs.
+"""Input design for model discrimination: which excitation separates effects that explain the same data.
 
-Each effect is told from the others by what it does to one feature of the input: a bias by zero and both signs, a gain by several
-sizes, a limit by sizes up to the largest, memory by steps seen at once after they are made, and one that couples inputs by
-values of the one at several values of the other.
+`advice` is one sentence: each effect is recognised by one feature of the input. A bias needs zero and both signs, a gain several sizes, a
+limit sizes up to the largest, memory samples right after steps, a coupling values of one input at several values of the other.
 
-A sequence is found by drawing many (`candidates`) and taking the one under which the smallest expected log likelihood difference between
-rivals (`discrimination`) is largest; for the whole library, the one under which most effects are told from one another and from none.
+`suggest` draws many sequences (`candidates`). It takes the one under which the smallest expected log likelihood difference between
+competing hypotheses (`discrimination`) is largest: a maximin T-optimal design (A. Atkinson, V. Fedorov, Biometrika 62, 1975). For the whole
+library it takes the sequence that separates most pairs.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.trace.design.candidates import Room, draw, room_of
-from s2r_runtime.trace.design.competing_fits import Rivals, ground, library, rivals_of
+from s2r_runtime.trace.design.competing_fits import Hypotheses, competing_hypotheses, ground, library
 from s2r_runtime.trace.design.discrimination import as_data, between, expected, refitted, trajectories
 from s2r_runtime.trace.design.suggestion import ENOUGH, Suggestion
 from s2r_runtime.trace.diagnostics.rollout_error import Held
@@ -36,28 +36,28 @@ Bounds = Mapping[str, tuple[float, float]]
 Ways = tuple[tuple[int, int], ...]
 
 DURATION_S, FEWEST, MOST = 20.0, 300, 4000
-"""Length of a drive if none is asked for, s; and in rows at least and at most."""
+"""Default length of a sequence, s; minimum and maximum number of samples."""
 
 ROWS, SEQUENCES = 30_000, (8, 60)
-"""Rows that are simulated for each rival, and how many sequences that may be."""
+"""Samples that are simulated for each hypothesis; minimum and maximum number of sequences."""
 
 FINALS, CLOSEST = 3, 5
-"""Sequences that are looked at again with rivals really refitted, and the closest pairs of each; of the best one all pairs."""
+"""Sequences that are re-evaluated with re-fitted hypotheses, and closest pairs of each; of the best one all pairs."""
 
 PLENTY = 10.0 * ENOUGH
-"""More nats than this are worth nothing."""
+"""Expected evidence, nats, beyond which more is not preferred."""
 
 HOMEWARD = 0.3
-"""Share of its worth that a drive loses if it ends at the edge of the room."""
+"""Share of its value that a sequence loses if it ends at the edge of the region."""
 
 NESTED = 0.02
-"""A rival that loses no more than this share, whatever is driven, of what the truth would lose in its place, can become the truth."""
+"""Nested hypotheses: one loses at most this share, under all inputs, of what the other loses in its place."""
 
 REPEATS = 10.0
-"""A drive that would have to be driven more often than that until it tells two apart is none."""
+"""Repetitions of a sequence beyond which it does not count as separating a pair."""
 
 MOST_NEEDS = 4
-"""Of one input that a sentence names."""
+"""Number of features of one input in a sentence."""
 
 _SIZES = "at least three sizes"
 _FAR = "steps between values far apart, each held until the response has settled"
@@ -112,17 +112,17 @@ def advice(model: ComposedModel, tied: Iterable[tuple[str, str]]) -> str:
             text = _NEEDS.get(name, _OTHERWISE)
             if text not in needs:
                 needs.append(text)
-    told = {channel: "; ".join(needs[:MOST_NEEDS]) for channel, needs in sorted(wanted.items(), reverse=True)}
-    if told.get("") in {needs for channel, needs in told.items() if channel}:
-        del told[""]  # what an input is to do anyway need not be said once more of none in particular
-    parts = [f"{channel}: {needs}" if channel else f"{needs[0].upper()}{needs[1:]}" for channel, needs in told.items()]
+    features = {channel: "; ".join(needs[:MOST_NEEDS]) for channel, needs in sorted(wanted.items(), reverse=True)}
+    if features.get("") in {needs for channel, needs in features.items() if channel}:
+        del features[""]  # it is listed for an input already
+    parts = [f"{channel}: {needs}" if channel else f"{needs[0].upper()}{needs[1:]}" for channel, needs in features.items()]
     apart = " Change one input at a time while the others hold still." if len([c for c in wanted if c]) > 1 else ""
-    return ("Drive " if next(iter(told)) else "") + ". ".join(parts) + "." + apart
+    return ("Drive " if next(iter(features)) else "") + ". ".join(parts) + "." + apart
 
 
 @dataclass(frozen=True)
 class _Choice:
-    """u: (T, nu); pairs: (one, other, nats), the closest first; never: pairs that no sequence tells apart."""
+    """u: (T, nu); pairs: (one, other, nats), the closest first; never: pairs that no sequence separates."""
 
     u: Array
     pairs: tuple[tuple[str, str, float], ...]
@@ -137,46 +137,44 @@ def suggest(
     duration: float | None = None,
     seed: int = 0,
 ) -> Suggestion:
-    """The drive for a trace. bounds: of the inputs (None: the range seen); region: of states that must be kept; duration: s."""
+    """Suggest inputs for a result. bounds: of the inputs (None: the range seen); region: allowed range of states; duration: s."""
     given = ground(r.held)
-    rivals = rivals_of(r, given)
-    base = evaluate(given, r.model) if rivals is None else rivals.fits[0]
-    found = _suggested(r.held, base, rivals, bounds, region, duration, seed)
-    longer = max(1, round(r.model.dt / r.spec.dt))  # what was fitted and judged on longer steps than the model's is driven on the model's
+    hypotheses = competing_hypotheses(r, given)
+    base = evaluate(given, r.model) if hypotheses is None else hypotheses.fits[0]
+    found = _suggested(r.held, base, hypotheses, bounds, region, duration, seed)
+    longer = max(1, round(r.model.dt / r.spec.dt))  # steps of the fit may be longer than the model's
     return found if found.u is None else replace(found, u=np.repeat(found.u, longer, axis=0), dt=r.spec.dt)
 
 
 def suggest_first(
     model: ComposedModel, data: Dataset, *, bounds: Bounds | None, region: Bounds | None, duration: float | None, seed: int
 ) -> Suggestion:
-    """The drive for a recording that says too little to be traced: one that shows whatever the library has."""
+    """Suggest inputs for a recording that cannot be traced: a sequence that excites the whole library."""
     steps = steps_of(data)
     held = Held(data, steps, (), np.ones(sum(len(run.y) - 1 for run in data.runs), dtype=bool), 1)
     return _suggested(held, evaluate(ground(held), model), None, bounds, region, duration, seed)
 
 
 def _suggested(
-    held: Held, base: Fit, rivals: Rivals | None, bounds: Bounds | None, region: Bounds | None, duration: float | None, seed: int
+    held: Held, base: Fit, hypotheses: Hypotheses | None, bounds: Bounds | None, region: Bounds | None, duration: float | None, seed: int
 ) -> Suggestion:
     model, rng = base.model, np.random.default_rng(seed)
     ends = _bounds(held, model.inputs, bounds)
-    told = {name: (float(low), float(high)) for name, (low, high) in zip(model.inputs, ends, strict=True)}
-    nothing = Suggestion(model.inputs, model.dt, told, bounds is None, rivals is not None)
+    limits = {name: (float(low), float(high)) for name, (low, high) in zip(model.inputs, ends, strict=True)}
+    nothing = Suggestion(model.inputs, model.dt, limits, bounds is None, hypotheses is not None)
     if not np.any(ends[:, 1] > ends[:, 0]):
-        return replace(nothing, refused="the bounds leave no input that may change; a profile would say what is allowed (--profile)")
+        return replace(nothing, refused="the bounds leave no input that may change; a profile states what is allowed (--profile)")
     room = room_of(model, held, ends, region)
     steps = _steps(duration, model.dt)
     drawn = draw(rng, model, room, ends, int(np.clip(ROWS // steps, *SEQUENCES)), steps)
-    drawn = _inside(rivals.fits if rivals else (base,), room, drawn, strictly=region is not None)
+    drawn = _inside(hypotheses.fits if hypotheses else (base,), room, drawn, strictly=region is not None)
     if not len(drawn):
-        return replace(nothing, refused="no drive of that length stays inside the region; give a shorter one or a larger region")
-    choice = _for_rivals(rivals, held, room, drawn, rng) if rivals else None
+        return replace(nothing, refused="no sequence of that length stays inside the region; give a shorter length or a larger region")
+    choice = _for_hypotheses(hypotheses, held, room, drawn, rng) if hypotheses else None
     if choice is None or not (choice.pairs or choice.never):
         nothing, choice = replace(nothing, tied=False), _for_library(base, held, room, drawn, rng)
     if not choice.pairs:
-        return replace(
-            nothing, refused=f"nothing within the bounds tells apart {'; '.join(choice.never) or 'anything'}", never=choice.never
-        )
+        return replace(nothing, refused=f"no inputs within the bounds separate {'; '.join(choice.never) or 'anything'}", never=choice.never)
     y = trajectories(model, None, room.start, choice.u[None], rng)[0]
     away = np.hypot(*(y - room.start)[:, list(room.pose)].T) if room.pose is not None else room.excess(y)
     begin = tuple((s, float(room.start[i])) for i, s in enumerate(model.states) if region and s in region and s in {"x", "y", "q"})
@@ -193,7 +191,7 @@ def _suggested(
 
 
 def _bounds(held: Held, inputs: tuple[str, ...], bounds: Bounds | None) -> Array:
-    """(nu, 2). The range seen has zero in it: the robot stood before it was driven."""
+    """(nu, 2) bounds of the inputs. The range seen includes zero: the robot was at rest before."""
     if bounds is not None:
         return np.array([bounds[name] for name in inputs], dtype=np.float64)
     u = np.concatenate([run.u for run in held.data.runs])
@@ -205,9 +203,7 @@ def _steps(duration: float | None, dt: float) -> int:
 
 
 def _inside(fits: tuple[Fit, ...], room: Room, drawn: Array, *, strictly: bool) -> Array:
-    """Of the sequences (count, T, nu) those under which every rival stays in the room. Without a region it is only what was seen: then at
-    least the ones that leave it least.
-    """
+    """Sequences (count, T, nu) under which every hypothesis stays in the region. If not strictly: at least those that leave it least."""
     worst = np.zeros(len(drawn))
     for fit in fits:
         y = trajectories(fit.model, None, room.start, drawn, np.random.default_rng(0))
@@ -216,48 +212,48 @@ def _inside(fits: tuple[Fit, ...], room: Room, drawn: Array, *, strictly: bool) 
     return drawn[good] if len(good) or strictly else drawn[np.argsort(worst)[: SEQUENCES[0]]]
 
 
-def _for_rivals(rivals: Rivals, held: Held, room: Room, drawn: Array, rng: np.random.Generator) -> _Choice:
-    """The sequence under which the closest pair is farthest apart; the best few with rivals really refitted."""
-    fits = rivals.fits
-    couples = [(i, j) for i, j in combinations(range(len(fits)), 2) if i == 0 or rivals.every]
+def _for_hypotheses(hypotheses: Hypotheses, held: Held, room: Room, drawn: Array, rng: np.random.Generator) -> _Choice:
+    """Sequence with the largest expected evidence for the closest pair; hypotheses are re-fitted for the best few."""
+    fits = hypotheses.fits
+    couples = [(i, j) for i, j in combinations(range(len(fits)), 2) if i == 0 or hypotheses.every]
     nats = np.zeros((len(drawn), len(fits), len(fits)))
     for truth, fit in enumerate(fits):
         y = trajectories(fit.model, fit.noise, room.start, drawn, rng)
         for c, u in enumerate(drawn):
             nats[c, truth] = expected(fits, truth, as_data(held.data, y[c], u))
     ways = [_ways(nats, i, j) for i, j in couples]
-    roughly = np.array([[min(n[way] for way in told) for told in ways] for n in nats])
+    roughly = np.array([[min(n[way] for way in both) for both in ways] for n in nats])
     ends = room.excess(trajectories(fits[0].model, None, room.start, drawn, rng)[:, -1])
     finals = np.argsort(-_worth(roughly, ends))[:FINALS]
     really = roughly[finals]
     for row, c in zip(really, finals, strict=True):
-        _refit(rivals, held, room, drawn[c], ways, row, np.argsort(row)[:CLOSEST])
+        _refit(hypotheses, held, room, drawn[c], ways, row, np.argsort(row)[:CLOSEST])
     best = int(np.argmax(_worth(really, ends[finals])))
-    _refit(rivals, held, room, drawn[finals[best]], ways, really[best], np.argsort(really[best]))
-    named = [rivals.named(i, j) for i, j in couples]
+    _refit(hypotheses, held, room, drawn[finals[best]], ways, really[best], np.argsort(really[best]))
+    named = [hypotheses.named(i, j) for i, j in couples]
     found = sorted(((*name, round(float(n), 2)) for name, n in zip(named, really[best], strict=True)), key=lambda pair: pair[2])
-    never = tuple(f"{one} and {other}" for one, other, n in found if n * REPEATS < ENOUGH) if rivals.every else ()
+    never = tuple(f"{one} and {other}" for one, other, n in found if n * REPEATS < ENOUGH) if hypotheses.every else ()
     return _Choice(drawn[finals[best]], tuple(pair for pair in found if pair[2] * REPEATS >= ENOUGH), never)
 
 
-def _refit(rivals: Rivals, held: Held, room: Room, u: Array, ways: list[Ways], nats: Array, which: NDArray[np.int64]) -> None:
-    """Lowers nats (pairs,) of some pairs to what is left when the rival is really fitted."""
+def _refit(hypotheses: Hypotheses, held: Held, room: Room, u: Array, ways: list[Ways], nats: Array, which: NDArray[np.int64]) -> None:
+    """Lower nats (pairs,) of some pairs to the value with a re-fitted hypothesis."""
     for pair in which.tolist():
         if nats[pair] * REPEATS >= ENOUGH:
-            left = [refitted(rivals.fits, truth, rival, held.data, room.start, u) for truth, rival in ways[pair]]
+            left = [refitted(hypotheses.fits, truth, alternative, held.data, room.start, u) for truth, alternative in ways[pair]]
             nats[pair] = min(float(nats[pair]), *left)
 
 
 def _worth(nats: Array, ends: Array) -> Array:
-    """(count,) of drives with nats (count, pairs): of the closest pair among those that some drive tells apart; less if it ends far off."""
+    """(count,) value of sequences with nats (count, pairs): evidence of the closest separable pair, less if it ends far away."""
     can = nats.max(axis=0) * REPEATS >= ENOUGH
     closest = nats[:, can].min(axis=1) if can.any() else nats.max(axis=1)
     return np.asarray(np.minimum(closest, PLENTY) * (1.0 - HOMEWARD * np.minimum(ends, 1.0)))
 
 
 def _ways(nats: Array, i: int, j: int) -> Ways:
-    """(truth, rival) that count for a pair, of nats (count, R, R): both, but not the one in which the rival can become the truth itself (a
-    gain by sign a gain): the tracer takes the simpler of two that say the same thing.
+    """(truth, alternative) that count for a pair, of nats (count, R, R): both, except if one contains the other (a gain by sign and a
+    gain): the tracer then takes the simpler one.
     """
     there, back = nats[:, i, j], nats[:, j, i]
     if np.all(there < 1.0 + NESTED * back):
@@ -266,16 +262,16 @@ def _ways(nats: Array, i: int, j: int) -> Ways:
 
 
 def _for_library(base: Fit, held: Held, room: Room, drawn: Array, rng: np.random.Generator) -> _Choice:
-    """The sequence under which most effects are told from one another, and from none."""
+    """Sequence that separates most effects from one another and from no effect."""
     y = trajectories(base.model, base.noise, room.start, drawn, rng)
-    rivals = library(base, as_data(held.data, y[0], drawn[0]))
+    hypotheses = library(base, as_data(held.data, y[0], drawn[0]))
     drawn, y = drawn[: SEQUENCES[0] * 2], y[: SEQUENCES[0] * 2]
-    tables = np.stack([between(rivals.fits, base, as_data(held.data, y[c], u)) for c, u in enumerate(drawn)])
-    either = np.maximum(tables, tables.transpose(0, 2, 1))  # of two that nest, the richer one may be what the robot does
-    couples = list(combinations(range(len(rivals.fits)), 2))
+    tables = np.stack([between(hypotheses.fits, base, as_data(held.data, y[c], u)) for c, u in enumerate(drawn)])
+    either = np.maximum(tables, tables.transpose(0, 2, 1))  # of nested effects, the richer one may be true
+    couples = list(combinations(range(len(hypotheses.fits)), 2))
     best = int(np.argmax(np.minimum(either / ENOUGH, 1.0).sum(axis=(1, 2))))
     shown = either[:, 0].max(axis=0) * REPEATS >= ENOUGH
     shown[0] = True
-    pairs = [(rivals.names[i], rivals.names[j], round(float(either[best, i, j]), 2)) for i, j in couples if shown[i] and shown[j]]
-    never = tuple(name for name, ok in zip(rivals.names, shown, strict=True) if not ok)
+    pairs = [(hypotheses.names[i], hypotheses.names[j], round(float(either[best, i, j]), 2)) for i, j in couples if shown[i] and shown[j]]
+    never = tuple(name for name, ok in zip(hypotheses.names, shown, strict=True) if not ok)
     return _Choice(drawn[best], tuple(sorted(pairs, key=lambda pair: pair[2])), never)

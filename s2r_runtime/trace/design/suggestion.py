@@ -1,4 +1,4 @@
-"""A drive that would tell apart what a recording cannot, with what it promises: as a CSV, in words, as JSON."""
+"""Suggested input sequence that separates hypotheses, with its expected evidence: as CSV, text and JSON."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 ENOUGH = 23.0
-"""Nats that tell two models apart. A log likelihood difference of m nats on average scatters by sqrt(2 m): m - 2 sqrt(2 m) exceeds the
-3 nats within which rivals tie from m = 14 on; and the fit sees six tenths of a recording."""
+"""Expected log likelihood difference in nats that separates two models. With mean m its standard deviation is sqrt(2 m). From m = 14 on
+m - 2 sqrt(2 m) exceeds the 3 nats of `selection/ties`, and the fit uses six tenths of a recording: 14 / 0.6 = 23."""
 
 NAMED = 4
-"""Things that are named one by one."""
+"""Number of hypotheses that are listed one by one."""
 
 
 @dataclass(frozen=True)
 class Suggestion:
-    """u: (T, nu), one row a step of dt; None if nothing within the bounds would do, and `refused` says why.
+    """u: (T, nu), one sample per step dt; None if no sequence within the bounds suffices, with the reason in `refused`.
 
-    bounds: of the inputs, `seen` in the recording or given. tied: it is about rivals that tie (or nearly); else about the whole library.
-    pairs: (one, other, nats) of those it tells apart, the closest first; never: what nothing within the bounds tells apart, or shows.
-    begin: where the robot should stand; farthest, ends: m from there at most, and at the end (without a planar pose: shares of the room).
+    bounds: of the inputs, `seen` in the recording or given. tied: it separates competing hypotheses of a result; else the whole library.
+    pairs: (one, other, nats) that it separates, the closest first; never: pairs, or effects, that no sequence within the bounds shows.
+    begin: start of the robot; farthest, ends: distance from it at most, and at the end, m (without a planar pose: shares of the region).
     """
 
     inputs: tuple[str, ...]
@@ -44,16 +44,16 @@ class Suggestion:
 
     @property
     def nats(self) -> float:
-        """Of the closest pair."""
+        """Expected log likelihood difference of the closest pair."""
         return self.pairs[0][2] if self.pairs else 0.0
 
     @property
     def rows(self) -> int | None:
-        """After about so many rows of it, driven again and again if need be, the closest pair is told apart."""
+        """Number of samples after which the closest pair is separated; the sequence may have to be repeated."""
         return math.ceil(len(self.u) * ENOUGH / self.nats) if self.u is not None and self.nats > 0.0 else None
 
     def to_csv(self) -> str:
-        """`t` in s and the inputs; each row's are held until the next."""
+        """Columns `t` in s and the inputs, zero-order hold."""
         if self.u is None:
             raise ValueError(self.refused)
         lines = [",".join(("t", *self.inputs))]
@@ -78,37 +78,38 @@ class Suggestion:
         }
 
     def text(self) -> str:
-        """What it is, what it promises, where the robot goes; a line each."""
+        """Bounds, expected evidence and displacement, one line each."""
         return "\n".join(self.lines())
 
     def lines(self) -> list[str]:
         """The lines of `text`."""
         if self.u is None:
-            return [f"no drive is suggested: {self.refused}"]
+            return [f"no inputs are suggested: {self.refused}"]
         within = ", ".join(f"{name} {low:.4g} to {high:.4g}" for name, (low, high) in self.bounds.items())
-        told = [
+        lines = [
             f"{len(self.u) * self.dt:.4g} s, {len(self.u)} rows, within {within}{' (the range seen in the recording)' if self.seen else ''}"
         ]
-        told += self._promise(len(self.u))
+        lines += self._evidence(len(self.u))
         if self.never:
             rest = f" and {len(self.never) - NAMED} more" if len(self.never) > NAMED else ""
-            told.append(f"nothing within these bounds {'tells apart' if self.tied else 'shows'} {'; '.join(self.never[:NAMED])}{rest}")
+            lines.append(f"no inputs within these bounds {'separate' if self.tied else 'show'} {'; '.join(self.never[:NAMED])}{rest}")
         at = ", ".join(f"{name} = {value:.3g}" for name, value in self.begin)
-        where = f"goes {self.farthest:.2g} m away at most and ends {self.ends:.2g} m from there"
-        room = f"uses {100.0 * self.farthest:.0f} % of the room it has and ends within {100.0 * self.ends:.0f} %"
-        return [*told, f"begin at rest{f' at {at}' if at else ''}; the robot {where if self.metres else room}"]
+        where = f"moves at most {self.farthest:.2g} m away and ends {self.ends:.2g} m from the start"
+        room = f"uses {100.0 * self.farthest:.0f} % of its range and ends within {100.0 * self.ends:.0f} % of it"
+        return [*lines, f"start at rest{f' at {at}' if at else ''}; the robot {where if self.metres else room}"]
 
-    def _promise(self, steps: int) -> list[str]:
+    def _evidence(self, steps: int) -> list[str]:
+        """Expected evidence of a sequence of n steps, one line each."""
         if not self.pairs:
             return []
         one, other, nats = self.pairs[0]
         if not self.tied:
             sure = sum(1 for *_, nats in self.pairs if nats >= ENOUGH)
-            return [f"it tells {sure} of {len(self.pairs)} pairs of effects apart, no effect counted as one"]
+            return [f"it separates {sure} of {len(self.pairs)} pairs of effects (`no effect` counts as one)"]
         closest = f", the closest of {len(self.pairs)} pairs" if len(self.pairs) > 1 else ""
-        told = [f"it promises {_nats(nats)} nats between {one} and {other}{closest}"]
-        again = f": drive it {math.ceil(ENOUGH / nats)} times" if nats < ENOUGH else ""
-        return [*told, f"{ENOUGH:g} nats tell them apart, which takes about {math.ceil(steps * ENOUGH / nats)} rows{again}"]
+        expected = [f"expected evidence: {_nats(nats)} nats between {one} and {other}{closest}"]
+        again = f": repeat it {math.ceil(ENOUGH / nats)} times" if nats < ENOUGH else ""
+        return [*expected, f"{ENOUGH:g} nats separate them, which takes about {math.ceil(steps * ENOUGH / nats)} rows{again}"]
 
 
 def _nats(value: float) -> str:

@@ -1,7 +1,6 @@
-"""What a trace looks like, as arrays for figures: residuals over time, their autocorrelation, rollouts against measurement.
+"""Arrays for figures of a trace: residuals over time, their autocorrelation, rollouts and measurement.
 
-Everything is of what was held out, before and after, but for `over_time`, which shows all of the recording. Long recordings are thinned so
-that extremes stay.
+All are of the held-out data, before and after, except `over_time` (the whole recording). Long recordings are thinned; extremes remain.
 """
 
 from __future__ import annotations
@@ -55,8 +54,8 @@ class Correlated:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Rollouts one after the other, each begun at the measured state. t: (m,) s; measured, before, after: (m, nx); starts: (r,) rows at
-    which a rollout begins: there the curves jump back to the measurement. about: which of them it is about.
+    """Rollouts one after the other, each begun at the measured state. t: (m,) s; measured, before, after: (m, nx); starts: (r,) indices
+    at which a rollout begins: there the curves jump back to the measurement. about: number of the rollout that it shows.
     """
 
     said: str
@@ -78,14 +77,14 @@ class OverTime:
 
 
 def views(r: TraceResult) -> dict[str, Any]:
-    """All of it as lists by state, for whoever draws it with tools of their own."""
+    """All arrays as lists by state, for other plotting tools."""
     steps, over = r.held.steps, variables(r.nominal, r.held)
     parts = {p.name: p for p in components(r.nominal, r.held, r.before.one_step, r.after.one_step, r.floor[0])}
     states = {name: (r.before.one_step[:, i], r.after.one_step[:, i]) for i, name in enumerate(r.nominal.states)}
-    told: dict[str, Any] = {}
+    residuals: dict[str, Any] = {}
     for name, (before, after) in {**states, **{n: (p.before, p.after) for n, p in parts.items()}}.items():
         keep = spread(POINTS, before, after)
-        told[name] = {
+        residuals[name] = {
             "t": steps.t[keep].tolist(),
             "before": before[keep].tolist(),
             "after": after[keep].tolist(),
@@ -94,7 +93,7 @@ def views(r: TraceResult) -> dict[str, Any]:
     correlated = dict(correlations(r, list(parts.values())))
     shown = stretches(r)
     return {
-        "residual": told,
+        "residual": residuals,
         "autocorrelation": {
             name: {"lag": c.lag.tolist(), "before": c.before.tolist(), "after": c.after.tolist()} for name, c in correlated.items()
         },
@@ -114,7 +113,7 @@ def _listed(s: Stretch, i: int) -> dict[str, list[float]]:
 
 
 def spread(most: int, *values: Array) -> Index:
-    """Rows to show of many: evenly, and those where some of the values is at its farthest from zero."""
+    """Indices to plot: evenly spaced, and those with the largest values."""
     n = len(values[0])
     if n <= most:
         return np.arange(n)
@@ -124,7 +123,7 @@ def spread(most: int, *values: Array) -> Index:
 
 
 def envelope(t: Array, e: Array, buckets: int = BUCKETS) -> Index:
-    """Rows of a curve to show: of each stretch of time the least and the largest value."""
+    """Indices of a curve to plot: minimum and maximum of each interval."""
     if len(t) <= 2 * buckets:
         return np.arange(len(t))
     edges = np.linspace(0, len(t), buckets + 1).astype(np.int64)
@@ -149,7 +148,7 @@ def _spans(steps: Steps, inside: NDArray[np.bool_]) -> list[tuple[float, float]]
 
 
 def correlations(r: TraceResult, parts: Sequence[Component]) -> list[tuple[str, Correlated]]:
-    """Of each component."""
+    """Autocorrelation of each component, with its 95 % band (Bartlett, moving average of order 1)."""
     steps = r.held.steps
     noise = evaluate(problem(r.held.data, steps), r.model).noise
     own = dict(zip(r.nominal.states, zip(noise.r, noise.q, strict=True), strict=True))
@@ -225,7 +224,7 @@ def _stretch(r: TraceResult, said: str, start: int) -> Stretch:
 
 
 def _rolled(model: ComposedModel, r: TraceResult, place: int, y: Array, begins: Index) -> Array:
-    """(m, nx) states foretold from each begin to the next; at a begin it is where the rollout before it ended."""
+    """(m, nx) predicted states from each start to the next; at a start, the end of the previous rollout."""
     act = acting(model, r.held.data)
     x = np.empty_like(y)
     x[0] = y[0]

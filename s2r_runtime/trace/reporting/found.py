@@ -1,4 +1,4 @@
-"""An effect that was found: its name, channel, and parameters with their 95 % intervals and units."""
+"""Identified effect: name, channel, and parameters with 95 % intervals and units."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from s2r_runtime.trace.reporting.wording import degrees, in_words
 
 Limit = float | list[list[float | None]] | None
 Value = tuple[Any, Limit, Limit, str]
-"""Value, low and high end of its 95 % interval (in the shape of the value; None where there is none), unit."""
+"""Value, low and high end of its 95 % interval (in the shape of the value; None if it has no interval), unit."""
 
 UNLIMITED = 1e5
-"""Ends of intervals beyond it are bounds of the parameter, not findings."""
+"""Ends of intervals beyond it are bounds of the parameter, not estimates."""
 
 DIGITS = 1
-"""Of an interval's half width that are written: more are noise."""
+"""Significant digits of an interval's half width."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """An effect. parameters: name -> (value, low, high, unit); low and high: 95 % interval, None where there is none. instead_of: (effect,
-    channel) of what was found in whose place it may stand: as a rival, or as the same_thing by another name.
+    """Identified effect. parameters: name -> (value, low, high, unit); low and high: 95 % interval, or None. instead_of: (effect, channel)
+    of the effects that it may replace: as a competing hypothesis, or as an equivalent (same_thing).
     """
 
     name: str
@@ -43,11 +43,11 @@ class Found:
         return {"name": self.name, "channel": self.channel, "parameters": values}
 
     def text(self) -> str:
-        """One line: what, where, and the numbers."""
-        told = ", ".join(f"{name} = {text}" for name, text in self.told())
-        return f"{self.name} on {self.channel}{': ' if told else ''}{told}"
+        """One line: effect, channel and parameters."""
+        values = ", ".join(f"{name} = {text}" for name, text in self.value_texts())
+        return f"{self.name} on {self.channel}{': ' if values else ''}{values}"
 
-    def told(self) -> Iterator[tuple[str, str]]:
+    def value_texts(self) -> Iterator[tuple[str, str]]:
         """(parameter, value with its unit and interval)."""
         for name, (value, low, high, unit) in self.parameters.items():
             if isinstance(value, float):
@@ -58,12 +58,12 @@ class Found:
                 yield name, str(value)
 
     def words(self) -> str:
-        """What it means for the robot, in a clause."""
+        """Meaning for the robot, one clause."""
         return in_words(self.name, self.channel, self.values)
 
 
 def each_once(found: Iterable[Found]) -> tuple[Found, ...]:
-    """The first of each name and channel: beside another rival it has other numbers, and is no other explanation."""
+    """The first of each effect and channel: other parameter values are not another explanation."""
     kept: dict[tuple[str, str], Found] = {}
     for e in found:
         kept.setdefault((e.name, e.channel), e)
@@ -71,14 +71,14 @@ def each_once(found: Iterable[Found]) -> tuple[Found, ...]:
 
 
 def interval_text(value: float, low: Limit, high: Limit, unit: str) -> str:
-    """`0.1000 rad/s (5.730 deg/s) (95 %: 0.0980 to 0.1020)`; an end at a parameter's bound says that the data do not limit it there."""
+    """`0.1000 rad/s (5.730 deg/s) (95 %: 0.0980 to 0.1020)`; an end at a parameter's bound is not limited by the data."""
     plain = "" if unit == "-" else unit
     ends = (low, high) if isinstance(low, float) and isinstance(high, float) else None
     known = [_limits(end, value) for end in ends or ()]
     within = all(known) and ends is not None
     width = 0.5 * (ends[1] - ends[0]) if ends is not None and within else 0.0
     turned = degrees(plain)
-    seen = max(min(width, 2.0 * abs(value)), 0.01 * width)  # of a number that is hardly known its first digit, not a zero
+    seen = max(min(width, 2.0 * abs(value)), 0.01 * width)  # of an uncertain parameter its first digit, not a zero
     text = _rounded(value, seen) + (f" {plain}" if plain else "")
     text += f" ({_rounded(math.degrees(value), math.degrees(seen))} {turned})" if turned else ""
     if ends is None:
@@ -90,12 +90,12 @@ def interval_text(value: float, low: Limit, high: Limit, unit: str) -> str:
 
 
 def _limits(end: float, value: float) -> bool:
-    """Whether an end of an interval says anything: not if it is at a bound far off, or so near to 0 that this is one."""
+    """Whether the data limit this end of an interval: not if it is at a distant bound, or at a bound next to 0."""
     return abs(end) < UNLIMITED and not 0.0 < abs(end) < abs(value) / UNLIMITED
 
 
 def _rounded(value: float, width: float) -> str:
-    """To DIGITS digits of the half width; to four without one."""
+    """Rounded to DIGITS digits of the half width; to four digits without one."""
     if not 0.0 < width < math.inf or not math.isfinite(value):
         return f"{value:.4g}"
     decimals = DIGITS - 1 - math.floor(math.log10(width))

@@ -1,4 +1,4 @@
-"""What the tracer found: as JSON (docs/json.md), as a short account, as arrays for plots, as a model."""
+"""Result of a trace: as JSON (docs/json.md), as text, as arrays for plots, as a model."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from s2r_runtime.trace.data.reconstruction import IN_PARTS, Reconstruction
 from s2r_runtime.trace.diagnostics.detectability import Visible
 from s2r_runtime.trace.diagnostics.rollout_error import Held, Judged
 from s2r_runtime.trace.diagnostics.validity_domain import Range
-from s2r_runtime.trace.diagnostics.validity_domain import told as domain_told
+from s2r_runtime.trace.diagnostics.validity_domain import told as validity_range
 from s2r_runtime.trace.estimation.problem import insert
 from s2r_runtime.trace.reporting.figures import views
 from s2r_runtime.trace.reporting.found import Found, Limit
@@ -34,18 +34,18 @@ __all__ = ["Found", "Limit", "TraceResult"]
 
 
 MEASURED = (
-    "{}: taken for a measurement with noise of its own, not for a command, as the inverse model says; what acts on it, and how it scales, "
-    "cannot be told here"
+    "{}: taken for a measurement with noise, not for a command, because of the inverse dynamics; its scale, and effects on it, cannot be "
+    "identified on this data"
 )
 
 
 @dataclass(frozen=True)
 class TraceResult:
-    """`spec`: the repaired model; the given one, if nothing was added, or if what ties does little here and may do harm elsewhere.
+    """`spec`: the repaired model; the given one, if nothing was added, or if the alternatives matter little here and may do harm elsewhere.
     `partial`: effects that explain a part only. `repair`: their errors on held-out data, if they lower those of rollouts by 5 % or more;
     `spec` then has them.
 
-    `depends_on`, `share_left`: of what the final model leaves. `floor`: what noise alone makes, (one step, rollout), (nx,) each.
+    `depends_on`, `share_left`: of the residual of the final model. `floor`: rms errors of noise alone, (one step, rollout), (nx,) each.
     """
 
     verdict: Verdict
@@ -72,45 +72,41 @@ class TraceResult:
     reconstruction: Reconstruction | None = None
     could_see: tuple[Visible, ...] = ()
     unseen: tuple[str, ...] = ()
-    """States of the model that were not measured, and that its motion does not need."""
+    """States of the model that were not measured and that the motion does not require."""
     unconfirmed: tuple[tuple[str, str], ...] = ()
-    """Name and channel of effects that what was held out never asks for: the fit alone speaks for them."""
+    """Name and channel of effects that the held-out data do not excite: only the fit supports them."""
     may_depend_on: tuple[str, ...] = ()
-    """Of `depends_on`, beside a name: what no rollout shows, or what is less sure."""
+    """The part of `depends_on` that is only a caveat: visible in no rollout, or less certain."""
     any_shape_of: tuple[str, ...] = ()
-    """Of `depends_on`: what several explanations have in common that tie, or add up to it; one without a name may, too
-    (`shared_dependence`).
-    """
+    """The part of `depends_on` that indistinguishable explanations share: an unnamed effect may be the true one (`shared_dependence`)."""
     repair: Judged | None = None
     way: Way = field(default_factory=Way)
-    """As the dataset's: how inputs went that the recording has samples of."""
+    """As in the dataset: how sampled inputs moved between samples."""
     noisy: dict[str, float] = field(default_factory=dict)
-    """Standard deviations of the noise that was taken out of inputs."""
+    """Standard deviation of the noise removed from each input, in its unit."""
     measured_forces: bool = False
-    """As the dataset's: the inputs were taken for measurements, and not for commands."""
+    """As in the dataset: the inputs are measurements, not commands."""
     behind: dict[str, float] = field(default_factory=dict)
-    """s by which states came late against others of the pose, and were taken earlier."""
+    """Delay in s, by state, relative to the other states of the pose; it was corrected."""
     forgetting: tuple[tuple[float, float], ...] = ()
-    """As the dataset's: first rows of runs of the recording that were left out, from and to, s."""
+    """As in the dataset: first samples of runs that were excluded, from and to, s."""
     unplaced: int = 0
-    """Transitions that were left out since a command changed in them, nobody knows when."""
+    """Number of transitions excluded because a command changed in them at an unknown time."""
     domain: tuple[Range, ...] = ()
-    """Of each state, then each input: where it was fitted or judged. Beyond that nothing speaks for what was found."""
+    """Range of validity of each state, then of each input."""
     subset: Subset | None = None
-    """Which rows of a long recording were used; None: all. test_subset: of the one that it was judged on."""
+    """Samples of a long recording that were used; None: all. test_subset: of the hold-out recording."""
     test_subset: Subset | None = None
     notes: tuple[str, ...] = ()
-    """What was guessed of the recording's columns, one sentence each."""
+    """How the columns were read, one sentence each."""
 
     def same(self, found: Found) -> tuple[Found, ...]:
-        """Of `ambiguous_with`: other names of the very same thing on this model."""
+        """Equivalents of an effect in `ambiguous_with`."""
         return tuple(e for e in self.ambiguous_with if e.same_thing and e.instead_of == ((found.name, found.channel),))
 
     @cached_property
     def rivals(self) -> tuple[Found, ...]:
-        """Of `ambiguous_with`: other things, which these data cannot tell from what was found. Of several names for a thing the first, also
-        where one could be a little more than the other one can: a push ahead, and a bias of the speed.
-        """
+        """Competing hypotheses in `ambiguous_with`: of equivalent ones the first, also if they are equivalent only nearly."""
         known = {name for e in self.effects for name in self._names_of(e)}
         kept: list[Found] = []
         for e in self.ambiguous_with:
@@ -124,32 +120,32 @@ class TraceResult:
 
     @property
     def blind(self) -> tuple[tuple[str, str], ...]:
-        """Effects that these data could not have shown. A second one on a channel where one was found is another question."""
+        """(effect, channel) of effects that these data could not have shown, on channels without an effect."""
         there = {e.channel for e in self.effects}
         return tuple((v.name, v.channel) for v in self.could_see if v.size is None and v.channel not in there)
 
     @property
     def left_as_given(self) -> bool:
-        """Whether the model does without what was found."""
+        """Whether the written model omits the effects."""
         return bool(self.effects) and self.spec.effects == self.nominal.spec.effects
 
     @property
     def done_to_data(self) -> tuple[str, ...]:
-        """What stands between the measurements and what was fitted, one line each."""
+        """Treatment of the data before the fit, one line each."""
         lines = [one.text() + of for one, of in ((self.subset, ""), (self.test_subset, " of what it is judged on")) if one]
         lines += [] if self.reconstruction is None else self.reconstruction.text()
         if self.unseen:
             was = "was" if len(self.unseen) == 1 else "were"
-            lines.append(f"{', '.join(self.unseen)} {was} not measured, and not needed: the motion follows from the inputs without")
+            lines.append(f"{', '.join(self.unseen)} {was} not measured, and not needed: the motion follows from the inputs")
         if self.behind:
             who, others = ", ".join(self.behind), ", ".join(s for s in ("x", "y", "theta") if s not in self.behind)
-            comes, was = ("comes", "was") if len(self.behind) == 1 else ("come", "were")
+            lags, was = ("lags", "was") if len(self.behind) == 1 else ("lag", "were")
             by = next(iter(self.behind.values()))
-            lines.append(f"{who} {comes} {by:.3g} s late against {others}, as the motion says, and {was} taken that much earlier")
+            lines.append(f"{who} {lags} {others} by {by:.3g} s, as the motion shows, and {was} shifted by that")
         of_test = self.held.data.forgetting if self.held.data.source != self.source else ()
         for stretches, of in ((self.forgetting, ""), (of_test, f" of {self.held.data.source}")):
             each = ", ".join(f"{a:.4g} to {b:.4g} s" for a, b in stretches[:3]) + (", ..." if len(stretches) > 3 else "")
-            lines += [f"left out: {each}{of}; what acts there may follow a command from before the recording"] if stretches else []
+            lines += [f"left out: {each}{of}; commands from before the recording may still act there"] if stretches else []
         apart = self.held.data if self.held.data.source != self.source else None
         for count, of in (
             (self.unplaced, ""),
@@ -157,64 +153,60 @@ class TraceResult:
         ):
             if count:
                 lines.append(
-                    f"left out: {count} transitions{of} in which a command changes: it changed between the rows, and nothing says when "
-                    "(record commands with stamps of their own)"
+                    f"left out: {count} transitions{of} in which a command changes between samples, at an unknown time "
+                    "(record commands with their own timestamps)"
                 )
         lines += self._inputs_taken()
         if self.unconfirmed:
             names = ", ".join(f"{name} on {channel}" for name, channel in self.unconfirmed)
-            lines.append(f"not confirmed: {names}; what it was judged on never asks for that, the fit alone speaks for it")
+            lines.append(f"not confirmed: {names}; the held-out data do not excite it, only the fit supports it")
         if self.effects:
-            lines.append(f"fitted or judged where {domain_told(self.domain)}; elsewhere untested")
+            lines.append(f"range of validity: {validity_range(self.domain)}; untested outside")
         if self.left_as_given:
-            lines.append("the model stays as it was given: what ties does little here, and on another drive it may do more harm than good")
+            lines.append("the model stays as it was given: the alternatives matter little here, and on other inputs one may do harm")
         if self.nominal.dt != self.spec.dt:
-            longer = f"fitted and judged on steps of {self.nominal.dt:g} s, the shortest that are independent"
+            longer = f"fitted and evaluated on steps of {self.nominal.dt:g} s, the shortest that are independent"
             lines.append(f"{longer}; the model's are {self.spec.dt:g} s")
         elif self._parts > 1 and self.reconstruction is None:
-            lines.append(
-                f"each step in {self._parts} parts, within which inputs change: their means over whole steps leave more than noise"
-            )
+            lines.append(f"each step in {self._parts} parts, because inputs change within steps")
         return tuple(lines)
 
     @property
     def _parts(self) -> int:
-        """Into how many parts a step of the model was cut for what it says."""
+        """Number of parts into which each step was divided."""
         return self.held.data.substeps if self.held.data.in_parts else 1
 
     def _inputs_taken(self) -> list[str]:
-        """How inputs were taken that the recording has samples of."""
+        """How sampled inputs were read, one line each."""
         lines = []
         if self.way.late:
-            lines.append("the inputs come a row late, as the motion says (a mean over the row before?): each was taken from the next row")
+            lines.append(
+                "the inputs are one sample behind, as the motion shows (a mean over the previous sample?): each was taken from the next one"
+            )
         if self.way.within:
-            lines.append("commands changed between the rows that tell them, as the motion says: each change was placed where it tells it")
+            lines.append("commands changed between samples: each change was placed where the motion shows it")
         if any(self.way.on):
             shares = {f"{50.0 * on:.0f} % of the way" for on in self.way.on}
             if len(shares) == 1:
-                lines.append(
-                    f"the inputs went on changing between the rows, as the motion says: each was taken {shares.pop()} to the next one"
-                )
+                lines.append(f"the inputs changed between samples, as the motion shows: each was taken {shares.pop()} to the next one")
             else:
                 each = ", ".join(f"{name} {50.0 * on:.0f} %" for name, on in zip(self.nominal.inputs, self.way.on, strict=True) if on)
-                lines.append(
-                    f"some inputs went on changing between the rows, as the motion says: taken on their way to the next one ({each})"
-                )
+                lines.append(f"some inputs changed between samples, as the motion shows: taken that far to the next one ({each})")
         if self.measured_forces:
             lines.append(MEASURED.format(", ".join(self.nominal.inputs)))
         if self.noisy:
             each = ", ".join(f"{name} {size:.2g}" for name, size in self.noisy.items())
-            lines.append(f"inputs are noisy samples, as the motion says: noise was taken out of them (standard deviation: {each})")
+            lines.append(f"inputs are noisy samples, as the motion shows: the noise was removed (standard deviation: {each})")
         return lines
 
     @property
     def horizon_s(self) -> float:
-        """Of the rollouts."""
+        """Length of the rollouts, s."""
         return self.held.horizon * self.held.data.dt
 
     @property
     def explaining(self) -> ComposedModel:
-        """The model of the answer, with what explains a part only."""
+        """Model of the result with the effects of `partial`."""
         model = self.model
         for found in self.partial:
             effect = AppliedEffect(registry().get("effects", found.name), found.channel, found.values)
@@ -279,13 +271,13 @@ class TraceResult:
         }
 
     def comments(self) -> tuple[str, ...]:
-        """For the head of the model's TOML."""
+        """Comments for the header of the model's TOML."""
         parts = self.reconstruction is not None and self.reconstruction.in_parts
         if self.repair is not None:
             partial = f"Partial repair by s2r trace on {self.source}: these effects lower the error, and more is missing"
-            return (partial, *(e.text() for e in self.partial), f"Fitted or judged where {domain_told(self.domain)}")
+            return (partial, *(e.text() for e in self.partial), f"Fitted or judged where {validity_range(self.domain)}")
         found = () if self.left_as_given else tuple(e.text() for e in self.effects)
-        found += (f"Fitted or judged where {domain_told(self.domain)}",) if found else ()
+        found += (f"Fitted or judged where {validity_range(self.domain)}",) if found else ()
         found += (IN_PARTS,) if parts else ()
         found += (MEASURED.format(", ".join(self.nominal.inputs)),) if found and self.measured_forces else ()
         return (
@@ -295,7 +287,7 @@ class TraceResult:
         )
 
     def text(self) -> str:
-        """A short account for a person."""
+        """Text report."""
         return account(self)
 
     def plots(self) -> dict[str, Any]:

@@ -1,5 +1,7 @@
-"""The account that a person reads in twenty seconds: what was left over and what it follows, what explains it, before and after,
-what is still there, what is wrong with the measurements, what was done to the data. 100 columns.
+"""Text report of a trace, at most 100 columns wide.
+
+The verdict and the effects; the residual of the given model; errors before and after; the remaining structure; faults of measurement; what
+was done to the data.
 """
 
 from __future__ import annotations
@@ -26,48 +28,48 @@ Array = NDArray[np.float64]
 WIDTH = 100
 
 LABEL = 12
-"""Columns of the words on the left."""
+"""Width of the labels, characters."""
 
 LISTED = 6
-"""Faults, and effects that could not have been seen, that are listed one by one."""
+"""Number of faults, and of undetectable effects, that are listed one by one."""
 
 SEGMENTS = 8
-"""Names of segments that are listed."""
+"""Number of segment names that are listed."""
 
-TOLD, FOLLOWED, SEEN = 1.05, 0.3, 0.1
-"""A part of the residual is spoken of from this many times the noise on; what it follows, from this share (of all of it) on."""
+ABOVE_NOISE, FOLLOWED, MIN_SHARE = 1.05, 0.3, 0.1
+"""Rms over noise from which a component of the residual is listed; shares of it, explained by a variable, from which that is listed."""
 
-TOLD_AWAY = 1.25
-"""The same at the end of rollouts, of which few are independent."""
+ROLLOUT_ABOVE_NOISE = 1.25
+"""ABOVE_NOISE at the end of rollouts, of which few are independent."""
 
 HEADLINES = {
-    "none": "nothing is left beyond noise: the model explains these data",
-    "unexplained": "structure is left that no effect in the library accounts for, so it gets no name",
-    "sensor_fault": "the measurements, not the motion, are wrong in places",
+    "none": "no unmodelled dynamics detected: the residual is consistent with noise",
+    "unexplained": "the residual has structure that no effect in the library explains",
+    "sensor_fault": "measurements are wrong at the times listed below; no effect is missing",
 }
 
-WANDERS = "what is left follows no input and no state: noise that is correlated in time"
-"""The headline of `none` where something is left that no effect accounts for, and that need not be one."""
+COLOURED = "no effect detected: the residual is noise that is correlated in time, independent of inputs and states"
+"""Headline of `none` if the residual is not white."""
 
 USUAL = 0.97
-"""Share of the rollouts that must be far off, too, for that to be said."""
+"""Share of the rollouts whose rms must exceed the limit, too: a few outliers do not count."""
 
 FAR_OFF = 2.0
-"""Times the noise at the end of rollouts from which on what was found did not explain all."""
+"""Rollout error over noise from which the effects explain only a part."""
 
-SOME_LEFT = 1.5
-"""The same, from which on it is not said that nothing is left. Rollouts are few, and not independent: less may be chance."""
+SLIGHTLY_OFF = 1.5
+"""The same, from which the error is mentioned. Rollouts are few and not independent: less may be chance."""
 
 ARROW = "->"
 
 
 def account(r: TraceResult) -> str:
-    """The lines."""
+    """Compose the report."""
     lines = [f"{r.verdict}: {headline(r)}", *_explained(r)]
-    lines += ["", *labelled("left over", _left_over(r))]
+    lines += ["", *labelled("residual", _residual(r))]
     lines += ["", *_table(r), ""]
     lines += labelled("gap", _gap(r))
-    lines += labelled("still there", _still_there(r))
+    lines += labelled("remaining", _remaining(r))
     lines += labelled("faults", list(_faults(r)))
     lines += labelled("not shown", _unseen(r))
     lines += labelled("data", _data(r))
@@ -75,38 +77,38 @@ def account(r: TraceResult) -> str:
 
 
 def headline(r: TraceResult) -> str:
-    """What the verdict says, in a clause."""
+    """One clause on the verdict."""
     if r.rivals:
-        return f"these data cannot decide between {1 + len(r.rivals)} explanations; the best is"
+        return f"{1 + len(r.rivals)} explanations are not distinguishable on this data; the best is"
     if r.effects:
         count = len(r.effects)
         all_of_it = not _shown(r) and not _away(r, r.after.ends, FAR_OFF)
-        explain = f"{'explains' if count == 1 else 'explain'} {'what' if all_of_it else 'a part of what'} was left over"
+        explain = f"{'explains' if count == 1 else 'explain'} {'the residual' if all_of_it else 'a part of the residual'}"
         return f"the model lacks {'one effect' if count == 1 else f'{count} effects'}, which {explain}"
-    return WANDERS if r.verdict == "none" and _wanders(r) else HEADLINES[r.verdict]
+    return COLOURED if r.verdict == "none" and _is_coloured(r) else HEADLINES[r.verdict]
 
 
-def _wanders(r: TraceResult) -> bool:
-    """Whether a verdict without an effect leaves noise that takes rollouts away."""
+def _is_coloured(r: TraceResult) -> bool:
+    """Whether the residual of a verdict without an effect is coloured, or rollouts end beyond the noise."""
     return bool(r.depends_on) or bool(_away(r, r.after.ends, FAR_OFF))
 
 
 def _explained(r: TraceResult) -> list[str]:
     lines = [line for e in r.effects for line in _known(r, e)]
     if r.rivals:
-        lines += ["cannot be told from:", *(line for e in r.rivals for line in [*_known(r, e), *_in_place_of(r, e)])]
-        lines += labelled("or", _nameless(r))
-        lines += labelled("try next", [r.suggested_excitation or "", "(--suggest FILE.csv writes such a drive)"])
+        lines += ["not distinguishable from:", *(line for e in r.rivals for line in [*_known(r, e), *_in_place_of(r, e)])]
+        lines += labelled("or", _unnamed(r))
+        lines += labelled("try next", [r.suggested_excitation or "", "(--suggest FILE.csv writes such inputs)"])
     elif r.any_shape_of:
-        lines += labelled("or", _nameless(r))
+        lines += labelled("or", _unnamed(r))
     if r.partial:
-        what = "explains a part, and makes the model better:" if r.repair is not None else "explains a part only, so no name is lent to it:"
+        what = "partial fit that improves the prediction:" if r.repair is not None else "partial fit, therefore not reported as a cause:"
         lines += [what, *(line for e in r.partial for line in _effect(e)), *labelled("repair", _partial_repair(r))]
     return lines
 
 
 def _partial_repair(r: TraceResult) -> list[str]:
-    """Errors at the end of held-out rollouts without and with what explains a part."""
+    """Errors at the end of held-out rollouts, without and with the effects of `partial`."""
     if r.repair is None:
         return []
     units: dict[str, str] = getattr(r.nominal.nominal, "units", {})
@@ -123,20 +125,24 @@ def _partial_repair(r: TraceResult) -> list[str]:
 
 
 def _in_place_of(r: TraceResult, e: Found) -> list[str]:
-    """Which of several effects a rival would replace."""
+    """Which of several effects an alternative would replace."""
     if len(r.effects) < 2 or not e.instead_of:
         return []
     return [f"      in place of {' and '.join(f'{name} on {channel}' for name, channel in e.instead_of)}"]
 
 
-def _nameless(r: TraceResult) -> list[str]:
-    """What else it may be where many explanations tie."""
+def _unnamed(r: TraceResult) -> list[str]:
+    """Unnamed alternatives, if many explanations are not distinguishable."""
     shared = " and ".join(r.any_shape_of)
-    return [f"by anything else that depends on {shared}: where several do alike, or add up, one without a name may, too"] if shared else []
+    return (
+        [f"any unnamed effect that depends on {shared}: several explanations agree there, and one outside the library may, too"]
+        if shared
+        else []
+    )
 
 
 def _known(r: TraceResult, e: Found) -> list[str]:
-    """An effect, and other names for it."""
+    """An effect and its equivalents."""
     others = [other for other in r.same(e) if (other.name, other.channel) != (e.name, "*")]  # on all of one input
     return [*_effect(e), *(line for other in others for line in _broken(f"      the same thing on this model: {other.text()}"))]
 
@@ -147,7 +153,7 @@ def _effect(e: Found) -> list[str]:
 
 
 def _broken(line: str) -> list[str]:
-    """Between numbers, to fit; what goes on stands four columns in."""
+    """Break a line between parameters; continuation lines are indented by four more characters."""
     lines, text = [], ""
     on = " " * (len(line) - len(line.lstrip()) + 4)
     for piece in line.split(", "):
@@ -159,38 +165,40 @@ def _broken(line: str) -> list[str]:
     return [*lines, text]
 
 
-def _left_over(r: TraceResult) -> list[str]:
-    """Of the model as it was given."""
+def _residual(r: TraceResult) -> list[str]:
+    """Residual of the given model, by component and variable."""
     if r.verdict in {"none", "sensor_fault"}:
         far = _away(r, r.before.ends, FAR_OFF)
-        return [f"nothing beyond noise in one step; {far}" if far else "nothing beyond noise"]
+        return [f"consistent with noise in one step; {far}" if far else "consistent with noise"]
     over = variables(r.nominal, r.held)
     inputs = over[: len(r.nominal.inputs)]
     over += derived(r.nominal, r.held)
-    there = _away(r, r.before.ends, TOLD_AWAY)
+    there = _away(r, r.before.ends, ROLLOUT_ABOVE_NOISE)
     away = [there] if there else []
     if r.verdict == "unexplained":  # some of the structure may still be in the noise: shares are of all, noise included
         parts = components(r.nominal, r.held, r.before.one_step, r.after.one_step, 0.0 * r.floor[0])
-        told = [v for v in over if v.token in r.depends_on]
-        shapes = [s for s in strongest(parts, told, inputs) if s.share > SEEN and s.variable is not None] if told else []
+        reported = [v for v in over if v.token in r.depends_on]
+        shapes = [s for s in strongest(parts, reported, inputs) if s.share > MIN_SHARE and s.variable is not None] if reported else []
         said = [f"{s.component.said}: {_percent(s.share)} of it, noise included, {s.said}" for s in shapes[:2]]
-        hidden = ["structure, which the transitions that were held out do not show"]
+        hidden = ["structure that the held-out transitions do not show"]
         return [*said, *away] or [_louder(part) for part in loud(r)] or hidden
     beyond = loud(r)
     shapes = strongest(beyond, over, inputs)
     return (
-        [*(_told(s) for s in shapes[:3]), *away] if beyond else [f"nothing beyond noise in one step{'; ' if away else ''}{''.join(away)}"]
+        [*(_described(s) for s in shapes[:3]), *away]
+        if beyond
+        else [f"consistent with noise in one step{'; ' if away else ''}{''.join(away)}"]
     )
 
 
 def loud(r: TraceResult) -> list[Component]:
-    """Parts of the residual of one step that are beyond the noise on what was held out."""
+    """Components of the one-step residual that exceed the noise on the held-out data."""
     parts = components(r.nominal, r.held, r.before.one_step, r.after.one_step, r.floor[0])
-    return [p for p in parts if float(rms(p.before)) > TOLD * p.floor]
+    return [p for p in parts if float(rms(p.before)) > ABOVE_NOISE * p.floor]
 
 
-def _told(shape: Shape) -> str:
-    """One line about a part of the residual and what it follows."""
+def _described(shape: Shape) -> str:
+    """One line on a component of the residual and the variable that it follows."""
     follows = f"{_percent(shape.share)} of that {shape.said}" if shape.share > FOLLOWED else "it follows no single variable"
     return f"{_louder(shape.component)}; {follows}"
 
@@ -204,19 +212,19 @@ def _percent(share: float) -> str:
 
 
 def _away(r: TraceResult, ends: Array, least: float) -> str:
-    """The state that is farthest beyond its noise at the ends of rollouts, (m, nx) errors; nothing if that is less than `least` times."""
+    """State with the largest rollout error over noise, from errors (m, nx); empty if that ratio is at most `least`."""
     if not len(ends):
         return ""
     ratio = rms(ends) / r.floor[1].clip(1e-300)
     worst = int(ratio.argmax())
-    usual = np.sort(np.abs(ends[:, worst]))[: max(1, round(USUAL * len(ends)))]  # a few wild rows are outliers, and counted
+    usual = np.sort(np.abs(ends[:, worst]))[: max(1, round(USUAL * len(ends)))]  # a few outliers are counted elsewhere
     if min(ratio[worst], float(np.sqrt(np.mean(usual**2))) / max(float(r.floor[1][worst]), 1e-300)) <= least:
         return ""
-    return f"{r.nominal.states[worst]} ends {float(ratio[worst]):.3g} times the noise away after {r.horizon_s:.4g} s"
+    return f"prediction error of {r.nominal.states[worst]} after {r.horizon_s:.4g} s: {float(ratio[worst]):.3g} times the noise"
 
 
 def _table(r: TraceResult) -> list[str]:
-    """One row a state, and one in degrees for an angle. Before and after are one column where nothing was added."""
+    """Table of errors: one line per state, and one in degrees for an angle. Without a new effect, one column instead of two."""
     units: dict[str, str] = getattr(r.nominal.nominal, "units", {})
     pairs = [(rms(r.before.one_step), rms(r.after.one_step), r.floor[0])]
     if len(r.before.ends):
@@ -246,7 +254,7 @@ def _short(value: float) -> str:
 
 def _gap(r: TraceResult) -> list[str]:
     before, after, independent = r.gap
-    kind = "independent samples" if independent else "transitions of the drive, which bound no other (no statement)"
+    kind = "independent samples" if independent else "transitions; descriptive only, no confidence statement"
     now = f"{before['radius']:.4g} {ARROW} {after['radius']:.4g}" if r.effects else f"{before['radius']:.4g}"
     lines = [f"{now}, the largest of {before['n']} {kind}"]
     if "hold_radius" in before:
@@ -256,67 +264,68 @@ def _gap(r: TraceResult) -> list[str]:
 
 
 def _shown(r: TraceResult) -> tuple[str, ...]:
-    """Of what is left, what it depends on beyond doubt."""
+    """Tokens on which the remaining residual depends significantly."""
     return tuple(token for token in r.depends_on if token not in {*r.may_depend_on, *r.any_shape_of})
 
 
-def _still_there(r: TraceResult) -> list[str]:
-    """What is left for sure, and what may be."""
-    look = ": look at the name again" if r.effects else ""
-    beside = [f"less sure, but something may depend on {', '.join(r.may_depend_on)}{look}"]
-    return [*_beyond_doubt(r), *(beside if r.may_depend_on else [])]
+def _remaining(r: TraceResult) -> list[str]:
+    """Remaining structure: significant, then less certain."""
+    check = ": check the effect" if r.effects else ""
+    caveat = [f"less certain: something may depend on {', '.join(r.may_depend_on)}{check}"]
+    return [*_significant(r), *(caveat if r.may_depend_on else [])]
 
 
-def _beyond_doubt(r: TraceResult) -> list[str]:
+def _significant(r: TraceResult) -> list[str]:
+    """Remaining structure that is significant."""
     away = _away(r, r.after.ends, FAR_OFF)
     if not _shown(r):
         if r.verdict == "unexplained":
-            return ["structure; what it depends on cannot be told"]
-        some = _away(r, r.after.ends, SOME_LEFT)
-        nothing = f"nothing beyond noise in one step; {some}" if some else "nothing beyond noise"
-        return [f"what no input and no state foretells: {away}" if away else nothing]
+            return ["structure; the signals that it depends on could not be identified"]
+        some = _away(r, r.after.ends, SLIGHTLY_OFF)
+        noise = f"none above noise in one step; {some}" if some else "none above noise"
+        return [f"not predictable from inputs and states: {away}" if away else noise]
     if _shown(r) == ("noise",):
-        whatever = "" if r.may_depend_on else ", whatever the inputs do"
+        whatever = "" if r.may_depend_on else ", independent of the inputs"
         return [f"coloured noise: correlated in time{whatever}", *([away] if away else [])]
     percent = f"{100.0 * r.share_left:.0f} %" if r.share_left >= 0.01 else "under 1 %"
-    much = f" ({percent} of what the model lacked)" if r.effects else ""
+    much = f" ({percent} of what the model lacks)" if r.effects else ""
     lines = [f"structure{much} that depends on {', '.join(_shown(r))}"]
-    return [*lines, "its shape is on the page that --report FILE.html writes"] if r.verdict == "unexplained" else lines
+    return [*lines, "--report FILE.html plots it"] if r.verdict == "unexplained" else lines
 
 
 def _faults(r: TraceResult) -> Iterator[str]:
-    """What stands at one time on several channels is one line; so is what several segments have."""
+    """One line for each interval and kind, with all channels, and one for what several segments share."""
     loud = sorted((f for f in r.faults if f.kind != "dropout" and not f.segment), key=lambda f: (f.from_s, f.to_s, f.kind))
-    grouped = [(key, [f.channel for f in found]) for key, found in groupby(loud, key=lambda f: (f.from_s, f.to_s, f.kind))]
-    told = [f"{kind} of {_channels(channels)} {_when(begin, end)}" for (begin, end, kind), channels in grouped]
-    told += _in_segments([f for f in r.faults if f.kind != "dropout" and f.segment])
-    yield from told[:LISTED]
-    if len(told) > LISTED:
-        yield f"and {len(told) - LISTED} more (all of them: --json)"
+    grouped = [(key, [f.channel for f in same]) for key, same in groupby(loud, key=lambda f: (f.from_s, f.to_s, f.kind))]
+    found = [f"{kind} of {_channels(channels)} {_when(begin, end)}" for (begin, end, kind), channels in grouped]
+    found += _in_segments([f for f in r.faults if f.kind != "dropout" and f.segment])
+    yield from found[:LISTED]
+    if len(found) > LISTED:
+        yield f"and {len(found) - LISTED} more (all of them: --json)"
     silent = [f for f in r.faults if f.kind == "dropout"]
     if silent:
         yield f"{len(silent)} dropout{'s' if len(silent) > 1 else ''}, the longest {max(f.to_s - f.from_s for f in silent):.3g} s"
     if any(f.kind != "late" for f in r.faults):
-        yield "what they spoil is left out"
+        yield "affected samples are excluded"
 
 
 def _in_segments(faults: Sequence[Fault]) -> list[str]:
-    """Those of recordings whose runs have names."""
+    """Faults of recordings whose runs have names."""
     at: dict[tuple[str, float, float, str], list[str]] = {}
     for f in faults:
         at.setdefault((f.segment, f.from_s, f.to_s, f.kind), []).append(f.channel)
     alike: dict[str, list[tuple[str, float, float]]] = {}
     for (segment, begin, end, kind), channels in at.items():
         alike.setdefault(f"{kind} of {_channels(channels)}", []).append((segment, begin, end))
-    told = []
+    lines = []
     for what, places in alike.items():
         names = list(dict.fromkeys(segment for segment, _, _ in places))
         if len(names) == 1:
-            told += [f"{what} in segment {segment} {_when(begin, end)}" for segment, begin, end in places]
+            lines += [f"{what} in segment {segment} {_when(begin, end)}" for segment, begin, end in places]
             continue
         more = f" and {len(names) - SEGMENTS} more (all of them: --json)" if len(names) > SEGMENTS else ""
-        told.append(f"{what} in segments {', '.join(names[:SEGMENTS])}{more}")
-    return told
+        lines.append(f"{what} in segments {', '.join(names[:SEGMENTS])}{more}")
+    return lines
 
 
 def _channels(channels: Sequence[str]) -> str:
@@ -328,12 +337,12 @@ def _when(begin: float, end: float) -> str:
 
 
 def _unseen(r: TraceResult) -> list[str]:
-    """Effects of which `none` on these data says nothing."""
+    """Effects that these data could not have shown."""
     blind = [f"{name}({channel})" for name, channel in r.blind]
     if not blind or r.verdict not in {"none", "traced"}:
         return []
     more = f" and {len(blind) - LISTED} more" if len(blind) > LISTED else ""
-    return [f"{', '.join(blind[:LISTED])}{more}: these data could not have shown that (--suggest FILE.csv writes a drive that does)"]
+    return [f"{', '.join(blind[:LISTED])}{more}: not detectable on this data (--suggest FILE.csv writes inputs that excite them)"]
 
 
 def _data(r: TraceResult) -> list[str]:
@@ -342,29 +351,29 @@ def _data(r: TraceResult) -> list[str]:
     lines = [f"{r.n_rows} rows in {runs} run{'s' if runs > 1 else ''}, {on}as recorded", *_assumed(r)]
     lines += list(r.done_to_data)
     if r.outliers:
-        lines.append(f"{r.outliers} outlying {'row counts' if r.outliers == 1 else 'rows count'} for next to nothing")
-    lines.append(f"fitted on {r.n_fit} transitions, judged on {len(r.held.steps)} that the fit never saw")
+        lines.append(f"{r.outliers} outlier{'' if r.outliers == 1 else 's'} down-weighted")
+    lines.append(f"fitted on {r.n_fit} transitions, evaluated on {len(r.held.steps)} held-out ones")
     return lines
 
 
 def _assumed(r: TraceResult) -> list[str]:
-    """Numbers of a model of others that are what they are because nobody said: a wheel base that was forgotten is traced as a gain."""
+    """Parameters with default values: a wrong default, such as a wheel base, is traced as a gain."""
     model, said = r.nominal.nominal, r.nominal.spec.parameters
     unsaid = {} if isinstance(model.shared, FileModel) else {k: v for k, v in model.parameters.items() if k not in said}
     if not unsaid:
         return []
     numbers = ", ".join(f"{name} = {value:g}" for name, value in unsaid.items())
-    return [f"nobody said otherwise, so as the model has it: {numbers} (--param {next(iter(unsaid))}=... if it is another)"]
+    return [f"default parameters of the model: {numbers} (--param {next(iter(unsaid))}=... for another value)"]
 
 
 def labelled(label: str, lines: Sequence[str]) -> list[str]:
-    """Lines behind a word on the left, broken at words to fit."""
+    """Lines next to a label, wrapped at words."""
     fitting = [piece for line in lines for piece in _wrapped(line)]
     return [f"{label if i == 0 else '':<{LABEL}}{line}" for i, line in enumerate(fitting)]
 
 
 def _wrapped(text: str) -> list[str]:
-    """At words, to fit behind a label."""
+    """Wrap at words, to the width next to a label."""
     lines, line = [], ""
     for word in text.split():
         if line and len(line) + 1 + len(word) > WIDTH - LABEL:
