@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import msgspec
 import pytest
 from core_rig import Rig, answers, of, one
 
@@ -93,7 +94,8 @@ def test_a_closing_counts_as_the_profile_says_and_once_a_scenario(kind: Any) -> 
     rig.observe((5.0, 0.0, 0.0))
     steps(rig, 12)  # the gate opens again within the scenario
     assert rig.state.gate_open
-    rig.observe((5.0, 0.0, 0.0))
+    rig.feed(LinkChanged(rig.t, up=False))
+    rig.feed(LinkChanged(rig.t, up=True))
     steps(rig, 12)
     ended(rig)
     assert counted(rig) == [(kind, "the gate closed: outside_region")]
@@ -127,6 +129,14 @@ def test_a_controller_that_fails_has_an_unsafe_run_whatever_closings_count_as(re
     rig.observe()
     rig.feed(SourceStopped(rig.t, "controller", reason))
     assert counted(rig) == [("unsafe", f"the controller failed: {reason}")]
+
+
+def test_a_controller_that_ends_by_itself_within_a_run_closes_the_gate() -> None:
+    for reason in ("finished", "stopped"):
+        rig = driving(gate_closing="censored")
+        rig.observe()
+        rig.feed(SourceStopped(rig.t, "controller", reason))  # type: ignore[arg-type]
+        assert counted(rig) == [("censored", "the gate closed: no_controller")]
 
 
 def test_a_controller_that_fails_at_the_first_step_has_an_unsafe_run() -> None:
@@ -277,6 +287,7 @@ def test_a_run_that_a_crash_cut_counts_as_censored_at_the_next_start() -> None:
     assert (counts.outcome, counts.reason) == ("censored", "the daemon was cut while this controller drove")
     assert (counts.limits[0].n, counts.limits[0].censored) == (2, 1)
     assert again.state.memory.open_run is None
+    assert again.state.memory.drives == memory.drives + 1 == 2
     assert of(Rig(again.state.memory, beta_episodes=BETA).outputs, EpisodeCounted) == []
     without = Rig(memory)
     assert of(without.outputs, EpisodeCounted) == []
@@ -343,14 +354,8 @@ def test_a_certificate_whose_controller_drove_under_another_begins_again_from_no
     memory = rig.state.memory
     own = memory.runs[1]
     changed = (runs.RunCounts("controller", "", 1, own.beta, 5), own)
-    found = runs._sequences(_replaced(memory, runs=changed), rig.settings, "controller", "c1")
+    found = runs._sequences(msgspec.structs.replace(memory, runs=changed), rig.settings, "controller", "c1")
     assert (found[0], found[1].n, found[2].number, found[2].n) == (2, 5, 2, 0)
-
-
-def _replaced(memory: Memory, **changes: Any) -> Memory:
-    import msgspec
-
-    return msgspec.structs.replace(memory, **changes)
 
 
 def test_a_lower_limit_above_the_profile_s_revokes_and_refuses_until_a_person_clears_it() -> None:
@@ -442,9 +447,24 @@ def test_runs_of_before_and_runs_without_a_budget_are_not_counted() -> None:
         assert core.status(rig.state)["runs"] is None
 
 
+def test_runs_under_another_certificate_in_force_and_of_other_controllers_are_kept() -> None:
+    memory = driving().state.memory
+    other = msgspec.structs.replace(memory.certificates[0], id="other")
+    before = tuple(
+        runs.RunCounts(*names, 1, 0.06, 3) for names in (("a", ""), ("controller", ""), ("controller", "other"), ("controller", "old"))
+    )
+    memory = msgspec.structs.replace(memory, certificates=(*memory.certificates, other), runs=before)
+    whole, own = runs.RunCounts("controller", "", 1, 0.06, 4), runs.RunCounts("controller", "c1", 2, 0.02, 1)
+    assert runs._kept(memory, whole, own) == (before[0], before[2], whole, own)
+    exceeded = tuple(msgspec.structs.replace(one, exceeded=one.controller == "a") for one in before)
+    rig = Rig(msgspec.structs.replace(memory, runs=exceeded), beta_episodes=BETA, max_unsafe=0.01)
+    rig.request("clear", text="unsafe_runs")
+    assert {run.controller for run in rig.state.memory.runs} == {"controller"}
+
+
 def test_the_number_of_controllers_that_are_remembered_is_bounded_and_refused_ones_stay_longest() -> None:
     many = tuple(runs.RunCounts(f"k{i}", "", i + 1, 0.01, 3, exceeded=i == 0) for i in range(runs.CONTROLLERS))
-    memory = _replaced(driving().state.memory, runs=many)
+    memory = msgspec.structs.replace(driving().state.memory, runs=many)
     kept = runs._kept(memory, runs.RunCounts("new", "", 300, 0.01), runs.RunCounts("new", "c", 300, 0.01))
     names = [one.controller for one in kept if not one.certificate]
     assert len(names) == runs.CONTROLLERS
