@@ -39,7 +39,9 @@ class Runs(Demonstration):
         path = super()._write_profile(ports)
         text = re.sub(r"(?m)^episodes = \d+$", "episodes = 0", path.read_text(encoding="utf-8"))
         text = re.sub(r"(?m)^headroom = [0-9.]+$", f"headroom = {HEADROOM}", text)
-        path.write_text(text.replace('name = "zenoh"\n', f'name = "zenoh"\n{PATIENT}'), encoding="utf-8")
+        before, _, transport = text.partition("[transport]\n")
+        own = re.sub(r"(?m)^(observation_timeout|lease) = .*\n?", "", transport)
+        path.write_text(f"{before}[transport]\n{PATIENT}{own}", encoding="utf-8")
         return path
 
     def _watch_it(self, robot: subprocess.Popen[str]) -> bool:

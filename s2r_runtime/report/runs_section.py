@@ -46,14 +46,22 @@ def _of_controller(page: Page, runs: list[EpisodeCounted], settings: Settings | 
 
 def _plot(limits: Sequence[RunLimits], settings: Settings | None) -> str:
     n = np.array([float(one.n) for one in limits])
-    curves = {
-        "at most": (n, 100.0 * np.array([one.upper for one in limits]), plots.BLUE),
-        "unsafe so far": (n, 100.0 * np.array([one.unsafe / one.n for one in limits]), plots.SOFT),
-        "at least": (n, 100.0 * np.array([one.lower for one in limits]), plots.ORANGE),
+    values = {
+        "at most": ([one.upper for one in limits], plots.BLUE),
+        "unsafe so far": ([one.unsafe / one.n for one in limits], plots.SOFT),
+        "at least": ([one.lower for one in limits], plots.ORANGE),
     }
+    curves = {name: (n, _percent(shares), colour) for name, (shares, colour) in values.items() if any(shares)}
     if settings is not None and settings.max_unsafe > 0.0:
         curves["guarantee.max_unsafe"] = (n, np.full(len(n), 100.0 * settings.max_unsafe), plots.RED)
-    return plots.series(curves, "runs of this controller on this robot", "unsafe runs, %", "limits of the share of unsafe runs over runs")
+    return plots.series(
+        curves, "runs of this controller on this robot", "unsafe runs, %", "limits of the share of unsafe runs over runs", log=True
+    )
+
+
+def _percent(shares: Sequence[float]) -> plots.Array:
+    """For a logarithmic axis: a share of 0 has no place there."""
+    return np.array([100.0 * share if share > 0.0 else np.nan for share in shares])
 
 
 def _caption(settings: Settings | None) -> str:
