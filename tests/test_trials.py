@@ -439,6 +439,9 @@ def test_a_profile_that_demands_a_limit_of_the_optimism_gets_no_certificate_with
         assert done.returncode == code, done.stdout + done.stderr
         assert line in done.stderr
         assert ("no attempt was spent" in done.stderr) == (code == 3)
+        if more:
+            runs = driven.s2r("trials", "controller.py", log, "--profile", "demanding.toml", "--simulate", "20")
+            assert ("max_optimism    met" in runs.stdout, "max_optimism    not met: the model's" in runs.stdout) == (code == 0, code == 3)
     signed = json.loads((driven.folder / "demanding.cert").read_bytes())["certificate"]
     assert signed["trials"]["simulated"]["rollouts"] == 20
     assert any(one.startswith("Optimism (G12).") for one in signed["shown"])

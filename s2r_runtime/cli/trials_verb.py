@@ -55,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
     from s2r_runtime.api.trials import Rollouts, trials_of
     from s2r_runtime.evidence.statements import of_runs, of_simulated, of_trials
     from s2r_runtime.evidence.trials import newest_limits
+    from s2r_runtime.trust.certificate import optimism_lack
 
     if not args.simulate and (args.radius is not None or args.on or args.law or args.score or args.range or args.better != "high"):
         raise UsageError(
@@ -74,12 +75,16 @@ def run(args: argparse.Namespace) -> int:
         raise
     counted = newest_limits(args.logs, controller.digest)
     statements = [of_trials(found), *(of_simulated(found.simulated) if found.simulated else ())]
+    demanded = found.simulated is not None and profile.verification.max_optimism < 1.0
+    lack = optimism_lack(profile, found) if demanded else None
     if args.json:
         runs = None if counted is None else {**msgspec.to_builtins(counted), "statement": of_runs(counted)}
-        output.result_json({**msgspec.to_builtins(found), "statement": " ".join(statements), "runs": runs})
+        output.result_json({**msgspec.to_builtins(found), "statement": " ".join(statements), "optimism_lack": lack, "runs": runs})
     else:
         for why, number in found.left_out.items():
             output.out(f"left out    {number}: {why}")
         for line in (*statements, *(() if counted is None else (of_runs(counted),))):
             output.out(line)
+        if lack is not None:
+            output.out(f"max_optimism    {f'not met: {lack}' if lack else 'met'}")
     return 1 if found.unsafe else 0
