@@ -170,10 +170,8 @@ def _over_time(page: Page, r: TraceResult, changed: bool) -> None:
     everything = over_time(r)
     same = r.held.data.source == r.source
     wrong = [f for f in r.faults if f.kind != "late"]
-    note = (
-        "Grey: held out, the fit never saw it." if everything.held_out else "All of it is held out: the fit was made on another recording."
-    )
-    page.text(note + (" Red: faults of measurement; what they spoil is left out." if wrong and same else ""), "soft")
+    note = "Grey: held out." if everything.held_out else "All of it is held out: the fit was made on another recording."
+    page.text(note + (" Red: faults of measurement; affected samples are excluded." if wrong and same else ""), "soft")
     page.key(BEFORE_AFTER if changed else [("residual", "blue")])
     for part in everything.parts:
         faults = (
@@ -251,8 +249,8 @@ def _suggested(page: Page, r: TraceResult, suggested: Any) -> None:
 
 def _data(page: Page, r: TraceResult) -> None:
     page.heading("Data")
-    page.text(f"{r.n_rows} rows. Fitted on {r.n_fit} transitions, judged on {len(r.held.steps)} that the fit never saw.")
+    page.text(f"{r.n_rows} rows. Fitted on {r.n_fit} transitions, evaluated on {len(r.held.steps)} held-out ones.")
     for line in r.done_to_data:
         page.text(line)
     if r.outliers:
-        page.text(f"{r.outliers} outlying {'row counts' if r.outliers == 1 else 'rows count'} for next to nothing.")
+        page.text(f"{r.outliers} outlier{'' if r.outliers == 1 else 's'} down-weighted.")

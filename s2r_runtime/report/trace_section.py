@@ -85,8 +85,8 @@ def _rows(effects: Sequence[dict[str, Any]], role: str) -> Iterator[tuple[str, s
 def _faults(page: Page, faults: Sequence[dict[str, Any]]) -> None:
     if not faults:
         return
-    spoilt = any(f["kind"] != "late" for f in faults)  # what is late is taken earlier
-    page.heading("Faults of measurement" + ("; what they spoil is left out" if spoilt else ""), 3)
+    spoilt = any(f["kind"] != "late" for f in faults)  # a delay is corrected
+    page.heading("Faults of measurement" + ("; affected samples are excluded" if spoilt else ""), 3)
     rows = [(f["kind"], f["channel"], f"{f['from_s']:.3f}", f"{f['to_s']:.3f}", f.get("segment") or "") for f in faults[:FAULTS]]
     several = any(row[-1] for row in rows)  # logs of before say nothing of it
     page.table(("kind", "of", "from (s)", "to (s)", "in segment")[: 4 + several], [row[: 4 + several] for row in rows])
@@ -113,7 +113,7 @@ def _errors(page: Page, error: dict[str, Any], noise: str) -> None:
         for name, factor in units:
             cells = [f"{factor * values[state]:.3g}" if state in values else "" for _, values in columns]
             rows.append((f"{state} ({name})" if name else state, *cells))
-    page.heading("Error on data that the fit never saw, rms", 3)
+    page.heading("Error on held-out data, rms", 3)
     page.table(("", *(name for name, _ in columns)), rows)
 
 
@@ -121,7 +121,7 @@ def _gap(page: Page, gap: dict[str, Any]) -> None:
     if not (gap.get("before") and gap.get("after")):
         return
     before, after = gap["before"], gap["after"]
-    kind = "independent samples" if gap.get("independent") else "transitions of the drive, which bound no other (no statement)"
+    kind = "independent samples" if gap.get("independent") else "transitions; descriptive only, no confidence statement"
     page.text(f"Gap: {_pair(before, after, 'radius')}: the largest of {after['n']} {kind}.")
     if "hold_radius" in before:
         page.text(f"After {before['hold_periods']} held periods: {_pair(before, after, 'hold_radius')}.")
