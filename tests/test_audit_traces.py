@@ -18,6 +18,7 @@ import pytest
 from audit_bench import Bench, audited, entries
 
 from s2r_runtime import messages as m
+from s2r_runtime.audit import log as audit_log
 from s2r_runtime.audit import traces
 from s2r_runtime.audit.findings import Findings
 from s2r_runtime.audit.log import audit
@@ -73,7 +74,7 @@ def test_a_persons_own_model_is_said_to_be_that(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_trace_that_takes_long_is_skipped_and_said_so_unless_it_was_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = slow_robot(tmp_path).trace().adopt().stop().write(tmp_path / "a.mcap")
-    monkeypatch.setattr("s2r_runtime.audit.log.SECONDS", 1e-9)
+    monkeypatch.setattr(audit_log, "SECONDS", 1e-9)
     skipped = audit([path])
     assert skipped.ok
     assert "was not run again" in skipped.skipped[0]

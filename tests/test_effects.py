@@ -22,7 +22,8 @@ def _starts(effect, u, model, channel):
         return [{"frequency": f, "amplitude": 0.3, "phase": 0.5} for f in (0.3, 1.0, 4.0)]
     if getattr(effect, "timed", False):
         return effect.starts(u, model, channel, DT, DT * np.arange(len(u)))
-    return effect.starts(u, model, channel, DT)
+    found = effect.starts(u, model, channel, DT)
+    return found or [{p.name: min(max(0.1, p.low), p.high) for p in effect.parameters}]  # the input does not show it
 
 
 def _places():

@@ -260,10 +260,11 @@ def test_a_profile_of_before_is_audited_as_it_was() -> None:
     assert set(msgspec.to_builtins(now.gate)) - set(plain_table("gate", then.gate)) == {"fault_share", "fault_burst"}
 
 
-def test_a_log_of_before_is_replayed_by_its_own_rule() -> None:
+def test_a_log_of_before_is_replayed_by_its_own_rule(monkeypatch: pytest.MonkeyPatch) -> None:
     """`Bench(...).sample().drive(40).stop()` as the version before wrote it."""
     import audit_bench
 
+    monkeypatch.setattr(audit_bench.BenchTask, "horizon", 150)  # of the task that it drove
     log = Path(__file__).parent / "replay" / "log_before_fault_bound.mcap"
     result = audit([log], audit_bench.PUBLIC)
     assert result.ok, result.text()

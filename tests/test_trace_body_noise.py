@@ -9,6 +9,7 @@ from s2r_runtime.models.composed import compose
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.trace.data.dataset import from_arrays
 from s2r_runtime.trace.diagnostics.lack_of_fit import left_of
+from s2r_runtime.trace.estimation import body_frame_noise
 from s2r_runtime.trace.estimation.body_frame_noise import body_noise, whitener
 from s2r_runtime.trace.estimation.prediction import steps_of
 from s2r_runtime.trace.estimation.problem import evaluate, problem
@@ -137,5 +138,5 @@ def test_it_must_be_clear(monkeypatch):
     """Of a robot without any, the likeliest of six brings a nat or two."""
     lefts = [_left(seed, 0.0) for seed in range(6)]
     assert [body_noise(left) for left in lefts] == [None] * 6
-    monkeypatch.setattr("s2r_runtime.trace.estimation.body_frame_noise.CLEARLY", -1e9)
+    monkeypatch.setattr(body_frame_noise, "CLEARLY", -1e9)
     assert any(body_noise(left) is not None for left in lefts)

@@ -115,7 +115,7 @@ def test_a_late_heading_is_a_fault_of_measurement_and_no_delay(tmp_path, capsys)
     assert [(e["name"], e["channel"]) for e in told["effects"]] in ([], [("integration_scheme", "*")])
     assert [(f["kind"], f["channel"], f["from_s"]) for f in told["faults"]] == [("late", "theta", 0.0)]
     assert told["states_late"] == {"theta": pytest.approx(4 * ROW_S, rel=0.05)}
-    assert "taken that much earlier" in report.read_text()
+    assert "shifted by that" in report.read_text()
     assert "affected samples are excluded" not in report.read_text()
 
 

@@ -422,7 +422,7 @@ def test_an_own_model_whose_steps_are_too_coarse_is_told_so_and_gets_no_other_va
     model = _pool(tmp_path)
     result = trace(_flowing(model), model)
     assert [(e.name, e.channel) for e in result.effects] == [("integration_scheme", "*")]
-    assert "in a straight piece a step" in result.text()
+    assert "the model uses Euler integration" in result.text()
 
 
 def test_what_else_is_wrong_is_told_beside_it_as_large_as_it_is(tmp_path):
