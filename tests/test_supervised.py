@@ -61,7 +61,11 @@ def test_a_process_that_a_model_leaves_behind_is_not_waited_for(tmp_path: Path) 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_the_verb_and_what_waits_for_it(number: signal.Signals, tmp_path: Path) -> None:
-    process, child = computing(tmp_path)
+    before = signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+    try:  # under nohup it would be ignored, here and in the verb
+        process, child = computing(tmp_path)
+    finally:
+        signal.signal(number, before)
     process.send_signal(number)
     assert process.wait(30) == (130 if number == signal.SIGINT else -number)
     with pytest.raises(ProcessLookupError):
