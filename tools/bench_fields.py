@@ -44,6 +44,10 @@ NOT_RECOMPUTED = {
     "JobFinished safety": "safety values of single scenarios: only with --rerun-controllers; number, failures and least value always",
     "JobFinished trace.cpu_s": "what a trace took of the processor",
     "JobFinished trace.model_path": "where its model's file was put",
+    "JobFinished trace.tracer": "which version of the tracer made it; a trace of another version is reported as that, and not run again",
+    "JobFinished behaviour": "what a controller did on the probe observations; what the core made of it is recomputed",
+    "SourceStarted t_ns": "when a controller or another source had started",
+    "Proposed command.ttl_ns": "for how long a controller's command was to hold; what the gate made of it is recomputed",
 }
 """What only the recorder's signature vouches for, or another option: kind of record, and field with what is in it -> what it is."""
 
