@@ -136,11 +136,12 @@ def test_what_is_due_waits_for_a_trace_that_runs_and_comes_to_nothing_without_a_
     [
         ({"verdict": "none"}, False, "trace of the campaign of epoch 1: none"),
         ({"verdict": "unexplained"}, False, "trace of the campaign of epoch 1: unexplained"),
+        ({**FOUND, "verdict": "unexplained"}, False, "trace of the campaign of epoch 1: unexplained"),  # a partial repair
         ({"verdict": "ambiguous"}, True, "trace of the campaign of epoch 1: ambiguous"),
         ({"verdict": "traced"}, True, "trace of the campaign of epoch 1: traced"),
         (FOUND, True, "trace of the campaign of epoch 1: traced; it proposes a model: s2r adopt"),
     ],
-    ids=["none", "unexplained", "ambiguous", "traced", "proposed"],
+    ids=["none", "unexplained", "partial", "ambiguous", "traced", "proposed"],
 )
 def test_a_finding_is_told_and_remembered(trace: dict[str, Any], known: bool, text: str) -> None:
     rig = Rig()
