@@ -22,7 +22,7 @@ def text() -> str:
     lines += ["Exit codes: 0 it holds, 1 it does not hold, 2 usage, 3 not enough evidence, 70 internal error, 78 bad configuration.", ""]
     for name, verb, summary in verbs(parser(), "s2r"):
         usage = " ".join(verb.format_usage().removeprefix("usage: ").split())
-        lines += [f"## {name}", "", summary[0].upper() + summary[1:] + ".", "", f"`{usage}`", ""]
+        lines += [f"## {name}", "", f"{summary[0].upper()}{summary[1:]}. `{usage}`", ""]
         rows = [(_form(a), (a.help or "").replace("|", "\\|")) for a in verb._actions if a.dest != "help"]
         if any(help_text for _, help_text in rows):
             lines += ["| option | meaning |", "| --- | --- |", *(f"| `{form}` | {help_text} |" for form, help_text in rows), ""]

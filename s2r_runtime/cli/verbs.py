@@ -43,8 +43,10 @@ GROUPS: dict[str, dict[str, Verb]] = {
         "compare": Verb("compare_verb", "whether controller B is worse than controller A on the robot, from paired runs"),
     },
     "look at a log": {
+        "live": Verb("live_verb", "what a robot does, as it does it, or a log once more: for Foxglove and Lichtblick"),
         "audit": Verb("log_verbs", "recompute every number and every decision from the log alone"),
         "report": Verb("log_verbs", "plots and statements of a log on one self-contained page"),
+        "export": Verb("live_verb", "a log's quantities under their names, for Foxglove, Lichtblick and PlotJuggler"),
         "log": Verb("log_verbs", "look at a log, or recover what a crash left"),
     },
     "set up": {
