@@ -165,6 +165,7 @@ class NominalModel(Protocol):
     theta) that is moved along the heading at the start of the step; `reached` (state -> the input that it is set to at once: such
     a state is compared with the input as it acts at the *end* of the step, the others with its mean over the step); `follows` (state that
     a recording may lack -> the states that it follows from, and how: `Follows`); `uneven` = True: `step` also takes dt as (n,), one a row;
+    `linear` = True: `step` is a linear function of x and u together, so that linear feedback has an exact tube (guarantee G13);
     `within` (input, an angle -> below which size it means something, rad: a recording in which it goes beyond is refused).
     """
 
@@ -293,6 +294,11 @@ class Task(Protocol):
     """A law of scenarios, a horizon and a safety metric (>= 0 iff safe). Constructed as `T(parameters, model, dt)` where
     parameters is the profile's `[task.parameters]`; raises ConfigError for a bad one. All randomness from the `rng`
     passed in (numpy Generator); batched over the rollouts.
+
+    A task may say what is safe within a distance, and then a scenario can be enclosed (guarantee G13). `position`: names of the states
+    that are a place, m. `enclosed(x, reach, scenario, threshold)`: two arrays (n,) of bool, or None where it cannot say. First: the
+    safety value stays at `threshold` or above as far as this step goes, for every state whose place is within `reach`, m, of x (n, nx),
+    whatever its other states. Second: a run that is in such a state is over at this step.
     """
 
     name: str

@@ -29,6 +29,7 @@ ORDER = (
     "fuzz_ros2.py",
     "bench_coverage.py",
     "bench_compare.py",
+    "bench_composition.py",
     "bench_duplicates.py",
     "bench_grinding.py",
     "bench_rates.py",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from s2r_runtime.api.composition import Composing, tubes_of
 from s2r_runtime.api.files import apart, own_file, writable
 from s2r_runtime.api.models import ModelLike, ProfileLike, controller_at, load_checked, profile_model
 from s2r_runtime.api.options import check_named_numbers, check_numbers
@@ -21,8 +22,9 @@ from s2r_runtime.api.verification import Verified, gap_of, load_recordings, run_
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.evidence.bounds import attempt_beta, epoch_beta
 from s2r_runtime.evidence.scores import SAFE
+from s2r_runtime.evidence.statements import of_composition
 from s2r_runtime.evidence.verify import verification_json
-from s2r_runtime.messages import Gap, Trials, Tries, Verification
+from s2r_runtime.messages import Composition, Gap, Trials, Tries, Verification
 from s2r_runtime.profile import Profile
 from s2r_runtime.trust import keys, offline_ledger
 from s2r_runtime.trust.certificate import optimism_lack
@@ -56,6 +58,8 @@ class Certification(Verified):
     output: Path
     written: bool
     """Whether the certificate is in `output`."""
+    composition: Composition | None = None
+    """What holds for the real closed loop, if that was requested and could be had."""
     trouble: str = ""
     """Why it is not, although the controller passed."""
 
@@ -69,6 +73,7 @@ class Certification(Verified):
                 "gap": self.gap,
                 "trials": self.trials,
                 "tries": self.tries,
+                "composition": self.composition,
                 "verified_radius": result.radius if result.passed else None,
                 "epoch": self.epoch,
                 "attempt": result.attempt,
@@ -83,6 +88,7 @@ class Certification(Verified):
         result, lines = self.verification, verification_lines(verification_json(self.verification))
         lines.append(f"gap epoch {self.epoch}, verification attempt {result.attempt}: {self.beta_spent:.4f} of beta {self.beta} spent")
         lines.append(f"on this gap: {self.tries.on_gap} attempts on {self.tries.controllers} controllers that differ in their behaviour")
+        lines += () if self.composition is None else of_composition(self.composition)
         written = f"gap {self.gap.radius:.4g}, certified to {result.radius:.4g}: certificate written to {self.output}"
         return "\n".join([*lines, written if self.written else "no certificate"])
 
@@ -100,6 +106,10 @@ def certify(
     key: str | Path | None = None,
     param: Mapping[str, float] | None = None,
     max_gb: float | None = None,
+    enclose: bool = False,
+    rate: float | None = None,
+    because: str = "",
+    runs: Sequence[str | Path] | str | Path = (),
     progress: Callback | bool | None = None,
 ) -> Certification:
     """Gap, verification and signature: a certificate for this controller. Every call spends an attempt of the key's budget.
@@ -107,17 +117,20 @@ def certify(
     controller, profile, model, param, max_gb, progress: as `s2r.verify`. recording: a campaign, or drives for which the profile states an
     assumption. output: where the certificate goes. trials: logs of closed-loop runs of this controller. simulate: roll each of them
     out this number of times, and in fresh scenarios (default: 20 where the profile demands `max_optimism`, else 0). key: the signing key
-    (default: the user's; `s2r keys new` makes one).
+    (default: the user's; `s2r keys new` makes one). enclose, rate, because: as `s2r.verify`, at the radius `verification.run_radius`;
+    runs: logs of runs of any certified controllers, whose residuals are compared with it (docs/composition.md).
 
     A controller that does not pass gives `passed == False`, and no file. Raises UsageError where `output` cannot be written (with the
     attempt spent, if that shows only at the end), ConfigError (profile, key, ledger, a log that does not hold), NotEnoughEvidence.
     """
-    check_numbers(max_gb=max_gb)
+    check_numbers(max_gb=max_gb, rate=rate)
     check_named_numbers(param=param)
+    driven = [runs] if isinstance(runs, str | Path) else list(runs)
     logs = [trials] if isinstance(trials, str | Path) else list(trials)
     found = certified(
         Path(controller), profile, _sources(recording), Path(output), watcher_of(progress), trials=[Path(log) for log in logs],
         simulate=simulate, model=model, key=None if key is None else Path(key), param=param or {}, max_gb=max_gb,
+        enclose=enclose, rate=rate, because=because, runs=[Path(log) for log in driven],
     )  # fmt: skip
     if found.trouble:
         raise UsageError(f"{found.trouble}; attempt {found.verification.attempt} passed and is spent")
@@ -137,8 +150,15 @@ def certified(
     key: Path | None,
     param: Mapping[str, float],
     max_gb: float | None,
+    enclose: bool = False,
+    rate: float | None = None,
+    because: str = "",
+    runs: Sequence[Path] = (),
 ) -> Certification:
     """As `certify`; what hinders the writing of a certificate is in `trouble`, since its attempt is spent."""
+    tubes = tubes_of(rate, because, enclose=enclose)
+    if runs and tubes is None:
+        raise UsageError("--runs goes with --enclose: their residuals are one term of a composed statement, enclosed scenarios the other")
     writable(output, replaced=True)  # now, because what is spent below stays spent, whatever becomes of the certificate
     key_path = key or keys.default_path()
     inputs: dict[str, Path | str | None] = {"the controller": controller}
@@ -155,10 +175,13 @@ def certified(
     ledger, beta = offline_ledger.open_ledger(key_path, loaded.robot.name), loaded.guarantee.beta
     epoch = ledger.epoch_for(digest, composed.spec.digest(), loaded.digest())
     gap, assumption, period = gap_of(found, composed, loaded, beta=epoch_beta(beta, epoch), epoch=epoch)
-    runs = _trials(trials, simulate, file, composed, loaded, gap, watcher)
-    if lack := optimism_lack(loaded, runs):
+    tried = _trials(trials, simulate, file, composed, loaded, gap, watcher)
+    if lack := optimism_lack(loaded, tried):
         raise NotEnoughEvidence(f"no certificate: {lack}; no attempt was spent")
+    composing = Composing(tubes, runs, file, composed, loaded, watcher)
+    composing.check()
     attempt = ledger.spend_attempt(file.digest, epoch=epoch)
+    seed = ledger.draw_seed(attempt)
     result, behaviour = run_verification(
         file,
         composed,
@@ -169,18 +192,31 @@ def certified(
         laws=loaded.verification.laws,
         n=0,
         attempt=attempt,
-        seed=ledger.draw_seed(attempt),
+        seed=seed,
         beta=attempt_beta(beta, attempt),
     )
     tries = ledger.ended(attempt, behaviour)
-    trouble = ""
+    trouble, composition = "", None
     if result.passed:
+        composition = composing.made(attempt, seed)
         try:
-            _write(output, loaded, composed, file, gap, result, runs, tries, assumption, period, signing)
+            _write(output, loaded, composed, file, gap, result, tried, tries, assumption, period, signing, composition)
         except UsageError as error:  # the attempt is spent: what it showed is reported all the same
             trouble = str(error)
     written = result.passed and not trouble
-    return Certification(result, gap, runs, tries, epoch, beta, ledger.spent(beta), output, written, trouble)
+    return Certification(
+        verification=result,
+        gap=gap,
+        trials=tried,
+        tries=tries,
+        epoch=epoch,
+        beta=beta,
+        beta_spent=ledger.spent(beta),
+        output=output,
+        written=written,
+        composition=composition,
+        trouble=trouble,
+    )
 
 
 def _trials(
@@ -206,6 +242,7 @@ def _write(
     assumption: str,
     period: str,
     key: Ed25519PrivateKey,
+    composition: Composition | None,
 ) -> None:
     """The certificate, signed."""
     from s2r_runtime.files import durable
@@ -224,6 +261,7 @@ def _write(
         tries=tries,
         assumption=assumption,
         period=period,
+        composition=composition,
     )
     try:
         durable.replace(path, certificate.sign(issued, key))

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
+from s2r_runtime.api.jobs import gap_at, work
 from s2r_runtime.api.models import controller_at, load_checked
 from s2r_runtime.api.progress import Watcher
-from s2r_runtime.api.verification import gap_at, work
 from s2r_runtime.errors import ConfigError, ControllerError, UsageError
 from s2r_runtime.evidence import seeds, trials
 from s2r_runtime.evidence.logged_scenarios import LoggedScenario

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from s2r_runtime.api.composition import enclosure_of, tubes_of
+from s2r_runtime.api.jobs import gap_at, work
 from s2r_runtime.api.models import ModelLike, ProfileLike, controller_at, load_checked, profile_model, weights_of
 from s2r_runtime.api.options import check_counts, check_named_numbers, check_numbers
 from s2r_runtime.api.progress import Callback, Watcher, watcher_of
@@ -17,8 +18,9 @@ from s2r_runtime.api.recordings import RecordingLike, recording
 from s2r_runtime.api.results import AFTER, LIMIT, Result, axes_of
 from s2r_runtime.api.spelling import front_door
 from s2r_runtime.errors import NotEnoughEvidence, RecordingError, UsageError
+from s2r_runtime.evidence.statements import of_enclosure
 from s2r_runtime.evidence.verify import seed_for, verification_json
-from s2r_runtime.messages import Gap, Verification
+from s2r_runtime.messages import Enclosure, Gap, Verification
 from s2r_runtime.models.composed import ComposedModel
 from s2r_runtime.profile import Profile
 
@@ -26,8 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from s2r_runtime.controllers.file import ControllerFile
-    from s2r_runtime.daemon.worker import Failed, Job
-    from s2r_runtime.daemon.worker import Result as Done
     from s2r_runtime.recordings.tables import Source
     from s2r_runtime.recordings.transitions import Transitions
 
@@ -74,14 +74,20 @@ class VerifyResult(Verified):
     verification: Verification
     gap_radius: float
     """Of the gap that it was verified for, in the norm's unit."""
+    enclosure: Enclosure | None = None
+    """Scenarios compared with tubes at that radius, if that was requested."""
 
     def to_dict(self) -> dict[str, Any]:
         """What `s2r verify --json` prints."""
-        return {**verification_json(self.verification), "gap_radius": self.gap_radius}
+        enclosed: dict[str, Any] = {}
+        if self.enclosure is not None:
+            enclosed["enclosure"] = {**msgspec.to_builtins(self.enclosure), "statement": of_enclosure(self.enclosure)}
+        return {**verification_json(self.verification), "gap_radius": self.gap_radius, **enclosed}
 
     def summary(self) -> str:
         """What `s2r verify` prints."""
-        return "\n".join(verification_lines(self.to_dict()))
+        lines = verification_lines(self.to_dict())
+        return "\n".join(lines if self.enclosure is None else [*lines, of_enclosure(self.enclosure)])
 
 
 @front_door
@@ -98,6 +104,9 @@ def verify(
     law: Sequence[str] | str = (),
     param: Mapping[str, float] | None = None,
     max_gb: float | None = None,
+    enclose: bool = False,
+    rate: float | None = None,
+    because: str = "",
     progress: Callback | bool | None = None,
 ) -> VerifyResult:
     """Runs a controller on the uncertain model, in a confined process. It spends no budget and founds no certificate.
@@ -106,18 +115,21 @@ def verify(
     radius: of the gap set, in the norm's unit (0: the model as it is); or recording: a campaign that radius and hold gap come from.
     hold_radius: hold gap (with `radius`; default: the radius times sqrt(hold periods)). headroom: verify up to this multiple of the radius.
     n: scenarios for each disturbance model (0: what beta needs). law: one or several of `uniform`, `persistent` and `adversarial`
-    (default: the profile's). param: parameters of the controller. progress: a function that takes a `Step`; True: tqdm; False: none.
+    (default: the profile's). param: parameters of the controller. enclose: also compare scenarios with a tube that no disturbance in the
+    gap set leaves (docs/composition.md). rate, because: of the tube, and its reason (default: the controller is linear feedback).
+    progress: a function that takes a `Step`; True: tqdm; False: none.
 
     A controller that does not pass gives `passed == False`. Raises ConfigError (profile, model or controller), NotEnoughEvidence (n or the
     campaign is too small), RecordingError, UsageError.
     """
-    check_numbers(radius=radius, hold_radius=hold_radius, headroom=headroom, max_gb=max_gb)
+    check_numbers(radius=radius, hold_radius=hold_radius, headroom=headroom, max_gb=max_gb, rate=rate)
     check_counts(n=n)
     check_named_numbers(param=param)
     given = None if recording is None else _sources(recording)
     return verified(
         controller, profile, watcher_of(progress), model=model, radius=radius, recordings=given, hold_radius=hold_radius, headroom=headroom,
         n=n, law=(law,) if isinstance(law, str) else tuple(law), param=param or {}, max_gb=max_gb,
+        enclose=enclose, rate=rate, because=because,
     )  # fmt: skip
 
 
@@ -135,6 +147,9 @@ def verified(
     law: tuple[str, ...],
     param: Mapping[str, float],
     max_gb: float | None,
+    enclose: bool = False,
+    rate: float | None = None,
+    because: str = "",
 ) -> VerifyResult:
     """As `verify`, with its options checked. recordings: paths, or tables in memory."""
     if (radius is None) == (recordings is None):
@@ -144,6 +159,7 @@ def verified(
     for option, value in (("radius", radius), ("hold-radius", hold_radius), ("n", n)):
         if value is not None and not 0.0 <= value < float("inf"):
             raise UsageError(f"{'-n' if option == 'n' else f'--{option}'} {value:g}: must be >= 0 and finite")
+    tubes = tubes_of(rate, because, enclose=enclose)
     loaded = load_checked(profile)
     composed = profile_model(model, loaded, _name_of(profile))
     measured = gap_of(load_recordings(recordings, composed, loaded, watcher, max_gb)[0], composed, loaded)[0] if recordings else None
@@ -155,28 +171,9 @@ def verified(
     file = controller_at(controller, param)
     seed = seed_for(file.digest, composed.spec.digest(), loaded.task_digest(), 1)
     beta = loaded.guarantee.beta
+    enclosed = enclosure_of(tubes, file, composed, loaded, gap.radius, watcher, beta=beta, n=n) if tubes is not None else None
     result, _ = run_verification(file, composed, loaded, watcher, gap=gap, headroom=share, laws=laws, n=n, attempt=1, seed=seed, beta=beta)
-    return VerifyResult(result, gap.radius)
-
-
-def gap_at(radius: float, hold_radius: float | None, model: ComposedModel, profile: Profile) -> Gap:
-    """A gap of that radius that nobody measured: for `--radius`."""
-    periods = profile.sampling.hold_periods
-    return Gap(
-        radius=radius,
-        radius_literal=radius,
-        hold_radius=hold_radius or radius * periods**0.5,
-        hold_periods=periods,
-        set=profile.norm.set,
-        weights=weights_of(model.states, {}, profile),
-        n=0,
-        discarded=0,
-        epsilon=profile.guarantee.epsilon,
-        beta=profile.guarantee.beta,
-        epoch=0,
-        model_digest=model.spec.digest(),
-        transitions_digest="",
-    )
+    return VerifyResult(result, gap.radius, enclosed)
 
 
 def load_recordings(
@@ -299,24 +296,6 @@ def run_verification(
         reason=done.text if isinstance(done, Failed) else "the worker gave no verification",
     )
     return failed, ""
-
-
-def work(job: Job, timeout_s: float, label: str, watcher: Watcher) -> Done | Failed:
-    """What a worker process makes of the job."""
-    from s2r_runtime.daemon.worker import Progress, Worker
-
-    worker = Worker(job, timeout_s)
-    try:
-        with watcher.phase(label) as report:
-            while True:
-                for message in worker.poll(time.monotonic_ns()):
-                    if isinstance(message, Progress):
-                        report(message.done, message.total, message.detail)
-                    else:
-                        return message
-                time.sleep(0.01)
-    finally:
-        worker.stop()
 
 
 def verification_lines(answer: Mapping[str, Any]) -> list[str]:

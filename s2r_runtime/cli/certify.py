@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from s2r_runtime.cli import output
-from s2r_runtime.cli.choices import add_limit, count, pairs
+from s2r_runtime.cli.choices import add_enclose_options, add_limit, count, pairs
 from s2r_runtime.cli.evidence import print_verification
 from s2r_runtime.errors import UsageError
 
@@ -35,6 +35,15 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         metavar="M",
         help="with --trials: roll each run out M times, as in s2r trials (default: 20 where the profile demands max_optimism, else 0)",
     )
+    add_enclose_options(verb)
+    verb.add_argument(
+        "--runs",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="LOG",
+        help="with --enclose: runs of any certified controller, whose residuals are compared with verification.run_radius; may be repeated",
+    )
     verb.add_argument("--model", metavar="MODEL.toml", help="a repaired model instead of the profile's")
     verb.add_argument("--key", type=Path, metavar="FILE", help="signing key (default: the user's; make one with s2r keys new)")
     verb.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the controller; may be repeated")
@@ -59,6 +68,10 @@ def run(args: argparse.Namespace) -> int:
         key=args.key,
         param=pairs(args.param, "--param"),
         max_gb=args.max_gb,
+        enclose=args.enclose,
+        rate=args.rate,
+        because=args.because,
+        runs=args.runs,
     )
     if args.json:
         output.result_json(found.to_dict())

@@ -43,6 +43,22 @@ def add_limit(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--max-gb", type=positive, metavar="GB", help="largest table that is read, as text, unpacked (default 4)")
 
 
+def add_enclose_options(verb: argparse.ArgumentParser) -> None:
+    """--enclose, --rate, --because."""
+    verb.add_argument(
+        "--enclose",
+        action="store_true",
+        help="also compare scenarios with a tube that no disturbance in the gap set leaves (G13, docs/composition.md)",
+    )
+    verb.add_argument(
+        "--rate",
+        type=positive,
+        metavar="L",
+        help="with --enclose: the closed loop steps at most L times as far from its undisturbed run (default: linear feedback, exact)",
+    )
+    verb.add_argument("--because", default="", metavar="TEXT", help="with --rate: why that may be assumed; it is part of the statement")
+
+
 def add_dbc(verb: argparse.ArgumentParser) -> None:
     """--dbc."""
     verb.add_argument(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from s2r_runtime.cli import output
 from s2r_runtime.cli.choices import (
+    add_enclose_options,
     add_limit,
     add_model_options,
     add_signal_options,
@@ -78,6 +79,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         metavar="L",
         help=f"disturbance law: {', '.join(LAWS)}; may be repeated (default: the profile's)",
     )
+    add_enclose_options(verify)
     verify.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the controller; may be repeated")
     add_limit(verify)
     verify.add_argument("--json", action="store_true", help="print one JSON object")
@@ -125,6 +127,9 @@ def run_verify(args: argparse.Namespace) -> int:
         law=tuple(args.law or ()),
         param=pairs(args.param, "--param"),
         max_gb=args.max_gb,
+        enclose=args.enclose,
+        rate=args.rate,
+        because=args.because,
     )
     if args.json:
         output.result_json(result.to_dict())

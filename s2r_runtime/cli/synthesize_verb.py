@@ -46,8 +46,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Exit 0 if the winner passed verification, 1 if it did not (the attempt is spent all the same)."""
+    from s2r_runtime.api.jobs import gap_at, work
     from s2r_runtime.api.models import controller_at, load_checked, profile_model
-    from s2r_runtime.api.verification import gap_at, gap_of, load_recordings, run_verification, verification_lines, work
+    from s2r_runtime.api.verification import gap_of, load_recordings, run_verification, verification_lines
     from s2r_runtime.controllers import candidates
     from s2r_runtime.daemon.worker import Failed, SynthesisJob
     from s2r_runtime.evidence.bounds import attempt_beta

@@ -17,6 +17,8 @@ from s2r_runtime.daemon.model_store import ModelStore
 from s2r_runtime.daemon.settings import facts_of, settings_of
 from s2r_runtime.daemon.worker import (
     Brought,
+    EnclosedCounts,
+    EncloseJob,
     GapJob,
     InputsJob,
     Job,
@@ -65,6 +67,8 @@ def run(job: Job, progress: Progress) -> Result:
             return synthesize(job, progress)
         case SimulateJob():
             return simulate(job, progress)
+        case EncloseJob():
+            return enclose(job, progress)
 
 
 def opened(raw: msgspec.Raw, kind: Any, what: str) -> Any:
@@ -191,7 +195,7 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
     return Result(verification=result, safety=safety, behaviour=behaviour)
 
 
-def _asked(job: VerifyJob | SynthesisJob | SimulateJob) -> tuple[ComposedModel, Task, GapSet]:
+def _asked(job: VerifyJob | SynthesisJob | SimulateJob | EncloseJob) -> tuple[ComposedModel, Task, GapSet]:
     """The model and task of the job's profile, and the disturbances that it names."""
     from s2r_runtime.evidence.uncertain import GapSet
     from s2r_runtime.models.composed import compose
@@ -253,6 +257,35 @@ def simulate(job: SimulateJob, progress: Progress) -> Result:
             progress=lambda done, total: progress(done, total, job.law),
         )
     return Result(simulated=found)
+
+
+def enclose(job: EncloseJob, progress: Progress) -> Result:
+    """Scenarios and the tube around each nominal run; the controller answers from a confined process, as in a verification."""
+    import numpy as np
+
+    from s2r_runtime.controllers.batches import BatchController
+    from s2r_runtime.controllers.linear_feedback import gain_of
+    from s2r_runtime.evidence.enclosure import enclose as enclosed
+    from s2r_runtime.evidence.enclosure import tube_for
+    from s2r_runtime.evidence.uncertain import LAWS
+
+    model, task, gap_set = _asked(job)
+    threshold = job.profile.verification.threshold
+    tube = tube_for(gain_of(job.controller), job.rate, task, model, gap_set, threshold)
+    rng = np.random.default_rng([job.seed, len(LAWS)])  # a verification of this seed draws from 0, 1, ...
+    with BatchController(job.controller, len(model.inputs)) as control:
+        found = enclosed(
+            control,
+            task,
+            model,
+            gap_set,
+            tube,
+            rng,
+            job.n,
+            threshold=threshold,
+            progress=lambda done, total: progress(done, total, "enclosure"),
+        )
+    return Result(enclosed=EnclosedCounts(found.failed, found.reach, found.rate_seen))
 
 
 def inputs(job: InputsJob) -> GivenInputs:

@@ -87,6 +87,8 @@ def settings_of(
         about = profile.guarantee
         runs = {"beta_episodes": about.beta_episodes, "max_unsafe": about.max_unsafe, "gate_closing": about.gate_closing}
         runs["threshold"] = profile.verification.threshold
+    if profile.verification.run_radius > 0.0:
+        runs["run_radius"] = profile.verification.run_radius
     return Settings(
         robot=profile.robot.name,
         states=facts.states,

@@ -148,6 +148,19 @@ class SimulateJob(msgspec.Struct, frozen=True, tag="simulate"):
     seed: int
 
 
+class EncloseJob(msgspec.Struct, frozen=True, tag="enclose"):
+    """Compare n scenarios with a tube around the controller's nominal runs (offline only). rate: as in `tube_for`."""
+
+    profile: Profile
+    controller: ControllerFile
+    gap: Gap
+    radius: float
+    hold_radius: float
+    rate: float
+    n: int
+    seed: int
+
+
 class Brought(msgspec.Struct, frozen=True):
     """A certificate that a person brought: what the core is to know of it, or `problem`. signer: the key that stands in it.
     untrusted: nothing but its key is wrong.
@@ -170,7 +183,15 @@ class Model(msgspec.Struct, frozen=True):
     toml: str
 
 
-Job = LoadJob | ModelJob | GapJob | VerifyJob | TraceJob | InputsJob | SynthesisJob | SimulateJob
+Job = LoadJob | ModelJob | GapJob | VerifyJob | TraceJob | InputsJob | SynthesisJob | SimulateJob | EncloseJob
+
+
+class EnclosedCounts(msgspec.Struct, frozen=True):
+    """Of an EncloseJob's scenarios: those that are not enclosed, the tube's reach that was compared, m, the largest rate that was drawn."""
+
+    failed: int
+    reach: float
+    rate_seen: float
 
 
 class Progress(msgspec.Struct, frozen=True, tag="progress"):
@@ -195,6 +216,7 @@ class Result(msgspec.Struct, frozen=True, tag="result"):
     inputs: GivenInputs | None = None
     synthesis: Synthesis | None = None
     simulated: SimulatedScores | None = None
+    enclosed: EnclosedCounts | None = None
 
 
 class Failed(msgspec.Struct, frozen=True, tag="failed"):

@@ -9,7 +9,19 @@ import math
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 
 from s2r_runtime.core.ledger import spent
-from s2r_runtime.messages import BEHAVIOURS, Gap, LawResult, RunLimits, Simulated, Trials, Tries, Verification
+from s2r_runtime.messages import (
+    BEHAVIOURS,
+    Composition,
+    Enclosure,
+    Gap,
+    InsideRuns,
+    LawResult,
+    RunLimits,
+    Simulated,
+    Trials,
+    Tries,
+    Verification,
+)
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Driving
 
@@ -19,6 +31,7 @@ HELD = {
 }
 """What is said of the period of a hold that gives the sample."""
 ASSUMED = "rests on an assumption that the user made"
+STATED = "rests on an assumption that was tested and is not proved"
 
 
 def shown(
@@ -33,8 +46,9 @@ def shown(
     period: str = "first",
     tries: Tries | None = None,
     runs: RunLimits | None = None,
+    composition: Composition | None = None,
 ) -> tuple[str, ...]:
-    """The statements G1 to G4, G8 and G10 of this evidence. budget: beta of the robot's life. assumption: one that the user made.
+    """The statements G1 to G4, G8, G10 and G13 of this evidence. budget: beta of the robot's life. assumption: one that the user made.
     period: of each hold that gave the sample (`sampling.period`). tries: what was tried before, if it was counted.
     runs: of this controller on this robot.
 
@@ -56,6 +70,7 @@ def shown(
         *(() if trials is None else (of_trials(trials),)),
         *(() if trials is None or trials.simulated is None else of_simulated(trials.simulated)),
         *(() if runs is None else (of_runs(runs),)),
+        *(() if composition is None else of_composition(composition)),
     )
 
 
@@ -141,6 +156,63 @@ def of_simulated(s: Simulated) -> tuple[str, str]:
     )
 
 
+def of_enclosure(e: Enclosure) -> str:
+    """The second term of G13."""
+    how = (
+        "The tube is exact, because the model and the controller's feedback are linear"
+        if e.method == "linear"
+        else (
+            f"The tube {STATED}: from any state in the tube, the closed loop steps at most {e.rate:g} times as "
+            f"far from the undisturbed run as it was, because {e.because}. States drawn in the tube came to {e.rate_seen:.3g}"
+        )
+    )
+    return (
+        f"Enclosure (G13). Of {e.n} scenarios drawn independently, {e.n - e.failed} are enclosed: no disturbance sequence in the gap set "
+        f"of radius {e.radius:.6g} makes them unsafe. With confidence {confidence(e.beta)} a new scenario is not enclosed with "
+        f"probability at most {bound(e.upper)}. {how}. The tube's reach is at most {bound(e.reach)} m."
+    )
+
+
+def of_inside_runs(r: InsideRuns) -> str:
+    """The first term of G13."""
+    several = r.controllers > 1 or r.own < r.n
+    tested = (
+        f"A test of it, at any time at level {r.level:g}, did not refute it (evidence {math.exp(min(r.capital, 30.0)):.3g} of "
+        f"{1.0 / r.level:g}); it is not proved."
+        if r.own
+        else "For this controller nothing here could test it, because it has no run of its own."
+    )
+    assumed = (
+        f" Runs of {r.controllers} controllers count, {r.own or 'none'} of them of this one. That rests on an assumption: the largest "
+        f"residual of a run has one distribution, whichever certified controller drives. {tested}"
+        if several
+        else ""
+    )
+    refuted = f" Runs of other controllers do not count: their residuals differ, at level {r.level:g}." if r.refuted else ""
+    return (
+        f"Residuals of runs (G13). Of {r.n} runs, {r.outside or 'none'} left the gap set of radius {r.radius:.6g}, which was fixed "
+        f"before them, or had an unknown end. With confidence {confidence(r.beta)}, after every run at once, the mean probability of that "
+        f"is at most {bound(r.upper)} for these runs.{assumed}{refuted}"
+    )
+
+
+def of_composition(c: Composition) -> tuple[str, ...]:
+    """The statement G13: both terms, and what they come to."""
+    if c.runs is None:
+        return of_enclosure(c.enclosure), "Composition (G13). No runs are part of it, so nothing is claimed of the robot."
+    return (
+        of_inside_runs(c.runs),
+        of_enclosure(c.enclosure),
+        (
+            "Composition (G13). A run whose residuals are all in the gap set is a run of the uncertain model. So this controller's runs on "
+            f"the robot are unsafe with probability at most {bound(c.upper)} on average, the sum of both limits, with confidence "
+            f"{confidence(c.runs.beta + c.enclosure.beta)}. It is about runs whose residuals are distributed as in these runs, in "
+            "scenarios drawn from the task's distribution, their starts too. The confidences are shares of a budget of their own "
+            "(guarantee.beta_composition)."
+        ),
+    )
+
+
 def assumption(driving: Driving) -> str:
     """The words of the profile's mixing assumption, as they stand on the certificate."""
     mixing = "independent" if driving.mixing == 0.0 else f"beta-mixing with a coefficient of at most {driving.mixing:g} a block"
@@ -150,8 +222,10 @@ def assumption(driving: Driving) -> str:
     )
 
 
-def not_shown(gap: Gap, verification: Verification, horizon: int = 0, *, trials: bool = False) -> tuple[str, ...]:
-    """What nobody may read into it. horizon: steps of the task (0: not said). trials: whether there were any."""
+def not_shown(gap: Gap, verification: Verification, horizon: int = 0, *, trials: bool = False, composed: bool = False) -> tuple[str, ...]:
+    """What nobody may read into it. horizon: steps of the task (0: not said). trials: whether there were any.
+    composed: whether G13 says something of the robot.
+    """
     run = ""
     if horizon > 1:
         once = 1.0 - (1.0 - gap.epsilon) ** horizon
@@ -162,11 +236,12 @@ def not_shown(gap: Gap, verification: Verification, horizon: int = 0, *, trials:
         if required == {"uniform"}
         else ()
     )
+    apart = " The composed statement (G13) uses neither." if composed else ""
     return (
         *alone,
         (
             "The gap's statement and the controller's do not compose into a statement about the robot with this controller: the first is "
-            f"about the robot under the sampling law, the second about the uncertain model.{run}"
+            f"about the robot under the sampling law, the second about the uncertain model.{run}{apart}"
         ),
         (
             "The inputs change when a controller drives: where it applies inputs rho times as often as they were sampled, epsilon becomes "

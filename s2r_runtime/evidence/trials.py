@@ -63,7 +63,7 @@ class Run:
     """One scenario. first, last: numbers of its first and last observation; driven: by the controller from the first step on; closed: the
     gate closed in it or refused its first command, or the controller failed in it; over: it came to its own end. seed, start: those from
     which its scenario is drawn again (`Episodes`), the start (nx,) as observed. progress: the task's, at its end. states: (nx,) each,
-    if they are wanted.
+    if they are wanted, the one at which it ended too; inputs: what the controller answered to each but that one (nu,), None: nothing.
     """
 
     index: int
@@ -78,6 +78,7 @@ class Run:
     start: tuple[float, ...] = ()
     progress: float | None = None
     states: list[tuple[float, ...]] = field(default_factory=list)
+    inputs: list[tuple[float, ...] | None] = field(default_factory=list)
 
 
 @dataclass
@@ -119,6 +120,8 @@ class _Deployment:
         if ended is not None:
             self._note(ended, seq)
             self.runs[-1].over = True
+            if self.with_states:
+                self.runs[-1].states.append(x)
         if seen is None:
             return
         if not self.runs or self.runs[-1].index != now.index:
@@ -126,6 +129,12 @@ class _Deployment:
         self._note(now, seq)
         if self.with_states:
             self.runs[-1].states.append(x)
+            self.runs[-1].inputs.append(None)
+
+    def answer(self, seq: int, u: tuple[float, ...]) -> None:
+        """The controller's answer to what it was shown."""
+        if self.runs and self.runs[-1].inputs and not self.runs[-1].over and self.runs[-1].last == seq:
+            self.runs[-1].inputs[-1] = u
 
     def _note(self, episode: Episode, seq: int) -> None:
         run = self.runs[-1]
@@ -172,8 +181,8 @@ def read_runs(
     Raises ConfigError for a log of another robot, task or profile.
     """
     found, used, threshold = Found(), set[tuple[int, int]](), profile.verification.threshold
-    for parts in sorted(logged_runs(paths, CHANNELS), key=_began):
-        for deployment in _deployments(parts, profile, task, with_states=with_states):
+    for parts in in_order(paths):
+        for deployment in deployments(parts, profile, task, with_states=with_states):
             for run in _judged(deployment):
                 reason = _left_out(run, deployment, controller_digest, model_digest, used, threshold)
                 if reason:
@@ -210,6 +219,11 @@ def values_of(found: Found, score: Score) -> list[float]:
         else:
             values.append(run.safety if score.name == "safety" else math.nan if run.progress is None else run.progress)
     return values
+
+
+def in_order(paths: Sequence[Path]) -> list[list[Reading]]:
+    """The logs of each run of the daemon, in the order in which these began."""
+    return sorted(logged_runs(paths, CHANNELS), key=_began)
 
 
 def _began(parts: Sequence[Reading]) -> tuple[float, str]:
@@ -251,8 +265,11 @@ def _judged(deployment: _Deployment) -> Iterator[Run]:
         yield run
 
 
-def _deployments(parts: Iterable[Reading], profile: Profile, task: Task, *, with_states: bool) -> Iterator[_Deployment]:
-    """One run of the daemon, message by message."""
+def deployments(parts: Iterable[Reading], profile: Profile, task: Task, *, with_states: bool) -> Iterator[_Deployment]:
+    """Controllers in one run of the daemon, message by message.
+
+    Raises ConfigError for a log of another robot, task or profile, and for a damaged one.
+    """
     settings: m.Settings | None = None
     model, seen, now = "", dict[int, tuple[float, ...]](), None
     for reading in parts:
@@ -289,6 +306,7 @@ def _within(now: _Deployment, message: Any, seen: dict[int, tuple[float, ...]]) 
             now.ask(seq)
         case m.Proposed(command=command) if command.source == "controller" and command.obs_seq in seen:
             now.look(command.obs_seq, seen[command.obs_seq])
+            now.answer(command.obs_seq, command.u)
         case m.SourceStopped(source="controller", reason=reason):
             if reason != "stopped":
                 now.look_at_asked(seen)
@@ -313,8 +331,8 @@ def _check(settings: m.Settings, profile: Profile, path: Path) -> None:
         ("task", settings.task_digest, profile.task_digest()),
         ("profile", settings.profile_digest, profile.digest()),
     ):
-        if what == "profile" and there in {profile.by_text().digest(), without_demand(profile).digest()}:
-            continue  # a log of an earlier version, or of before a limit of the model's optimism was demanded
+        if what == "profile" and there in {one.digest() for one in (profile.by_text(), without_demand(profile), without_radius(profile))}:
+            continue  # a log of an earlier version, or of before a limit was demanded or a radius fixed
         if there != here:
             raise ConfigError(f"{path}: its {what} is {there}, the profile's is {here}")
 
@@ -322,6 +340,12 @@ def _check(settings: m.Settings, profile: Profile, path: Path) -> None:
 def without_demand(profile: Profile) -> Profile:
     """The profile before it demanded a limit of the model's optimism. Runs are driven and judged under it in the same way."""
     return replace_field(profile, verification=replace_field(profile.verification, max_optimism=1.0))
+
+
+def without_radius(profile: Profile) -> Profile:
+    """The profile before it fixed a radius of the runs' residuals (guarantee G13), and demanded anything."""
+    demanded = without_demand(profile)
+    return replace_field(demanded, verification=replace_field(demanded.verification, run_radius=0.0))
 
 
 def first(found: Found, n: int) -> Found:

@@ -288,7 +288,8 @@ def statement(v: Verification) -> str:
     if [r.law for r in required] == ["uniform"]:
         told.append("Only uniform was required: nothing is shown about a disturbance that persists.")
     told += [
-        f"Reported and not required: under {r.law} s* = {worst(r.s_star)}, {r.failures} of {r.n} rollouts below the threshold."
+        f"Reported and not required: under {r.law} s* = {worst(r.s_star)}, {r.failures} of {r.n} rollouts below the threshold "
+        "(worst found, not proved)."
         for r in v.laws
         if not r.required
     ]
@@ -302,6 +303,7 @@ def not_shown() -> list[str]:
         "A controller that drives chooses other inputs than a campaign: where it does so rho times as often, epsilon becomes rho epsilon.",
         "Epsilon is a probability a step: over a run of hundreds of steps the gap may be exceeded at least once.",
         "The disturbance laws are models: independent, zero-mean noise averages out where a real, persistent disturbance does not.",
+        "What rollouts show against disturbances is the worst found, not proved; only an enclosure covers all of them (G13).",
         "Nothing is said about scenarios outside the task's law, states outside the region, or a robot that changed since the campaign.",
     ]
 

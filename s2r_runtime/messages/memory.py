@@ -81,6 +81,8 @@ class Settings(Struct, frozen=True):
     """What a run counts as in which the gate closed."""
     threshold: float = 0.0
     """Safety value below which a run is unsafe."""
+    run_radius: float = 0.0
+    """Residuals up to this are in the gap set of a composed statement (guarantee G13). 0: none is meant. The core does not use it."""
 
 
 GRID = 2

@@ -197,6 +197,61 @@ class RunLimits(Struct, frozen=True):
     beta_upper: float
 
 
+class Enclosure(Struct, frozen=True):
+    """Scenarios compared with a tube that holds every run of the uncertain model (guarantee G13, `enclosure`).
+
+    method: of the tube; rate: the stated one of the closed loop, because: the reason a person gave (0 and empty for `linear`). radius: of
+    the gap set. n scenarios, `failed` not enclosed; upper: limit of the probability of that, at confidence 1-beta. reach: the
+    tube's largest, m. rate_seen: the largest that drawn states showed.
+    """
+
+    method: Literal["linear", "rate"]
+    rate: float
+    because: str
+    radius: float
+    n: int
+    failed: int
+    upper: float
+    beta: float
+    seed: int
+    reach: float
+    rate_seen: float
+    controller_digest: str
+    model_digest: str
+    task_digest: str
+
+
+class InsideRuns(Struct, frozen=True):
+    """Runs of certified controllers, and limits of the mean probability that a run has a residual outside the gap set (guarantee G13).
+
+    radius: of the gap set, fixed before them. n runs count, `outside` of them left it or are not known. upper: at confidence 1-beta after
+    every run. largest: residual of those that are known. own: runs of the controller that the statement is about; controllers: number of
+    different ones among the n. capital: log of the largest capital against "it does not matter who drives", nats; level: of that
+    test; refuted: then own runs alone count. logs: heads of the chains.
+    """
+
+    radius: float
+    n: int
+    outside: int
+    upper: float
+    beta: float
+    largest: float
+    own: int
+    controllers: int
+    capital: float
+    level: float
+    refuted: bool
+    logs: tuple[str, ...] = ()
+
+
+class Composition(Struct, frozen=True):
+    """Both, and their sum: limit of the probability that a run of this controller on the robot is unsafe (guarantee G13)."""
+
+    enclosure: Enclosure
+    runs: InsideRuns | None
+    upper: float
+
+
 class CertificateFacts(Struct, frozen=True):
     """What the gate compares. Taken from a certificate whose signature was verified when it was loaded."""
 

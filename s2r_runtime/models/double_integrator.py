@@ -26,6 +26,7 @@ class DoubleIntegrator:
         "vy": Follows(("y",), lambda x, rates, parameters: rates["y"]),
     }
     uneven = True
+    linear = True
     units = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s", "ax": "m/s²", "ay": "m/s²"}
 
     def step(self, x: Array, u: Array, dt: float | Array, parameters: dict[str, float]) -> Array:

@@ -91,6 +91,7 @@ def _probabilities(p: Profile) -> Iterator[Check]:
         ("guarantee.beta", g.beta),
         ("guarantee.alpha", g.alpha),
         ("guarantee.beta_episodes", g.beta_episodes),
+        ("guarantee.beta_composition", g.beta_composition),
         ("verification.epsilon", p.verification.epsilon),
     ):
         yield 0.0 < value < 1.0, field, value, "between 0 and 1"
@@ -130,6 +131,7 @@ def _verification(v: VerificationSettings) -> Iterator[Check]:
     among = bool(v.required) and set(v.required) <= set(v.laws)
     yield among, "verification.required", list(v.required), "at least one of verification.laws"
     yield 0.0 < v.max_optimism <= 1.0, "verification.max_optimism", v.max_optimism, "above 0 and at most 1 (1: no demand)"
+    yield 0.0 <= v.run_radius < math.inf, "verification.run_radius", v.run_radius, "0 (none is meant) or above, in the norm's unit"
     yield _lasting(v.timeout), "verification.timeout", v.timeout, "> 0 s and at most 1e9 s"
 
 

@@ -93,6 +93,9 @@ class Guarantee(_Table, frozen=True):
     it, so by default a confidence of 95.4 %."""
     max_unsafe: float = 0.0
     """A controller is revoked and refused when the lower limit of its unsafe runs is above this. 0: none is."""
+    beta_composition: float = 0.1
+    """One minus the confidence of all composed statements in the robot's life together (guarantee G13). Verification attempt j has
+    6 beta / (pi² j²) of it: half for the runs, half for the scenarios."""
     gate_closing: Literal["unsafe", "safe", "censored"] = "unsafe"
     """What a run counts as in which the gate closed while its safety value was good. `censored`: as unsafe in the upper limit, as safe in
     the lower one. A run in which the controller itself failed is always unsafe."""
@@ -117,6 +120,9 @@ class VerificationSettings(_Table, frozen=True):
     """It must be shown that the uncertain model's share of safe runs exceeds the robot's by at most this (guarantee G12); 1: no demand.
     Below 1, a certificate needs trials (`s2r certify --trials`): the daemon issues none by itself, and takes one that is brought.
     """
+    run_radius: float = 0.0
+    """A run stays in the gap set if each of its residuals is at most this, in the norm's unit (guarantee G13). It is fixed before the runs:
+    only runs that are driven under it count. 0: none is meant."""
     timeout: float = 60.0
     """s; a controller that is not done by then has not passed. Time in which it waits for a processor does not count."""
 
@@ -257,8 +263,8 @@ class Repair(_Table, frozen=True):
 AS_BEFORE: dict[str, dict[str, Any]] = {
     "gate": {"fault_share": 0.0, "fault_burst": 0},
     "sampling": {"period": "first"},
-    "guarantee": {"beta_episodes": 0.1, "max_unsafe": 0.0, "gate_closing": "unsafe"},
-    "verification": {"max_optimism": 1.0},
+    "guarantee": {"beta_episodes": 0.1, "max_unsafe": 0.0, "gate_closing": "unsafe", "beta_composition": 0.1},
+    "verification": {"max_optimism": 1.0, "run_radius": 0.0},
 }
 """Settings that were added later: table -> setting -> the value by which everything was done before it was there. A log is audited, and a
 digest computed, as if a profile with that value did not have the setting.

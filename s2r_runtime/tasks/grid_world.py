@@ -46,6 +46,7 @@ class GridWorld:
     """Interface: `hookspecs.Task`. Models with the states x, y, theta."""
 
     name = "grid_world"
+    position = ("x", "y")
     PARAMETERS: ClassVar[dict[str, tuple[float, str]]] = {
         "columns": (8, "cells along x"),
         "rows": (5, "cells along y"),
@@ -222,6 +223,17 @@ class GridWorld:
                     there = flat.take(at + (i + j * width)) & ~inside
                     np.minimum(nearest, np.sqrt(dx * dx + dy * dy), out=nearest, where=there)
         return nearest
+
+    def enclosed(self, x: Array, reach: float, scenario: Scenario, threshold: float) -> tuple[Bools, Bools] | None:
+        """Nothing is touched from any place within `reach`, m; and it is within a goal's cell. `clearance` is never above the distance
+        from what is touched, which is 1-Lipschitz in the place. A threshold above 0 requires progress: None.
+        """
+        if threshold > 0.0:
+            return None
+        cell, fx, fy = self.grid.place(x[:, self._x], x[:, self._y])
+        goal = scenario["distance"].ravel().take(np.arange(len(x)) * self.grid.size + cell) == 0.0
+        within = self.grid.cell / 2.0 - np.maximum(np.abs(fx), np.abs(fy)) >= reach
+        return self.clearance(x, scenario) - reach > 0.0, goal & within
 
     def begin(self, scenario: Scenario) -> Tally:
         """Nothing has happened."""

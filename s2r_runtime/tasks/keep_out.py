@@ -43,6 +43,7 @@ class KeepOut:
     """Interface: `hookspecs.Task`. Models with the states x, y."""
 
     name = "keep_out"
+    position = ("x", "y")
     PARAMETERS: ClassVar[dict[str, tuple[float, str]]] = {
         "x_low": (-1.6, "the region, m"),
         "x_high": (1.6, "the region, m"),
@@ -156,6 +157,13 @@ class KeepOut:
     def clearance(self, x: Array, scenario: Scenario) -> Array:
         """Distance of the robot's disc from the keep-out disc and the region's edge, m, (n,); negative if it touches."""
         return self._clear(x[:, self._x], x[:, self._y], scenario["disc"])
+
+    def enclosed(self, x: Array, reach: float, scenario: Scenario, threshold: float) -> tuple[Bools, Bools] | None:
+        """Every place within `reach`, m, keeps the clearance `threshold`; and it is within the goal. Clearance and distance are
+        1-Lipschitz in the place.
+        """
+        arrived = self._from_goal(x, scenario) + reach <= self._p["goal_radius"]
+        return self.clearance(x, scenario) - reach >= threshold, arrived
 
     def _from_goal(self, x: Array, scenario: Scenario) -> Array:
         goal: Array = scenario["goal"]

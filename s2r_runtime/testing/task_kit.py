@@ -143,6 +143,25 @@ class TaskKit:
             assert isinstance(verdict, bool)
             assert not verdict, "a robot that never moves passes"
 
+    def test_what_is_called_safe_within_a_distance_is_safe_in_all_of_it(self, cases: list[tuple[NominalModel, Task]]) -> None:
+        for model, task, scenarios, states in self._runs(cases, 40):
+            named: Any = task
+            if not hasattr(task, "enclosed"):
+                continue
+            rng, columns = np.random.default_rng(6), [model.states.index(name) for name in named.position]
+            for scenario, x in list(zip(scenarios, states, strict=True))[::10]:
+                for within in (0.0, 0.1 * self.reach):
+                    found = named.enclosed(x, within, scenario, 0.0)
+                    assert found is not None, "it says nothing at the threshold 0"
+                    safe, over = found
+                    assert (safe.shape, safe.dtype, over.shape, over.dtype) == ((40,), np.bool_, (40,), np.bool_)
+                    moved = x + rng.normal(size=x.shape)  # all but the place may be anything
+                    way = rng.normal(size=(40, len(columns)))
+                    moved[:, columns] = x[:, columns] + 0.999 * within * way / np.linalg.norm(way, axis=1, keepdims=True)
+                    tally = task.observe(task.begin(scenario), moved, scenario)
+                    assert (task.safety(tally)[safe] >= 0.0).all(), "a state within the distance is not safe"
+                    assert task.done(tally)[safe & over].all(), "a run in a state within the distance is not over"
+
     # ------------------------------------------------------------ how
 
     def _rows(self, scenario: Scenario, n: int) -> None:

@@ -21,9 +21,21 @@ from s2r_runtime.controllers.file import ControllerFile, Identity
 from s2r_runtime.core import anytime
 from s2r_runtime.core.ledger import binomial_tail, campaign_size, sample_size, share
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
+from s2r_runtime.evidence import composition as composing
 from s2r_runtime.evidence import statements
 from s2r_runtime.files.canonical import canonical, digest
-from s2r_runtime.messages import NOT_INDEPENDENT, CertificateFacts, Gap, RunLimits, Simulated, Struct, Trials, Tries, Verification
+from s2r_runtime.messages import (
+    NOT_INDEPENDENT,
+    CertificateFacts,
+    Composition,
+    Gap,
+    RunLimits,
+    Simulated,
+    Struct,
+    Trials,
+    Tries,
+    Verification,
+)
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import Profile, TaskValue
 from s2r_runtime.trust import keys
@@ -70,6 +82,8 @@ class Certificate(Struct, frozen=True):
     """None: issued before seeds were drawn. Then the key is not in the file, as it was not then."""
     runs: RunLimits | None = None
     """Of this controller on this robot until then (guarantee G10). None: it drove none, or they were not counted; then the same holds."""
+    composition: Composition | None = None
+    """What holds for the real closed loop (guarantee G13). None: nothing was composed; then the same holds."""
 
     @property
     def id(self) -> str:
@@ -99,13 +113,14 @@ def issue(
     period: str = "",
     tries: Tries | None = None,
     runs: RunLimits | None = None,
+    composition: Composition | None = None,
 ) -> Certificate:
     """Writes down what gap and verification show, if they show it. profile: with the model in force.
 
     lifetime_s: the profile's unless given. horizon: the task's, for the sentences. assumption: one the user made about independence.
     trials: closed-loop runs, if there were any. period: of each hold that gave the sample, where that is not what the profile says.
     tries: what was tried until this attempt (None: as a certificate of before, whose seed anybody knew beforehand).
-    runs: of this controller on this robot, with their limits.
+    runs: of this controller on this robot, with their limits. composition: scenarios enclosed at this attempt's shares, and runs.
     Raises NotEnoughEvidence if the evidence doesn't carry a certificate, ConfigError if its parts don't belong together.
     """
     identity = controller.identity if isinstance(controller, ControllerFile) else controller
@@ -139,15 +154,17 @@ def issue(
             period or profile.sampling.period,
             tries,
             runs,
+            composition,
         ),
-        not_shown=statements.not_shown(gap, verification, horizon, trials=trials is not None),
+        not_shown=statements.not_shown(gap, verification, horizon, trials=trials is not None, composed=composition is not None),
         issued_unix_s=issued_unix_s,
         expires_unix_s=issued_unix_s + lifetime,
         trials=trials,
         tries=tries,
         runs=runs,
+        composition=composition,
     )
-    for what, ok in (*_bindings(certificate), *_asked_for(profile, gap, verification)):
+    for what, ok in (*_bindings(certificate), *_asked_for(profile, gap, verification), *_composed_for(profile, certificate)):
         if not ok:
             raise ConfigError(f"no certificate: {what}")
     for lack, ok, missing in _evidence(certificate, traced_not_adopted=traced_not_adopted):
@@ -275,6 +292,8 @@ def _plain(certificate: Certificate) -> dict[str, Any]:
         del plain["tries"]
     if certificate.runs is None:
         del plain["runs"]
+    if certificate.composition is None:
+        del plain["composition"]
     return plain
 
 
@@ -328,8 +347,14 @@ def _bindings(c: Certificate) -> list[tuple[str, bool]]:
             or (c.trials.controller_digest, c.trials.task_digest, c.trials.model_digest)
             == (c.controller_digest, c.task_digest, c.model_digest),
         ),
+        ("the enclosure is of another controller, model or task", c.composition is None or _is_of(c.composition, c)),
         ("it expires before it is issued", c.issued_unix_s < c.expires_unix_s),
     ]
+
+
+def _is_of(composition: Composition, c: Certificate) -> bool:
+    e = composition.enclosure
+    return (e.controller_digest, e.model_digest, e.task_digest) == (c.controller_digest, c.model_digest, c.task_digest)
 
 
 def _asked_for(profile: Profile, gap: Gap, v: Verification) -> list[tuple[str, bool]]:
@@ -347,6 +372,21 @@ def _asked_for(profile: Profile, gap: Gap, v: Verification) -> list[tuple[str, b
     ]
 
 
+def _composed_for(profile: Profile, c: Certificate) -> list[tuple[str, bool]]:
+    """As `_asked_for`, of a composed statement."""
+    if c.composition is None:
+        return []
+    enclosure, runs = c.composition.enclosure, c.composition.runs
+    most = share(profile.guarantee.beta_composition, c.verification.attempt) * (1.0 + 1e-9)
+    return [
+        ("the composed statement is of another radius than verification.run_radius", enclosure.radius == profile.verification.run_radius),
+        (
+            "the composed statement spends more than its attempt's share of guarantee.beta_composition",
+            max(enclosure.beta, runs.beta if runs is not None else 0.0) <= most,
+        ),
+    ]
+
+
 def _evidence(c: Certificate, *, traced_not_adopted: bool) -> list[tuple[str, bool, int]]:
     """(what is lacking, whether it is there, how many samples more would do)."""
     gap, v = c.gap, c.verification
@@ -357,6 +397,7 @@ def _evidence(c: Certificate, *, traced_not_adopted: bool) -> list[tuple[str, bo
     least_n = min((law.n for law in required), default=0)
     assumed = any(statements.ASSUMED in line for line in c.shown)  # half of the share pays for the mixing (`blocked`)
     halved = holds or assumed
+    wrong = "" if c.composition is None else composing.problem(c.composition)
     wanted_n = campaign_size(gap.epsilon, gap.beta, gap.discarded) if halved else sample_size(gap.epsilon, gap.beta, gap.discarded)
     return [
         ("the controller did not pass verification" + (f": {v.reason}" if v.reason else ""), v.passed, 0),
@@ -383,6 +424,11 @@ def _evidence(c: Certificate, *, traced_not_adopted: bool) -> list[tuple[str, bo
         ),
         ("the trials do not carry their statement", c.trials is None or _carried(c.trials, slack), 0),
         ("the limits of its runs do not follow from their counts", c.runs is None or _follow(c.runs), 0),
+        (
+            "the composed statement does not follow from its numbers" + (f": {wrong}" if wrong else ""),
+            not wrong,
+            0,
+        ),
         ("only the law uniform was required, and an effect was traced that the model lacks", not (alone and traced_not_adopted), 0),
     ]
 

@@ -1,0 +1,1 @@
+../../../../controllers/point_mass_keep_out.py
