@@ -97,7 +97,7 @@ $(RUNS): $(PROJECTS)
 
 # What developers need besides.
 $(STAMP): $(RUNS)
-	$(INSTALL) --editable '.[report,formats,dev]' --editable plugins/zenoh --editable plugins/can --editable plugins/mavlink \
+	$(INSTALL) --editable '.[report,formats,onnx,dev]' --editable plugins/zenoh --editable plugins/can --editable plugins/mavlink \
 	    --editable 'plugins/standins[sim]' --editable 'plugins/ros2[formats]'
 	@touch $(STAMP)
 

@@ -11,7 +11,7 @@ heavy is imported until it is used. Built-in models, effects and tasks come thro
     task, with its safety metric       `s2r_tasks`, `Task`: the metric is what `safety` says, >= 0 iff safe
     format of files                    `s2r_formats`: named time series, whatever robot they are of
     kit                                `s2r_kits`: how `s2r plugin check` tries what is offered
-    controller                         no hook: a Python file, named where it is used (its bytes are what a certificate is about)
+    controller                         no hook: a Python or ONNX file, named where it is used (its bytes are what a certificate is about)
     recorder, dashboard                no hook: a separate process reads the log while it is written (docs/plugin-reference.md)
 
     from s2r_runtime.hookspecs import Offer, hookimpl

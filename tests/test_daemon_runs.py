@@ -87,3 +87,29 @@ def test_a_controller_that_is_unsafe_too_often_is_revoked_and_stays_refused(rig:
     assert all(one.outcome in ("unsafe", "left_out") for one in counted(rig) if one.index > 0)
     audited = rig.s2r("audit", *map(str, rig.log_files()), "--json")
     assert json.loads(audited.stdout)["first_difference"] is None, audited.stdout
+
+
+@pytest.mark.slow
+def test_learned_policy_is_verified_certified_and_drives(rig: Rig) -> None:
+    """From a campaign to counted runs, then the audit evaluates the policy again on every state; a file that does not fit costs nothing."""
+    pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    from onnx_rig import linear, tables, write
+
+    weights = [[0.0, 0.02], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.01]]
+    settings = tables(("x", "time_left"), top="history = 2", limits="lower = -0.1\nupper = 0.1")
+    good = write(rig.folder, linear([*weights[:3], [0.0, 0.3]]), settings)
+    bad = write(rig.folder, linear(weights), settings, "bad")
+    rig.start()
+    assert rig.sample()["exit_code"] == 0
+    refused = rig.ask("deploy", path=str(bad))
+    assert refused["exit_code"] == 78
+    assert "bad.onnx: its input has shape (n, 5), must be (n, 2, 2) or (n, 4)" in refused["text"]
+    assert rig.status()["attempts"] == 0
+    answer = rig.ask("deploy", path=str(good))
+    assert answer["exit_code"] == 0, answer
+    rig.until(lambda: (runs_of(rig)["all"] or {"n": 0})["n"] >= 4)
+    assert rig.stop() == 0
+    audited = json.loads(rig.s2r("audit", *map(str, rig.log_files()), "--rerun-controllers", "--json").stdout)
+    assert (audited["ok"], audited["first_difference"], audited["unchecked"]) == (True, None, []), audited
+    assert audited["recomputed"]["driving commands that their controller gives again"] > 50

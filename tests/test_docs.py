@@ -1,12 +1,14 @@
 """What the docs show is what happens: console blocks are run, Python blocks are run, verbs and hooks are all documented.
 
 A ```console block's lines that begin with `$ ` are commands, the lines after each are its stdout and stderr; `...` stands
-for anything. Python blocks of a page share their names. Blocks marked no-run show what needs hardware, root or minutes.
+for anything. Python blocks of a page share their names. Blocks marked no-run show what needs hardware, root or minutes. Those
+marked `needs MODULE` are run where that extra is installed.
 The demo is run by test_demo.py, a log and a daemon in Python by test_python_evidence.py.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import shutil
@@ -32,7 +34,8 @@ def blocks(language: str) -> list[tuple[str, str]]:
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
         for match in FENCE.finditer(text):
-            if match.group(1) == language and "no-run" not in match.group(2):
+            extra = match.group(2).partition("needs ")[2].strip()
+            if match.group(1) == language and "no-run" not in match.group(2) and (not extra or importlib.util.find_spec(extra)):
                 line = text.count("\n", 0, match.start()) + 1
                 found.append((f"{page.relative_to(ROOT)}:{line}", match.group(3)))
     return found

@@ -12,13 +12,13 @@ import msgspec
 
 from s2r_runtime.api.composition import Composing, tubes_of
 from s2r_runtime.api.files import apart, own_file, writable
-from s2r_runtime.api.models import ModelLike, ProfileLike, controller_at, load_checked, profile_model
+from s2r_runtime.api.models import ModelLike, ProfileLike, load_checked, profile_model
 from s2r_runtime.api.options import check_named_numbers, check_numbers
 from s2r_runtime.api.progress import Callback, Watcher, watcher_of
 from s2r_runtime.api.recordings import RecordingLike, recording
 from s2r_runtime.api.spelling import front_door
 from s2r_runtime.api.trials import Rollouts, trials_of
-from s2r_runtime.api.verification import Verified, gap_of, load_recordings, run_verification, verification_lines
+from s2r_runtime.api.verification import Verified, checked_controller, gap_of, load_recordings, run_verification, verification_lines
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.evidence.bounds import attempt_beta, epoch_beta
 from s2r_runtime.evidence.scores import SAFE
@@ -170,7 +170,7 @@ def certified(
     composed = profile_model(model, loaded, str(profile) if isinstance(profile, str | Path) else "the profile")
     apart({"-o": output}, {"the model's file": own_file(composed.spec)})
     signing = keys.load(key_path)
-    file = controller_at(controller, param)
+    file = checked_controller(controller, param, msgspec.structs.replace(loaded, model=composed.spec), watcher)
     found, digest = load_recordings(recordings, composed, loaded, watcher, max_gb)
     ledger, beta = offline_ledger.open_ledger(key_path, loaded.robot.name), loaded.guarantee.beta
     epoch = ledger.epoch_for(digest, composed.spec.digest(), loaded.digest())

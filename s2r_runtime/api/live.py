@@ -196,7 +196,9 @@ def sample_request(*, n: int = 0, retry: bool = False, detach: bool = False, inp
 def deploy_request(controller: Path, param: Mapping[str, float], certificate: Path | None) -> dict[str, Any]:
     """A controller's file, parameters and certificate. Raises UsageError for a file that cannot be read."""
     if not controller.exists():
-        raise UsageError(f"{controller}: no such file; a controller is a Python file with control(x, theta, parameters)")
+        raise UsageError(
+            f"{controller}: no such file; a controller is a Python file with control(x, theta, parameters), or a learned policy (.onnx)"
+        )
     request: dict[str, Any] = {"verb": "deploy", "path": str(controller.resolve()), "parameters": dict(param)}
     if certificate:
         try:

@@ -250,7 +250,9 @@ def controller_at(path: Path | str, param: Mapping[str, float]) -> ControllerFil
 
     path = Path(path)
     if not path.is_file():
-        raise UsageError(f"{path}: no such file; a controller is a Python file with control(x, theta, parameters)")
+        raise UsageError(
+            f"{path}: no such file; a controller is a Python file with control(x, theta, parameters), or a learned policy (.onnx)"
+        )
     try:
         return controllers.load(path, dict(param))
     except ConfigError as error:

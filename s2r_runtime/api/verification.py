@@ -17,7 +17,7 @@ from s2r_runtime.api.progress import Callback, Watcher, watcher_of
 from s2r_runtime.api.recordings import RecordingLike, recording
 from s2r_runtime.api.results import AFTER, LIMIT, Result, axes_of
 from s2r_runtime.api.spelling import front_door
-from s2r_runtime.errors import NotEnoughEvidence, RecordingError, UsageError
+from s2r_runtime.errors import ConfigError, NotEnoughEvidence, RecordingError, UsageError
 from s2r_runtime.evidence.statements import of_enclosure
 from s2r_runtime.evidence.verify import seed_for, verification_json
 from s2r_runtime.messages import Enclosure, Gap, Verification
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 LAWS = ("uniform", "persistent", "adversarial")
 """Names of the disturbance models."""
+LOAD_TIMEOUT_S = 30.0
+"""For a learned policy to start and give its first answer; the daemon's too."""
 
 
 class Verified(Result):
@@ -111,7 +113,8 @@ def verify(
 ) -> VerifyResult:
     """Runs a controller on the uncertain model, in a confined process. It spends no budget and founds no certificate.
 
-    controller: a Python file with `control(x, theta, parameters)`. profile: the robot's. model: a repaired model instead of the profile's.
+    controller: a Python file with `control(x, theta, parameters)`, or a learned policy (`.onnx`). profile: the robot's.
+    model: a repaired model instead of the profile's.
     radius: of the gap set, in the norm's unit (0: the model as it is); or recording: a campaign that radius and hold gap come from.
     hold_radius: hold gap (with `radius`; default: the radius times sqrt(hold periods)). headroom: verify up to this multiple of the radius.
     n: scenarios for each disturbance model (0: what beta needs). law: one or several of `uniform`, `persistent` and `adversarial`
@@ -168,12 +171,23 @@ def verified(
     share = headroom or (loaded.verification.headroom if measured else 1.0)
     if share < 1.0:
         raise UsageError(f"--headroom {share:g}: must be >= 1")
-    file = controller_at(controller, param)
+    file = checked_controller(controller, param, msgspec.structs.replace(loaded, model=composed.spec), watcher)
     seed = seed_for(file.digest, composed.spec.digest(), loaded.task_digest(), 1)
     beta = loaded.guarantee.beta
     enclosed = enclosure_of(tubes, file, composed, loaded, gap.radius, watcher, beta=beta, n=n) if tubes is not None else None
     result, _ = run_verification(file, composed, loaded, watcher, gap=gap, headroom=share, laws=laws, n=n, attempt=1, seed=seed, beta=beta)
     return VerifyResult(result, gap.radius, enclosed)
+
+
+def checked_controller(path: str | Path, param: Mapping[str, float], profile: Profile, watcher: Watcher) -> ControllerFile:
+    """The controller in that file; a learned policy is evaluated once on the profile's task. Raises UsageError, ConfigError."""
+    from s2r_runtime.controllers.policy import is_policy
+    from s2r_runtime.daemon.worker import Failed, LoadJob
+
+    file = controller_at(path, param)
+    if is_policy(file.entry) and isinstance(done := work(LoadJob(str(path), profile=profile), LOAD_TIMEOUT_S, "loading", watcher), Failed):
+        raise ConfigError(done.text)
+    return file
 
 
 def load_recordings(

@@ -12,6 +12,7 @@ import numpy as np
 
 from s2r_runtime.controllers.batches import BatchController
 from s2r_runtime.controllers.episodes import Episodes
+from s2r_runtime.controllers.observing import view_of
 from s2r_runtime.controllers.rehearsal import TOLERANCE
 from s2r_runtime.errors import S2RError
 from s2r_runtime.plugins import registry
@@ -48,6 +49,7 @@ class DrivenAgain:
         task = registry().get("tasks", choice.name)(choice.parameters, model.nominal, model.dt)
         self._largest, self._episodes = 0.0, Episodes(task, seed, choice.episodes)
         try:
+            self._view = view_of(file, model)
             self._control = BatchController(file, len(model.inputs), within_s=WITHIN_S)
         except (S2RError, OSError) as error:
             self._findings.cannot(f"what a controller drove: {error}")
@@ -64,13 +66,14 @@ class DrivenAgain:
         if self._control is None or x is None:
             return
         try:
-            theta, _, _ = self._episodes.look(np.array(x))
+            theta, episode, _ = self._episodes.look(np.array(x))
         except Exception as error:  # noqa: BLE001 - a third party's task
             self._findings.cannot(f"what a controller drove: task: {type(error).__name__}: {error}")
             self.stop()
             return
         try:
-            again = self._control(np.array([x]), theta or {})[0]
+            state = np.array([x])
+            again = self._control(state, self._view(state, theta or {}, first=episode.k == 0))[0]
         except S2RError as error:
             self._findings.differ(entry.index, entry.channel, f"the controller gives no answer here: {error}", event, None)
             self.stop()

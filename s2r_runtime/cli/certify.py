@@ -14,7 +14,9 @@ from s2r_runtime.errors import UsageError
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verb."""
     verb = verbs.add_parser("certify")
-    verb.add_argument("controller", type=Path, metavar="CONTROLLER", help="a Python file with control(x, theta, parameters)")
+    verb.add_argument(
+        "controller", type=Path, metavar="CONTROLLER", help="a Python file with control(x, theta, parameters), or a learned policy (.onnx)"
+    )
     verb.add_argument("--profile", type=Path, required=True, metavar="P", help="the robot's profile (TOML)")
     verb.add_argument(
         "--recording",

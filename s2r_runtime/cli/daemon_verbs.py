@@ -67,7 +67,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "deploy",
         "Ctrl-C before the controller drives withdraws it. Once it drives, it drives on without this command: s2r undeploy ends that.",
     )
-    deploy.add_argument("controller", type=Path, metavar="CONTROLLER", help="a Python file with control(x, theta, parameters)")
+    deploy.add_argument(
+        "controller", type=Path, metavar="CONTROLLER", help="a Python file with control(x, theta, parameters), or a learned policy (.onnx)"
+    )
     deploy.add_argument("--certificate", type=Path, metavar="CERT", help="a certificate made by s2r certify")
     deploy.add_argument("--param", action="append", default=[], metavar="K=V", help="a parameter of the controller; may be repeated")
     deploy.set_defaults(run=run_deploy)

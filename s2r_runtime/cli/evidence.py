@@ -51,7 +51,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     gap.set_defaults(run=run_gap)
 
     verify = verbs.add_parser("verify")
-    verify.add_argument("controller", type=Path, metavar="CONTROLLER", help="a Python file with control(x, theta, parameters)")
+    verify.add_argument(
+        "controller", type=Path, metavar="CONTROLLER", help="a Python file with control(x, theta, parameters), or a learned policy (.onnx)"
+    )
     verify.add_argument("--profile", type=Path, required=True, metavar="P", help="the robot's profile (TOML)")
     verify.add_argument("--model", metavar="MODEL.toml", help="a repaired model instead of the profile's")
     size = verify.add_mutually_exclusive_group(required=True)

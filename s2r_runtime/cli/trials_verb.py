@@ -18,7 +18,9 @@ SCORES = ("safe", "safety", "progress")
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds the verb."""
     verb = verbs.add_parser("trials")
-    verb.add_argument("controller", type=Path, metavar="CONTROLLER", help="a Python file with control(x, theta, parameters)")
+    verb.add_argument(
+        "controller", type=Path, metavar="CONTROLLER", help="a Python file with control(x, theta, parameters), or a learned policy (.onnx)"
+    )
     verb.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="logs of drives; each is audited first")
     verb.add_argument("--profile", type=Path, required=True, metavar="P", help="the robot's profile (TOML)")
     verb.add_argument("--model", metavar="MODEL.toml", help="a repaired model instead of the profile's")

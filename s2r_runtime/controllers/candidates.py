@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 
 from s2r_runtime.controllers.file import ControllerFile
+from s2r_runtime.controllers.policy import is_policy
 from s2r_runtime.errors import ConfigError
 
 Bounds = dict[str, tuple[float, float]]
@@ -40,6 +41,8 @@ class Synthesis(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def declared_bounds(file: ControllerFile, given: Mapping[str, tuple[float, float]]) -> Bounds:
     """The box: BOUNDS of the file, and in their place those given. Raises ConfigError for what is no box, or is of no parameter."""
+    if is_policy(file.entry):
+        raise ConfigError(f"{file.path}: a learned policy has no parameters to search")
     bounds = {**_literal(file), **given}
     if not bounds:
         raise ConfigError(

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2r_runtime.controllers.file import ControllerFile
-from s2r_runtime.errors import ControllerError, one_line
+from s2r_runtime.controllers.policy import is_policy
+from s2r_runtime.errors import ConfigError, ControllerError, one_line
 from s2r_runtime.hookspecs import Scenario
 
 Array = NDArray[np.float64]
@@ -40,18 +41,23 @@ class Malformed(ControllerError):
 def batch_control(file: ControllerFile, nu: int | None = None) -> Control:
     """`control(x, theta) -> u`: x (n, nx), theta arrays (n, ...), u (n, nu) float64 of the caller's own.
 
-    nu: the model's number of inputs; None: any. Raises ControllerError if libraries have changed since `load`, if the
+    nu: the model's number of inputs; None: any. For a learned policy theta has its observations (`observing`).
+    Raises ControllerError if libraries have changed since `load`, if the
     file raises when it is executed, and, when called, Raised or Malformed.
     """
     if (here := file.as_found_here()).digest != file.digest:
         raise ControllerError(f"{file.path}: {_difference(file, here)}; verify it again as it is now")
-    entry = _execute(file)
+    entry = _execute(file, nu)
     if (here := file.as_found_here()).digest != file.digest:  # what is not in memory was read from the disk in between
         raise ControllerError(f"{file.path}: while it was started, {_difference(file, here)}; verify it again as it is now")
+
+    reasons = (ConfigError, Raised, Malformed) if is_policy(file.entry) else ()  # whose text has the file's name already
 
     def control(x: Array, theta: Scenario) -> Array:
         try:
             result = entry(_readable(x), {name: _readable(value) for name, value in theta.items()}, dict(file.parameters))
+        except reasons:
+            raise
         except (Exception, SystemExit) as error:  # noqa: BLE001 - a controller may raise anything; that is its answer
             raise Raised(f"{Path(file.path).name}: {_describe(error)}") from None
         try:
@@ -118,9 +124,13 @@ class _Memory(importlib.abc.MetaPathFinder, importlib.abc.InspectLoader):
 _MEMORY = _Memory()
 
 
-def _execute(file: ControllerFile) -> Callable[..., Any]:
-    """Runs the source as a module and returns its entry. Raises ControllerError if that fails."""
+def _execute(file: ControllerFile, nu: int | None) -> Callable[..., Any]:
+    """Runs the source as a module and returns its entry. Raises ControllerError if that fails, ConfigError for a bad network."""
     name = Path(file.path).name
+    if is_policy(file.entry):
+        from s2r_runtime.controllers.onnx_session import Policy
+
+        return Policy(file, name, nu)
     for module, source in file.modules.items():
         if _MEMORY.modules.setdefault(module, source) != source:
             raise ControllerError(f"{name}: imports {module}, and another controller in this process has a different one of that name")

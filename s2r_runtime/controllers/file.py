@@ -8,6 +8,8 @@ The digest covers the source, every module beside it that it imports (and that t
 distributions they import, the version of Python, the parameter values and the entry's name. The file is read once: what was
 digested is what runs, whatever happens to the file afterwards. `control` must be a function of its arguments. What it
 gets by other means than an import statement (`importlib`, the clock; data files where its process can open any) is not in the digest.
+
+A learned policy (`.onnx`) is a controller without Python: its source is the network, its parameters are its settings (`policy`).
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from typing import Any
 
 import msgspec
 
+from s2r_runtime.controllers import policy
 from s2r_runtime.controllers.imports import Imports, installed, parse, read_source, version
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.files.canonical import digest, digest_of
@@ -85,8 +88,11 @@ def load(path: Path, parameters: Mapping[str, Any] | None = None) -> ControllerF
     """Reads a controller without running it. parameters: values in place of those in the file, for names that it has.
 
     Raises ConfigError: a file that is missing or doesn't parse (with the line), no `control(x, theta, parameters)`, PARAMETERS
-    that are no literal, an import that is neither beside the file nor installed, or that means two things.
+    that are no literal, an import that is neither beside the file nor installed, or that means two things. For a learned policy: as
+    `policy.read_policy`.
     """
+    if path.suffix == policy.SUFFIX:
+        return _load_policy(path, dict(parameters or {}))
     source = read_source(path)
     tree = parse(source, path)
     _check_entry(tree, path)
@@ -105,6 +111,20 @@ def load(path: Path, parameters: Mapping[str, Any] | None = None) -> ControllerF
         libraries=dict(sorted(imports.libraries.items())),
         absent=tuple(sorted(imports.absent)),
         python=python_version(),
+    )
+
+
+def _load_policy(path: Path, given: dict[str, Any]) -> ControllerFile:
+    source, settings = policy.read_policy(path)
+    if given:
+        raise ConfigError(
+            f"{path}: has no parameter {next(iter(given))!r}: a learned policy has none; change {path.with_suffix('.toml').name}"
+        )
+    libraries = {name: found for name in policy.LIBRARIES if (found := version(name)) is not None}
+    if missing := [name for name in policy.LIBRARIES if name not in libraries]:
+        raise ConfigError(f"{path}: needs {missing[0]}: pip install 's2r-runtime[onnx]'")
+    return ControllerFile(
+        path=str(path), source=source, parameters=settings, libraries=libraries, python=python_version(), entry=policy.ENTRY
     )
 
 

@@ -29,6 +29,7 @@ from s2r_runtime.profile import TaskChoice
 if TYPE_CHECKING:
     from s2r_runtime.controllers.batches import BatchController
     from s2r_runtime.controllers.code import Control
+    from s2r_runtime.controllers.observing import View
 
 
 class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -112,12 +113,16 @@ def _host(channel: socket.socket, lines: BinaryIO) -> Ended:
     from s2r_runtime.controllers.asked_again import AskedAgain, Inconsistent
     from s2r_runtime.controllers.batches import MEMORY_BYTES, BatchController, Died
     from s2r_runtime.controllers.code import Malformed
+    from s2r_runtime.controllers.observing import view_of, whole
+    from s2r_runtime.controllers.policy import is_policy
     from s2r_runtime.errors import S2RError
+    from s2r_runtime.models.composed import compose
 
     package = msgspec.json.decode(lines.readline(), type=Package)
     _send(channel, Loaded(package.file.as_found_here().digest))
     try:
         episodes = _episodes(package)
+        view = view_of(package.file, compose(package.model)) if is_policy(package.file.entry) else whole
         memory_bytes = package.memory_bytes or MEMORY_BYTES
         with (
             BatchController(package.file, package.nu, memory_bytes, printed=1) as control,
@@ -128,7 +133,7 @@ def _host(channel: socket.socket, lines: BinaryIO) -> Ended:
             gc.freeze()  # what is there now stays; collections while driving have little to look at
             _send(channel, Up(control.contained, control.pid))
             while line := _question(channel, lines, control):
-                answer = _answer(msgspec.json.decode(line, type=Question), episodes, asked)
+                answer = _answer(msgspec.json.decode(line, type=Question), episodes, view, asked)
                 if isinstance(answer, Ended):
                     return answer
                 _send(channel, answer)
@@ -163,7 +168,7 @@ def _episodes(package: Package) -> Episodes | None:
     return Episodes(task, package.seed, package.task.episodes)
 
 
-def _answer(question: Question, episodes: Episodes | None, control: Control) -> Chosen | Ended:
+def _answer(question: Question, episodes: Episodes | None, view: View, control: Control) -> Chosen | Ended:
     import numpy as np
 
     theta, episode, ended = {}, None, None
@@ -175,7 +180,8 @@ def _answer(question: Question, episodes: Episodes | None, control: Control) -> 
         if seen is None:
             return Ended("finished", f"all {episode.index + 1} scenarios are over", ended)
         theta = seen
-    u = control(np.array([question.x]), theta)
+    x = np.array([question.x])
+    u = control(x, view(x, theta, first=episode is not None and episode.k == 0))
     return Chosen(question.obs_seq, tuple(u[0].tolist()), episode, ended)
 
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 import ast
 
 from s2r_runtime.controllers.file import ControllerFile
+from s2r_runtime.controllers.policy import is_policy
 
 BODY = "target, feedforward = reference(theta, parameters)\nreturn feedforward - (x - target) @ np.array(GAIN).T"
 NAMES = ("GAIN", "reference", "control", "np", "numpy")
@@ -28,6 +29,8 @@ NAMES = ("GAIN", "reference", "control", "np", "numpy")
 
 def gain_of(file: ControllerFile) -> tuple[tuple[float, ...], ...] | None:
     """K, (nu, nx), if the source is of this form; None if it is not."""
+    if is_policy(file.entry):
+        return None
     try:
         tree = ast.parse(file.source)
     except (SyntaxError, ValueError):

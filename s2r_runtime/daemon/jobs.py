@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from s2r_runtime.controllers.file import ControllerFile, load
+from s2r_runtime.controllers.observing import has_history, view_of
+from s2r_runtime.controllers.policy import is_policy
 from s2r_runtime.daemon.given_inputs import BYTES_MAX, GivenInputs, parse_inputs
 from s2r_runtime.daemon.model_store import ModelStore
 from s2r_runtime.daemon.settings import facts_of, settings_of
@@ -82,10 +84,43 @@ def opened(raw: msgspec.Raw, kind: Any, what: str) -> Any:
 def brought(job: LoadJob) -> Result:
     """The controller, and the certificate that came along."""
     file = load(Path(job.path), opened(job.parameters, dict[str, float | str | bool], "parameters"))
+    if job.profile is not None and is_policy(file.entry):
+        _check_policy(file, job.profile)
     text = opened(job.certificate, str, "--certificate")
     if not text or job.profile is None:
         return Result(controller=file)
     return Result(controller=file, certificate=_certificate(text, job, job.profile, file.digest))
+
+
+def _check_policy(file: ControllerFile, profile: Profile) -> None:
+    """Starts the policy and evaluates it in one scenario, so that a network that fits neither robot nor settings costs no attempt.
+
+    Raises ConfigError.
+    """
+    import numpy as np
+
+    from s2r_runtime.controllers.batches import BatchController
+    from s2r_runtime.controllers.code import Malformed
+    from s2r_runtime.models.composed import compose
+
+    model = compose(profile.model)
+    task, view = task_of(profile, model), view_of(file, model)
+    scenario = task.draw(np.random.default_rng(0), 1)
+    x = np.asarray(scenario["start"])
+    theta = view(x, task.view(scenario), first=True)
+    try:
+        with BatchController(file, len(model.inputs)) as control, suppress(Malformed):  # an answer in one state decides nothing
+            control(x, theta)
+    except ControllerError as error:
+        raise ConfigError(f"{Path(file.path).parent / str(error)}") from None
+
+
+def task_of(profile: Profile, model: ComposedModel) -> Task:
+    """The profile's task, for this model."""
+    from s2r_runtime.plugins import registry
+
+    task: Task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
+    return task
 
 
 def _certificate(text: str, job: LoadJob, profile: Profile, controller: str) -> Brought:
@@ -164,6 +199,7 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
 
     profile, settings = job.profile, job.profile.verification
     model, task, gap_set = _asked(job)
+    view = view_of(job.controller, model)
     with BatchController(job.controller, len(model.inputs)) as control:
         kept = Kept(control)
         result, details = verify_in_detail(
@@ -183,13 +219,14 @@ def verify(job: VerifyJob, progress: Progress) -> Result:
             controller_digest=job.controller.digest,
             task_digest=profile.task_digest(),
             progress=progress,
+            view=view,
         )
     if result.passed:
         with BatchController(job.controller, len(model.inputs)) as again:
             kept.compare(again)
     behaviour = ""
     with suppress(ControllerError), BatchController(job.controller, len(model.inputs)) as probed:
-        behaviour = probe.behaviour(probed, task, model, [profile.inputs[name] for name in model.inputs])
+        behaviour = probe.behaviour(probed, task, model, [profile.inputs[name] for name in model.inputs], view)
     lowest = -np.finfo(np.float64).max  # what `verify` counts a value that is no number as
     safety = {one.law: np.nan_to_num(one.rollouts.safety, nan=lowest, neginf=lowest, posinf=-lowest).tolist() for one in details}
     return Result(verification=result, safety=safety, behaviour=behaviour)
@@ -199,11 +236,9 @@ def _asked(job: VerifyJob | SynthesisJob | SimulateJob | EncloseJob) -> tuple[Co
     """The model and task of the job's profile, and the disturbances that it names."""
     from s2r_runtime.evidence.uncertain import GapSet
     from s2r_runtime.models.composed import compose
-    from s2r_runtime.plugins import registry
 
-    model, task = compose(job.profile.model), job.profile.task
-    gap_set = GapSet(job.gap.set, job.gap.weights, job.radius, job.hold_radius, job.gap.hold_periods)
-    return model, registry().get("tasks", task.name)(task.parameters, model.nominal, model.dt), gap_set
+    model = compose(job.profile.model)
+    return model, task_of(job.profile, model), GapSet(job.gap.set, job.gap.weights, job.radius, job.hold_radius, job.gap.hold_periods)
 
 
 def synthesize(job: SynthesisJob, progress: Progress) -> Result:
@@ -255,6 +290,7 @@ def simulate(job: SimulateJob, progress: Progress) -> Result:
             rollouts=job.rollouts,
             seed=job.seed,
             progress=lambda done, total: progress(done, total, job.law),
+            view=view_of(job.controller, model),
         )
     return Result(simulated=found)
 
@@ -273,9 +309,12 @@ def enclose(job: EncloseJob, progress: Progress) -> Result:
     threshold = job.profile.verification.threshold
     tube = tube_for(gain_of(job.controller), job.rate, task, model, gap_set, threshold)
     rng = np.random.default_rng([job.seed, len(LAWS)])  # a verification of this seed draws from 0, 1, ...
+    view = view_of(job.controller, model)
+    if has_history(job.controller):
+        raise ConfigError("a policy with a history is no feedback of the state alone, so no tube of states holds its runs")
     with BatchController(job.controller, len(model.inputs)) as control:
         found = enclosed(
-            control,
+            lambda x, theta: control(x, view(x, theta, first=True)),
             task,
             model,
             gap_set,

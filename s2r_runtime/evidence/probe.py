@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from s2r_runtime.controllers.observing import View, whole
 from s2r_runtime.files.canonical import digest_of
 
 if TYPE_CHECKING:
@@ -27,15 +28,15 @@ RESOLUTION = 1e-3
 """Of an input's bounds: far above what rounding in another order makes, far below what a scenario's outcome depends on."""
 
 
-def behaviour(control: Control, task: Task, model: ComposedModel, bounds: Sequence[tuple[float, float]]) -> str:
-    """16 hex digits. bounds: (lower, upper) of each input. Raises what the controller raises."""
+def behaviour(control: Control, task: Task, model: ComposedModel, bounds: Sequence[tuple[float, float]], view: View = whole) -> str:
+    """16 hex digits. bounds: (lower, upper) of each input. view: what the controller is shown. Raises what the controller raises."""
     rng = np.random.default_rng(SEED)
     lower, upper = np.array(bounds).T
     scenario = task.draw(rng, ROWS)
     x, hidden = np.asfortranarray(scenario["start"]), model.at_rest(ROWS)
     answers = []
-    for _ in range(STEPS):
-        u = control(x, task.view(scenario))
+    for k in range(STEPS):
+        u = control(x, view(x, task.view(scenario), first=k == 0))
         answers.append(np.rint(u / (RESOLUTION * np.maximum(np.abs(lower), np.abs(upper)))))
         stepped, hidden = model.step(x, rng.uniform(lower, upper, u.shape), hidden)
         x, scenario = np.asfortranarray(stepped), task.advance(scenario, rng)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.controllers.observing import View, whole
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.evidence.logged_scenarios import LoggedScenario, SimulatedScores
 from s2r_runtime.evidence.real_means import mean_in_unit, mean_with_simulation, optimism, optimism_in_unit
@@ -55,8 +56,10 @@ def roll_out_logged(
     rollouts: int,
     seed: int,
     progress: Callable[[float, float], None] | None = None,
+    view: View = whole,
 ) -> SimulatedScores:
     """Scores by `score` (`trials.SCORES`) of `rollouts` rollouts of either kind for each run. seed: of fresh scenarios and disturbances.
+    view: what the controller is shown.
 
     Raises UsageError without rollouts or for an unknown score, else as `uncertain.roll_out`.
     """
@@ -71,7 +74,7 @@ def roll_out_logged(
     together = {name: np.concatenate([scenario[name] for scenario in drawn]) for name in drawn[0]}
     given: Any = _Given(task, together)
     rng = np.random.default_rng([seed, len(scenarios)])
-    found = roll_out(control, given, model, gap, law, rng, len(drawn), progress=progress)
+    found = roll_out(control, given, model, gap, law, rng, len(drawn), progress=progress, view=view)
     values = _scores(score, found.safety, found.progress, threshold).reshape(len(scenarios), 2, rollouts)
     plain = [[[v if np.isfinite(v) else None for v in kind] for kind in run] for run in values.tolist()]
     return SimulatedScores([run[0] for run in plain], [run[1] for run in plain])

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from s2r_runtime.controllers.observing import View, whole
 from s2r_runtime.errors import ControllerError, UsageError
 from s2r_runtime.evidence.disturbance import LAWS, Ahead, DisturbanceLaw, GapSet
 from s2r_runtime.hookspecs import Scenario, Task
@@ -57,8 +58,10 @@ def roll_out(
     keep: int = 0,
     progress: Progress | None = None,
     give_up_below: float = -np.inf,
+    view: View = whole,
 ) -> Rollouts:
-    """n scenarios drawn independently, each driven once. keep: so many paths are kept; progress: called with done, total.
+    """n scenarios drawn independently, each driven once. keep: so many paths are kept; progress: called with done, total. view: what
+    the controller is shown (`controllers.observing`).
 
     give_up_below: once a rollout is over with a safety value below this, all of them are left where they are (for who only asks whether
     there is one).
@@ -74,7 +77,7 @@ def roll_out(
     for first in range(0, n, BATCH):
         size = min(BATCH, n - first)
         told = None if progress is None else lambda share, first=first, size=size: progress(first + share * size, n)
-        parts.append(_batch(control, task, model, gap, LAWS[law], rng, size, max(0, min(size, keep - first)), told, give_up_below))
+        parts.append(_batch(control, task, model, gap, LAWS[law], rng, size, max(0, min(size, keep - first)), told, give_up_below, view))
         if np.any(parts[-1].safety < give_up_below):
             break
     return Rollouts(
@@ -96,6 +99,7 @@ def _batch(
     keep: int,
     progress: Callable[[float], None] | None,
     give_up_below: float,
+    view: View,
 ) -> Rollouts:
     scenario = first = task.draw(rng, n)
     # columns contiguous: a state of all rollouts is one run of memory
@@ -107,7 +111,7 @@ def _batch(
     paths = [x[:keep].copy()]
     ends = np.full(keep, task.horizon)
     for k in range(task.horizon):
-        u = _answer(control(x, task.view(scenario)), n, len(model.inputs))
+        u = _answer(control(x, view(x, task.view(scenario), first=k == 0)), n, len(model.inputs))
         stepped, hidden = model.step(x, u, hidden)
         ahead = np.asfortranarray(stepped)
         scenario = task.advance(scenario, rng)

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from s2r_runtime.controllers.observing import View, whole
 from s2r_runtime.core.headroom import grid, search
 from s2r_runtime.errors import ControllerError, NotEnoughEvidence, UsageError
 from s2r_runtime.evidence import seeds
@@ -71,8 +72,10 @@ def verify_in_detail(
     least_radius: float = 0.0,
     keep: int = 0,
     progress: Progress | None = None,
+    view: View = whole,
 ) -> tuple[Verification, list[Detail]]:
-    """n scenarios for each law (0: as many as epsilon and beta ask for). keep: so many paths a law are kept for plots.
+    """n scenarios for each law (0: as many as epsilon and beta ask for). keep: so many paths a law are kept for plots. view: what the
+    controller is shown.
 
     least_radius: the largest radius between this and gap_set's at which the controller passes is looked for (0: at gap_set's only).
     A controller that raises or answers with anything but finite (n, nu) inputs has failed, with the reason in the result. Raises
@@ -94,6 +97,7 @@ def verify_in_detail(
         progress=progress,
         most=1 + math.ceil(math.log2(len(radii))),
         laws=laws,
+        view=view,
     )
     best, tried = _farthest(runs, gap_set, radii)
     runs.complete(best)
@@ -156,6 +160,7 @@ class _Runs:
     progress: Progress | None
     most: int
     laws: Sequence[str]
+    view: View
     done: int = 0
 
     def run(self, gap_set: GapSet, *, only_required: bool) -> _Run:
@@ -192,6 +197,7 @@ class _Runs:
                 keep=self.keep,
                 progress=told,
                 give_up_below=give_up_below,
+                view=self.view,
             )
         except ControllerError as error:
             # a controller's own failure is a verdict on the controller, under whichever law it shows; nothing was shown under this one
