@@ -17,7 +17,8 @@ from s2r_runtime.core import anytime
 from s2r_runtime.core.ledger import binomial_tail, sample_size
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence, S2RError
 from s2r_runtime.evidence import statements
-from s2r_runtime.evidence.trials import Found, Run, trials
+from s2r_runtime.evidence.logged_deployments import Run
+from s2r_runtime.evidence.trials import Found, trials
 from s2r_runtime.messages import RunLimits, Tries
 from s2r_runtime.trust import certificate, keys
 

@@ -12,9 +12,11 @@ import pytest
 
 from s2r_runtime.cli.main import main
 from s2r_runtime.errors import NotEnoughEvidence, RecordingError, UsageError
+from s2r_runtime.evidence.compared_runs import Compared, Outcome
+from s2r_runtime.evidence.logged_deployments import Run
 from s2r_runtime.evidence.run_pairs import from_logs, from_table
 from s2r_runtime.evidence.scores import SAFE, Score
-from s2r_runtime.evidence.trials import Found, Run, values_of
+from s2r_runtime.evidence.trials import Found, values_of
 
 HEADER = "scenario,old,new\n"
 
@@ -136,9 +138,12 @@ def test_a_margin_beyond_the_range_is_refused(tmp_path: Path, capsys: pytest.Cap
     assert (code, "must be below the length of the score's range, 1" in err) == (2, True)
 
 
-def runs(*given: tuple[int, int, bool]) -> Found:
-    """seed, index, safe."""
-    return Found([(Run(index, 10 * index, seed=seed, safety=float(safe), progress=0.5), safe) for seed, index, safe in given])
+def runs(*given: tuple[int, int, bool | None]) -> Compared:
+    """seed, index, safe (None: censored)."""
+    outcome: dict[bool | None, Outcome] = {True: "safe", False: "unsafe", None: "censored"}
+    return Compared(
+        [(Run(index, 10 * index, seed=seed, safety=float(bool(safe)), progress=0.5), outcome[safe]) for seed, index, safe in given], {}
+    )
 
 
 def test_runs_in_the_same_scenario_are_a_pair_in_the_order_of_the_first() -> None:
@@ -146,6 +151,12 @@ def test_runs_in_the_same_scenario_are_a_pair_in_the_order_of_the_first() -> Non
     b = runs((1, 3, False), (1, 1, True), (1, 0, True), (9, 9, True))
     assert from_logs(a, b, SAFE, "scenario") == ((1.0, 0.0, 1.0), (1.0, 1.0, 0.0), (1, 1))
     assert from_logs(a, runs((5, 0, False), (5, 1, True)), SAFE, "order") == ((1.0, 0.0), (0.0, 1.0), (2, 0))
+
+
+def test_a_censored_run_is_a_pair_even_without_a_partner() -> None:
+    a = runs((1, 0, True), (1, 1, None), (1, 2, None), (1, 4, True))
+    b = runs((1, 0, None), (1, 1, False), (1, 3, None))
+    assert from_logs(a, b, SAFE, "scenario") == ((1.0, None, None, None), (None, 0.0, None, None), (1, 0))
 
 
 def test_without_a_common_scenario_the_line_says_what_would_pair_them() -> None:
@@ -156,7 +167,7 @@ def test_without_a_common_scenario_the_line_says_what_would_pair_them() -> None:
 
 
 def test_a_run_that_the_gate_ended_scores_the_worst_value_whatever_it_had_reached() -> None:
-    found = runs((1, 0, True), (1, 1, False))
+    found = Found([(run, outcome == "safe") for run, outcome in runs((1, 0, True), (1, 1, False)).runs])
     found.counted[1][0].closed = True
     found.counted[0][0].progress = None
     assert values_of(found, SAFE) == [1.0, 0.0]

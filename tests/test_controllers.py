@@ -22,7 +22,7 @@ from s2r_runtime.controllers import confined_process
 from s2r_runtime.controllers.code import batch_control
 from s2r_runtime.controllers.episodes import Episodes
 from s2r_runtime.controllers.hosted import ControllerFile, HostedController, Late, Ready, Reply, Stopped, load
-from s2r_runtime.messages import Observation
+from s2r_runtime.messages import Observation, Scenarios
 from s2r_runtime.models.composed import compose
 from s2r_runtime.plugins import registry
 from s2r_runtime.profile import TaskChoice
@@ -339,7 +339,7 @@ def test_a_question_that_is_no_state_is_the_callers_fault(tmp_path: Path) -> Non
             with pytest.raises(ValueError, match="must be 3 finite numbers"):
                 it.host.ask(Observation(1, 0, x), 0)
         assert isinstance(it.ask(), Reply)
-    host = HostedController(load(tmp_path / "controller.py"), model=MODEL, nx=3, nu=2, task=None, seed=7)
+    host = HostedController(load(tmp_path / "controller.py"), model=MODEL, nx=3, nu=2, task=None, scenarios=Scenarios(7, 0, 0))
     with pytest.raises(ValueError, match="not ready"):
         host.ask(Observation(1, 0, (0.0, 0.0, 0.0)), 0)
     host.close()
@@ -349,9 +349,9 @@ PARENT = """
 import sys, time
 from pathlib import Path
 from s2r_runtime.controllers.hosted import HostedController, load
-from s2r_runtime.messages import Observation
+from s2r_runtime.messages import Observation, Scenarios
 from s2r_runtime.modelspec import ModelSpec
-host = HostedController(load(Path(sys.argv[1])), model=ModelSpec("unicycle", 0.033), nx=3, nu=2, task=None, seed=7)
+host = HostedController(load(Path(sys.argv[1])), model=ModelSpec("unicycle", 0.033), nx=3, nu=2, task=None, scenarios=Scenarios(7, 0, 0))
 host.start()
 while not host.poll(time.monotonic_ns()):
     time.sleep(0.01)

@@ -18,7 +18,8 @@ from s2r_runtime.api.models import weights_of
 from s2r_runtime.errors import ConfigError, UsageError
 from s2r_runtime.evidence.disturbance import GapSet
 from s2r_runtime.evidence.driven_runs import DrivenRuns, read_driven_runs
-from s2r_runtime.evidence.trials import Run, _Deployment, read_runs, without_radius
+from s2r_runtime.evidence.logged_deployments import Deployment, Run, without_radius
+from s2r_runtime.evidence.trials import read_runs
 from s2r_runtime.models.composed import compose
 from s2r_runtime.profile import Profile, load_profile
 from s2r_runtime.tasks.keep_out import KeepOut
@@ -176,7 +177,7 @@ def _written(path: Path, text: str) -> Path:
 
 
 def deployment(*runs: Run) -> Any:
-    found = _Deployment("sha256:c", 1, "", None)  # type: ignore[arg-type]
+    found = Deployment("sha256:c", 1, "", None)  # type: ignore[arg-type]
     found.runs = list(runs)
     return found
 

@@ -128,3 +128,26 @@ def test_the_statement_begins_with_the_answer() -> None:
     )
     better = compare(outcomes(0.2, 200, 3), outcomes(0.9, 200, 4))
     assert statement(better, "old.py", "new.py").startswith("new.py is better than old.py (confidence 95 %")
+
+
+def test_an_unknown_score_never_helps_to_show_anything() -> None:
+    """Whatever the score would have been, nothing is shown that would not have been shown with it."""
+    rng = np.random.default_rng(11)
+    for seed in range(20):
+        a, b = outcomes(0.8, 60, 100 + seed), outcomes(0.5, 60, 200 + seed)
+        unknown_a, unknown_b = rng.random(60) < 0.1, rng.random(60) < 0.2
+        found = compare(np.where(unknown_a, np.nan, a), np.where(unknown_b, np.nan, b), delta=0.1)
+        for _ in range(5):
+            filled = np.where(unknown_a, rng.random(60), a), np.where(unknown_b, rng.random(60), b)
+            with_all = compare(*filled, delta=0.1)
+            for name in ("e_worse", "e_not_worse", "e_better"):
+                assert getattr(found, name) <= getattr(with_all, name) * (1.0 + 1e-9)
+            assert found.lower <= with_all.lower + 1e-9
+            assert found.upper >= with_all.upper - 1e-9
+        assert found.censored == int(np.sum(unknown_a | unknown_b))
+
+
+def test_a_comparison_of_unknown_scores_alone_shows_nothing() -> None:
+    found = compare(np.full(50, np.nan), np.full(50, np.nan))
+    assert (found.answer, found.a, found.difference, found.agree, found.censored) == ("undecided", 0.5, 0.0, 0, 50)
+    assert (found.lower, found.upper) == (-1.0, 1.0)

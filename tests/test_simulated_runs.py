@@ -11,13 +11,14 @@ from certificate_rig import KEY, PROFILE, PUBLIC, Evidence, evidence
 
 from s2r_runtime.errors import NotEnoughEvidence, UsageError
 from s2r_runtime.evidence.disturbance import GapSet
+from s2r_runtime.evidence.logged_deployments import Run
 from s2r_runtime.evidence.logged_scenarios import LoggedScenario, SimulatedScores
 from s2r_runtime.evidence.real_means import mean_with_simulation, optimism
 from s2r_runtime.evidence.scores import SAFE, Score
 from s2r_runtime.evidence.seen_rows import sketch
 from s2r_runtime.evidence.simulated_runs import fitted_on_runs, roll_out_logged, with_real
 from s2r_runtime.evidence.statements import of_simulated
-from s2r_runtime.evidence.trials import Found, Run, trials
+from s2r_runtime.evidence.trials import Found, trials
 from s2r_runtime.hookspecs import Scenario
 from s2r_runtime.messages import Trials
 from s2r_runtime.models.composed import compose

@@ -19,9 +19,10 @@ from s2r_runtime.controllers.episodes import Episodes
 from s2r_runtime.controllers.file import load
 from s2r_runtime.errors import NotEnoughEvidence
 from s2r_runtime.evidence.bounds import clopper_pearson_upper
+from s2r_runtime.evidence.logged_deployments import Deployment, Run, _within
 from s2r_runtime.evidence.seen_rows import sketch
 from s2r_runtime.evidence.statements import of_trials
-from s2r_runtime.evidence.trials import Found, Run, _Deployment, _judged, _left_out, _within, read_runs, trials
+from s2r_runtime.evidence.trials import Found, _judged, left_out_because, read_runs, trials
 from s2r_runtime.models.composed import compose
 from s2r_runtime.models.unicycle import MODEL as UNICYCLE
 from s2r_runtime.modelspec import EffectSpec, dump_model
@@ -178,12 +179,12 @@ def test_a_certificate_of_this_controller_says_what_it_did_on_the_robot(driven: 
 # ---------------------------------------------------------------- what counts
 
 
-def deployment(seed: int = 1) -> _Deployment:
+def deployment(seed: int = 1) -> Deployment:
     one = StlTask({"horizon": 0.3, "metric": "always (x < 1)", "progress": "none"}, UNICYCLE, 0.1)
-    return _Deployment("controller", seed, "model", Episodes(one, seed))
+    return Deployment("controller", seed, "model", Episodes(one, seed))
 
 
-def drive(now: _Deployment, sources: list[str], x: float = 0.0, first: int = 0) -> None:
+def drive(now: Deployment, sources: list[str], x: float = 0.0, first: int = 0) -> None:
     """One observation a step; the source that answers each."""
     for seq, source in enumerate(sources, first):
         command = m.Command(seq, seq, "controller", (0.0, 0.0), seq, 1)
@@ -191,9 +192,11 @@ def drive(now: _Deployment, sources: list[str], x: float = 0.0, first: int = 0) 
         _within(now, m.Send(seq, seq, source, (0.0, 0.0), seq, 1), {})  # type: ignore[arg-type]
 
 
-def judged(now: _Deployment, used: set[tuple[int, int]] | None = None, threshold: float = 0.0) -> list[tuple[str, bool]]:
+def judged(now: Deployment, used: set[tuple[int, int]] | None = None, threshold: float = 0.0) -> list[tuple[str, bool]]:
     taken = set[tuple[int, int]]() if used is None else used
-    return [(_left_out(run, now, "controller", "model", taken, threshold), run.closed or run.safety < threshold) for run in _judged(now)]
+    return [
+        (left_out_because(run, now, "controller", "model", taken, threshold), run.closed or run.safety < threshold) for run in _judged(now)
+    ]
 
 
 CUT_SHORT = "cut short by a person or the end of the log, safe so far"
@@ -202,7 +205,7 @@ AGAIN = "the same scenario as an earlier run (same seed)"
 SEEN = dict.fromkeys(range(20), (0.0, 0.0, 0.0))
 
 
-def told(now: _Deployment, *messages: Any) -> None:
+def told(now: Deployment, *messages: Any) -> None:
     for message in messages:
         _within(now, message, SEEN)
 
@@ -316,9 +319,9 @@ def test_a_scenario_whose_first_run_was_left_out_is_not_run_again_until_it_count
     used = set()
     now = deployment()
     drive(now, ["controller"] * 4)
-    assert _left_out(next(_judged(now)), now, "controller", "another model", used, 0.0) == "measured against another model"
+    assert left_out_because(next(_judged(now)), now, "controller", "another model", used, 0.0) == "measured against another model"
     assert judged(now, used)[0] == (AGAIN, False)
-    assert not _left_out(next(_judged(now)), now, "controller", "model", set(), 0.0)
+    assert not left_out_because(next(_judged(now)), now, "controller", "model", set(), 0.0)
 
 
 def test_299_safe_runs_show_one_percent_at_most() -> None:

@@ -17,9 +17,12 @@ PAGE = Path(__file__).parent.parent / "docs" / "commands.md"
 
 def text() -> str:
     """The page's text."""
-    lines = ["# Commands", "", "Written by `tools/command_reference.py` from the command line itself.", ""]
-    lines += ["Results go to stdout, everything else to stderr; `--json` prints one JSON object; `NO_COLOR` is honoured."]
-    lines += ["Exit codes: 0 it holds, 1 it does not hold, 2 usage, 3 not enough evidence, 70 internal error, 78 bad configuration.", ""]
+    about = (
+        "Written by `tools/command_reference.py` from the command line itself. Results go to stdout, everything else to stderr; `--json` "
+        "prints one JSON object; `NO_COLOR` is honoured. Exit codes: 0 it holds, 1 it does not hold, 2 usage, 3 not enough evidence, 70 "
+        "internal error, 78 bad configuration."
+    )
+    lines = ["# Commands", "", about, ""]
     for name, verb, summary in verbs(parser(), "s2r"):
         usage = " ".join(verb.format_usage().removeprefix("usage: ").split())
         lines += [f"## {name}", "", f"{summary[0].upper()}{summary[1:]}. `{usage}`", ""]

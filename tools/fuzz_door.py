@@ -55,6 +55,7 @@ BASE = (
     {"verb": "revoke", "text": "sha256:00"},
     {"verb": "permit", "duration_s": 1.0},
     {"verb": "sample", "count": 3, "detached": True},
+    {"verb": "deploy", "path": "c.py", "seed": 7, "first": 2, "count": 1},
     {"verb": "trace", "text": "campaign"},
     {"verb": "deploy", "path": "/nowhere/c.py", "parameters": {"gain": 1.0, "name": "a", "on": True}, "certificate": "{}"},
     {"verb": "adopt", "text": "[model]\nname = 'unicycle'\ndt = 0.033\n", "base": "/nowhere"},
@@ -160,7 +161,21 @@ def request_line(rng: random.Random) -> bytes:
     if rng.random() < 0.4:
         return mutated(rng, json.dumps(request).encode()).replace(b"\n", b" ")
     field = rng.choice(
-        [*request, "verb", "path", "text", "base", "certificate", "parameters", "duration_s", "count", "detached", rng.choice(TEXTS)]
+        [
+            *request,
+            "verb",
+            "path",
+            "text",
+            "base",
+            "certificate",
+            "parameters",
+            "duration_s",
+            "count",
+            "seed",
+            "first",
+            "detached",
+            rng.choice(TEXTS),
+        ]
     )
     request[field] = "@@"
     value = rng.choice(JSONS) if rng.random() < 0.7 else json.dumps(rng.choice((*TEXTS, *TOMLS))).encode()

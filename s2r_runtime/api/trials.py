@@ -13,6 +13,8 @@ from s2r_runtime.api.models import controller_at, load_checked
 from s2r_runtime.api.progress import Watcher
 from s2r_runtime.errors import ConfigError, ControllerError, UsageError
 from s2r_runtime.evidence import seeds, trials
+from s2r_runtime.evidence.compared_runs import judge_compared
+from s2r_runtime.evidence.logged_deployments import read_deployments
 from s2r_runtime.evidence.logged_scenarios import LoggedScenario
 from s2r_runtime.evidence.run_pairs import How, Pairs, from_logs
 from s2r_runtime.evidence.scores import Score
@@ -91,8 +93,10 @@ def pairs_of(
     score: Score,
     how: How,
     watcher: Watcher,
+    seed: int | None = None,
 ) -> tuple[Pairs, dict[str, int]]:
-    """Pairs of runs of controllers A and B, and which runs were left out, by reason. logs: of both, of A alone, of B alone.
+    """Pairs of runs of controllers A and B, and which runs were left out, by reason. logs: of both, of A alone, of B alone. seed: runs in
+    scenarios of this seed alone.
 
     Raises UsageError where there is no log of one of them, or where A and B cannot be separated; ConfigError for a log that does not hold.
     """
@@ -109,13 +113,11 @@ def pairs_of(
     for paths in logs:
         if paths:
             check_logs(paths, watcher)
-    found = [trials.read_runs([*both, *paths], profile, task, file.digest, model_digest="") for paths, file in zip(own, files, strict=True)]
-    left_out = {
-        f"{name}: {why}": number
-        for name, one in zip("AB", found, strict=True)
-        for why, number in one.left_out.items()
-        if why != "of another controller"
-    }
+    found = [
+        judge_compared(read_deployments([*both, *paths], profile, task), file.digest, profile.verification.threshold, seed)
+        for paths, file in zip(own, files, strict=True)
+    ]
+    left_out = {f"{name}: {why}": number for name, one in zip("AB", found, strict=True) for why, number in one.left_out.items()}
     return from_logs(found[0], found[1], score, how), left_out
 
 

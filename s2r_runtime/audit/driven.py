@@ -20,7 +20,7 @@ from s2r_runtime.plugins import registry
 if TYPE_CHECKING:
     from s2r_runtime.audit.findings import Findings
     from s2r_runtime.controllers.file import ControllerFile
-    from s2r_runtime.messages import Observation, Proposed
+    from s2r_runtime.messages import Observation, Proposed, Scenarios
     from s2r_runtime.models.composed import ComposedModel
     from s2r_runtime.profile import TaskChoice
     from s2r_runtime.recording.reading import Entry
@@ -40,14 +40,14 @@ class DrivenAgain:
         self._seen: dict[int, tuple[float, ...]] = {}
         self._largest = 0.0
 
-    def start(self, file: ControllerFile | None, model: ComposedModel, choice: TaskChoice, seed: int) -> None:
-        """A controller starts; its scenarios are the task's of this seed."""
+    def start(self, file: ControllerFile | None, model: ComposedModel, choice: TaskChoice, scenarios: Scenarios) -> None:
+        """A controller starts, in these scenarios of the task."""
         self.stop()
         if file is None:
             self._findings.cannot("what a controller drove: it is not attached")
             return
         task = registry().get("tasks", choice.name)(choice.parameters, model.nominal, model.dt)
-        self._largest, self._episodes = 0.0, Episodes(task, seed, choice.episodes)
+        self._largest, self._episodes = 0.0, Episodes.of(task, scenarios)
         try:
             self._view = view_of(file, model)
             self._control = BatchController(file, len(model.inputs), within_s=WITHIN_S)

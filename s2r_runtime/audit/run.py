@@ -53,6 +53,7 @@ from s2r_runtime.messages import (
     RecorderChanged,
     Revoked,
     SampleTaken,
+    Scenarios,
     SeedDrawn,
     Send,
     Settings,
@@ -332,10 +333,11 @@ class RunAudit:
                 self._campaigns.start(output, in_force, profile.sampling)
             case StartController():
                 model = self._compose(profile.model)
+                scenarios = output.scenarios or Scenarios(settings.seed, 0, profile.task.episodes)
                 if settings.rules >= EPISODES:
-                    self._runs.start(model, profile, settings.seed)
+                    self._runs.start(model, profile, scenarios)
                 if self._rerun and model is not None:
-                    self._driven.start(attached_controller(self._attached(), output.digest), model, profile.task, settings.seed)
+                    self._driven.start(attached_controller(self._attached(), output.digest), model, profile.task, scenarios)
                 if state.memory.gap is not None and model is not None:
                     self._beside.begin(profile, state.memory.gap, state.memory, lockstep=settings.lockstep, rules=settings.rules)
             case StopController():

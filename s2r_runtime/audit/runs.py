@@ -21,7 +21,7 @@ from s2r_runtime.messages import EpisodeEnded, EpisodeScored
 from s2r_runtime.plugins import registry
 
 if TYPE_CHECKING:
-    from s2r_runtime.messages import Observation, SourceStopped
+    from s2r_runtime.messages import Observation, Scenarios, SourceStopped
     from s2r_runtime.models.composed import ComposedModel
     from s2r_runtime.profile import Profile
     from s2r_runtime.recording.reading import Entry
@@ -42,15 +42,15 @@ class RunsReplay:
         self._shown: int | None = None
         self._reported: list[tuple[Entry, EpisodeEnded | EpisodeScored]] = []
 
-    def start(self, model: ComposedModel | None, profile: Profile, seed: int) -> None:
-        """A controller starts; its scenarios are the task's of this seed."""
+    def start(self, model: ComposedModel | None, profile: Profile, scenarios: Scenarios) -> None:
+        """A controller starts, in these scenarios of the task."""
         self._reported, self._shown, self._scored = [], None, (-1, False)
         self._episodes = None
         if model is None:
             self._findings.cannot("how the runs of a controller went: its model does not run here")
             return
         task = registry().get("tasks", profile.task.name)(profile.task.parameters, model.nominal, model.dt)
-        self._episodes = Episodes(task, seed, profile.task.episodes)
+        self._episodes = Episodes.of(task, scenarios)
         self._threshold = profile.verification.threshold
 
     def observed(self, observation: Observation) -> None:

@@ -8,12 +8,12 @@ let the controller see the scenario, step. Scenario i draws from the seed (seed,
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
 
 from s2r_runtime.hookspecs import Scenario, Task
-from s2r_runtime.messages import EpisodeEnded, EpisodeScored
+from s2r_runtime.messages import EpisodeEnded, EpisodeScored, Scenarios
 
 if TYPE_CHECKING:
     import numpy as np
@@ -34,20 +34,25 @@ class Episode(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Episodes:
-    """`look` at one state after the other. count: how many scenarios (0: no end)."""
+    """`look` at one state after the other. count: how many scenarios (0: no end). first: number of the first one."""
 
-    def __init__(self, task: Task, seed: int, count: int = 0) -> None:
-        self._task, self._seed, self._count = task, seed, count
-        self._index, self._k = -1, 0
+    def __init__(self, task: Task, seed: int, count: int = 0, first: int = 0) -> None:
+        self._task, self._seed, self._end = task, seed, first + count if count else 0
+        self._index, self._k, self._begun = first - 1, 0, False
         self._scenario: Scenario = {}
         self._tally: Any = None
+
+    @classmethod
+    def of(cls, task: Task, scenarios: Scenarios) -> Self:
+        """These scenarios of the task."""
+        return cls(task, scenarios.seed, scenarios.count, scenarios.first)
 
     def look(self, x: Array) -> tuple[Scenario | None, Episode, Episode | None]:
         """Takes the next state (nx,). Returns what the controller may see of the scenario (None: all scenarios are over),
         where the scenario stands, and how the one before ended, if it did with this state.
         """
         ended = None
-        if self._index < 0:
+        if not self._begun:
             self._begin(x)
         else:
             self._k += 1
@@ -55,7 +60,7 @@ class Episodes:
             self._tally = self._task.observe(self._tally, x[None, :], self._scenario)
             if self._k >= self._task.horizon or bool(self._task.done(self._tally)[0]):
                 ended = self._status(x, done=True)
-                if self._index + 1 == self._count:
+                if self._index + 1 == self._end:
                     return None, ended, ended
                 self._begin(x)
         return self._task.view(self._scenario), self._status(x, done=False), ended
@@ -64,7 +69,7 @@ class Episodes:
         import numpy as np  # here, because the daemon's process reads this module for `Episode` and does without numpy
 
         self._index += 1
-        self._k = 0
+        self._k, self._begun = 0, True
         self._rng = np.random.default_rng([self._seed, self._index])
         self._scenario = self._task.draw_at(self._rng, x)
         self._tally = self._task.observe(self._task.begin(self._scenario), x[None, :], self._scenario)

@@ -1,6 +1,6 @@
 """Loads controllers, and hosts one in a process of its own, for the daemon: nothing here ever waits.
 
-    host = HostedController(file, model=..., nx=3, nu=2, task=..., seed=1)
+    host = HostedController(file, model=..., nx=3, nu=2, task=..., scenarios=Scenarios(seed=1, first=0, count=0))
     host.start()                       -> Ready(digest) or Stopped(...) from a later `poll`
     host.ask(observation, deadline)    -> Reply(obs_seq, u, ...) or Stopped(...) from a later `poll`
 
@@ -26,7 +26,7 @@ from s2r_runtime.controllers.file import ControllerFile, Identity, load
 from s2r_runtime.controllers.hosting import Chosen, Ended, Loaded, Message, Package, Question, Up
 from s2r_runtime.controllers.processor import Used, used
 from s2r_runtime.errors import ControllerError, one_line
-from s2r_runtime.messages import Observation
+from s2r_runtime.messages import Observation, Scenarios
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import TaskChoice
 
@@ -120,16 +120,18 @@ class HostedController:
         nx: int,
         nu: int,
         task: TaskChoice | None,
-        seed: int,
+        scenarios: Scenarios,
         memory_bytes: int = 0,
         start_timeout_s: float = START_TIMEOUT_S,
         patience_s: float = 0.0,
     ) -> None:
-        """memory_bytes: what it may allocate (0: as in a verification). patience_s: how long an answer may take in all where the computer
+        """scenarios: count 0: no end.
+
+        memory_bytes: what it may allocate (0: as in a verification). patience_s: how long an answer may take in all where the computer
         is to blame; 0: its deadline, whoever is to blame.
         """
         self.file, self._nx, self._nu = file, nx, nu
-        self._package = Package(file, model, nu, task, seed, memory_bytes)
+        self._package = Package(file, model, nu, task, scenarios, memory_bytes)
         self._start_timeout_ns, self._patience_ns = round(start_timeout_s * 1e9), round(patience_s * 1e9)
         self._start_deadline_ns = 0
         self._process: ConfinedProcess | None = None

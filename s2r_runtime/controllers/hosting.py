@@ -23,6 +23,7 @@ import msgspec
 
 from s2r_runtime.controllers.episodes import Episode, Episodes
 from s2r_runtime.controllers.file import ControllerFile
+from s2r_runtime.messages import Scenarios
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import TaskChoice
 
@@ -43,7 +44,7 @@ class Package(_Message, frozen=True):
     model: ModelSpec
     nu: int
     task: TaskChoice | None
-    seed: int
+    scenarios: Scenarios
     memory_bytes: int
 
 
@@ -165,7 +166,7 @@ def _episodes(package: Package) -> Episodes | None:
         return None
     model = compose(package.model)
     task = registry().get("tasks", package.task.name)(package.task.parameters, model.nominal, package.model.dt)
-    return Episodes(task, package.seed, package.task.episodes)
+    return Episodes.of(task, package.scenarios)
 
 
 def _answer(question: Question, episodes: Episodes | None, view: View, control: Control) -> Chosen | Ended:

@@ -368,7 +368,7 @@ def start_controller(turn: Turn, deployment: Deployment, facts: CertificateFacts
     """The deployment has its certificate: its process may start."""
     turn.set(deployment=msgspec.structs.replace(deployment, stage="starting", certificate_id=facts.id), ended="")
     runs.begin(turn, deployment.digest, facts.id)
-    turn.emit(StartController(turn.now, deployment.digest, facts.id))
+    turn.emit(StartController(turn.now, deployment.digest, facts.id, deployment.scenarios))
     regate(turn)
 
 

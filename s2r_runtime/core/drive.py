@@ -17,6 +17,8 @@ from __future__ import annotations
 
 from typing import Literal
 
+import msgspec
+
 from s2r_runtime import gate
 from s2r_runtime.core import goto
 from s2r_runtime.core.state import Asked, Turn, situation
@@ -265,7 +267,9 @@ def active(turn: Turn) -> Literal["sampler", "controller"] | None:
 def _answer_instant(turn: Turn) -> None:
     state, settings = turn.state, turn.settings
     obs_seq, source = _instant(turn), active(turn)
-    if source is not None:
+    if source == "controller" and _waits_for_gate(turn):
+        _send_recovery(turn, obs_seq)
+    elif source is not None:
         turn.set(asked=Asked(source, obs_seq, turn.now), idle=0)
         turn.emit(Ask(turn.now, source, obs_seq))
     elif not settings.lockstep:
@@ -275,6 +279,16 @@ def _answer_instant(turn: Turn) -> None:
         arrived = turn.state.sent is None or not any(turn.state.sent.u)
         if arrived or settings.recovery != "return":  # on its way home the robot has not settled
             turn.set(idle=state.idle + 1)
+
+
+def _waits_for_gate(turn: Turn) -> bool:
+    """A scenario of a comparison begins with the gate open, so that the controller drives it from its start."""
+    deployment = turn.state.deployment
+    if deployment is None or deployment.scenarios is None or deployment.begun:
+        return False
+    if turn.state.gate_open:
+        turn.set(deployment=msgspec.structs.replace(deployment, begun=True))
+    return not turn.state.gate_open
 
 
 def wake(turn: Turn) -> None:

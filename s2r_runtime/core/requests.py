@@ -78,7 +78,12 @@ def _deploy(turn: Turn, request: Requested) -> None:
     stopped = next((reason for reason in gate.ALWAYS_LATCHING if reason in turn.memory.latched), "")
     if not digest:
         turn.answer(request.request_id, 2, "deploy needs a controller")
-    elif state.deployment is not None and state.deployment.stage == "running" and state.deployment.digest == digest:
+    elif (
+        state.deployment is not None
+        and state.deployment.stage == "running"
+        and state.deployment.digest == digest
+        and not _compared(turn, request)
+    ):
         turn.answer(request.request_id, 0, "this controller is deployed already")
     elif state.deployment is not None:
         turn.answer(request.request_id, 2, "another deployment is in force or under way; first: s2r undeploy")
@@ -89,12 +94,22 @@ def _deploy(turn: Turn, request: Requested) -> None:
     elif exceeded := driven.refusal(turn.memory, turn.settings) or runs.refusal(turn.memory, turn.settings, digest):
         turn.answer(request.request_id, 1, f"refused: {exceeded}")
     elif (facts := valid_certificate(turn, digest)) is not None:
-        start_controller(turn, Deployment(digest, request.request_id, "starting"), facts)
+        start_controller(turn, Deployment(digest, request.request_id, "starting", scenarios=request.scenarios), facts)
+    elif request.scenarios is not None:
+        turn.answer(
+            request.request_id, 1, "refused: no certificate covers this controller; a comparison spends no attempt: s2r deploy first"
+        )
     elif refusal := refusal_to_verify(turn):
         turn.answer(request.request_id, 1, f"refused: {refusal}")
     else:
         turn.set(deployment=Deployment(digest, request.request_id, "verifying"), ended="")
         begin_verification(turn, "deploy", digest, request.request_id)
+
+
+def _compared(turn: Turn, request: Requested) -> bool:
+    """Whether this request or the deployment in force is of a comparison: then one is not the other."""
+    deployment = turn.state.deployment
+    return request.scenarios is not None or (deployment is not None and deployment.scenarios is not None)
 
 
 def _verify(turn: Turn, request: Requested) -> None:

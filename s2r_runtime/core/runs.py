@@ -128,7 +128,8 @@ def follow(turn: Turn, event: Event) -> None:
         run = turn.state.run
         match output:
             case StartController():
-                turn.set(run=Run(output.digest, output.certificate_id))
+                first = 0 if output.scenarios is None else output.scenarios.first
+                turn.set(run=Run(output.digest, output.certificate_id, index=first))
             case _ if run is None:
                 pass
             case Ask(source="controller"):

@@ -20,6 +20,7 @@ from s2r_runtime.messages import (
     Observation,
     Output,
     Persist,
+    Scenarios,
     Send,
     Settings,
     Source,
@@ -55,7 +56,8 @@ class Campaign(Struct, frozen=True):
 class Deployment(Struct, frozen=True):
     """The one controller that drives or is to drive. `running`: digest of what really runs, empty until it does.
 
-    verifying: until it has a certificate; starting: until its process answers. `request_id` 0: its request was answered.
+    verifying: until it has a certificate; starting: until its process answers. `request_id` 0: its request was answered. scenarios: of a
+    comparison; begun: it was shown the first of them.
     """
 
     digest: str
@@ -63,6 +65,8 @@ class Deployment(Struct, frozen=True):
     stage: Literal["verifying", "starting", "running"]
     certificate_id: str = ""
     running: str = ""
+    scenarios: Scenarios | None = None
+    begun: bool = False
 
 
 class Job(Struct, frozen=True):

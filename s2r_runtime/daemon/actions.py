@@ -185,7 +185,7 @@ class Actions:
             watching = Watching(profile.model, memory.gap, jump, alpha=alpha, run_length=run_length, **stood)
             self._d.watcher.begin(watching)
         self.episodes.clear()
-        self._d.driver.start(file, self._d.settings.seed)
+        self._d.driver.start(file, order.scenarios or m.Scenarios(self._d.settings.seed, 0, profile.task.episodes))
 
     def _stop_controller(self, _order: m.StopController) -> None:
         self._d.driver.stop()

@@ -223,7 +223,7 @@ class Desk:
             self._d.actions.keep_controller(result.controller)
             digest = result.controller.digest
             if (result.certificate is None or self._install(connection, result.certificate)) and connection.listening:
-                self.request("deploy", connection, digest=digest, text=request.path)
+                self.request("deploy", connection, digest=digest, text=request.path, scenarios=request.scenarios)
 
         d = self._d
         now = max(int(time.time()), unix_now(d.state))

@@ -13,6 +13,7 @@ import math
 import msgspec
 
 from s2r_runtime.errors import ConfigError, UsageError, one_line
+from s2r_runtime.messages import Scenarios
 
 TEXT_MAX = 200
 """Characters of a reason, an id or a stretch; the longest id of a certificate has 71."""
@@ -23,6 +24,8 @@ ESCAPED = 6
 NUMBER_MAX = 40
 """Digits of a number."""
 COUNT_MAX = 2**31
+SEED_MAX = 2**53
+"""Exact in every JSON reader."""
 NOTHING, NO_TEXT, NO_TABLE = msgspec.Raw(b""), msgspec.Raw(b'""'), msgspec.Raw(b"{}")
 
 
@@ -37,11 +40,14 @@ class _Line(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     base: msgspec.Raw = NO_TEXT
     duration_s: msgspec.Raw = msgspec.Raw(b"0")
     count: msgspec.Raw = msgspec.Raw(b"0")
+    seed: msgspec.Raw = msgspec.Raw(b"0")
+    first: msgspec.Raw = msgspec.Raw(b"0")
     detached: bool = False
 
 
 class Request(msgspec.Struct, frozen=True):
-    """What a client may ask. deploy: path, parameters, certificate (text). adopt: `model`, the text of the model's TOML, base its folder;
+    """What a client may ask. deploy: path, parameters, certificate (text), scenarios (from its `seed`, `first` and `count`).
+    adopt: `model`, the text of the model's TOML, base its folder;
     no text: the proposed one. excite: path. trace: text says what. detached (sample, excite): answered when it drives, and not stopped when
     the client is gone. parameters, certificate and model are JSON that nobody has decoded.
     """
@@ -56,6 +62,7 @@ class Request(msgspec.Struct, frozen=True):
     duration_s: float = 0.0
     count: int = 0
     detached: bool = False
+    scenarios: Scenarios | None = None
 
 
 _DECODE = msgspec.json.Decoder(_Line).decode
@@ -70,9 +77,8 @@ def decode_request(line: bytes) -> Request:
     verb = _text(came.verb, "verb", TEXT_MAX)
     if not verb:
         raise UsageError('the request must be an object with a "verb"')
-    duration_s, count = _number(came.duration_s, f"{verb}: duration_s"), _number(came.count, f"{verb}: count")
-    if not 0 <= count < COUNT_MAX or count != int(count):
-        raise ConfigError(f"{verb}: count is {count:g}, must be a whole number >= 0 and below 2^31")
+    duration_s, count = _number(came.duration_s, f"{verb}: duration_s"), _whole(came.count, f"{verb}: count", COUNT_MAX)
+    seed, first = _whole(came.seed, f"{verb}: seed", SEED_MAX), _whole(came.first, f"{verb}: first", COUNT_MAX)
     return Request(
         verb,
         _text(came.path, f"{verb}: path", PATH_MAX),
@@ -82,8 +88,9 @@ def decode_request(line: bytes) -> Request:
         "" if verb == "adopt" else _text(came.text, f"{verb}: text", TEXT_MAX),
         _text(came.base, f"{verb}: base", PATH_MAX),
         duration_s,
-        int(count),
+        count,
         came.detached,
+        Scenarios(seed, first, count) if verb == "deploy" and count else None,
     )
 
 
@@ -99,6 +106,14 @@ def _text(raw: msgspec.Raw, where: str, most: int) -> str:
     if any(c < " " or "\x7f" <= c <= "\x9f" for c in value) or (most == TEXT_MAX and not value.isprintable()):
         raise UsageError(f"{where}: holds characters that cannot be printed: {one_line(value, 60)!r}")
     return value
+
+
+def _whole(raw: msgspec.Raw, where: str, below: int) -> int:
+    """Raises UsageError, ConfigError."""
+    value = _number(raw, where)
+    if value != int(value) or value >= below:
+        raise ConfigError(f"{where} is {value:g}, must be a whole number >= 0 and below 2^{below.bit_length() - 1}")
+    return int(value)
 
 
 def _number(raw: msgspec.Raw, where: str) -> float:

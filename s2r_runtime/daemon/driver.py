@@ -18,6 +18,7 @@ from s2r_runtime.messages import (
     Event,
     Observation,
     Proposed,
+    Scenarios,
     Settings,
     SourceStarted,
     SourceStopped,
@@ -69,7 +70,7 @@ class Driver:
         """When `poll` must be called at the latest (host's clock)."""
         return self._host.deadline_ns if self._host is not None else None
 
-    def start(self, file: ControllerFile, seed: int) -> None:
+    def start(self, file: ControllerFile, scenarios: Scenarios) -> None:
         """Starts the process; SourceStarted or SourceStopped(start_failed) follows."""
         self.stop()
         self._stood_still_ns, self._scored = self._awake.stood_still_ns, (-1, False)
@@ -80,7 +81,7 @@ class Driver:
             nx=len(settings.states),
             nu=len(settings.inputs),
             task=self._profile.task,
-            seed=seed,
+            scenarios=scenarios,
             start_timeout_s=self._profile.machine.start_timeout,
             patience_s=self._patience_s,
         )

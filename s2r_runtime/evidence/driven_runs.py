@@ -14,7 +14,7 @@ from pathlib import Path
 
 from s2r_runtime.errors import ConfigError
 from s2r_runtime.evidence.composition import DrivenRun, largest_residual
-from s2r_runtime.evidence.trials import Run, deployments, in_order
+from s2r_runtime.evidence.logged_deployments import Run, deployments, in_order
 from s2r_runtime.evidence.uncertain import GapSet
 from s2r_runtime.hookspecs import Task
 from s2r_runtime.models.composed import ComposedModel
@@ -42,7 +42,7 @@ def read_driven_runs(paths: Sequence[Path], profile: Profile, task: Task, model:
         _check_fixed(parts, gap.radius)
         for deployment in deployments(parts, profile, task, with_states=True):
             for run in deployment.runs:
-                reason = _left_out(run, (deployment.digest, deployment.seed, run.index), used)
+                reason = left_out_because(run, (deployment.digest, deployment.seed, run.index), used)
                 if reason:
                     found.left_out[reason] = found.left_out.get(reason, 0) + 1
                     continue
@@ -54,7 +54,7 @@ def read_driven_runs(paths: Sequence[Path], profile: Profile, task: Task, model:
     return found
 
 
-def _left_out(run: Run, scenario: tuple[str, int, int], used: set[tuple[str, int, int]]) -> str:
+def left_out_because(run: Run, scenario: tuple[str, int, int], used: set[tuple[str, int, int]]) -> str:
     """Why this run does not count, or empty. used: the scenarios that were met; this one is added."""
     if scenario in used:
         return "the same scenario as an earlier run (same seed)"

@@ -11,6 +11,9 @@ Each capital is an e-process under its null hypothesis, whatever the dependence 
 second capital is never below the third one, so together they spend beta/2 (Ville), and the first one spends the other half. Nothing that
 is shown is wrong with probability 1-beta, however often one looks and whenever one stops.
 
+A score that nobody knows (a run that was cut) lies anywhere in its range. The first capital takes the least D, which is worst for it; the
+others take the largest one. So each stays an e-process whatever the run would have scored and for whatever reason it was cut.
+
 With outcomes 0 and 1 and delta = 0 the factor of a pair is 1 + t, 1 - t, or 1 where both did alike. This is the sequential sign test of
 the discordant pairs. Under independent scenarios of equal number it is within 2 % of the growth of the two-sample e-values of
 R. Turner, A. Ly & P. Grünwald (*Generic e-variables for exact sequential k-sample tests*, JSPI 2024) where success rates differ by 0.2
@@ -41,7 +44,8 @@ class Comparison(msgspec.Struct, frozen=True):
 
     difference: mean of A - B in the score's unit, with its limits `lower` and `upper`, valid at all times. e_worse, e_not_worse, e_better:
     largest capital so far for "B is worse than A by more than delta", "B is not", and "A is worse than B by more than delta". e_required:
-    the capital at which one is shown. a, b: mean scores. agree: pairs of equal scores.
+    the capital at which one is shown. a, b: mean scores, an unknown one at the middle of its range. agree: pairs of equal scores. censored:
+    pairs with a score that nobody knows.
     """
 
     answer: Answer
@@ -60,10 +64,11 @@ class Comparison(msgspec.Struct, frozen=True):
     e_not_worse: float
     e_better: float
     e_required: float
+    censored: int = 0
 
 
 def compare(merits_a: Array, merits_b: Array, *, delta: float = 0.0, beta: float = 0.05) -> Comparison:
-    """What the pairs show. merits_a, merits_b: (n,) in [0, 1], 1 the best, in the order of the pairs. delta: in [0, 1).
+    """What the pairs show. merits_a, merits_b: (n,) in [0, 1], 1 the best, in the order of the pairs; NaN: not known. delta: in [0, 1).
 
     Raises NotEnoughEvidence without pairs, UsageError for arrays that do not fit or settings out of range.
     """
@@ -75,9 +80,10 @@ def compare(merits_a: Array, merits_b: Array, *, delta: float = 0.0, beta: float
     n = len(merits_a)
     if n == 0:
         raise NotEnoughEvidence("no pairs of runs, at least one is needed", 1)
-    d = merits_a - merits_b
+    (a_low, a_high), (b_low, b_high) = _ranges(merits_a), _ranges(merits_b)
+    least, most = a_low - b_high, a_high - b_low
     worse, not_worse, better = (
-        np.maximum.accumulate(log_capital(x, -1.0, mean, COMPARISON_BETS)) for x, mean in ((d, delta), (-d, -delta), (-d, delta))
+        np.maximum.accumulate(log_capital(x, -1.0, mean, COMPARISON_BETS)) for x, mean in ((least, delta), (-most, -delta), (-most, delta))
     )
     required = math.log(2.0 / beta)
     first = {
@@ -93,19 +99,26 @@ def compare(merits_a: Array, merits_b: Array, *, delta: float = 0.0, beta: float
         decided_at=first["worse"] if answer == "worse" else first["not"],
         better=bool(better[-1] >= required),
         n=n,
-        agree=int(np.sum(d == 0.0)),
-        a=float(np.mean(merits_a)),
-        b=float(np.mean(merits_b)),
-        difference=float(np.mean(d)),
-        lower=float(lower_limit(d, -1.0, beta / 2.0, -1.0, 1.0, COMPARISON_BETS)),
-        upper=-float(lower_limit(-d, -1.0, beta / 2.0, -1.0, 1.0, COMPARISON_BETS)),
+        agree=int(np.sum(merits_a == merits_b)),
+        a=float(np.mean((a_low + a_high) / 2.0)),
+        b=float(np.mean((b_low + b_high) / 2.0)),
+        difference=float(np.mean((least + most) / 2.0)),
+        lower=float(lower_limit(least, -1.0, beta / 2.0, -1.0, 1.0, COMPARISON_BETS)),
+        upper=-float(lower_limit(-most, -1.0, beta / 2.0, -1.0, 1.0, COMPARISON_BETS)),
         delta=delta,
         beta=beta,
         e_worse=_capital(worse[-1]),
         e_not_worse=_capital(not_worse[-1]),
         e_better=_capital(better[-1]),
         e_required=2.0 / beta,
+        censored=int(np.sum(np.isnan(merits_a) | np.isnan(merits_b))),
     )
+
+
+def _ranges(merits: Array) -> tuple[Array, Array]:
+    """Least and largest value that each merit may have."""
+    unknown = np.isnan(merits)
+    return np.where(unknown, 0.0, merits), np.where(unknown, 1.0, merits)
 
 
 def in_unit(c: Comparison, score: Score) -> Comparison:

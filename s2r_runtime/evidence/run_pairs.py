@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from s2r_runtime.errors import NotEnoughEvidence, RecordingError
+from s2r_runtime.evidence.compared_runs import Compared, compared_values
 from s2r_runtime.evidence.scores import Score
-from s2r_runtime.evidence.trials import Found, values_of
 from s2r_runtime.files.bounded_file import MB, read_bounded
 from s2r_runtime.recordings.units import number_of
 
@@ -26,27 +26,32 @@ How = Literal["scenario", "order"]
 
 
 class Pairs(NamedTuple):
-    """Scores of A and B, one of each a pair. unpaired: runs that have no partner, of A and of B."""
+    """Scores of A and B, one of each a pair; None for a censored run. unpaired: runs without a partner, of A and of B."""
 
-    a: tuple[float, ...]
-    b: tuple[float, ...]
+    a: tuple[float | None, ...]
+    b: tuple[float | None, ...]
     unpaired: tuple[int, int] = (0, 0)
 
 
-def from_logs(a: Found, b: Found, score: Score, how: How) -> Pairs:
+def from_logs(a: Compared, b: Compared, score: Score, how: How) -> Pairs:
     """scenario: runs in scenarios of the same seed and number, in A's order. order: the k-th run of A with the k-th of B.
 
+    A censored run without a partner is a pair of two unknown scores, so that cutting a run short before its partner drives gains nothing.
     Raises NotEnoughEvidence if there is no pair.
     """
-    of_a, of_b = values_of(a, score), values_of(b, score)
+    of_a, of_b = compared_values(a, score), compared_values(b, score)
     if how == "order":
         n = min(len(of_a), len(of_b))
         pairs = Pairs(tuple(of_a[:n]), tuple(of_b[:n]), (len(of_a) - n, len(of_b) - n))
     else:
-        partner = {(run.seed, run.index): value for (run, _), value in zip(b.counted, of_b, strict=True)}
-        keys = [(run.seed, run.index) for run, _ in a.counted]
-        both = [(value, partner[key]) for key, value in zip(keys, of_a, strict=True) if key in partner]
-        pairs = Pairs(tuple(x for x, _ in both), tuple(y for _, y in both), (len(of_a) - len(both), len(of_b) - len(both)))
+        in_a, in_b = (
+            {(run.seed, run.index): value for (run, _), value in zip(one.runs, values, strict=True)}
+            for one, values in ((a, of_a), (b, of_b))
+        )
+        keys = [key for key in (*in_a, *in_b) if (key in in_a and key in in_b) or in_a.get(key, in_b.get(key)) is None]
+        keys = list(dict.fromkeys(keys))
+        alone = (len(in_a) - sum(key in in_a for key in keys), len(in_b) - sum(key in in_b for key in keys))
+        pairs = Pairs(tuple(in_a.get(key) for key in keys), tuple(in_b.get(key) for key in keys), alone)
     if not pairs.a:
         other = "; --pair order pairs them in the order of driving" if how == "scenario" and of_a and of_b else ""
         common = " in a common scenario (the same seed and number)" if other else ""

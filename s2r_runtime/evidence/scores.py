@@ -6,6 +6,7 @@ counts as the best value: a model gains nothing in the comparison of `real_means
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import msgspec
@@ -48,6 +49,13 @@ class Score(msgspec.Struct, frozen=True):
 
 SAFE = Score("safe")
 """1 for a safe run, 0 for an unsafe one."""
+
+
+def known_merits(values: Sequence[float | None], score: Score, *, what: str = "run") -> tuple[Array, tuple[str, ...]]:
+    """As `merits`; NaN where the value is None, which nobody knows."""
+    unknown = np.array([value is None for value in values], dtype=np.bool_)
+    merit, lines = merits([score.worst if value is None else value for value in values], score, what=what)
+    return np.where(unknown, np.nan, merit), lines
 
 
 def merits(values: ArrayLike, score: Score, *, simulated: bool = False, what: str = "run") -> tuple[Array, tuple[str, ...]]:

@@ -44,6 +44,7 @@ from s2r_runtime.messages.link import (
     Frame,
     LogHead,
     Observation,
+    Scenarios,
     Source,
     Struct,
 )
@@ -129,7 +130,8 @@ __all__ = [
     "GateChanged", "InputsFinished", "InsideRuns", "IssueCertificate", "JobFinished", "LawResult", "LinkChanged", "LogHead", "Measured",
     "Memory", "ModelAdopted", "Observation", "ObservationRefused", "Observed", "OpenRun", "Optimism", "Output", "OverrideChanged",
     "Persist", "Proposal", "Proposed", "RadiusGrew", "RadiusTried", "RealMean", "Record", "RecorderChanged", "RefusedCampaign",
-    "Requested", "Revoked", "RunCounts", "RunLimits", "SampleTaken", "SeedDrawn", "Send", "Settings", "Simulated", "Source",
+    "Requested", "Revoked", "RunCounts", "RunLimits", "SampleTaken", "Scenarios", "SeedDrawn", "Send", "Settings", "Simulated",
+    "Source",
     "SourceStarted", "SourceStopped", "StartCampaign", "StartController", "StartInputs", "StartJob", "Started", "StopCampaign",
     "StopController", "Stopping", "Stretch", "Struct", "Ticked", "TraceEnded", "Trials", "Tries", "Verification", "WallClockRead",
     "WatchStood",

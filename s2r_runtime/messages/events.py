@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from s2r_runtime.messages.link import Command, Observation, Source, Struct
+from s2r_runtime.messages.link import Command, Observation, Scenarios, Source, Struct
 from s2r_runtime.messages.memory import Memory, Settings
 from s2r_runtime.messages.results import CertificateFacts, Gap, Verification
 
@@ -293,7 +293,8 @@ class CertificatesDistrusted(Struct, frozen=True, tag="certificates_distrusted")
 class Requested(Struct, frozen=True, tag="requested"):
     """An operator's decision, from the control socket. `by`: user id of the peer. Unused fields are at their defaults.
 
-    deploy: `digest` of the controller that was loaded for it. adopt: `digest` of the model. revoke: `text` a certificate
+    deploy: `digest` of the controller that was loaded for it; `scenarios` that it is to drive (None: as the profile says).
+    adopt: `digest` of the model. revoke: `text` a certificate
     id, or empty for all. clear: `text` the reason. permit: `duration_s`. sample: `count` (0: the profile's), `text` "retry" to
     repeat it once if its samples depend on each other. excite: `digest` of the
     inputs, `count` their rows. trace: `text` a stretch (empty: campaign). pause: `count` the request whose asker is gone (0: none,
@@ -310,6 +311,7 @@ class Requested(Struct, frozen=True, tag="requested"):
     text: str = ""
     duration_s: float = 0.0
     count: int = 0
+    scenarios: Scenarios | None = None
 
 
 Event = (

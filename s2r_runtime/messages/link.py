@@ -47,6 +47,14 @@ class Command(Struct, frozen=True, tag="command"):
     fault: str = ""
 
 
+class Scenarios(Struct, frozen=True):
+    """Scenarios `first` to `first + count - 1` of this seed, for a comparison: a deployment drives them and ends."""
+
+    seed: int
+    first: int
+    count: int
+
+
 class LogHead(Struct, frozen=True, tag="log_head"):
     """Not logged, but told to whoever keeps it: so far the log of this run is on the disk (docs/log-format.md). head, public_key: hex."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from s2r_runtime.messages.link import Source, Struct
+from s2r_runtime.messages.link import Scenarios, Source, Struct
 from s2r_runtime.messages.memory import Memory, Stretch
 from s2r_runtime.messages.results import CertificateFacts, Gap, RunLimits, Tries, Verification
 
@@ -60,11 +60,14 @@ class StopCampaign(Struct, frozen=True, tag="stop_campaign"):
 
 
 class StartController(Struct, frozen=True, tag="start_controller"):
-    """The controller of this digest is to start in its process: it was deployed, and this certificate covers it."""
+    """The controller of this digest is to start in its process: it was deployed, and this certificate covers it. scenarios: that it is to
+    drive; None: those of the run's seed, as many as the profile says.
+    """
 
     t_ns: int
     digest: str
     certificate_id: str
+    scenarios: Scenarios | None = None
 
 
 class StopController(Struct, frozen=True, tag="stop_controller"):

@@ -64,8 +64,9 @@ class Reading:
     software, or of another version.
     """
 
-    def __init__(self, path: Path, channels: Iterable[str] | None = None) -> None:
-        self.path = path
+    def __init__(self, path: Path, channels: Iterable[str] | None = None, *, growing: bool = False) -> None:
+        """growing: it is being written; iterate it once more for what came since."""
+        self.path, self._growing = path, growing
         self.wanted = frozenset(CHANNELS) - {CHAIN} if channels is None else frozenset(channels)
         refuse_special(path)
         try:
@@ -158,11 +159,17 @@ class Reading:
 
     def blocks(self) -> Iterator[Checked]:
         """The same by whole blocks, each checked before it is given out; `counts` then counts nothing."""
+        if self._growing and (self._final or (self._ending is not None and self._ending.kind == "broken")):
+            return
         self._file: BinaryIO = self.path.open("rb")
         try:
+            if self._growing:
+                self._grow()
             if not self.start:
                 raise Damage(0, "the file ends before its first record", cut=True)
             while (block := self._take()) is not None:
+                if self._growing and (block.last or block.lacking):  # the rest of it is about to come
+                    break
                 if block.last:
                     self._finish(block)
                     return
@@ -180,6 +187,11 @@ class Reading:
             self._damaged(damage)
         finally:
             self._file.close()
+
+    def _grow(self) -> None:
+        """Looks how long the file is by now."""
+        self._ending, self.size = None, os.fstat(self._file.fileno()).st_size
+        self._until = extent(self._file, self.size)
 
     # ---- read by another process (`audit.ahead`)
 

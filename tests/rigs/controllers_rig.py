@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 
 from s2r_runtime.controllers.hosted import ControllerFile, HostedController, Late, Ready, Reply, Stopped
-from s2r_runtime.messages import Observation
+from s2r_runtime.messages import Observation, Scenarios
 from s2r_runtime.modelspec import ModelSpec
 from s2r_runtime.profile import TaskChoice
 
@@ -35,7 +35,7 @@ class Hosted:
             nx=3,
             nu=2,
             task=task,
-            seed=7,
+            scenarios=Scenarios(7, 0, 0 if task is None else task.episodes),
             memory_bytes=memory_bytes,
             start_timeout_s=start_timeout_s,
             patience_s=patience_s,

@@ -38,6 +38,7 @@ LATER: dict[str, object] = {
     "drives": 0,
     "run_limits": None,
     "later": False,
+    "scenarios": None,
 }
 """Fields of memory and outputs that came after the lives were recorded: at their defaults they say nothing else than before."""
 LATER_STATUS = ("refused_campaign", "next_campaign", "next_attempt", "driven", "clock_behind_s", "runs")
