@@ -29,6 +29,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from trace_sets import sindy
 from trace_sets.families import FAMILIES, UNTOUCHED, make
+from trace_sets.log_kinds import LOG_KINDS
+from trace_sets.log_scoring import delay_right
 from trace_sets.recording import TraceSet
 from trace_sets.scoring import covered, depends_right, located, outcome
 from trace_sets.targets import Record, beside, by, reached, rows
@@ -50,11 +52,12 @@ KEPT = (
     "accepted",
     "depends_on",
     "share",
+    "delayed",
 )
 SELDOM = {"long": 10, "long_clean": 10} | dict.fromkeys(UNOPENED, 5)
 """Of these families every tenth or fifth seed is run: one long set takes as long as ten others, and `unopened` are many families."""
 
-GROUPS = {"unopened": [*UNOPENED]}
+GROUPS = {"unopened": [*UNOPENED], "logs": [*LOG_KINDS]}
 """Names that stand for some families each."""
 
 GOOD = {"right", "clean", "tie", "found", "honest"}
@@ -93,7 +96,7 @@ def _answer(given: TraceSet, path: Path) -> Record:
         result = trace(data, nominal)
     except S2RError as error:
         text = str(error).replace(f"{path.parent}/", "")
-        word = "refused" if given.truth["expect"] != "bad" else "honest" if "\n" not in text else "long_error"
+        word = "refused" if given.truth["expect"] not in {"bad", "reversed"} else "honest" if "\n" not in text else "long_error"
         return {"outcome": word, "verdict": "", "cpu_s": time.process_time() - begin, "error": text, "digest": _digest(text)}
     except Exception as error:  # noqa: BLE001  a bench reports whatever the tracer does
         text = f"{type(error).__name__}: {error}"
@@ -105,6 +108,7 @@ def _answer(given: TraceSet, path: Path) -> Record:
     truth = given.truth | {"unreached": _unreached(given)}
     told |= {"partial": answer.get("partial", []), "cpu_s": cpu_s, "outcome": outcome(truth, answer), "covered": covered(truth, answer)}
     told["located"] = "true_faults" in truth and located(truth, answer)
+    told["delay_right"] = delay_right(truth, answer)
     told["depends_right"] = "depends_on" in truth and depends_right(truth, answer)
     if sindy.available() and truth["expect"] in {"one", "outside", "clean"}:
         told["sindy"] = sindy.answer(data, alike(nominal, data, None)[0])

@@ -11,6 +11,8 @@ unmeasured      one effect that matters, and no speed is measured
 tie             not separable, by how the robot was driven
 fault, bad      measurements that are wrong in places; input from which nothing can be traced
 tiny, long      20 to 120 steps; 50 000 to 100 000 steps
+late_heading, late_speed, measured_torque, position_faults, rounded, same_place, between_samples, hidden_gain, newer
+                as logs of real robots are, and the library's newer effects (log_kinds.py)
 unopened_...    effects of no library, and another robot; not to be opened by whoever changes the tracer (unopened.py)
 """
 
@@ -29,6 +31,7 @@ from trace_sets.confounded import confounded
 from trace_sets.excitation import LAWS
 from trace_sets.faulty import faulty
 from trace_sets.layouts import OFF_GRID, ON_GRID, draw_layout, odd_layout
+from trace_sets.log_kinds import LOG_KINDS
 from trace_sets.making import (
     EXACT,
     Draft,
@@ -252,5 +255,6 @@ FAMILIES: dict[str, Family] = {
     "tiny_clean": _clean("white", most=120),
     "long": _one(MATTERS, least=50_000, most=100_000),
     "long_clean": _clean("white", closed=0.0, least=50_000, most=100_000),
+    **LOG_KINDS,
     **UNOPENED,
 }

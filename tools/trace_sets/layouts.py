@@ -10,6 +10,7 @@ In parts of a step:
     finer      states and commands some times a step
     split      position and heading on rows of their own, half a step apart
     stamped    on the grid, but each stamp is wrong by up to some per cent of a step
+    between    commands on a jittered clock of their own; the file is a table on the grid with the last command in each row
 """
 
 from __future__ import annotations
@@ -63,6 +64,11 @@ def stamps(rng: Rng, layout: str, s: Scale, n: int) -> tuple[Whole, Whole]:
         period = int(rng.integers(max(parts // 2, 3), 2 * parts))
         wobble = rng.integers(0, max(period // 4, 1) + 1, int(n * parts / period) + 1)
         return grid, int(rng.integers(1, parts)) + period * np.arange(len(wobble)) + wobble
+    if layout == "between":
+        period = int(rng.integers(max(parts // 2, 3), parts + 1))
+        wobble = rng.integers(0, max(period // 3, 1) + 1, int(n * parts / period) + 1)
+        wobble[0] = 0
+        return grid, period * np.arange(len(wobble)) + wobble
     if layout == "late":
         return grid, grid[:-1] + int(rng.integers(1, parts))
     if layout == "finer":
@@ -81,6 +87,9 @@ def as_seen(rng: Rng, layout: str, s: Scale, run: Run) -> Run:
         off = float(rng.uniform(0.03, 0.25)) * s.dt * rng.uniform(-0.5, 0.5, len(run.t))
         off[0] = 0.0
         return Run(run.t + off, run.y, run.t_u + off[: len(run.t_u)], run.u)
+    if layout == "between":
+        last = np.searchsorted(run.t_u, run.t + 1e-9, side="right") - 1
+        return Run(run.t, run.y, run.t, run.u[np.maximum(last, 0)])
     if layout == "split":
         y = run.y.copy()
         heading = np.arange(len(y)) % 2 == 1

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from trace_sets import draws
 from trace_sets.excitation import Controller, open_loop, tracker
 from trace_sets.layouts import as_seen, lost, stamps, under_way
-from trace_sets.library import physics
+from trace_sets.newer_effects import newer_physics
 from trace_sets.noise import Noise
 from trace_sets.recording import Recording, Run, record
 from trace_sets.scale import Scale, log_uniform
@@ -48,7 +48,8 @@ class Missing:
 @dataclass
 class Draft:
     """euler: whether the truth itself moves by Euler's rule; declared: what the tracer's model has besides its nominal step;
-    asked: a law of commands of its own; whole: nothing is lost on the way into the file; extra: goes into the truth.
+    asked: a law of commands of its own; begin: the true state in which each run begins; whole: every sample reaches the file; extra: goes
+    into the truth.
     """
 
     scale: Scale
@@ -61,6 +62,7 @@ class Draft:
     runs: int = 1
     declared: tuple[dict[str, Any], ...] = ()
     asked: Callable[[Rng, Array], Array | Controller] | None = None
+    begin: Callable[[Rng], list[float]] | None = None
     together: bool = True
     whole: bool = False
     extra: dict[str, Any] = field(default_factory=dict)
@@ -71,7 +73,7 @@ class Draft:
         named = [m for m in self.missing if m.name != "integration_scheme"]
         first = [m for m in named if m.name == "input_delay"]
         rest = [m for m in named if m.name != "input_delay"]
-        effects = (*(physics(plant, m.name, m.channel, m.p) for m in (*first, *rest)), *self.outside)
+        effects = (*(newer_physics(plant, m.name, m.channel, m.p) for m in (*first, *rest)), *self.outside)
         return World(plant, self.scale.dt, self.scale.parts, effects, self.euler)
 
     def nominal(self) -> World:
@@ -151,7 +153,7 @@ def drive(rng: Rng, draft: Draft, *, ahead: int | None = None, rollouts: int = 3
         n = max(s.n // draft.runs, 10)
         rows, orders = stamps(rng, draft.layout, s, n)
         commands = draft.asked(rng, s.dt / s.parts * orders) if draft.asked else asked(rng, draft, s.dt / s.parts * orders)
-        x0 = _begin(rng, s)
+        x0 = draft.begin(rng) if draft.begin else _begin(rng, s)
         usual = max(1, min(round(HORIZON_S / (world.h * float(np.median(np.diff(rows))))), n // 4))
         how: dict[str, Any] = {"origin": origin, "ahead": ahead or usual, "rollouts": max(rollouts // draft.runs, 6)}
         run = record(world, rows, orders, commands, draft.noise, x0, rng, **how)
@@ -170,7 +172,7 @@ def asked(rng: Rng, draft: Draft, t: Array) -> Array | Controller:
 
 
 def recording_of(rng: Rng, draft: Draft, runs: list[Run]) -> Recording:
-    """What the file says: on some clock, with so many digits."""
+    """What the file says: on some clock, with a number of digits."""
     s = draft.scale
     timed = any(m.name in TIMED for m in draft.missing)
     seen = [as_seen(rng, draft.layout, s, run) for run in runs]
@@ -203,7 +205,7 @@ def draw_missing(rng: Rng, s: Scale, name: str, size: float) -> Missing:
 
 
 def common(draft: Draft, errors: Rollouts | None) -> dict[str, Any]:
-    """What every truth tells."""
+    """What every truth holds."""
     s = draft.scale
     return {
         "robot": s.plant.name,

@@ -6,9 +6,15 @@
     outside    flagged (unexplained) | named_flagged (a name, and depends_on says that more is left) | false_name | none | fault
     tie        tie | overclaimed (one of several, as if it were sure) | wrong | none | withheld | fault
     fault      found (sensor_fault, and where) | located (where, under another verdict) | missed | wrong (a name)
-    bad        honest (refused in one line, or no name) | named | accepted (a file that is none) | crash
+    fault_effect   as `one`
+    reversed   right | tie | honest (unexplained; or refused) | none | fault | wrong. The sign of an input is wrong
+    unpromised honest (no effect is reported) | false_name
+    bad        honest (refused in one line, or no name) | named | accepted (a file without a recording) | crash
 
-An answer is what `s2r trace --json` prints. A truth is what stands in NAME.truth.json. Both are plain data.
+In truths with `close`, `off` stands for right effects with a value far from the true one; in those with `no_fault`, a fault of these kinds
+is an alarm, or wrong.
+
+An answer is what `s2r trace --json` prints. A truth is what NAME.truth.json holds. Both are plain data.
 """
 
 from __future__ import annotations
@@ -35,6 +41,12 @@ def is_one_of(found: tuple[str, str], names: list[list[str | None]]) -> bool:
 
 def outcome(truth: Truth, answer: Answer) -> str:
     """One word."""
+    from trace_sets.log_scoring import close, false_fault
+
+    if false_fault(truth, answer):
+        return "alarm" if truth["expect"] == "clean" else "wrong"
+    if truth["expect"] == "unpromised":
+        return "false_name" if answer["verdict"] in {"traced", "ambiguous"} else "honest"
     if truth["expect"] == "clean":
         return _of_clean(truth, answer)
     if truth["expect"] == "outside":
@@ -44,6 +56,10 @@ def outcome(truth: Truth, answer: Answer) -> str:
     if truth["expect"] == "bad":
         return "accepted" if truth["must_refuse"] else "named" if answer["verdict"] in {"traced", "ambiguous"} else "honest"
     word = _of_named(truth, answer)
+    if truth["expect"] == "reversed" and word == "withheld":
+        return "honest"
+    if word == "right" and truth.get("close") and not close(truth, answer):
+        return "off"
     return "overclaimed" if truth["expect"] == "tie" and word in {"right", "part"} else word
 
 

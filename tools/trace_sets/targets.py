@@ -13,12 +13,14 @@ from typing import Any
 import numpy as np
 from scipy.special import betaincinv
 
+from trace_sets.log_kinds import LOG_KINDS
 from trace_sets.sizing import STRONG, WEAK
 from trace_sets.unopened import KINDS, ROBOT_CLEAN, ROBOT_KINDS, ROBOT_NAMED
 
 Record = dict[str, Any]
 
 RIGHT, NOT_WRONG = {"right"}, {"right", "tie", "none"}
+SURE, GOOD_REVERSED = {"right", "tie"}, {"right", "tie", "honest"}
 LARGE = 50_000
 """Steps of a long set."""
 NOTHING = 1e-9
@@ -29,7 +31,7 @@ ROUGH = {"clean_coloured", "clean_outliers", "clean_student", "clean_quantised",
 
 @dataclass(frozen=True)
 class Row:
-    """what; k of n; the share (or figure) found, its interval, what was asked, and whether that is met (None: nothing to judge by)."""
+    """what; k of n; the share (or figure) found, its interval, the target, and whether that is met (None: nothing to judge by)."""
 
     what: str
     n: int
@@ -75,7 +77,7 @@ def _figure(
 
 
 def reached(record: Record, kind: str = "noisy") -> float | None:
-    """Share of the error reduction that was there to be reached; None where none was: the new drive never asks for what is missing (a limit
+    """Share of the error reduction that was there to be reached; None where none was: on new inputs the missing effect may not act (a limit
     beyond its commands).
     """
     again = record.get("again")
@@ -125,6 +127,7 @@ def rows(records: list[Record]) -> list[Row]:
         _share("known unnamed kinds: right depends_on", [r["depends_right"] for r in outside], 0.70),
         replace(_share("  said that nothing is left, or noise", words(outside, "none"), 0.0), target="", met=None),
         *_unopened(done),
+        *_log_kinds(done),
         _share("not separable by construction: tie reported", words(of("tie"), "tie"), 0.90),
         _figure("error reduction reached, median (matters, pairs)", share, lambda v: float(np.median(v)), 0.97),
         _figure("error reduction reached, 10th percentile", share, lambda v: float(np.quantile(v, 0.1)), 0.85),
@@ -140,6 +143,27 @@ def rows(records: list[Record]) -> list[Row]:
         _share("bad input: refused in a line, or no name", words([r for r in records if r["family"] == "bad"], "honest"), 0.95),
         _share("crashed, or refused 120 steps or more", lost, 0.0, at_most=True),
     ]
+
+
+def _log_kinds(done: list[Record]) -> list[Row]:
+    """Recordings as logs of real robots are: for each family that was run its clean sets, its faults, and its effects."""
+    found: list[Row] = []
+    for family in (f for f in LOG_KINDS if any(r["family"] == f for r in done)):
+        here = [r for r in done if r["family"] == family]
+        clean = [r["outcome"] in {"alarm", "false_name"} for r in here if r["expect"] in {"clean", "unpromised"}]
+        faults = [r["outcome"] == "found" for r in here if r["expect"] == "fault"]
+        effects = [r for r in here if r["expect"] in {"one", "pair", "fault_effect"} and (r["ratio"] or 0.0) >= STRONG]
+        reversed_ = [r["outcome"] in GOOD_REVERSED for r in here if r["expect"] == "reversed"]
+        late = [r["delay_right"] for r in here if r.get("delay_right") is not None]
+        found += [
+            _share(f"{family}: false alarms, nothing missing", clean, 0.05, at_most=True),
+            _share("  a fault: found and placed, no effect lent", faults, 0.80),
+            _share("  delay of a sensor: within a fifth, or half a sample", late, 0.80),
+            _share("  wrong sign: rejected, unexplained, or a gain below zero", reversed_, 0.95),
+            _share("  an effect that matters: right, with its values, or an honest tie", [r["outcome"] in SURE for r in effects], 0.90),
+            _share("  an effect: wrong name, or a value far off", [r["outcome"] in {"wrong", "off"} for r in effects], 0.03, at_most=True),
+        ]
+    return [row for row in found if row.n]
 
 
 def _unopened(done: list[Record]) -> list[Row]:
