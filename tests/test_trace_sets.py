@@ -83,7 +83,7 @@ def test_every_family_is_driven_with_a_known_model():
                 given.model["name"], given.model["dt"], given.model["parameters"], tuple(EffectSpec(**e) for e in given.model["effects"])
             )
         )
-        assert given.truth["expect"] in {"clean", "one", "pair", "outside", "tie", "fault", "fault_effect", "bad"}
+        assert given.truth["expect"] in {"clean", "one", "pair", "outside", "tie", "fault", "fault_effect", "bad", "reversed"}
 
 
 # ---------------------------------------------------------------- physics
