@@ -21,7 +21,6 @@ from s2r_runtime.controllers.file import ControllerFile, Identity
 from s2r_runtime.core import anytime
 from s2r_runtime.core.ledger import binomial_tail, campaign_size, sample_size, share
 from s2r_runtime.errors import ConfigError, NotEnoughEvidence
-from s2r_runtime.evidence import composition as composing
 from s2r_runtime.evidence import statements
 from s2r_runtime.files.canonical import canonical, digest
 from s2r_runtime.messages import (
@@ -397,7 +396,11 @@ def _evidence(c: Certificate, *, traced_not_adopted: bool) -> list[tuple[str, bo
     least_n = min((law.n for law in required), default=0)
     assumed = any(statements.ASSUMED in line for line in c.shown)  # half of the share pays for the mixing (`blocked`)
     halved = holds or assumed
-    wrong = "" if c.composition is None else composing.problem(c.composition)
+    wrong = ""
+    if c.composition is not None:
+        from s2r_runtime.evidence.composition import problem  # numpy, which the gate's process does without
+
+        wrong = problem(c.composition)
     wanted_n = campaign_size(gap.epsilon, gap.beta, gap.discarded) if halved else sample_size(gap.epsilon, gap.beta, gap.discarded)
     return [
         ("the controller did not pass verification" + (f": {v.reason}" if v.reason else ""), v.passed, 0),
