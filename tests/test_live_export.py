@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +106,7 @@ def test_the_residual_by_state_is_what_the_watch_measured(log: Path, exported: d
         assert norm == pytest.approx(one.discrepancy, rel=1e-9)
 
 
-def test_an_earlier_versions_log_is_placed_by_its_wall_clock(log: Path, exported: dict[str, Any]) -> None:
+def test_times_are_the_wall_clock_at_the_start_of_the_run(log: Path, exported: dict[str, Any]) -> None:
     first = next(iter(read(log)))
     assert first.log_time_ns == first.message.t_ns  # type: ignore[attr-defined]
     assert all(series[0][0] >= START_UNIX_S * NS for series in exported.values())
@@ -164,3 +165,16 @@ def test_bad_calls_are_one_line(log: Path, tmp_path: Path, capsys: pytest.Captur
         assert says in said, (argv, said)
         assert said.count("\n") == 1, said
     assert list(tmp_path.iterdir()) == [tmp_path / "a.csv"]
+
+
+def test_the_layout_shows_channels_and_fields_that_there_are(exported: dict[str, Any]) -> None:
+    layout = json.loads((Path(__file__).parent.parent / "examples" / "foxglove" / "s2r.json").read_text(encoding="utf-8"))
+    panels = re.findall(r'"(?:first|second)": "([^"]+)"', json.dumps(layout["layout"]))
+    assert sorted(panels) == sorted(layout["configById"])
+    shown = {topic for panel in layout["configById"].values() for topic in panel.get("topics", {})}
+    shown |= {panel["topicToRender"] for panel in layout["configById"].values() if "topicToRender" in panel}
+    for path in (path["value"] for panel in layout["configById"].values() for path in panel.get("paths", ())):
+        topic, _, field = path.partition(".")
+        assert any(field in data for _, data in exported[topic]), path
+        shown.add(topic)
+    assert shown | {"/tf"} == set(exported)

@@ -63,7 +63,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def run_live(args: argparse.Namespace) -> int:
     """Exit 0 when it is ended by a person."""
     from s2r_runtime.live.foxglove_stream import PORT, Stream
-    from s2r_runtime.live.series import WANTED, Series
+    from s2r_runtime.live.series import WANTED, Series, topics
     from s2r_runtime.live.source import Replay, Running
 
     port = _port(args, PORT)
@@ -71,9 +71,9 @@ def run_live(args: argparse.Namespace) -> int:
     series = Series(source.attached, source.folder)
     if isinstance(source, Running):
         series.begin(source.started, source.status)
-    stream = Stream(f"s2r {source.robot}", args.host, port, args.origin)
-    output.err(f"s2r: Foxglove WebSocket at ws://{args.host}:{stream.port} (Ctrl-C ends it)")
+    stream = Stream(f"s2r {source.robot}", args.host, port, topics(source.started.settings).values(), args.origin)
     with contextlib.suppress(KeyboardInterrupt), contextlib.closing(stream):
+        output.err(f"s2r: Foxglove WebSocket at ws://{args.host}:{stream.port} (Ctrl-C ends it)")
         _stream(source, series, stream)
     return 0
 
@@ -87,6 +87,8 @@ def _stream(source: Running | Replay, series: Series, stream: Stream) -> NoRetur
             for sample in series.take(row):
                 stream.send(sample)
                 last_ns = sample.log_ns
+        if rows:
+            stream.time(last_ns)
         if stream.newcomer() and (shown := series.scene(last_ns)) is not None:
             stream.send(shown)
         if (trouble := series.simulation.trouble) != said:

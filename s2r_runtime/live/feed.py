@@ -45,7 +45,7 @@ _IN_DATA = frozenset({Opcode.HEADER, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.
 
 
 class Row(NamedTuple):
-    """One message. log_ns: its `log_time`: the wall clock (unix, ns); in logs of earlier versions the daemon's clock, as `message.t_ns`."""
+    """One message. log_ns: its `log_time`, which is the daemon's clock, ns."""
 
     log_ns: int
     channel: str

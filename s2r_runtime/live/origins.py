@@ -4,6 +4,9 @@ Any page in a browser on this machine can open a WebSocket to a port of it; the 
 (0.30) does not look at that. So its server listens at an address of the loopback network that was drawn at random (40 bits with the port),
 and what comes to the public port is looked at here first, and then handed on as it is. A client that reads slowly is read for slowly: the
 server behind drops what it then has too much of.
+
+The SDK calls the protocol `foxglove.sdk.v1` and refuses `foxglove.websocket.v1`, which earlier viewers alone know.
+What it sends is the same, so for those the name is exchanged.
 """
 
 from __future__ import annotations
@@ -27,8 +30,12 @@ BUFFER = 64 << 10
 """Bytes that wait for a client here, and about the same again in the kernel."""
 APPS = ("https://app.foxglove.dev", "file://")
 """Foxglove's web application; the desktop applications of Foxglove and Lichtblick."""
+OLD, NEW = b"foxglove.websocket.v1", b"foxglove.sdk.v1"
 _REFUSED = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 _BUSY = b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+
+
+Side = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
 def random_loopback() -> str:
@@ -63,9 +70,11 @@ class Door:
             self._loop.call_soon_threadsafe(self._server.close)
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._thread.join(5.0)
-            for task in asyncio.all_tasks(self._loop):
+            left = asyncio.all_tasks(self._loop)
+            for task in left:
                 task.cancel()
-            self._loop.run_until_complete(asyncio.sleep(0))
+            self._loop.run_until_complete(asyncio.wait(left, timeout=1.0) if left else asyncio.sleep(0))
+            self._loop.run_until_complete(asyncio.sleep(0))  # transports that were closed are freed in the next turn
             self._loop.close()
 
     def may(self, origin: str | None) -> bool:
@@ -88,22 +97,35 @@ class Door:
                 await writer.drain()
                 return
             theirs, ours = await asyncio.open_connection(*self._behind)
-            for one in (writer, ours):
-                one.transport.set_write_buffer_limits(high=BUFFER)
-            ours.write(head)
-            ways = [asyncio.ensure_future(_pipe(reader, ours)), asyncio.ensure_future(_pipe(theirs, writer))]
             try:
-                await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+                await self._between(head, (reader, writer), (theirs, ours))
             finally:
-                for way in ways:
-                    way.cancel()
                 ours.transport.abort()
-        except (OSError, asyncio.CancelledError):
+        except (OSError, EOFError, asyncio.CancelledError, asyncio.LimitOverrunError):
             pass
         finally:
             self._open -= 1
             with contextlib.suppress(OSError, RuntimeError):
+                if writer.transport.get_write_buffer_size():  # it does not read: nobody waits for that
+                    writer.transport.abort()
                 writer.close()
+
+    async def _between(self, head: bytes, client: Side, server: Side) -> None:
+        """Hands on what comes from either side, until one of them ends."""
+        (reader, writer), (theirs, ours) = client, server
+        for one in (writer, ours):
+            one.transport.set_write_buffer_limits(high=BUFFER)
+        old = OLD in head and NEW not in head
+        ours.write(head.replace(OLD, NEW) if old else head)
+        answer = await asyncio.wait_for(theirs.readuntil(b"\r\n\r\n"), HEAD_S)
+        writer.write(answer.replace(NEW, OLD) if old else answer)
+        ways = [asyncio.ensure_future(_pipe(reader, ours)), asyncio.ensure_future(_pipe(theirs, writer))]
+        try:
+            await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for way in ways:
+                way.cancel()
+            await asyncio.gather(*ways, return_exceptions=True)
 
     async def _head(self, reader: asyncio.StreamReader) -> bytes | None:
         """The request's head if it is a WebSocket's and its origin may look."""

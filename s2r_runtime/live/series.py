@@ -9,8 +9,9 @@
     /scene      foxglove.SceneUpdate: region, geofence, goals, obstacles     every second; what moves, every 100 ms
     /events     foxglove.Log: what happened, in words
 
-They are made here and not by the daemon, so that not one more byte goes through its recorder. Times are the log's: the wall clock. A log of
-an earlier version has the daemon's clock instead; its wall clock at the start is known to the second, and that is used. SI units and rad.
+They are made here and not by the daemon, so that not one more byte goes through its recorder. Times are the log's, which are the daemon's
+clock, moved to the wall clock at the run's start as the log has it, to the second. A wall clock that is set during a run moves nothing. SI
+units and radians.
 """
 
 from __future__ import annotations
@@ -38,7 +39,6 @@ GAP_NS = 1_000_000_000
 """A steady series has no values in a pause that is longer: nobody knows them."""
 HEADINGS = ("theta", "yaw", "psi", "heading")
 """What the state is called that turns the robot in the plane, if the model says that it is an angle."""
-CLOCK = "log/clock"
 WANTED = frozenset(CHANNELS) - {"frame/in", "frame/out", "log/chain", "out/persist", "out/decided", "event/sample_taken"}
 """Channels that something here is made of."""
 WATCH = schemas.table(
@@ -68,6 +68,15 @@ def _topic(name: str, schema: Json) -> Topic:
     return Topic(name, schema["title"], json.dumps(schema))
 
 
+def topics(settings: m.Settings) -> dict[str, Topic]:
+    """Every channel of a run with these settings, by name."""
+    state = schemas.table("s2r.State", **dict.fromkeys(settings.states, schemas.NUMBER))
+    given = schemas.table("s2r.Input", **dict.fromkeys(settings.inputs, schemas.NUMBER), source=schemas.TEXT)
+    residual = schemas.table("s2r.Residual", **dict.fromkeys(settings.states, schemas.NUMBER))
+    named = [_topic("/state", state), _topic("/input", given), _topic("/residual", residual)]
+    return {one.name: one for one in (*named, WATCHED, GATED, EVENTS, *((POSE, TF, SCENE) if {"x", "y"} <= set(settings.states) else ()))}
+
+
 POSE = _topic("/pose", schemas.POSE_IN_FRAME)
 TF = _topic("/tf", schemas.TRANSFORMS)
 SCENE = _topic("/scene", schemas.SCENE)
@@ -83,7 +92,6 @@ class Series:
         self._words = Words()
         self.simulation = Simulation(attached, folder)
         self._settings: m.Settings | None = None
-        self._mapped = False
         self._offset_ns = 0
         self._next_ns = self._shown_ns = 0
         self._certificates: dict[str, float] = {}
@@ -95,7 +103,6 @@ class Series:
     def begin(self, started: m.Started, status: Mapping[str, Any]) -> None:
         """Goes on in the middle of a run, whose beginning is `started`, where the daemon's status is this (docs/json.md)."""
         self._start(started, str(status["model"]))
-        self._mapped = True
         known = {"gap": "radius", "gap_measured": "gap_radius", "verified_radius": "verified_radius", "e_value": "e_value"}
         self._watch |= {name: status[key] for name, key in known.items() if status.get(key) is not None}
         self._gate |= {"open": int(status["gate"] == "open"), "reason": str(status["reason"]), "driving": str(status["driving"] or "")}
@@ -104,11 +111,7 @@ class Series:
         """What a row adds."""
         self._out = []
         message = row.message
-        if row.channel == CLOCK:
-            self._mapped, self._offset_ns = True, 0
         if isinstance(message, m.Started):
-            if not self._mapped:
-                self._offset_ns = message.unix_s * 1_000_000_000 - row.log_ns
             self._start(message, message.settings.model_digest)
         if self._settings is None:
             return []
@@ -123,8 +126,8 @@ class Series:
         return self._out
 
     def scene(self, ns: int) -> Sample | None:
-        """All that stands around the robot, for whoever has seen nothing yet; None before a run."""
-        if self._settings is None:
+        """All that stands around the robot, for whoever has seen nothing yet; None before a run, and without x and y."""
+        if self._settings is None or self._place is None:
             return None
         view = self.simulation.view
         entities = scene.bounds(self._settings, ns) + ([] if view is None else scene.scenario(view, ns))
@@ -135,11 +138,10 @@ class Series:
 
     def _start(self, started: m.Started, model_digest: str) -> None:
         settings, memory = started.settings, started.memory
-        self._settings = settings
+        self._settings, self._offset_ns = settings, started.unix_s * 1_000_000_000 - started.t_ns
         self.simulation.begin(settings, model_digest)
-        self._state = _topic("/state", schemas.table("s2r.State", **dict.fromkeys(settings.states, schemas.NUMBER)))
-        self._input = _topic("/input", schemas.table("s2r.Input", **dict.fromkeys(settings.inputs, schemas.NUMBER), source=schemas.TEXT))
-        self._residual = _topic("/residual", schemas.table("s2r.Residual", **dict.fromkeys(settings.states, schemas.NUMBER)))
+        named = topics(settings)
+        self._state, self._input, self._residual = named["/state"], named["/input"], named["/residual"]
         self._place = (settings.states.index("x"), settings.states.index("y")) if {"x", "y"} <= set(settings.states) else None
         headings = [settings.states.index(name) for name in HEADINGS if name in settings.angles and name in settings.states]
         self._heading = headings[0] if headings else None

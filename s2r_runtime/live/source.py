@@ -89,7 +89,8 @@ class Replay:
     def __init__(self, path: Path, channels: Collection[str] | None, speed: float = 1.0) -> None:
         if not path.is_file():
             raise UsageError(f"{path}: no such log file")
-        self.robot = beginning(path).settings.robot
+        self.started = beginning(path)
+        self.robot = self.started.settings.robot
         self.attached: dict[str, bytes] = {}
         self.folder = path.parent
         self._feed, self._speed = Feed(path, channels, self.attached), speed
