@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any
 
 from s2r_runtime.errors import ConfigError
@@ -15,16 +16,16 @@ BEFORE, AFTER, MEASURED, LIMIT = "#d9822b", "#2f6db3", "#1b2330", "#c23030"
 """Colours of plots: the model as given, the repaired one, measurements, bounds."""
 
 
-class Result:
+class Result(ABC):
     """A frozen result. `print(result)` shows `summary()`; a notebook shows it as HTML."""
 
+    @abstractmethod
     def summary(self) -> str:
         """The account that the command line prints."""
-        raise NotImplementedError
 
+    @abstractmethod
     def to_dict(self) -> dict[str, Any]:
         """Plain data, as the command line prints it with `--json` (docs/json.md). Numbers in SI units and radians."""
-        raise NotImplementedError
 
     def __str__(self) -> str:
         return printable_lines(self.summary())

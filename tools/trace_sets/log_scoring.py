@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from trace_sets.scoring import INTERVAL_FREE, matching, named
+from trace_sets.scoring import own_values
 
 Answer = dict[str, Any]
 Truth = dict[str, Any]
@@ -24,18 +24,7 @@ DIRECTIONS = {("link_gravity", "angle"), ("torque_ripple", "phase"), ("periodic_
 
 def close(truth: Truth, answer: Answer) -> bool:
     """Whether each parameter that goes by the truth's own name is near the true value."""
-    found = matching(named(answer["effects"]), truth["accepted"])
-    for effect, place in zip(answer["effects"], found, strict=True):
-        if place is None or place >= len(truth["effects"]) or truth["effects"][place]["name"] != effect["name"]:
-            continue
-        if {truth["effects"][place]["channel"], effect["channel"]} == {"world", "body"}:
-            continue  # the same push, along other axes
-        true = truth["effects"][place]["parameters"]
-        for name, value in effect["parameters"].items():
-            beyond = name in {"low", "high"} and abs(true.get(name, 0.0)) > truth["unreached"].get(effect["channel"], math.inf)
-            if name in true and name not in INTERVAL_FREE and not beyond and not _near(effect["name"], name, true[name], value):
-                return False
-    return True
+    return all(_near(effect, name, true, value) for effect, name, true, value in own_values(truth, answer))
 
 
 def _near(effect: str, name: str, true: float, value: dict[str, Any]) -> bool:

@@ -19,6 +19,7 @@ An answer is what `s2r trace --json` prints. A truth is what NAME.truth.json hol
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 Answer = dict[str, Any]
@@ -152,6 +153,15 @@ def covered(truth: Truth, answer: Answer) -> list[tuple[str, bool]]:
     if answer["verdict"] not in {"traced", "ambiguous"}:
         return []
     told = []
+    for effect, name, true, value in own_values(truth, answer):
+        low, high = value["low"], value["high"]
+        if isinstance(low, float | int) and isinstance(high, float | int):
+            told.append((f"{effect}.{name}", bool(low <= true <= high)))
+    return told
+
+
+def own_values(truth: Truth, answer: Answer) -> Iterator[tuple[str, str, float, dict[str, Any]]]:
+    """(effect, parameter, true value, what is said of it) for each parameter that goes by the truth's own name, as far as inputs went."""
     pairs = zip(answer["effects"], matching(named(answer["effects"]), truth.get("accepted", [])), strict=True)
     for effect, place in pairs:
         if place is None or place >= len(truth["effects"]) or truth["effects"][place]["name"] != effect["name"]:
@@ -160,10 +170,7 @@ def covered(truth: Truth, answer: Answer) -> list[tuple[str, bool]]:
             continue  # the same push, along other axes
         true = truth["effects"][place]["parameters"]
         for name, value in effect["parameters"].items():
-            low, high = value["low"], value["high"]
-            if name in INTERVAL_FREE or name not in true or not isinstance(low, float | int) or not isinstance(high, float | int):
+            if name in INTERVAL_FREE or name not in true:
                 continue
-            if name in {"low", "high"} and abs(true[name]) > truth["unreached"].get(effect["channel"], float("inf")):
-                continue
-            told.append((f"{effect['name']}.{name}", bool(low <= true[name] <= high)))
-    return told
+            if name not in {"low", "high"} or abs(true[name]) <= truth["unreached"].get(effect["channel"], float("inf")):
+                yield effect["name"], name, true[name], value
