@@ -53,7 +53,7 @@ def runs_of(rig: Rig) -> Any:
 def test_runs_are_counted_over_a_kill_and_an_old_state_does_not_forget_them(rig: Rig) -> None:
     rig.start()
     assert rig.deploy()["exit_code"] == 0
-    rig.until(lambda: len(counted(rig)) >= 4 and kept_runs(rig) >= 4)  # status tells them some milliseconds before they are on the disk
+    rig.until(lambda: len(counted(rig)) >= 4 and kept_runs(rig) >= 4)  # status shows them some milliseconds before they are on the disk
     rig.kill()
     kept = (rig.state / "state.json").read_bytes()
     rig.start()

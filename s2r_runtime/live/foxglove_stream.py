@@ -71,7 +71,7 @@ class Stream:
         return channel
 
     def time(self, log_ns: int) -> None:
-        """Tells viewers what time it is in the log: in a replay theirs is another."""
+        """Gives viewers the time in the log: in a replay theirs is another."""
         self._server.broadcast_time(log_ns)
 
     def newcomer(self) -> bool:
